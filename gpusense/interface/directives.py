@@ -23,9 +23,9 @@ class _Branches:
 
     Attributes:
         line: Line number of the ``#if``.
-        taken: Whether the current branch is kept.
-        done: Whether this branch or an earlier one is kept.
-        ended: Whether ``#else`` has been read.
+        taken: The current branch is kept.
+        done: This branch or an earlier one is kept.
+        ended: ``#else`` has been read.
     """
 
     line: int

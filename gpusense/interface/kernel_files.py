@@ -23,7 +23,7 @@ def kernel_root() -> Path:
     """Return the folder that holds ``opencl/`` and ``warp/``.
 
     Raises:
-        FileNotFoundError: The folder is neither inside the package nor beside it.
+        FileNotFoundError: The folder is neither inside the package nor next to it.
     """
     package = Path(__file__).resolve().parents[1]
     candidates = (package / "kernels", package.parent / "kernels")
@@ -36,7 +36,7 @@ def kernel_root() -> Path:
 
 @functools.cache
 def opencl_source(name: str) -> str:
-    """Return the text of ``opencl/<name>.cl``, which is read once.
+    """Return the text of ``opencl/<name>.cl``; each file is read once.
 
     Args:
         name: The file's name with its subfolder and without its suffix: ``"beam"``, ``"lanes/beam"``.

@@ -1,11 +1,11 @@
 """Functions of scalar OpenCL files, written again for vectors.
 
-A body in lanes may compute the same operations on the same numbers as the scalar one, a vector at a time. Its text is
-then that of the scalar function: a file in ``kernels/opencl/lanes`` says
+A body in lanes may compute the same operations on the same numbers as the scalar one, a vector at a time. It then
+reuses the text of the scalar function: a file in ``kernels/opencl/lanes`` says
 
     // in lanes: STEP two_sum ordered_sum
 
-in the place of these functions, structs and macros, which stand in the scalar file of its name or in a file that it
+in place of these functions, structs and macros; they are taken from the scalar file of its name or from a file that it
 requires. Numbers become vectors by ``TYPES``; a function or struct ``name`` for which there is a ``name_lanes`` becomes
 that one. Numbers in memory, ``global const real *``, stay what they are. A text that serves both chooses by ``?:``,
 keeps comparisons as ``long``, and calls functions of numbers alone. Macros are taken as they stand. So are kernels, but

@@ -57,7 +57,7 @@ def with_lanes_flag(
         lanes: Lanes of the device.
         kernel: The kernel.
         flags: Its other flags.
-        float64: Whether the device has float64, which some bodies in lanes need.
+        float64: True if the device has float64, which some bodies in lanes need.
     """
     return _flagged(lanes, kernel, frozenset(flags), float64)
 
@@ -77,7 +77,7 @@ def with_loops_flag(vector_loops: bool, kernel: str, flags: frozenset[str]) -> f
     """Return the flags of a launch, with IN_LANES where the compiler makes vectors of the kernel's loops over readings.
 
     Args:
-        vector_loops: Whether the device's compiler does so, as in ``BackendInfo``.
+        vector_loops: As in ``BackendInfo``.
         kernel: The kernel.
         flags: Its other flags.
     """
@@ -89,9 +89,9 @@ def with_loops_flag(vector_loops: bool, kernel: str, flags: frozenset[str]) -> f
 def with_teams_flags(
     kind: str, kernel: str, flags: frozenset[str], points: int, largest_group: Callable[[str, frozenset[str]], int]
 ) -> tuple[frozenset[str], int]:
-    """Return the flags of a launch with those of teams on a GPU, and the work-items of an item.
+    """Return the flags of a launch, including flags of teams on a GPU, and the work-items of an item.
 
-    Teams are the smallest ones with a work-item for every two points, or the largest ones that the device holds.
+    A team is the smallest with a work-item for every two points, or the largest that the device holds.
 
     Args:
         kind: Kind of the device.

@@ -1,7 +1,7 @@
 """The scene plan: the parts of a computation that a scene does not need, the reasons, and the savings.
 
-Flags choose the code of a kernel; tuned numbers are arguments. The plan follows from the scene, which is parameters,
-scanner, map, and the last scan and cloud. With ``specialize=False`` nothing is left out, and results do not change.
+Flags choose the code of a kernel; tuned numbers are arguments. The plan follows from the scene: parameters, scanner,
+map, and the last scan and cloud. ``specialize=False`` leaves nothing out and does not change results.
 """
 
 from __future__ import annotations

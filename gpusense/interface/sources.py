@@ -41,8 +41,8 @@ def prelude(*, float64: bool, doubles: bool = False) -> str:
     define the macro for it.
 
     Args:
-        float64: Whether ``real`` is float64.
-        doubles: Whether the program uses float64 also where ``real`` is float32.
+        float64: ``real`` is float64.
+        doubles: The program uses float64 even where ``real`` is float32.
     """
     return _PRELUDE.format(
         extension="#pragma OPENCL EXTENSION cl_khr_fp64 : enable\n" if float64 or doubles else "",
@@ -88,9 +88,9 @@ def _with_parameters(text: str, file: str) -> str:
 def required_files(name: str, flags: frozenset[str] = frozenset()) -> list[str]:
     """List the files of a kernel file's program, the file itself last.
 
-    With ``IN_LANES``, ``lanes/<name>`` replaces ``<name>`` where there is such a file. Names in ``// requires:`` are
-    taken literally, so a file in lanes may name files of both folders. ``caster`` stands for the caster of the flags,
-    and ``lanes/caster`` for its body in lanes or, where it has none, for ``lanes/other_caster``.
+    ``IN_LANES`` replaces ``<name>`` by ``lanes/<name>``, if that file exists. Names in ``// requires:`` are taken
+    literally, so a file in lanes may name files of both folders. ``caster`` is replaced by the flags' caster, and
+    ``lanes/caster`` by its body in lanes or else by ``lanes/other_caster``.
     """
     return _with_requirements(f"lanes/{name}" if _in_lanes(name, flags) else name, flags)
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-# Above this peak [1/m] the rounding errors of an exponent may exceed the tolerance beside a log density near 0.
+# Above this peak [1/m] the rounding errors of an exponent may exceed the tolerance of a log density near 0.
 HIGH_PEAK = 64.0
 # The uniform density of a linear sum must be far above the size at which the other densities underflow, with or without
 # denormals.

@@ -23,7 +23,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
 
 
 def deviations(covariance: Floats) -> tuple[float, float]:
-    """Return the largest standard deviation of the position over directions [m], and that of the heading [rad]."""
+    """Return the largest standard deviation of the position over directions [m], and the heading's deviation [rad]."""
     # Python's floats, since arrays of nine items take several times as long.
     (xx, xy, xt), (yx, yy, yt), (tx, ty, tt) = covariance.tolist()
     if not all(map(math.isfinite, (xx, xy, xt, yx, yy, yt, tx, ty, tt))):

@@ -82,7 +82,7 @@ def score_beams(
 ) -> None:  # fmt: skip
     """Score scans; ray r has the readings first[r] to first[r + 1] - 1, and ``score`` has the constant term.
 
-    With SCANS, the rays of a scan begin at start[scan]; where rays are shared, first counts the readings of all scans.
+    SCANS: the rays of a scan begin at start[scan]; where rays are shared, first counts the readings of all scans.
     """
     if "SCANS" in flags:
         for scan, part in particles_of_scans(particles, batch):
@@ -124,7 +124,7 @@ def beam_tiles(
 ) -> None:  # fmt: skip
     """Write the term of reading k to parts[place + k * particles]; GPUs do so in tiles of particles and rays.
 
-    With STRANDED the number there is the sum of strand k.
+    STRANDED: the number at place k is the sum of strand k.
     """
     places = np.arange(particles)
     if "ORDERED" in flags:
@@ -158,9 +158,9 @@ def beam_tiles(
 def sum_terms(
     flags: frozenset[str], term: np.ndarray, score: structs.Score, plainly: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
-    """Sum (M, K) terms and a constant one in the order of the beams; -inf where one of them is -inf.
+    """Sum (M, K) terms and a constant term in the order of the beams; -inf where any term is -inf.
 
-    ``plainly`` is block_sums or strand_sums, whose results are added to a compensated total.
+    ``plainly`` is block_sums or strand_sums; their results are added to a compensated total.
     """
     finite = np.where(np.isneginf(term), 0, term).astype(term.dtype)
     total = (np.full(len(term), score.constant_term, term.dtype), np.zeros(len(term), term.dtype))

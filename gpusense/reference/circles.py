@@ -1,7 +1,7 @@
 """Circles through parts of scans: poles, and walls that are round.
 
-Errors are those of ranges along beams. Their derivatives grow without bound where a beam grazes the circle, so the
-cosine of the angle of incidence is at least ``STEEPEST`` in them. The bearings of the edges of a pole, between its
+Errors are range errors along beams. Their derivatives grow without bound where a beam grazes the circle, so the cosine
+of the angle of incidence is at least ``STEEPEST`` in them. The bearings of the edges of a pole, between its
 last beam and the next one, are measurements of ``asin(radius / distance)``. Levenberg's and Marquardt's steps
 minimise the sum of squares over centre and radius.
 """
@@ -136,7 +136,8 @@ def fit_circles(
 ) -> None:  # fmt: skip
     """Fit circles to parts of scans, of a first point and a number of points.
 
-    Edges are the bearings of the right and the left edge and their deviations, which are 0 where edges are not seen.
+    Edges are the bearings of the right and the left edge and their deviations; a deviation of 0 marks an edge that is
+    not seen.
     """
     for k in range(parts):
         begin, end = start[scan[k]], start[scan[k] + 1]

@@ -1,6 +1,6 @@
 """Cubes of densities, which nav2_amcl and Beluga sum over the beams of a scan; for users who migrate.
 
-terms[10] are those of the mixture in the linear domain, with two exceptions: terms[0] is z_hit alone for amcl, and
+terms[10] holds the mixture's terms in the linear domain, with two exceptions: terms[0] is z_hit alone for amcl, and
 terms[7] is z_max, not its logarithm.
 """
 

@@ -1,7 +1,7 @@
 """Exact squared Euclidean distance transform in cells, in integers.
 
-The device kernels follow Meijster, Roerdink and Hesselink (2000). Here the second pass visits every row in turn, which
-is simple to read and bounded by the farthest obstacle.
+The device kernels follow Meijster, Roerdink and Hesselink (2000). Here the second pass simply visits every row in turn,
+bounded by the farthest obstacle.
 """
 
 from __future__ import annotations

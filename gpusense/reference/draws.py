@@ -76,7 +76,7 @@ def copy_particle(
 
 
 def words_of(settings: np.ndarray, stage: int, index: np.ndarray, stream: int) -> tuple[np.ndarray, ...]:
-    """Return the random words of draws in one of the streams of their stage."""
+    """Return the random words of draws in a stream of their stage."""
     zero = np.zeros(np.shape(index), np.uint64)
     counter = (
         index,
@@ -96,7 +96,7 @@ def draw_particle(
     source: np.ndarray, ends: np.ndarray, settings: np.ndarray, state: np.ndarray, pool: np.ndarray, target: np.ndarray,
     after: np.ndarray, particles: int, stage: int, n: np.ndarray, chosen: np.ndarray,
 ) -> None:  # fmt: skip
-    """Draw particles from those with indices ``chosen``: move them by jitter where a stage follows, or inject poses."""
+    """Draw the particles of indices ``chosen``: move them by jitter where a stage follows, or inject poses."""
     poses = source[: 3 * particles].reshape(-1, 3)
     pose, total = poses[chosen], state[stage * STAGE + TOTAL]
     after[n] = 1.0

@@ -35,8 +35,8 @@ def hit_normal(
 ) -> np.ndarray:
     """Return the normals of the cells in which M rays end at distances t.
 
-    The distance determines the cell of the exact walk: it has crossed all boundaries in x up to t, and those in y
-    before t or, after a step in y, up to t as well. At a corner it steps in x first.
+    The distance determines the cell of the exact walk: it has crossed all boundaries in x up to t, and all boundaries
+    in y before t, or up to t after a step in y. At a corner it steps in x first.
     """
     x, y = cell.T.astype(np.int64)
     col = x + r.step[0] * crossed(t, r.speed[0], r.a[0], r.inv[0], True).astype(np.int64)
@@ -77,8 +77,8 @@ def nearest_echo(
         caster: The knobs of the caster.
 
     Returns:
-        (M,) distances in cells, limit where nothing returns, and cosines and sines of angles of incidence. Without a
-        return these are 2 and 0: 2 exceeds every cosine, so that the first bin can be for such beams alone.
+        (M,) distances in cells, limit where nothing returns, and cosines and sines of angles of incidence. A beam
+        without a return gets 2 and 0: 2 exceeds every cosine, so that the first bin can hold such beams alone.
     """
     real = pose.dtype.type
     nearest = np.full(len(cell), limit, pose.dtype)

@@ -51,8 +51,8 @@ def rest_of(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
 def pair_sum(a: Pair, b: Pair) -> Pair:
     """Add two numbers of two parts each, to about twice the working precision.
 
-    Where the first parts cancel, their sum is at least the last bit of either, so its exponent is at least that of the
-    second parts.
+    When the first parts cancel, their sum is at least the last bit of either, so its exponent is no smaller than the
+    second parts' exponent.
     """
     total, error = two_sum(a[0], b[0])
     return ordered_sum(total, error + (a[1] + b[1]))

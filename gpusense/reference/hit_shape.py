@@ -15,7 +15,7 @@ from gpusense.reference.error_free import Pair, two_product
 
 
 def shape_exponent(flags: frozenset[str], t: Pair, numbers: np.ndarray) -> Pair:
-    """Return the exponent E as a sum of two numbers; ``numbers`` are those of the shape."""
+    """Return the exponent E as a sum of two numbers; ``numbers`` describe the shape."""
     if "STUDENT" not in flags:
         return t
     power, rate = numbers

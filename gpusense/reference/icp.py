@@ -15,13 +15,13 @@ def match_scans(
 ) -> None:  # fmt: skip
     """Match pairs of scans (reference, second scan, level of its rules) from guesses (x, y, theta).
 
-    A guess is the pose of the second scan in the reference's frame. With ``one_way`` the reference's points do not
-    count in the score. A result is the pose (3), the score, iterations, whether the last step was below ten tolerances,
-    the information (6), its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared
+    A guess is the pose of the second scan in the reference's frame. ``one_way`` excludes the reference's points from
+    the score. A result is the pose (3), the score, iterations, whether the last step was below ten tolerances, the
+    information (6), its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared
     errors, points that the other scan should see, points through which it saw, points that it did not see, and for
     blocks of 1, 2, 4 to 128 successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with
-    ``thin``; the last step (3). With two turns, pairs are matched again from results that are farther from their
-    guesses than ``far`` along an axis or ``far_turn``.
+    ``thin``; the last step (3). Two turns match pairs again from results that are farther from their guesses than
+    ``far`` along an axis or ``far_turn``.
     """
     which, of = pair[: 3 * pairs].reshape(-1, 3), rules[: MATCH_RULES * levels].reshape(-1, MATCH_RULES)
     for n, out in enumerate(result[: MATCH_RESULT * turns * pairs * starts].reshape(-1, turns, MATCH_RESULT)):

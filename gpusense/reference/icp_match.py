@@ -81,7 +81,7 @@ def mutual_agreement(
 ) -> np.ndarray:
     """Return how well two scans agree at a pose (x, y, theta), as the sum of both directions.
 
-    With ``one_way`` the reference's points do not count.
+    ``one_way`` excludes the reference's points.
     """
     both, one, other = np.zeros(4, point.dtype), point[first], point[second]
     if not len(one) or not len(other):

@@ -1,8 +1,8 @@
 """Search for the landmarks near the end point of a feature, book table 6.5.
 
-Landmarks lie in square buckets, row by row; ``start[i]`` is the first landmark of bucket i. A search visits the buckets
-that a disc around the feature's end point touches, and evaluates the landmarks within the disc; landmarks outside have
-a negligible density.
+Landmarks are stored in square buckets, row by row; ``start[i]`` is the first landmark of bucket i. A search visits the
+buckets that a disc around the feature's end point touches, and evaluates the landmarks within the disc; landmarks
+outside have a negligible density.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ BLOCK_PAIRS = 1 << 18
 
 
 def bucket_at(position: np.ndarray, size: float, count: int) -> np.ndarray:
-    """Return the row or column of the bucket at a position, the nearest one for positions outside."""
+    """Return the row or column of the bucket at a position; positions outside get the nearest bucket."""
     return np.clip(np.floor(position / size), 0, count - 1).astype(np.int64)
 
 
@@ -40,7 +40,7 @@ def candidates(
 
 
 def near(off: Quad, turned: Quad, feature: np.ndarray) -> np.ndarray:
-    """Return whether landmarks lie in a feature's disc, and within limits for components that it does not measure."""
+    """Return whether landmarks are in a feature's disc, and within limits for components that it does not measure."""
     reach, radius, hole = feature[REACH], feature[RADIUS], feature[HOLE]
     x, y = off[0] - reach * turned[0], off[2] - reach * turned[2]
     squared = off[0] * off[0] + off[2] * off[2]
@@ -75,7 +75,7 @@ def search(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Return per particle the log density, the log density of the likeliest landmark, and its index.
 
-    The log density is that of the likeliest landmark, or with MARGINAL of all landmarks.
+    The log density belongs to the likeliest landmark or, if MARGINAL, to all landmarks.
     """
     real, particles = terms.dtype, len(place[0])
     best, chosen = np.full(particles, -np.inf, real), np.full(particles, -1, np.int32)

@@ -27,7 +27,7 @@ LOG_2 = 0.69314718055994531
 def add_landmark(
     j: int, log_each: np.ndarray, numbers: np.ndarray, best: np.ndarray, choice: np.ndarray, value: np.ndarray
 ) -> None:
-    """Let landmark j be seen by one more feature of each set, at most one of each group.
+    """Let landmark j be seen by one more feature of each set, at most one feature per group.
 
     Args:
         j: The landmark.

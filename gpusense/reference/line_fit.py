@@ -10,7 +10,7 @@ WHOLE_TURN = 6.283185307179586
 def line_through(point: np.ndarray, sums: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Return the lines through points and their neighbours: unit normals, offsets, 1 / (sums of squares along them).
 
-    Without neighbours a line is perpendicular to the point's beam, with -1 in place of that sum.
+    A point without neighbours gets the line perpendicular to its beam, and -1 instead of the sum.
 
     Args:
         point: (N, 4) points.

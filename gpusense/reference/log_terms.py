@@ -1,6 +1,6 @@
 """Exponents and logarithms for the densities of absolute, radio and contact sensors.
 
-Where a density's peak is high, exponent and log peak are large and nearly cancel: both are sums of two numbers.
+Exponent and log peak are large and nearly cancel where a density's peak is high: both are sums of two numbers.
 """
 
 from __future__ import annotations

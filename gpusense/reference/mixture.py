@@ -78,7 +78,7 @@ def hit_scale(flags: frozenset[str], expected: np.ndarray, terms: np.ndarray) ->
         return one / (one + terms[12] * expected), none
     total = one + terms[12] * expected
     share = one / total
-    # By how much the sum is too large; below 2^24 the sum less 1 is exact.
+    # Rounding error of the sum; below 2^24 the sum less 1 is exact.
     excess = rest_of(terms[12] + none, expected, total - one) - terms[13] * expected
     return share, rest_of(total, share, one) + excess * share
 
@@ -88,8 +88,8 @@ def normal_exponent(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ``(z - mean)^2 / (2 sigma^2)`` as a sum of two numbers.
 
-    Where the density's peak is high, exponent and log peak are large and nearly cancel; the second part keeps the
-    digits that remain.
+    Exponent and log peak are large and nearly cancel where the density's peak is high; the second part keeps the digits
+    that remain.
     """
     off, off_low = hit_offset(flags, z, expected, terms)
     scale = hit_scale(flags, expected, terms)
@@ -113,7 +113,7 @@ def hit_exponent(
 
 
 def log_hit(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Return ``log(z_hit p_hit(z | z*))``; terms are those of the log domain."""
+    """Return ``log(z_hit p_hit(z | z*))``; terms are in the log domain."""
     exponent = hit_exponent(flags, z, expected, terms)
     scale = hit_scale(flags, expected, terms)[0]
     log_p = (terms[0] - exponent[0]) + (terms[8] - exponent[1]) + np.log(scale)
@@ -136,7 +136,7 @@ def short_peak(decay: float, expected: np.ndarray) -> np.ndarray:
 
 
 def log_short(z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Return ``log(z_short p_short(z | z*))``; terms are those of the log domain."""
+    """Return ``log(z_short p_short(z | z*))``; terms are in the log domain."""
     inside = (z <= expected) & (expected > 0)
     log_p = (terms[3] + np.log(short_peak(terms[4], expected))) - terms[4] * z
     return np.where(inside, log_p, -np.inf)

@@ -1,7 +1,7 @@
 """Offsets between places in sums of two numbers.
 
-A relative error of eps in 20 m is too much beside a deviation of 1 cm. A place is (x, its low part, y, its low part),
-and so is an offset.
+A relative error of eps in 20 m is too large for a deviation of 1 cm. A place is (x, its low part, y, its low part), and
+so is an offset.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ Quad = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def offset(landmark: np.ndarray, place: Quad) -> Quad:
-    """Return offsets from sensors to landmarks or beacons, which have x, y, and the low parts of both."""
+    """Return offsets from sensors to landmarks or beacons (x, y, and the low parts of both)."""
     x, y = two_sum(landmark[:, 0], -place[0]), two_sum(landmark[:, 1], -place[2])
     x = two_sum(x[0], x[1] + (landmark[:, 2] - place[1]))
     y = two_sum(y[0], y[1] + (landmark[:, 3] - place[3]))

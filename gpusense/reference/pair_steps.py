@@ -36,7 +36,7 @@ def deviation_of(
         right: (P,) weights of the neighbours after.
 
     Returns:
-        (S, P), infinite where the three do not lie on one surface.
+        (S, P), infinite where the three are on different surfaces.
     """
     expected = 1 / (left / before + right / after)
     share = np.sqrt(1 + np.square(np.square(expected / before) * left) + np.square(np.square(expected / after) * right))

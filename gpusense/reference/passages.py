@@ -1,6 +1,6 @@
 """Classes of the beams of a scan at one pose: each beam is walked through the map with two companions.
 
-These start beside it and diverge. :mod:`gpusense.localization.passages` describes the classes. Steps are half a cell.
+These start next to it and diverge. :mod:`gpusense.localization.passages` describes the classes. Steps are half a cell.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def value_at(cells: np.ndarray, index: np.ndarray, within: np.ndarray) -> np.nda
 
 
 def is_wall(value: np.ndarray, occupied: int) -> np.ndarray:
-    """Return whether values are those of walls."""
+    """Return whether values mark walls."""
     return (value >= occupied) & (value < UNKNOWN)
 
 
@@ -68,7 +68,7 @@ def walk_ray(
     after = corner + 1
     inner = (number[after] > 0) & within[after] & within[corner]
     corner, after = corner[inner], after[inner]
-    # Cells beside two cells of the map are on the map as well.
+    # Cells next to two cells of the map are also on the map.
     moved = col[after] - col[corner]
     stops[after] |= is_wall(cells[index[corner] + moved], occupied) & is_wall(cells[index[after] - moved], occupied)
     first = np.full((2, len(steps)), np.inf)
@@ -98,7 +98,7 @@ def walk_beside(
     Args:
         direction: (B,) directions of the beams in the map's frame [rad].
         origin: Where the beams begin [m].
-        companion: Distance by which companions start beside a beam [m], and angle by which they diverge [rad].
+        companion: Companions' offset from a beam at its start [m], and angle of divergence [rad].
         steps: (B,) numbers of steps.
         cells: Values of the cells of a part of the map.
         part: Column and row of the map at which the part begins.
@@ -109,7 +109,7 @@ def walk_beside(
     """
     slope = np.empty((2, len(SIDES), len(direction)))
     slope[0], slope[1] = cos_sin(direction + SIDES * companion[1])
-    # Companions begin at right angles to the beam, whose side is 0.
+    # Companions begin at right angles to the beam; the beam has side 0.
     cos, sin = slope[:, 0]
     shift, start = SIDES * companion[0], np.empty_like(slope)
     start[0], start[1] = origin[0] - shift * sin, origin[1] + shift * cos
@@ -132,7 +132,7 @@ def origin_of(estimate: np.ndarray, frame: structs.Frame) -> tuple[float, float]
 
 
 def deviations_of(estimate: np.ndarray) -> tuple[float, float]:
-    """Return the largest deviation of an estimated position over directions [m], and that of the heading [rad].
+    """Return the largest deviation of an estimated position over directions [m], and the heading's deviation [rad].
 
     Both are infinite if the covariance is not finite; a variance is negative by rounding.
     """
@@ -151,8 +151,8 @@ def judge_beams(
 ) -> None:  # fmt: skip
     """Judge the beams of an estimated pose.
 
-    The scan has their directions relative to the heading, in the map's frame, then their readings, which are NaN for no
-    beam. The result has their classes, then the distances to the first wall on the beam itself.
+    The scan has their directions relative to the heading, in the map's frame, then their readings (NaN for no beam).
+    The result has their classes, then the distances to the first wall on the beam itself.
     """
     relative, measured = scan[: 2 * beams].reshape(2, beams)
     origin, (position, turn) = origin_of(estimate, frame), deviations_of(estimate)

@@ -56,7 +56,7 @@ def place_pose(
     rounded = exact.astype(real)
     # A fraction just below 1 may round to 1, which would be the next cell.
     rounded[:2] = np.minimum(rounded[:2], np.nextafter(real(1), real(0)))
-    # Column by column, which is faster than a transposed copy.
+    # Column by column is faster than a transposed copy.
     for axis in range(2):
         pose_cell[:, axis] = cell[axis]
     for column in range(4):

@@ -100,8 +100,8 @@ def start_casts(
 
     Returns:
         Cells of the origins (2, M); boundaries crossed (2, M) and distances (M,) as of ``start_walk``; ranges known so
-        far (M,), which are limit, or 0 for origins outside the grid where the outside is occupied; and the indices of
-        the rays that remain to be walked.
+        far (M,), limit, or 0 for origins outside the grid where the outside is occupied; and the indices of the rays
+        that remain to be walked.
     """
     origin = cell.T.astype(np.int64)
     k, t = start_walk(flags, r, cell, window, limit)

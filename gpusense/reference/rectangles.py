@@ -2,10 +2,9 @@
 
 The cell is at its corner; sides are at most 255, kept as width + 256 height. A ray may cross such a rectangle in one
 step without missing an obstacle; it is the rectangle in which the ray in the middle of the sector stays longest. The
-idea follows the anisotropic Chebyshev distance maps of Deakin and Knackstedt (2020), which have squares. Planes are
-padded by a ring of zeros; quadrant q extends to (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2
-or 4 sectors from flat to steep. Planes store rows one after the other, or in groups: a group has the cells of its first
-column, then those of the next column.
+idea follows the anisotropic Chebyshev distance maps of Deakin and Knackstedt (2020), made of squares. Planes are padded
+by a ring of zeros; quadrant q extends to (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4
+sectors from flat to steep. Planes store rows one after the other, or in groups: a group is stored column by column.
 
 Planes can be updated after a change of the cells in rows [top, bottom) and columns [left, right) of the map: only cells
 whose rectangles can contain one of these are computed. The input has a band of rows, from row first on.
@@ -83,8 +82,8 @@ def longest(runs: np.ndarray, along: int, across: int) -> np.ndarray:
         across: Cells across them.
 
     Returns:
-        (2, lines, length) cells along and across. The longest one that is high enough is put together from powers of
-        two, whose least runs a pyramid has; the next longer one, not high enough, may be better.
+        (2, lines, length) cells along and across. The longest one that is high enough is combined from powers of two; a
+        pyramid holds their least runs. The next longer one, not high enough, may be better.
     """
     lines, length = runs.shape
     levels = [np.pad(runs.astype(np.uint8), ((0, 0), (0, LONGEST + 1)))]

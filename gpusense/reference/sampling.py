@@ -7,8 +7,8 @@ SERIES_END one half less the continued fraction of Laplace. Quantiles: Wichura, 
 it is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or as a series where lambda z* is small.
 Everything is computed in float64 by +, -, *, / and sqrt, so that every device draws the same bits.
 
-Other shapes of hits than the normal (MASS_TABLE) have a table of masses and one of quantiles: cells of equal width in
-log(1 + b), b = u / sqrt 2, and in -log(1 - 2 mass), with the coefficients of a polynomial in the position within the
+Other shapes of hits than the normal (MASS_TABLE) have a table of masses and a table of quantiles: cells of equal width
+in log(1 + b), b = u / sqrt 2, and in -log(1 - 2 mass), with the coefficients of a polynomial in the position within the
 cell.
 
 ``mixture`` = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short, place of the tables) of
@@ -47,7 +47,7 @@ NORMAL_PEAK, MOST_HALF = 0.3989422804014327, 0.49999999999999994
 # Tables of shapes; beyond FARTHEST_HIT scales the mass is one half.
 DRAW_CELLS, DRAW_PER_LOG, DRAW_POWERS = TABLE_CELLS[8], TABLE_PER_LOG[8], TABLE_POWERS[8]
 FARTHEST_HIT = 1e16
-# Where the series of the mass gives way to the continued fraction; where the mass is one half.
+# Change from the series of the mass to the continued fraction; median.
 SERIES_END, SERIES_TERMS, FRACTION_TERMS, HALF_FROM = 4.0, 48, 24, 9.0
 # AS 241: quantiles of central, outer and outermost probabilities, the highest power first.
 CENTRAL, CENTRAL_END, CENTRAL_OFFSET = 0.425, 5.0, 0.180625
@@ -159,7 +159,7 @@ def table_within(u: np.ndarray, low: np.ndarray, high: np.ndarray, tables: np.nd
 
 
 def short_of(u: np.ndarray, expected: np.ndarray, decay: np.ndarray) -> np.ndarray:
-    """Return a range drawn from p_short, up to the expected one, which is above 0."""
+    """Return a range drawn from p_short, up to the expected range (> 0)."""
     x = decay * expected
     square = u * u
     bend = (u / 6.0 - square / 2.0) + square * u / 3.0

@@ -1,4 +1,4 @@
-"""Placement of poses and readings that lie on the device.
+"""Placement of poses and readings in the device's memory.
 
 Readings are selected and placed as ``gpusense.models.scan.classed`` does it on the host. Uninformative readings are
 left out and the others move up, so that sums over blocks of readings have the same bits. The places that remain at the

@@ -17,11 +17,11 @@ def place_pair(
 ) -> None:  # fmt: skip
     """Place two scans of one scanner, a reference and a second one: points of their hits by bearing, and lines.
 
-    Lines are those for the noise of the pair. A beam is its cosine and sine, its bearing in [0, 2 pi), and the place of
-    its reading; beams come by bearing. Weights are those of the beams before and after each of the places, every
-    ``step``-th beam but the ends. A level of noise is its largest noise, and the slack of its lines. The pair has the
-    row of its rules, which depends on its level and on the stride of its second scan. The summary is its level, the
-    points of both scans, and their sums of squared ranges.
+    Lines are fitted for the pair's noise. A beam is its cosine and sine, its bearing in [0, 2 pi), and the place of its
+    reading; beams come by bearing. Weights belong to the beams before and after each place, every ``step``-th beam but
+    the ends. A level of noise is its largest noise, and the slack of its lines. The pair has the row of its rules,
+    which depends on its level and on the stride of its second scan. The summary is its level, the points of both scans,
+    and their sums of squared ranges.
     """
     readings = reading[: 2 * beams].reshape(2, beams)
     weights = weight[: 2 * places].reshape(places, 2)

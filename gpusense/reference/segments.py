@@ -1,10 +1,10 @@
 """Straight segments of scans: pieces of the sequence of points that a line explains up to the noise of ranges.
 
-On a line the inverse range is ``a cos(bearing) + b sin(bearing)``, linear in (a, b). Weighted by range^2 / sigma,
-squared residuals are those of ranges in standard deviations; their sum is the cost. A scan is split where two lines
+On a line the inverse range is ``a cos(bearing) + b sin(bearing)``, linear in (a, b). Squared residuals, weighted by
+range^2 / sigma, are range residuals in standard deviations; their sum is the cost. A scan is split where two lines
 lower the cost most, until no split lowers it by ``penalty``; neighbours are merged where a single line costs less
 than ``penalty`` more (split and merge, Pavlidis and Horowitz 1974), and ends are moved to where both lines together
-cost least. Lines are then fitted to ranges by Gauss-Newton steps, which is maximum likelihood.
+cost least. Lines are then fitted to ranges by Gauss-Newton steps for maximum likelihood.
 """
 
 from __future__ import annotations

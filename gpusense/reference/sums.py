@@ -14,9 +14,9 @@ def sum_parts(
 ) -> None:  # fmt: skip
     """Sum ``count`` numbers of each particle, number k at parts[place + k * particles].
 
-    The numbers are sums of blocks or strands, and block is 1, or single terms, whose strands are added plainly first.
-    All are added to a compensated total. Several scans have a count each, with STRANDED of readings, whose strands are
-    added; numbers beyond it count as 0, which changes no sum.
+    The numbers are sums of blocks or strands (block is 1), or single terms; strands of a block are first added without
+    compensation. All are added to a compensated total. Each of several scans has a count, in readings if STRANDED;
+    numbers beyond the count are read as 0, which changes no sum.
     """
     places, particle = np.arange(particles), order[:particles] if "ORDERED" in flags else np.arange(particles)
     counted, constant_term = np.full(particles, count), np.full(particles, score.constant_term, parts.dtype)

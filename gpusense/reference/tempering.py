@@ -42,7 +42,7 @@ def largest_of(largest: np.ndarray, begin: int, end: int) -> float:
 
 
 def possible_of(totals: np.ndarray, largest: float) -> float:
-    """Return the largest score; -inf where all particles with a weight are impossible next to those without one."""
+    """Return the largest score; -inf if all particles with a weight are impossible next to particles without."""
     return largest if totals[RUNGS - 1] > 0.0 else -np.inf
 
 

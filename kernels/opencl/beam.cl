@@ -55,7 +55,7 @@ real scan_log(const real sum) {
 }
 
 // Score scans: one work-item takes a particle. Where rays are shared, ray r has the readings from first[r] on, up to
-// first[r + 1] - 1. With SCANS, the rays of a scan begin at start[scan], and first counts the readings of all scans.
+// first[r + 1] - 1. SCANS: the rays of a scan begin at start[scan], and first counts the readings of all scans.
 kernel void score_beams(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
@@ -119,9 +119,9 @@ kernel void score_beams(ARGUMENTS) {
 #endif
 }
 
-// Write the term of reading k to parts[place + k * particles], in tiles of particles and rays, for GPUs. With
-// STRANDED the number there is the sum of strand k, and a work-item takes whole strands. There are fewer than 2^31
-// numbers. With restrict the compiler need not read arguments again after a write.
+// Write the term of reading k to parts[place + k * particles], in tiles of particles and rays, for GPUs. STRANDED: the
+// number at place k is the sum of strand k, and a work-item takes whole strands. There are fewer than 2^31 numbers.
+// With restrict the compiler need not read arguments again after a write.
 kernel void beam_tiles(ARGUMENTS) {
     const int item = get_global_id(0), place = tile_place(item, spread);
     if (place >= particles) return;

@@ -1,5 +1,5 @@
 // Bounds of poses, in float64 and exact. Work-items are a multiple of three, so that each of them sees one column. A
-// first launch bounds the poses, and a second one the bounds of its work-items, which lie in two halves.
+// first launch bounds the poses, and a second one bounds the results of the first, which fill two halves.
 
 #if POSES_FLOAT32
 typedef float coordinate;

@@ -1,9 +1,9 @@
 // Circles through parts of scans: poles, and walls that are round.
 //
-// Errors are those of ranges along beams. Their derivatives grow without bound where a beam grazes the circle, so the
+// Errors are range errors along beams. Their derivatives grow without bound where a beam grazes the circle, so the
 // cosine of the angle of incidence is at least STEEPEST in them. The bearings of the edges of a pole, between its last
-// beam and the next one, are measurements of asin(radius / distance). Levenberg's and Marquardt's steps minimise the sum
-// of squares over centre and radius.
+// beam and the next one, are measurements of asin(radius / distance). Levenberg's and Marquardt's steps minimise the
+// sum of squares over centre and radius.
 
 // Steps of a fit; the first steps, which minimise distances from the circle; the smallest cosine of an angle of
 // incidence.
@@ -179,7 +179,7 @@ void fit_circle(const Part *mine, global real *result) {
 }
 
 // Fit circles to parts of scans, of a first point and a number of points. Edges are the bearings of the right and the
-// left edge and their deviations, which are 0 where edges are not seen. One work-item takes a part.
+// left edge and their deviations; a deviation of 0 marks an edge that is not seen. One work-item takes a part.
 kernel void fit_circles(ARGUMENTS) {
     const int k = get_global_id(0);
     if (k >= parts) return;

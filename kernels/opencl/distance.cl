@@ -1,7 +1,7 @@
 // Exact squared Euclidean distance transform in cells (Meijster, Roerdink and Hesselink 2000), in integers. On
 // processors a work-item takes a line, in time linear in its length. Lines of a pass are parallel: line i starts at i *
-// line_stride, and its cells are step apart. GPUs need more work-items than a map has lines: there a work-item takes a
-// cell, and searches around it only as far as a nearer obstacle is possible.
+// line_stride, and its cells are step apart. GPUs need more work-items than a map has lines: on a GPU a work-item takes
+// a cell, and stops its search around the cell once no nearer obstacle is possible.
 // requires: bits
 
 #define NO_OBSTACLE (-1)
@@ -32,8 +32,7 @@ kernel void distance_lines(ARGUMENTS) {
 int parabola(const int i, const int j, const int across) { return (i - j) * (i - j) + across * across; }
 
 // Second pass: evaluate the lower envelope of the parabolas of the first pass. One work-item takes a line. The stack of
-// vertices lies in squared, which is overwritten from its far end: entry q of the stack never lies beyond the cell that
-// reads it.
+// vertices shares squared, overwritten from its far end: entry q of the stack never passes the cell that reads it.
 kernel void distance_envelope(ARGUMENTS) {
     const int line = get_global_id(0);
     if (line >= lines) return;
@@ -103,8 +102,8 @@ kernel void distance_blocks(ARGUMENTS) {
 uint squares_sum(const uint a, const uint b) { return a * a + b * b; }
 
 // Second pass: find the least sum of squares along the column of a cell, UNREACHABLE where it is over most. One
-// work-item takes a cell. Near rows are read one by one. Farther away, the minima of blocks give an upper bound first,
-// and then the blocks that may hold less.
+// work-item takes a cell. Near rows are read singly. Farther away, the minima of blocks give an upper bound first, and
+// then the blocks that may hold less.
 kernel void distance_search(ARGUMENTS) {
     const int col = get_global_id(0), row = get_global_id(1);
     if (row >= rows || col >= cols) return;
@@ -118,7 +117,7 @@ kernel void distance_search(ARGUMENTS) {
             if (row + j < rows) best = min(best, squares_sum(j, column[(long)(row + j) * cols]));
         }
     }
-    // Blocks begin beyond the rows read so far, so all rows of a block lie on one side.
+    // Blocks begin beyond the rows read so far, so all rows of a block are on one side.
     for (int pass = (uint)(i * i) < best ? 0 : 2; pass < 2; ++pass) {
         for (int way = -1; way <= 1; way += 2) {
             for (int b = (row + way * i) >> BLOCK_BITS; b >= 0 && b < count; b += way) {

@@ -71,7 +71,7 @@ void copy_particle(global const double *source, global const double *weight, glo
     after[n] = total > 0.0 ? kept : 1.0;
 }
 
-// Return the random words of a draw in one of the streams of its stage.
+// Return the random words of a draw in a stream of its stage.
 uint4 words_of(global const double *settings, const int stage, const uint index, const uint stream) {
     const uint4 counter = (uint4)(index, (uint)settings[STEP], DRAW_STREAM + DRAW_STREAMS * stage + stream, 0);
     return random_words(counter, (uint)settings[SEED], (uint)settings[SEED + 1]);

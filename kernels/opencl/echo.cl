@@ -5,8 +5,8 @@
 // requires: caster mixture
 
 #if CONES
-// Distance in cells, and cosine and sine of the angle of incidence. Without a return these are limit, 2 and 0: 2
-// exceeds every cosine, so that the first bin can be for such beams alone.
+// Distance in cells, and cosine and sine of the angle of incidence. A beam without a return gets limit, 2 and 0: 2
+// exceeds every cosine, so that the first bin can hold such beams alone.
 typedef struct {
     real t, cosine, sine;
 } Echo;
@@ -28,7 +28,7 @@ real2 normal_at(global const real2 *normals, const Window window, const int col,
 }
 
 // Return the normal of the cell in which a ray ends at a distance t. The distance determines the cell of the exact
-// walk: it has crossed all boundaries in x up to t, and those in y before t or, after a step in y, up to t as well. At
+// walk: it has crossed all boundaries in x up to t, and all boundaries in y before t, or up to t after a step in y. At
 // a corner it steps in x first.
 real2 hit_normal(global const real2 *normals, const Window window, const int2 cell, const Ray r, const real t) {
     if (t == 0) {
@@ -57,7 +57,7 @@ Echo nearest_echo(global const entry *map_table, global const real2 *normals, co
                   const real4 pose, global const real2 *ray, const Cone cone, const real limit, const Caster caster) {
     Echo echo = {limit, 2, 0};
     for (int i = 0; i < cone.rays; ++i) {
-        // Most casters may stop at the nearest return so far; those of tables and lines may not.
+        // Most casters may stop at the nearest return so far; casters of tables and lines may not.
         real farthest = echo.t;
 #if LOOKUP
         farthest = limit;

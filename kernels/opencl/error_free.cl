@@ -38,8 +38,8 @@ real rest_of(const real a, const real b, const real c) {
     return (c - product.x) - product.y;
 }
 
-// Add two numbers of two parts each, to about twice the working precision. Where the first parts cancel, their sum is
-// at least the last bit of either, so its exponent is at least that of the second parts.
+// Add two numbers of two parts each, to about twice the working precision. When the first parts cancel, their sum is at
+// least the last bit of either, so its exponent is no smaller than the second parts' exponent.
 real2 pair_sum(const real2 a, const real2 b) {
     const real2 sum = two_sum(a.x, b.x);
     return ordered_sum(sum.x, sum.y + (a.y + b.y));

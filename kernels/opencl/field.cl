@@ -1,5 +1,5 @@
 // Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point. A ring of two cells around
-// the table stands for everything outside the grid, so no look-up needs a bounds test.
+// the table represents everything outside the grid, so no look-up needs a bounds test.
 // requires: field_term
 
 // Particles per work-group of field_blocks.
@@ -52,8 +52,8 @@ real field_log(const real2 total, const real temperature) {
 #endif
 }
 
-// Score scans: one work-item takes a particle. ROUNDED_CELLS changes this kernel in Warp alone, on processors, whose
-// compiler makes vector code of loops.
+// Score scans: one work-item takes a particle. ROUNDED_CELLS changes this kernel in Warp alone, on processors: their
+// compiler vectorises loops.
 kernel void score_field(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;

@@ -91,7 +91,7 @@ kernel void field_gradient(ARGUMENTS) {
     global real *out = gradient + (long)GRADIENT_NUMBERS * n;
     out[0] = isinf(total.x) ? total.x : score.temperature * (total.x + total.y);
     for (int i = 0; i < 6; ++i) out[1 + i] = score.temperature * sums[i];
-    // The other rows of the information, which is symmetric.
+    // The other rows of the symmetric information matrix.
     out[7] = score.temperature * sums[4];
     out[8] = score.temperature * sums[6];
     out[9] = score.temperature * sums[7];

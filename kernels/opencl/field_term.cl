@@ -41,7 +41,8 @@ real2 field_exponent(const real2 distance, global const real *terms) {
     return shape_exponent(field_square(distance, terms), terms[6], terms[7]);
 }
 
-// Return log p of the distance from an end point to the nearest obstacle. Without random readings it is that of a hit.
+// Return log p of the distance from an end point to the nearest obstacle. If z_rand is 0, the logarithm belongs to a
+// hit alone.
 real log_field(const real2 distance, global const real *terms) {
     const real2 exponent = field_exponent(distance, terms);
 #if LINEAR

@@ -2,8 +2,8 @@
 // requires: icp_pairs icp_match
 
 // Match scans: a work-item, or with IN_TEAMS a team of them, takes a pair (reference, second scan, level of its rules)
-// and a guess (x, y, theta), the pose of the second scan in the reference's frame. With one_way the reference's points do
-// not count in the score.
+// and a guess (x, y, theta), the pose of the second scan in the reference's frame. one_way excludes the reference's
+// points from the score.
 kernel void match_scans(ARGUMENTS) {
 #if IN_TEAMS
     local real shared[TEAM * AT_ONCE];

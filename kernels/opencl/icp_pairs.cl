@@ -98,7 +98,7 @@ real4 agreement(global const real4 *point, global const real4 *line, const int c
     return (real4)(sum[0], sum[1], sum[2], sum[3]);
 }
 
-// Write the sums over the pairs of a scan's points at a pose (x, y, cos, sin), and those of blocks, 0 unless full.
+// Write the sums over the pairs of a scan's points at a pose (x, y, cos, sin), and the sums of blocks, 0 unless full.
 void sum_pairs(global const real4 *point, global const real4 *line, const int count, global const real4 *other,
                const int others, const int stride, const int skip, const real4 pose, const real capture,
                const real scale, const int last, const int full, real *sums, real *squares, const Team team) {

@@ -29,8 +29,8 @@ typedef struct {
 #endif
 } Team;
 
-// Return the binary logarithm of the points of a member, which are enough for all members to cover count; a team of one
-// takes at least the longest block.
+// Return log2 of the points of a member, enough for all members to cover count; a team of one takes at least the
+// longest block.
 int log_share(const int count) {
     int log = TEAM > 1 ? 0 : MATCH_BLOCKS - 1;
     while ((long)TEAM << log < count) ++log;
@@ -83,7 +83,7 @@ void add_to_blocks(real *squares, real *open, const int levels, const int i, con
     }
 }
 
-// Add the last blocks, which have fewer points.
+// Add the last, shorter blocks.
 void close_blocks(real *squares, const real *open, const int levels, const int count) {
     real rest = 0;
     for (int l = 0; l + 1 < levels; ++l) {

@@ -1,5 +1,5 @@
-// Search for the landmarks near the end point of a feature, book table 6.5. Landmarks lie in square buckets, row by
-// row; start[i] is the first landmark of bucket i. A search visits the buckets that a disc around the feature's end
+// Search for the landmarks near the end point of a feature, book table 6.5. Landmarks are stored in square buckets, row
+// by row; start[i] is the first landmark of bucket i. A search visits the buckets that a disc around the feature's end
 // point touches, and evaluates the landmarks within the disc; landmarks outside have a negligible density.
 // requires: error_free landmarks line_feature
 
@@ -13,13 +13,13 @@ typedef struct {
     int chosen;
 } Match;
 
-// Return the row or column of the bucket at a position, the nearest one for positions outside.
+// Return the row or column of the bucket at a position; positions outside get the nearest bucket.
 int bucket_at(const real position, const real size, const int count) {
     return (int)clamp(floor(position / size), (real)0, (real)(count - 1));
 }
 
-// Return whether a landmark lies in a feature's disc, within the limits of the sensor that the feature does not
-// measure, and no farther from the end point than the square root of most.
+// Return whether a landmark is in a feature's disc, within the limits of the sensor that the feature does not measure,
+// and no farther from the end point than the square root of most.
 int near(const real4 off, const real4 turned, global const real *feature, const real most) {
     const real reach = feature[REACH], radius = feature[RADIUS], hole = feature[HOLE];
     const real x = off.x - reach * turned.x, y = off.z - reach * turned.z, squared = off.x * off.x + off.z * off.z;
@@ -31,9 +31,9 @@ int near(const real4 off, const real4 turned, global const real *feature, const 
     return d <= feature[FARTHEST] && turned.x * off.x + turned.z * off.z >= feature[AXIS] * d;
 }
 
-// Return the square of the radius around a feature's end point outside which exponents are larger than exponent. With r
-// the error of the range and b that of the bearing, a landmark is sqrt(r^2 + 2 z (z + r) (1 - cos b)) away, and 2 (1 -
-// cos b) <= b^2. A factor and SLACK cover rounding errors of such distances.
+// Return the square of the radius around a feature's end point outside which exponents are larger than exponent. Let r
+// be the error of the range and b the error of the bearing: a landmark is sqrt(r^2 + 2 z (z + r) (1 - cos b)) away, and
+// 2 (1 - cos b) <= b^2. A factor and SLACK cover rounding errors of such distances.
 real squared_reach(const real exponent, global const real *feature) {
     if (!(exponent > 0)) return 0;
     const real r = sqrt(exponent) * feature[RANGE_SPREAD], b = sqrt(exponent) * feature[BEARING_SPREAD];

@@ -11,7 +11,8 @@
 // A landmark's part of a density exceeds the false positive's if the density is more than twice the latter.
 #define LOG_2 ((real)0.69314718055994531)
 
-// Let landmark j be seen by one more feature of each set, at most one of each group; log_each has the features' log p.
+// Let landmark j be seen by one more feature of each set, at most one feature per group; log_each has the features' log
+// p.
 void add_landmark(const int j, const real *log_each, global const real *feature, global real *best, global int *choice,
                   global real *value, const int features, const int sets, const int groups) {
     // From the full set down, since smaller sets must not yet contain this landmark for the group.

@@ -2,8 +2,8 @@
 // requires: error_free landmarks landmark_grid
 
 // Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one. One work-item takes a
-// particle. With PER_BEAM, parts has the term of each feature, and which the index of its likeliest landmark, -1 where
-// a false positive is likelier. With MARGINAL share is log(1 / landmarks), the prior of a landmark, else 0.
+// particle. PER_BEAM: parts has the term of each feature, and which the index of its likeliest landmark, -1 where a
+// false positive is likelier. share is log(1 / landmarks), the prior of a landmark, if MARGINAL, else 0.
 kernel void score_features(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;

@@ -3,10 +3,10 @@
 // d and b_j are the landmark's distance and bearing from the sensor; differences of bearings are wrapped to (-pi, pi].
 // m is the mass of a component on the measurable interval: [0, range_max], the field of view, the span of signatures.
 // Components that were not measured are left out. Positions, directions and quantities derived from them are sums of
-// two numbers, since a relative error of eps in a distance of 20 m is too large for a deviation of 1 cm. A
-// feature is FEATURE numbers, which are named below, in the same order in all three languages. A place is (x, its low
-// part, y, its low part), and so are an offset and a direction. terms[4] = {range_max, its low part, field of view,
-// density of a bearing at zero range over that of its peak and scale}.
+// two numbers, since a relative error of eps in a distance of 20 m is too large for a deviation of 1 cm. A feature is
+// FEATURE numbers, named below, in the same order in all three languages. A place is (x, its low part, y, its low
+// part), and so are an offset and a direction. terms[4] = {range_max, its low part, field of view, density of a bearing
+// at zero range relative to its peak and scale}.
 // requires: error_free log_terms offsets
 
 // Range; cosine and sine of the bearing on the robot; signature.

@@ -3,8 +3,8 @@
 #define WHOLE_TURN ((real)6.283185307179586)
 
 // Return the line through a point and its neighbours, a unit normal, an offset, and 1 / (sum of squared distances along the
-// line), from sums of the neighbours' coordinates relative to the point and of their products. Without neighbours it is
-// perpendicular to the point's beam, with -1 in place of that sum.
+// line), from sums of the neighbours' coordinates relative to the point and of their products. A point without
+// neighbours gets the line perpendicular to its beam, and -1 instead of the sum.
 real4 line_through(const real4 centre, const real2 sum, const real xx, const real xy, const real yy, const int size) {
     const real2 mean = sum / (real)size;
     const real a = xx - size * mean.x * mean.x, b = xy - size * mean.x * mean.y, d = yy - size * mean.y * mean.y;

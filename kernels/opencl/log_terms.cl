@@ -1,5 +1,5 @@
-// Exponents and logarithms for the densities of absolute, radio and contact sensors. Where a density's peak is high,
-// exponent and log peak are large and nearly cancel: both are sums of two numbers.
+// Exponents and logarithms for the densities of absolute, radio and contact sensors. Exponent and log peak are large
+// and nearly cancel where a density's peak is high: both are sums of two numbers.
 // requires: error_free
 
 #define LARGEST_ROOT ((real)(FLOAT64 ? 1e140 : 1e17))

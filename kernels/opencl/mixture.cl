@@ -82,7 +82,7 @@ real2 hit_scale(const real expected, global const real *terms) {
 #if GROWTH
     const real sum = 1 + terms[12] * expected, scale = 1 / sum;
 #if EXACT_EXPONENT
-    // By how much the sum is too large; below 2^24 the sum less 1 is exact.
+    // Rounding error of the sum; below 2^24 the sum less 1 is exact.
     const real excess = rest_of(terms[12], expected, sum - 1) - terms[13] * expected;
     return (real2)(scale, rest_of(sum, scale, 1) + excess * scale);
 #else
@@ -93,8 +93,8 @@ real2 hit_scale(const real expected, global const real *terms) {
 #endif
 }
 
-// Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers. Where the density's peak is high, exponent and log peak are
-// large and nearly cancel; the second part keeps the digits that remain.
+// Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers. Exponent and log peak are large and nearly cancel where
+// the density's peak is high; the second part keeps the digits that remain.
 real2 normal_exponent(const real z, const real expected, global const real *terms) {
     real2 off = hit_offset(z, expected, terms);
 #if EXACT_EXPONENT
@@ -127,7 +127,7 @@ real2 hit_exponent(const real z, const real expected, global const real *terms) 
     return shape_exponent(normal_exponent(z, expected, terms), terms[17], terms[18]);
 }
 
-// Return log(z_hit p_hit(z | z*)); terms are those of the log domain.
+// Return log(z_hit p_hit(z | z*)); terms are in the log domain.
 real log_hit(const real z, const real expected, global const real *terms) {
     const real2 exponent = hit_exponent(z, expected, terms);
     const real scale = hit_scale(expected, terms).x;
@@ -154,7 +154,7 @@ real short_peak(const real lambda, const real expected) {
     return (h > TINY_DECAY ? lambda * (1 + t) : (real)1) / (h > TINY_DECAY ? 2 * t : shortest);
 }
 
-// Return log(z_short p_short(z | z*)); terms are those of the log domain.
+// Return log(z_short p_short(z | z*)); terms are in the log domain.
 real log_short(const real z, const real expected, global const real *terms) {
     if (!(z <= expected && expected > 0)) return -INFINITY;
     return (terms[3] + log(short_peak(terms[4], expected))) - terms[4] * z;

@@ -2,7 +2,7 @@
 // A place is (x, its low part, y, its low part), and so is an offset.
 // requires: error_free
 
-// Return the offset from a sensor to a landmark or beacon, which has x, y, and the low parts of both.
+// Return the offset from a sensor to a landmark or beacon (x, y, and the low parts of both).
 real4 offset(const real4 landmark, const real4 place) {
     const real2 x = two_sum(landmark.x, -place.x), y = two_sum(landmark.y, -place.z);
     return (real4)(two_sum(x.x, x.y + (landmark.z - place.y)), two_sum(y.x, y.y + (landmark.w - place.w)));

@@ -10,7 +10,7 @@
 // Units of a turn.
 #define TURN ((real)65536)
 
-// Return the heading relative to that of the first particle, from -TURN / 2 to TURN / 2.
+// Return the heading relative to the first particle's, from -TURN / 2 to TURN / 2.
 int relative_turn(const real4 pose, const real4 other) {
     const real2 heading = (real2)(pose.z * other.z + pose.w * other.w, pose.w * other.z - pose.z * other.w);
     const int turn = (int)(turn_of(heading.x, heading.y) * TURN);

@@ -15,8 +15,8 @@
 // Points nearer than this have no bearing [m].
 #define NEAREST 1e-6
 
-// Return how far a range is from the one that its neighbours predict on a straight wall, in the standard deviation of this
-// difference; infinite where they do not lie on one surface. weight has those of the neighbours.
+// Return the difference between a range and its prediction from neighbours on a straight wall, in standard deviations;
+// infinite where they are on different surfaces. weight has the neighbours' weights.
 double deviation_of(const double before, const double here, const double after, global const double *weight) {
     const double expected = 1 / (weight[0] / before + weight[1] / after), limit = LARGEST_STEP * here;
     if (!(expected > 0 && fabs(before - here) < limit && fabs(after - here) < limit)) return INFINITY;

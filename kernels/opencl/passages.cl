@@ -1,9 +1,9 @@
-// Classes of the beams of a scan at one pose: each beam is walked through the map with two companions that start beside
-// it and diverge. gpusense.localization.passages describes the classes. Steps are half a cell. With IN_TEAMS the work-items
-// of a group share the steps of a walk, of which each takes some neighbours.
+// Classes of the beams of a scan at one pose: each beam is walked through the map with two companions that start next
+// to it and diverge. gpusense.localization.passages describes the classes. Steps are half a cell. With IN_TEAMS the
+// work-items of a group share the steps of a walk, of which each takes some neighbours.
 // requires: heading
 
-// Values of cells that are unknown, and of places off the map, which are unknown as well.
+// Values of unknown cells, and of places off the map, also unknown.
 #define UNKNOWN 255
 #define OFF 256
 // Step of a walk, and farthest start of one, where no map reaches [cells].
@@ -59,7 +59,7 @@ int value_at(global const uchar *cells, const int col, const int row, const int 
     return (uint)col < (uint)cols && (uint)row < (uint)rows ? cells[(long)row * cols + col] : OFF;
 }
 
-// Return whether a value is that of a wall.
+// Return whether a value marks a wall.
 int is_wall(const int value, const int occupied) {
     return value >= occupied && value < UNKNOWN;
 }
@@ -98,7 +98,7 @@ double2 walk_ray(const double2 start, const double2 slope, const int begin, cons
     return first;
 }
 
-// Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1), which starts beside it and
+// Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1), which starts next to it and
 // diverges.
 double2 walk_beside(const double side, const double direction, const double2 origin, const double2 companion,
                     const int steps, global const uchar *cells, const int2 part, const int rows, const int cols,
@@ -125,8 +125,8 @@ double2 origin_of(global const double *estimate, const Frame frame) {
     return (double2)(frame.yaw_cos * x + frame.yaw_sin * y, frame.yaw_cos * y - frame.yaw_sin * x);
 }
 
-// Return the largest deviation of an estimated position over directions [m], and that of the heading [rad]. Both are
-// infinite if the covariance is not finite; a variance is negative by rounding.
+// Return the largest deviation of an estimated position over directions [m], and the heading's deviation [rad]. Both
+// are infinite if the covariance is not finite; a variance is negative by rounding.
 double2 deviations_of(global const double *estimate) {
     const double xx = fmax(estimate[3], 0.0), xy = estimate[4], yy = fmax(estimate[6], 0.0), tt = fmax(estimate[8], 0.0);
     const double all = estimate[3] + estimate[4] + estimate[5] + estimate[6] + estimate[7] + estimate[8];
@@ -136,8 +136,8 @@ double2 deviations_of(global const double *estimate) {
 }
 
 // Judge the beams of an estimated pose: a work-item, or with IN_TEAMS a team of them, takes a beam. The scan has their
-// directions relative to the heading, in the map's frame, then their readings, which are NaN for no beam. The result has
-// their classes, then the distances to the first wall on the beam itself.
+// directions relative to the heading, in the map's frame, then their readings (NaN for no beam). The result has their
+// classes, then the distances to the first wall on the beam itself.
 kernel void judge_beams(ARGUMENTS) {
 #if IN_TEAMS
     local double2 shared[WALKERS];

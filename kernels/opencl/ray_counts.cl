@@ -49,7 +49,7 @@ kernel void count_rays(ARGUMENTS) {
     }
     col += step_x * (int)done_x, row += step_y * (int)done_y;
     left_x -= (int)done_x, left_y -= (int)done_y;
-    // Negative where the next boundary lies in x.
+    // Negative where x has the next boundary.
     long lead = (first_x + done_x * UNIT) * size_y - (first_y + done_y * UNIT) * size_x;
     while (!has_left(col, step_x, cols) && !has_left(row, step_y, rows)) {
         const bool at_end = left_x + left_y == 0;

@@ -5,8 +5,8 @@
 // half less the continued fraction of Laplace. Quantiles: Wichura, "Algorithm AS 241" (1988). For p_short it is 1 - u
 // (1 - exp(-lambda z*)), written as a sum of positive terms, or as a series where lambda z* is small. Everything is
 // computed in float64 by +, -, *, / and sqrt, so that every device draws the same bits. Other shapes of hits than the
-// normal (MASS_TABLE) have a table of masses and one of quantiles: cells of equal width in log(1 + b), b = u / sqrt 2,
-// and in -log(1 - 2 mass), with the coefficients of a polynomial in the position within the cell. mixture = (z_hit,
+// normal (MASS_TABLE) have a table of masses and a table of quantiles: cells of equal width in log(1 + b), b = u / sqrt
+// 2, and in -log(1 - 2 mass), with the coefficients of a polynomial in the position within the cell. mixture = (z_hit,
 // z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short, place of the tables) of each bin of angles
 // of incidence, and then the tables. chances = for each bin of expected ranges, the cumulative probabilities of the
 // bins of readings.
@@ -33,7 +33,7 @@
 #define DRAW_PER_LOG 27.0
 #define DRAW_POWERS 8
 #define FARTHEST_HIT 1e16
-// Where the series of the mass gives way to the continued fraction; where the mass is one half.
+// Change from the series of the mass to the continued fraction; median.
 #define SERIES_END 4.0
 #define SERIES_TERMS 48
 #define FRACTION_TERMS 24
@@ -148,7 +148,7 @@ double table_within(const double u, const double low, const double high, global 
     return fmin(fmax(mark < 0.0 ? -size : size, -low), high);
 }
 
-// Return a range drawn from p_short, up to the expected one, which is above 0.
+// Return a range drawn from p_short, up to the expected range (> 0).
 double short_of(const double u, const double expected, const double decay) {
     const double x = decay * expected;
     if (x < SHORT_SERIES) {

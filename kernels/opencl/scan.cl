@@ -1,4 +1,4 @@
-// Placement of poses and readings that lie on the device. Readings are selected and placed as
+// Placement of poses and readings in the device's memory. Readings are selected and placed as
 // gpusense.models.scan.classed does it on the host. Uninformative readings are left out and the others move up, so that
 // sums over blocks of readings have the same bits. The places that remain at the end get missing readings (nan), which
 // add nothing.
@@ -15,8 +15,7 @@ typedef double measured;
 #define MAX_FIXED 1
 #define MAX_PLACED 2
 
-// Return whether an even choice of informative readings includes one of this rank: some i * informative / chosen is the
-// rank.
+// Return whether an even choice of informative readings includes this rank: some i * informative / chosen equals it.
 int is_chosen(const int rank, const int informative, const int chosen) {
     if (chosen >= informative) return 1;
     if (chosen == 0) return 0;
@@ -34,7 +33,7 @@ double reading_of(const int k, global const measured *ranges, global const int *
 #endif
 }
 
-// Return the number of informative readings, which is not counted where all are chosen.
+// Return the number of informative readings; not counted where all are chosen.
 int count_informative(global const measured *ranges, global const int *beam, const ReadingRules rules) {
     if (rules.chosen >= rules.beams) return rules.beams;
     int informative = 0;
@@ -60,7 +59,7 @@ uint2 read_block(const int first, global const measured *ranges, global const in
     return (uint2)(hits, fars);
 }
 
-// Return the set of those of a block's informative readings that are chosen; the first one has the rank.
+// Return the set of a block's informative readings that are chosen; rank belongs to the first reading.
 uint chosen_of(const uint telling, const int rank, const int informative, const int chosen) {
     uint used = telling;
     if (chosen >= informative) return used;
@@ -85,7 +84,8 @@ uint4 placed_of(const uint used, const uint2 sets, const int left, const Reading
 }
 
 #if END_POINTS
-// Return the longest of a block's ranges that come to the block of places from begin on; place is that of the first reading.
+// Return a block's longest range among readings placed in the block of places from begin on; place belongs to the first
+// reading.
 double longest_beside(const double *several, const uint as_range, const uint placed, const int place, const int begin) {
     double longest = 0;
 #pragma unroll

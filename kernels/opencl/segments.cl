@@ -1,11 +1,11 @@
 // Straight segments of scans: pieces of the sequence of points that a line explains up to the noise of ranges.
 //
-// On a line the inverse range is a cos(bearing) + b sin(bearing), linear in (a, b). Weighted by range^2 / sigma, squared
-// residuals are those of ranges in standard deviations; their sum is the cost. A scan is split where two lines lower the
-// cost most, until no split lowers it by penalty; neighbours are merged where a single line costs less than penalty more
-// (split and merge, Pavlidis and Horowitz 1974), and ends are moved to where both lines together cost least. Lines are
-// then fitted to ranges by Gauss-Newton steps, which is maximum likelihood. Rows are added by Givens rotations, whose
-// costs have no cancellation.
+// On a line the inverse range is a cos(bearing) + b sin(bearing), linear in (a, b). Squared residuals, weighted by
+// range^2 / sigma, are range residuals in standard deviations; their sum is the cost. A scan is split where two lines
+// lower the cost most, until no split lowers it by penalty; neighbours are merged where a single line costs less than
+// penalty more (split and merge, Pavlidis and Horowitz 1974), and ends are moved to where both lines together cost
+// least. Lines are then fitted to ranges by Gauss-Newton steps for maximum likelihood. Rows are added by Givens
+// rotations, which avoid cancellation in costs.
 
 // Passes of merging and of moving ends; Gauss-Newton steps of a line.
 #define PASSES 2
@@ -67,8 +67,8 @@ real cost_of(global const real4 *point, const int first, const int last, const r
     return rows.cost;
 }
 
-// Return the first point of the second line of the best split, by how much it lowers the cost, and the unsplit cost.
-// The point is -1 if no split can lower the cost by penalty.
+// Return the first point of the second line of the best split, the cost reduction, and the unsplit cost. The point is
+// -1 if no split can lower the cost by penalty.
 int best_split(global const real4 *point, const int first, const int last, global real *cost, const real sigma,
                const real penalty, real *gain, real *total) {
     Rows rows = {0, 0, 0, 0, 0, 0};

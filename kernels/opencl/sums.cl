@@ -1,12 +1,12 @@
 // Sums of the terms of readings, or of blocks of readings, in the order of the readings.
 // requires: error_free
 
-// Sum count numbers, number k at parts[place + k * particles]: one work-item takes a particle. They are sums of
-// blocks or strands (block is 1), or single terms in blocks of BLOCK_TERMS, whose strands are added plainly first. All
-// are added to a compensated total. With SCANS each scan has a separate count; with STRANDED the count is of readings,
-// and the numbers are sums of their strands. BLOCK_TERMS numbers are read before any is added, so that a work-item
-// waits once for all of them; numbers beyond the last count as 0, which changes no sum. There are fewer than 2^31
-// numbers.
+// Sum count numbers, number k at parts[place + k * particles]: one work-item takes a particle. They are sums of blocks
+// or strands (block is 1), or single terms in blocks of BLOCK_TERMS; strands of a block are first added without
+// compensation. All are added to a compensated total. SCANS: each scan has a separate count. STRANDED: the count is of
+// readings, and the numbers are sums of their strands. BLOCK_TERMS numbers are read before any is added, so that a
+// work-item waits once for all of them; numbers beyond the last count as 0, which changes no sum. There are fewer than
+// 2^31 numbers.
 kernel void sum_parts(ARGUMENTS) {
     const int place = get_global_id(0);
     if (place >= particles) return;

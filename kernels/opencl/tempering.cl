@@ -39,7 +39,7 @@ double8 eight_at(global const double *values, const int first, const int end, co
                      count > 6 ? values[6] : missing, count > 7 ? values[7] : missing);
 }
 
-// A sum of integers over a block; in lanes, one for each lane.
+// Sum of integers over a block; in lanes, a sum per lane.
 typedef double Total;
 
 // Return the sum of 8 numbers, rounded down to integers.
@@ -77,7 +77,7 @@ double largest_of(global const double *largest, const int begin, const int end) 
     return two.x > two.y ? two.x : two.y;
 }
 
-// Return the largest score; -inf where all particles with a weight are impossible next to those without one.
+// Return the largest score; -inf if all particles with a weight are impossible next to particles without.
 double possible_of(global const double *totals, const double largest) {
     return totals[RUNGS - 1] > 0.0 ? largest : -INFINITY;
 }
@@ -87,7 +87,8 @@ int column_of(const double high, const int rung) {
     return high == -INFINITY ? 2 * RUNGS : rung;
 }
 
-// Return the sum of a column of all blocks before one: of those in its group, and of the groups before it.
+// Return the sum of a column over all blocks before one: over the blocks before it in its group, and over the groups
+// before it.
 double sum_before(global const double *sums, global const double *joined, const int b, const int fan, const int column) {
     const double before = sums[(long)b * WEIGHT_SUMS + column];
     return b < fan ? before : before + joined[(long)(b / fan) * WEIGHT_SUMS + column];

@@ -1,6 +1,6 @@
-// Tiles of work-items for GPUs: a work-group takes a tile of neighbouring particles and rays, whose paths are similar.
-// With spread = s a tile of particles has 2^s groups, each with every 2^s-th tile of rays, so that few particles also
-// fill a device. Particles are in the order of the file order, if it was computed.
+// Tiles of work-items for GPUs: a work-group takes a tile of neighbouring particles and rays with similar paths. spread
+// = s gives a tile of particles 2^s groups, each with every 2^s-th tile of rays, so that few particles also fill a
+// device. Particles are in the order of the file order, if it was computed.
 
 #define TILE_RAYS 4
 #define TILE_PARTICLES 16

@@ -123,8 +123,8 @@ def make(name, flags):
         return before, start[scan + 1] - before, readings_before
 
     # Score scans: one work-item takes a particle. Where rays are shared, ray r has the readings first[r] to first[r +
-    # 1] - 1. With SCANS, the rays of a scan begin at start[scan], and first counts the readings of all scans. A launch
-    # has fewer than 2^31 parts.
+    # 1] - 1. SCANS: the rays of a scan begin at start[scan], and first counts the readings of all scans. A launch has
+    # fewer than 2^31 parts.
     @kernel(flags, entry=ENTRY)
     def score_beams(
         map_table, normals, pose_cell, pose, ray, first, reading, terms, edges, sensor, start, constant_terms, log_p,
@@ -213,8 +213,8 @@ def make(name, flags):
         else:
             log_p[n] = score.temperature * scan_log(total.x + total.y)
 
-    # Write the term of reading k to parts[place + k * particles], in tiles of particles and rays, for GPUs. With
-    # STRANDED the number there is the sum of strand k, and a work-item takes whole strands.
+    # Write the term of reading k to parts[place + k * particles], in tiles of particles and rays, for GPUs. STRANDED:
+    # the number at place k is the sum of strand k, and a work-item takes whole strands.
     @kernel(flags, entry=ENTRY)
     def beam_tiles(
         map_table, normals, pose_cell, pose, order, ray, first, reading, terms, edges, sensor, start, parts, window,

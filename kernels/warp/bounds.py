@@ -1,7 +1,7 @@
 """Bounds of poses, in float64 and exact.
 
 Work-items are a multiple of three, so that each of them sees one column. A first launch bounds the poses, and a second
-one the bounds of its work-items, which lie in two halves.
+one bounds the results of the first, which fill two halves.
 """
 
 import functools

@@ -1,8 +1,8 @@
 """Exact squared Euclidean distance transform in cells (Meijster, Roerdink and Hesselink 2000), in integers.
 
 On processors a work-item takes a line, in time linear in its length. Lines of a pass are parallel: line i starts at i *
-line_stride, and its cells are step apart. GPUs need more work-items than a map has lines: there a work-item takes a
-cell, and searches around it only as far as a nearer obstacle is possible. The grid has fewer than 2^31 cells, so
+line_stride, and its cells are step apart. GPUs need more work-items than a map has lines: on a GPU a work-item takes a
+cell, and stops its search around the cell once no nearer obstacle is possible. The grid has fewer than 2^31 cells, so
 indices fit int32.
 """
 
@@ -51,8 +51,7 @@ def parabola(i: wp.int32, j: wp.int32, across: wp.int32):
 
 
 # Second pass: evaluate the lower envelope of the parabolas of the first pass. One work-item takes a line. The stack of
-# vertices lies in squared, which is overwritten from its far end: entry q of the stack never lies beyond the cell that
-# reads it.
+# vertices shares squared, overwritten from its far end: entry q of the stack never passes the cell that reads it.
 @kernel()
 def distance_envelope(along, starts, squared, lines, length, line_stride, step):
     line = wp.tid()
@@ -131,8 +130,8 @@ def squares_sum(a: wp.uint32, b: wp.uint32):
 
 
 # Second pass: find the least sum of squares along the column of a cell, UNREACHABLE where it is over most. One
-# work-item takes a cell. Near rows are read one by one. Farther away, the minima of blocks give an upper bound first,
-# and then the blocks that may hold less.
+# work-item takes a cell. Near rows are read singly. Farther away, the minima of blocks give an upper bound first, and
+# then the blocks that may hold less.
 @kernel()
 def distance_search(nearest, blocks, squared, rows, cols, count, most):
     row, col = wp.tid()
@@ -149,7 +148,7 @@ def distance_search(nearest, blocks, squared, rows, cols, count, most):
             if row + j < rows:
                 best = wp.min(best, squares_sum(wp.uint32(j), wp.uint32(nearest[(row + j) * cols + col])))
         i += STEP_ROWS
-    # Blocks begin beyond the rows read so far, so all rows of a block lie on one side.
+    # Blocks begin beyond the rows read so far, so all rows of a block are on one side.
     step = int(4)
     if wp.uint32(i * i) < best:
         step = 0

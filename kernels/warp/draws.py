@@ -94,7 +94,7 @@ def functions(flags):
                 kept = weight[copied]
         after[n] = kept
 
-    # Return the random words of a draw in one of the streams of its stage.
+    # Return the random words of a draw in a stream of its stage.
     @wp.func
     def words_of(settings: wp.array(dtype=wp.float64), stage: wp.int32, index: wp.uint32, stream: wp.int32):
         of_stage = wp.uint32(DRAW_STREAM + DRAW_STREAMS * stage + stream)

@@ -36,8 +36,8 @@ def functions(flags):
     ZERO, ONE, TWO = real(0.0), real(1.0), real(2.0)
     NOWHERE = real(math.nan)
 
-    # Distance in cells, and cosine and sine of the angle of incidence. Without a return these are limit, 2 and 0: 2
-    # exceeds every cosine, so that the first bin can be for such beams alone.
+    # Distance in cells, and cosine and sine of the angle of incidence. A beam without a return gets limit, 2 and 0: 2
+    # exceeds every cosine, so that the first bin can hold such beams alone.
     @wp.struct
     class Echo:
         t: real
@@ -60,7 +60,7 @@ def functions(flags):
         return normals[padded(row, col, window.cols)]
 
     # Return the normal of the cell in which a ray ends at a distance t. The distance determines the cell of the exact
-    # walk: it has crossed all boundaries in x up to t, and those in y before t or, after a step in y, up to t as well.
+    # walk: it has crossed all boundaries in x up to t, and all boundaries in y before t, or up to t after a step in y.
     # At a corner it steps in x first.
     @wp.func
     def hit_normal(normals: wp.array(dtype=vec2), window: types.Window, cell: wp.vec2i, r: Ray, t: real):
@@ -97,7 +97,7 @@ def functions(flags):
         echo.t = limit
         echo.cosine = TWO
         for i in range(first, first + cone.rays):
-            # Most casters may stop at the nearest return so far; those of tables and lines may not.
+            # Most casters may stop at the nearest return so far; casters of tables and lines may not.
             farthest = real(echo.t)
             if TO_THE_LIMIT:
                 farthest = limit

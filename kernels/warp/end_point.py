@@ -127,8 +127,8 @@ def functions(flags):
     """)
     def rounding_margin(guard: real) -> real: ...
 
-    # Nearest cell of an end point, whose place is given half a cell lower: rounded to nearest, and ROUNDING_BITS too
-    # much. The second number is the place's distance from the cell's centre.
+    # Nearest cell of an end point, plus ROUNDING_BITS: place, half a cell lower, is rounded to nearest. The second
+    # number is the place's distance from the cell's centre.
     @wp.func
     def rounded_cell(lowered: vec4, point: vec2):
         x = multiply_add(lowered.z, point.x, multiply_add(-lowered.w, point.y, lowered.x))

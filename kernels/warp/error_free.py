@@ -70,8 +70,8 @@ def functions(flags):
         product = two_product(a, b)
         return (c - product.x) - product.y
 
-    # Add two numbers of two parts each, to about twice the working precision. Where the first parts cancel, their sum
-    # is at least the last bit of either, so its exponent is at least that of the second parts.
+    # Add two numbers of two parts each, to about twice the working precision. When the first parts cancel, their sum is
+    # at least the last bit of either, so its exponent is no smaller than the second parts' exponent.
     @wp.func
     def pair_sum(a: vec2, b: vec2):
         total = two_sum(a.x, b.x)

@@ -1,6 +1,6 @@
 """Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point.
 
-A ring of two cells around the table stands for everything outside the grid, so no look-up needs a bounds test. It has
+A ring of two cells around the table represents everything outside the grid, so no look-up needs a bounds test. It has
 fewer than 2^31 cells, and a launch fewer than 2^31 parts, so indices fit int32.
 """
 

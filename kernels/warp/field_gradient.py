@@ -154,7 +154,7 @@ def make(name, flags):
             gradient[out] = score.temperature * (total.x + total.y)
         for i in range(6):
             gradient[out + 1 + i] = score.temperature * sums[i]
-        # The other rows of the information, which is symmetric.
+        # The other rows of the symmetric information matrix.
         gradient[out + 7] = score.temperature * sums[4]
         gradient[out + 8] = score.temperature * sums[6]
         gradient[out + 9] = score.temperature * sums[7]

@@ -2,8 +2,8 @@
 
 The density falls from its peak by the factor exp(-E). A normal has E = t and the weight E'(t) = 1. STUDENT: Student's t
 with nu degrees of freedom has E = power log(1 + rate t), power = (nu + 1) / 2, rate = 2 / nu, and the weight
-(nu + 1) / (nu + u^2). The mass between the mean and a distance, b = u / sqrt 2, comes from a table (MASS_TABLE), whose
-cells of log(1 + b) have the coefficients of a polynomial in the position within the cell.
+(nu + 1) / (nu + u^2). The mass between the mean and a distance, b = u / sqrt 2, comes from a table (MASS_TABLE): each
+cell of log(1 + b) stores the coefficients of a polynomial in the position within the cell.
 """
 
 import functools

@@ -16,8 +16,8 @@ def make(name, flags):
     TEAM = icp_step.functions(flags).TEAM
 
     # Match scans: a work-item, or with IN_TEAMS a team of them, takes a pair (reference, second scan, level of its
-    # rules) and a guess (x, y, theta), the pose of the second scan in the reference's frame. With one_way the
-    # reference's points do not count in the score.
+    # rules) and a guess (x, y, theta), the pose of the second scan in the reference's frame. one_way excludes the
+    # reference's points from the score.
     @kernel(flags)
     def match_scans(
         point, start, line, pair, guess, rules, result, scans, points, pairs, starts, levels, turns, far, far_turn

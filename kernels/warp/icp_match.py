@@ -137,8 +137,8 @@ def functions(flags):
                 )
         return both
 
-    # Match a pair (reference, second scan, level of its rules), which is numbers from which on, from a guess, write the
-    # result from out on, and return the pose.
+    # Match pair number which (reference, second scan, level of its rules) from a guess, write the result from out on,
+    # and return the pose.
     @wp.func
     def match_pair(
         point: wp.array(dtype=vec4), start: wp.array(dtype=wp.int32), line: wp.array(dtype=vec4),

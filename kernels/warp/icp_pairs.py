@@ -156,7 +156,8 @@ def functions(flags):
                 total[j] = numbers[j]
         return total
 
-    # Return the sums over the pairs of a scan's points at a pose (x, y, cos, sin), and those of blocks, 0 unless full.
+    # Return the sums over the pairs of a scan's points at a pose (x, y, cos, sin), and the sums of blocks, 0 unless
+    # full.
     @wp.func
     def sum_pairs(
         point: wp.array(dtype=vec4), line: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, second: wp.int32,

@@ -89,8 +89,8 @@ def functions(flags):
     @wp.func_native(_COOPERATES)
     def cooperates() -> bool: ...
 
-    # Return the binary logarithm of the points of a member, which are enough for all members to cover count; a team of
-    # one takes at least the longest block.
+    # Return log2 of the points of a member, enough for all members to cover count; a team of one takes at least the
+    # longest block.
     @wp.func
     def log_share(count: wp.int32):
         members = int(1)
@@ -168,7 +168,7 @@ def functions(flags):
                     total += blocks[MATCH_BLOCKS + level]
         return blocks
 
-    # Return blocks with the last ones, which have fewer points.
+    # Return blocks including the last, shorter ones.
     @wp.func
     def close_blocks(before: Blocks, levels: wp.int32, count: wp.int32):
         blocks = before

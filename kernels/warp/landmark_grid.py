@@ -1,8 +1,8 @@
 """Search for the landmarks near the end point of a feature, book table 6.5.
 
-Landmarks lie in square buckets, row by row; start[i] is the first landmark of bucket i. A search visits the buckets
-that a disc around the feature's end point touches, and evaluates the landmarks within the disc; landmarks outside have
-a negligible density.
+Landmarks are stored in square buckets, row by row; start[i] is the first landmark of bucket i. A search visits the
+buckets that a disc around the feature's end point touches, and evaluates the landmarks within the disc; landmarks
+outside have a negligible density.
 """
 
 import functools
@@ -54,12 +54,12 @@ def functions(flags):
         chosen: wp.int32
         total: vec2
 
-    # Return the row or column of the bucket at a position, the nearest one for positions outside.
+    # Return the row or column of the bucket at a position; positions outside get the nearest bucket.
     @wp.func
     def bucket_at(position: real, size: real, count: wp.int32):
         return int(wp.clamp(wp.floor(position / size), ZERO, real(count - 1)))
 
-    # Return whether a landmark lies in a feature's disc, within the limits of the sensor that the feature does not
+    # Return whether a landmark is in a feature's disc, within the limits of the sensor that the feature does not
     # measure, and no farther from the end point than the square root of most.
     @wp.func
     def near(off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, most: real):
@@ -79,8 +79,8 @@ def functions(flags):
         return d <= feature[base + FARTHEST] and turned[0] * off[0] + turned[2] * off[2] >= feature[base + AXIS] * d
 
     # Return the square of the radius around a feature's end point outside which exponents are larger than exponent.
-    # With r the error of the range and b that of the bearing, a landmark is sqrt(r^2 + 2 z (z + r) (1 - cos b)) away,
-    # and 2 (1 - cos b) is at most b^2. A factor and SLACK cover rounding errors of such distances.
+    # Let r be the error of the range and b the error of the bearing: a landmark is sqrt(r^2 + 2 z (z + r) (1 - cos b))
+    # away, and 2 (1 - cos b) is at most b^2. A factor and SLACK cover rounding errors of such distances.
     @wp.func
     def squared_reach(exponent: real, feature: wp.array(dtype=real), base: wp.int32):
         squared = real(0.0)

@@ -35,8 +35,8 @@ def make(name, flags):
     # Largest number of features.
     LogEach = wp.types.vector(length=8, dtype=real)
 
-    # Let landmark j be seen by one more feature of each set, at most one of each group; log_each has the features' log
-    # p. The particle's sets begin at index sums of best, and their features at index begin of choice and value.
+    # Let landmark j be seen by one more feature of each set, at most one feature per group; log_each has the features'
+    # log p. The particle's sets begin at index sums of best, and their features at index begin of choice and value.
     @wp.func
     def add_landmark(
         j: wp.int32, log_each: LogEach, feature: wp.array(dtype=real), best: wp.array(dtype=real),

@@ -18,7 +18,8 @@ def functions(flags):
 
     # Return the line through a point and its neighbours, a unit normal, an offset, and 1 / (sum of squared distances
     # along the line), from sums of the neighbours' coordinates relative to the point and of their products; weight is
-    # the number of points. Without neighbours it is perpendicular to the point's beam, with -1 in place of that sum.
+    # the number of points. A point without neighbours gets the line perpendicular to its beam, and -1 instead of the
+    # sum.
     @wp.func
     def line_through(centre: vec4, total: vec2, xx: real, xy: real, yy: real, weight: real):
         mean_x = total.x / weight

@@ -121,13 +121,13 @@ def functions(flags):
             share = ONE / total
             scale = vec2(share, ZERO)
             if EXACT_EXPONENT:
-                # By how much the sum is too large; below 2^24 the sum less 1 is exact.
+                # Rounding error of the sum; below 2^24 the sum less 1 is exact.
                 excess = rest_of(at(terms, 12), expected, total - ONE) - at(terms, 13) * expected
                 scale = vec2(share, rest_of(total, share, ONE) + excess * share)
         return scale
 
-    # Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers. Where the density's peak is high, exponent and log peak
-    # are large and nearly cancel; the second part keeps the digits that remain.
+    # Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers. Exponent and log peak are large and nearly cancel where
+    # the density's peak is high; the second part keeps the digits that remain.
     @wp.func
     def normal_exponent(z: real, expected: real, terms: wp.array(dtype=real)):
         off = hit_offset(z, expected, terms)
@@ -153,7 +153,7 @@ def functions(flags):
     def hit_exponent(z: real, expected: real, terms: wp.array(dtype=real)):
         return shape_exponent(normal_exponent(z, expected, terms), at(terms, 17), at(terms, 18))
 
-    # Return log(z_hit p_hit(z | z*)); terms are those of the log domain.
+    # Return log(z_hit p_hit(z | z*)); terms are in the log domain.
     @wp.func
     def log_hit(z: real, expected: real, terms: wp.array(dtype=real)):
         exponent = hit_exponent(z, expected, terms)
@@ -186,7 +186,7 @@ def functions(flags):
             below = t + t
         return above / below
 
-    # Return log(z_short p_short(z | z*)); terms are those of the log domain.
+    # Return log(z_short p_short(z | z*)); terms are in the log domain.
     @wp.func
     def log_short(z: real, expected: real, terms: wp.array(dtype=real)):
         if z <= expected and expected > ZERO:

@@ -21,7 +21,7 @@ def functions(flags):
     two_sum, two_product = exact.two_sum, exact.two_product
     ZERO, TWO = real(0.0), real(2.0)
 
-    # Return the offset from a sensor to a landmark or beacon, which has x, y, and the low parts of both.
+    # Return the offset from a sensor to a landmark or beacon (x, y, and the low parts of both).
     @wp.func
     def offset(landmark: vec4, place: vec4):
         x = two_sum(landmark[0], -place[0])

@@ -31,7 +31,7 @@ def make(name, flags):
     HALF_TURN, WHOLE_TURN = 32768, 65536
     PARTS = real(32.0)
 
-    # Return the heading relative to that of the first particle, from -TURN / 2 to TURN / 2.
+    # Return the heading relative to the first particle's, from -TURN / 2 to TURN / 2.
     @wp.func
     def relative_turn(pose: vec4, other: vec4):
         turn = int(turn_of(vec2(pose.z * other.z + pose.w * other.w, pose.w * other.z - pose.z * other.w)) * TURN)

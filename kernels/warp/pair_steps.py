@@ -25,8 +25,8 @@ LEAST_BEAMS = wp.constant(12)
 NEAREST = wp.constant(wp.float64(1e-6))
 
 
-# Return how far a range is from the one that its neighbours predict on a straight wall, in the standard deviation of
-# this difference; infinite where they do not lie on one surface. left and right are the neighbours' weights.
+# Return the difference between a range and its prediction from neighbours on a straight wall, in standard deviations;
+# infinite where they are on different surfaces. left and right are the neighbours' weights.
 @wp.func
 def deviation_of(before: wp.float64, here: wp.float64, after: wp.float64, left: wp.float64, right: wp.float64):
     expected = ONE / (left / before + right / after)

@@ -1,6 +1,6 @@
 """Classes of the beams of a scan at one pose: each beam is walked through the map with two companions.
 
-These start beside it and diverge. gpusense.localization.passages describes the classes. Steps are half a cell. With
+These start next to it and diverge. gpusense.localization.passages describes the classes. Steps are half a cell. With
 IN_TEAMS the work-items of a group share the steps of a walk, of which each takes some neighbours.
 """
 
@@ -14,7 +14,7 @@ from gpusense.interface import constants
 from . import heading
 from .prelude import kernel, precision, work_item
 
-# Values of cells that are unknown, and of places off the map, which are unknown as well.
+# Values of unknown cells, and of places off the map, also unknown.
 UNKNOWN, OFF = wp.constant(255), wp.constant(256)
 # Step of a walk, and farthest start of one, where no map reaches [cells].
 STEP, AFAR, MINUS_AFAR = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1e9)), wp.constant(wp.float64(-1e9))
@@ -51,7 +51,7 @@ return own;
 """
 
 
-# Return the number of work-items that share a walk; those of processors share nothing, so the first one takes it all.
+# Return the number of work-items that share a walk; on processors the first work-item walks alone.
 @wp.func_native(_WALKERS)
 def walkers() -> wp.int32: ...
 
@@ -70,7 +70,7 @@ def value_at(cells: wp.array(dtype=wp.uint8), col: wp.int32, row: wp.int32, rows
     return value
 
 
-# Return whether a value is that of a wall.
+# Return whether a value marks a wall.
 @wp.func
 def is_wall(value: wp.int32, occupied: wp.int32):
     return value >= occupied and value < UNKNOWN
@@ -128,7 +128,7 @@ def make(name, flags):
     if IN_TEAMS:
         TEAM = FEWER_WALKERS if "SMALL_TEAMS" in flags else MOST_WALKERS
 
-    # Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1), which starts beside it and
+    # Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1), which starts next to it and
     # diverges.
     @wp.func
     def walk_beside(
@@ -163,8 +163,8 @@ def make(name, flags):
             y += heading.y * frame.mount_x + heading.x * frame.mount_y
         return wp.vec2d(frame.yaw_cos * x + frame.yaw_sin * y, frame.yaw_cos * y - frame.yaw_sin * x)
 
-    # Return the largest deviation of an estimated position over directions [m], and that of the heading [rad]. Both are
-    # infinite if the covariance is not finite; a variance is negative by rounding.
+    # Return the largest deviation of an estimated position over directions [m], and the heading's deviation [rad]. Both
+    # are infinite if the covariance is not finite; a variance is negative by rounding.
     @wp.func
     def deviations_of(estimate: wp.array(dtype=wp.float64)):
         xx = wp.max(estimate[3], ZERO)
@@ -178,8 +178,8 @@ def make(name, flags):
         return wp.vec2d(wp.sqrt((xx + yy) / TWO + wp.sqrt(half_apart * half_apart + xy * xy)), wp.sqrt(tt))
 
     # Judge the beams of an estimated pose: a work-item, or with IN_TEAMS a team of them, takes a beam. The scan has
-    # their directions relative to the heading, in the map's frame, then their readings, which are NaN for no beam. The
-    # result has their classes, then the distances to the first wall on the beam itself.
+    # their directions relative to the heading, in the map's frame, then their readings (NaN for no beam). The result
+    # has their classes, then the distances to the first wall on the beam itself.
     @kernel(flags)
     def judge_beams(cells, estimate, scan, judged, frame, rules, rows, cols, beams):
         item = work_item(wp.tid())

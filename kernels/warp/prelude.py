@@ -31,16 +31,16 @@ _module = wp.kernel(module="unique", enable_backward=False, module_options=OPTIO
 
 
 def kernel(flags=frozenset(), entry=None):
-    """Return the decorator of a kernel, whose parameters get the types of its row of the signature table.
+    """Return the decorator that types a kernel's parameters by its row of the signature table.
 
-    The kernel and the functions that it calls become a module of their own, named by their contents.
+    The kernel and the functions that it calls become a separate module, named by their contents.
 
     Args:
-        flags: Flags of the kernel's code, which say what real, coordinate and measured are.
+        flags: Flags of the kernel's code; they choose real, coordinate and measured.
         entry: The type of an entry of the map's table, where the kernel casts rays.
 
     Raises:
-        TypeError: the parameters' names are not those of the row.
+        TypeError: the parameters' names differ from the row.
     """
 
     def decorate(body):
@@ -120,7 +120,7 @@ def reader(dtype, count=1):
     Arrays are contiguous and begin at multiples of 16 bytes. Warp's subscripts would add the length to a negative i,
     multiply by a stride of 64 bits and load vectors number by number: ten instructions in place of two on GPUs. On GPUs
     vectors are loaded whole. On processors they are not, since compilers make no vector code of loops that load
-    vectors. With a count, as many neighbours are read as one vector; i must be a multiple of it.
+    vectors. count reads as many neighbours as one vector; i must be a multiple of it.
     """
     per_element = getattr(dtype, "_length_", 1)
     scalar = getattr(dtype, "_wp_scalar_type_", dtype)
@@ -177,7 +177,7 @@ def fused(real):
     return multiply_add
 
 
-# Return whether the device multiplies and adds at once, which is known when the code is compiled.
+# Return whether the device has fused multiply-add, as decided at compile time.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__) || defined(__FMA__) || defined(__ARM_FEATURE_FMA)
 return true;

@@ -76,7 +76,7 @@ def count_rays(start_cell, start_inside, end_cell, end_inside, hit, hits, misses
     row += step_y * wp.int32(done_y)
     left_x -= wp.int32(done_x)
     left_y -= wp.int32(done_y)
-    # Negative where the next boundary lies in x.
+    # Negative where x has the next boundary.
     lead = (wp.int64(first_x) + done_x * wp.int64(UNIT)) * size_y
     lead -= (wp.int64(first_y) + done_y * wp.int64(UNIT)) * size_x
     while left_x + left_y > 0 and not has_left(col, step_x, cols) and not has_left(row, step_y, rows):

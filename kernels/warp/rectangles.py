@@ -1,15 +1,15 @@
 """Empty rectangles: for each cell and each sector of directions, width and height of a rectangle of free cells that has
 the cell at its corner and extends in that direction. Both are at most 255, stored as width + 256 height. A ray may
-cross the rectangle in one step without missing an obstacle. Of all such rectangles it is the rectangle in which the ray
-in the middle of the sector stays longest. The idea follows the anisotropic Chebyshev distance maps of Deakin and
-Knackstedt (2020), which have squares.
+cross the rectangle in one step without missing an obstacle. The ray in the middle of the sector stays longest in the
+chosen rectangle. The idea follows the anisotropic Chebyshev distance maps of Deakin and Knackstedt (2020), made of
+squares.
 
 Planes are padded by a ring of zeros, so a walk that leaves the grid stops. Quadrant q extends to (+x, +y), (-x, +y),
 (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep, with a plane for each. All planes
 have fewer than 2^31 cells, so indices fit int32.
 
-Planes have one row after the other, or groups of rows: a group has the cells of its first column, then those of the
-next one, so that cells above one another lie as close together as those beside one another.
+Planes store rows one after the other, or in groups: a group is stored column by column, so that vertical neighbours are
+as close in memory as horizontal neighbours.
 
 Planes can be updated after a change of the cells in rows [top, bottom) and columns [left, right) of the map: only cells
 whose rectangles can contain one of these are computed. For new planes all cells have changed. The input has a band of
@@ -93,8 +93,8 @@ def free_columns(occupied, runs, band, cols, begin, end):
 
 
 # Find the rectangles along rows, from the far end of a row to its begin. For processors: one work-item takes a row and
-# quadrant. The widest rectangle of sufficient height is at most one column wider than that of its neighbour. The stack
-# has the columns that bound its height, each lower than all before it: free cells in the upper 16 bits, and the last 16
+# quadrant. The widest rectangle of sufficient height is at most one column wider than its neighbour's. The stack has
+# the columns that bound its height, each lower than all before it: free cells in the upper 16 bits, and the last 16
 # bits of the column, which give the distance.
 @kernel()
 def rectangles_rows(runs, stack, rectangles, rows, cols, sectors, first, band, top, left, bottom, right):

@@ -7,8 +7,8 @@ SERIES_END one half less the continued fraction of Laplace. Quantiles: Wichura, 
 it is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or as a series where lambda z* is small.
 Everything is computed in float64 by +, -, *, / and sqrt, so that every device draws the same bits.
 
-Other shapes of hits than the normal (MASS_TABLE) have a table of masses and one of quantiles: cells of equal width in
-log(1 + b), b = u / sqrt 2, and in -log(1 - 2 mass), with the coefficients of a polynomial in the position within the
+Other shapes of hits than the normal (MASS_TABLE) have a table of masses and a table of quantiles: cells of equal width
+in log(1 + b), b = u / sqrt 2, and in -log(1 - 2 mass), with the coefficients of a polynomial in the position within the
 cell.
 
 ``mixture`` = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short, place of the tables) of
@@ -51,7 +51,7 @@ NORMAL_PEAK, MOST_HALF = wp.constant(wp.float64(0.3989422804014327)), wp.constan
 DRAW_CELLS, DRAW_POWERS = wp.constant(1024), wp.constant(8)
 DRAW_PER_LOG, DRAW_LAST = wp.constant(wp.float64(27.0)), wp.constant(wp.float64(1023.0))
 FARTHEST_HIT, SQRT_HALF = wp.constant(wp.float64(1e16)), wp.constant(wp.float64(0.7071067811865476))
-# Where the series of the mass gives way to the continued fraction; where the mass is one half.
+# Change from the series of the mass to the continued fraction; median.
 SERIES_END, HALF_FROM = wp.constant(wp.float64(4.0)), wp.constant(wp.float64(9.0))
 SERIES_TERMS, FRACTION_TERMS = wp.constant(48), wp.constant(24)
 # AS 241: quantiles of central, outer and outermost probabilities, the highest power first.
@@ -180,7 +180,7 @@ def functions(flags):
         size = (exp_of(tabulated(level, tables, place + DRAW_CELLS * DRAW_POWERS)) - ONE) / SQRT_HALF
         return wp.min(wp.max(wp.where(mark < ZERO, -size, size), -low), high)
 
-    # Return a range drawn from p_short, up to the expected one, which is above 0.
+    # Return a range drawn from p_short, up to the expected range (> 0).
     @wp.func
     def short_of(u: wp.float64, expected: wp.float64, decay: wp.float64):
         x = decay * expected

@@ -1,4 +1,4 @@
-"""Placement of poses and readings that lie on the device.
+"""Placement of poses and readings in the device's memory.
 
 Readings are selected and placed as gpusense.models.scan.classed does it on the host. Uninformative readings are left
 out and the others move up, so that sums over blocks of readings have the same bits. The places that remain at the end
@@ -21,8 +21,7 @@ ZERO = wp.constant(wp.float64(0.0))
 MISSING, FAR = wp.constant(wp.float64(math.nan)), wp.constant(wp.float64(math.inf))
 
 
-# Return whether an even choice of informative readings includes one of this rank: some i * informative / chosen is the
-# rank.
+# Return whether an even choice of informative readings includes this rank: some i * informative / chosen equals it.
 @wp.func
 def is_chosen(rank: wp.int32, informative: wp.int32, chosen: wp.int32):
     if chosen >= informative:
@@ -60,7 +59,7 @@ def make(name, flags):
                 z = wp.float64(ranges[k])
         return z
 
-    # Return the number of informative readings, which is not counted where all are chosen.
+    # Return the number of informative readings; not counted where all are chosen.
     @wp.func
     def count_informative(ranges: wp.array(dtype=measured), beam: wp.array(dtype=wp.int32), rules: ReadingRules):
         informative = int(rules.beams)
@@ -89,7 +88,7 @@ def make(name, flags):
             fars = fars | (int(is_max(several[i], rules.farthest)) << i)
         return several, hits, fars
 
-    # Return the set of those of a block's informative readings that are chosen; the first one has the rank.
+    # Return the set of a block's informative readings that are chosen; rank belongs to the first reading.
     @wp.func
     def chosen_of(telling: wp.int32, rank: wp.int32, informative: wp.int32, chosen: wp.int32):
         used = int(telling)
@@ -115,8 +114,8 @@ def make(name, flags):
             placed = (1 << wp.min(left, BLOCK_TERMS)) - 1
         return as_range, as_far, placed
 
-    # Return the longest of a block's ranges that come to the block of places from begin on; place is that of the first
-    # reading.
+    # Return a block's longest range among readings placed in the block of places from begin on; place belongs to the
+    # first reading.
     @wp.func
     def longest_beside(several: block_terms, as_range: wp.int32, placed: wp.int32, place: wp.int32, begin: wp.int32):
         longest = wp.float64(0.0)

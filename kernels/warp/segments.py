@@ -1,11 +1,11 @@
 """Straight segments of scans: pieces of the sequence of points that a line explains up to the noise of ranges.
 
-On a line the inverse range is a cos(bearing) + b sin(bearing), linear in (a, b). Weighted by range^2 / sigma, squared
-residuals are those of ranges in standard deviations; their sum is the cost. A scan is split where two lines lower the
+On a line the inverse range is a cos(bearing) + b sin(bearing), linear in (a, b). Squared residuals, weighted by range^2
+/ sigma, are range residuals in standard deviations; their sum is the cost. A scan is split where two lines lower the
 cost most, until no split lowers it by penalty; neighbours are merged where a single line costs less than penalty more
 (split and merge, Pavlidis and Horowitz 1974), and ends are moved to where both lines together cost least. Lines are
-then fitted to ranges by Gauss-Newton steps, which is maximum likelihood. Rows are added by Givens rotations, whose
-costs have no cancellation.
+then fitted to ranges by Gauss-Newton steps for maximum likelihood. Rows are added by Givens rotations, which avoid
+cancellation in costs.
 """
 
 import functools
@@ -78,7 +78,7 @@ def functions(flags):
             v = c * v - s * side
         return rows6(r11, r12, z1, r22, z2, rows[5] + v * v)
 
-    # Return the rows with that of a point.
+    # Return the rows including a point's.
     @wp.func
     def with_point(rows: rows6, point: wp.array(dtype=vec4), i: wp.int32, first: wp.int32, last: wp.int32, sigma: real):
         weight = weight_at(point, i, first, last, sigma)
@@ -93,8 +93,8 @@ def functions(flags):
             rows = with_point(rows, point, i, first, last, sigma)
         return rows[5]
 
-    # Return the first point of the second line of the best split, by how much it lowers the cost, and the unsplit cost.
-    # The point is -1 if no split can lower the cost by penalty.
+    # Return the first point of the second line of the best split, the cost reduction, and the unsplit cost. The point
+    # is -1 if no split can lower the cost by penalty.
     @wp.func
     def best_split(
         point: wp.array(dtype=vec4), first: wp.int32, last: wp.int32, cost: wp.array(dtype=real), sigma: real,

@@ -66,7 +66,7 @@ def largest_of(largest: wp.array(dtype=wp.float64), begin: wp.int32, end: wp.int
     return high
 
 
-# Return the largest score; -inf where all particles with a weight are impossible next to those without one.
+# Return the largest score; -inf if all particles with a weight are impossible next to particles without.
 @wp.func
 def possible_of(totals: wp.array(dtype=wp.float64), largest: wp.float64):
     high = NEVER + ZERO
@@ -84,7 +84,8 @@ def column_of(high: wp.float64, rung: wp.int32):
     return column
 
 
-# Return the sum of a column of all blocks before one: of those in its group, and of the groups before it.
+# Return the sum of a column over all blocks before one: over the blocks before it in its group, and over the groups
+# before it.
 @wp.func
 def sum_before(
     sums: wp.array(dtype=wp.float64), joined: wp.array(dtype=wp.float64), b: wp.int32, fan: wp.int32, column: wp.int32

@@ -69,11 +69,11 @@ class Argument:
 class Kernel:
     """A kernel: its file, the objects that a work-item takes, its arguments, and its work-group size.
 
-    The first axis of a global size is rounded up to whole groups; heavier work-items have smaller groups. Where a
-    kernel is compiled with IN_LANES, its groups have ``lanes_group`` work-items, and with ``in_lanes`` each of them
-    takes as many neighbours of the first axis as there are lanes. With IN_TEAMS the ``team`` work-items of a group
-    share an item, with SMALL_TEAMS an eighth as many, so the first axis has as many work-items for each. ``apart`` says
-    that no two of its arrays share memory, so a compiler need not reload arguments after a write.
+    The first axis of a global size is rounded up to whole groups; heavier work-items have smaller groups. A kernel
+    compiled with IN_LANES has groups of ``lanes_group`` work-items; with ``in_lanes`` a work-item takes as many
+    neighbours of the first axis as a vector has lanes. With IN_TEAMS the ``team`` work-items of a group share an item,
+    with SMALL_TEAMS an eighth as many, so the first axis has as many work-items for each. ``apart`` says that no two of
+    its arrays share memory, so a compiler need not reload arguments after a write.
     """
 
     file: str

@@ -95,7 +95,7 @@ kernel void score_beams(ARGUMENTS) {
         EchoLanes echo[VECTORS];
         for (int k = from, v = 0; k < until; k += LANES, ++v) {
 #if SHARED_RAYS
-            // Readings of the same ray are neighbours, so those of a vector have rays of two vectors at most.
+            // Readings of the same ray are neighbours, so a vector of readings has rays of at most two vectors.
             int at[LANES];
             for (int i = 0; i < LANES; ++i) {
                 while (first[r + 1] - begin <= k + i && k + i < count) ++r;

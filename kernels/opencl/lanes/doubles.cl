@@ -1,5 +1,5 @@
-// Vectors of float64 in which the kernels of particle filters compute 8 particles at once. Their operations are those of
-// the scalar kernels, one by one, so the bits are the same; comparisons and masks stand in for calls.
+// Vectors of float64 in which the kernels of particle filters compute 8 particles at once. They repeat the operations
+// of the scalar kernels in order, so the bits are the same; comparisons and masks replace calls.
 // requires: lanes/types
 
 typedef double8 doubles;

@@ -1,5 +1,5 @@
-// Draws of LANES neighbours, whose marks ascend: the first is searched, and the others are found by walking on from there.
-// See drawing.cl.
+// Draws of LANES neighbours with ascending marks: the first is searched, and the others are found by walking on from
+// it. See drawing.cl.
 // requires: lanes/types draws
 
 // A work-item takes LANES particles.

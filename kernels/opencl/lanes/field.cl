@@ -1,8 +1,9 @@
 // Likelihood field of LANES particles at once: score_field of field.cl.
 // requires: lanes/field_term
 
-// Particles of a work-item, in vectors. They share each block of beams: while a robot is tracked, its end points lie in
-// few cells of the table. There is a work-item for each 16 particles; the first of ITEMS does the work of all of them.
+// Particles of a work-item, in vectors. They share each block of beams: while a robot is tracked, its end points fall
+// into few cells of the table. There is a work-item for each 16 particles; the first of ITEMS does the work of all of
+// them.
 #define TOGETHER 64
 #define ITEMS 4
 #define VECTORS (TOGETHER / LANES)

@@ -1,5 +1,5 @@
 // Gradient and information of LANES particles at once: field_gradient of field_gradient.cl. End points are rounded to
-// the working precision: the interpolated distance is continuous, so an error of an end point moves it by as much.
+// the working precision: the interpolated distance is continuous, so it changes by no more than the end point's error.
 // requires: lanes/end_point lanes/math lanes/hit_shape
 
 #define GRADIENT_NUMBERS 13

@@ -2,7 +2,7 @@
 // requires: lanes/icp_pairs icp_match
 
 // Match scans: one work-item takes a pair (reference, second scan, level of its rules) and a guess (x, y, theta), the
-// pose of the second scan in the reference's frame. With one_way the reference's points do not count in the score.
+// pose of the second scan in the reference's frame. one_way excludes the reference's points from the score.
 kernel void match_scans(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= pairs * starts) return;

@@ -31,7 +31,7 @@ lanes bearing_lanes(const lanes x, const lanes y) {
     return y < 0.0f ? FULL_TURN - above : above;
 }
 
-// Return the bearing of the i-th point of a scan, whose points follow each other turn after turn; i is from -count to
+// Return the bearing of the i-th point of a scan; points repeat turn after turn, and i is from -count to
 // 2 count.
 real turned_bearing(global const real4 *point, const int count, const int skip, const int i) {
     return i < 0 ? point[skip * (i + count)].z - FULL_TURN
@@ -75,7 +75,7 @@ ilanes nearest_lanes(global const real4 *point, const int count, const int skip,
     from = from > 0.5f * FULL_TURN ? from - FULL_TURN : from;
     from = from < -0.5f * FULL_TURN ? from + FULL_TURN : from;
     const real low = bearing.s0 + least_lane(from), turn = low < 0 ? FULL_TURN : low >= FULL_TURN ? -FULL_TURN : 0;
-    // Bearings of the block relative to the smallest one, which is in [0, 2 pi).
+    // Bearings of the block relative to the smallest one, itself in [0, 2 pi).
     from += bearing.s0 - low;
     const real first = low + turn, high = first - least_lane(-from);
     const int begin = points_before(point, kept, skip, first, min(*hint, kept));
@@ -127,7 +127,7 @@ lanes add_pairing_lanes(lanes *sums, const lanes *line, const lanes x, const lan
     return pull;
 }
 
-// Return the points of a block from the first-th on, every stride-th; the last one stands in for missing ones.
+// Return the points of a block from the first-th on, every stride-th; the last one is repeated for missing ones.
 ilanes block_of(const int first, const int stride, const int count) {
     const ilanes i = first + stride * (ilanes)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
     return i < count ? i : (ilanes)(count - 1);
@@ -182,7 +182,7 @@ real4 agreement(global const real4 *point, global const real4 *line, const int c
     return all + (real4)(sum_lanes(sum), sum_lanes(seen), 0, 0);
 }
 
-// Write the sums over the pairs of a scan's points at a pose (x, y, cos, sin), and those of blocks, 0 unless full.
+// Write the sums over the pairs of a scan's points at a pose (x, y, cos, sin), and the sums of blocks, 0 unless full.
 void sum_pairs(global const real4 *point, global const real4 *line, const int count, global const real4 *other,
                const int others, const int stride, const int skip, const real4 pose, const real capture,
                const real scale, const int last, const int full, real *sums, real *squares, const Team team) {

@@ -13,8 +13,8 @@ real2 ends_of_lanes(const lanes a) {
 }
 
 // Results of a search: the log densities, of the likeliest landmarks or with MARGINAL of all of them; the log densities
-// of the likeliest ones, and with PER_BEAM their indices. With MARGINAL sum is the sum of densities relative to log_p. most is the
-// squared radius around an end point within which another landmark may be likelier.
+// of the likeliest ones, and with PER_BEAM their indices. MARGINAL: sum is the sum of densities relative to log_p. most
+// is the squared radius around an end point within which another landmark may be likelier.
 typedef struct {
     lanes log_p, best, most;
     ilanes chosen;
@@ -42,9 +42,9 @@ void with_density_lanes(MatchLanes *match, const ilanes seen, const lanes log_p,
 }
 
 #if !MARGINAL
-// Return the lanes in which a landmark at an offset may be likelier than the best so far. The exponent is at least that of
-// the error of the range and the sine of the bearing's; margins cover rounding errors, and landmarks without a bearing
-// at zero range.
+// Return the lanes in which a landmark at an offset may be likelier than the best so far. The error of the range and
+// the sine of the bearing's error bound the exponent from below; margins cover rounding errors, and landmarks without a
+// bearing at zero range.
 ilanes may_be_likelier(const LanePlace off, const lanes d, const LanePlace turned, const lanes best,
                        global const real *feature) {
     const float at = feature[RANGE_AT];
@@ -57,7 +57,7 @@ ilanes may_be_likelier(const LanePlace off, const lanes d, const LanePlace turne
 }
 #endif
 
-// Update the matches by landmark j, where it lies in a feature's disc, within the limits of the sensor that the feature
+// Update the matches by landmark j, where it is in a feature's disc, within the limits of the sensor that the feature
 // does not measure, and may be likelier than the best so far.
 void with_landmark_lanes(MatchLanes *match, global const real4 *landmark, global const real4 *signature, const int j,
                          const LanePlace place, const LanePlace turned, const lanes end_x, const lanes end_y,
@@ -104,9 +104,9 @@ int is_beyond(const real4 here, const real2 x, const real2 y, const float square
     return (across > 0 ? across * across : 0) + (along > 0 ? along * along : 0) > squared_radius;
 }
 
-// Search the landmarks of some buckets. The landmark nearest to the middle of the end points, which lie in the intervals
-// x and y, comes first: after it most others are too far to be likelier. Sums have the order of the landmarks, which
-// does not depend on the other lanes.
+// Search the landmarks of some buckets. The landmark nearest to the middle of the end points (in the intervals x and y)
+// comes first: after it most others are too far to be likelier. Sums have the order of the landmarks, which does not
+// depend on the other lanes.
 void search_buckets_lanes(MatchLanes *match, global const real4 *landmark, global const real4 *signature,
                           global const int *start, const int4 buckets, const int cols, const real2 x, const real2 y,
                           const LanePlace place, const LanePlace turned, const lanes end_x, const lanes end_y,

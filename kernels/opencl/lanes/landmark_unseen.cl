@@ -27,7 +27,7 @@ Viewer viewer_of(const int2 cell, const real4 high, const real4 low, const Bucke
     return viewer;
 }
 
-// Return the lanes of landmarks in view that belong to no feature, as -1; indices are those of the landmarks.
+// Return the lanes of landmarks in view that belong to no feature, as -1; indices are landmark indices.
 ilanes unseen_lanes(const Viewer *viewer, const LanePlace at, const ilanes index, global const int *which,
                     const int features, const SensorView view) {
     const lanes x = offset_to_lanes(at.x.hi, at.y.hi, viewer->place.x, viewer->place.y);

@@ -1,6 +1,6 @@
 // Density of one feature at one landmark for LANES particles at once: landmarks.cl in lanes. Every lane has the
-// arithmetic of the scalar kernel, except that exp, log and erf are those of lanes/math, that the arc tangent has two
-// arcs only, 0 and pi/4, and that a fused multiply-add gives the rounding error of a product.
+// arithmetic of the scalar kernel, except that exp, log and erf come from lanes/math, that the arc tangent has two arcs
+// only, 0 and pi/4, and that a fused multiply-add gives the rounding error of a product.
 // requires: landmarks lanes/offsets lanes/log_terms
 
 // tan(pi/8); pi/4, pi/2 and pi as sums of two numbers.
@@ -108,7 +108,7 @@ LanePair add_square_lanes(const LanePair total, const LanePair residual, const f
     return (LanePair){sum.hi, low - low == 0 ? low : (lanes)0};
 }
 
-// Return log(z_detect p(f | j)) of a feature at an offset; signature is that of the landmark.
+// Return log(z_detect p(f | j)) of a feature at an offset; signature is the landmark's.
 lanes log_detection_lanes(const LanePlace off, const LanePlace turned, global const real *feature,
                           const real4 signature, global const real *terms) {
     LanePair exponent = {0, 0};

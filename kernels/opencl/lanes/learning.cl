@@ -12,7 +12,7 @@
 
 // Add the terms of a pair in each lane to the sums of the lane.
 void add_pair_lanes(const lanes reading, const lanes expected_range, global const real *terms, lanes *sums) {
-    // Padding has no weight; a pair of zeros stands in for it.
+    // Padding has no weight and is read as a pair of zeros.
     const ilanes known = reading == reading;
     const lanes z = known ? reading : (lanes)0, expected = known ? expected_range : (lanes)0;
 
@@ -90,7 +90,7 @@ void add_pair_lanes(const lanes reading, const lanes expected_range, global cons
 #endif
 }
 
-// Sum over blocks of pairs: one work-item takes a block, whose pairs are contiguous (along is 1) and fill all lanes.
+// Sum over blocks of pairs: one work-item takes a block of contiguous pairs (along is 1) that fill all lanes.
 kernel void e_step(ARGUMENTS) {
     const int block = get_global_id(0);
     if (block >= blocks) return;

@@ -45,7 +45,7 @@ lanes erf_lanes(const lanes x) { return any_lane(x < LANE_ERF_ONE) ? erf(x) : (l
 #define LOG2_HIGH 0.693145752f
 #define LOG2_LOW 1.42860677e-06f
 #define ONE_OVER_LOG2 1.44269502f
-// 1.5 * 2^23: a sum with it is rounded to a whole number, which stands in its last bits.
+// 1.5 * 2^23: a sum with it is rounded to a whole number, held in its last bits.
 #define LANE_ROUNDER 12582912.0f
 // e^EXP_ZERO is close to the smallest normal number; e^EXP_LOST is below half of the last bit of 1.
 #define EXP_ZERO -87.0f

@@ -65,7 +65,7 @@ LanePair hit_scale_lanes(const lanes expected, global const real *terms, const i
 #if GROWTH
 #if EXACT_EXPONENT
     const lanes growth = TERM(12), sum = multiply_add_lanes(growth, expected, (lanes)1), scale = 1 / sum;
-    // By how much the sum is too large; below 2^24 the sum less 1 is exact.
+    // Rounding error of the sum; below 2^24 the sum less 1 is exact.
     const lanes excess = multiply_add_lanes(-TERM(13), expected, rest_lanes(growth, expected, sum - 1));
     return (LanePair){scale, multiply_add_lanes(excess, scale, rest_lanes(sum, scale, (lanes)1))};
 #else
@@ -174,7 +174,7 @@ lanes short_length_lanes(const lanes expected, global const real *terms, const i
 #endif
 
 // Densities of components, or their logarithms. A sum of densities is in the first number. The logarithm of p_short may
-// be that of its numerator alone, beside the reciprocal of the length that divides it.
+// omit its denominator, passed as the reciprocal of the length that divides it.
 typedef struct {
     lanes hit, shorter, reciprocal;
 } DensityParts;
@@ -198,7 +198,7 @@ INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, glo
     const lanes mass = mass_within_lanes(mean, above, TERM(2), terms, bin_at, &within);
 #endif
 #if EXACT_EXPONENT
-    // Where the density underflows, the second part is arbitrary.
+    // The second part is arbitrary where the density underflows.
     hit = hit > 0 ? hit * (1 - exponent.lo) : hit;
 #endif
     p += within ? hit : hit / mass;

@@ -25,7 +25,7 @@ LanePair distance_pair_lanes(const LanePlace off) {
     return (LanePair){d, d > 0 ? rest / (2.0f * d) : (lanes)0};
 }
 
-// Read LANES numbers of two parts; the last of count stands in for those beyond it.
+// Read LANES numbers of two parts; the last of count is repeated beyond the end.
 LanePair load_pairs(global const real *numbers, const int count) {
     if (count >= LANES) {
         const lanes a = load_lanes(0, numbers), b = load_lanes(1, numbers);

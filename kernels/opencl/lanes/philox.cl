@@ -1,5 +1,5 @@
-// Random numbers of 8 particles: those of philox.cl. Words stand in the lower halves of integers of 64 bits, whose
-// products are whole.
+// Random numbers of 8 particles: those of philox.cl. Words fill the lower halves of 64-bit integers, so that products
+// are exact.
 // requires: philox lanes/elementary lanes/heading
 
 // Compute four random words for each index.

@@ -2,7 +2,7 @@
 // requires: raycast lanes/rays lanes/each_ray
 
 // Return the distances in cells to the first occupied cells along LANES rays of one pose, limits where none is nearer.
-// A lane that has ended reads the first cell of the table's ring, which is 0.
+// A lane that has ended reads 0, the first cell of the table's ring.
 lanes cast_ray_lanes(global const entry *map_table, const Window window, const int2 cell, const real4 pose,
                      const lanes ray_x, const lanes ray_y, const lanes limit, const Caster caster) {
 #if ORIGINS_OUTSIDE

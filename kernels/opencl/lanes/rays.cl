@@ -8,8 +8,8 @@
 #define FIRST_BITS 0x4b000000
 #endif
 
-// Load cosines and sines of LANES rays: from index first on, each stride apart. The last of count rays stands in for
-// those beyond it.
+// Load cosines and sines of LANES rays: from index first on, each stride apart. The last of count rays is repeated
+// beyond the end.
 void load_ray_lanes(global const real2 *ray, const int first, const int count, const int stride, lanes *x, lanes *y) {
     if (stride == 1 && first + LANES <= count) {
         const lanes low = load_lanes(0, (global const real *)(ray + first));

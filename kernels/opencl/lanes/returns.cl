@@ -63,7 +63,7 @@ EchoLanes nearest_echo_lanes(global const entry *map_table, global const real2 *
     EchoLanes echo = {limit, 2};
     for (int i = 0; i < cone.rays; ++i) {
         load_ray_lanes(ray + i, first, count, cone.rays, &x, &y);
-        // Most casters may stop at the nearest return so far; those of tables and lines may not.
+        // Most casters may stop at the nearest return so far; casters of tables and lines may not.
         lanes farthest = echo.t;
 #if LOOKUP
         farthest = limit;

@@ -3,7 +3,7 @@
 
 // Return the bins of ranges; the last one, after the cells, is for range_max and more.
 ilanes range_bin_lanes(const lanes range, const MixtureTables tables, const real range_max) {
-    // Missing readings, which are NaN, are in no cell either.
+    // Missing readings (NaN) are in no cell either.
     const ilanes below = range < range_max, bin = to_ilanes((below ? range : (lanes)0) * tables.per_metre);
     const ilanes within = bin < tables.cells ? bin : (ilanes)(tables.cells - 1);
     return below ? within : (ilanes)tables.cells;

@@ -1,9 +1,8 @@
 // Vector types of the kernels in this folder: one work-item computes LANES particles, beams or pairs at once. They are
-// for processors whose compilers make no vector code of scalar kernels. Where a processor's vectors are shorter than
-// LANES, the loads of several vectors wait for memory side by side. A function in lanes has the name of its scalar one
-// and the ending _lanes. There are 16 lanes of float32, or 8 of float64.
-// PoCL compiles any, fabs, fmax, min and max as calls, which are too slow for an inner loop: comparisons and masks
-// stand in their place.
+// for processors whose compilers make no vector code of scalar kernels. The loads of several vectors overlap where a
+// processor's vectors are shorter than LANES. A function in lanes has the name of its scalar one and the ending _lanes.
+// There are 16 lanes of float32, or 8 of float64.
+// PoCL compiles any, fabs, fmax, min and max as calls, too slow for an inner loop: comparisons and masks replace them.
 
 #if FLOAT64
 typedef double8 lanes;

@@ -1,5 +1,5 @@
-// Weights of 8 particles at once: the kernels of weighing.cl, whose vectors a processor reads, adds and writes whole. Sums
-// of integer weights are exact in any order.
+// Weights of 8 particles at once: the kernels of weighing.cl on vectors that a processor reads, adds and writes whole.
+// Sums of integer weights are exact in any order.
 // requires: tempering lanes/elementary
 
 typedef doubles Total_lanes;

@@ -187,7 +187,7 @@ def functions(flags):
             if HIT:
                 hit = number_at(terms, 0) * exp_lanes(-exponent)
                 if EXACT_EXPONENT:
-                    # Where the density underflows, the second part is arbitrary.
+                    # The second part is arbitrary where the density underflows.
                     hit = wp.where(hit > ZERO, hit * (ONE - exponent_low), hit)
                 p += hit
             return log_lanes(p)

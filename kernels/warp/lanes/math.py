@@ -24,7 +24,7 @@ def _numbers(*values):
 ZERO, HALF, ONE = _numbers(0.0, 0.5, 1.0)
 # log 2 in two parts; the first has 16 bits, so that its products with counts are exact.
 LOG2_HIGH, LOG2_LOW, ONE_OVER_LOG2 = _numbers(0.693145752, 1.42860677e-06, 1.44269502)
-# 1.5 * 2^23: a sum with it is rounded to a whole number, which stands in its last bits.
+# 1.5 * 2^23: a sum with it is rounded to a whole number, held in its last bits.
 ROUNDER = wp.constant(_number(12582912.0))
 ROUNDER_BITS = wp.constant(wp.int32(0x4B400000))
 # e^EXP_ZERO is close to the smallest normal number; e^EXP_LOST is below half of the last bit of 1.

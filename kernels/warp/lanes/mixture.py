@@ -140,7 +140,7 @@ def functions(flags):
             if GROWTH:
                 hit = hit * scale.x
             if EXACT_EXPONENT:
-                # Where the density underflows, the second part is arbitrary.
+                # The second part is arbitrary where the density underflows.
                 hit = wp.where(hit > ZERO, hit * (ONE - exponent.y), hit)
             return hit
         else:
@@ -247,7 +247,7 @@ def functions(flags):
             i += 1
         return results
 
-    # Return the terms of a block of readings whose angles of incidence lie in several bins.
+    # Return the terms of a block of readings whose angles of incidence fall into several bins.
     @apart
     def block_of_bins(
         z: block_numbers, expected: block_numbers, cosine: block_numbers, terms: wp.array(dtype=real),

@@ -95,7 +95,7 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track
     print(f"last pose  {_pose(track.poses[-1])}; deviations {_deviations(deviations)}")
     print(f"scans      {result['scans']}, {sum(result[f'ms_{part}'] for part in _PARTS):.2g} ms each")
     if result["scans"] > 1 and not result["odometry_moves"]:
-        print("odometry   does not move: absent, at other times than the scans, or the robot stands")
+        print("odometry   does not move: absent, unreadable, at other times than the scans, or the robot stands")
     if result["references_repeat_odometry"]:
         print("reference  none: the logged poses are the odometry's own, "
               f"{length(result['error_median'])} away in the median")  # fmt: skip

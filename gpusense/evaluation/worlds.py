@@ -50,6 +50,7 @@ def free_pose(grid: OccupancyGrid, rng: Rng, clearance: float = 0.4) -> Floats:
     from scipy.ndimage import distance_transform_edt
 
     # Distances are from centre to centre [cells]; the nearest points may be half a diagonal nearer on either side.
+    _check(grid, rng)
     wanted = checks.real("clearance", clearance, low=0) / grid.resolution + math.sqrt(2)
     rows, cols = np.nonzero(distance_transform_edt(np.pad(grid.free, 1))[1:-1, 1:-1] >= wanted)
     if len(rows) == 0:
@@ -78,6 +79,7 @@ def cloud_uniform(grid: OccupancyGrid, n: int, rng: Rng) -> Floats:
         >>> gs.worlds.cloud_uniform(gs.worlds.building(), 1000, np.random.default_rng(0)).shape
         (1000, 3)
     """
+    _check(grid, rng)
     rows, cols = np.nonzero(grid.free)
     if len(rows) == 0:
         raise ValueError("grid: must have a free cell, got none")
@@ -108,6 +110,7 @@ def cloud_around(pose: ArrayLike, n: int, sigma_xy: float, sigma_theta: float, r
         >>> poses.mean(axis=0).round(1).tolist()
         [2.0, 3.0, 0.5]
     """
+    checks.instance("rng", rng, np.random.Generator)
     mean = checks.array("pose", pose, (3,))
     spread = [checks.real("sigma_xy", sigma_xy, low=0)] * 2 + [checks.real("sigma_theta", sigma_theta, low=0)]
     return mean + rng.standard_normal((checks.integer("n", n, low=0), 3)) * spread
@@ -193,6 +196,11 @@ def sample_readings(expected: ArrayLike, range_max: float, parameters: BeamParam
     drawn = np.choose(kind, [np.clip(hit, 0, limit), short, np.inf, RandomDensity(limit).drawn(u)])
     # Rounding must not turn a range into "no return".
     return np.where(np.isinf(drawn), drawn, np.minimum(drawn, np.nextafter(limit, 0)))
+
+
+def _check(grid: OccupancyGrid, rng: Rng) -> None:
+    checks.instance("grid", grid, OccupancyGrid)
+    checks.instance("rng", rng, np.random.Generator)
 
 
 def _in_cells(grid: OccupancyGrid, rows: NDArray[np.intp], cols: NDArray[np.intp], rng: Rng) -> Floats:

@@ -45,12 +45,17 @@ def readings_of(readings: Any, sensors: Sequence[Sensor]) -> list[SensorReadings
         raise TypeError(f"readings: must be a mapping from models to their readings, got {checks.show(readings)}")
     else:
         pairs = [] if readings is None else [(0, readings)]
-    return [(i, value if _is_several(value) else (value,)) for i, value in pairs]
+    several = [(i, value if _is_several(value) else (value,)) for i, value in pairs]
+    # Lists become arrays, so that ragged ones are refused by name.
+    return [
+        (i, tuple(checks.as_array("readings", part) if isinstance(part, list) else part for part in value))
+        for i, value in several
+    ]
 
 
 def _is_several(value: Any) -> bool:
     """Tell whether a reading is a tuple of arguments: its first item is an array, not a number."""
-    return isinstance(value, tuple) and len(value) > 0 and np.ndim(value[0]) > 0
+    return isinstance(value, tuple) and len(value) > 0 and (isinstance(value[0], list) or np.ndim(value[0]) > 0)
 
 
 class FilterScoring:

@@ -11,6 +11,7 @@ import inspect
 import re
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -140,6 +141,12 @@ def numbers_in(value: Any) -> Iterator[np.ndarray]:
     elif isinstance(value, (tuple, list)):
         for each in value:
             yield from numbers_in(each)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take an empty folder, in which calls may write a file of any name."""
+    monkeypatch.chdir(tmp_path)
 
 
 def check(name: str, chosen: list[tuple[str, str]], capfd: pytest.CaptureFixture[str]) -> None:

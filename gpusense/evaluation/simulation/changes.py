@@ -57,6 +57,8 @@ def change_world(
         >>> bool((world.occupied != grid.occupied).any())
         True
     """
+    checks.instance("grid", grid, OccupancyGrid)
+    checks.instance("rng", rng, np.random.Generator)
     shares = [checks.real("moved", moved, low=0, high=1), checks.real("removed", removed, low=0, high=1)]
     new = checks.real("added", added, low=0)
     if sum(shares) > 1:
@@ -118,7 +120,9 @@ def _allowed(grid: OccupancyGrid, keep: ArrayLike, clearance: float) -> Bools:
     poses = checks.as_array("keep", keep)
     if poses.size == 0:
         return allowed
-    places = checks.array("keep", poses, ("T", poses.shape[-1]))[:, :2]
+    if poses.ndim != 2 or poses.shape[1] not in (2, 3):
+        raise ValueError(f"keep: shape must be (T, 2) or (T, 3), got {checks.shape_text(poses.shape)}")
+    places = checks.array("keep", poses)[:, :2]
     far = np.ones(grid.shape, bool)
     cols, rows = np.floor(grid.world_to_cells(places)).astype(np.int64).T
     inside = (rows >= 0) & (rows < grid.shape[0]) & (cols >= 0) & (cols < grid.shape[1])

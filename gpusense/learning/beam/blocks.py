@@ -38,7 +38,7 @@ def check_blocks(blocks: ArrayLike, shape: tuple[int, ...], pairs: Pairs) -> NDA
         TypeError: The labels are not integers.
         ValueError: The shape differs from that of the readings, or fewer than 2 blocks have a reading.
     """
-    labels = np.asarray(blocks)
+    labels = checks.as_array("blocks", blocks)
     if labels.dtype.kind not in "iu":
         raise TypeError(f"blocks: must hold integers, got {checks.show(blocks)}")
     if labels.shape != shape:

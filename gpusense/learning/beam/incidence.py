@@ -210,7 +210,7 @@ def fit_incidence_parameters(
     angles = _angles(incidence, np.shape(ranges), pairs)
     edges = _edges(bins)
     strength = checks.real("strength", strength, low=0)
-    if method == "em-book":
+    if isinstance(method, str) and method == "em-book":
         raise ValueError("method: must not be 'em-book', which has no prior, got 'em-book'")
     options = check_options(
         method, max_iterations, tolerance, restarts, seed, range_bias, progress, callback, responsibilities=False

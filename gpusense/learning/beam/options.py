@@ -20,6 +20,8 @@ Callback = Callable[[int, float, BeamParameters], object]
 
 # Default lower bound of sigma_hit as a share of range_max, if readings are not rounded to a larger step.
 _SMALLEST_SIGMA = 1e-6
+# Bounds of a user, as multiples of the default ones.
+_WIDEST = 1e-9, 1e9
 # Default bounds of lambda_short range_max: nearly uniform, and readings within 1e-4 range_max.
 _RATES = (1e-3, 1e4)
 
@@ -109,8 +111,11 @@ def _bounds(name: str, value: tuple[float, float] | None, default: tuple[float, 
     if value is None:
         return default
     low, high = checks.array(name, value, (2,)).tolist()
-    if not 0 < low <= high:
-        raise ValueError(f"{name}: must be two numbers, 0 < smallest <= largest, got {checks.show(value)}")
+    if not _WIDEST[0] * default[0] <= low <= high <= _WIDEST[1] * default[1]:
+        least, most = (f"{factor * bound:.3g}" for factor, bound in zip(_WIDEST, default, strict=True))
+        raise ValueError(
+            f"{name}: must be two numbers, {least} <= smallest <= largest <= {most}, got {checks.show(value)}"
+        )
     return low, high
 
 

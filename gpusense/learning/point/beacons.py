@@ -185,7 +185,7 @@ def fit_beacon_parameters(
     checks.choice("kind", kind, ("normal", "student_t", "mixture"))
     checks.choice("bias", bias, ("none", "common", "each"))
     degrees = checks.integer("nu", nu, low=1, high=MOST_DEGREES)
-    longest = checks.real("range_max", range_max, above=0)
+    longest = checks.real("range_max", range_max, above=0, high=checks.FARTHEST)
     points = checks.array("xy", xy, ("M", 2), largest=checks.FARTHEST)
     most = checks.integer("max_iterations", max_iterations, low=1)
     least = checks.real("tolerance", tolerance, above=0)

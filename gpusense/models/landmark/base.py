@@ -154,7 +154,8 @@ class FeatureModel(PointModel):
         """Return the indices of the landmarks that are drawn: all, or those in a correspondence."""
         if correspondence is None:
             return np.arange(self._count)
-        return check_correspondence(correspondence, np.size(correspondence), self._count)
+        partners = checks.as_array("correspondence", correspondence)
+        return check_correspondence(partners, partners.size, self._count)
 
     def _read(self, features: object) -> tuple[np.ndarray, np.ndarray]:
         """Return features as ``_possible`` does; the first calls also check for angles in degrees."""

@@ -48,7 +48,7 @@ def readings_of(readings: Any, sensors: Sequence[Sensor]) -> list[SensorReadings
     several = [(i, value if _is_several(value) else (value,)) for i, value in pairs]
     # Lists become arrays, so that ragged ones are refused by name.
     return [
-        (i, tuple(checks.as_array("readings", part) if isinstance(part, list) else part for part in value))
+        (i, tuple(checks.as_array("readings", part, masked=True) if isinstance(part, list) else part for part in value))
         for i, value in several
     ]
 

@@ -16,7 +16,7 @@ _UNFINISHED: set[Path] = set()
 
 @contextlib.contextmanager
 def naming(path: object) -> Iterator[None]:
-    """Name a file in errors of the operating system that lack a name, such as that of a full disk.
+    """Name a file in errors of the operating system that lack a name; a full disk raises one.
 
     Raises:
         OSError: The error, with the file's name.

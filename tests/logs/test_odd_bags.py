@@ -6,26 +6,13 @@ import gzip
 import math
 import shutil
 import sqlite3
-import warnings
 from pathlib import Path
 from typing import Any
 
 import pytest
-from support.bags import BASE, LASER, Writer
+from support.bags import BASE, KINDS, LASER, Writer, each_kind, read
 
-import gpusense as gs
-
-KINDS = ("ros1", "sqlite3", "mcap")
-each_kind = pytest.mark.parametrize("kind", KINDS)
 FLAT = (0.0, 0.0, 0.0)
-
-
-def read(path: Path, **options: Any) -> tuple[list[Any], list[str]]:
-    """Return the records of a log, and the warnings."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        records = list(gs.read_log(path, **options))
-    return records, [str(one.message) for one in caught]
 
 
 def bag_of(folder: Path, kind: str, name: str = "run", begin: int = 0) -> Path:

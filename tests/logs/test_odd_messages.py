@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 import math
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from support.bags import BASE, LASER, Writer
+from support.bags import BASE, KINDS, LASER, Writer, each_kind, read
 
 import gpusense as gs
 from gpusense.commands.cli import main
 
-KINDS = ("ros1", "sqlite3", "mcap")
-each_kind = pytest.mark.parametrize("kind", KINDS)
 NAN, INF = math.nan, math.inf
 FLAT = (0.0, 0.0, 0.0)
-
-
-def read(path: Path, **options: Any) -> tuple[list[Any], list[str]]:
-    """Return the records of a log, and the warnings."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        records = list(gs.read_log(path, **options))
-    return records, [str(one.message) for one in caught]
 
 
 # ---- frames

@@ -3,13 +3,27 @@
 from __future__ import annotations
 
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
+
+import gpusense as gs
 
 LASER, BASE = "laser", "base_link"
 SCAN = "sensor_msgs/msg/LaserScan"
+KINDS = ("ros1", "sqlite3", "mcap")
+each_kind = pytest.mark.parametrize("kind", KINDS)
+
+
+def read(path: Path, **options: Any) -> tuple[list[Any], list[str]]:
+    """Return the records of a log, and the warnings."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        records = list(gs.read_log(path, **options))
+    return records, [str(one.message) for one in caught]
 
 
 class Writer:

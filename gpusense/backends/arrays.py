@@ -42,7 +42,7 @@ def on_device(array: object) -> bool:
 
 
 def to_host(array: object, name: str = "poses") -> object:
-    """Return a NumPy view of an array of another library in host memory; other objects as they are.
+    """Return a NumPy view of an array of another library in host memory; return other objects unchanged.
 
     Raises:
         TypeError: A tensor whose gradients are recorded.

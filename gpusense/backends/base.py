@@ -24,7 +24,7 @@ Buffer = Any
 
 
 class Launcher(Protocol):
-    """A compiled kernel, which is called with the global size and the arguments of its row in order."""
+    """A compiled kernel, called with the global size and the arguments of its row in order."""
 
     def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
         """Start one launch with buffers and scalars in the order of the signature table."""
@@ -39,7 +39,7 @@ class Adopted:
         shape: Its shape.
         dtype: Type of its numbers.
         strides: Bytes from one number to the next along each axis.
-        contiguous: Whether it is C-contiguous.
+        contiguous: True if it is C-contiguous.
         to_host: Function that copies it to the host, after all earlier work.
         owner: The object that keeps the memory alive.
     """
@@ -72,7 +72,7 @@ class Backend(ABC):
     def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
         """Copy a C-contiguous array to the device, into the beginning of ``out`` if that is not None.
 
-        Without ``wait`` the array must not change until ``synchronize`` has returned.
+        If ``wait`` is false, the array must not change until ``synchronize`` has returned.
         """
 
     def refill(self, array: np.ndarray, buffer: Buffer) -> None:
@@ -94,7 +94,7 @@ class Backend(ABC):
     def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
         """Copy the beginning of a buffer into a C-contiguous array, after all earlier work.
 
-        Without ``wait`` the array must stay alive, and is not filled, until ``synchronize`` has returned.
+        If ``wait`` is false, the array must stay alive, and is not filled, until ``synchronize`` has returned.
         """
 
     def empty_result(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:

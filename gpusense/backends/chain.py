@@ -15,7 +15,7 @@ from gpusense.backends.listing import Device
 from gpusense.backends.proof import Verdict
 from gpusense.backends.registry import BY_NAME, ENTRIES, SPEED_CLASSES, Entry
 
-# The factor by which a device must be faster than one of its class that is listed before it, to be chosen instead.
+# Least speed ratio at which a device replaces an earlier device of its class.
 NOTICED = 1.1
 # The device that needs no driver.
 _LAST = "numpy"
@@ -29,7 +29,7 @@ class Failure:
         selection: Its selection string; empty without one.
         reason: The reason, with the remedy.
         line: Device and reason, as messages have them.
-        lasting: Whether the reason is an earlier verdict, which was reported when it was made.
+        lasting: Whether the reason is an earlier verdict, already reported.
     """
 
     selection: str
@@ -100,7 +100,7 @@ def best_of(candidates: list[Device], failures: list[Failure] | None = None) -> 
     runs do not change between devices.
 
     Args:
-        candidates: The devices; those that are not usable are removed where ``failures`` are wanted.
+        candidates: The devices; unusable ones are removed if ``failures`` is passed.
         failures: Receives the devices that are not usable.
     """
     for row in SPEED_CLASSES:

@@ -1,4 +1,4 @@
-"""Child processes for work with a driver, whose crash or hang does not harm the user's process.
+"""Child processes for work with a driver: its crash or hang does not harm the user's process.
 
 A driver may also end its process with exit status 0, so the status proves nothing: the child's last report must repeat
 a number that it was sent.
@@ -32,7 +32,7 @@ _START = (
     "import sys, json; job = json.loads(sys.stdin.readline()); sys.path[:] = job['path']; "
     "from gpusense.backends.child import main; main(job)"
 )
-# Signals from outside, which are not a failure of the driver.
+# External signals, no failure of the driver.
 _FOREIGN = tuple(getattr(signal, name) for name in ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP") if hasattr(signal, name))
 # Failures due to the state of the machine, not to the driver.
 PASSING = re.compile(
@@ -98,8 +98,8 @@ def run(job: dict[str, Any]) -> Outcome:
     """Do a job in a child.
 
     Args:
-        job: ``do`` is the name of a function ``module:name``, which is called with the job and a function that reports
-            a dictionary; the rest belongs to the function.
+        job: ``do`` names a function ``module:name``; it is called with the job and a function that reports a
+            dictionary; the rest belongs to the function.
     """
     path = [os.path.abspath(entry) for entry in sys.path]
     return run_text(["-P", "-W", "ignore", "-c", _START], {**job, "path": path})
@@ -151,7 +151,7 @@ def _await(process: subprocess.Popen[bytes], text: bytes, limit: float) -> bool:
     """Wait for the end of a child, at most a limit of seconds in which it does not wait for a processor.
 
     Returns:
-        Whether it was ended before it had its limit: so busy a machine says nothing of the driver.
+        True if it was ended before it had its limit: a machine that busy gives no verdict on the driver.
     """
     begun, wait, unsent, left = time.monotonic(), limit, text, 0.0
     while wait > 0:
@@ -222,7 +222,7 @@ def _describe(code: int, words: str) -> str:
 
 
 def main(job: dict[str, Any]) -> None:
-    """Do a job in this process, which is the child."""
+    """Do a job in this process, the child."""
     with contextlib.suppress(ImportError, ValueError, OSError):
         import resource
 

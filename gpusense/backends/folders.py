@@ -3,7 +3,7 @@
 The place is ``$GPUSENSE_CACHE_DIR``, else ``$XDG_CACHE_HOME/gpusense``, else the system's place for caches:
 ``~/.cache/gpusense`` on Linux, ``~/Library/Caches/gpusense`` on macOS, and below ``%LOCALAPPDATA%`` on Windows.
 ``GPUSENSE_CACHE=off`` switches the cache off. A place may hold files of other programs: gpusense reads, writes and
-deletes only in the folder ``gpusense-kernels`` there, which has a marker file. Kernels are code, so it must be this
+deletes only in its folder ``gpusense-kernels``, identified by a marker file. Kernels are code, so it must be this
 user's, and no other user may write in it or rename a folder above it, whatever variable chose the place.
 """
 

@@ -25,7 +25,7 @@ def threads() -> int:
 
 @functools.cache
 def pool(process: int) -> ThreadPoolExecutor:
-    """Return the threads of a process, one fewer than it has processors: the calling thread works as well."""
+    """Return the threads of a process, one fewer than it has processors: the calling thread also works."""
     # Calls of few particles, and most processes, need no threads.
     from concurrent.futures import ThreadPoolExecutor
 

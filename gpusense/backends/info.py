@@ -23,7 +23,7 @@ class BackendInfo:
             compiler.
         vector_loops: Whether the compiler vectorises a work-item's loops over readings rather than over work-items.
         target: The processor for which the driver compiles, by its compiler's name; empty where it is not known.
-        graphs: Whether the launches and copies of a call are a batch, which is replayed as one graph once it repeats.
+        graphs: True if the launches and copies of a call are a batch, replayed as one graph once it repeats.
 
     Example:
         >>> from gpusense.backends import get_backend

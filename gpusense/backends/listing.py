@@ -18,7 +18,7 @@ class Device:
     """A device of this machine, or one that it could have.
 
     Attributes:
-        backend: The name of its backend: ``"numpy"``, ``"opencl"``, ``"warp"`` or a further one of the registry.
+        backend: The name of its backend: ``"numpy"``, ``"opencl"``, ``"warp"`` or another name of the registry.
         name: The name of the device, or of the absent part.
         kind: ``"cpu"``, ``"gpu"`` or ``"simulator"``.
         available: Whether a model can run on it.

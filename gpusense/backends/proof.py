@@ -5,7 +5,7 @@ child computes a small scene and compares it with NumPy, once for each combinati
 version of gpusense. A family of kernels that fails is not used: lanes are replaced by narrower ones and then by scalar
 kernels, float64 counts as absent, and a device whose scalar kernels fail is unusable. The verdict is kept in the cache,
 and so are the programs that the child compiled; a hang is kept once it has happened twice. ``GPUSENSE_PROOF=off``
-trusts every driver. If no child can be started, a device without a cached verdict is trusted, and the log says so.
+trusts every driver. If no child can be started, a device without a cached verdict is trusted, with an entry in the log.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class Verdict:
         float64: Whether float64 kernels were proved.
         reason: The failures, empty where nothing failed.
         remedy: The remedy for them.
-        rate: Calls of a scan per second, by which devices of a class are ranked; 0 if not measured.
-        passing: Whether the failure is due to the state of the machine, without a proof; such a verdict is not cached.
+        rate: Calls of a scan per second, the rank of a device in its class; 0 if not measured.
+        passing: True if the failure is due to the state of the machine, without a proof; such a verdict is not cached.
     """
 
     usable: bool
@@ -89,7 +89,7 @@ def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> V
     Args:
         info: The device.
         setup: The preparation of the child; see ``library.Library.child_setup``.
-        anew: Whether the cached verdict is dropped.
+        anew: True if the cached verdict is dropped.
     """
     if child.is_off():
         return trust(info)

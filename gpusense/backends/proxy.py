@@ -1,4 +1,4 @@
-"""A backend that forwards every method to another one."""
+"""A backend that forwards every method to another backend."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _forwarded(name: str) -> Any:
 
 
 def _forwarded_property(name: str) -> Any:
-    """Make a property that is that of the backend behind."""
+    """Make a property that forwards to the wrapped backend."""
     return property(lambda self: getattr(self._backend, name))
 
 

@@ -1,4 +1,4 @@
-"""Recordings: programs with bound arguments, which are started repeatedly."""
+"""Recordings: programs with bound arguments, for repeated starts."""
 
 from __future__ import annotations
 

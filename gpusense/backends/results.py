@@ -20,7 +20,7 @@ class Result:
         shape: Its shape.
         real: Its precision.
         backend: The device.
-        on_device: Whether the poses are on it.
+        on_device: True if the poses are on it.
 
     Attributes:
         flat: A flat NumPy array, or a buffer on the device.

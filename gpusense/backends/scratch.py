@@ -1,9 +1,9 @@
-"""A folder of this process for the compiled kernels of drivers, which is removed when the process ends.
+"""A folder of this process for the compiled kernels of drivers, removed when the process ends.
 
 Drivers do not check the files in their folders: a half-written or damaged file ends the run. Therefore every process
 begins with an empty folder, and only files whose checksums hold are copied into it (see
 :mod:`gpusense.backends.cache`). Only this user may change it. Its name, owner and lock file distinguish it from other
-folders, which are never removed.
+folders; those are never removed.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ def get_backend(selection: Selection = "auto") -> Backend:
     """Return the backend of a selection string; one and the same object for one device.
 
     Args:
-        selection: See :mod:`gpusense.backends.selection`; a backend is returned as it is.
+        selection: See :mod:`gpusense.backends.selection`; a backend is returned unchanged.
 
     Raises:
         TypeError: The selection is neither a string nor a queue.
@@ -98,7 +98,7 @@ def forget() -> None:
 def _circumstances() -> tuple[Any, ...]:
     """Return the key on which the meaning of a selection string depends: the process, and environment variables.
 
-    Looking up an unset variable takes more than a microsecond in ``os.environ``, and a tenth of that in its dictionary.
+    Looking up an unset variable takes more than a microsecond in ``os.environ``, and a tenth as long in its dictionary.
     """
     values = getattr(os.environ, "_data", None)
     if not isinstance(values, dict):

@@ -72,7 +72,7 @@ class Staging:
         return self._run(array, buffer, _send)
 
     def download(self, buffer: Any, out: np.ndarray) -> bool:
-        """Copy the head of a buffer into a C-contiguous array, which is full on return.
+        """Copy the head of a buffer into a C-contiguous array, full on return.
 
         Returns:
             False if a plain copy is faster; nothing was copied then.
@@ -114,7 +114,7 @@ def _send(slots: Sequence[Slot], source: np.ndarray, buffer: Any, started: list[
 
     for number in range(1, min(_AHEAD, len(pieces))):
         fill(number)
-    # The calling thread works as well.
+    # The calling thread also works.
     slots[0].wait()
     np.copyto(slots[0].bytes[: pieces[0][1]], source[: pieces[0][1]])
     for number, (first, size) in enumerate(pieces):

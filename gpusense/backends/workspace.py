@@ -23,7 +23,7 @@ POSE_STATUS = ("pose_status", np.dtype(np.int32))
 
 
 class _Result:
-    """Context of the launches that write a part of a result, which is delivered at its end."""
+    """Context of the launches that write a part of a result, delivered at its end."""
 
     def __init__(
         self, space: Workspace, backend: Backend, name: str, target: np.ndarray | Buffer, first: int, count: int,
@@ -69,7 +69,7 @@ class Workspace:
         self._held: dict[str, tuple[Hashable, Buffer]] = {}
 
     def __enter__(self) -> Workspace:
-        """Begin a call, whose launches and copies are a batch where the device has graphs."""
+        """Begin a call; its launches and copies are a batch where the device has graphs."""
         if self._backend.info.graphs:
             self._backend.begin_batch()
         return self
@@ -143,7 +143,7 @@ class Workspace:
         return program
 
     def _identity(self, value: Any) -> Hashable:
-        """Return a number or struct as it is, and a buffer by its address."""
+        """Return a number or struct unchanged, and a buffer by its address."""
         return value if value is None or isinstance(value, (int, float, tuple)) else self._backend.address(value)
 
     def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False, lent: bool = False) -> Buffer:
@@ -224,7 +224,7 @@ class Workspace:
         return _Result(self, self._backend, name, target, first, count, dtype)
 
     def download(self, buffer: Buffer, out: np.ndarray) -> None:
-        """Start copying the beginning of a buffer into a C-contiguous array, which is filled after ``wait``."""
+        """Start copying the beginning of a buffer into a C-contiguous array, filled after ``wait``."""
         self._busy.append(out)
         self._backend.download(buffer, out, wait=False)
 
@@ -239,7 +239,7 @@ class Workspace:
         self._busy.clear()
 
     def _forget(self) -> None:
-        """Drop programs and parts: one of their buffers is replaced."""
+        """Drop programs and parts, because a buffer is replaced."""
         self._programs.clear()
         self._parts.clear()
 

@@ -23,8 +23,8 @@ Flags = NDArray[np.bool]
 
 # Least number of matches that agree with a match, including itself.
 _AGREE = 3
-# Evidence that a group needs where nothing else is known, the sum of -log10(1 - p_right) with p_right at most a largest
-# one, and where one of a hundred weak steps is a break; different scans on both sides.
+# Evidence that a group needs where nothing else is known, the sum of -log10(1 - p_right) with p_right clamped to a
+# maximum, and where 1 % of weak steps are breaks; different scans on both sides.
 EVIDENCE, EVIDENCE_OVER_WEAK, _MOST_RIGHT, _SCANS = 6.5, 4.5, 0.999, 3
 # Compared matches are at most this far apart on both sides [m], and at most this many key scans; matches of a batch.
 _PASSAGE, _KEYS, _MATCHES = 8.0, 64, 1024
@@ -90,7 +90,7 @@ def _supported(table: Any, kept: Flags) -> Flags:
 
 
 def _groups(table: Any, kept: Flags, matches: Links) -> Groups:
-    """Return the groups of the kept matches only, which are fewer than L."""
+    """Return the groups of the kept matches only, fewer than L."""
     from scipy.sparse.csgraph import connected_components
 
     rows = np.flatnonzero(kept)

@@ -76,7 +76,7 @@ def fitted_odometry(front: Front, links: Links, reported: Floats) -> OdometryMot
 
 
 def constant_motion_links(poses: Floats, keys: NDArray[np.int64], jumped: Flags, links: Links) -> Links:
-    """Return links of constant motion, whose errors accumulate, where other links leave directions open.
+    """Return links of constant motion where other links leave directions open; errors of such links accumulate.
 
     Args:
         poses: (M, 3) poses of the nodes.

@@ -65,8 +65,8 @@ def chain_scans(
     other. The poses are the least-squares solution with a robust kernel over all links. Directions that scans do not
     observe are filled by the odometry, with noise fitted to the matches, or else by constant motion.
 
-    With several scanners, scans of the same scanner are matched; loops also match scanners of equal bearings, such as a
-    front and a rear one. A key scan is coupled with the scans of the other scanners before and after it.
+    Scans are matched to scans of the same scanner; loops also match scanners of equal bearings, such as a front and a
+    rear one. A key scan is coupled with the scans of the other scanners before and after it.
 
     Args:
         scans: (S, K) readings in the order of time [m], at least one; with several scanners S readings, each of its
@@ -75,13 +75,13 @@ def chain_scans(
         odometry: (S, 3) poses of the odometer at the scans [m, m, rad]. None: no odometry.
         sensor: (S,) index of the scanner of each scan; with several scanners only.
         times: (S,) times of the first beams [s]. None: unknown.
-        duration: Time from the first beam of a scan to the last one [s], by which scans are corrected for the robot's
-            motion; needs ``times``. Beams are measured evenly in time in their order, in reverse, or all at once; the
-            order in which scans agree best is used. 0: at once. With several scanners optionally one number for each.
+        duration: Time from the first beam of a scan to the last one [s], to correct scans for the robot's motion; needs
+            ``times``. Beams are measured evenly in time in their order, in reverse, or all at once; the order in which
+            scans agree best is used. 0: at once. With several scanners optionally one number for each.
         motion: Noise of the odometry. None: fitted to the matches.
         step: Motion by odometry below which a scan is not matched [m, rad]; such scans cost nothing.
         key_step: Motion after which a scan becomes a key scan [m, rad].
-        close_loops: Whether places that are seen again are searched for.
+        close_loops: Search for places that are seen again.
         precision: Precision of the matches, ``"float32"`` or ``"float64"``.
         backend: The device, see :func:`gpusense.devices`.
 
@@ -221,7 +221,7 @@ class Chainer:
             loops = self._loops[1]
             closures = loops.closures.renumbered(joint.keys)
             poses = _carried(poses, joint.keys, loops.solution.poses)
-        # Without closures hardly anything tells how a long chain bends, and the chain of matches bends least.
+        # The bend of a long chain is barely observable without closures, and the chain of matches bends least.
         solution = solve(poses, Links.joined([links, closures]), settle=len(closures) > 0)
         spread = pose_covariances(solution)
         found = solution.links.kind == CLOSURE
@@ -248,7 +248,7 @@ class Chainer:
         )  # fmt: skip
 
     def _all_links(self, joint: Joint) -> Links:
-        """Return the links of matches and of odometry or constant motion; those of the last trajectory are kept."""
+        """Return the links of matches and of odometry or constant motion; keep the last trajectory's links."""
         if self._links_of is None or self._links_of[0] is not joint:
             self._links_of = joint, self._made_links(joint)
         return self._links_of[1]

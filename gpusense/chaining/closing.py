@@ -3,9 +3,9 @@
 Candidates are key scans that show the same cells of the plane. Each is matched in a window of three deviations of the
 expected drift in the pose graph so far. A closure is accepted if its p_right is high, it agrees with the drift, and
 further matches of the same passages agree with it (see ``agreement``). Small drifts are closed first, which reduces the
-larger ones. Where the chain is broken between two places, or they are farther apart than the drift allows, a group of
-agreeing matches is needed. Over a weak step, which rests on few or unsure matches, a group of less evidence suffices. A
-closure across a break removes the break.
+larger ones. A broken chain between two places, or a distance beyond the drift, requires a group of agreeing matches.
+Over a weak step, which rests on few or unsure matches, a group of less evidence suffices. A closure across a break
+removes the break.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _LEVELS = (
     ((10.0, 1.6), 4.0, 150),
 )
 # Deviations of the drift that a window covers; largest squared distance of a closure from the drift [squared
-# deviations], and the same for one of a group.
+# deviations], and the same for a closure in a group.
 _DEVIATIONS, _GATE, _FAR = 3.0, 16.0, 100.0
 # Least p_right of a closure.
 _SURE = 0.9
@@ -52,7 +52,7 @@ _EACH, _NEIGHBOURS = 2, 3
 _ELSEWHERE = 0.5
 # Relative gain of the cost below which a solution between rounds ends.
 _GAIN = 1e-4
-# Most rounds of a level, and the least motion of poses in a round that justifies another one [m].
+# Most rounds of a level, and the least motion of poses in a round that justifies another round [m].
 _ROUNDS, _MOVED = 5, 0.3
 
 
@@ -66,7 +66,7 @@ class Loops:
     Attributes:
         matcher: Matches scans.
         nodes: (K,) indices of the key scans.
-        sequence: (K,) scanners of the key scans, and (K,) their numbers among those of their scanner.
+        sequence: (K,) scanners of the key scans, and (K,) their numbers among their scanner's scans.
         places: End points of the key scans.
         broken: (K,) number of breaks of the chain before each key scan; a closed break counts for its earlier side.
         weak: (K,) number of breaks and weak steps of the chain before each key scan, likewise.
@@ -185,7 +185,7 @@ class Loops:
         self._tried = first[last], second[last], level[last], guess[last]
 
     def _keep_matches(self, found: Links) -> None:
-        """Remember sure matches, which replace earlier ones of the same pairs."""
+        """Remember sure matches in place of earlier matches of the same pairs."""
         again = np.isin(self._pairs(self.matches.first, self.matches.second), self._pairs(found.first, found.second))
         self.matches = Links.joined([self.matches[~again], found])
 

@@ -18,7 +18,7 @@ Flags = NDArray[np.bool]
 # this share are sides of steps whose variance is this many times the usual one, so that breaks of the chain are
 # represented.
 _ANCHORS, _BREAKS, _LOOSE = 300, 0.4, 10.0
-# Lever by which variances of headings are compared with variances of positions [m].
+# Length that converts heading to position variance [m].
 _LEVER = 3.0
 # Poses of a stretch that is eliminated at once, and stretches that are joined for the next elimination.
 _STRETCH, _JOINED = 32, 16
@@ -141,7 +141,7 @@ def _without_stretches(matrix: Any, kept: Flags, stretch: Integers) -> tuple[Any
     place, of = np.zeros((2, count), np.int64)
     of[members], place[members] = part, _ranks(part)
     size = int(place.max(initial=-1)) + 1
-    # Missing rows of short stretches are those of an identity.
+    # Missing rows of short stretches are rows of an identity.
     pivots = np.tile(np.eye(size), (len(parts), 1, 1))
     some = inner[row] & inner[column]
     pivots[of[row[some]], place[row[some]], place[column[some]]] = value[some]
@@ -193,7 +193,7 @@ def _add_closures(whole: Floats, poses: Floats, closures: Links, anchors: Intege
 
     Small motions are expressed as motions of a frame at the origin that is fixed to the scan, so a link has the same
     information between any scans of a rigid body. The covariance of the steps from the kept poses to the scans, as if
-    these had no further links, is added to that of the closure.
+    these had no further links, is added to the closure's.
     """
     steps = np.arange(len(spread))
     _, two = pose_jacobians(poses, steps, steps + 1)

@@ -1,8 +1,8 @@
 """Normal equations of a pose graph: sparse symmetric matrices of 3 x 3 blocks whose places are found once.
 
-With d the way from a link's first to its second pose in the world, and W its information turned into the world, the
-link adds W to the diagonal block of the second pose, T' W T to that of the first one, and -T' W between both. T turns a
-small motion of the first pose into that of the second one: it is the identity but for a lever -d_y, d_x of headings.
+Let d lead from a link's first to its second pose in the world, and let W be its information in the world: the link adds
+W to the diagonal block of the second pose, T' W T to the first pose's, and -T' W between both. T turns a small motion
+of the first pose into a motion of the second one: it is the identity but for a lever -d_y, d_x of headings.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Equations:
         first: (L,) poses in whose frames the links' poses are.
         second: (L,) poses that are linked to these.
         fixed: The pose that is kept; it has no rows and columns.
-        ordered: Whether rows and columns are in an order with little fill; else in that of the poses.
+        ordered: True if rows and columns are in an order with little fill; else in the poses' order.
 
     Attributes:
         rows: (N - 1,) the free pose of each row of blocks.
@@ -80,7 +80,7 @@ class Equations:
             poses: (N, 3) poses.
             information: (L, 3, 3) information of the links times their weights.
             pull: (L, 3) its product with the residuals of the links.
-            damping: Added to the diagonal; a number, or one for each free pose.
+            damping: Added to the diagonal; a number, or a number per free pose.
         """
         from scipy import sparse
 

@@ -1,7 +1,7 @@
 """Match successive scans from the odometry or from rest, and doubtful ones again from neighbouring motions.
 
-Without odometry, rest is a poor guess for a robot that moves far between scans: along a corridor, where scans look
-alike everywhere, the match then stays at its guess. So doubtful matches, and matches whose motion differs from their
+Rest is a poor guess for a robot that moves far between scans without odometry: along a corridor, where scans look alike
+everywhere, the match then stays at its guess. So doubtful matches, and matches whose motion differs from their
 neighbours', are also tried from constant motion. The match with the highest ``p_right`` is taken, which falls with the
 distance from the guess.
 """
@@ -116,7 +116,7 @@ def weakened(information: Floats, offset: Floats) -> Floats:
 def motions_around(motion: Floats, good: Flags, last: Floats | None) -> tuple[Floats, Floats, Floats]:
     """Return the last good motion before each, the next good motion, and their mean, each (L, 3).
 
-    Without a good motion on one side, that of the opposite side is taken; without another one, rest.
+    A side without a good motion takes the opposite side's; if both lack one, rest.
 
     Args:
         motion: (L, 3) motions.

@@ -30,7 +30,7 @@ Flags = NDArray[np.bool]
 LOCAL = 4
 # Least p_right of a failed match that is still a better guess than constant motion.
 _LIKELY = 0.1
-# Least p_right of a match that bridges failed ones, and most failed ones in a row that it bridges.
+# Least p_right of a match that bridges failed matches, and most failed matches in a row that it bridges.
 _BRIDGE, _GAP = 0.8, 5
 # A match is beyond doubt from this p_right, or with this many further matches over its step.
 _BEYOND, _CONFIRMED = 0.9, 2
@@ -60,8 +60,8 @@ class Front:
         keys: Numbers of the nodes that are key scans.
         p_right: Probabilities of the matches of steps; 0 where none is usable.
         lost: Numbers of directions that these matches leave open.
-        rivalled: Whether a second motion explains the scans of a step about as well.
-        bridged: Whether a step without a match of its own is taken from a match that spans it.
+        rivalled: A second motion explains the scans of a step about equally well.
+        bridged: A step without a match is taken from a match that spans it.
         spanned: Whether a match spans an unmatched step together with its neighbours.
         unseen: (L, 3, 3) projections of steps onto their open directions.
         links: The links between nodes.

@@ -6,9 +6,9 @@ normal equations are sparse and are factored by SuperLU. Poses are relative to a
 some directions of some or even all links: an undetermined direction keeps its initial value.
 
 A step changes the poses in the world. Where asked for, it changes these or the motions from pose to pose, whichever
-costs less: both are equal at first, but one is right for a loose pose among firm ones, the second one for a long chain
-that turns. Each pose then has damping of its own [1/m^2, 1/rad^2], so a few loose poses, which lie in curved valleys of
-the cost, do not hold up all others.
+costs less: both are equal at first, but the first is right for a loose pose among firm ones, the second for a long
+chain that turns. Damping is then per pose [1/m^2, 1/rad^2], so a few loose poses in curved valleys of the cost do not
+hold up all others.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ KERNEL = 3.0
 # Most iterations, the step that ends them [m, rad], and the first, least and largest damping.
 _ITERATIONS, _SMALL = 50, 1e-6
 _DAMPING, _LEAST, _MOST = 1e-6, 1e-9, 1e6
-# After a step that is taken, damping falls by this factor, and where poses have damping of their own by the second one.
+# After a step that is taken, damping falls by this factor, or by the second one if damping is per pose.
 _RELAXED, _RELAXED_APART = 10.0, 3.0
-# After a step that fails, damping rises from at least this value, and where poses have damping of their own from at
-# least the second one. It rises at links whose cost rises by this share of the largest rise, after a second failure by
-# its square, and after this many everywhere.
+# After a step that fails, damping rises from at least this value, or from at least the second one if damping is per
+# pose. It rises at links whose cost rises by this share of the largest rise, after a second failure by its square, and
+# after this many everywhere.
 _FAILED, _FAILED_APART, _RISE, _FAILS = 1e-4, 1e-2, 0.01, 3
 
 
@@ -68,8 +68,7 @@ def solve(
         fixed: Index of the pose that is kept.
         kernel: Scale of Cauchy's kernel [deviations]; infinity for plain least squares.
         least: Relative gain of the cost below which the iterations end.
-        settle: Whether steps may also change motions, and each pose has damping of its own: more work for each step,
-            for fewer steps.
+        settle: Steps may also change motions, and damping is per pose: more work for each step, for fewer steps.
         equations: Ordered equations of these poses and links, if there are any from an earlier call.
     """
     at, damping, fails = np.array(poses, np.float64), np.full(len(poses), _DAMPING), 0

@@ -50,7 +50,7 @@ class Joint:
         keys: (K,) numbers of nodes that are key scans.
         failed: (M - 1,) whether no scanner determines the motion from a node to the next.
         open: (M - 1,) whether the scanners that determine it leave a direction open.
-        contested: (M - 1,) whether a second motion explains their scans as well.
+        contested: (M - 1,) whether a second motion explains their scans equally well.
         poses: (M, 3) poses by the matches that determine each motion best, chained from the first one.
     """
 
@@ -240,7 +240,7 @@ def _shares(moved: Floats, share: float) -> Floats:
 
 
 def _information(deviation: Floats) -> Floats:
-    """Return the information (L, 3, 3) of couplings from their deviations and those of mounts."""
+    """Return the information (L, 3, 3) of couplings from the deviations of couplings and mounts."""
     diagonal = 1 / (np.array([_MOUNTS, _MOUNTS, _MOUNTS_TURN]) ** 2 + deviation[:, [0, 0, 1]] ** 2)
     return diagonal[:, :, None] * np.eye(3)
 

@@ -84,7 +84,7 @@ class Links:
         return replace(self, first=numbers[self.first], second=numbers[self.second])
 
     def residuals(self, poses: Floats) -> Floats:
-        """Return (L, 3) differences between the relative poses of (N, 3) poses and those of the links."""
+        """Return (L, 3) differences between the relative poses of (N, 3) poses and the links' poses."""
         cos, sin = np.cos(poses[:, 2])[self.first], np.sin(poses[:, 2])[self.first]
         x, y, turn = (poses[self.second] - poses[self.first]).T
         off = np.stack([cos * x + sin * y, cos * y - sin * x, turn], axis=1) - self.pose

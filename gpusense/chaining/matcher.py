@@ -109,8 +109,7 @@ class Matcher:
     ) -> Found:
         """Return the robot's poses at scans of a second scanner with equal bearings, relative to those at these.
 
-        Both are matched as scans of one scanner in the middle of a robot, so that matched poses are those of the
-        scanners.
+        Both are matched as scans of one scanner in the middle of a robot, so that matched poses are scanner poses.
         """
         one, two = (np.array(matcher.scanner.mount) for matcher in (self, other))
         plain = Scanner(
@@ -162,7 +161,7 @@ class TeamMatcher:
     Args:
         matchers: The matcher of each scanner.
         sensor: (S,) indices of the scanners of all scans.
-        place: (S,) indices of the scans among those of their scanners.
+        place: (S,) indices of the scans among their scanners' scans.
     """
 
     def __init__(self, matchers: Sequence[Matcher], sensor: Integers, place: Integers) -> None:

@@ -96,7 +96,7 @@ def relative(poses: Floats, first: NDArray[np.int64], second: NDArray[np.int64])
 
 
 def partial_motion(motion: Floats, share: Floats) -> Floats:
-    """Return the motions (L, 3) after a share (L,) of full motions, which are arcs."""
+    """Return the motions (L, 3) after a share (L,) of full motions along arcs."""
     return np.stack(part_of_arc(motion, share), axis=1)
 
 

@@ -30,7 +30,7 @@ class ChainOptions:
         key_step: Motion after which a scan becomes a key scan [m, rad].
         duration: Time from the first beam of a scan to the last one [s].
         motion: Noise of the odometry; None to fit it to the matches.
-        close_loops: Whether places that are seen again are searched for.
+        close_loops: Search for places that are seen again.
         backend: The device.
         precision: Precision of the matches.
     """
@@ -77,7 +77,7 @@ def check_durations(duration: object, scanners: int, timed: bool) -> tuple[float
     Args:
         duration: A number for all, or L numbers.
         scanners: L.
-        timed: Whether the times of the scans are known.
+        timed: True if the times of the scans are known.
 
     Raises:
         TypeError, ValueError: another kind, negative numbers, or numbers without times of the scans.

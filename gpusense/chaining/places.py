@@ -30,7 +30,7 @@ _PAIRS, _LARGE = 8, 0.6
 
 
 def place_points_of(data: SensorScans, scans: Integers) -> list[Floats]:
-    """Return the end points of scans in the robot's frame, without the farthest ones of each."""
+    """Return the end points of scans in the robot's frame, without the farthest points of each scan."""
     result, sensor, place = [np.zeros((0, 2))] * len(scans), data.sensor[scans], data.places()[scans]
     for one, scanner in enumerate(data.scanners):
         some = np.flatnonzero(sensor == one)
@@ -53,7 +53,7 @@ def overlaps(
 ) -> tuple[Integers, Integers, Floats]:
     """Return pairs of key scans that share many cells, the best of each passage.
 
-    From successive key scans of a scanner that share cells with a second one, the one with the largest share is taken.
+    From successive key scans of a scanner that share cells with a second one, take the scan with the largest share.
     Earlier scans come from the first passages through each place, so their number does not grow with further passages.
 
     Args:
@@ -61,7 +61,7 @@ def overlaps(
         poses: (K, 3) poses of the key scans.
         cell: Side of a cell [m].
         apart: Key scans of a pair are at least this many apart.
-        sequence: (K,) scanners of the key scans, and (K,) their numbers among those of their scanner.
+        sequence: (K,) scanners of the key scans, and (K,) their numbers among their scanner's scans.
 
     Returns:
         (L,) first ones, (L,) second ones, and (L,) shares of common cells.

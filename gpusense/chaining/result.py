@@ -54,9 +54,9 @@ class ScanChain:
         motions: (S, 3) motion of the robot from the first listed beam of each scan to the last one, or None if scans
             are instantaneous.
         duration: Time from the first listed beam to the last one that was used [s]; negative where beams are listed in
-            reverse: see :attr:`later`. With several scanners a tuple.
+            reverse: see :attr:`later`. A tuple for several scanners.
         sensor: (S,) index of the scanner of each scan.
-        corrections: (C,) distances [m] by which the closures moved the second scans in the frames of the first ones.
+        corrections: (C,) distances [m] that closures moved second scans in the frames of first scans.
         doubts: Stretches that are doubtful.
         matched: Number of scans that were matched; during all remaining ones the robot stood still by its odometry.
         searched: Number of pairs of key scans that were matched in the search for places that are seen again.
@@ -99,7 +99,7 @@ class ScanChain:
 
     @property
     def later(self) -> Floats:
-        """Time [s] from each scan to its pose, (S,); that of the scan if beams are listed in reverse, else 0."""
+        """Time [s] from each scan to its pose, (S,); the scan's duration if beams are listed in reverse, else 0."""
         result: Floats = np.maximum(-np.atleast_1d(np.array(self.duration, np.float64)), 0.0)[self.sensor]
         return result
 
@@ -139,7 +139,7 @@ def doubts_of(joint: Joint, alone: bool) -> tuple[Doubt, ...]:
 
     Args:
         joint: The matched scans.
-        alone: Whether odometry is missing.
+        alone: True if odometry is missing.
     """
     failed, open_, nodes = joint.failed, joint.open & alone, joint.nodes
     contested = joint.contested & ~failed & ~open_

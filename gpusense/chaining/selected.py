@@ -1,10 +1,10 @@
 """Covariances of all poses of a pose graph: the diagonal blocks of the inverse of its sparse normal equations.
 
 The matrix of 3 x 3 blocks is eliminated front by front along the elimination tree (Duff and Reid 1983): successive
-columns with equal rows at once, and fronts of equal shape whose children are done together. From its root down, the
-blocks of the inverse within each front follow from those of its parent (Takahashi et al. 1973): with L the columns
-below pivots D, and Z the inverse, Z_sj = -Z_ss L and Z_jj = D^-1 + L' Z_ss L. No further blocks are computed, so time
-and memory are those of the elimination.
+columns with equal rows at once, and fronts of equal shape whose children are done together. The blocks of the inverse
+within each front follow from its parent's blocks, from the root down (Takahashi et al. 1973): with L the columns below
+pivots D, and Z the inverse, Z_sj = -Z_ss L and Z_jj = D^-1 + L' Z_ss L. No further blocks are computed, so time and
+memory equal the elimination's.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ class Tree:
     def parents(self, which: Integers) -> list[tuple[int, Integers, Integers]]:
         """Return for each group of parents of a group's parts: its number, its parts' children, and their places.
 
-        Places (C, R) are those of the scalar rows below in the fronts of the parents.
+        Places (C, R) locate the scalar rows below in the fronts of the parents.
         """
         rows = self._at[self._start[which][:, None] + np.arange(self.below[which[0]])]
         group = self._group[self.parent[which]]

@@ -28,7 +28,7 @@ def signed_duration(matcher: Matcher, times: Floats, duration: float) -> float:
     Args:
         matcher: Matches scans without correction for motion.
         times: (S,) times of the scans [s].
-        duration: The time in the listed order [s], which is returned where the scans do not decide.
+        duration: The time in the listed order [s], returned where the scans do not decide.
     """
     count = min(len(times), _SCANS)
     if count <= _LAG + 1:

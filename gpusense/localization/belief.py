@@ -72,7 +72,7 @@ class Comparison(NamedTuple):
     Attributes:
         ratio: Its log-likelihood ratio of "wrong" against "right".
         pose: Pose that was compared; None before.
-        chosen: Whether the next pose is one that scans choose among many.
+        chosen: True if the next pose is one that scans choose among many.
     """
 
     ratio: float = 0.0
@@ -88,7 +88,7 @@ class Belief(NamedTuple):
         ratio: Log-likelihood ratio of the last judged scan.
         pose: Pose at which that scan was judged; None before.
         scans: Scans since that one.
-        chosen: Whether the next pose is one that scans choose among many.
+        chosen: True if the next pose is one that scans choose among many.
         alike: Share of "wrong" that looks like the right place.
         compared: Last comparison of the pose with other places.
     """

@@ -43,8 +43,8 @@ class Diagnosis:
         through: Number of beams that pass through a mapped wall.
         short: Number of beams that end in mapped free space.
         place: (x, y) of the wall near which most beams pass through [m]; None without one.
-        inside: Whether the pose is inside solid cells.
-        off: Whether the pose is in unknown cells or off the map.
+        inside: True if the pose is inside solid cells.
+        off: True if the pose is in unknown cells or off the map.
         elsewhere: (x, y, theta) of a pose that explains the scan better; None without one, or without a search.
         turned: Angle by which the scanner seems to be turned relative to its mount [rad]; pi with ``mirrored`` for a
             scanner that is upside down; None if the mount fits or no other mount does.

@@ -172,7 +172,7 @@ class MapJudge:
             ranges: (K,) readings [m].
 
         Returns:
-            Whether there are beams, and cells of the map on the device.
+            True if there are beams, and cells of the map on the device.
         """
         self._expected = self._known = None
         if self._cells is None:

@@ -114,7 +114,7 @@ def fit_odometry_motion(odometry: AnyArray, poses: AnyArray, *, systematic: bool
     Args:
         odometry: (M, 3) poses of the odometer, M > 2 [m, m, rad].
         poses: (M, 3) reference poses at the same times; rows of NaN where unknown, at most M - 3.
-        systematic: Whether to fit the errors that repeat at each step; otherwise they are 0.
+        systematic: Fit the errors that repeat at each step; otherwise they are 0.
 
     Raises:
         TypeError, ValueError: the arrays are no poses, or fewer than three, or the odometer moved by less than 1 cm and

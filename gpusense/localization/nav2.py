@@ -99,7 +99,7 @@ class Nav2Options:
     topics: tuple[str, str]
     """Topics of the map and the scans."""
     tf_broadcast: bool
-    """Whether the transform from map to odometry is sent."""
+    """True if the transform from map to odometry is sent."""
     transform_tolerance: float
     """Time by which the transform is dated ahead [s]."""
     initial_pose: tuple[float, float, float] | None
@@ -117,7 +117,7 @@ class Nav2Options:
         Args:
             grid: The map.
             scanner: The scanner.
-            compat: Whether to weigh as nav2_amcl does, by ``weights``; otherwise log p of the book, by ``parameters``.
+            compat: Weigh as nav2_amcl does, by ``weights``; otherwise log p of the book, by ``parameters``.
             options: Options of :class:`BeamModel` or :class:`LikelihoodFieldModel`, such as ``backend``.
 
         Raises:

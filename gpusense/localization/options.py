@@ -127,7 +127,7 @@ def settings_of_step(
         pool: Number of poses that recovery injects, and half widths of the box around each in x, y [m] and heading
             [rad].
         sensors: Temperature and beams of each sensor that is used.
-        one_peak: Whether the particles lie together, and no sensor has several peaks among them.
+        one_peak: True if the particles lie together, and no sensor has several peaks among them.
     """
     settings = _settings_of_run(options, count, pool, tuple(sensors), one_peak).copy()
     settings[STEP] = step

@@ -59,7 +59,7 @@ class Places(NamedTuple):
             most: Largest number of stages.
             drawn: Particles of the next step.
             kind: Kind of the motion that begins the first stage.
-            same: Whether the present step has as many particles, so that each stage draws this number.
+            same: True if the present step has as many particles, so that each stage draws this number.
         """
         (poses, weights), state = kept.free(), 1 - kept.state
         known = drawn if same or most == 1 else 0

@@ -45,8 +45,8 @@ class Passages(NamedTuple):
         origin: Origin of the beams [m].
         heading: Direction of bearing 0 in the world [rad].
         near: Distance from a wall within which agreeing readings are close to it [m].
-        inside: Whether the pose is inside solid cells.
-        off: Whether the pose is in unknown cells or off the map.
+        inside: True if the pose is inside solid cells.
+        off: True if the pose is in unknown cells or off the map.
     """
 
     kind: Floats

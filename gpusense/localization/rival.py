@@ -69,7 +69,7 @@ class Rival:
         tracker: A second set of particles with the filter's sensors.
 
     Attributes:
-        active: Whether there is a rival now.
+        active: True if there is a rival now.
         log_odds: Log odds of the rival against the particles.
     """
 

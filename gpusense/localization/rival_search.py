@@ -53,7 +53,7 @@ class Candidates(NamedTuple):
             the estimate, less that at the estimate [nats]; NaN without a search of the whole map.
         beams: Number of independent beams, the temperature times the number of beams.
         walls: Ratio of the beams that meet walls at that candidate.
-        is_found: Whether a candidate is at the estimate.
+        is_found: True if a candidate is at the estimate.
     """
 
     poses: np.ndarray

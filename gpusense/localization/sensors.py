@@ -43,7 +43,7 @@ class Sensor:
         beams: Beams that a scan uses; 0 for other models.
         seconds: Time of all calls of ``score``.
         calibrates: Whether temperature="auto" learns from it.
-        ambiguous: Whether its likelihood may have several peaks among particles that lie together, as for landmarks
+        ambiguous: True if its likelihood may have several peaks among particles that lie together, as for landmarks
             that may be exchanged.
 
     Raises:

@@ -38,7 +38,7 @@ class Spread(NamedTuple):
     Attributes:
         wide: Whether the position's exceeds 0.5 m, or the heading's 0.25 rad.
         apart: Whether the position's exceeds 1 m, or the heading's 0.5 rad: the distribution may cover several places.
-        narrow: Whether the position's is below 0.2 m and the heading's below 0.1 rad: a normal density then describes
+        narrow: True if the position's is below 0.2 m and the heading's below 0.1 rad: a normal density then describes
             the particles well enough.
     """
 

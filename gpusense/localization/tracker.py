@@ -53,11 +53,11 @@ class Tracker:
         cloud: The particles.
 
     Attributes:
-        started: Whether there are particles.
+        started: True if there are particles.
         progress: Steps so far, and the motion since the last correction.
         shown: Number of shown particles, which are those of the last step.
         wide: Number of remaining corrections at a low temperature.
-        together: Whether the particles lie together, as far as is known.
+        together: True if the particles lie together, as far as is known.
         pool: Number of poses that recovery injects, and half widths of the box around each.
         corrections: Corrections so far.
     """

@@ -75,7 +75,7 @@ class Verdict:
 
     Attributes:
         state: Everything that the verdict remembers.
-        informed: Whether a sensor has a map, so that readings can contradict a pose.
+        informed: True if a sensor has a map, so that readings can contradict a pose.
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("state",)
@@ -97,7 +97,7 @@ class Verdict:
         """Forget all scans.
 
         Args:
-            anywhere: Whether the pose is searched on the whole map.
+            anywhere: True if the pose is searched on the whole map.
         """
         self.state = VerdictState(Belief.anywhere() if anywhere else Belief())
 

@@ -29,7 +29,7 @@ class Weights:
         log_evidence: Logarithm of the mean likelihood, ``log(sum p / N)``: a measure of how well the cloud explains the
             scan; -inf if no particle is possible.
         effective_sample_size: ``1 / sum w^2``, from 1 to N.
-        degenerate: Whether every log-likelihood was -inf: no particle is possible, and the weights are uniform.
+        degenerate: True if every log-likelihood was -inf: no particle is possible, and the weights are uniform.
 
     Example:
         >>> import gpusense as gs

@@ -16,7 +16,7 @@ def word_of(p_lost: float, wrong: float, *, wide: bool, apart: bool) -> Word:
     Args:
         p_lost: The probability.
         wrong: Probability that another place is right, by the scans.
-        wide: Whether the distribution is too wide for a pose that is tracked.
+        wide: True if the distribution is too wide for a pose that is tracked.
         apart: Whether the distribution covers several places, so that scans cannot contradict a single one.
     """
     if wrong > LOST and not apart:

@@ -81,7 +81,7 @@ def _starts(match: ScanMatch) -> np.ndarray:
 
 
 def _inverse(pose: np.ndarray) -> np.ndarray:
-    """Return (L, 3) poses of first frames in second ones from those of the second in the first."""
+    """Return (L, 3) poses of first frames in second frames from the inverse poses."""
     x, y, theta = pose.T
     c, s = np.cos(theta), np.sin(theta)
     return np.stack([-c * x - s * y, s * x - c * y, -theta], axis=1)

@@ -59,7 +59,7 @@ def match_pairs(
         method: ``"icp"`` or ``"auto"``.
         options: Capture radius, noise and window.
         mount: Place of the scanner on the robot [m].
-        noise: (S,) standard deviations of ranges [m]; None for that of the options.
+        noise: (S,) standard deviations of ranges [m]; None takes the options'.
     """
     lock, space = space_of(backend)
     sensor = to_sensor(guess, mount)
@@ -95,7 +95,7 @@ def judged_pairs(
     Args:
         device: The pairs.
         guess: (S, 3) guesses in the sensors' frames.
-        result: (S, 35) results from the guesses, which are overwritten.
+        result: (S, 35) results from the guesses, overwritten.
         points: Points of the references, and of the second scans.
         lever: (S,) root mean square ranges of the second scans [m].
         method: ``"icp"`` or ``"auto"``.

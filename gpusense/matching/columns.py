@@ -1,9 +1,9 @@
 """Columns of the numbers of S matches: arrays (S,), or Python's numbers where there is a single match.
 
 An operation on an array of one number takes 20 times as long as on a number. Both round alike: sums, products,
-quotients, remainders and square roots. Other functions are those of arrays, which accept numbers, so from the same
-results of the kernel a single match has the bits that it has among others, but for the axes of its information.
-Denominators must not be 0, and conditions are negated by :func:`is_not`.
+quotients, remainders and square roots. Other functions are array functions, also for numbers, so the same results of
+the kernel give a single match the same bits as in a batch, except for the axes of its information. Denominators must
+not be 0, and conditions are negated by :func:`is_not`.
 """
 
 from __future__ import annotations
@@ -85,5 +85,5 @@ def all_of(column: Column) -> bool:
 
 
 def upright(column: Column, axes: int = 1) -> Column:
-    """Return a column with axes of length 1 behind its own, by which it multiplies vectors or matrices of matches."""
+    """Return a column with trailing axes of length 1, to multiply vectors or matrices of matches."""
     return column.reshape(-1, *[1] * axes) if isinstance(column, np.ndarray) else column

@@ -20,8 +20,8 @@ NAMES = ("disagreement", "contradiction", "overlap", "pairs", "roughness", "misf
 ``disagreement``: 1 less the score. ``contradiction``: share of the points in common sight that one scan saw through.
 ``overlap``: share of all points that are in common sight. ``pairs``: number of pairs of points. ``roughness``: root
 mean square error of pairs over the noise. ``misfit``: 1 less the mean weight of pairs. ``lost``: number of directions
-that are not observed. ``rival``: 1 where another pose agrees about as well. ``distance``: distance from the guess over
-the window's half width.
+that are not observed. ``rival``: 1 where another pose agrees about equally well. ``distance``: distance from the guess
+over the window's half width.
 """
 
 # A fully observed pose is doubtful below the first probability, a partly observed one below the second: it is used only
@@ -59,7 +59,7 @@ def pair_evidence(result: np.ndarray, lost: Column, other: np.ndarray, noise: np
 
 
 def has_rival(other: np.ndarray) -> Column:
-    """Return whether there are offsets (S, 3) to other poses: NaN stands for none."""
+    """Return whether there are offsets (S, 3) to other poses: NaN for none."""
     x, y, turn = columns_of(other)
     total = x + y + turn
     return np.isfinite(total) if isinstance(total, np.ndarray) else math.isfinite(total)

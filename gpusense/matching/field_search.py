@@ -206,7 +206,7 @@ _SEARCHES: weakref.WeakKeyDictionary[LikelihoodFieldModel, FieldSearch] = weakre
 
 
 def field_search(model: LikelihoodFieldModel, stride: int) -> FieldSearch:
-    """Return the search of a model, which is rebuilt after a change of its map."""
+    """Return the search of a model, rebuilt after a change of its map."""
     search = _SEARCHES.get(model)
     if search is None or search.grid is not model.grid or search.stride != stride:
         search = _SEARCHES[model] = FieldSearch(model, stride)
@@ -221,7 +221,7 @@ def _first_of_largest(log_p: np.ndarray, found: Found, rows: np.ndarray) -> int:
 
 
 def _tile_numbers(points: np.ndarray, headings: np.ndarray, start: np.ndarray, tiles: int) -> np.ndarray:
-    """Return the numbers (A, K) of the tiles in which end points lie at each heading; see ``end_places``."""
+    """Return the numbers (A, K) of the tiles that hold end points at each heading; see ``end_places``."""
     place = end_places(points, headings, start)
     tile = np.minimum(np.floor((place - np.floor(place)) * tiles), tiles - 1).astype(np.int32)
     number: np.ndarray = tile[..., 1] * tiles + tile[..., 0]

@@ -27,7 +27,7 @@ REACH, _MOST, _FEWER, _RATIO, _SLACK = 2, 48, 16, 0.1, 0.05
 WIDTH, STRAIGHT_WIDTH, LONG_WIDTH = 0.04, 3.5, 8.0
 # Neighbours may be this many deviations apart, or this many of the scanner's steps in bearing times the range.
 _SLACK_DEVIATIONS, _STEPS = 6.0, 2.5
-# With larger steps of bearing, lines have three points [rad].
+# Larger steps of bearing give lines three points [rad].
 _SPARSE = 0.12
 # Most starts of one launch; a call can be interrupted between launches.
 _MOST_STARTS = {"cpu": 1 << 12, "gpu": 1 << 18}
@@ -70,14 +70,14 @@ def line_rules(width: float, gap: float) -> dict[str, float]:
 
 
 def slack_of(noise: float) -> float:
-    """Return the distance that is added to that of neighbours on a line, by the noise of ranges [m]."""
+    """Return the distance that range noise adds to the distance of neighbours on a line [m]."""
     return max(_SLACK, _SLACK_DEVIATIONS * noise)
 
 
 class PlacedPairs:
     """Pairs of scans whose points and lines are on a device.
 
-    Pairs whose ranges have equal noise form a level, with rules of its own.
+    Pairs whose ranges have equal noise form a level, with separate rules.
 
     Args:
         backend: The device.

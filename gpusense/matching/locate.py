@@ -51,8 +51,8 @@ def locate_scan(
     a step is shorter than 0.1 mm and 1e-4 rad in float64, and three times that in float32.
 
     ``p_right`` is the probability that the pose is right. It is computed from the shares of the readings that agree
-    with the map, pass through its walls or end before them, at this pose and at other poses that score nearly as well.
-    A pose is ``"found"`` if ``p_right`` is at least ``min_probability``.
+    with the map, pass through its walls or end before them, at this pose and at other poses of nearly the same score. A
+    pose is ``"found"`` if ``p_right`` is at least ``min_probability``.
 
     Args:
         model: A likelihood field; its beams, parameters and device are used.
@@ -60,7 +60,7 @@ def locate_scan(
         resolution: Distance between neighbouring positions [m], > 0; rounded to whole cells, at least one.
         angle: Angle between neighbouring headings [rad], up to a right angle; lowered to the next that divides
             a right angle.
-        positions: ``"free"``: the robot's position must lie in a free cell; ``"all"``: anywhere on the map.
+        positions: ``"free"``: the robot's position must be in a free cell; ``"all"``: anywhere on the map.
         modes: Largest number of modes.
         min_probability: Least ``p_right`` of a pose that counts as found, from 0 to 1.
         refine: Whether ``pose`` may lie between the poses of the grid, up to two steps from the likeliest of them.
@@ -128,7 +128,7 @@ def end_points_of(model: LikelihoodFieldModel, ranges: np.ndarray) -> tuple[np.n
 
 
 def _allowed(grid: OccupancyGrid, stride: int) -> np.ndarray:
-    """Return which positions lie in free cells."""
+    """Return which positions are in free cells."""
     allowed = grid.free[::stride, ::stride]
     if not allowed.any():
         raise ValueError("positions: 'free' needs a position in a free cell, got none; use positions='all'")
@@ -160,7 +160,7 @@ def _refined(
 
 
 def _is_free(grid: OccupancyGrid, pose: np.ndarray) -> bool:
-    """Return whether a pose lies in a free cell."""
+    """Return whether a pose is in a free cell."""
     col, row = np.floor(grid.world_to_cells(pose[None, :2])[0]).astype(int)
     inside = 0 <= row < grid.shape[0] and 0 <= col < grid.shape[1]
     return inside and bool(grid.free[row, col])

@@ -1,9 +1,9 @@
 """Evidence for and against a pose on a whole map, and the probability that it is right.
 
-The probability is a product of two: the pose explains the scan, and it is the right one among poses that score nearly
-as well. The latter is 1/2 where a second pose is as good. Both are logistic functions, whose weights were fitted by
-``bench/derive/location_evidence.py`` to scans of half of the recorded logs and of simulated ones, on the maps of the
-same and of other places; right and wrong poses have equal weight.
+The probability is a product of two: the pose explains the scan, and it is the right one among poses of nearly the same
+score. The latter is 1/2 where a second pose is as good. Both are logistic functions;
+``bench/derive/location_evidence.py`` fitted their weights to scans of half of the recorded logs and of simulated ones,
+on the maps of the same and of other places; right and wrong poses have equal weight.
 """
 
 from __future__ import annotations

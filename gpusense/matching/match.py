@@ -57,9 +57,9 @@ def match_scan(
 
     Points of the second scan are paired with the nearest points of the reference, and moved onto the lines through
     these and their neighbours (point-to-line ICP, Censi 2008) with weights that suppress outliers. Space that the
-    reference did not see neither attracts nor repels. Where the scans do not agree at the end, ``"auto"`` searches
-    around the guess from many starts, and takes the pose with the best score. In a map, the reference is the scan that
-    is expected at the guess, and then at the pose found; where that fails, the whole window is searched.
+    reference did not see neither attracts nor repels. If the scans do not agree at the end, ``"auto"`` searches around
+    the guess from many starts, and takes the pose with the best score. In a map, the reference is the scan that is
+    expected at the guess, and then at the pose found; where that fails, the whole window is searched.
 
     Args:
         reference: (K,) readings of the earlier scan [m], or (S, K) for S matches; or a map.
@@ -121,7 +121,7 @@ def _matches(
     reference: AnyArray | OccupancyGrid, ranges: AnyArray, scanner: Scanner, guess: ArrayLike, method: Method,
     device: Backend, precision: Precision, options: MatchOptions, motions: tuple[object, object], given: bool,
 ) -> tuple[ScanMatch, bool]:  # fmt: skip
-    """Check the scans, the guess and the motions; return S matches, and whether a single one is wanted.
+    """Check the scans, the guess and the motions; return S matches, and whether a single match is requested.
 
     ``given`` states whether the caller chose the noise; otherwise it is estimated from the scans.
     """
@@ -193,7 +193,7 @@ def _to_scans(
     before, motion = motions
     reference = np.arange(len(second)) if len(first) == len(second) else np.zeros(len(second), np.intp)
     if len(first) != len(second) and len(noise) > 1:
-        # Lines depend on the noise, so each level of it has a reference of its own.
+        # Lines depend on the noise, so each level of it has a separate reference.
         levels, reference = np.unique(noise, return_inverse=True)
         first = np.repeat(first, len(levels), axis=0)
         before = None if before is None else np.repeat(before, len(levels), axis=0)
@@ -240,7 +240,7 @@ def match_log(
 
 
 def _still(ranges: np.ndarray, scanner: Scanner, motion: np.ndarray | None) -> np.ndarray:
-    """Return (S, K) readings as those of a robot at rest."""
+    """Return (S, K) readings as if the robot were at rest."""
     return ranges if motion is None else still_readings(ranges, scanner, motion)
 
 
@@ -290,7 +290,7 @@ def match_by_maps(
     references: np.ndarray, ranges: np.ndarray, scanner: Scanner, guess: np.ndarray, method: str, backend: Backend,
     precision: str, options: MatchOptions,
 ) -> ScanMatch:  # fmt: skip
-    """Match (S, K) readings one by one to maps of (S, K) or (1, K) references, from (S, 3) guesses."""
+    """Match (S, K) readings singly to maps of (S, K) or (1, K) references, from (S, 3) guesses."""
     matches = []
     matcher = None
     for i, scan in enumerate(ranges):

@@ -184,7 +184,7 @@ def _scores(grid: OccupancyGrid, *, backend: Selection) -> np.ndarray:
 
 
 def _whole(grid: OccupancyGrid, angle: float, yaw: float) -> PoseGrid:
-    """Return positions in all cells of a map, and headings all around; ``yaw`` is that of the local map's cells."""
+    """Return positions in all cells of a map, and headings all around; ``yaw`` turns the local map's cells."""
     turns = 4 * math.ceil(math.pi / 2 / angle - 1e-9)
     return PoseGrid(np.array([[0.5, 0.5]]), 2 * math.pi / turns * np.arange(turns)[None] - yaw, *grid.shape)
 

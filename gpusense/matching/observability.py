@@ -1,7 +1,7 @@
 """Directions of a pose that the pairs of a match observe, tested against spurious information from noise.
 
 The information of Gauss-Newton counts errors of the lines as information: in a corridor, noise turns lines, and turned
-lines seem to constrain the position along it. Where a direction v is not observed, all of v' I v is such a sum of
+lines seem to constrain the position along it. For a direction v that is not observed, all of v' I v is such a sum of
 squares. Its mean is v' S v, where S is the spurious information due to the variance of the points, and it scatters like
 a chi-squared variable with as many degrees of freedom as there are lines without a common point. So the generalised
 eigenvalues of I v = lambda S v decide: lambda is 1 in the mean where nothing is observed, whatever the units of the
@@ -81,7 +81,7 @@ def observed_information(
     Args:
         information: Sums of w J J'.
         spurious: The expected part of it that is due to the variance of the points.
-        lever: Lengths by which headings are multiplied [m].
+        lever: Lengths that convert headings to distances [m].
         lines: Lines of the scan without a common point; None for few.
         least: Least pairs of an observed direction.
         unneeded: Which matches need no information if they lose a direction; their number of these may then be 1.
@@ -112,7 +112,7 @@ def observed_information(
 
 
 def _with_diagonal(triangle: Triangle, place: Column, heading: Column) -> Triangle:
-    """Return matrices with numbers added to the diagonal: one for x and y, and one for the heading."""
+    """Return matrices with numbers added to the diagonal: the first for x and y, the second for the heading."""
     xx, xy, xt, yy, yt, tt = triangle
     return xx + place, xy, xt, yy + place, yt, tt + heading
 
@@ -203,7 +203,7 @@ def _lost_basis(
     basis[one, :, 0] = translation[one, :, 0]
     two = (count == 2) & (sliding == 2)
     basis[two, :, :2] = np.eye(3)[:, :2]
-    # Beside one translation, choose the direction that is less parallel to it.
+    # Given a translation, choose the direction less parallel to it.
     mixed = np.flatnonzero((count == 2) & (sliding == 1))
     if len(mixed):
         along = np.abs(np.einsum("si,sik->sk", translation[mixed, :, 0], basis[mixed, :, :2]))
@@ -251,7 +251,7 @@ def covariance_of(
 
     Args:
         information: (S, 3, 3), 0 along lost directions.
-        lever: Lengths by which headings are multiplied [m].
+        lever: Lengths that convert headings to distances [m].
         reach: Farthest distance [m] and angle [rad] from the guess.
         known_axes: The result of ``axes_of``, where it is known.
     """

@@ -18,7 +18,7 @@ from gpusense.matching.points import GAP
 COARSE_POINTS, _SEARCH_POINTS = 200, 30
 # Most points of the reference in a search.
 _SEARCH_REFERENCE = 64
-# Margin by which poses on the edge of a window count as inside [m, rad].
+# Margin around a window within which poses count as inside [m, rad].
 _MARGIN = 1e-3
 # Pairs may be as far apart as half the distance of neighbouring points, this times their step of bearing [m / rad].
 _SPARSE = 1.5
@@ -36,7 +36,7 @@ class MatchOptions:
         noise: Standard deviation of ranges [m].
         capture: Farthest distance between paired points at the start [m].
         window: Half widths of the search in x and y [m] and theta [rad] about a guess from which ICP fails.
-        one_way: Whether the second scan alone says how well it agrees, because the reference has many more points.
+        one_way: Only the second scan counts for the agreement, because the reference has many more points.
     """
 
     noise: float
@@ -70,7 +70,7 @@ class MatchOptions:
         )  # fmt: skip
 
     def last_rules(self, gap: float) -> MatchRules:
-        """Return the rules of a single last iteration at the poses of matches, whose scores do not count."""
+        """Return the rules of a single last iteration at the poses of matches, ignoring scores."""
         full = self.rules(1, gap)
         return full._replace(iterations=1, capture=full.least_capture, scale=full.least_scale, score_stride=_NO_SCORE)
 

@@ -158,7 +158,7 @@ def pose_likelihood(
 
     The map is divided into square tiles, counted from its first corner; tiles at its far edges may be smaller. Each
     position is the centre of a tile's middle cell. Headings are 0, 2 pi / A, ... in the world. The model evaluates
-    poses in batches, so memory is that of the result.
+    poses in batches, so memory is limited to the result.
 
     Args:
         model: A scan model: its map, parameters and device are used.

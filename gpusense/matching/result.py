@@ -54,7 +54,7 @@ class ScanMatch:
         covariance: (3, 3) of x, y, theta [m^2, m rad, rad^2]; infinite in every coordinate that an unconstrained
             direction involves, and where the match failed.
         information: (3, 3) inverse of the covariance, finite: exactly 0 along directions that nothing constrains, and
-            where the match failed. A pose graph adds it as it is.
+            where the match failed. A pose graph adds it unchanged.
         p_right: Probability that the pose is right: off by at most 0.2 m and 5 degrees along its observed directions.
             It assumes that pairs of the same place and of different places are equally frequent.
         score: Share of the points in common sight that agree, 1 at best; points that one scan saw through count

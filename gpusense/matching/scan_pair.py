@@ -1,6 +1,6 @@
 """Match a single pair of scans: the device makes noise, points and lines of their readings, and starts from the guess.
 
-NumPy takes 0.1 ms for the noise and the points of two scans, whatever their size, which is a third of a match.
+NumPy takes 0.1 ms for the noise and the points of two scans of any size, a third of a match.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class _Scene(NamedTuple):
 
 
 def takes(backend: Backend, scanner: Scanner) -> bool:
-    """Return whether a device matches the scans of a scanner in this way."""
+    """Return whether a device matches the scans of a scanner as a single pair."""
     return (
         backend.info.kind == "cpu"
         and backend.info.float64
@@ -80,7 +80,7 @@ def match_pair(
         guess: (1, 3) pose of the second robot frame in the first one.
         method: ``"icp"`` or ``"auto"``.
         options: Capture radius, noise and window.
-        given: Whether the noise is that of the options; otherwise the scans tell it.
+        given: True if the options set the noise; otherwise it is estimated from the scans.
     """
     mount = scanner.mount[:2]
     sensor = to_sensor(guess, mount)

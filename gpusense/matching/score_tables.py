@@ -23,7 +23,7 @@ _MOST_CELLS = (1 << 31) - 1
 def quantized(values: np.ndarray, low: float, high: float) -> np.ndarray:
     """Round values from ``low`` to ``high`` to scores from 0 to 255; a score differs by at most half a step.
 
-    A step is ``(high - low) / 255``. Without a difference all scores are 0.
+    A step is ``(high - low) / 255``. All scores are 0 without a difference.
     """
     if not high > low:
         return np.zeros(np.shape(values), _BYTE)
@@ -42,8 +42,7 @@ class ScoreTables:
     Args:
         backend: The device.
         scores: (T, H, W) or (H, W) uint8; row 0 and column 0 touch the tables' origin.
-        levels: Number of times that tables can be pooled: a pooled cell stands for ``2^levels`` positions along each
-            axis.
+        levels: Number of times that tables can be pooled: a pooled cell covers ``2^levels`` positions along each axis.
         stride: Cells between neighbouring positions.
         beyond: Score of every cell outside a table.
 

@@ -1,8 +1,8 @@
 """The best poses on a grid of poses, by branch and bound or by brute force, for several scans at once.
 
 Scores are sums of integers, so both methods return the same poses with the same scores. Branch and bound evaluates
-blocks of positions by pooled tables, whose sums are upper bounds, and only divides blocks whose bound reaches the best
-score so far (Hess et al., Real-time loop closure in 2D lidar SLAM, ICRA 2016).
+blocks of positions by sums of pooled tables, upper bounds of scores, and only divides blocks if the bound reaches the
+best score so far (Hess et al., Real-time loop closure in 2D lidar SLAM, ICRA 2016).
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ __all__ = ["Found", "PoseGrid", "Search"]
 
 _INT = np.dtype(np.int32)
 _NO_FLAGS: frozenset[str] = frozenset()
-# Blocks of the first round, whose best descendants give the first lower bound, and growth from round to round.
+# Blocks of the first round, and growth from round to round; the best descendants of the first round give the first
+# lower bound.
 _FIRST, _GROWTH = 16, 8
 # Most sums of one launch, and most poses that are kept.
 _MOST_SUMS, _MOST_KEPT = 1 << 27, 1 << 18
@@ -61,11 +62,11 @@ class Search:
             level: Blocks of ``2^level`` x ``2^level`` positions are bounded first; 0 is brute force. None: all levels
                 of the tables.
             allowed: (height, width) bool: positions that may be found. None: all.
-            images: (K_s,) table of each point, or (A, K_s) at each heading. None: those of the scans.
+            images: (K_s,) table of each point, or (A, K_s) at each heading. None: the scans'.
             floor: Least score of a pose that is found.
 
         Returns:
-            The poses. A scan without points scores 0 everywhere. Without an allowed position there is no pose.
+            The poses. A scan without points scores 0 everywhere. No pose is returned without an allowed position.
         """
         level = self.tables.levels if level is None else level
         run = _Run(self, grid, slack, allowed, level, floor)
@@ -93,7 +94,7 @@ class _Run:
         self._least = floor
         self._floor = np.full(scans, floor, np.int64)
         self._complete = np.ones(scans, bool)
-        # Whether as many poses as are kept of a scan have the best score.
+        # True if all kept poses of a scan have the best score.
         self._full = np.zeros(scans, bool)
         self._kept: list[tuple[np.ndarray, np.ndarray]] = []
         self._evaluated = 0
@@ -182,7 +183,7 @@ class _Run:
         self._raise(candidates, score)
 
     def descend_all(self, bounds: np.ndarray) -> None:
-        """Divide all blocks whose bounds reach the floor, the best ones of each scan first."""
+        """Divide all blocks whose bounds reach the floor, each scan's best blocks first."""
         candidates, bound = self.above(bounds, self._floor)
         rank = _ranks(candidates[:, 0] // self._turns, bound)
         most = _FIRST
@@ -205,7 +206,7 @@ class _Run:
         self.keep(candidates, score)
 
     def _divide(self, candidates: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the allowed quarters of blocks, which are blocks of a level, with their bounds."""
+        """Return the allowed quarters of blocks of a level, with their bounds."""
         half = 1 << level
         parts = (candidates[:, None] + np.array([[0, i, j] for i in (0, half) for j in (0, half)])).reshape(-1, 3)
         parts = parts[(parts[:, 1] < self._grid.height) & (parts[:, 2] < self._grid.width)]

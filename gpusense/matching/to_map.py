@@ -1,7 +1,7 @@
 """Matches of scans to a map: to expected scans, by Gauss-Newton on likelihood fields, and by searches.
 
 A likelihood field measures distances to the centres of occupied cells, half a cell behind the surface that a laser
-sees. Expected scans lie on the surfaces themselves, and show which space a scan could not see.
+sees. Expected scans follow the surfaces themselves, and show which space a scan could not see.
 """
 
 from __future__ import annotations
@@ -249,7 +249,7 @@ class MapMatcher:
         observed = observed_information(triangle_of(information), triangle_of(nothing), *given)
         of_field = matrices_of(observed.information) / np.maximum(variance, 1e-12)[:, None, None]
         own = observable_directions(ranges, pose, variance, self._scanner, self._backend, self._real, self._options)
-        # Surfaces are half a cell off the centres of cells, and poses of a search lie on a grid.
+        # Surfaces are half a cell off the centres of cells, and poses of a search form a grid.
         spacing = self._stride * self._grid.resolution / math.sqrt(12) if method == "correlative" else 0.0
         bias = np.hypot(0.5 * self._grid.resolution, spacing)
         joint, lost = _joint(of_field, own, bias, lever)

@@ -1,6 +1,6 @@
 """Symmetric 3x3 matrices of S matches: columns of their upper triangles, xx, xy, xt, yy, yt, tt for x, y and heading.
 
-A function of ``numpy.linalg`` takes 5 us for a single matrix and more beside kernels; sums and products of six of
+A function of ``numpy.linalg`` takes 5 us for a single matrix and more while kernels run; sums and products of six of
 Python's numbers take a third of a microsecond. See :mod:`gpusense.matching.columns`.
 """
 
@@ -20,7 +20,7 @@ UPPER = np.array([0, 1, 2, 4, 5, 8])
 _BOTH = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 # Pivots below this are not divisors.
 _LEAST_PIVOT = 1e-30
-# Numbers beside the diagonal end Jacobi's rotations when all are below this share of the trace, or after these sweeps.
+# Jacobi's rotations end when all off-diagonal numbers are below this share of the trace, or after these sweeps.
 _ROUNDING, _SWEEPS = 1e-16, 12
 
 Vector = tuple[float, float, float]
@@ -73,7 +73,7 @@ def inverse_of(triangle: Triangle) -> Triangle:
 
 
 def _pivot(number: Column) -> Column:
-    """Return positive numbers, and NaN in place of others, by which Python's numbers can be divided."""
+    """Return positive numbers, and NaN in place of others, as safe divisors of Python's numbers."""
     return chosen(number > 0, number, math.nan)
 
 
@@ -93,7 +93,7 @@ def squared_length(triangle: Triangle, x: Column, y: Column, turn: Column) -> Co
 def axes_of_one(triangle: Triangle) -> list[tuple[float, Vector]]:
     """Return the three eigenvalues of a single matrix in ascending order, with unit vectors.
 
-    Jacobi's rotations (Golub and Van Loan, Matrix Computations, section 8.5) make the numbers beside the diagonal 0.
+    Jacobi's rotations (Golub and Van Loan, Matrix Computations, section 8.5) make the off-diagonal numbers 0.
     """
     xx, xy, xt, yy, yt, tt = triangle
     least = _ROUNDING * (abs(xx) + abs(yy) + abs(tt))
@@ -116,7 +116,7 @@ def axes_of_one(triangle: Triangle) -> list[tuple[float, Vector]]:
 def _rotated(
     one: float, other: float, both: float, beside: float, across: float, first: Vector, second: Vector
 ) -> tuple[float, float, float, float, Vector, Vector]:
-    """Rotate two axes so that the number ``both`` of their row and column, which is not 0, becomes 0.
+    """Rotate two axes so that the nonzero number ``both`` of their row and column becomes 0.
 
     Returns:
         Their two numbers on the diagonal, their two numbers in the third row, and the vectors of both axes.

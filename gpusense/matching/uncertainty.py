@@ -45,8 +45,8 @@ def noise_of(ratio: Column) -> tuple[Column, Column]:
         ratio: (S,) sum of w e^2 over the sum of w, for errors in scales, and weights (1 / (1 + e^2))^2.
 
     Returns:
-        (S,) deviations in scales, at most 2, and E[w] E[w^2 e^2] / E[d(w e)/de]^2, by which the inverse of the sum of
-        w J J' is multiplied.
+        (S,) deviations in scales, at most 2, and E[w] E[w^2 e^2] / E[d(w e)/de]^2, a factor of the inverse of the sum
+        of w J J'.
     """
     if isinstance(ratio, np.ndarray):
         known, sigma, factor = _noise_table()
@@ -139,7 +139,7 @@ def observed_pairs(
         information: Sums of w J J'.
         doubt: The part of it that is due to a unit variance of the points.
         variance: Variances of the points [m^2].
-        lever: Lengths by which headings are multiplied [m].
+        lever: Lengths that convert headings to distances [m].
         lines: Lines without a common point; None for few.
         unneeded: Which matches need no information if they lose a direction.
     """

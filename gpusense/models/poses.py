@@ -242,7 +242,7 @@ def place(
         backend: The device.
         space: Holds the buffers.
         real: Precision of the placed poses.
-        careful: Whether low parts are needed.
+        careful: True if low parts are needed.
     """
     count, corners = part[1] - part[0], poses.corners(part, backend, space)
     flags = poses.flags(corners)
@@ -290,7 +290,7 @@ def bounds_on_device(backend: Backend, space: Workspace, poses: Buffer, count: i
         space: Holds the results.
         poses: ``count`` poses on the device.
         count: Their number, not 0.
-        single: Whether they are float32 numbers, not float64.
+        single: True if they are float32 numbers, not float64.
     """
     program: Program = ()
     flags = flags_if(POSES_FLOAT32=single)

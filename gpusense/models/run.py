@@ -67,7 +67,7 @@ def run_pieces(space: Workspace, whole: Piece, most: int, score: Callable[[Piece
     """Score particles in pieces; a piece that does not fit into memory is retried with half the particles.
 
     Args:
-        space: Holds the buffers, which are freed before a second try.
+        space: Holds the buffers, freed before a second try.
         whole: All particles, of whole scans that one program may score.
         most: Most particles of a piece; a piece of several scans holds whole scans.
         score: Runs the program of a piece.

@@ -64,7 +64,7 @@ class Peer(Likelihood, ABC):
     """A program whose weights ``compat`` reproduces.
 
     Args:
-        prob: Whether the likelihood field is the peer's ``likelihood_field_prob``, a product of densities.
+        prob: True if the likelihood field is the peer's ``likelihood_field_prob``, a product of densities.
     """
 
     prob: bool = False
@@ -108,7 +108,7 @@ class Amcl(Peer):
     """The weights of nav2_amcl 1.5.0.
 
     Args:
-        prob: Whether the likelihood field is ``likelihood_field_prob`` without beam skipping, a product of densities.
+        prob: True if the likelihood field is ``likelihood_field_prob`` without beam skipping, a product of densities.
 
     Raises:
         TypeError: ``prob`` is neither True nor False.
@@ -132,7 +132,7 @@ class Amcl(Peer):
         Args:
             ranges: Readings of any shape and value [m].
             scanner: The scanner.
-            field: Whether the readings are for the likelihood field, not for the beam model.
+            field: True if the readings are for the likelihood field, not for the beam model.
 
         Returns:
             float64 readings of the same shape.
@@ -159,11 +159,11 @@ class Beluga(Peer):
     """The weights of Beluga 2.1.1 with the defaults of its node ``beluga_amcl``.
 
     Args:
-        prob: Whether the likelihood field is ``likelihood_field_prob``, a product of densities.
-        model_unknown_space: Whether unknown cells have the density ``1 / range_max`` in the likelihood field, if that
+        prob: True if the likelihood field is ``likelihood_field_prob``, a product of densities.
+        model_unknown_space: True if unknown cells have the density ``1 / range_max`` in the likelihood field, if that
             exceeds the density of a cell at ``max_distance``; with ``only_obstacle_boundaries`` also occupied cells
             without a free neighbour.
-        only_obstacle_boundaries: Whether only occupied cells beside a free cell are obstacles of the likelihood field.
+        only_obstacle_boundaries: True if only occupied cells beside a free cell are obstacles of the likelihood field.
             None is the node's default: True, but False with ``prob``, to which the node does not pass the option.
 
     Raises:

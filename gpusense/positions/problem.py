@@ -178,7 +178,7 @@ class Problem:
         Args:
             states: (S, d) solutions, the best first.
             status: Status of the best; "unique" and the like become "singular" if its information is.
-            flat: Whether the information is known to be singular, despite rounding.
+            flat: True if the information is known to be singular, despite rounding.
         """
         solutions = np.asarray(states, np.float64).reshape(-1, self.dimension)
         assert status in STATUSES

@@ -51,14 +51,14 @@ class Caster(ABC):
 
     Attributes:
         name: Name that selects the caster with its default knobs, and its entry in the registry.
-        exact: Whether its ranges are exact.
+        exact: True if its ranges are exact.
         error: ``"exact"``, or the bound on its error.
         memory: Memory on the device, in words.
         precomputation: Work on the map before the first ray, in words.
         knobs: Parameters that trade error for time, in words.
         backends: Backends that have it.
         whole: Whether the table needs the whole map at once.
-        ring: Whether the table has a ring of cells that stands for space outside the grid.
+        ring: True if the table has a ring of cells that stands for space outside the grid.
         stops: Whether a ray may end before the longest range.
     """
 

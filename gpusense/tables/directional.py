@@ -18,7 +18,7 @@ def directional_table(obstacles: np.ndarray, bins: int, *, pruned: bool, outside
         obstacles: (rows, cols) bool.
         bins: Angle bins of a full turn.
         pruned: Whether to leave out obstacles that begin inside another obstacle of the same line.
-        outside: Whether space outside the grid is a wall.
+        outside: True if space outside the grid is a wall.
 
     Returns:
         int32 table.

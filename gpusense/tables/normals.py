@@ -52,8 +52,8 @@ def surface_normals(grid: OccupancyGrid, *, unknown: Space = "free", outside: Sp
 
     Args:
         grid: The map.
-        unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
-        outside: Whether space outside the grid is ``"free"`` or ``"occupied"``.
+        unknown: Treatment of unknown cells: ``"free"`` or ``"occupied"``.
+        outside: Treatment of space outside the grid: ``"free"`` or ``"occupied"``.
 
     Returns:
         (H, W, 2) float64 unit vectors in the world's frame, towards the free side; NaN for a cell without a normal.
@@ -84,7 +84,7 @@ def normal_table(obstacles: np.ndarray, window: Window, outside: str, real: np.d
     Args:
         obstacles: (H, W) bool, the whole map.
         window: A part of it.
-        outside: Whether space outside the map is ``"free"`` or ``"occupied"``.
+        outside: Treatment of space outside the map: ``"free"`` or ``"occupied"``.
         real: Precision.
 
     Returns:

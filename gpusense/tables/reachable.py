@@ -38,7 +38,7 @@ class MapState:
     Attributes:
         grid: The map.
         obstacles: (H, W) mask of the map; None if an interrupted update may have written to it.
-        shared: Whether the array of obstacles belongs to the grid and is read-only.
+        shared: True if the array of obstacles belongs to the grid and is read-only.
         table: The table; None without one.
         window: The table's window; empty without one.
         preparations: Number of tables made.
@@ -62,7 +62,7 @@ class ReachableMap:
     Args:
         backend: The device.
         grid: The map.
-        unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
+        unknown: Treatment of unknown cells: ``"free"`` or ``"occupied"``.
         mount: The sensor's pose on the robot [m, m, rad].
         reach: Longest distance from a sensor that matters [cells].
         prepare: Function that makes the table of a window from its (rows, cols) obstacles.

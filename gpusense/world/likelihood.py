@@ -25,9 +25,9 @@ class Likelihood:
         outside: ``"free"`` or ``"occupied"``: state of space outside the grid for the beam model.
         unknown: ``"free"`` or ``"occupied"``: state of unknown cells for the beam model.
         caster: Default caster of the beam model.
-        is_peer: Whether weights are those of a peer.
+        is_peer: True if weights are those of a peer.
         cubes: Whether the likelihood field sums cubes of densities instead of logarithms.
-        overlaid: Whether the likelihood field has cells of a fixed density.
+        overlaid: True if the likelihood field has cells of a fixed density.
         neighbors: Cells around a cell on which its state in a mask depends.
     """
 
@@ -70,7 +70,7 @@ class Likelihood:
         Args:
             constant: The sum of its constant terms.
             first: The first term of sums.
-            cubes: Whether the model sums cubes, which have no constant terms.
+            cubes: True if the model sums cubes, which have no constant terms.
         """
         with np.errstate(divide="ignore"):
             return float(np.log(first)) if cubes else constant

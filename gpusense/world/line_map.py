@@ -15,7 +15,7 @@ class LineMap:
 
     Args:
         segments: (M, 4) ends x1, y1, x2, y2 in the world [m]; M may be 0.
-        two_sided: Whether walls are seen from both sides, or only from the left of the direction from the first end to
+        two_sided: True if walls are seen from both sides, or only from the left of the direction from the first end to
             the second: one bool for all, or (M,). The faces of a thick wall are two lines with one side each.
 
     Attributes:

@@ -21,7 +21,7 @@ class Painting(NamedTuple):
     Attributes:
         mode: Mode of map_server.
         pixels: A grey for each cell; with ``alpha``, each followed by its opacity.
-        alpha: Whether unknown cells are transparent.
+        alpha: True if unknown cells are transparent.
         occupied_thresh: Least darkness of an occupied cell.
         free_thresh: Largest darkness of a free cell.
     """

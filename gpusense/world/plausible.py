@@ -183,7 +183,7 @@ def look_at_start(pose: NDArray[np.float64], inside: bool, bounds: tuple[float, 
 
     Args:
         pose: (3,) start [m, m, rad].
-        inside: Whether it lies on the map.
+        inside: True if it lies on the map.
         bounds: (x_min, y_min, x_max, y_max) of the map [m].
     """
     x, y, theta = pose.tolist()

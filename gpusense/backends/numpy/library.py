@@ -1,4 +1,4 @@
-"""NumPy as a library of the registry, whose one device is the host."""
+"""NumPy as a library of the registry; its one device is the host."""
 
 from __future__ import annotations
 

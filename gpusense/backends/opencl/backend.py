@@ -40,7 +40,7 @@ _ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
 
 
 def _binary_cache(info: BackendInfo, device: cl.Device) -> BinaryCache | None:
-    """Return the cache of programs; None for PoCL, whose kernels are kept one by one.
+    """Return the cache of programs; None for PoCL: its kernels are kept singly.
 
     For a binary, PoCL would compile every kernel of the program for work-groups of any size, which takes three times as
     long as the rest of the build.
@@ -83,7 +83,7 @@ class OpenCLBackend(ProcessBound, Backend):
         # The last launch, if its groups leave a processor to the calling thread.
         self._most_watched = helpers.threads() - 1 if self._pocl is not None else 0
         self._last: cl.Event | None = None
-        # Ranges are the same bits everywhere only if division is rounded correctly, which is an option on GPUs.
+        # Ranges are the same bits everywhere only if division is rounded correctly, an option on GPUs.
         rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
         self.options = ["-cl-fp32-correctly-rounded-divide-sqrt"] if rounded else []
         if self._pocl is not None:
@@ -294,7 +294,7 @@ class OpenCLBackend(ProcessBound, Backend):
         return program, key
 
     def _built_of_bitcode(self, compiled: pocl_kernels.PoclKernels, file: str, source: str, key: str) -> cl.Program:
-        """Return a program of a kernel file whose kernels have names of their own."""
+        """Return a program of a kernel file, with unique kernel names."""
         names = {name: pocl_kernels.own_name(name, key) for name, row in KERNELS.items() if row.file == file}
         options = [*self.options, *(f"-D{name}={other}" for name, other in names.items())]
         return compiled.built(

@@ -1,4 +1,4 @@
-"""pyopencl's caches, which are switched off because a read-only folder or a damaged file would end the run.
+"""Switch pyopencl's caches off: a read-only folder or a damaged file would end the run.
 
 pyopencl keeps code that sets kernels' arguments in a database, and programs in files, both without checksums. Programs
 are kept by :mod:`gpusense.backends.cache`, and that code is made in a millisecond.
@@ -17,7 +17,7 @@ from typing import Any
 
 import pyopencl as cl
 
-# Whether pyopencl's caches are off; once it is imported it has no other switch.
+# True if pyopencl's caches are off; once it is imported it has no other switch.
 _SWITCH = "_PYOPENCL_NO_CACHE"
 _lock = threading.RLock()
 

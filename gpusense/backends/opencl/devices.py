@@ -36,7 +36,7 @@ def _devices_of(platform: cl.Platform) -> list[cl.Device]:
 
 
 def silence_of_pocl() -> str:
-    """Return why PoCL, which is loaded, offers no device, with the remedy; empty where it offers one or is absent."""
+    """Return why the loaded PoCL offers no device, with the remedy; empty where it offers one or is absent."""
     try:
         platforms = drivers.platforms()
     except RuntimeError:
@@ -98,8 +98,8 @@ def info_of(device: cl.Device) -> BackendInfo:
 def _lanes(device: cl.Device) -> int:
     """Return the lanes of kernels that have bodies in lanes.
 
-    PoCL compiles loops in kernels as they are written. Intel's driver vectorises over neighbouring work-items, but
-    kernels in lanes were up to three times as fast there. Other drivers for processors were not measured.
+    PoCL does not transform loops in kernels. Intel's driver vectorises over neighbouring work-items, but kernels in
+    lanes were up to three times as fast there. Other drivers for processors were not measured.
     """
     known = pocl.is_pocl(device) or device.platform.name.startswith("Intel")
     if not known or not device.type & cl.device_type.CPU:

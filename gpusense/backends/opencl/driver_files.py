@@ -1,11 +1,11 @@
 """The files of the OpenCL drivers of this machine.
 
 A driver is a library that an ``.icd`` file names. The loader inside pyopencl's wheel reads the system's files
-(``/etc/OpenCL/vendors`` or ``$OCL_ICD_VENDORS``) and the files beside pyopencl, where PoCL's wheel puts its file.
+(``/etc/OpenCL/vendors`` or ``$OCL_ICD_VENDORS``) and the files next to pyopencl, where PoCL's wheel puts its file.
 
 Intel's runtime for processors is also a wheel, but its ``.icd`` file names a folder that exists on no user's machine. A
 new ``.icd`` file replaces it, in a folder with the system's files. Loading the library by its path would need another
-loader; writing beside pyopencl would change files that another package owns.
+loader; writing next to pyopencl would change files that another package owns.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def _registered() -> list[Driver]:
     place = _place()
     beside = Path(cl.__file__).parent / ".libs"
     if place.is_file():
-        # A single file or library stands for all drivers.
+        # A single file or library replaces all drivers.
         return [Driver(place, _library(place) if place.suffix == ".icd" else str(place))]
     files = [*sorted(place.glob("*.icd")), *sorted(beside.glob("*.icd"))]
     drivers = [Driver(file, _library(file)) for file in files]
@@ -61,7 +61,7 @@ def _place() -> Path:
 
 
 def _library(file: Path) -> str:
-    """Return the library that an ``.icd`` file names, by its path where it lies beside the file."""
+    """Return the library that an ``.icd`` file names, by its path if it is in the same folder."""
     try:
         name = file.read_text(encoding="utf-8", errors="replace").strip().splitlines()[0].strip()
     except (OSError, IndexError):

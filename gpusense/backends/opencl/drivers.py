@@ -163,7 +163,7 @@ def as_job() -> list[tuple[str, str]] | None:
 
 
 def take(job: list[tuple[str, str]] | None) -> None:
-    """Load the drivers of :func:`as_job` in this process, which is a child."""
+    """Load the drivers of :func:`as_job` in this child process."""
     global _choice
     _choice = Choice(None if job is None else tuple(Driver(Path(file), library) for file, library in job))
 
@@ -226,7 +226,7 @@ def _key(drivers: tuple[Driver, ...]) -> str:
 
 
 def _variables(drivers: tuple[Driver, ...] | None, *, kernels: bool = True) -> dict[str, str]:
-    """Return the variables by which the loader loads these drivers only, and PoCL keeps kernels in scratch."""
+    """Return variables that make the loader load these drivers only, and PoCL keep kernels in scratch."""
     variables = {}
     with contextlib.suppress(OSError):
         variables["POCL_CACHE_DIR"] = str(_pocl_folder(kernels=kernels))
@@ -238,7 +238,7 @@ def _variables(drivers: tuple[Driver, ...] | None, *, kernels: bool = True) -> d
     for i, driver in enumerate(drivers):
         # The loader takes files in the order of the folder. The number keeps files of one name apart.
         (folder / f"{i}-{driver.file.stem}.icd").write_text(driver.library + "\n", encoding="utf-8")
-    # With this home the loader finds no files beside pyopencl; the folder has those drivers as well.
+    # This home hides the files next to pyopencl from the loader; the folder also lists their drivers.
     return variables | {"OCL_ICD_VENDORS": str(folder), "PYOPENCL_HOME": str(folder)}
 
 

@@ -124,7 +124,7 @@ class Launch:
 
 
 def _set_as(argument: Argument, real: np.dtype) -> Any:
-    """Return the type by which pyopencl sets an argument; None for buffers."""
+    """Return the type with which pyopencl sets an argument; None for buffers."""
     if argument.is_struct:
         return np.dtype(("V", struct.calcsize(structs.layout(argument.type, real))))
     return argument.dtype(real).type if argument.shape is None else None

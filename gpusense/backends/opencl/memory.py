@@ -40,7 +40,8 @@ class SharedBuffer(cl.SVMAllocation):
     def __del__(self, run: Callable[[Callable[[], object]], None] = undisturbed) -> None:
         # As a default, the function is there when the interpreter ends and has emptied its modules.
         # The driver does not keep it alive for queued commands, as it does a buffer. Freed through the queue, as
-        # pyopencl can also do, it ended in a corrupted heap with PoCL 3. Without an allocation there is no attribute.
+        # pyopencl can also do, it ended in a corrupted heap with PoCL 3. The attribute is missing without an
+        # allocation.
         if (settle := getattr(self, "_settle", None)) is not None:
             run(settle)
 

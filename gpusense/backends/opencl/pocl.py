@@ -149,7 +149,7 @@ def _version(device: cl.Device) -> tuple[int, ...] | None:
 
 @functools.cache
 def _has_libraries() -> bool:
-    """Return whether PoCL has libraries for several processors, rather than one for the machine that compiled it.
+    """Return whether PoCL has libraries for several processors, not only for the machine that compiled it.
 
     PoCL looks for them relative to its code.
     """
@@ -166,7 +166,7 @@ def _has_libraries() -> bool:
 def _find_name(device: cl.Device) -> tuple[int, str]:
     """Return where the device's description holds the address of its processor's name, and the name.
 
-    The address follows that of the target's name, ``x86_64-...``. Memory is read through Linux, which answers an
+    The address follows the address of the target's name, ``x86_64-...``. Memory is read through Linux, which answers an
     invalid address with an error. The name is empty where there is no such pair.
     """
     try:

@@ -1,7 +1,7 @@
 """Kernels that PoCL has compiled: kept between processes, with checksums.
 
 PoCL keeps a program's kernels in files below ``<folder>/XX/YYY...``, named by a hash of the source and the options, and
-loads them without a check. Its folder is one of this process. The folder of a program is copied there from an entry of
+loads them without a check. Its folder belongs to this process. The folder of a program is copied there from an entry of
 the cache before the program is built, and back into an entry after its kernels have run.
 
 For that hash PoCL preprocesses its own headers and the source, which takes 27 ms for each program. So a program is made
@@ -32,7 +32,7 @@ from gpusense.backends.scratch import scratch_folder
 # Files that PoCL reads again: programs, and kernels for a group size.
 _ENDINGS = (".bc", ".so")
 _BITCODE = "program.bc"
-# The end of an own name.
+# Suffix of a unique kernel name.
 _OWN = re.compile(r"_[0-9a-f]{24}$")
 
 _Program = TypeVar("_Program")
@@ -108,7 +108,7 @@ class PoclKernels:
             if not file.is_file():
                 before = self._listed()
                 program = compiled()
-                # There is no folder where a program has loaded PoCL before, with a folder of its own.
+                # No folder exists if a program has already loaded PoCL with another folder.
                 written = (self.folder / name for name in self._listed() - before)
                 try:
                     os.rename(

@@ -18,7 +18,7 @@ from gpusense.backends.recording import Recording, pluralize
 
 @dataclass(frozen=True)
 class BoundLaunch:
-    """A kernel whose arguments are set, its size and group, and its arguments, whose memory it keeps alive."""
+    """A kernel with its arguments set, its size and group; keeps the arguments' memory alive."""
 
     kernel: cl.Kernel
     size: tuple[int, ...]
@@ -65,7 +65,7 @@ class OpenCLRecording(Recording):
             self._used.clear()
 
     def _wait_for_all(self) -> None:
-        """Wait for the device's queue, and for those of users; repeated after an interrupt, it waits for all again."""
+        """Wait for the device's queue, and for users' queues; repeated after an interrupt, it waits for all again."""
         with self._lock:
             used = [self._queue, *self._used]
         with driver_errors():

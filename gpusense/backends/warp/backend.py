@@ -49,7 +49,7 @@ class WarpBackend(ProcessBound, Backend):
         self._device = wp.get_device(device)
         self._graphs = GraphCache(self._device)
         self._results = ResultMemory() if info.kind == "gpu" else None
-        # Large copies; None on the processor, whose memory is the host's.
+        # Large copies; None on the processor, which uses the host's memory.
         self._staging = Staging(functools.partial(slots_of, self._device)) if self._device.is_cuda else None
         # The queue of each thread that has a batch, and the queues that no call uses.
         self._thread = threading.local()
@@ -251,7 +251,7 @@ class WarpBackend(ProcessBound, Backend):
             self._graphs.start(steps)
 
     def _wait(self) -> None:
-        """Wait for the current stream; on the processor, which has none, launches have ended when they return."""
+        """Wait for the current stream; on the processor, launches have ended when they return."""
         if self._device.is_cuda:
             wp.synchronize_stream(self._device)
 

@@ -37,7 +37,7 @@ class Capture(NamedTuple):
     Attributes:
         graph: The graph; None where there is none.
         reason: Why there is none.
-        final: Whether the driver refuses these steps, so that another attempt is useless.
+        final: True if the driver refuses these steps, so that another attempt is useless.
     """
 
     graph: Any

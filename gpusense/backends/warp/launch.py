@@ -69,7 +69,7 @@ class Launch:
         return LaunchStep(self, size, tuple(views), _keys(arguments))
 
     def start(self, size: tuple[int, ...], arguments: tuple[Any, ...], keys: list[Any], stream: Any) -> None:
-        """Launch on a stream, or on the device's current one; the keys are those of the arguments."""
+        """Launch on a stream, or on the device's current stream; the keys name the arguments."""
         recorded = getattr(self._thread, "recorded", None)
         if recorded is None:
             bound = [bind(value) for bind, value in zip(self._binds, arguments, strict=True)]

@@ -14,7 +14,7 @@ from gpusense.backends.warp.steps import Step, as_graph, one_by_one, start_each
 
 
 class WarpRecording(Recording, Step):
-    """Launches of a program, which are one step of a batch."""
+    """Launches of a program, one step of a batch."""
 
     reports = True
     _numbers = itertools.count()
@@ -27,7 +27,7 @@ class WarpRecording(Recording, Step):
         # Whether the driver refuses a graph of these launches.
         self._refused = False
         self._started = one_by_one(steps, FIRST)
-        # Whether they were started one by one, which loads modules: a capture must not wait for that.
+        # True once they were started singly: this loads modules, for which a capture must not wait.
         self._loaded = False
         self._streams: dict[int, wp.Stream] = {}
         # The streams on which they were started since the last wait; the processor has none.

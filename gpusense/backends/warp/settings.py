@@ -1,4 +1,4 @@
-"""Warp's start without output, and its settings, which are restored after each use."""
+"""Start Warp without output; change its settings, and restore them after each use."""
 
 from __future__ import annotations
 

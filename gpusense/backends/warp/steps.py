@@ -17,7 +17,7 @@ class Step(ABC):
         key: The work and its memory: steps of equal keys are the same.
         launches: Number of launches in it.
         copies: Number of copies in it.
-        reports: Whether it reports how the call with it is started.
+        reports: True if it reports how the call with it is started.
     """
 
     key: Hashable
@@ -48,7 +48,7 @@ class Copy(Step):
 
 
 def start_each(steps: Sequence[Step], stream: wp.Stream | None) -> None:
-    """Start steps one by one in their order."""
+    """Start steps singly, in order."""
     for step in steps:
         step.start(stream)
 
@@ -66,5 +66,5 @@ def as_graph(steps: Sequence[Step]) -> str:
 
 
 def one_by_one(steps: Sequence[Step], reason: str) -> str:
-    """Return in words that steps are started one by one, and why."""
+    """Describe that steps are started singly, and why."""
     return f"{contents(steps)} one by one: {reason}"

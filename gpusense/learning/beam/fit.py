@@ -81,7 +81,7 @@ def fit_beam_parameters(
         seed: Seed of the random starts and of ``"genetic"``.
         range_bias: Whether the parameters also contain an offset b of correct ranges: z = z* + b. p_hit then has its
             mean at z* + b, clamped to [0, range_max].
-        sigma_growth: Whether the deviation of correct ranges also grows with range: it is sigma_hit + sigma_growth z*.
+        sigma_growth: True if the deviation of correct ranges also grows with range: it is sigma_hit + sigma_growth z*.
             All parameters are then fitted together on the host, from the fit without growth.
         hit: Shape of correct ranges: ``"normal"``, or ``"student"``, a Student t whose degrees of freedom ``hit_dof``
             are also fitted. All parameters are then fitted together by EM and Newton steps, from the fit with a normal.
@@ -92,7 +92,7 @@ def fit_beam_parameters(
         sigma_bounds: Smallest and largest sigma_hit [m]. None is from the rounding step of the readings over sqrt(12),
             or without one from 1e-6 range_max, to range_max.
         lambda_bounds: Smallest and largest lambda_short [1/m]. None is 1e-3 / range_max to 1e4 / range_max.
-        progress: Whether to show a progress bar on standard error if that is a terminal.
+        progress: Show a progress bar on standard error if that is a terminal.
         callback: Function called after each iteration with its number, the log-likelihood and the parameters.
 
     Returns:

@@ -185,7 +185,7 @@ def fit_incidence_parameters(
         blocks: Integer label of each reading's block, for standard errors of correlated readings.
         sigma_bounds: Smallest and largest sigma_hit [m].
         lambda_bounds: Smallest and largest lambda_short [1/m].
-        progress: Whether to show a progress bar for each fit on standard error if that is a terminal.
+        progress: Show a progress bar for each fit on standard error if that is a terminal.
         callback: Function called after each iteration.
 
     Returns:

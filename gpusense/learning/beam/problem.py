@@ -175,7 +175,7 @@ class Problem:
         pairs: The readings.
         bounds: Bounds of the shapes.
         prior: Pseudo-readings.
-        fit_bias: Whether the offset of correct ranges is free.
+        fit_bias: True if the offset of correct ranges is free.
         readings: Number of readings that are not missing.
         total: Number of these readings and of pseudo-readings.
     """

@@ -67,7 +67,7 @@ def choose_starts(pairs: Pairs, bounds: Bounds, causes: NDArray[np.bool_], fit_b
         pairs: The readings.
         bounds: Bounds of the shapes.
         causes: (4,) mask of the causes that take part.
-        fit_bias: Whether the offset of correct ranges is free.
+        fit_bias: True if the offset of correct ranges is free.
     """
     if not pairs.hits or not causes[[HIT, SHORT, RAND]].any():
         return []

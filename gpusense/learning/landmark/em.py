@@ -83,7 +83,7 @@ def climb(
     Args:
         pairs: Features and landmarks.
         start: Start of the search.
-        bias: Whether to also fit offsets of ranges and bearings.
+        bias: Also fit offsets of ranges and bearings.
         max_iterations: Largest number of iterations.
         tolerance: Remaining gain [nats].
 

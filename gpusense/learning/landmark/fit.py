@@ -84,7 +84,7 @@ def fit_landmark_parameters(
         field_of_view: Field of view of the sensor, in (0, 2 pi] [rad].
         signature_span: Smallest and largest signature; None is the span of the map's and the features' signatures.
         mount: The sensor's pose (x, y, yaw) on the robot [m, m, rad].
-        bias: Whether to also fit offsets of ranges and bearings, which then do not increase the standard deviations.
+        bias: Also fit offsets of ranges and bearings, which then do not increase the standard deviations.
         initial: Start of the search, without its limits; None guesses it from the residuals.
         max_iterations: Largest number of iterations.
         tolerance: The search has converged once it expects to gain less than ``tolerance`` [nats].

@@ -84,7 +84,7 @@ class Pairs:
         means: (P, 3) expected range, bearing and signature.
         in_view: (P,) whether the landmark is within the limits.
         uniform: (F,) log density of a false positive.
-        present: Whether at least one feature has a range, a bearing and a signature.
+        present: True if at least one feature has a range, a bearing and a signature.
         limits: Limits of the sensor.
     """
 

@@ -90,8 +90,8 @@ def fit_bumper_parameters(
         grid: The map.
         outline: The robot's outline, as in :class:`BumperModel`.
         segments: The outline's parts, as in :class:`BumperModel`.
-        unknown: Whether unknown cells are ``"free"`` (the default) or ``"occupied"``.
-        outside: Whether space outside the grid is ``"free"`` (the default) or ``"occupied"``.
+        unknown: Treatment of unknown cells: ``"free"`` (the default) or ``"occupied"``.
+        outside: Treatment of space outside the grid: ``"free"`` (the default) or ``"occupied"``.
         blocks: None, or (F,) integer labels of poses whose errors are correlated, for standard errors.
         max_iterations: Largest number of iterations of a search.
         tolerance: The search has converged once it expects to gain less than ``tolerance`` [nats].

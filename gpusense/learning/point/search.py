@@ -31,7 +31,7 @@ class Climb:
         theta: (k,) coordinates.
         value: Log-likelihood.
         trace: Log-likelihood at the start and after each iteration.
-        converged: Whether the end is a maximum.
+        converged: True if the end is a maximum.
         free: (k,) mask of the coordinates that are not held at a bound.
     """
 

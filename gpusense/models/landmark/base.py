@@ -44,7 +44,7 @@ class Call:
         places: Places of the landmarks of known features among the buckets.
         fixed: The constant term: log-likelihoods of known false positives.
         flags: Flags of the scoring kernel.
-        joint: Whether the features are assigned jointly.
+        joint: True if the features are assigned jointly.
     """
 
     prepared: PreparedFeatures
@@ -66,7 +66,7 @@ def known_features(
 
     Args:
         prepared: The features.
-        partner: (K,) landmark of each, -1 for a false positive, which is the same at every pose.
+        partner: (K,) landmark of each, -1 for a false positive, equal at every pose.
         buckets: The landmarks in buckets.
     """
     known = partner >= 0
@@ -123,7 +123,7 @@ class FeatureModel(PointModel):
     @property
     @abstractmethod
     def corners(self) -> np.ndarray:
-        """(P, 2) points in the world, whose box holds the map [m]."""
+        """(P, 2) points in the world; their bounding box contains the map [m]."""
 
     @abstractmethod
     def log_likelihood(
@@ -134,7 +134,7 @@ class FeatureModel(PointModel):
     def associate(self, poses: AnyArray, features: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return the landmark or line of each feature, for each particle.
 
-        With ``association="sum"`` this is the landmark or line with the largest part of the sum.
+        ``association="sum"`` gives the landmark or line with the largest part of the sum.
 
         Args:
             poses: (N, 3) robot poses in the world [m, m, rad], as in ``log_likelihood``.
@@ -151,7 +151,7 @@ class FeatureModel(PointModel):
         return which, parts
 
     def _partners(self, correspondence: ArrayLike | None) -> np.ndarray:
-        """Return the indices of the landmarks that are drawn: all, or those in a correspondence."""
+        """Return the indices of the landmarks that are drawn: all, or all in a correspondence."""
         if correspondence is None:
             return np.arange(self._count)
         partners = checks.as_array("correspondence", correspondence)

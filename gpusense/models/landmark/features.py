@@ -157,7 +157,7 @@ def reach_of(p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarr
     if math.isinf(far):
         # All landmarks may matter until one is likelier than every landmark beyond some distance.
         return Reach(z, far, 0.0)
-    # Of the points of a ring's sector, a corner is farthest from its middle.
+    # A corner is the point of a ring's sector farthest from its middle.
     if measured[0]:
         ahead = z
     else:

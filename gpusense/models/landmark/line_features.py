@@ -17,7 +17,7 @@ from gpusense.world.sensor_parameters import LARGEST_ANGLE_DEVIATION, LineParame
 ANGLE, DISTANCE, FIRST, LAST, ANGLE_VARIANCE, MIXED, DISTANCE_VARIANCE = range(7)
 # Columns of features: angle and distance; and the ends; and the covariance.
 _COLUMNS = (2, 4, 7)
-# Distance that stands for unknown ends [m].
+# Distance assumed for unknown ends [m].
 _UNKNOWN_END = 1e9
 # Columns of low parts, and the columns that they belong to.
 _LOW_PARTS = (

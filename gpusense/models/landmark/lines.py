@@ -95,7 +95,7 @@ class LineModel(FeatureModel):
 
     @property
     def corners(self) -> np.ndarray:
-        """(2 M, 2) ends of the lines [m], whose box holds the map."""
+        """(2 M, 2) ends of the lines [m]; their bounding box contains the map."""
         return self.lines.segments.reshape(-1, 2)
 
     def log_likelihood(
@@ -107,11 +107,11 @@ class LineModel(FeatureModel):
         angle has a deviation beyond 0.349 rad (20 degrees).
 
         Args:
-            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
+            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library, like scans.
             features: (F, 2) angle of the normal [rad] and distance [m]; or (F, 4) with the places of both ends along
                 the line, from the foot of the normal, positive to the left of it [m]; or (F, 7) with the variance of
-                the angle, the covariance and the variance of the distance, which are added to the model's:
-                ``extract_features(...).lines()``. Without ends, or where they are NaN, every wall is overlapped.
+                the angle, the covariance and the variance of the distance, added to the model's:
+                ``extract_features(...).lines()``. Missing or NaN ends overlap every wall.
             correspondence: None, or (F,) indices of the walls, -1 for a false positive.
             out: The array for the result, in the memory of the poses.
 
@@ -130,9 +130,9 @@ class LineModel(FeatureModel):
     ) -> np.ndarray:
         """Draw lines from p(f | x, m) at each pose, on the host in float64; see ``BeamModel.sample``.
 
-        Without ``correspondence`` every wall that is seen from its side, with a part within range_max, gives a line
-        with probability p_detect. Walls hide nothing. With ``correspondence``, each wall in it gives a line for
-        certain. With probability z_false a line is a false positive, uniform in angle and distance.
+        Unless ``correspondence`` is passed, every wall that is seen from its side, with a part within range_max, gives
+        a line with probability p_detect. Walls hide nothing. With ``correspondence``, each wall in it gives a line for
+        certain. A line is a false positive, uniform in angle and distance, with probability z_false.
 
         Args:
             poses: (N, 3) or (S, N, 3) robot poses in the world [m, m, rad].

@@ -39,7 +39,7 @@ class LandmarkModel(FeatureModel):
 
     Each feature adds ``log(z_detect p(f | j) + z_false p_uniform(f))``; docs/landmarks.md defines both
     densities. The landmark j is known from ``correspondence``, or chosen by ``association`` (tables 6.4 and 6.5).
-    Signatures of features are ignored where ``sigma_signature`` of the parameters is None, which is the default.
+    Signatures of features are ignored where ``sigma_signature`` of the parameters is None (the default).
 
     Args:
         landmarks: The map.
@@ -104,7 +104,7 @@ class LandmarkModel(FeatureModel):
 
     @property
     def corners(self) -> np.ndarray:
-        """(M, 2) positions of the landmarks [m], whose box holds the map."""
+        """(M, 2) positions of the landmarks [m]; their bounding box contains the map."""
         return self.landmarks.xy
 
     def log_likelihood(
@@ -115,7 +115,7 @@ class LandmarkModel(FeatureModel):
         A feature is left out if none of its parts was measured, or if a part is outside the sensor's limits.
 
         Args:
-            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
+            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library, like scans.
             features: (F, 2) ranges [m] and bearings [rad], or (F, 3) with signatures, which count where
                 ``sigma_signature`` is a number; NaN for parts not measured.
             correspondence: None, or (F,) indices of the landmarks of the features, -1 for a false positive.
@@ -140,10 +140,10 @@ class LandmarkModel(FeatureModel):
     ) -> np.ndarray:
         """Draw features from p(f | x, m) at each pose, on the host in float64; see ``BeamModel.sample``.
 
-        Without ``correspondence``, each landmark within range_max and the field of view is detected with probability
-        p_detect. With it, each landmark in it gives a feature for certain. With probability z_false a feature is a
-        false positive, uniform within the sensor's limits. Given their correspondence, features have the density of
-        ``log_likelihood``.
+        Unless ``correspondence`` is passed, each landmark within range_max and the field of view is detected with
+        probability p_detect. With it, each landmark in it gives a feature for certain. A feature is a false positive,
+        uniform within the sensor's limits, with probability z_false. Given their correspondence, features have the
+        density of ``log_likelihood``.
 
         Args:
             poses: (N, 3) or (S, N, 3) robot poses in the world [m, m, rad].

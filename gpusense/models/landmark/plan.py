@@ -60,7 +60,7 @@ def feature_omissions(
         name: "landmarks" or "lines".
         total: Number of features of the call.
         impossible: Number of features that the sensor cannot have measured.
-        known: Whether the correspondences are known.
+        known: True if the correspondences are known.
     """
     omissions, count = [], len(buckets.index)
     silent = total - len(prepared.columns) - impossible

@@ -45,7 +45,7 @@ def draw_features(
         p: The sensor's parameters.
         span: Smallest and largest signature.
         mount: The sensor's pose on the robot.
-        every: Whether every landmark is detected, even out of view.
+        every: True if every landmark is detected, even out of view.
     """
     columns = 2 if p.sigma_signature is None else 3
     features = np.full((len(draws.poses), len(partners), columns), np.nan)
@@ -121,7 +121,7 @@ def draw_lines(
         lines: The map.
         p: The parameters.
         mount: The sensor's pose on the robot.
-        every: Whether every line is detected, also from behind.
+        every: True if every line is detected, also from behind.
     """
     features = np.full((len(draws.poses), len(partners), 4), np.nan)
     place, none = mounted(draws.poses, mount), (np.zeros(1), np.zeros(1))

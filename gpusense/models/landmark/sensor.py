@@ -10,7 +10,7 @@ import numpy as np
 from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.parameters import LandmarkParameters
 
-# Standard deviations by which the span of signatures extends beyond the map's signatures.
+# Margin of the span of signatures around the map's signatures [sigma].
 _SPREAD = 4.0
 
 

@@ -80,7 +80,7 @@ class PositionModel(PointModel):
         """Return log p(z | x) of a fix for each particle, natural logarithm.
 
         Args:
-            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
+            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library, like scans.
             fix: (2,) measured x and y of the antenna [m]. A value that is not finite is missing and has log p = 0.
             covariance: None, or the (2, 2) covariance matrix of this fix in the world [m^2].
             out: The array for the result, in the memory of the poses.
@@ -234,7 +234,7 @@ class HeadingModel(PointModel):
         """Return log p(z | x) of a heading for each particle, natural logarithm.
 
         Args:
-            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
+            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library, like scans.
             heading: The reading [rad], any number of turns. A value that is not finite is missing and has log p = 0.
             out: The array for the result, in the memory of the poses.
 

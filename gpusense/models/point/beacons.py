@@ -88,7 +88,7 @@ class BeaconModel(PointModel):
         """Return log p(z_1 ... z_F | x) for each particle, natural logarithm.
 
         Args:
-            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
+            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library, like scans.
             ranges: (F,) ranges [m] to all M beacons, or to the beacons in ``ids``. NaN, and values outside [0,
                 range_max], are missing and add 0.
             ids: None, or (F,) indices of the beacons that the ranges belong to; one may have several.

@@ -54,8 +54,8 @@ class BumperModel(PointModel):
             the next, or -1 for none.
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
-        unknown: Whether unknown cells are ``"free"`` (the default) or ``"occupied"``.
-        outside: Whether space outside the grid is ``"free"`` (the default) or ``"occupied"``.
+        unknown: Treatment of unknown cells: ``"free"`` (the default) or ``"occupied"``.
+        outside: Treatment of space outside the grid: ``"free"`` (the default) or ``"occupied"``.
         temperature: In (0, 1]: multiplies the sum over segments. 1 is the plain product of probabilities.
 
     Raises:
@@ -116,7 +116,7 @@ class BumperModel(PointModel):
         """Return log p(pressed | x, m) for each particle, natural logarithm.
 
         Args:
-            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
+            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library, like scans.
             pressed: True or False, or 1 or 0; with segments (B,) of these values. NaN or None is missing, and adds 0.
             out: The array for the result, in the memory of the poses.
 

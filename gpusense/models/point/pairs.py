@@ -1,6 +1,6 @@
 """Arguments of kernels to twice a model's precision: computed with 50 digits, split into high and low parts.
 
-Where a peak is high, its logarithm and the exponent nearly cancel, so every digit of either counts.
+The logarithm of a high peak and the exponent nearly cancel, so every digit of either counts.
 """
 
 from __future__ import annotations

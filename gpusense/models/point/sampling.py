@@ -1,7 +1,7 @@
 """Readings that point and landmark models draw.
 
-They are drawn on the host in float64 for all backends, whose readings therefore have the same bits. Random numbers come
-from Philox (reference/philox.py) with the counter (pose, step, stream, call). A distribution is drawn by inverting its
+They are drawn on the host in float64, so that all backends give readings of the same bits. Random numbers come from
+Philox (reference/philox.py) with the counter (pose, step, stream, call). A distribution is drawn by inverting its
 distribution function, so that readings move smoothly with poses; a von Mises is drawn by rejection.
 """
 

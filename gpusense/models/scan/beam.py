@@ -53,9 +53,9 @@ class BeamModel(ScanModel):
             a caster of ``gpusense.casters`` with its knobs.
         sensor_table: None to evaluate the mixture, or the width [m] of bins of readings and expected ranges in which
             log p is tabulated, at least range_max / 8192, as racing particle filters do.
-        unknown: Whether unknown cells are ``"free"`` (the default) or ``"occupied"``.
-        outside: Whether space outside the grid is ``"free"`` (the default) or ``"occupied"``.
-        temperature: In (0, 1]: multiplies the sum over beams, which is overconfident because beams are not
+        unknown: Treatment of unknown cells: ``"free"`` (the default) or ``"occupied"``.
+        outside: Treatment of space outside the grid: ``"free"`` (the default) or ``"occupied"``.
+        temperature: In (0, 1]: multiplies the sum over beams: the plain sum is overconfident because beams are not
             independent. 1 is the book's plain product.
         beams: None, the number of informative beams to use, evenly chosen, or the indices of the beams to use.
         compat: None; or ``"amcl"`` or ``"beluga"`` for the weights of these programs, with their defaults for
@@ -162,7 +162,7 @@ class BeamModel(ScanModel):
         return self._caster.table_bytes
 
     def update_map(self, cells: ArrayLike, region: Sequence[int]) -> None:
-        """Replace cells of the map; later results equal those of a model made with the changed grid.
+        """Replace cells of the map; a model made with the changed grid would give the same results.
 
         The exact caster updates only the affected part of its table; see ``RayCaster.update_map``.
 
@@ -217,11 +217,11 @@ class BeamModel(ScanModel):
         A reading depends only on the seed, the step, and the indices of pose and beam, by the counter-based generator
         Philox; all backends draw the same bits. A component of the mixture is drawn by its weight, and a range by
         inverting the component's distribution function, so readings move smoothly with the poses (*Probabilistic
-        Robotics* section 6.3.1, the simulation of equation 6.12). With z* = 0, p_short has no mass, and the other
+        Robotics* section 6.3.1, the simulation of equation 6.12). At z* = 0, p_short has no mass, and the other
         components share its weight.
 
-        ``temperature`` and ``beams`` of the model have no effect, and with ``sensor_table`` readings are those of the
-        mixture. Readings below ``range_min`` are also drawn; they are missing readings to every model.
+        ``temperature`` and ``beams`` of the model have no effect, and ``sensor_table`` draws readings from the mixture.
+        Readings below ``range_min`` are also drawn; they are missing readings to every model.
 
         Args:
             poses: (N, 3) robot poses in the world [m, m, rad], or (S, N, 3) of S scans; arrays of other libraries as
@@ -237,7 +237,7 @@ class BeamModel(ScanModel):
         Raises:
             TypeError: An argument does not hold numbers of its kind.
             ValueError: A wrong shape, a pose that is not finite, a seed or step beyond its limits, or a model with
-                ``compat``, whose weights are not a density.
+                ``compat``: its weights are not a density.
 
         Example:
             >>> import gpusense as gs, numpy as np

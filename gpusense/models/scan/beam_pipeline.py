@@ -33,7 +33,7 @@ class BeamPipeline(ScanPipeline):
         caster: Casts expected ranges.
         cones: Cones of the sensor.
         mixture: The mixture.
-        max_evaluated: Whether max readings are evaluated by the mixture.
+        max_evaluated: True if max readings are evaluated by the mixture.
     """
 
     orders = True
@@ -86,7 +86,7 @@ class BeamPipeline(ScanPipeline):
         if several:
             begins = np.append(0, np.cumsum(scans.ray_counts)).astype(np.int32)
             start, counts = space.upload_all("scans", [begins, scans.counts.astype(np.int32)])
-        # Without shared rays kernels do not read ``first``; NumPy's kernel does for a single scan.
+        # Kernels read ``first`` only for shared rays; NumPy's kernel does for a single scan.
         first = space.upload("first", scans.first) if shared and (several or scans.shared) else self._one_each
         return Readings(
             scans.scans, scans.most_rays, scans.most_readings, flags_if(SHARED_RAYS=shared, SCANS=several),

@@ -1,8 +1,8 @@
 """``bind`` of a model: the choice among bound calls, and bound calls of arrays in host memory.
 
 A call that waits is the ordinary one, except for NumPy arrays of few particles on a GPU. They are copied to the device,
-as :mod:`.packed_call` describes. The choice names every kind of call, so it stands above :mod:`.bound`, whose calls
-filters make themselves.
+as :mod:`.packed_call` describes. The choice names every kind of call, so it belongs above :mod:`.bound`; filters make
+those calls themselves.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class _HostCall(BoundCall):
         """See BoundCall.check."""
 
     def long_reason(self) -> str:
-        """Return why arrays in host memory are not copied with a recorded program; empty for those of a short call."""
+        """Return why arrays in host memory are not copied with a recorded program; empty for arrays of a short call."""
         poses, ranges = self.arrays
         if not self.pipeline.backend.replays:
             return f"{self.pipeline.backend.info.selection} starts launches fast enough without a recording"

@@ -34,7 +34,7 @@ class BoundCall(ABC):
 
     Attributes:
         out: (N,) log-likelihoods, in the memory and of the library of the poses; every call writes them.
-        waits: Whether a call has ended when it returns.
+        waits: True if a call has ended when it returns.
 
     Example:
         >>> import gpusense as gs, numpy as np

@@ -37,8 +37,8 @@ class RayCaster(Pickled):
         method: The same as ``caster``.
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
-        unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
-        outside: Whether space outside the grid is ``"free"`` or ``"occupied"``.
+        unknown: Treatment of unknown cells: ``"free"`` or ``"occupied"``.
+        outside: Treatment of space outside the grid: ``"free"`` or ``"occupied"``.
 
     Raises:
         TypeError: An argument is of the wrong kind.
@@ -143,7 +143,7 @@ class RayCaster(Pickled):
         self._caster.prepare(Poses(poses, self._caster.backend))
 
     def update_map(self, cells: ArrayLike, region: Sequence[int]) -> None:
-        """Replace cells of the map; later ranges equal those of a caster made with the changed grid.
+        """Replace cells of the map; a caster made with the changed grid would give the same ranges.
 
         The exact caster updates its table where rectangles can hold a changed obstacle, up to 254 cells away. Other
         casters rebuild their tables at the next cast.

@@ -20,11 +20,11 @@ class LeftOut(NamedTuple):
 
     Attributes:
         hit: (K,) whether each reading is a range.
-        far: Whether it is a max reading.
-        used: Whether it is a used range.
-        used_max: Whether it is a used max reading.
-        constant: Whether it is part of the constant term.
-        informs: Whether max readings have information: z_max > 0.
+        far: True if it is a max reading.
+        used: True if it is a used range.
+        used_max: True if it is a used max reading.
+        constant: True if it is part of the constant term.
+        informs: True if max readings have information: z_max > 0.
     """
 
     hit: np.ndarray
@@ -178,7 +178,7 @@ def _of_complete_scan(ranges: np.ndarray, classes: tuple[np.ndarray, np.ndarray]
 
 
 def _separated(scans: ClassedScans, ray_of: np.ndarray) -> ClassedScans:
-    """Return scans with readings on one bearing beside each other, which share a ray."""
+    """Return scans with readings of equal bearing adjacent; they share a ray."""
     if scans.scans == 1:
         return _grouped(scans, ray_of)
     return _join([_grouped(scans.part(i, i + 1), ray_of) for i in range(scans.scans)])
@@ -190,7 +190,7 @@ def _numbers_of(chosen: np.ndarray) -> np.ndarray:
 
 
 def _grouped(scan: ClassedScans, ray_of: np.ndarray) -> ClassedScans:
-    """Return a single scan with its readings in the order of their rays, which have no repetition."""
+    """Return a single scan with its readings in the order of their rays, without repetition of rays."""
     vectors, rays = scan.vectors, ray_of.take(scan.columns)
     _, index, inverse, counts = np.unique(rays, return_index=True, return_inverse=True, return_counts=True)
     if len(index) == len(vectors):

@@ -19,7 +19,7 @@ class Cones:
     Attributes:
         rays: Rays of each cone; 1 for a laser.
         critical: Least cosine of an angle of incidence at which a surface returns; 0 without a limit.
-        incidence: Whether angles of incidence are computed, not ranges.
+        incidence: True if angles of incidence are computed, not ranges.
     """
 
     rays: int = 1

@@ -41,9 +41,9 @@ def log_hit(
     terms: nothing cancels, however large sigma is. Then ``-u^2 / 2 - log(sigma sqrt(2 pi) mass)``, u = (z - z*) /
     sigma; the product tends to Z for a huge sigma, so neither does the logarithm cancel.
 
-    For z* < 0 let a = -z* / sigma, u = z / sigma, w = Z / sigma. Numerator and normaliser share the factor
-    ``exp(-a^2 / 2)``, which is taken out before anything is evaluated: ``log p = -u (a + u / 2) - log(sigma I)`` with
-    I the integral of ``exp(-a v - v^2 / 2)`` over [0, w]. Where the exponent ``w (a + w / 2)`` exceeds 1 that is
+    For z* < 0 let a = -z* / sigma, u = z / sigma, w = Z / sigma. Numerator and normaliser share the factor ``exp(-a^2 /
+    2)``, cancelled before anything is evaluated: ``log p = -u (a + u / 2) - log(sigma I)`` with
+    I the integral of ``exp(-a v - v^2 / 2)`` over [0, w]. Beyond an exponent ``w (a + w / 2)`` of 1 the quotient is
     ``sqrt(pi / 2) (erfcx(a / sqrt 2) - erfcx((a + w) / sqrt 2) exp(-w (a + w / 2)))``, a difference that loses at most
     a bit; below, where it would cancel, ten Gauss-Legendre nodes are exact to rounding. z* > Z is the mirror image.
 

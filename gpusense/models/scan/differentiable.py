@@ -1,6 +1,6 @@
 """Log-likelihoods as operations that PyTorch and JAX differentiate, by the model's own gradient.
 
-A library is imported only after one of its arrays has been passed.
+A library is imported only after an array of it has been passed.
 """
 
 from __future__ import annotations

@@ -30,9 +30,9 @@ from gpusense.world.scanner import Scanner
 class LikelihoodFieldModel(ScanModel):
     """log p(z | x, m) of a scan by the distance of its end points to the nearest obstacle.
 
-    Each hit has the density ``z_hit N(d; 0, sigma_hit) + z_rand / range_max``; d is capped at ``max_distance``, which
-    is also its value outside the grid. Max readings add ``log z_max`` where z_max > 0 and are left out otherwise (book
-    table 6.3).
+    Each hit has the density ``z_hit N(d; 0, sigma_hit) + z_rand / range_max``; d is capped at ``max_distance``, also
+    its value outside the grid. Max readings add ``log z_max`` where z_max > 0 and are left out otherwise (book table
+    6.3).
 
     Args:
         grid: The map.
@@ -40,7 +40,7 @@ class LikelihoodFieldModel(ScanModel):
         parameters: Weights, deviation, cap and interpolation.
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
-        unknown: Whether unknown cells are ``"free"`` (the default) or ``"occupied"``.
+        unknown: Treatment of unknown cells: ``"free"`` (the default) or ``"occupied"``.
         outside: ``"free"`` (the default), or ``"occupied"`` for an obstacle at distance 0 everywhere outside the grid.
         temperature: In (0, 1]: multiplies the sum over beams. 1 is the book's plain product.
         beams: None, the number of informative beams to use, evenly chosen, or the indices of the beams to use.
@@ -144,7 +144,7 @@ class LikelihoodFieldModel(ScanModel):
         )  # fmt: skip
 
     def update_map(self, cells: ArrayLike, region: Sequence[int]) -> None:
-        """Replace cells of the map; later results equal those of a model made with the changed grid.
+        """Replace cells of the map; a model made with the changed grid would give the same results.
 
         Only distances within ``max_distance`` of a changed obstacle are computed again.
 

@@ -108,7 +108,7 @@ class FieldPipeline(ScanPipeline):
             # Missing and max readings have no length; their points hold nan and inf.
             finite = np.isfinite(cells)
             lengths = np.where(finite, cells, 0.0)
-        # Products of long rows take NumPy half the time of those of pairs.
+        # NumPy multiplies long rows in half the time of pairs.
         high, low = split((scans.vectors.reshape(-1) * lengths.repeat(2)).reshape(-1, 2), self.real)
         if not self.specialize:
             high[~finite] = cells[~finite, None]

@@ -21,9 +21,9 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
 
     Args:
         models: :class:`BeamModel` and :class:`LikelihoodFieldModel` objects of one device.
-        poses: As for ``log_likelihood``, (N, 3) or (S, N, 3): one array for all models, or a list or tuple of one for
-            each of them.
-        ranges: (K,) or (S, K) readings: one array for all models, or a list or tuple of one for each of them.
+        poses: As for ``log_likelihood``, (N, 3) or (S, N, 3): one array for all models, or a list or tuple with an
+            array per model.
+        ranges: (K,) or (S, K) readings: one array for all models, or a list or tuple with an array per model.
         out: None, or a list or tuple of an array for each model's result, or None, as in ``log_likelihood``.
 
     Returns:

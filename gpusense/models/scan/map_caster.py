@@ -42,8 +42,8 @@ class MapCaster:
         mount: The sensor's pose on the robot; its yaw belongs to the ray vectors.
         range_max: Longest range [m].
         method: The method for ranges.
-        unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
-        outside: Whether space outside the grid is ``"free"`` or ``"occupied"``.
+        unknown: Treatment of unknown cells: ``"free"`` or ``"occupied"``.
+        outside: Treatment of space outside the grid: ``"free"`` or ``"occupied"``.
         crop: False prepares the whole map at once.
         obstacles_of: Function that returns the mask of a grid's cells that stop a beam, from the grid and ``unknown``.
     """

@@ -217,13 +217,13 @@ class ScanModel(Pickled):
             ranges: (K,) readings [m], or (S, K). NaN, -inf and readings below range_min are missing, +inf and readings
                 of range_max or more are max readings.
             per_beam: Also return the term of each reading, before the temperature; NumPy arrays.
-            out: The array for the log-likelihoods, which is returned: of their shape and precision, C-contiguous, in
-                the memory of the poses. After an error its contents are undefined.
+            out: The array for the log-likelihoods, also returned: of their shape and precision, C-contiguous, in the
+                memory of the poses. After an error its contents are undefined.
 
         Returns:
             (N,) log-likelihoods, or (S, N), in the model's precision: a density in 1/m for each hit, a probability for
-            each max reading. With ``per_beam`` also (N, K) or (S, N, K) parts; left-out readings have 0. With
-            ``compat`` the logarithm of a particle's weight, and the cubes or logarithms that it sums.
+            each max reading. ``per_beam`` adds (N, K) or (S, N, K) parts; left-out readings have 0. With ``compat`` the
+            logarithm of a particle's weight, and the cubes or logarithms that it sums.
 
         Raises:
             TypeError: An argument does not hold real numbers, or is on a device that the backend cannot read.
@@ -283,7 +283,7 @@ class ScanModel(Pickled):
             finish(self._workspace, on_device=True)
 
     def _differentiable(self, ranges: AnyArray) -> Differentiable | None:
-        """Return the calls by which log-likelihoods are differentiated; None for a model without a gradient."""
+        """Return the calls that differentiate log-likelihoods; None for a model without a gradient."""
         return None
 
     def bind(self, poses: Any, ranges: Any, *, out: Any = None) -> BoundCall:
@@ -317,7 +317,7 @@ class ScanModel(Pickled):
     def explain(self, *, measure: bool = False) -> str:
         """Report the parts that this scene leaves out, keeps, and could leave out, each with the reason.
 
-        Readings and map are those of the last call.
+        Readings and map come from the last call.
 
         Args:
             measure: Whether to time the scene with and without each part that flags of the kernel bring back. The line

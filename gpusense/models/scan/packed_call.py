@@ -1,8 +1,8 @@
 """Calls of few particles in NumPy arrays on a GPU: inputs go to the device as one array, results come back as one.
 
 A copy of few numbers takes as long as a launch, and the device classes a scan faster than the host. Therefore the
-recording of :class:`.bound.DeviceCall` follows the copy, and the device classes the readings. With CUDA, copies and
-launches are one graph. Bound calls of such arrays work like this, and so do ordinary calls that repeat a size.
+recording of :class:`.bound.DeviceCall` follows the copy, and the device classes the readings. On CUDA, copies and
+launches form one graph. Bound calls of such arrays work like this, and so do ordinary calls that repeat a size.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ class _Pack:
 class PackedCall:
     """The recorded program of a number of poses.
 
-    Poses and readings are float64 on the device, which is exact for float32. Limits of readings are rounded to the
-    precision of the readings, as on the host.
+    Poses and readings are float64 on the device, exact for float32. Limits of readings are rounded to the precision of
+    the readings, as on the host.
 
     Args:
         pipeline: The stages of the model.
@@ -183,7 +183,7 @@ class ShortCalls:
             poses: Poses as ``log_likelihood`` takes them.
             ranges: Its readings.
             out: Its array for the result, or None.
-            per_beam: Whether the log-likelihoods of the readings are requested.
+            per_beam: True if the log-likelihoods of the readings are requested.
         """
         self.last = None
         if per_beam or type(poses) is not np.ndarray or type(ranges) is not np.ndarray:

@@ -54,7 +54,7 @@ class ScanLaunch(NamedTuple):
         log_p: The buffer for the log-likelihoods.
         flags: Flags of the scoring kernel.
         tiles: The tiles of GPUs, which sum in a second launch; None if a single launch does everything.
-        per_beam: Whether the log-likelihoods of single readings are kept.
+        per_beam: True if the log-likelihoods of single readings are kept.
     """
 
     readings: Readings

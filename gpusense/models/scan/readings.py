@@ -37,7 +37,7 @@ class Readings(NamedTuple):
         constant_term: The constant term of a single scan.
         key: All values on which the launches depend, except buffers.
         reach: Longest range in cells, and a bound of its error; infinite if unknown.
-        constants_there: Whether a constant term of a single scan is in ``constant_terms`` on the device.
+        constants_there: True if a constant term of a single scan is in ``constant_terms`` on the device.
         placing: The launch that places them on the device; None where the host has placed them.
     """
 
@@ -83,7 +83,7 @@ class Sensing:
         z_max: Probability of a max reading.
         end_points: Whether readings become end points.
         max_depends: Whether the probability of a max reading depends on the pose.
-        possible: Whether some range is possible.
+        possible: True if some range is possible.
         specialize: False leaves nothing out.
         top: Largest range below a max reading.
         guard_scale: Bound of the rounding errors of end points per cell of range.

@@ -1,4 +1,4 @@
-"""Scans of poses that stay in place on a processor, as those of a filter: only readings change from call to call.
+"""Scans of poses that stay in place on a processor, such as a filter's: only readings change from call to call.
 
 The host classes and uploads the readings of each scan. All other work of a call, from the checks of arguments to the
 arguments of its launches, is done once for each place of the poses and each number of readings.
@@ -31,8 +31,8 @@ class _Place(NamedTuple):
     """Poses and log-likelihoods on the device.
 
     Attributes:
-        number: A number of its own.
-        owners: The user's arrays, whose identities are therefore theirs alone.
+        number: A unique number.
+        owners: The user's arrays, kept alive so that their identities are unique.
         poses: The poses.
         log_p: The buffer for log-likelihoods.
     """
@@ -47,7 +47,7 @@ class _Placed(NamedTuple):
     """Poses in a map.
 
     Attributes:
-        number: A number of its own.
+        number: A unique number.
         poses: The poses.
         map: The map with its table.
         flags: Flags of the launch that places them, as ``explain`` reports them.

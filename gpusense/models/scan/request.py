@@ -27,7 +27,7 @@ class Request(NamedTuple):
         shape: Shape of the result, (N,) or (S, N).
         result: Memory of the result.
         parts: (S, N, K) log-likelihoods of the readings; (S, N, 0) where they are not requested.
-        per_beam: Whether they are requested, of a scanner with beams.
+        per_beam: True if they are requested, of a scanner with beams.
         before: Called once readings are on the device; it starts the launches that write the poses.
     """
 
@@ -71,7 +71,7 @@ def make_request(
         poses: (N, 3), or (S, N, 3).
         ranges: (K,), or (S, K).
         out: None, or the array for the result.
-        per_beam: Whether the log-likelihoods of the readings are requested.
+        per_beam: True if the log-likelihoods of the readings are requested.
         known: Poses that were checked before.
         before: See Request.
     """

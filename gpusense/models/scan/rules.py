@@ -31,7 +31,7 @@ class BeamChoice:
     Attributes:
         columns: Beams that may be used.
         most: Largest number of readings that are used, evenly chosen from more.
-        every: Whether all beams are used.
+        every: True if all beams are used.
     """
 
     columns: np.ndarray
@@ -71,14 +71,14 @@ class BeamChoice:
 
 @dataclass(frozen=True)
 class Rules:
-    """Rules by which readings are classed, thinned and grouped.
+    """Rules that class, thin and group readings.
 
     Attributes:
         scanner: The scanner's geometry.
         vectors: (K, 2) float64 cosines and sines of the bearings, the mount's yaw included.
         z_max: Probability of a max reading; 0 makes it missing.
         beams: The beams that are used.
-        specialize: False keeps readings without information, and casts equal bearings one by one.
+        specialize: False keeps readings without information, and casts equal bearings separately.
         max_is_range: Evaluate finite max readings like ranges.
         max_depends: The probability of a max reading depends on the pose, so such readings are evaluated.
         map_size: Diagonal of the map [m]; None without a map.
@@ -165,7 +165,7 @@ class ModelContext:
         cubes: Whether the model sums cubes of densities instead of logarithms.
         temperature: Multiplies the sum over readings.
         constant_term: The first term of that sum.
-        possible: Whether some range is possible at some pose.
+        possible: True if some range is possible at some pose.
     """
 
     backend: Backend

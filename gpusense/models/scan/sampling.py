@@ -29,7 +29,7 @@ MOST_SEED, MOST_STEP = (1 << 64) - 1, (1 << 31) - 1
 
 @dataclass(frozen=True)
 class Drawing:
-    """The numbers by which readings are drawn.
+    """The numbers from which readings are drawn.
 
     Attributes:
         mixture: Numbers of the mixture for each bin of angles of incidence, then the tables of the hit shape.
@@ -107,7 +107,7 @@ class Drawing:
 def drawing_of(
     density: BeamDensity, range_max: float, real: np.dtype, *, seed: object, step: object, per_scan: int
 ) -> Drawing:
-    """Return the numbers by which a model draws.
+    """Return the numbers from which a model draws.
 
     Raises:
         TypeError, ValueError: A seed or a step that is not an integer, or beyond its limits.

@@ -71,7 +71,7 @@ def ranges_of(scan: ClassedScans, beams: int) -> np.ndarray:
 
 
 def _difference(pipeline: ScanPipeline, request: Request, with_part: tuple[frozenset[str], frozenset[str]]) -> float:
-    """Return by how much longer a call takes with other flags of the scoring kernel [s], measured in turns."""
+    """Return the extra time of a call with other flags of the scoring kernel [s], measured in turns."""
     spaces = [(Workspace(pipeline.backend), None), (Workspace(pipeline.backend), with_part)]
 
     def turn(which: int, calls: int) -> float:

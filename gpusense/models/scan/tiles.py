@@ -21,12 +21,12 @@ _UNBOUNDED = np.full(7, -(1 << 31), _INT)
 LEAST_ORDERED = (1 << 22, 1 << 12)
 # Number of work-items that fill any device.
 ENOUGH = 1 << 21
-# The same for the likelihood field, whose short work-items have a relatively costly start.
+# The same for the likelihood field: its short work-items have a relatively costly start.
 ENOUGH_SHORT = 1 << 19
 
 
 def all_within(placed: PlacedPoses, reach: float, ring: int = 0) -> bool:
-    """Return whether all cells within ``reach`` of the sensors surely lie in the window and a ring around it."""
+    """Return whether all cells within ``reach`` of the sensors are surely in the window and a ring around it."""
     if placed.corners is None:
         return False
     window, frame = placed.frame.window, placed.frame

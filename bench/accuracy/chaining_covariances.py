@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize
 from scipy.stats import chi2
 
 import gpusense as gs
@@ -28,8 +29,8 @@ import gpusense as gs
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+from chaining import drifts
 from chaining_logs import Log, load, references
-from chaining_mount import STEPS, fitted, remounted
 from common import make_parser, note, parse, publish, table
 
 from gpusense.chaining.chain import Chainer
@@ -44,6 +45,9 @@ KEPT = 0.9
 REFERENCE, JARVIS_REFERENCE = (0.03, 0.01), (0.01, 0.004)
 INFLATIONS = np.geomspace(0.02, 50, 200)
 LEVELS = (0.5, 0.8, 0.95)
+# Path of the drift that mounts and clocks are fitted to [m], and first steps of the search [m, m, rad, s].
+LENGTH = 5.0
+STEPS = (0.02, 0.02, 0.01, 0.03)
 
 
 def simulated(name: str, seed: int) -> Log:
@@ -133,6 +137,30 @@ def errors_of(log: Log, backend: str) -> Errors:
         spread = drift.relative(chosen[first], chosen[second])
         parts.append(Errors(off, spread, np.tile(reference, (len(off), 1, 1)), np.full(len(off), length)))
     return Errors(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def remounted(poses: np.ndarray, mount: np.ndarray, off: np.ndarray) -> np.ndarray:
+    """Return the robot's poses (S, 3) if the scanner is mounted as stated plus an offset (3,)."""
+    return gs.compose_poses(gs.compose_poses(poses, mount), gs.invert_poses(mount + off))
+
+
+def fitted(log: Log, poses: np.ndarray, part: slice, steps: tuple[float, ...]) -> np.ndarray:
+    """Return the offsets of mount and clock (4,) with the least drift on a part; those with a step of 0 stay 0."""
+    free = np.flatnonzero(steps)
+    start = np.array([0.0, 0.0, 0.0, 0.05])
+
+    def drift(values: np.ndarray) -> float:
+        found = start.copy()
+        found[free] = values
+        moved = remounted(poses, np.array(log.scanner.mount), found[:3])
+        return drifts(moved[part], references(log, found[3])[part], LENGTH)[0]
+
+    simplex = start[free] + np.concatenate([np.zeros((1, len(free))), np.diag(np.array(steps)[free])])
+    result = start.copy()
+    result[free] = minimize(
+        drift, start[free], method="Nelder-Mead", options={"initial_simplex": simplex, "maxiter": 200}
+    ).x
+    return result
 
 
 def matched_frames(log: Log, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,6 @@ from typing import Any
 import numpy as np
 
 import gpusense as gs
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
-from matching_odometry import recorded
 
 BOTH = "jarvis-both"
 
@@ -41,6 +35,27 @@ class Log:
         if self.lasers is None:
             return {"scanner": self.scanner, "duration": duration}
         return {"scanner": self.lasers[0], "sensor": self.lasers[1], "duration": self.lasers[2]}
+
+
+def recorded(data: Path, log: str) -> tuple[list[gs.Scan], np.ndarray]:
+    """Return the scans of a log, and the raw odometry's motion from each scan to the next.
+
+    The odometry of a scan is a copy of its corrected pose. Records of odometry continue the corrected pose of the last
+    scan by the wheels, so the last one before a scan holds their motion.
+    """
+    scans: list[gs.Scan] = []
+    motions, wheels = [], None
+    for record in gs.read_log(data / f"carmen_logs/{log}-corrected.log.gz", odometry=True):
+        if isinstance(record, gs.Odometry):
+            wheels = record.pose
+            continue
+        if scans:
+            if wheels is None:
+                raise ValueError(f"{log}: must have odometry between scans, got none before scan {len(scans)}")
+            motions.append(gs.pose_difference(scans[-1].pose, wheels))
+        scans.append(record)
+        wheels = None
+    return scans, np.array(motions)
 
 
 def load(data: Path, name: str) -> Log:

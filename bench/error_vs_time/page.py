@@ -4,8 +4,7 @@
     python bench/error_vs_time/page.py --check   # exit code 1 if a file differs or a report is of older code
 
 The same reports give the same bytes everywhere. Answers of the last page, which standing.csv lists, stand until reports
-show a method that is clearly better. The build of the site writes the interactive page. The counts of answers that are
-the same on other days are those that agreement.py wrote last.
+show a method that is clearly better. The build of the site writes the interactive page.
 """
 
 from __future__ import annotations
@@ -45,7 +44,6 @@ HERE = Path(__file__).parent
 PAGE = Path("docs/error-vs-time.md")
 IMAGES = Path("docs/img")
 STANDING = Path("bench/error_vs_time/standing.csv")
-AGREEMENT = HERE / "agreement.csv"
 NEEDS = tuple(SHOWN)
 # Methods with a knob that other implementations share.
 TABLES = ("cddt", "lookup", "march, centre")
@@ -216,7 +214,7 @@ def files(folder: Path = RESULTS, last: Standing | None = None) -> dict[Path, st
         "lead": lead(rows, devices, standing), "first": answers(rows, able, FIRST, standing),
         "answers": answers(rows, devices, WISHES, standing), "peers": peers(rows),
         "matchers": rivals(rows, "matching", "a match"), "filters": rivals(rows, "localisation", "a scan"),
-        "maps": by_map(rows, devices), "reports": listing(found), "limit": [str(LIMIT)], "agreement": agreement(),
+        "maps": by_map(rows, devices), "reports": listing(found), "limit": [str(LIMIT)],
     }  # fmt: skip
     for need in NEEDS:
         blocks[need] = methods(rows, need, devices, fronts=need == "localisation") if need in needs else ["(none yet)"]
@@ -226,25 +224,6 @@ def files(folder: Path = RESULTS, last: Standing | None = None) -> dict[Path, st
     for name, lines in blocks.items():
         text = text.replace(f"{{{{{name}}}}}", "\n".join(lines))
     return made | {PAGE: text}
-
-
-def agreement() -> list[str]:
-    """Return the table of answers that are the same in pairs of reports, with the sums of its columns."""
-    with AGREEMENT.open(encoding="utf-8", newline="") as stream:
-        counts = list(csv.DictReader(stream))
-    kinds = list(dict.fromkeys(count["reports of"] for count in counts))
-    lines = []
-    for device in [*dict.fromkeys(count["device"] for count in counts), "all"]:
-        line = [device]
-        for kind in kinds:
-            chosen = [count for count in counts if count["reports of"] == kind and device in (count["device"], "all")]
-            pairs, answers, same, afresh = (
-                sum(int(count[name]) for count in chosen) for name in ("pairs", "answers", "same", "afresh")
-            )
-            line += [str(pairs), f"{same} of {answers}", str(afresh)]
-        lines.append(line)
-    heads = [head for kind in kinds for head in (f"pairs of {kind}", "the same", "afresh")]
-    return table(("device", *heads), lines, 7)
 
 
 def main() -> int:

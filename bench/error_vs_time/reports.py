@@ -10,19 +10,17 @@ import json
 import math
 import re
 import statistics
-import sys
+import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from commits import ROOT, commits_since
 
 from gpusense._util.files import write_whole
 from gpusense.evaluation.benchmark.rows import ALL, MODEL_MEASURES, Row, model_rows, origin_of, titles_of
 
+ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "bench" / "results"
 PATTERN = "error_vs_time_*_{}.json"
 # Folders whose changes make a report old, and the number of commits to them after which it must not be published.
@@ -72,6 +70,31 @@ class Source:
 # ---- commits
 
 
+def git(*words: str, root: Path = ROOT) -> str:
+    """Return the output of git."""
+    command = ["git", "-C", str(root), *words]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout.strip()
+
+
+def has_history(root: Path = ROOT) -> bool:
+    """Return whether the folder is a checkout with its whole history."""
+    try:
+        own = Path(git("rev-parse", "--show-toplevel", root=root)).resolve() == root.resolve()
+        return own and git("rev-parse", "--is-shallow-repository", root=root) == "false"
+    except (OSError, subprocess.SubprocessError):
+        return False
+
+
+@cache
+def _commits_since(commit: str, folders: tuple[str, ...], root: Path) -> float:
+    """Count the later commits to folders; infinite where HEAD does not descend from the commit."""
+    try:
+        git("merge-base", "--is-ancestor", commit, "HEAD", root=root)
+        return int(git("rev-list", "--count", f"{commit}..HEAD", "--", *folders, root=root))
+    except subprocess.CalledProcessError:
+        return math.inf
+
+
 def commit_trouble(commit: str, *, root: Path = ROOT, limit: int = LIMIT, folders: Sequence[str] = FOLDERS) -> str:
     """Return why a report of a commit must not be published; empty if it may.
 
@@ -83,7 +106,7 @@ def commit_trouble(commit: str, *, root: Path = ROOT, limit: int = LIMIT, folder
     """
     if not commit or commit.endswith("+"):
         return f"is of a checkout with uncommitted changes: {commit or 'no commit'}"
-    since = commits_since(commit, folders, root=root, ancestor=True)
+    since = _commits_since(commit, tuple(folders), root)
     if math.isinf(since):
         return f"is of {commit}, which is no commit of this history"
     return f"is of {commit}, {since} commits to {', '.join(folders)} ago, more than {limit}" if since > limit else ""

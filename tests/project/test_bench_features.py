@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support.bench_scripts import BENCH, run_here, run_script
+from support.bench_scripts import BENCH, run_script
 
 
 @pytest.mark.slow
@@ -25,14 +25,6 @@ def test_features_are_measured(data_dir: Path, needs: Callable[[str], str], tmp_
     corners = report["real"]["jarvis-nav350 corner"]
     assert corners["expected"] >= corners["again"] >= corners["within_3_sigma"] > 0
     assert all(row["scans_per_s"] > 0 for row in report["rates"].values())
-
-
-def test_corners_beyond_their_covariances_are_listed(needs: Callable[[str], str], tmp_path: Path) -> None:
-    arguments = ["--backend", needs("opencl"), "--floors", "2", "--scans", "3"]
-    report = run_here("accuracy/feature_outliers.py", *arguments, output=tmp_path / "outliers")
-    within = report["1081 0.01 within"]
-    assert within["corners"] > 10 and sum(within.values()) == 2 * within["corners"]
-    assert within["walls that meet"] > within["walls that do not meet"]
 
 
 def test_a_scan_with_its_features_is_drawn(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:

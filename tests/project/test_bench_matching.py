@@ -20,15 +20,6 @@ def test_global_matching_runs(data_dir: Path, needs: Callable[[str], str], tmp_p
     assert olin["right"] == 1 and olin["found_wrong"] == 0
 
 
-@pytest.mark.slow
-def test_matching_odometry_runs(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:
-    arguments = ["--recorded", str(data_dir), "--backend", needs("opencl"), "--scans", "4", "--log", "csail"]
-    report = run_script("accuracy/matching_odometry.py", *arguments, output=tmp_path / "odometry")
-    assert len(report["rows"]) == 2
-    # The odometry of a scan is a copy of its pose; that of the wheels is not.
-    assert all(row["wheels_p95_mm"] > 1 for row in report["rows"])
-
-
 def test_matching_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     """Match in generated buildings alone, which need no data."""
     arguments = ["--matches", "6", "--backend", needs("opencl")]

@@ -285,19 +285,6 @@ def test_stretches_of_machine_code_end_at_labels_and_branches(
     assert [names for names in found if names] == [["LDC", "BRA"], ["FADD", "FMUL"], ["EXIT"]]
 
 
-@pytest.mark.slow
-def test_real_scores_runs(data_dir: Path, tmp_path: Path) -> None:
-    """Score on a recorded map, on every device that is present."""
-    arguments = ["--data", str(data_dir), "--map", "columbia", "--log", "none"]
-    report = run_script("accuracy/real_scores.py", *arguments, output=tmp_path / "real")
-    rows = report["maps"]
-    count = len({row["left"] for row in rows if row["right"] == "truth"})
-    assert count >= 2 and len(rows) == count + count * (count - 1) // 2
-    for row in rows:
-        assert row["breaches"] == 0 and "float32 beam model, scans" in row["differences"]
-    assert str(data_dir) not in str(report)
-
-
 def test_scenes_of_the_compiled_peers_are_those_of_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     """The script that compiled the peers makes the maps, readings and options whose weights the tests have."""
     monkeypatch.syspath_prepend(str(BENCH))

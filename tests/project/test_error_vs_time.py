@@ -37,12 +37,6 @@ def reports(page: ModuleType) -> ModuleType:
     return importlib.import_module("error_vs_time.reports")
 
 
-@pytest.fixture(scope="module")
-def commits(page: ModuleType) -> ModuleType:
-    """Import the module that reads the history."""
-    return importlib.import_module("commits")
-
-
 # ---- the committed page and reports
 
 
@@ -57,8 +51,8 @@ def test_the_page_is_what_the_reports_give(page: ModuleType) -> None:
     assert "{{" not in made[page.PAGE] and f"python {Path(page.__file__).relative_to(ROOT)}" in made[page.PAGE]
 
 
-def test_reports_are_of_this_code(reports: ModuleType, commits: ModuleType) -> None:
-    if not commits.has_history():
+def test_reports_are_of_this_code(reports: ModuleType) -> None:
+    if not reports.has_history():
         pytest.skip("the checkout has no history, or a part of it only")
     found = {source.name: reports.commit_trouble(source.report["commit"]) for source in reports.sources()}
     assert {name: trouble for name, trouble in found.items() if trouble} == {} and found
@@ -122,11 +116,9 @@ def history(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_commits_that_are_old_unknown_or_unclean_are_refused(
-    reports: ModuleType, commits: ModuleType, history: Path
-) -> None:
-    assert commits.has_history(history) and not commits.has_history(history / "kernels")
-    hashes = {name: commits.git("rev-parse", name, root=history) for name in ("c0", "c2", "c4", "aside")}
+def test_commits_that_are_old_unknown_or_unclean_are_refused(reports: ModuleType, history: Path) -> None:
+    assert reports.has_history(history) and not reports.has_history(history / "kernels")
+    hashes = {name: reports.git("rev-parse", name, root=history) for name in ("c0", "c2", "c4", "aside")}
 
     def trouble(commit: str, limit: int) -> str:
         return reports.commit_trouble(commit, root=history, limit=limit, folders=["kernels"])
@@ -222,25 +214,6 @@ def test_answers_of_the_last_page_stand(page: ModuleType, tmp_path: Path) -> Non
         assert files == page.files(tmp_path, {(DEVICE, WISH): answer["answer"]})
         found.append(answer["answer"])
     assert found == ["beam, 500 x 60", "field, 1000 x 60"]
-
-
-def test_reports_of_other_days_are_compared(page: ModuleType, tmp_path: Path) -> None:
-    """Only common settings count: the beam model is now slower than the limit, and 100 000 particles are new."""
-    agreement, texts = importlib.import_module("error_vs_time.agreement"), []
-    slow = [one | {"processor_s": 2 * one["processor_s"]} if one["method"] == "beam" else one for one in ROWS]
-    for rows in (ROWS, [*slow, task("field", "100000 x 8", 0.001, 0.001)]):
-        write_tasks(tmp_path, rows)
-        texts.append((tmp_path / "error_vs_time_x_tasks.json").read_text())
-    old, new = (agreement.report_of(name, text) for name, text in zip("ab", texts, strict=True))
-    assert agreement.report_of("c", json.dumps({"schema": 1, "points": []})) is None
-    lines = agreement.summary([new, old])
-    assert lines[0] == "2 of 3 answers of 1 pairs of reports are the same, 2 afresh."
-    device = (
-        f"| {DEVICE} | 1000 particles at 100 Hz | a, 2026-01-01 | **beam, 1000 x 60**: 9 ms, 6 mm | b, 2026-01-01 |"
-    )
-    assert device in lines[-1]
-    assert agreement.counts([new, old]).splitlines()[1:] == [f'"{DEVICE}",one date,1,3,2,2']
-    assert agreement.summary([old])[0] == "0 of 0 answers of 0 pairs of reports are the same, 0 afresh."
 
 
 def test_a_variant_of_a_device_stands_behind_it(reports: ModuleType) -> None:

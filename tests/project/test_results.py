@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
-import math
 import re
-import subprocess
 from pathlib import Path
 from types import ModuleType
 
@@ -41,17 +39,18 @@ def test_each_report_is_published(published: str) -> None:
     assert [file.name for file in REPORTS if file.stem not in names] == []
 
 
-@pytest.fixture(scope="module")
-def report_ages() -> ModuleType:
-    """Import the script that lists the reports and their ages."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / "bench"))
-        return importlib.import_module("report_ages")
+def parts_of(file: Path) -> list[str]:
+    """Return the reports of a file: the elements of a list, or the sections of the first level."""
+    text = file.read_text(encoding="utf-8")
+    if file.suffix == ".json":
+        whole = json.loads(text)
+        return [json.dumps(one) for one in whole] if isinstance(whole, list) else [text]
+    return [part for part in re.split(r"(?m)^(?=# )", text) if part.strip()]
 
 
 @pytest.mark.parametrize("file", REPORTS, ids=lambda file: file.name)
-def test_each_report_states_commit_and_command(file: Path, report_ages: ModuleType) -> None:
-    for part in report_ages.parts_of(file):
+def test_each_report_states_commit_and_command(file: Path) -> None:
+    for part in parts_of(file):
         assert COMMIT.search(part) or "--commit" in part, f"no commit: {part[:80]}"
         assert COMMAND.search(part), f"no command: {part[:80]}"
 
@@ -63,35 +62,6 @@ def test_scripts_of_reports_are_here(file: Path) -> None:
     for script in SCRIPT.findall(file.read_text(encoding="utf-8")):
         stem = Path(script).stem
         assert (ROOT / script).is_file() or FORMER.get(stem, stem) in names, script
-
-
-def test_the_age_of_a_report_counts_commits_of_the_code(tmp_path: Path, report_ages: ModuleType) -> None:
-    """Sections and elements are reports of their own, other commits do not count, an unknown one is the oldest."""
-
-    def git(*words: str) -> str:
-        command = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b", *words]
-        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
-
-    git("init", "-q")
-    commits = []
-    for name in ("kernels/a", "docs/a", "gpusense/a", "kernels/b"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).touch()
-        git("add", "-A")
-        git("commit", "-qm", name)
-        commits.append(git("rev-parse", "--short=7", "HEAD"))
-    results = tmp_path / "results"
-    results.mkdir()
-    sections = f"# One\n\n## Rows\ncommit {commits[3]}, numpy\n# Two\nPublished with commit {commits[1]}.\n"
-    (results / "a.md").write_text(sections + f"commit {commits[2]}")
-    reports = [{"title": "T", "published_with": commits[0]}, {"commit": "0123abc"}, {"commit": ""}]
-    (results / "b.json").write_text(json.dumps(reports))
-    (results / "c.json").write_text(json.dumps({"machine": {"commit": commits[2]}}, indent=1))
-    assert list(report_ages.ages(results, tmp_path)) == [
-        (0, "a.md, One", commits[3]), (2, "a.md, Two", commits[1]),
-        (2, "b.json, T", commits[0]), (math.inf, "b.json, 2", "0123abc"), (math.inf, "b.json, 3", "none"),
-        (1, "c.json", commits[2]),
-    ]  # fmt: skip
 
 
 @pytest.fixture

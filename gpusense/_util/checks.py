@@ -61,10 +61,6 @@ def real(
         low: Inclusive lower limit.
         below: Exclusive upper limit.
         high: Inclusive upper limit.
-
-    Raises:
-        TypeError: The value is not a real number; bools are refused.
-        ValueError: The value is not finite, or breaks a limit.
     """
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise TypeError(f"{name}: must be a real number, got {show(value)}")
@@ -87,12 +83,7 @@ def real(
 
 
 def integer(name: str, value: object, *, low: int | None = None, high: int | None = None) -> int:
-    """Return ``value`` as an int after checking that it is an integer from ``low`` to ``high``, both included.
-
-    Raises:
-        TypeError: The value is not an integer; bools and floats such as 2.0 are refused.
-        ValueError: The value breaks a limit.
-    """
+    """Return ``value`` as an int after checking that it is an integer from ``low`` to ``high``, both included."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
         raise TypeError(f"{name}: must be an integer, got {show(value)}")
     number = int(value)
@@ -104,12 +95,7 @@ def integer(name: str, value: object, *, low: int | None = None, high: int | Non
 
 
 def choice(name: str, value: object, options: Sequence[str]) -> str:
-    """Return ``value`` after checking that it is one of ``options``.
-
-    Raises:
-        TypeError: The value is not a string.
-        ValueError: The value is none of the options.
-    """
+    """Return ``value`` after checking that it is one of ``options``."""
     rule = f"must be one of {', '.join(map(repr, options))}"
     if not isinstance(value, str):
         raise TypeError(f"{name}: {rule}, got {show(value)}")
@@ -119,22 +105,14 @@ def choice(name: str, value: object, options: Sequence[str]) -> str:
 
 
 def boolean(name: str, value: object) -> bool:
-    """Return ``value`` after checking that it is True or False; 0 and 1 are refused.
-
-    Raises:
-        TypeError: The value is not a bool.
-    """
+    """Return ``value`` after checking that it is True or False; 0 and 1 are refused."""
     if not isinstance(value, (bool, np.bool)):
         raise TypeError(f"{name}: must be True or False, got {show(value)}")
     return bool(value)
 
 
 def instance(name: str, value: object, kind: type[T], *, optional: bool = False) -> T:
-    """Return ``value`` after checking that it is an instance of ``kind``, or with ``optional`` None.
-
-    Raises:
-        TypeError: ``value`` is of another type.
-    """
+    """Return ``value`` after checking that it is an instance of ``kind``, or with ``optional`` None."""
     if not isinstance(value, kind) and not (optional and value is None):
         word = kind.__name__
         article = "" if word.endswith("s") else "an " if word[0] in "AEIOU" else "a "
@@ -143,11 +121,7 @@ def instance(name: str, value: object, kind: type[T], *, optional: bool = False)
 
 
 def or_default(name: str, value: object, kind: Callable[[], T]) -> T:
-    """Return ``value`` after checking that it is an instance of ``kind``; for None, one with default values.
-
-    Raises:
-        TypeError: ``value`` is of another type.
-    """
+    """Return ``value`` after checking that it is an instance of ``kind``; for None, one with default values."""
     return kind() if value is None else instance(name, value, cast("type[T]", kind))
 
 
@@ -158,10 +132,6 @@ def as_array(name: str, value: object, *, masked: bool = False) -> NDArray[Any]:
         name: Name of the argument.
         value: Anything that ``numpy.asarray`` accepts.
         masked: Whether values may be masked; these become NaN, and integers with them float64.
-
-    Raises:
-        TypeError: The value has no values, because JAX traces it.
-        ValueError: The value is a ragged sequence, or a value is masked.
     """
     check_values(name, value)
     try:
@@ -226,11 +196,7 @@ def array(
 
 
 def _limited(name: str, values: NDArray[Any], largest: float) -> NDArray[Any]:
-    """Return ``values`` after checking that no finite one is larger in magnitude than ``largest``.
-
-    Raises:
-        ValueError: A value is larger.
-    """
+    """Return ``values`` after checking that no finite one is larger in magnitude than ``largest``."""
     beyond = np.isfinite(values) & ((values > largest) | (values < -largest))
     if beyond.any():
         raise ValueError(f"{name}: every value must be from -{largest:g} to {largest:g}, got {_first(values, beyond)}")
@@ -244,12 +210,7 @@ def _first(values: NDArray[Any], bad: NDArray[np.bool]) -> str:
 
 
 def indices(name: str, value: object, size: int, shape: Sequence[int | str] | None = None) -> NDArray[np.int64]:
-    """Return ``value`` as an array of indices from 0 to ``size`` - 1.
-
-    Raises:
-        TypeError: The array does not hold integers.
-        ValueError: The shape differs, or an index is out of range.
-    """
+    """Return ``value`` as an array of indices from 0 to ``size`` - 1."""
     found = array(name, value, shape, dtype=np.int64)
     bad = (found < 0) | (found >= size)
     if bad.any():
@@ -258,11 +219,7 @@ def indices(name: str, value: object, size: int, shape: Sequence[int | str] | No
 
 
 def broadcast(named: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
-    """Return arrays by their names as views of one shape.
-
-    Raises:
-        ValueError: The shapes do not broadcast; the message names the last array.
-    """
+    """Return arrays by their names as views of one shape."""
     try:
         return list(np.broadcast_arrays(*named.values()))
     except ValueError:
@@ -273,11 +230,7 @@ def broadcast(named: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
 
 
 def check_values(name: str, array: object) -> None:
-    """Refuse an array without values, which JAX traces.
-
-    Raises:
-        TypeError: JAX traces the array.
-    """
+    """Refuse an array without values, which JAX traces."""
     if type(array).__module__.partition(".")[0] == "jax" and isinstance(array, sys.modules["jax"].core.Tracer):
         raise TypeError(
             f"{name}: must have values, got an array that JAX traces (jit, grad, vmap); only the poses of "
@@ -286,11 +239,7 @@ def check_values(name: str, array: object) -> None:
 
 
 def check_gradients(array: object, name: str, error: Exception) -> None:
-    """Raise a clear error if ``array`` could not be exported because its library records its gradients.
-
-    Raises:
-        TypeError: The array requires gradients, which this package does not compute.
-    """
+    """Raise a clear error if ``array`` could not be exported because its library records its gradients."""
     if getattr(array, "requires_grad", False) is True:
         raise TypeError(
             f"{name}: must not require gradients, which are not computed here, got a "
@@ -302,15 +251,6 @@ def nested(name: str, value: object, *, deepest: int, most: int) -> int:
     """Count the values in nested mappings, lists and tuples; a value that occurs twice counts twice.
 
     Keys of mappings count as values. A string counts once more for every 64 characters.
-
-    Args:
-        name: Name of the argument.
-        value: The caller's value.
-        deepest: Largest number of levels.
-        most: Largest number of values.
-
-    Raises:
-        ValueError: The value is nested deeper, as a list that contains itself is, or holds more values.
     """
     count = 0
     inner: list[Iterator[Any]] = [iter([value])]
@@ -330,12 +270,7 @@ def nested(name: str, value: object, *, deepest: int, most: int) -> int:
 
 
 def path(name: str, value: object) -> Path:
-    """Return ``value``, a string or path object, as a path.
-
-    Raises:
-        TypeError: The value is neither a string nor a path object.
-        ValueError: The path is empty or holds a null character.
-    """
+    """Return ``value``, a string or path object, as a path."""
     if not isinstance(value, (str, os.PathLike)):
         raise TypeError(f"{name}: must be a path, got {show(value)}")
     text = os.fspath(value)
@@ -347,12 +282,7 @@ def path(name: str, value: object) -> Path:
 
 
 def existing_file(file: Path) -> Path:
-    """Return ``file`` after checking that it is an existing regular file.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        ValueError: The path is not a regular file: a folder or a device, for example.
-    """
+    """Return ``file`` after checking that it is an existing regular file."""
     # For an impossible name os.path reports a missing file, where Path raises another error.
     if not os.path.exists(file):
         found = "a link that leads to no file" if os.path.islink(file) else "no such file"

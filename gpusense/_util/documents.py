@@ -57,9 +57,6 @@ def check_yaml(text: str | bytes) -> None:
     """Refuse YAML whose parts are nested too deeply, contain themselves, or grow without bound by aliases.
 
     The parser's events are read one by one, so that no alias is expanded.
-
-    Raises:
-        ValueError: The document breaks a bound, or is not YAML.
     """
     import yaml
 
@@ -168,10 +165,6 @@ def read_json(file: Path, kind: str) -> Any:
     Args:
         file: The file.
         kind: Description of the file for messages, with an article, such as ``"a report of gpusense bench"``.
-
-    Raises:
-        FileNotFoundError: The file is missing.
-        ValueError: The file is too large, or is not JSON.
     """
     text = _bounded(checks.existing_file(file), _LARGEST_JSON_BYTES, kind)
     try:

@@ -16,11 +16,7 @@ _UNFINISHED: set[Path] = set()
 
 @contextlib.contextmanager
 def naming(path: object) -> Iterator[None]:
-    """Name a file in errors of the operating system that lack a name; a full disk raises one.
-
-    Raises:
-        OSError: The error, with the file's name.
-    """
+    """Name a file in errors of the operating system that lack a name; a full disk raises one."""
     try:
         yield
     except OSError as error:
@@ -30,12 +26,7 @@ def naming(path: object) -> Iterator[None]:
 
 
 def check_writable(path: Path) -> None:
-    """Check that a file can be written, and leave no trace.
-
-    Raises:
-        OSError: The folder is absent or not writable.
-        ValueError: The path names something other than a regular file.
-    """
+    """Check that a file can be written, and leave no trace."""
     if os.path.lexists(path) and not path.is_file():
         raise ValueError(f"{path}: must be a regular file, got another kind")
     _write_fresh(path, lambda stream: stream.write(b"\0"), None)
@@ -47,9 +38,6 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
     Args:
         path: The file; replaced if it exists.
         write: Function that writes the contents to a binary stream.
-
-    Raises:
-        OSError, ValueError: As in :func:`check_writable`, and all exceptions of ``write``.
     """
     # A symbolic link is kept; its target is replaced.
     target = Path(os.path.realpath(path))
@@ -139,11 +127,7 @@ def _remove_unfinished(process: int = os.getpid()) -> None:
 
 
 def unnamed_file() -> IO[bytes]:
-    """Open a temporary file without a name; in memory if no folder can hold it.
-
-    Raises:
-        OSError: Neither is possible.
-    """
+    """Open a temporary file without a name; in memory if no folder can hold it."""
     try:
         return tempfile.TemporaryFile()
     except OSError:

@@ -22,9 +22,6 @@ def inflated(make: Callable[[], Any], data: bytes, most: int) -> bytes:
         make: Constructor of a decompressor with the interface of :class:`bz2.BZ2Decompressor`.
         data: The compressed bytes.
         most: Largest size of the result [bytes].
-
-    Raises:
-        ValueError: The result is longer, or the data end within a frame.
     """
     parts: list[bytes] = []
     total = 0

@@ -44,11 +44,7 @@ def filled(value: Any) -> Any:
 
 
 def unmasked(name: str, value: Any) -> Any:
-    """Return a masked array without masked values as a plain one; other values as they are.
-
-    Raises:
-        ValueError: A value is masked.
-    """
+    """Return a masked array without masked values as a plain one; other values as they are."""
     if not is_masked(value):
         return value
     data, mask = _parts(value)

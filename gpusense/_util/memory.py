@@ -26,9 +26,6 @@ def check_room(name: str, needed: int, what: str) -> None:
         name: Name of the file or argument.
         needed: Memory [bytes].
         what: Contents of the memory, such as ``"20000 x 20000 cells"``.
-
-    Raises:
-        MemoryError: Less memory is free.
     """
     room = available()
     if room is not None and needed > room:

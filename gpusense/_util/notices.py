@@ -9,12 +9,7 @@ _PACKAGE = __name__.partition(".")[0]
 
 
 def warn_user(message: str, category: type[Warning] = UserWarning) -> None:
-    """Warn at the nearest frame outside this package, so that Python shows a message once for each calling line.
-
-    Args:
-        message: The message.
-        category: Class of the warning.
-    """
+    """Warn at the nearest frame outside this package, so that Python shows a message once for each calling line."""
     level, frame = 2, sys._getframe(1)
     while frame.f_back is not None and _is_own(str(frame.f_globals.get("__name__", ""))):
         frame, level = frame.f_back, level + 1

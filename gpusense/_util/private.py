@@ -126,9 +126,6 @@ def read_regular(path: Path, most: int, *, touch: bool = False, head: int | None
         most: Largest size of the file [bytes].
         touch: Whether to set the file's times to now, where that is possible.
         head: Number of leading bytes to read; all by default.
-
-    Raises:
-        OSError: The file is absent, is not a regular file of this user, or is too large.
     """
     # Opening some devices has side effects, so the file type is checked before; the check afterwards holds for the
     # opened file itself.

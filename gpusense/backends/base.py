@@ -84,11 +84,7 @@ class Backend(ABC):
 
     @abstractmethod
     def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
-        """Allocate a buffer of ``count`` numbers, cleared with ``zero``.
-
-        Raises:
-            MemoryError: The device cannot hold it.
-        """
+        """Allocate a buffer of ``count`` numbers, cleared with ``zero``."""
 
     @abstractmethod
     def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
@@ -103,11 +99,7 @@ class Backend(ABC):
 
     @abstractmethod
     def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
-        """Return ``count`` numbers of a buffer from number ``first`` on as ``dtype``, without a copy.
-
-        Raises:
-            ValueError: Parts cannot begin there; see ``alignment``.
-        """
+        """Return ``count`` numbers of a buffer from number ``first`` on as ``dtype``, without a copy."""
 
     # ---- programs
 
@@ -169,11 +161,7 @@ class Backend(ABC):
         return id(buffer)
 
     def check_process(self) -> None:  # noqa: B027
-        """Refuse a forked child of the process that opened the device.
-
-        Raises:
-            RuntimeError: This process is such a child.
-        """
+        """Refuse a forked child of the process that opened the device."""
 
     # ---- arrays of other libraries in the memory of the device
 
@@ -182,12 +170,7 @@ class Backend(ABC):
         return False
 
     def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
-        """Return an array of another library without a copy; a misaligned one is copied unless ``in_place``.
-
-        Raises:
-            TypeError: It is not in this device's memory, or does not hold numbers.
-            ValueError: It must be used in place, and cannot.
-        """
+        """Return an array of another library without a copy; a misaligned one is copied unless ``in_place``."""
         raise TypeError(f"{name}: must be in host memory for {self.info.selection}, got an array on a device")
 
     def view(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> Adopted:

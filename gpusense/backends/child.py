@@ -79,11 +79,7 @@ def can_start() -> bool:
 
 
 def time_limit() -> float:
-    """Return the time limit of a child [s]: ``$GPUSENSE_PROOF_SECONDS``.
-
-    Raises:
-        ValueError: The variable is not a positive number.
-    """
+    """Return the time limit of a child [s]: ``$GPUSENSE_PROOF_SECONDS``."""
     text = os.environ.get("GPUSENSE_PROOF_SECONDS", "")
     try:
         seconds = float(text) if text else _LIMIT

@@ -55,11 +55,7 @@ class ProcessBound:
         self._process = os.getpid()
 
     def check_process(self) -> None:
-        """Refuse a forked child, where the driver would hang or corrupt memory.
-
-        Raises:
-            RuntimeError: This process is not the one that opened the device.
-        """
+        """Refuse a forked child, where the driver would hang or corrupt memory."""
         if os.getpid() != self._process:
             raise RuntimeError(
                 f"{self.info.selection} was opened by process {self._process} and does not survive a fork: start "

@@ -77,9 +77,5 @@ class Library(ABC):
         raise NotImplementedError(f"{type(self).__name__} takes no queues of users")
 
     def open_queue(self, queue: Any, info: BackendInfo) -> Backend:
-        """Return a backend that works on a user's queue.
-
-        Raises:
-            ValueError: The queue is not an in-order queue.
-        """
+        """Return a backend that works on a user's queue."""
         raise NotImplementedError(f"{type(self).__name__} takes no queues of users")

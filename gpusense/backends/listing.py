@@ -84,11 +84,7 @@ def present(entry: Entry) -> tuple[list[Device], list[Device]]:
 
 
 def lookup(selection: str) -> tuple[Library, BackendInfo, Any]:
-    """Return the library, the description and the handle of a device by its selection string.
-
-    Raises:
-        ValueError: The library cannot be imported, or has no such device.
-    """
+    """Return the library, the description and the handle of a device by its selection string."""
     library, reason = registry.load(BY_NAME[selection.partition(":")[0]])
     if library is None:
         raise ValueError(f"backend: {reason}, got {selection!r}")
@@ -108,11 +104,7 @@ def verdict_on(info: BackendInfo, handle: Any, library: Library, *, anew: bool =
 
 
 def open_device(info: BackendInfo) -> Backend:
-    """Open a device without a verdict, with the lanes and precisions that ``info`` says.
-
-    Raises:
-        RuntimeError: Its selection string now means another device.
-    """
+    """Open a device without a verdict, with the lanes and precisions that ``info`` says."""
     library, other, handle = lookup(info.selection)
     if (other.name, other.driver) != (info.name, info.driver):
         raise RuntimeError(f"{info.selection} is {other.name} ({other.driver}), not {info.name} ({info.driver})")

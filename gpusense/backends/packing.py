@@ -29,11 +29,7 @@ def pack(files: dict[str, bytes]) -> bytes:
 
 
 def unpack(payload: bytes) -> dict[str, bytes]:
-    """Return the files of :func:`pack`.
-
-    Raises:
-        ValueError: A path leads out of the folder, the files are too large, or the contents are no packed files.
-    """
+    """Return the files of :func:`pack`."""
     try:
         with zipfile.ZipFile(io.BytesIO(payload)) as archive:
             for name in archive.namelist():
@@ -65,11 +61,7 @@ def _read_all(archive: zipfile.ZipFile) -> dict[str, bytes]:
 
 
 def write_files(folder: Path, files: dict[str, bytes]) -> None:
-    """Write files below a folder, each by rename.
-
-    Raises:
-        OSError: The folder does not take them.
-    """
+    """Write files below a folder, each by rename."""
     for name, data in files.items():
         path = folder / name
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -24,11 +24,7 @@ T = TypeVar("T")
 
 
 class ProgramCache(Generic[T]):
-    """Programs by their keys, in the form in which their owner starts them.
-
-    Args:
-        most: Largest number of programs that are kept.
-    """
+    """Programs by their keys, in the form in which their owner starts them."""
 
     def __init__(self, most: int) -> None:
         self._most, self._kept = most, dict[Hashable, T]()
@@ -56,11 +52,6 @@ class ProgramCache(Generic[T]):
 
 class ChangingProgram:
     """A program without the arguments that change from call to call.
-
-    Args:
-        backend: The device.
-        program: The program.
-        changing: Names of the arguments.
 
     Attributes:
         flags: Flags of its launches.
@@ -113,12 +104,7 @@ class RecordedProgram:
 
 
 class RepeatedPrograms:
-    """Programs that may run again: each is recorded when it runs a second time.
-
-    Args:
-        backend: The device.
-        most: Largest number of programs that are kept.
-    """
+    """Programs that may run again: each is recorded when it runs a second time."""
 
     def __init__(self, backend: Backend, most: int) -> None:
         self._backend, self._programs = backend, ProgramCache[Recording](most)

@@ -133,11 +133,7 @@ def _has_wheel(distribution: str) -> bool:
 
 
 def set_up_child(name: str, setup: Any) -> None:
-    """Prepare a backend in a child as its parent's is; see :meth:`gpusense.backends.library.Library.child_setup`.
-
-    Raises:
-        RuntimeError: The library cannot be imported.
-    """
+    """Prepare a backend in a child as its parent's is; see :meth:`gpusense.backends.library.Library.child_setup`."""
     library, reason = load(BY_NAME[name])
     if library is None:
         raise RuntimeError(reason)

@@ -24,9 +24,6 @@ class Result:
 
     Attributes:
         flat: A flat NumPy array, or a buffer on the device.
-
-    Raises:
-        TypeError, ValueError: ``out`` breaks its rules.
     """
 
     def __init__(

@@ -39,9 +39,6 @@ def scratch_folder(*, executable: bool = True) -> Path:
 
     Args:
         executable: Whether the system must allow code from there to run; some drivers only read the files.
-
-    Raises:
-        OSError: There is no such folder.
     """
     if not executable:
         with contextlib.suppress(OSError):

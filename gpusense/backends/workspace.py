@@ -147,15 +147,7 @@ class Workspace:
         return value if value is None or isinstance(value, (int, float, tuple)) else self._backend.address(value)
 
     def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False, lent: bool = False) -> Buffer:
-        """Return a buffer of at least ``count`` numbers; its old contents are lost.
-
-        Args:
-            name: Its name in this workspace.
-            count: Number of elements.
-            dtype: Their type.
-            zero: Clear a new buffer.
-            lent: Allocate a new buffer that can be lent.
-        """
+        """Return a buffer of at least ``count`` numbers; its old contents are lost."""
         capacity, buffer = self._buffers.get((name, dtype), (0, None))
         if buffer is None or capacity < count:
             self._forget()

@@ -45,22 +45,14 @@ class ChainOptions:
 
 
 def check_steps(name: str, value: object) -> tuple[float, float]:
-    """Return a step in x and y [m], and a turn [rad].
-
-    Raises:
-        TypeError, ValueError: not two finite numbers of at least 0.
-    """
+    """Return a step in x and y [m], and a turn [rad]."""
     values = checks.array(name, value, (2,))
     length = checks.real(f"{name}[0]", float(values[0]), low=0.0, high=checks.FARTHEST)
     return length, checks.real(f"{name}[1]", float(values[1]), low=0.0, high=math.pi + 1e-9)
 
 
 def check_times(times: object, scans: int) -> Floats | None:
-    """Return the times of S scans.
-
-    Raises:
-        TypeError, ValueError: not S finite numbers, or they decrease.
-    """
+    """Return the times of S scans."""
     if times is None:
         return None
     values: Floats = checks.array("times", times, (scans,))
@@ -72,16 +64,7 @@ def check_times(times: object, scans: int) -> Floats | None:
 
 
 def check_durations(duration: object, scanners: int, timed: bool) -> tuple[float, ...]:
-    """Return the times of scans of L scanners from the first beam to the last one [s].
-
-    Args:
-        duration: A number for all, or L numbers.
-        scanners: L.
-        timed: True if the times of the scans are known.
-
-    Raises:
-        TypeError, ValueError: another kind, negative numbers, or numbers without times of the scans.
-    """
+    """Return the times of scans of L scanners from the first beam to the last one [s]."""
     several = scanners > 1 and checks.as_array("duration", duration).ndim == 1
     given = checks.array("duration", duration, (scanners,)).tolist() if several else [duration] * scanners
     values = tuple(float(checks.real("duration", value, low=0.0, high=_LONGEST)) for value in given)

@@ -135,12 +135,7 @@ class ScanChain:
 
 
 def doubts_of(joint: Joint, alone: bool) -> tuple[Doubt, ...]:
-    """Return the stretches that are doubtful.
-
-    Args:
-        joint: The matched scans.
-        alone: True if odometry is missing.
-    """
+    """Return the stretches that are doubtful."""
     failed, open_, nodes = joint.failed, joint.open & alone, joint.nodes
     contested = joint.contested & ~failed & ~open_
     single = (joint.confirmations() == 0) & alone | joint.weak

@@ -69,9 +69,6 @@ def open_backends(selections: Sequence[str] | None) -> tuple[list[Backend], list
 
     Returns:
         Distinct backends, and the errors of devices that were not selected by name.
-
-    Raises:
-        ValueError: a selection names no device that is present.
     """
     from gpusense.backends import devices, get_backend
 
@@ -153,11 +150,7 @@ def _finite(text: str) -> float:
 
 
 class Output:
-    """A type for ``add_argument``: a file to write, which must not be one of the command's other files.
-
-    Args:
-        convert: Function that makes a path from the text.
-    """
+    """A type for ``add_argument``: a file to write, which must not be one of the command's other files."""
 
     def __init__(self, convert: Callable[[str], Path] = Path) -> None:
         self._convert = convert

@@ -141,11 +141,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def make_plan(args: argparse.Namespace) -> tuple[Plan, list[str]]:
-    """Make the plan of a run, and list absent devices with their reasons.
-
-    Raises:
-        ValueError: an option names a scene, method or device that is not present.
-    """
+    """Make the plan of a run, and list absent devices with their reasons."""
     from gpusense.evaluation.benchmark.candidates import candidates
     from gpusense.evaluation.benchmark.runner import Plan
     from gpusense.evaluation.benchmark.scenes import sources

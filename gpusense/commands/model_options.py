@@ -46,12 +46,7 @@ def add_parameters(parser: argparse.ArgumentParser) -> None:
 
 
 def parameters_of(args: argparse.Namespace) -> BeamParameters | LikelihoodFieldParameters:
-    """Return the parameters of the model that the options choose.
-
-    Raises:
-        FileNotFoundError: the file of parameters is missing.
-        ValueError: a parameter breaks its rule or belongs to the other model.
-    """
+    """Return the parameters of the model that the options choose."""
     from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 
     options = {name: getattr(args, name) for name in (*_SHARED, *_SPECIFIC["beam"], *_SPECIFIC["field"])}

@@ -13,12 +13,7 @@ if TYPE_CHECKING:
 
 
 def read_beam_parameters(path: Path) -> BeamParameters:
-    """Read the mapping ``beam_model`` of a YAML file.
-
-    Raises:
-        FileNotFoundError: the file is missing.
-        ValueError: the file lacks the mapping, or a parameter breaks its rule.
-    """
+    """Read the mapping ``beam_model`` of a YAML file."""
     from gpusense.world.parameters import BeamParameters
 
     values = _content(path).get("beam_model")
@@ -46,10 +41,6 @@ def read_localization(path: Path, node: str | None = None) -> Localization:
     Args:
         path: The file.
         node: Name of the node in a file of nav2; None for the only amcl.
-
-    Raises:
-        FileNotFoundError: the file is missing.
-        ValueError: the file has none of these, or a parameter breaks its rule.
     """
     from gpusense._util import checks
     from gpusense.localization.motion import OdometryMotion

@@ -92,11 +92,7 @@ def add_reference(parser: argparse.ArgumentParser) -> None:
 
 @contextlib.contextmanager
 def options_named() -> Iterator[None]:
-    """Name the options of the command line in errors about arguments of the library.
-
-    Raises:
-        ValueError: what a call within raises, with the option's name.
-    """
+    """Name the options of the command line in errors about arguments of the library."""
     try:
         yield
     except ValueError as error:
@@ -112,10 +108,6 @@ def read_scans(args: argparse.Namespace, *, posed: bool = True) -> list[tuple[in
     Args:
         args: Arguments of a command with the options of :func:`add_log` and :func:`add_reference`.
         posed: Whether each scan must have a pose.
-
-    Raises:
-        ValueError: a file breaks its format, no scan is chosen, or a chosen scan has no pose or another scanner.
-        FileNotFoundError: a file is missing.
     """
     from gpusense.evaluation.scoring import chosen_scans, with_one_scanner, with_poses
 
@@ -129,12 +121,7 @@ def read_scans(args: argparse.Namespace, *, posed: bool = True) -> list[tuple[in
 
 
 def read_scan(args: argparse.Namespace) -> Scan:
-    """Read the scan ``--scan`` of ``--log``, the first one by default.
-
-    Raises:
-        FileNotFoundError: the log is missing.
-        ValueError: the log breaks its format, or has fewer scans.
-    """
+    """Read the scan ``--scan`` of ``--log``, the first one by default."""
     from gpusense.logs.merge import read_laser
 
     wanted, index = args.scan or 0, 0
@@ -147,12 +134,7 @@ def read_scan(args: argparse.Namespace) -> Scan:
 
 
 def read_scans_of_lasers(args: argparse.Namespace) -> tuple[list[tuple[int, Scan]], list[int]]:
-    """Read the chosen scans of the lasers of ``--topic`` in the order of their times, and the laser of each.
-
-    Raises:
-        ValueError: a file breaks its format, a laser has no chosen scan, or changes its scanner.
-        FileNotFoundError: a file is missing.
-    """
+    """Read the chosen scans of the lasers of ``--topic`` in the order of their times, and the laser of each."""
     from gpusense.evaluation.steps import read_steps
 
     if len(args.topic) < 2:

@@ -150,11 +150,7 @@ def _draw(path: Path, grid: OccupancyGrid, score: BackendScore, pose: str) -> No
 
 
 def make_models(args: argparse.Namespace, grid: OccupancyGrid, scans: list[tuple[int, Scan]]) -> list[Model]:
-    """Make the model on each distinct backend, with one temperature.
-
-    Raises:
-        ValueError: a backend is absent, or a parameter breaks its rule or belongs to the other model.
-    """
+    """Make the model on each distinct backend, with one temperature."""
     from gpusense.evaluation.fitness import temperature_of_log
     from gpusense.models.scan.beam import BeamModel
     from gpusense.models.scan.field import LikelihoodFieldModel

@@ -93,9 +93,6 @@ def compare_held_out(
         data: The held-out readings.
         readings: Number of readings that the parameters were fitted to.
         incidence: Fit by angles of incidence, or None; ``data`` then has angles.
-
-    Raises:
-        ValueError: every reading is missing.
     """
     known = data.kinds != Reading.MISSING
     if not known.any():

@@ -33,9 +33,6 @@ class DriftingOdometry:
         reverse: Probability that the translation had the opposite direction.
         drift: Random walk of the translation [m / sqrt(s)].
         drift_heading: Random walk of the heading [rad / sqrt(s)].
-
-    Raises:
-        TypeError, ValueError: a number is missing, negative or not finite.
     """
 
     alpha: tuple[float, ...] = ALPHA

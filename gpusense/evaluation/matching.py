@@ -89,9 +89,6 @@ def match_log(
         spread: Largest change of a guess in x and in y [m] and in heading [rad], uniformly at random.
         seed: Seed of these changes.
         noise: Standard deviation of ranges [m]; None for the default of ``match_scan``.
-
-    Raises:
-        ValueError: the guesses need poses that the log lacks, or there is no pair.
     """
     if grid is not None and guess != "logged":
         raise ValueError(f"guess: must be 'logged' with a map, got {guess!r}")

@@ -62,11 +62,7 @@ class RangeData:
         return RangeData(*parts, self.range_max, self.range_min)
 
     def halves(self) -> tuple[RangeData, RangeData]:
-        """Split the data into even and odd blocks.
-
-        Raises:
-            ValueError: there is only one block.
-        """
+        """Split the data into even and odd blocks."""
         odd = self.block % 2 == 1
         if not odd.any():
             raise ValueError("holdout: must have at least 2 blocks of readings, got 1")

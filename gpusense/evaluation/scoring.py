@@ -197,10 +197,6 @@ def chosen_scans(
         limit: Largest number of scans; None for all.
         topic: The laser, see :func:`gpusense.logs.merge.read_laser`; None for the only or main laser.
         options: See :func:`gpusense.read_log`.
-
-    Raises:
-        ValueError: the log breaks its format, or no scan is chosen.
-        FileNotFoundError: the log is missing.
     """
     last = None if limit is None else offset + every * limit
     scans = read_laser(path, topic, **options)
@@ -211,21 +207,13 @@ def chosen_scans(
 
 
 def with_poses(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> list[tuple[int, Scan]]:
-    """Return numbered scans of a log, which must have poses and one scanner.
-
-    Raises:
-        ValueError: a scan has no pose, or another scanner.
-    """
+    """Return numbered scans of a log, which must have poses and one scanner."""
     check_poses(scans, path)
     return with_one_scanner(scans, path)
 
 
 def check_poses(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> None:
-    """Check that numbered scans of a log have poses.
-
-    Raises:
-        ValueError: a scan has none.
-    """
+    """Check that numbered scans of a log have poses."""
     for index, scan in scans:
         if scan.pose is None:
             rule = "every scan must have a pose, of its own or by --reference"
@@ -236,11 +224,7 @@ def check_poses(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> 
 
 
 def with_one_scanner(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> list[tuple[int, Scan]]:
-    """Return numbered scans of a log, which must have one scanner.
-
-    Raises:
-        ValueError: a scan has another scanner.
-    """
+    """Return numbered scans of a log, which must have one scanner."""
     for index, scan in scans:
         check_scanner(scan, scans[0][1].scanner, f"scan {index} of {path}")
     return scans

@@ -55,13 +55,7 @@ class Scene:
 
 
 def scene_in(grid: OccupancyGrid, scanner: Scanner, seed: int = 0) -> Scene:
-    """Simulate a scan with missing and max readings, and draw poses near it, everywhere, off the map and on corners.
-
-    Args:
-        grid: The map.
-        scanner: The scanner.
-        seed: Seed of the random numbers.
-    """
+    """Simulate a scan with missing and max readings, and draw poses near it, everywhere, off the map and on corners."""
     random = np.random.default_rng(seed)
     pose = free_pose(grid, random, 0.2)
     ranges = simulate_scan(grid, scanner, pose, BeamParameters(), random)
@@ -96,9 +90,6 @@ def chosen_backends(selections: Sequence[str] = ()) -> list[Backend]:
 
     Args:
         selections: Selection strings; none selects every backend present except simulators.
-
-    Raises:
-        ValueError: a selection is unknown, or names a device that is absent.
     """
     names = list(selections) or [d.selection for d in devices() if d.available and d.kind != "simulator"]
     if len(names) == 1:

@@ -64,10 +64,6 @@ def read_steps(
         limit: Largest number of scans; None for all. Nothing is read after the last one.
         sensors: Lasers of the log: topics of a bag, front or rear of a CARMEN log; none for its only or main laser.
         options: See :func:`gpusense.read_log`.
-
-    Raises:
-        ValueError: the log breaks its format, has no chosen scan, or a laser changes its geometry.
-        FileNotFoundError: the log is missing.
     """
     chained, last, between = np.zeros(3), None, None
     steps: list[Step] = []
@@ -110,11 +106,7 @@ def repeats_odometry(steps: Sequence[Step]) -> bool:
 
 
 def references_to_learn_from(steps: Sequence[Step]) -> tuple[list[Pose], list[Pose]]:
-    """Return odometry and reference poses of all steps, for a fit of the odometry's noise; NaN without a reference.
-
-    Raises:
-        ValueError: there are fewer than three, or they are the odometry's own poses.
-    """
+    """Return odometry and reference poses of all steps, for a fit of the odometry's noise; NaN without a reference."""
     known = sum(step.reference is not None for step in steps)
     if known < _LEAST_KNOWN:
         raise ValueError(f"--fit-motion: must have poses of the robot at {_LEAST_KNOWN} scans at least, got {known}")
@@ -131,9 +123,6 @@ def with_references(steps: Sequence[Step], times: Floats, poses: Floats) -> list
         steps: Steps.
         times: (T,) increasing times of the trajectory [s].
         poses: (T, 3) its poses.
-
-    Raises:
-        ValueError: no scan has a time of the trajectory.
     """
     found = poses_at([step.scan.time for step in steps], times, poses)
     return [replace(step, reference=pose) for step, pose in zip(steps, found, strict=True)]

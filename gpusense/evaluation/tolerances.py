@@ -48,10 +48,6 @@ class Tolerance:
 
         In units that count, bits are compared: NaN equals NaN, and -0 does not equal 0. In other units equal values
         differ by 0, including infinite ones; a NaN, or an infinity on one side only, gives an infinite difference.
-
-        Args:
-            computed: The array to check.
-            truth: The array to compare it with.
         """
         if self.unit in _COUNTED:
             return differing(computed, truth)
@@ -192,9 +188,6 @@ def scan_tolerance(dtype: DTypeLike, beams: int) -> Tolerance:
     Args:
         dtype: The precision, float32 or float64.
         beams: Number of beams.
-
-    Raises:
-        ValueError: float32 and more than 10 000 beams, for which there is no bound in nats.
     """
     if np.dtype(dtype) == np.float64:
         return TOLERANCES["float64 scan"]

@@ -105,9 +105,6 @@ def start(
         everywhere: Whether the filter starts anywhere on the map.
         pose: The pose; None for the first reference pose.
         covariance: (3, 3) covariance of the start; None for the usual one.
-
-    Raises:
-        ValueError: the first scan has no reference pose, and the start is not everywhere.
     """
     first = steps[0].reference if pose is None else pose
     if everywhere:

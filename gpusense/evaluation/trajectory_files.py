@@ -34,9 +34,6 @@ def write_tum(path: Path, times: Iterable[float], poses: Iterable[Floats], *, in
         times: Times [s].
         poses: Poses (x, y [m], theta), as many.
         indices: Whether the times are indices of scans, which a comment then states.
-
-    Raises:
-        OSError, ValueError: the file cannot be written.
     """
 
     def write(stream: BinaryIO) -> None:
@@ -104,9 +101,6 @@ def poses_at(scans: Sequence[float], times: Floats, poses: Floats) -> list[Pose 
         scans: Times of the scans [s], at least one.
         times: (T,) increasing times of the trajectory [s].
         poses: (T, 3) its poses.
-
-    Raises:
-        ValueError: no scan has a time of the trajectory.
     """
     found = [_pose_at(time, times, poses) for time in scans]
     if not any(found):

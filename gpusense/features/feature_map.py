@@ -127,12 +127,7 @@ class FeatureMap:
 
 
 def kinds_of(kinds: str | Sequence[str], allowed: tuple[str, ...]) -> tuple[str, ...]:
-    """Return kinds as a tuple, checked.
-
-    Raises:
-        TypeError: not a name, nor a sequence of names.
-        ValueError: another kind.
-    """
+    """Return kinds as a tuple, checked."""
     try:
         names = (kinds,) if isinstance(kinds, str) else tuple(kinds)
     except TypeError:

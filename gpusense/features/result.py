@@ -171,12 +171,7 @@ def signature_of(kind: NDArray[np.str_], size: Floats) -> Floats:
 
 
 def check_kinds(name: str, kinds: str | Sequence[str]) -> tuple[str, ...]:
-    """Return kinds as a tuple, checked.
-
-    Raises:
-        TypeError: not a name, nor a sequence of names.
-        ValueError: an unknown kind.
-    """
+    """Return kinds as a tuple, checked."""
     if isinstance(kinds, str):
         return (checks.choice(name, kinds, KINDS),)
     try:

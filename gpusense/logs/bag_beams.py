@@ -31,11 +31,7 @@ _LONGEST = 2.0
 
 
 def geometry_of(message: object) -> Geometry:
-    """Return the geometry that a scan states.
-
-    Raises:
-        ValueError: Its angles are not finite, or its beams coincide.
-    """
+    """Return the geometry that a scan states."""
     return (laser_beams(message), *_limits(message))
 
 
@@ -75,11 +71,7 @@ class Beams:
                                range_max=self.range_max, range_min=self.range_min, mount=mount)  # fmt: skip
 
     def take(self, message: object) -> tuple[Floats, NDArray[np.float32] | None, float]:
-        """Return readings [m], intensities or None, and the duration [s] of a scan on these beams; arrays read-only.
-
-        Raises:
-            ValueError: The message's angles are not finite.
-        """
+        """Return readings [m], intensities or None, and the duration [s] of a scan on these beams; arrays read-only."""
         first, step, count = laser_beams(message)
         ranges = np.array(field_of("message", message, "ranges"), np.float64)[: distinct_beams(step, count)]
         ranges[ranges == 0] = math.nan
@@ -136,9 +128,6 @@ def shared_beams(place: str, found: Counter[Geometry], range_min: float | None, 
         range_min: Replaces the messages' value [m]; None for the most frequent one.
         range_max: Replaces the messages' value [m]; None for the most frequent one.
 
-    Raises:
-        ValueError: The most frequent limit is not a range, and nothing replaces it.
-
     Warns:
         UserWarning: Some scans have other beams or limits, or beams vary.
     """
@@ -176,11 +165,7 @@ def shared_beams(place: str, found: Counter[Geometry], range_min: float | None, 
 
 
 def _most_frequent(place: str, name: str, stated: Counter[float], given: float | None) -> float:
-    """Return the most frequent limit, the larger one of equally frequent ones.
-
-    Raises:
-        ValueError: It is not a range, and nothing replaces it.
-    """
+    """Return the most frequent limit, the larger one of equally frequent ones."""
     if given is not None:
         return given
     value = max(stated, key=lambda each: (stated[each], math.isfinite(each), each))

@@ -95,11 +95,7 @@ class _Chunked(Storage):
 
 
 def _decompressed(data: bytes, chunk: _Chunk) -> bytes:
-    """Decompress a chunk; of a chunk that is cut off, as much as possible.
-
-    Raises:
-        ValueError: It is broken, larger than stated, or compressed in an unknown way.
-    """
+    """Decompress a chunk; of a chunk that is cut off, as much as possible."""
     if chunk.compression in (b"", b"none"):
         return data
     makers: dict[bytes, Callable[[], Any]] = {

@@ -46,11 +46,7 @@ def is_bag_folder(folder: Path) -> bool:
 
 
 def storages(path: Path) -> list[Storage]:
-    """Return the files of a bag in the order of time.
-
-    Raises:
-        ValueError: A file is broken, or compressed as a whole without the folder of its bag.
-    """
+    """Return the files of a bag in the order of time."""
     files = _parts(path) if path.is_dir() else [path]
     packed = [file for file in files if begins(file, ZSTD)]
     metadata = path / "metadata.yaml"
@@ -65,11 +61,7 @@ def storages(path: Path) -> list[Storage]:
 
 
 def _check_parts(metadata: Path, files: list[Path]) -> None:
-    """Check that a folder holds the files that its metadata list; nothing else in them is read.
-
-    Raises:
-        ValueError: A file is absent.
-    """
+    """Check that a folder holds the files that its metadata list; nothing else in them is read."""
     with metadata.open("rb") as stream:
         text = stream.read(_LARGEST_METADATA).decode(errors="replace")
     known = {file.name for file in files} | {file.with_suffix("").name for file in files}
@@ -112,11 +104,7 @@ def _folder() -> Path:
 
 
 def _decompressed(file: Path) -> Path:
-    """Decompress a file, up to a bound.
-
-    Raises:
-        ValueError: The file holds more than the bound, or than the disk.
-    """
+    """Decompress a file, up to a bound."""
     out = _folder() / file.with_suffix("").name
     room = min(most_bytes(file.stat().st_size), shutil.disk_usage(tempfile.gettempdir()).free * 9 // 10)
     with file.open("rb") as packed, zstd().open(packed, "rb") as stream, out.open("wb") as target:

@@ -113,9 +113,6 @@ def chosen_track(
         laser: Frame of the laser.
         wanted: Topic or frame that the user wants.
 
-    Raises:
-        ValueError: The wanted one is absent.
-
     Warns:
         UserWarning: There are several.
     """

@@ -65,9 +65,6 @@ class _Skipped:
 def survey(path: Path, topic: str | None, frame: str | None, odometry_from: str | None) -> Bag:
     """Read everything but readings; arguments as for :func:`gpusense.read_log`.
 
-    Raises:
-        ValueError: The bag has no such laser or odometry, or the user must choose a laser.
-
     Warns:
         UserWarning: Messages are skipped, a choice was made, or odometry is not level or has other times than scans.
     """
@@ -108,11 +105,7 @@ def frame_of(message: object) -> str:
 
 
 def _scan_topic(path: Path, topics: dict[str, list[str]], topic: str | None) -> str:
-    """Return the topic of the scans.
-
-    Raises:
-        ValueError: There is no such topic, or the user must choose one.
-    """
+    """Return the topic of the scans."""
     known = topics.get(SCAN, []) or topics.get(ECHOES, [])
     if not known:
         others = ", ".join(f"{name} ({kind})" for kind, names in sorted(topics.items()) for name in names)
@@ -190,11 +183,7 @@ def _by_the_clock(path: Path) -> TransformBuffer:
 
 
 def _name_frames(bag: Bag, frame: str | None) -> None:
-    """Keep the lasers of a wanted frame; scans without a frame belong to the first one.
-
-    Raises:
-        ValueError: No scan has the wanted frame.
-    """
+    """Keep the lasers of a wanted frame; scans without a frame belong to the first one."""
     unnamed = bag.lasers.pop("", Counter())
     bag.unnamed = next(iter(bag.lasers), "")
     bag.lasers.setdefault(bag.unnamed, Counter()).update(unnamed)

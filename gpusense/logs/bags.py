@@ -39,11 +39,7 @@ class Message(NamedTuple):
 
 
 def topics_of(path: Path) -> dict[str, list[str]]:
-    """Return the topics of a bag, sorted, by the type of their messages; without empty topics, if others have messages.
-
-    Raises:
-        ValueError: The bag is broken.
-    """
+    """Return the sorted topics of a bag by message type; topics without messages only if all are empty."""
     counts: Counter[Topic] = Counter()
     with errors_at(str(path)):
         files = storages(path)
@@ -65,9 +61,6 @@ def messages(path: Path, wanted: Mapping[str, set[str] | None]) -> Iterator[Mess
     Args:
         path: The bag.
         wanted: Wanted topics of each type of message; None for all topics.
-
-    Raises:
-        ValueError: The bag or a message is broken; the error names the file, the topic and the message's number.
     """
 
     def chosen(topic: Topic) -> bool:

@@ -25,14 +25,6 @@ def write_carmen(path: Path, scans: Iterable[Scan]) -> None:
 
     Readings have four decimals; "no return" is the scanner's ``range_max``. A scan without a pose is written with its
     odometry. The format has no mount and no missing readings.
-
-    Args:
-        path: The file.
-        scans: Scans with poses of the laser.
-
-    Raises:
-        ValueError: a scanner has a mount or bearings in uneven steps, or a reading is NaN.
-        OSError: the file cannot be written.
     """
 
     def write(stream: BinaryIO) -> None:

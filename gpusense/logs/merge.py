@@ -26,10 +26,6 @@ def read_laser(
         topic: Topic of the laser in a ROS bag; ``"front"`` or ``"rear"`` for a CARMEN log. None for the laser that
             ``read_log`` takes.
         options: See :func:`gpusense.read_log`.
-
-    Raises:
-        FileNotFoundError: The log is missing.
-        ValueError: The log has no such laser, or is broken.
     """
     form = format_of(checks.path("path", path))
     records = _records(form, path, topic, False, options)
@@ -51,10 +47,6 @@ def read_lasers(
 
     Yields:
         The index of a laser in ``sensors`` with its scan, or 0 with a reading of the odometry.
-
-    Raises:
-        FileNotFoundError: The log is missing.
-        ValueError: The log has no such laser or is broken, or a mount is passed for several lasers.
     """
     for index, name in enumerate(sensors):
         if name in sensors[:index]:

@@ -44,10 +44,6 @@ def read_mrclam(
         robot: N of the files' names, >= 1.
         range_max: Largest range of the sensor [m]; None is the next metre above the largest reading.
         field_of_view: Field of view of the sensor [rad]; None is 2.1 times the largest bearing.
-
-    Raises:
-        FileNotFoundError: A file is missing.
-        TypeError, ValueError: An argument breaks its rule, or a line the format; the message names file and line.
     """
     base = checks.path("folder", folder)
     robot = checks.integer("robot", robot, low=1)

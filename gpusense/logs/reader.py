@@ -177,12 +177,7 @@ def _with_range_min(records: Iterator[Scan | Odometry], range_min: float) -> Ite
 
 
 def format_of(file: Path) -> Format:
-    """Return the format of a log.
-
-    Raises:
-        FileNotFoundError: It is missing.
-        ValueError: It is a folder but no ROS 2 bag.
-    """
+    """Return the format of a log."""
     if file.is_dir():
         if is_bag_folder(file):
             return BAG2
@@ -200,12 +195,7 @@ def format_of(file: Path) -> Format:
 
 
 def _ros_options(form: Format, mount: ArrayLike | None, **others: object) -> dict[str, object]:
-    """Return the checked options of ROS bags.
-
-    Raises:
-        TypeError: A name is no string, or ``mount`` does not hold numbers.
-        ValueError: ``mount`` has another shape, or the format is no bag.
-    """
+    """Return the checked options of ROS bags."""
     for name in ("topic", "frame", "odometry_from"):
         if others[name] is not None and not isinstance(others[name], str):
             raise TypeError(f"{name}: must be a string or None, got {checks.show(others[name])}")

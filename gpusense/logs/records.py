@@ -52,11 +52,7 @@ class Scan:
 
 
 def check_scanner(scan: Scan, scanner: Scanner, where: str) -> None:
-    """Check that a scan of a log comes from the scanner of the scans before.
-
-    Raises:
-        ValueError: The scanners differ.
-    """
+    """Check that a scan of a log comes from the scanner of the scans before."""
     if scan.scanner != scanner:
         remedy = ""
         if scan.scanner.mount != scanner.mount:

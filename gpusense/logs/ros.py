@@ -152,9 +152,6 @@ def _lasers(bag: Bag, given: Pose | None, range_min: float | None, range_max: fl
 def _mounted(bag: Bag, given: Pose | None) -> dict[str, _Laser]:
     """Return the lasers with their mounts, by their frames.
 
-    Raises:
-        ValueError: Only some lasers of the topic have transforms.
-
     Warns:
         UserWarning: A mount contradicts transforms, is not level, moves, is assumed, or serves several lasers.
     """

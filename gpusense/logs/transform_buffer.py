@@ -132,10 +132,6 @@ class TransformBuffer:
         Args:
             message: The transform, read by its fields.
             static: Whether it holds at all times, as on ``/tf_static``.
-
-        Raises:
-            TypeError: A field is absent or not a number.
-            ValueError: A value is not finite, the quaternion is 0, a name is empty, or both frames are the same.
         """
         parent, child = (
             str(field_of("message", message, name)).lstrip("/") for name in ("header.frame_id", "child_frame_id")

@@ -35,12 +35,6 @@ def bands(shape: tuple[int, int], most: int) -> list[Window]:
 class BandCounts:
     """Hits and misses of the cells of a band of a map on a device.
 
-    Args:
-        backend: The device.
-        frame: Frame of the whole map.
-        shape: Rows and columns of the whole map.
-        band: The band.
-
     Attributes:
         rays: Rays that were counted and end in the band, or beside it outside the map.
     """

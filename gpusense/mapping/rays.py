@@ -168,9 +168,6 @@ def check_lengths(ends: RayEnds, resolution: float, first: int) -> None:
         ends: The rays.
         resolution: Side of a cell [m].
         first: Index of the first scan, for the message.
-
-    Raises:
-        ValueError: A ray is too long.
     """
     if len(ends.hit) == 0:
         return
@@ -188,9 +185,6 @@ def extent(boxes: np.ndarray, resolution: float) -> tuple[tuple[float, float, fl
     Args:
         boxes: (S, 4) least x and y and largest x and y of the rays of each scan [m].
         resolution: Side of a cell [m].
-
-    Raises:
-        ValueError: no ray, or a map that is too large or too far from 0.
     """
     low, high = boxes[:, :2].min(axis=0, initial=np.inf), boxes[:, 2:].max(axis=0, initial=-np.inf)
     if not (low <= high).all():

@@ -247,12 +247,7 @@ LIKELIHOOD = Likelihood()
 
 
 def choose(compat: object) -> Likelihood:
-    """Return the peer that ``compat`` names, or ``compat`` if it is a peer; the book's likelihood for None.
-
-    Raises:
-        TypeError: ``compat`` is neither None, a string nor a peer.
-        ValueError: ``compat`` names no peer.
-    """
+    """Return the peer that ``compat`` names, or ``compat`` if it is a peer; the book's likelihood for None."""
     if isinstance(compat, (Amcl, Beluga)):
         return compat
     return LIKELIHOOD if compat is None else PEERS[checks.choice("compat", compat, tuple(PEERS))]

@@ -52,13 +52,7 @@ class Animation:
         self._each, self._scans, self._frames = -(-scans // FRAMES), 0, list[Any]()
 
     def add(self, pf: ParticleFilter, track: Track, step: Step) -> None:
-        """Draw the last scan of a track, if it is one of the frames.
-
-        Args:
-            pf: The filter after the scan.
-            track: The track.
-            step: The scan.
-        """
+        """Draw the last scan of a track, if it is one of the frames."""
         self._scans += 1
         if (self._scans - 1) % self._each:
             return
@@ -78,15 +72,7 @@ class Animation:
         self._frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
 
     def write(self, track: Track, path: Path) -> None:
-        """Write the frames atomically as a GIF that repeats.
-
-        Args:
-            track: The whole track.
-            path: The file.
-
-        Raises:
-            OSError: The file cannot be written.
-        """
+        """Write the frames atomically as a GIF that repeats."""
         from PIL import Image, ImageColor
 
         # Each colour, and its mixtures with white along the edges of shapes.

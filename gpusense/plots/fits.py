@@ -146,12 +146,7 @@ def trace_figure(trace: NDArray[np.float64], method: str) -> Figure:
 
 
 def surface_figure(data: RangeData, parameters: BeamParameters) -> Figure:
-    """Draw log p(z | z*) over readings and expected ranges; the title has log p of a reading without return.
-
-    Args:
-        data: The readings, which set the extent.
-        parameters: The fitted parameters.
-    """
+    """Draw log p(z | z*) over readings and expected ranges; the title has log p of a reading without return."""
     from gpusense.models.scan.densities import log_mixture
 
     figure = new_figure(6.6, 5.2)

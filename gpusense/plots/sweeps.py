@@ -26,9 +26,6 @@ def sweep_figure(columns: Mapping[str, Sequence[Any]]) -> Figure:
 
     Args:
         columns: Columns of a table, as :func:`gpusense.sweep.read_table` returns them.
-
-    Raises:
-        ValueError: no job has an error and a time.
     """
     tasks = [TASKS[task].error for task in dict.fromkeys(columns.get("task", ())) if task in TASKS]
     error = next((name for name in tasks if name in columns), None)

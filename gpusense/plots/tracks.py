@@ -17,12 +17,7 @@ LOGGED, ESTIMATED, CLOUD = "#8fa3b8", "#e4572e", "#4c78a8"
 
 
 def track_figure(pf: ParticleFilter, track: Track) -> Figure:
-    """Draw the map with estimated and reference poses and the last particles, and errors along the track.
-
-    Args:
-        pf: The filter after its last step.
-        track: Its track.
-    """
+    """Draw the map with estimated and reference poses and the last particles, and errors along the track."""
     figure = new_figure(11.0, 6.0)
     axes = figure.subplot_mosaic([["map", "error"], ["map", "explained"]], width_ratios=(1.6, 1.0))
     ax, upper, lower = (axes[name] for name in ("map", "error", "explained"))

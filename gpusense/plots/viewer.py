@@ -28,9 +28,6 @@ _ESTIMATE, _REFERENCE = (228, 87, 46), (143, 163, 184)
 class Recording:
     """Recording of a run, in memory until it is written.
 
-    Args:
-        grid: The map.
-
     Raises:
         ImportError: rerun-sdk is not installed.
     """
@@ -43,13 +40,7 @@ class Recording:
         self._points("map", walls, _WALL, grid.resolution / 2, static=True)
 
     def add(self, pf: ParticleFilter, track: Track, step: Step) -> None:
-        """Record the last scan of a track.
-
-        Args:
-            pf: The filter after the scan.
-            track: The track.
-            step: The scan.
-        """
+        """Record the last scan of a track."""
         rr, pose = self._rr, track.poses[-1]
         self._stream.set_time("scan", sequence=step.index)
         cloud = pf.host_particles()
@@ -64,15 +55,7 @@ class Recording:
         self._stream.log("p_lost", rr.Scalars(float(track.p_lost[-1])))
 
     def write(self, track: Track, path: Path) -> None:
-        """Write the recording atomically as a file .rrd.
-
-        Args:
-            track: The whole track, whose paths are added.
-            path: The file.
-
-        Raises:
-            OSError, ValueError: the file cannot be written.
-        """
+        """Write the recording atomically as a file .rrd."""
         paths = [("path/estimate", np.array(track.poses).reshape(-1, 3), _ESTIMATE)]
         if track.references is not None:
             known = np.isfinite(track.references[:, 0])

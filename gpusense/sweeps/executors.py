@@ -118,11 +118,7 @@ class ProcessExecutor(Executor):
 
 
 def device_names(devices: int | Sequence[str]) -> list[str]:
-    """Return the selection string of each worker; empty strings for a number of workers.
-
-    Raises:
-        TypeError, ValueError: no worker, or no texts.
-    """
+    """Return the selection string of each worker; empty strings for a number of workers."""
     if isinstance(devices, (str, bool)) or not isinstance(devices, (Sequence, int)):
         raise TypeError(f"devices: must be a number or selection strings, got {checks.show(devices)}")
     names = [""] * devices if isinstance(devices, int) else list(devices)

@@ -47,11 +47,7 @@ def read_plan(path: str | os.PathLike[str]) -> tuple[Job, ...]:
 
 
 def jobs_of(document: Mapping[Any, Any]) -> tuple[Job, ...]:
-    """Return the jobs of a plan's mapping.
-
-    Raises:
-        TypeError, ValueError: ``document`` is no plan.
-    """
+    """Return the jobs of a plan's mapping."""
     unknown = [name for name in document if name not in _NAMES]
     if unknown:
         raise ValueError(f"plan: must have {', '.join(_NAMES)} only, got {checks.show(unknown[0])}")

@@ -182,9 +182,6 @@ class Starts:
     def ended(self, window: Callable[[], int]) -> Iterator[Ended]:
         """Yield the jobs in the order in which they end.
 
-        Args:
-            window: Returns the jobs to submit at once.
-
         Raises:
             SweepLost: the executor has ended.
         """

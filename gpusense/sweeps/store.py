@@ -114,16 +114,7 @@ def _chosen(job: Job, group: str = "") -> dict[str, Any]:
 
 
 def contents_of(jobs: Iterable[Job], root: str | Path) -> dict[str, Any]:
-    """Read the maps and the bytes of the logs of jobs, by the paths that the jobs name.
-
-    Args:
-        jobs: The jobs.
-        root: Folder of their files.
-
-    Raises:
-        FileNotFoundError: a file is missing.
-        ValueError: a map breaks its format, or a log is a folder or too large.
-    """
+    """Read the maps and the bytes of the logs of jobs, by the paths that the jobs name."""
     from gpusense.world.map_files import read_map
 
     folder, contents = Path(root), dict[str, Any]()

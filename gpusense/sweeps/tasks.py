@@ -50,15 +50,6 @@ def model_of(job: Job, store: Store, scanner: Scanner, *, temperature: float = 1
     A likelihood field has the defaults of ``gpusense localize``, a beam model the defaults of ``BeamParameters``;
     ``parameters.*`` replace them. ``fit: true`` learns a beam model from the logged poses of the scans that
     ``training.*`` choose. A discrete model without parameters is also learned from these scans.
-
-    Args:
-        job: The job.
-        store: Store of the worker.
-        scanner: The scanner of the log.
-        temperature: Factor of log-likelihoods.
-
-    Raises:
-        TypeError, ValueError: a name or an option breaks its rule.
     """
     checks.choice("model", job.model, MODELS)
     names = {name: job.option(name) for name in MODEL_OPTIONS}
@@ -174,11 +165,7 @@ TASKS: dict[str, Task] = {
 
 
 def task_of(job: Job) -> Callable[[Job, Store], Values]:
-    """Return the function of a job's task.
-
-    Raises:
-        ValueError: there is no such task or function.
-    """
+    """Return the function of a job's task."""
     if ":" not in job.task:
         return TASKS[checks.choice("task", job.task, tuple(TASKS))].run
     module, _, name = job.task.partition(":")
@@ -189,11 +176,7 @@ def task_of(job: Job) -> Callable[[Job, Store], Values]:
 
 
 def check_options(job: Job) -> None:
-    """Check the names of a job's model and options, and the options that choose scans.
-
-    Raises:
-        TypeError, ValueError: the task has no such model or option, or a value breaks its rule.
-    """
+    """Check the names of a job's model and options, and the options that choose scans."""
     checks.choice("model", job.model, MODELS)
     known = (*TASKS[job.task].options, *MODEL_OPTIONS)
     for name, value in job.options:

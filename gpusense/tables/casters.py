@@ -74,9 +74,6 @@ class Bresenham(Caster):
         lines: None; ``"amcl"`` for the lines of nav2_amcl, which extend one cell beyond the ray's end and may be longer
             than range_max; or ``"beluga"`` for Beluga's, which go straight midway between two cells, and meet nothing
             from outside the grid.
-
-    Raises:
-        TypeError, ValueError: ``lines`` is neither None nor one of these words.
     """
 
     lines: str | None = None
@@ -113,9 +110,6 @@ class March(Caster):
         rule: ``"safe"`` shortens steps by sqrt(2) cells, so that only the least step can pass an obstacle. ``"centre"``
             steps by the distance between cell centres, as range_libc and f1tenth_gym do: it is faster, but misses
             corners.
-
-    Raises:
-        TypeError, ValueError: A knob has the wrong type, or is out of range.
     """
 
     tolerance: float = 0.1
@@ -153,9 +147,6 @@ class Cddt(Caster):
         bins: Angle bins of a full turn, 4 to 4096: more bins are more exact and take more memory.
         pruned: Whether to leave out obstacles that begin inside another obstacle of their line. The table is smaller;
             rays from free origins beside that other obstacle may then pass through walls of one cell's thickness.
-
-    Raises:
-        TypeError, ValueError: A knob has the wrong type, or is out of range.
     """
 
     bins: int = 216
@@ -189,9 +180,6 @@ class Lookup(Caster):
     Args:
         bins: Angle bins of a full turn, 4 to 4096: more bins are more exact and take more memory.
         file: Table written by ``RayCaster.save_table`` for the same map, range and number of bins; None makes it.
-
-    Raises:
-        TypeError, ValueError: A knob has the wrong type, or is out of range.
     """
 
     bins: int = 108
@@ -250,12 +238,7 @@ CASTERS = {caster.name: caster for caster in _ALL}
 
 
 def choose(argument: str, value: object, lines: str | None = None) -> Caster:
-    """Return a caster by name, Bresenham with the lines of a program; a caster is returned unchanged.
-
-    Raises:
-        TypeError: The value is neither a name nor a caster.
-        ValueError: The value names no caster.
-    """
+    """Return a caster by name, Bresenham with the lines of a program; a caster is returned unchanged."""
     if isinstance(value, Caster):
         return value
     caster = CASTERS[checks.choice(argument, value, tuple(CASTERS))]

@@ -11,11 +11,7 @@ _MOST_CELLS = (1 << 31) // 4 - 1
 
 
 def check_size(rows: int, cols: int) -> None:
-    """Check that the tables of a window can be indexed.
-
-    Raises:
-        ValueError: There are more than 536 million padded cells.
-    """
+    """Check that the tables of a window can be indexed."""
     if (rows + 4) * (cols + 4) > _MOST_CELLS:
         raise ValueError(f"grid: the part in use must have at most {_MOST_CELLS} cells, got {rows} x {cols}")
 

@@ -22,9 +22,6 @@ def directional_table(obstacles: np.ndarray, bins: int, *, pruned: bool, outside
 
     Returns:
         int32 table.
-
-    Raises:
-        ValueError: There are more than 2^31 entries.
     """
     rows, cols = obstacles.shape
     row, col = _exposed(np.pad(obstacles, 1, constant_values=outside), outside)

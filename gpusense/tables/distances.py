@@ -36,9 +36,6 @@ def squared_distances(backend: Backend, obstacles: np.ndarray, most: int = NO_OB
 
     Returns:
         (rows, cols) int32 on the device; 2^31 - 1 without obstacles.
-
-    Raises:
-        ValueError: There are more cells, or longer sides, than the kernels can index.
     """
     rows, cols = obstacles.shape
     check_size(rows, cols)

@@ -48,11 +48,7 @@ def describe(obstacles: np.ndarray, limit: float, outside: str, bins: int) -> di
 
 
 def write_lookup(path: Path, entries: np.ndarray, description: dict[str, object]) -> None:
-    """Write a table atomically.
-
-    Raises:
-        OSError, ValueError: The file cannot be written.
-    """
+    """Write a table atomically."""
     numbers = np.ascontiguousarray(entries, _DTYPE)
     head = json.dumps({**description, "sha256": _checksum(numbers)}).encode() + b"\n"
 
@@ -64,12 +60,7 @@ def write_lookup(path: Path, entries: np.ndarray, description: dict[str, object]
 
 
 def read_lookup(path: Path, obstacles: np.ndarray, limit: float, outside: str, bins: int) -> np.ndarray:
-    """Read a table after checking that it belongs to these inputs; see :func:`describe`.
-
-    Raises:
-        OSError: The file cannot be read.
-        ValueError: The file is not a table, is damaged, belongs to other inputs, or has an old format.
-    """
+    """Read a table after checking that it belongs to these inputs; see :func:`describe`."""
     required = describe(obstacles, limit, outside, bins)
     count = obstacles.size * bins
     with path.open("rb") as stream:

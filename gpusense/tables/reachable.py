@@ -162,9 +162,6 @@ class ReachableMap:
 
         Returns:
             The new map.
-
-        Raises:
-            TypeError, ValueError: The cells or the place do not fit the grid; nothing has changed.
         """
         grid = self.grid.with_cells(cells, place)  # type: ignore[arg-type]
         row, col = np.asarray(place).tolist()

@@ -35,9 +35,6 @@ class Planes:
     Attributes:
         sectors: Sectors per quadrant: 1, 2 or 4. More sectors make steps longer and tables larger.
         group: Rows of a group: 1, or ``ROWS`` on GPUs.
-
-    Raises:
-        ValueError: ``group`` is another number, which no kernel reads.
     """
 
     sectors: int
@@ -94,9 +91,6 @@ def empty_rectangles(
         planes: How the rectangles are stored.
         rectangles: Planes of the map before the change, refreshed in place; None makes new planes.
         changed: Window whose obstacles changed; None for the whole map.
-
-    Raises:
-        ValueError: Planes for a processor have groups of rows, which its kernels do not write.
     """
     if planes.group > 1 and backend.info.kind == "cpu":
         raise ValueError(f"planes: must have single rows on a processor, got groups of {planes.group}")

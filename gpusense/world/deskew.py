@@ -29,9 +29,6 @@ def check_motion(name: str, motion: object, scans: int) -> Floats | None:
         name: The argument's name.
         motion: (3,) for all scans, or (S, 3), or None.
         scans: S.
-
-    Raises:
-        TypeError, ValueError: The type or the shape is wrong, or a value is not finite.
     """
     if motion is None:
         return None

@@ -84,11 +84,7 @@ class FieldDensity:
         return sums_linearly(self.rand, self.peak, real)
 
     def terms(self, real: np.dtype) -> np.ndarray:
-        """Return the numbers of the kernel file ``field_term``, for a sum of densities or of logarithms.
-
-        Raises:
-            ValueError: Sigma_hit is too small or too large for the precision.
-        """
+        """Return the numbers of the kernel file ``field_term``, for a sum of densities or of logarithms."""
         hit, rand = (self.peak, self.rand) if self.is_linear(real) else (self.log_peak, self.log_rand)
         terms = rounded_terms([hit, self.rate, rand, NoReturn(self.parameters.z_max).number], real)
         return np.append(terms, np.array(self.shape.numbers, real))

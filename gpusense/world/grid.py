@@ -287,11 +287,7 @@ class OccupancyGrid:
 def grid_of_checked(
     cells: NDArray[np.int8], resolution: object, origin: object, *, occupied_threshold: int
 ) -> OccupancyGrid:
-    """Make a map of (H, W) occupancies that are known to be valid; the array is not copied, and becomes read-only.
-
-    Raises:
-        TypeError, ValueError: An argument other than the cells breaks a rule of :class:`OccupancyGrid`.
-    """
+    """Make a map of (H, W) occupancies that are known to be valid; the array is not copied, and becomes read-only."""
     kept = np.ascontiguousarray(cells)
     kept.setflags(write=False)
     return object.__new__(OccupancyGrid)._place(kept, resolution, origin, occupied_threshold)

@@ -51,22 +51,12 @@ class GridFrame(NamedTuple):
 
 
 def check_resolution(value: object) -> float:
-    """Return the side of a cell after checking its bounds [m].
-
-    Raises:
-        TypeError: The value is not a real number.
-        ValueError: The value is out of bounds.
-    """
+    """Return the side of a cell after checking its bounds [m]."""
     return checks.real("resolution", value, low=SMALLEST_RESOLUTION, high=LARGEST_RESOLUTION)
 
 
 def check_origin(value: object) -> tuple[float, float, float]:
-    """Return the pose of a map after checking it [m, m, rad].
-
-    Raises:
-        TypeError: The value does not hold real numbers.
-        ValueError: The shape is wrong, a value is not finite, or a coordinate is out of bounds.
-    """
+    """Return the pose of a map after checking it [m, m, rad]."""
     x, y, yaw = checks.array("origin", value, (3,)).tolist()
     for index, coordinate in enumerate((x, y)):
         checks.real(f"origin[{index}]", coordinate, low=-FARTHEST_ORIGIN, high=FARTHEST_ORIGIN)

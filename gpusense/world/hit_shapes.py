@@ -52,11 +52,7 @@ class HitShape(ABC):
     starts: ClassVar[tuple[tuple[float, ...], ...]] = ((1.0,),)
 
     def __init_subclass__(cls) -> None:
-        """Check the numbers of fitted parameters, limits and coordinates of starts.
-
-        Raises:
-            TypeError: They differ, or are more than one.
-        """
+        """Check the numbers of fitted parameters, limits and coordinates of starts."""
         super().__init_subclass__()
         counts = {len(cls.fitted), len(cls.limits), *(len(start) - 1 for start in cls.starts)}
         if len(counts) > 1 or max(counts) > 1:

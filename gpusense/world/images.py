@@ -61,9 +61,6 @@ def open_raster(stream: BinaryIO, file: Path, size: int) -> Raster:
         stream: The open file.
         file: Name of the file for messages.
         size: Length of the file [bytes].
-
-    Raises:
-        ValueError: The format is unknown, or the file breaks it.
     """
     magic = stream.read(8)
     stream.seek(0)
@@ -166,11 +163,7 @@ class _PlainValues:
         self._ready, self._taken, self._rest, self._ended = np.empty(0, np.uint32), 0, b"", False
 
     def take(self, number: int) -> NDArray[np.uint32]:
-        """Return the next numbers.
-
-        Raises:
-            ValueError: The stream holds something else, or too few numbers.
-        """
+        """Return the next numbers."""
         blocks, have = [self._ready], len(self._ready)
         while have < number:
             if self._ended:

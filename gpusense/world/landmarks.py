@@ -88,11 +88,7 @@ class Buckets:
 
 
 def make_buckets(landmarks: LandmarkMap) -> Buckets:
-    """Sort landmarks into buckets with about two landmarks each.
-
-    Raises:
-        ValueError: The landmarks span an infinite distance.
-    """
+    """Sort landmarks into buckets with about two landmarks each."""
     xy, count = landmarks.xy, len(landmarks)
     low, high = (xy.min(axis=0), xy.max(axis=0)) if count else (np.zeros(2), np.zeros(2))
     most = max(count // _PER_BUCKET, 1)

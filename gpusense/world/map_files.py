@@ -273,11 +273,7 @@ def _frees_unknown(meta: _MapYaml, table: NDArray[np.int8]) -> bool:
 
 
 def _check_no_image(file: Path) -> None:
-    """Refuse an image in place of the YAML file of a map.
-
-    Raises:
-        ValueError: The file is an image; the message names the YAML file that belongs to it, if any.
-    """
+    """Refuse an image in place of the YAML file of a map."""
     if file.suffix.lower() not in _ENDINGS:
         return
     found = next(_yaml_files(file), None)

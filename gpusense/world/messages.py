@@ -23,9 +23,6 @@ def field(name: str, message: object, path: str) -> Any:
         name: Name of the argument, for errors.
         message: An object with attributes, or a mapping with keys.
         path: The field's name, with dots before names of nested fields.
-
-    Raises:
-        TypeError: The message has no such field.
     """
     value = message
     for part in path.split("."):
@@ -36,12 +33,7 @@ def field(name: str, message: object, path: str) -> Any:
 
 
 def real_field(name: str, message: object, path: str) -> float:
-    """Return a field that is a finite real number.
-
-    Raises:
-        TypeError: The field is absent or not a number.
-        ValueError: The number is not finite.
-    """
+    """Return a field that is a finite real number."""
     return checks.real(f"{name}.{path}", _number(message, path, name))
 
 
@@ -62,12 +54,7 @@ def stamp_of(name: str, message: object) -> float:
 
 
 def unit_quaternion(name: str, quaternion: object) -> tuple[float, float, float, float]:
-    """Return (x, y, z, w) of a quaternion with these fields, divided by its norm.
-
-    Raises:
-        TypeError: A field is absent or not a number.
-        ValueError: The quaternion is not finite, or 0.
-    """
+    """Return (x, y, z, w) of a quaternion with these fields, divided by its norm."""
     x, y, z, w = (real_field(name, quaternion, each) for each in "xyzw")
     size = math.hypot(x, y, z, w)
     if not 1e-6 < size < math.inf:
@@ -85,22 +72,12 @@ def rotation_matrix(x: float, y: float, z: float, w: float) -> np.ndarray:
 
 
 def rotation_of(name: str, quaternion: object) -> np.ndarray:
-    """Return the (3, 3) rotation matrix of a quaternion with fields x, y, z and w.
-
-    Raises:
-        TypeError: A field is absent or not a number.
-        ValueError: The quaternion is not finite, or 0.
-    """
+    """Return the (3, 3) rotation matrix of a quaternion with fields x, y, z and w."""
     return rotation_matrix(*unit_quaternion(name, quaternion))
 
 
 def planar_part(name: str, pose: object) -> tuple[tuple[float, float, float], float]:
-    """Return (x, y, yaw) of a pose with fields position and orientation, and its tilt [rad].
-
-    Raises:
-        TypeError: A field is absent or not a number.
-        ValueError: The pose is not finite, or its quaternion is 0.
-    """
+    """Return (x, y, yaw) of a pose with fields position and orientation, and its tilt [rad]."""
     rotation = rotation_of(f"{name}.orientation", field(name, pose, "orientation"))
     x, y = (real_field(name, pose, f"position.{axis}") for axis in "xy")
     return (x, y, math.atan2(rotation[1, 0], rotation[0, 0])), tilt_of(rotation)
@@ -112,12 +89,7 @@ def tilt_of(rotation: np.ndarray) -> float:
 
 
 def planar_pose(name: str, pose: object) -> tuple[float, float, float]:
-    """Return (x, y, yaw) of a pose that must be level.
-
-    Raises:
-        TypeError: A field is absent or not a number.
-        ValueError: The pose is not level, or not finite.
-    """
+    """Return (x, y, yaw) of a pose that must be level."""
     planar, tilt = planar_part(name, pose)
     if tilt > LEVEL:
         rule = "must be level, with a rotation about z only"
@@ -164,12 +136,7 @@ def spread_readings(message: object, places: int, upside_down: bool = False) -> 
 
 
 def laser_beams(message: object) -> tuple[float, float, int]:
-    """Return angle_min, angle_increment and the number of beams of a ``sensor_msgs/LaserScan``.
-
-    Raises:
-        TypeError: A field is absent or not a number.
-        ValueError: An angle is not finite, or several beams have the same bearing.
-    """
+    """Return angle_min, angle_increment and the number of beams of a ``sensor_msgs/LaserScan``."""
     first, step = (real_field("message", message, name) for name in ("angle_min", "angle_increment"))
     count = len(checks.array("message.ranges", field("message", message, "ranges"), ("K",), finite=False))
     if count > 1 and step == 0:
@@ -178,12 +145,7 @@ def laser_beams(message: object) -> tuple[float, float, int]:
 
 
 def _range_limit(message: object, name: str, value: float | None, **rule: float) -> float:
-    """Return a limit of ranges [m], or the value that replaces it.
-
-    Raises:
-        TypeError: The field is absent or not a number.
-        ValueError: The field breaks its rule, and nothing replaces it.
-    """
+    """Return a limit of ranges [m], or the value that replaces it."""
     if value is not None:
         return value
     try:
@@ -199,10 +161,6 @@ def laser_geometry(message: object, range_max: float | None = None, range_min: f
         message: The scan.
         range_max: Upper limit instead of the message's [m].
         range_min: Lower limit instead of the message's [m].
-
-    Raises:
-        TypeError: A field is absent or not a number.
-        ValueError: A value is not finite, or several beams have the same bearing.
     """
     first, step, count = laser_beams(message)
     nearest = _range_limit(message, "range_min", range_min, low=0)

@@ -25,12 +25,7 @@ class _Parameters:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Make parameters from the fields that :meth:`to_dict` returns; a missing field takes its default.
-
-        Raises:
-            TypeError: ``values`` is not a mapping, or a value has the wrong type for its field.
-            ValueError: A key names no field, or a value breaks its field's rule.
-        """
+        """Make parameters from the fields that :meth:`to_dict` returns; a missing field takes its default."""
         if not isinstance(values, Mapping):
             raise TypeError(f"values: must be a mapping, got {checks.show(values)}")
         names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
@@ -41,12 +36,7 @@ class _Parameters:
         return cls(**values)
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with some fields changed.
-
-        Raises:
-            TypeError: A value has the wrong type for its field.
-            ValueError: A name is not a field, or the result breaks a rule.
-        """
+        """Return a copy with some fields changed."""
         return self.from_dict({**self.to_dict(), **changes})
 
     def _check(self, name: str, **limits: float) -> None:

@@ -19,12 +19,7 @@ LARGEST_ANGLE_DEVIATION = 0.349
 
 
 def check_covariance(name: str, value: object) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return ``value`` after checking that it is a symmetric positive definite 2 x 2 matrix.
-
-    Raises:
-        TypeError: The value does not hold numbers.
-        ValueError: The shape differs, or the matrix is not finite, symmetric and positive definite.
-    """
+    """Return ``value`` after checking that it is a symmetric positive definite 2 x 2 matrix."""
     c = checks.array(name, value, (2, 2))
     if abs(c[0, 1] - c[1, 0]) > 1e-9 * math.sqrt(abs(c[0, 0])) * math.sqrt(abs(c[1, 1])):
         raise ValueError(f"{name}: must be symmetric, got {checks.show(c.tolist())}")

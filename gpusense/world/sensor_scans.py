@@ -53,9 +53,6 @@ def check_scans(scans: Any, scanner: Scanner | Sequence[Scanner], sensor: Any, r
         sensor: (S,) indices of the scanners; None for one scanner.
         read: Function that checks and returns the readings of one scanner, from the argument's name, its value and the
             scanner.
-
-    Raises:
-        TypeError, ValueError: An argument has the wrong type or breaks its rule; the message names it.
     """
     if isinstance(scanner, Scanner):
         if sensor is not None:

@@ -21,9 +21,6 @@ class SensorTable(ABC):
         """Return the (bins + 1, bins + 1) table of log densities by bin of the reading, then of the expected range.
 
         Its last row, "no return", holds log probabilities.
-
-        Raises:
-            ValueError: A logarithm does not fit the dtype.
         """
 
     @abstractmethod

@@ -21,11 +21,7 @@ _SPECIFICATION, _SIZE = b"robot_specifications->", b"global_map[0]:"
 
 
 def read_probabilities(file: Path, *, occupied_threshold: int) -> OccupancyGrid:
-    """Read such a map; cells are ``round(100 (1 - p))``, p the probability of being free. The file may be gzipped.
-
-    Raises:
-        ValueError: The file breaks the format; the message names the line and the rule.
-    """
+    """Read such a map; cells are ``round(100 (1 - p))``, p the probability of being free. The file may be gzipped."""
     resolution, columns = _RESOLUTION, []
     for number, line in numbered_lines(file):
         where = f"{file}:{number}"

@@ -18,11 +18,7 @@ if TYPE_CHECKING:
 
 
 def check_in_order(queue: cl.CommandQueue, name: str) -> None:
-    """Refuse a queue that is not an in-order queue.
-
-    Raises:
-        ValueError: Its commands may run out of order.
-    """
+    """Refuse a queue that is not an in-order queue."""
     if queue.properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE:
         raise ValueError(f"{name}: must be an in-order queue, got an out-of-order one")
 
@@ -39,11 +35,7 @@ def alignment_of(device: cl.Device) -> int:
 
 
 def part_of(buffer: Buffer, first: int, size: int, alignment: int) -> Buffer:
-    """Return ``size`` bytes of a buffer from byte ``first`` on, without a copy.
-
-    Raises:
-        ValueError: ``first`` is not a multiple of the alignment.
-    """
+    """Return ``size`` bytes of a buffer from byte ``first`` on, without a copy."""
     if first == 0 or size == 0:
         return buffer
     if isinstance(buffer, SHARED):

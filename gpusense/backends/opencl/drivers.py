@@ -74,11 +74,7 @@ def pocl_came_first() -> bool:
 
 
 def platforms() -> list[cl.Platform]:
-    """Return the platforms of all drivers that can be loaded.
-
-    Raises:
-        RuntimeError: No combination of drivers can be loaded.
-    """
+    """Return the platforms of all drivers that can be loaded."""
     global _loaded, _pocl_came_first
     with _lock:
         if _loaded:

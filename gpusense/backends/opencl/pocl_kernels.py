@@ -39,12 +39,7 @@ _Program = TypeVar("_Program")
 
 
 def own_name(kernel: str, key: str) -> str:
-    """Return the name of a kernel that no kernel of another program has.
-
-    Args:
-        kernel: The kernel's name in its source.
-        key: Key of the program's entry.
-    """
+    """Return the name of a kernel that no kernel of another program has."""
     return f"{kernel}_{_hash(key)}"
 
 
@@ -193,11 +188,7 @@ def trouble_of_own_folder() -> str:
 
 @functools.cache
 def pocl_kernels() -> PoclKernels:
-    """Return the kernels of this process.
-
-    Raises:
-        OSError: No folder takes files.
-    """
+    """Return the kernels of this process."""
     folder = scratch_folder() / "pocl"
     folder.mkdir(exist_ok=True)
     return PoclKernels(folder)

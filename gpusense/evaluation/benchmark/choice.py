@@ -119,9 +119,6 @@ def parse_error(text: str) -> tuple[str, float]:
 
     Returns:
         The unit (``"nats"``, ``"m"``, ``"%"`` or ``"cells"``) and the value in it; for ``"%"`` the share.
-
-    Raises:
-        ValueError: the text is no number with one of these units, or the number is not positive and finite.
     """
     value, unit = _quantity(text, ("nats", "cells", "%", *LENGTHS), "--max-error")
     if unit in LENGTHS:
@@ -130,11 +127,7 @@ def parse_error(text: str) -> tuple[str, float]:
 
 
 def parse_time(text: str) -> float:
-    """Read a limit of the time of a call, such as ``"1 ms"``; return seconds.
-
-    Raises:
-        ValueError: the text is no number with ``s``, ``ms`` or ``us``, or the number is not positive and finite.
-    """
+    """Read a limit of the time of a call, such as ``"1 ms"``; return seconds."""
     value, unit = _quantity(text, tuple(_SECONDS), "--max-time")
     return value * _SECONDS[unit]
 

@@ -123,9 +123,6 @@ def sources(names: Sequence[str] | None = None, maps: Sequence[Path] = (), *, qu
         names: Names of scenes; None for all available scenes, or for ``maps`` alone if there are some.
         maps: map_server YAML files of further scenes, named by their stems.
         quick: Whether generated maps are small, and recorded maps included only by name.
-
-    Raises:
-        ValueError: a scene is unknown or not available, or two scenes have the same name.
     """
     sizes = _QUICK_SIZES if quick else _SIZES
     known = {name: MapSource(name, f"generated, {w:g} x {h:g} m", None, (w, h)) for name, (w, h) in sizes.items()}
@@ -159,10 +156,6 @@ def make_scene(source: MapSource, device: Backend, *, beams: int, particles: int
         beams: K of the scanner.
         particles: N of each cloud.
         seed: Seed of map, pose, scan and clouds.
-
-    Raises:
-        ValueError: the map has no room for a robot.
-        OSError: the map cannot be read.
     """
     grid = source.grid(seed)
     scanner = Scanner.uniform(

@@ -54,11 +54,7 @@ def write_run(run: SimulatedRun, path: str | os.PathLike[str], kind: str | None 
 
 
 def kind_of(path: Path) -> str:
-    """Return the format of a log by its name.
-
-    Raises:
-        ValueError: the name belongs to a file within a bag of ROS 2.
-    """
+    """Return the format of a log by its name."""
     suffix = path.suffix.lower()
     if suffix in (".db3", ".mcap"):
         raise ValueError(

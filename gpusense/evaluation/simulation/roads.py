@@ -24,9 +24,6 @@ class Roads:
         free: (H, W) cells where the robot may be.
         clearance: Least distance of a path from every other cell, and from the grid's edge [m].
         rng: Random generator, which chooses a part with probability proportional to the number of its nodes.
-
-    Raises:
-        ValueError: No two neighbouring nodes have this clearance.
     """
 
     def __init__(self, grid: OccupancyGrid, free: Bools, clearance: float, rng: Rng) -> None:

@@ -32,12 +32,7 @@ _PART = 1 << 18
 
 
 def check_blocks(blocks: ArrayLike, shape: tuple[int, ...], pairs: Pairs) -> NDArray[np.intp]:
-    """Return the (n,) blocks of all readings, numbered from 0 in the order of their labels.
-
-    Raises:
-        TypeError: The labels are not integers.
-        ValueError: The shape differs from that of the readings, or fewer than 2 blocks have a reading.
-    """
+    """Return the (n,) blocks of all readings, numbered from 0 in the order of their labels."""
     labels = checks.as_array("blocks", blocks)
     if labels.dtype.kind not in "iu":
         raise TypeError(f"blocks: must hold integers, got {checks.show(blocks)}")

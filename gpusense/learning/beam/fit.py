@@ -155,9 +155,6 @@ def fit_pairs(
         options: Options of the fit.
         prior: Pseudo-readings.
         chosen: Whether the user chose the start, so that no other replaces it.
-
-    Raises:
-        ValueError: The start makes a reading impossible.
     """
     problem = Problem(device, pairs, bounds, prior, options.range_bias)
     if not math.isfinite(problem.value(start).objective):

@@ -46,9 +46,6 @@ class Binned:
             surface: (n,) mask of readings with a surface.
             angles: (n,) angles of incidence [rad].
             edges: (B + 1,) edges of the bins [rad].
-
-        Raises:
-            ValueError: A bin has neither a reading nor a pseudo-reading.
         """
         incidence_bin = np.digitize(angles, edges[1:-1])
         fits, counts = [], []

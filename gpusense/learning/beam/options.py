@@ -52,11 +52,7 @@ def check_options(
     callback: Callback | None,
     responsibilities: bool,
 ) -> Options:
-    """Check the options of a fit.
-
-    Raises:
-        TypeError, ValueError: As in :func:`fit_beam_parameters`.
-    """
+    """Check the options of a fit."""
     method = checks.choice("method", method, METHODS)
     if max_iterations is None:
         max_iterations = {"em": 500, "em-book": 60}.get(method, 1000)
@@ -80,11 +76,7 @@ def check_options(
 
 
 def open_device(backend: Selection, precision: str | None) -> tuple[Backend, np.dtype]:
-    """Open the device and choose the precision of its kernels.
-
-    Raises:
-        TypeError, ValueError: As in :func:`fit_beam_parameters`.
-    """
+    """Open the device and choose the precision of its kernels."""
     opened = get_backend(backend)
     if precision is None:
         precision = "float64" if opened.info.float64 else "float32"

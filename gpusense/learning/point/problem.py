@@ -116,21 +116,12 @@ def mix(parts: list[tuple[float, Floats]]) -> tuple[Floats, Floats, list[Floats]
 
 
 def check_labels(blocks: object, rows: int) -> Integers:
-    """Return (rows,) labels of blocks.
-
-    Raises:
-        TypeError: The labels are not integers.
-        ValueError: The shape differs.
-    """
+    """Return (rows,) labels of blocks."""
     return checks.array("blocks", blocks, (rows,), dtype=np.int64)
 
 
 def number_blocks(labels: Integers | None) -> Integers | None:
-    """Return the blocks of the readings numbered from 0; None without blocks.
-
-    Raises:
-        ValueError: Fewer than 2 blocks have a reading.
-    """
+    """Return the blocks of the readings numbered from 0; None without blocks."""
     if labels is None:
         return None
     known, numbers = np.unique(labels, return_inverse=True)

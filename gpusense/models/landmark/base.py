@@ -143,9 +143,6 @@ class FeatureModel(PointModel):
         Returns:
             (N, F) int32 indices in the map, -1 where a false positive is likelier or a feature is left out, and (N, F)
             terms of the features in the log-likelihood, before the temperature; always NumPy arrays.
-
-        Raises:
-            TypeError, ValueError: As ``log_likelihood``.
         """
         _, which, parts = self._evaluate(poses, features, None, each=True)
         return which, parts

@@ -62,12 +62,7 @@ def _impossible(full: np.ndarray, p: LandmarkParameters, span: tuple[float, floa
 def possible_features(
     features: object, p: LandmarkParameters, span: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (F, 3) features, all NaN where a part is impossible, and (F,) whether a feature is impossible.
-
-    Raises:
-        TypeError: Not numbers.
-        ValueError: Another shape.
-    """
+    """Return (F, 3) features, all NaN where a part is impossible, and (F,) whether a feature is impossible."""
     full = _read(features, p)
     bad = np.asarray(_impossible(full, p, span).any(axis=1))
     full[bad] = np.nan
@@ -75,12 +70,7 @@ def possible_features(
 
 
 def check_features(features: object, p: LandmarkParameters, span: tuple[float, float]) -> np.ndarray:
-    """Return (F, 3) float64 features, NaN for parts not measured or left out; bearings are in [-pi, pi].
-
-    Raises:
-        TypeError: Not numbers.
-        ValueError: Another shape, or a value outside the sensor's limits.
-    """
+    """Return (F, 3) float64 features, NaN for parts not measured or left out; bearings are in [-pi, pi]."""
     full = _read(features, p)
     half, rules = p.field_of_view / 2, [f"range must be in [0, {p.range_max:.15g}] (range_max)"]
     if full_circle(p):
@@ -103,12 +93,7 @@ def wrapped(angle: np.ndarray) -> np.ndarray:
 
 
 def check_correspondence(correspondence: object, count: int, landmarks: int) -> np.ndarray:
-    """Return the (F,) landmark of each feature, -1 for none.
-
-    Raises:
-        TypeError: Not integers.
-        ValueError: Another shape, or an index outside the map.
-    """
+    """Return the (F,) landmark of each feature, -1 for none."""
     indices = checks.array("correspondence", correspondence, (count,), dtype=np.int64)
     bad = np.flatnonzero((indices < -1) | (indices >= landmarks))
     if len(bad):

@@ -32,12 +32,7 @@ _ALIKE = 0.5
 
 
 def possible_lines(features: object, p: LineParameters) -> tuple[np.ndarray, np.ndarray]:
-    """Return (F, 7) lines, all NaN where impossible or not measured, and (F,) whether they are impossible.
-
-    Raises:
-        TypeError: Not numbers.
-        ValueError: Another shape, or a covariance that is not positive semidefinite.
-    """
+    """Return (F, 7) lines, all NaN where impossible or not measured, and (F,) whether they are impossible."""
     values = checks.as_array("features", features, masked=True)
     values = np.zeros((0, 7)) if values.shape == (0,) else checks.array("features", values, finite=False)
     if values.ndim != 2 or values.shape[1] not in _COLUMNS:

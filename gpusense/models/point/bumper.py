@@ -263,12 +263,7 @@ def _kept(value: Any) -> Any:
 
 
 def sample_outline(outline: object, segments: object, spacing: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the contact radius around an outline's points, the (Q, 2) points, and (B + 1,) starts of segments.
-
-    Raises:
-        TypeError: Not numbers, or segments of a polygon that are no integers.
-        ValueError: A radius that is not positive, fewer than 3 corners, segments of a wrong shape, or too many points.
-    """
+    """Return the contact radius around an outline's points, the (Q, 2) points, and (B + 1,) starts of segments."""
     if isinstance(outline, (int, float, np.integer, np.floating)) and not isinstance(outline, bool):
         radius = checks.real("outline", outline, above=0)
         if segments is None:

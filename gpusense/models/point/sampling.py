@@ -61,11 +61,7 @@ class Draws:
 
 
 def draws_at(poses: Any, backend: Backend, seed: object, step: object) -> Draws:
-    """Return the random numbers of (N, 3) or (S, N, 3) poses.
-
-    Raises:
-        TypeError, ValueError: Poses, seed or step have the wrong type, or are beyond their limits.
-    """
+    """Return the random numbers of (N, 3) or (S, N, 3) poses."""
     key = checks.integer("seed", seed, low=0, high=MOST_SEED)
     first = checks.integer("step", step, low=0, high=MOST_STEP)
     read = arrays.copied_to_host(poses, backend, "poses")

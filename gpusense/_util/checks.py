@@ -162,11 +162,6 @@ def array(
         largest: Largest magnitude of a finite value.
         dtype: Dtype of the result. An integer dtype accepts integers only. None keeps a floating dtype (in the
             machine's byte order) and converts integers to float64.
-
-    Raises:
-        TypeError: The dtype holds no real numbers (object, complex, string, bool), or no integers where ``dtype``
-            requires them.
-        ValueError: The shape or a value breaks the rule.
     """
     if type(value) is np.ndarray and value.dtype == _DOUBLE and (dtype is None or dtype is np.float64):
         # Most arguments are such arrays, and the other checks take five times as long.

@@ -100,12 +100,7 @@ def _events(text: str | bytes) -> Iterator[Any]:
 
 
 def read_mapping(file: Path) -> dict[Any, Any]:
-    """Read the mapping in a YAML file of plain values; numbers are decimal.
-
-    Raises:
-        ValueError: The file is too large, is not plain YAML, holds no mapping or a doubled key, or breaks a bound of
-            :func:`check_yaml`.
-    """
+    """Read the mapping in a YAML file of plain values; numbers are decimal."""
     import yaml
 
     text = _bounded(file, _LARGEST_YAML_BYTES, "a YAML file")

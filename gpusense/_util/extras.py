@@ -64,11 +64,7 @@ def library(module: str, purpose: str) -> ModuleType:
 
 
 def check_library(module: str, purpose: str) -> None:
-    """Check that a library is installed, without importing it.
-
-    Raises:
-        MissingLibraryError: The library is absent.
-    """
+    """Check that a library is installed, without importing it."""
     name = module.partition(".")[0]
     try:
         absent = importlib.util.find_spec(name) is None

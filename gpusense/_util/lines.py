@@ -26,10 +26,6 @@ def numbered_lines(file: Path) -> Iterator[tuple[int, bytes]]:
         The line's number, from 1 on, and the line with its end.
 
     A byte order mark is left out. A truncated compressed file is read up to its end, with a warning.
-
-    Raises:
-        ValueError: A line is too long, or a compressed file is broken or grows without bound; the message begins with
-            file and line.
     """
     number = 0
     mark = b"\xef\xbb\xbf"  # byte order mark of UTF-8

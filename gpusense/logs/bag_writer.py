@@ -49,13 +49,7 @@ def write_bag(path: Path, scans: Iterable[Scan], *, first: bool) -> None:
 
 
 def check_bag(path: Path, *, first: bool) -> None:
-    """Check that a bag can be written.
-
-    Raises:
-        ValueError: The folder of a ROS 2 bag exists, or the name is that of another kind of bag.
-        ImportError: The library rosbags is absent.
-        FileNotFoundError: The bag's parent folder is missing.
-    """
+    """Check that a bag can be written."""
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path.parent}: must be a folder, got none")
     if (path.suffix.lower() == ".bag") != first or path.suffix.lower() in (".db3", ".mcap"):

@@ -203,11 +203,7 @@ def _mounted(bag: Bag, given: Pose | None) -> dict[str, _Laser]:
 
 
 def _by_transforms(bag: Bag, base: str, frame: str) -> _Laser:
-    """Return a laser by the transforms from the robot's base to its frame.
-
-    Raises:
-        TransformError: They are not connected, or never known at the same time.
-    """
+    """Return a laser by the transforms from the robot's base to its frame."""
     buffer = bag.transforms
     try:
         return _Laser(*planar_mount(buffer.fixed(base, frame)))

@@ -88,11 +88,7 @@ class Link:
         self.times, self.values = self.times[first:last], self.values[first * _SIZE : last * _SIZE]
 
     def at(self, time: float) -> Vector:
-        """Return the transform at a time.
-
-        Raises:
-            TransformError: The time is outside the known interval.
-        """
+        """Return the transform at a time."""
         if self.static:
             return self._value(0)
         if not self.times:

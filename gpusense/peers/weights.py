@@ -254,12 +254,7 @@ def choose(compat: object) -> Likelihood:
 
 
 def check_weights(parameters: BeamParameters | LikelihoodFieldParameters, compat: object) -> None:
-    """Check that peers' weights are used only with ``compat``, and only normal hits with it.
-
-    Raises:
-        ValueError: ``parameters`` are a peer's weights and ``compat`` is None, or the shape of their hits differs from
-            the peer's.
-    """
+    """Check that peers' weights are used only with ``compat``, and only normal hits with it."""
     if compat is not None and parameters.hit != "normal":
         raise ValueError(f"hit: must be 'normal' with compat, as in that program, got {parameters.hit!r}")
     if compat is None and isinstance(parameters, (BeamWeights, FieldWeights)):

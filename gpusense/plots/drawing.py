@@ -173,10 +173,6 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     Args:
         figure: The figure.
         path: A path that ends in .png, .pdf, .svg or another format that Matplotlib writes.
-
-    Raises:
-        OSError: the file cannot be written.
-        ValueError: the suffix names no format.
     """
     target = checks.path("path", path)
     kind = target.suffix.lower().removeprefix(".")

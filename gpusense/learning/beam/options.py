@@ -119,10 +119,6 @@ def start_of(initial: BeamParameters, pairs: Pairs, bounds: Bounds, hit: str) ->
         pairs: The readings.
         bounds: Bounds of the shapes.
         hit: Name of the shape of hits that is finally fitted.
-
-    Raises:
-        ValueError: The remaining causes do not explain the readings, sigma_hit grows with range, or the shape of
-            hits is neither the normal nor that of the fit.
     """
     if initial.hit not in ("normal", hit):
         raise ValueError(f"initial: hit must be 'normal' or that of the fit, {hit!r}, got {checks.show(initial)}")

@@ -70,11 +70,6 @@ def make_pairs(ranges: ArrayLike, expected: ArrayLike, range_max: float, range_m
         expected: Expected ranges of the same shape [m].
         range_max: Longest range [m].
         range_min: Shortest range [m].
-
-    Raises:
-        TypeError: An argument does not hold real numbers.
-        ValueError: The shapes differ, every reading is missing, or an expected range is not in [0, range_max] beside a
-            reading that is not missing.
     """
     range_max = checks.real("range_max", range_max, low=checks.SMALLEST, high=checks.FARTHEST)
     range_min = checks.real("range_min", range_min, low=0, below=range_max)

@@ -25,10 +25,6 @@ def check_pairs(ranges: object, expected: object, range_max: float) -> tuple[NDA
 
     Returns:
         float64 readings, NaN for missing and inf for no return, and float64 expected ranges, inf for no obstacle.
-
-    Raises:
-        TypeError, ValueError: An array does not hold real numbers, the shapes differ, or an expected range is negative
-            or NaN beside a reading that is not missing.
     """
     z = checks.array("ranges", ranges, finite=False, dtype=None)
     z_exp = checks.array("expected", expected, z.shape, finite=False, dtype=None)

@@ -185,11 +185,7 @@ def output_path(*suffixes: str) -> Output:
 
 
 def check_writer(suffix: str) -> None:
-    """Check that the library that writes files with a suffix is installed.
-
-    Raises:
-        argparse.ArgumentTypeError: it is absent; the message has the command that installs it.
-    """
+    """Check that the library that writes files with a suffix is installed."""
     if suffix not in _WRITERS:
         return
     try:

@@ -41,9 +41,6 @@ def report(
 
     Returns:
         The figures of :func:`gpusense.evaluation.tracking.summary`.
-
-    Raises:
-        OSError, ValueError: a file cannot be written.
     """
     from gpusense.evaluation.tracking import summary
     from gpusense.evaluation.trajectory_files import write_tum

@@ -23,11 +23,7 @@ if TYPE_CHECKING:
 
 
 def read_parameters(args: argparse.Namespace) -> Localization:
-    """Read ``--parameters``, and print which parameters of a nav2 file have no effect.
-
-    Raises:
-        ValueError: the file breaks its format.
-    """
+    """Read ``--parameters``, and print which parameters of a nav2 file have no effect."""
     if args.parameters is None:
         if args.node is not None:
             raise ValueError(f"--node: must come with --parameters, got {args.node} alone")
@@ -40,11 +36,7 @@ def read_parameters(args: argparse.Namespace) -> Localization:
 
 
 def read_chosen(args: argparse.Namespace, read: Localization) -> list[Step]:
-    """Read the chosen scans, with the poses of ``--reference`` if it is given.
-
-    Raises:
-        ValueError: a file breaks its format, or has no chosen scan or pose.
-    """
+    """Read the chosen scans, with the poses of ``--reference`` if it is given."""
     from gpusense.evaluation.steps import read_steps, with_references
     from gpusense.evaluation.trajectory_files import read_tum
 
@@ -86,11 +78,7 @@ def start_of(args: argparse.Namespace, nav2: Nav2Options | None) -> tuple[Any, A
 
 
 def make_filter(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step], read: Localization) -> ParticleFilter:
-    """Make the filter, with a model for each laser; options of the command line override the file.
-
-    Raises:
-        ValueError: an option breaks its rule, or the backend is absent.
-    """
+    """Make the filter, with a model for each laser; options of the command line override the file."""
     from gpusense.localization.filter import ParticleFilter
     from gpusense.models.scan.beam import BeamModel
     from gpusense.models.scan.field import LikelihoodFieldModel

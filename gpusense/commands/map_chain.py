@@ -62,21 +62,13 @@ def add_chain(parser: argparse.ArgumentParser) -> None:
 
 
 def check_chain(args: argparse.Namespace) -> None:
-    """Check that a chain and a trajectory are not both requested.
-
-    Raises:
-        ValueError: both are requested.
-    """
+    """Check that a chain and a trajectory are not both requested."""
     if args.chain and args.reference is not None:
         raise ValueError("--chain: must not be used with --reference, which has the poses, got both")
 
 
 def is_chained(args: argparse.Namespace, scans: Scans) -> bool:
-    """Return whether the poses are found by a chain, and check the options that need one.
-
-    Raises:
-        ValueError: an option needs a chain.
-    """
+    """Return whether the poses are found by a chain, and check the options that need one."""
     chained = args.chain or (args.reference is None and any(scan.pose is None for _, scan in scans))
     for name in ("tum", "poses", "plot", "no_odometry", "no_loops"):
         if not chained and getattr(args, name):

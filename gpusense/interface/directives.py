@@ -43,10 +43,6 @@ def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
         text: The source.
         flags: The flags that are set.
         name: Name of the file for messages.
-
-    Raises:
-        ValueError: A condition is not a single known flag, or a directive is unknown or unbalanced; the message
-            begins with file and line.
     """
     kept: list[str] = []
     open_branches: list[_Branches] = []

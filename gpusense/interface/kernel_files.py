@@ -20,11 +20,7 @@ _LOCK = threading.Lock()
 
 @functools.cache
 def kernel_root() -> Path:
-    """Return the folder that holds ``opencl/`` and ``warp/``.
-
-    Raises:
-        FileNotFoundError: The folder is neither inside the package nor next to it.
-    """
+    """Return the folder that holds ``opencl/`` and ``warp/``."""
     package = Path(__file__).resolve().parents[1]
     candidates = (package / "kernels", package.parent / "kernels")
     for root in candidates:
@@ -40,9 +36,6 @@ def opencl_source(name: str) -> str:
 
     Args:
         name: The file's name with its subfolder and without its suffix: ``"beam"``, ``"lanes/beam"``.
-
-    Raises:
-        FileNotFoundError: No such file exists; the message lists the names of all files.
     """
     folder = kernel_root() / "opencl"
     try:
@@ -69,9 +62,6 @@ def warp_module(name: str) -> ModuleType:
 
     Args:
         name: The file's name without its suffix.
-
-    Raises:
-        ModuleNotFoundError: No such file exists, or Warp is not installed.
     """
     _register_package()
     return importlib.import_module(f"{_PACKAGE}.warp.{name}")

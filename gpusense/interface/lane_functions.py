@@ -55,9 +55,6 @@ def written_in_lanes(text: str, file: str, sources: dict[str, str]) -> str:
         text: The text, with the branches that the flags select.
         file: The file's name.
         sources: Texts of the scalar file and of the required ones, by name, likewise.
-
-    Raises:
-        ValueError: No source has a definition of that name.
     """
     if not takes_scalar_text(text):
         return text

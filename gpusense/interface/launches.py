@@ -91,12 +91,7 @@ class _Row:
         self.accepted: set[tuple[type, ...]] = set()
 
     def check(self, types: tuple[type, ...]) -> None:
-        """Check the types of arguments against the row.
-
-        Raises:
-            TypeError: A number replaces a buffer, a buffer a number, a real number an integer, or a struct is of
-                another type.
-        """
+        """Check the types of arguments against the row."""
         for argument, kind in zip(self._row.arguments, types, strict=True):
             is_number = issubclass(kind, _NUMBERS)
             if argument.shape is not None:

@@ -66,11 +66,7 @@ def parameters(kernel: str) -> str:
 
 
 def source_text(file: str) -> str:
-    """Return the text of a kernel file with the parameters of its kernels.
-
-    Raises:
-        ValueError: A kernel has no row in the signature table.
-    """
+    """Return the text of a kernel file with the parameters of its kernels."""
     return _with_parameters(opencl_source(file), file)
 
 

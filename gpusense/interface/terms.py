@@ -19,11 +19,7 @@ def sums_linearly(rand: float, peak: float, real: np.dtype) -> bool:
 
 
 def rounded_terms(terms: list[float], real: np.dtype) -> np.ndarray:
-    """Return the numbers of a mixture in a model's precision, then the rounding errors of the first two.
-
-    Raises:
-        ValueError: Sigma_hit or lambda_short is too small or too large for the precision.
-    """
+    """Return the numbers of a mixture in a model's precision, then the rounding errors of the first two."""
     with np.errstate(over="ignore"):
         rounded = np.array(terms).astype(real)
     # Logarithms of zero weights are -inf; no other number may be infinite.

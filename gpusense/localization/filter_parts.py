@@ -60,11 +60,7 @@ class FilterParts:
         return self, self.tracker, self.tracker.cloud, self.verdict, *self.sensors, *self.recovery.changing()
 
     def check_started(self) -> None:
-        """Refuse to continue without particles.
-
-        Raises:
-            RuntimeError: there are no particles.
-        """
+        """Refuse to continue without particles."""
         if not self.tracker.started:
             raise RuntimeError(
                 "ParticleFilter: must be initialised first, by initialize, initialize_uniform or initialize_from"

@@ -223,11 +223,7 @@ def plain_state(owner: Any, *, without: Collection[str] = ()) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Return a copy of a value as plain data.
-
-    Raises:
-        _NotPlainError: the value is not plain data.
-    """
+    """Return a copy of a value as plain data."""
     kind = type(value)
     if isinstance(value, np.ndarray):
         return value.copy()

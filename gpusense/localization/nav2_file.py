@@ -43,10 +43,6 @@ def parameters_of(content: Mapping[str, Any], name: str, node: str | None, known
         name: Name of the file.
         node: Name of the node, with or without its namespaces; None for the only node named amcl.
         known: Names of amcl's parameters.
-
-    Raises:
-        TypeError: ``node`` is no string.
-        ValueError: There is no such node, or more than one; a parameter has two values; or the names are from ROS 1.
     """
     if node is not None and not isinstance(node, str):
         raise TypeError(f"node: must be a string or None, got {checks.show(node)}")
@@ -161,9 +157,6 @@ def first_pose(name: str, parameters: Mapping[str, Any]) -> Row:
     Args:
         name: Name of the file.
         parameters: Parameters by dotted names.
-
-    Raises:
-        TypeError, ValueError: A part is no finite number.
     """
     if _START in parameters:
         raise TypeError(f"{name}: {_START}: must be a mapping, got {checks.show(parameters[_START])}")
@@ -172,11 +165,7 @@ def first_pose(name: str, parameters: Mapping[str, Any]) -> Row:
 
 
 def first_covariance(name: str, parameters: Mapping[str, Any]) -> Matrix | None:
-    """Return the covariance of the first pose; None where the file has no part of it.
-
-    Raises:
-        TypeError, ValueError: A part is no finite number, or the matrix is not positive semidefinite.
-    """
+    """Return the covariance of the first pose; None where the file has no part of it."""
     if not any(key in parameters for key in _COVARIANCES):
         return None
     xx, xy, xt, yy, yt, tt = (checks.real(f"{name}: {key}", parameters.get(key, 0.0)) for key in _COVARIANCES)

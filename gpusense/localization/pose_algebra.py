@@ -136,10 +136,6 @@ def _poses(name: str, poses: object) -> np.ndarray:
 
 
 def _pair(name: str, poses: object, other_name: str, others: object) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays of poses whose shapes broadcast.
-
-    Raises:
-        TypeError, ValueError: They are no poses, or their shapes do not broadcast.
-    """
+    """Return two arrays of poses whose shapes broadcast."""
     one, two = checks.broadcast({name: _poses(name, poses), other_name: _poses(other_name, others)})
     return one, two

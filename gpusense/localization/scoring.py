@@ -30,10 +30,6 @@ def readings_of(readings: Any, sensors: Sequence[Sensor]) -> list[SensorReadings
         readings: The reading of the only sensor, or a mapping from models to readings. A tuple that begins with an
             array holds several arguments; any other tuple is an array itself.
         sensors: The sensors.
-
-    Raises:
-        KeyError: a model that no sensor has.
-        TypeError: there are several sensors, and ``readings`` is no mapping.
     """
     if isinstance(readings, Mapping):
         index = {id(sensor.model): i for i, sensor in enumerate(sensors)}

@@ -193,11 +193,6 @@ def sensors_of(models: Any) -> list[Sensor]:
 
     Args:
         models: A measurement model, or several.
-
-    Raises:
-        TypeError: another object.
-        ValueError: there are none, too many, or one twice, or they have a temperature, several devices or precisions,
-            or a device without float64.
     """
     chosen = list(models) if isinstance(models, Sequence) else [models]
     if not 0 < len(chosen) <= _MOST_SENSORS:

@@ -43,11 +43,7 @@ def _wrapped(poses: np.ndarray) -> np.ndarray:
 
 
 def normal(mean: Any, covariance: Any, count: int, key: Key) -> np.ndarray:
-    """Draw poses from a normal density.
-
-    Raises:
-        TypeError, ValueError: not a mean and a covariance.
-    """
+    """Draw poses from a normal density."""
     centre, matrix = checks.array("mean", mean, (3,)), checks.array("covariance", covariance, (3, 3))
     if np.abs(matrix - matrix.T).max() > 1e-9 * max(np.abs(matrix).max(), 1e-300):
         raise ValueError("covariance: must be symmetric, got one that is not")
@@ -80,11 +76,7 @@ def spread(pool: np.ndarray, half: Spread, count: int, key: Key, *, each: bool =
 
 
 def free_pool(models: Sequence[Any], bounds: Any) -> tuple[np.ndarray, Spread]:
-    """Return the centres of free cells of the first map among the models, and half widths with any heading.
-
-    Raises:
-        TypeError, ValueError: bounds that are not two corners, no map and no bounds, or no free cell.
-    """
+    """Return the centres of free cells of the first map among the models, and half widths with any heading."""
     box = None if bounds is None else checks.array("bounds", bounds, (2, 2))
     grid = next((model.grid for model in models if hasattr(model, "grid")), None)
     if grid is None:
@@ -115,11 +107,7 @@ def rows_by_weight(weights: np.ndarray, count: int, start: float = 0.5) -> np.nd
 
 
 def likely_pool(likelihood: Any, count: int, key: Key) -> tuple[np.ndarray, Spread]:
-    """Return poses drawn by their likelihood, and half widths of a cell of the likelihood's grid.
-
-    Raises:
-        TypeError, ValueError: ``likelihood`` has no such arrays, or no finite log-likelihood.
-    """
+    """Return poses drawn by their likelihood, and half widths of a cell of the likelihood's grid."""
     if not hasattr(likelihood, "log_p") or not (hasattr(likelihood, "poses") or hasattr(likelihood, "positions")):
         raise TypeError(f"likelihood: must be one of pose_likelihood, got {checks.show(likelihood)}")
     shape = np.shape(likelihood.log_p)

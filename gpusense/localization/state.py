@@ -117,12 +117,7 @@ def readings_on_host(readings: Mapping[int, tuple[Any, ...]], backend: Backend) 
 
 
 def check_state(state: object, options: dict[str, Any], models: tuple[str, ...]) -> FilterState:
-    """Check that a state is of a filter with these options and models; the motion model may differ.
-
-    Raises:
-        TypeError: ``state`` is no FilterState.
-        ValueError: it belongs to a filter with another option or other models.
-    """
+    """Check that a state is of a filter with these options and models; the motion model may differ."""
     checked = checks.instance("state", state, FilterState)
     if checked.models != models:
         raise ValueError(f"state: must be of a filter of {', '.join(models)}, got one of {', '.join(checked.models)}")

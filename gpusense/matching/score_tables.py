@@ -50,9 +50,6 @@ class ScoreTables:
         shape: Sizes of the tables, as kernels take them.
         levels: Number of times that tables can be pooled.
         stride: Cells between neighbouring positions.
-
-    Raises:
-        ValueError: more cells than kernels can index.
     """
 
     def __init__(

@@ -78,11 +78,7 @@ def covariance_fields(covariance: np.ndarray) -> list[float]:
 
 
 def covariance_of(numbers: Any) -> np.ndarray:
-    """Return the (3, 3) covariance of x, y and yaw out of the 36 numbers of geometry_msgs/PoseWithCovariance.
-
-    Raises:
-        ValueError: A number is not finite, or the covariance is not positive semidefinite.
-    """
+    """Return the (3, 3) covariance of x, y and yaw out of the 36 numbers of geometry_msgs/PoseWithCovariance."""
     full = np.asarray(numbers, np.float64).reshape(6, 6)
     part = full[np.ix_((0, 1, 5), (0, 1, 5))]
     if not np.isfinite(part).all():
@@ -102,10 +98,6 @@ def start_of(message: Any, frame: str) -> tuple[Pose, np.ndarray]:
     Args:
         message: The pose.
         frame: Frame in which it must be given.
-
-    Raises:
-        TypeError: A field is absent or not a number.
-        ValueError: The pose is in another frame, not finite or not level, or its covariance is none.
     """
     named = str(field("message", message, "header.frame_id")).lstrip("/")
     if named != frame.lstrip("/"):
@@ -133,10 +125,6 @@ def laser_scan(
         laser: (4, 4) pose of the laser on the robot's base. If it is upside down, the beams run clockwise.
         limits: Narrow the message's ``range_min`` and ``range_max``, as in nav2_amcl, or replace them where they are no
             such limits [m]; None for the message's values.
-
-    Raises:
-        TypeError: A field is absent or not a number.
-        ValueError: A field breaks a rule.
     """
     mount, upside_down, _ = planar_mount(laser)
     names = ("angle_min", "angle_increment", "range_min", "range_max", "ranges")

@@ -68,11 +68,7 @@ class Localizer:
             self.start_at(options.initial_pose, np.asarray(covariance))
 
     def warm_up(self) -> None:
-        """Open the device, and compile what scans need, on the map or a made-up room.
-
-        Raises:
-            TypeError, ValueError: The device is absent, or a parameter breaks a rule.
-        """
+        """Open the device, and compile what scans need, on the map or a made-up room."""
         cells = np.zeros((80, 80), np.int8)
         cells[[0, -1]] = cells[:, [0, -1]] = 100
         grid = OccupancyGrid(cells, 0.1) if self.grid is None else self.grid

@@ -34,10 +34,6 @@ def options_of(values: Mapping[str, Any]) -> tuple[Nav2Options, tuple[str, ...]]
     Args:
         values: Parameters of the node by dotted names. Where ``parameters`` names a file, it replaces those of
             nav2_amcl, save for a first pose.
-
-    Raises:
-        OSError: The file cannot be read.
-        TypeError, ValueError: A parameter breaks a rule.
     """
     _check_own(values)
     first = {name: value for name, value in values.items() if name.startswith("initial_pose.")}
@@ -70,11 +66,7 @@ def _check_own(values: Mapping[str, Any]) -> None:
 
 
 def mount_of(value: Any) -> tuple[float, float, float] | None:
-    """Return the pose (x, y, yaw) of the laser on the robot; None where transforms give it.
-
-    Raises:
-        TypeError, ValueError: The value is neither empty nor three finite numbers.
-    """
+    """Return the pose (x, y, yaw) of the laser on the robot; None where transforms give it."""
     if not len(value):
         return None
     x, y, yaw = checks.array("mount", list(value), (3,)).tolist()
@@ -89,12 +81,7 @@ WATCH: dict[str, Any] = {
 
 
 def check_watch(values: Mapping[str, Any]) -> None:
-    """Check the parameters of the watching node.
-
-    Raises:
-        OSError: The map is missing.
-        TypeError, ValueError: A parameter breaks a rule.
-    """
+    """Check the parameters of the watching node."""
     for name in ("laser_max_range", "patience", "tolerance"):
         checks.real(name, values[name], above=0)
     mount_of(values["mount"])

@@ -85,11 +85,7 @@ class Watcher:
         self._scans.append((stamp_of("message", message), scanner, np.array(fields["ranges"], np.float64)))
 
     def add_pose(self, message: Any) -> bool:
-        """Take a geometry_msgs/PoseWithCovarianceStamped; return whether there was a map, and a scan of its time.
-
-        Raises:
-            ValueError: The pose is in another frame, not finite or not level, or its covariance is none.
-        """
+        """Take a geometry_msgs/PoseWithCovarianceStamped; return whether there was a map, and a scan of its time."""
         pose, covariance = start_of(message, self.frame)
         time = stamp_of("message", message)
         nearest = min(self._scans, key=lambda scan: abs(scan[0] - time), default=None)

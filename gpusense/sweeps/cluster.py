@@ -334,9 +334,6 @@ def security_of(authority: Path, certificate: Path, key: Path) -> Any:
         authority: Certificate of the authority that has signed the cluster's certificates.
         certificate: Certificate of the client.
         key: Private key of the client.
-
-    Raises:
-        ImportError: Dask is not installed.
     """
     return library("distributed", "a sweep on Dask").Security(
         tls_ca_file=str(authority), tls_client_cert=str(certificate), tls_client_key=str(key), require_encryption=True

@@ -47,11 +47,7 @@ class Store:
         self._sent.update(sent)
 
     def path(self, name: str) -> Path:
-        """Return the path of a log or another file.
-
-        Raises:
-            ValueError: the name is empty.
-        """
+        """Return the path of a log or another file."""
         if not name:
             raise ValueError("job: must name a map and a log, got an empty name")
         sent = self._sent.get(name)

@@ -223,11 +223,7 @@ class LocalizationNode(LifecycleNode):
             self.get_logger().warning(f"a scan is skipped: {self.queue.reason}", throttle_duration_sec=2.0)
 
     def look_up(self, message: LaserScan) -> tuple[Pose, Any]:
-        """Return the pose of the base in the odometry frame at a scan's stamp, and the laser's (4, 4) on the base.
-
-        Raises:
-            TransformError: They are not known yet.
-        """
+        """Return the pose of the base in the odometry frame at a scan's stamp, and the laser's (4, 4) on the base."""
         laser = self.transforms.laser(message.header.frame_id)
         odometry = self.transforms.buffer.look_up(*self.options.frames[1:], stamp_of("message", message))
         return conversions.planar(odometry), laser

@@ -154,11 +154,7 @@ class Transforms:
             self.subscriptions.append(node.create_subscription(Odometry, odometry, self._take_odometry, 50))
 
     def laser(self, frame: str) -> np.ndarray:
-        """Return the (4, 4) pose of a laser on the robot's base.
-
-        Raises:
-            TransformError: It is not known yet.
-        """
+        """Return the (4, 4) pose of a laser on the robot's base."""
         if self.mount is not None:
             return pose_matrix(self.mount)
         matrix = self.buffer.look_up(self.frames[1], frame)

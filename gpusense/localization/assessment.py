@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.localization.estimates import Estimate, clustered
+from gpusense.localization.pose_algebra import wrap_angle
+from gpusense.localization.protection import WIDENING, Distances
 from gpusense.localization.recovery import Recovery
-from gpusense.localization.spread import Spread, share_off, share_off_of, spread_of
+from gpusense.localization.spread import share_off, share_off_of, spread_of
 from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import Verdict
 from gpusense.localization.words import word_of
@@ -25,31 +27,41 @@ def estimate_of(tracker: Tracker, verdict: Verdict, recovery: Recovery, method: 
         method: "mean", "cluster" or "best".
     """
     cloud, shown = tracker.cloud, tracker.shown
-    pose, covariance = tracker.mean_and_covariance()
+    mean, covariance = tracker.mean_and_covariance()
+    pose, about = mean, covariance
     summary = cloud.summary()
     if method == "best":
         pose = tracker.host_particles()[int(np.argmax(cloud.host_weights(shown)))]
     elif method == "cluster":
         pose, covariance = clustered(tracker.host_particles(), cloud.host_weights(shown))
-    spread = spread_of(covariance)
-    p_lost = _p_lost(tracker, verdict, recovery, pose, covariance, spread)
-    word = word_of(p_lost, verdict.wrong, wide=spread.wide, apart=spread.apart)
-    temperature = tracker.sensors[0].temperature(tracker.options.temperature)
-    return Estimate(
-        pose, covariance, tracker.sample_size(), p_lost, word, verdict.state.explained, temperature,
-        summary.temperature, summary.degenerate, shown,
-    )  # fmt: skip
-
-
-def _p_lost(
-    tracker: Tracker, verdict: Verdict, recovery: Recovery, pose: np.ndarray, covariance: np.ndarray, spread: Spread
-) -> float:
-    """Return the probability that a pose is far off, according to scans and particles."""
-    if spread.narrow or tracker.shown > _MOST_LOOKED_AT:
-        share = share_off(covariance)
-    else:
-        share = share_off_of(tracker.host_particles(), tracker.cloud.host_weights(tracker.shown), pose)
+    if method != "mean":
+        offset = pose - mean
+        offset[2] = wrap_angle(offset[2])
+        about = about + np.outer(offset, offset)
+    share, distances = _spread_about(tracker, pose, about)
     if recovery.rival is not None:
         share = 1 - (1 - share) * (1 - recovery.rival.probability(pose))
     wrong = verdict.wrong
-    return wrong + (1 - wrong) * share
+    p_lost, spread = wrong + (1 - wrong) * share, spread_of(covariance)
+    word = word_of(p_lost, wrong, wide=spread.wide, apart=spread.apart)
+    temperature = tracker.sensors[0].temperature(tracker.options.temperature)
+    widening = WIDENING if verdict.informed and verdict.state.corrections else 1.0
+    return Estimate(
+        pose, covariance, tracker.sample_size(), p_lost, word, verdict.state.explained, temperature,
+        summary.temperature, summary.degenerate, shown, widening,
+        None if method == "mean" else about, distances,
+    )  # fmt: skip
+
+
+def _spread_about(tracker: Tracker, pose: np.ndarray, about: np.ndarray) -> tuple[float, Distances | None]:
+    """Return the share of the particles that is far off a pose, and their distances where they lie apart.
+
+    Args:
+        tracker: The particles.
+        pose: (3,) pose.
+        about: (3, 3) second moments of the particles about it.
+    """
+    if spread_of(about).narrow or tracker.shown > _MOST_LOOKED_AT:
+        return share_off(about), None
+    poses, weights = tracker.host_particles(), tracker.cloud.host_weights(tracker.shown)
+    return share_off_of(poses, weights, pose), Distances.of(poses, weights, pose)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from gpusense._util.html import card, pose_rows
 from gpusense.localization.pose_algebra import mean_pose, wrap_angle
+from gpusense.localization.protection import LEAST_SAMPLE, Distances, protection_level
 from gpusense.localization.words import LOST, Word
 
 # Bins of positions and headings [m, rad]; neighbouring bins belong to one cluster.
@@ -33,6 +35,10 @@ class Estimate:
             have left too few particles.
         degenerate: Whether no particle was possible at the last correction, which then changed nothing.
         particles: Number of particles.
+        widening: Factor of the spread in :meth:`protection_level`; 1 without a map, and before the first correction.
+        moments: (3, 3) second moments of the particles about the pose, if they are not the covariance: for the methods
+            "cluster" and "best".
+        distances: Distances of the particles from the pose, where the covariance does not describe them.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -50,6 +56,9 @@ class Estimate:
     used: float
     degenerate: bool
     particles: int
+    widening: float = 1.0
+    moments: np.ndarray | None = field(default=None, repr=False, compare=False)
+    distances: Distances | None = field(default=None, repr=False, compare=False)
 
     def __repr__(self) -> str:
         x, y, theta = (float(value) for value in self.pose)
@@ -68,6 +77,32 @@ class Estimate:
     def lost(self) -> bool:
         """Tell whether p_lost is above 0.5: the pose is unusable, because scans contradict it or the spread is wide."""
         return self.p_lost > LOST
+
+    def protection_level(self, risk: float) -> float:
+        """Return the radius that the error of the position exceeds with at most a stated probability [m].
+
+        It is the smallest r with ``p_lost + (1 - p_lost) P(|error| > r | not lost) <= risk``. P comes
+        from the particles, with their spread times ``widening``; see ``docs/localization.md``.
+
+        Args:
+            risk: The probability, from 0.01 to 1; logs support no lower one.
+
+        Returns:
+            The radius; infinite where p_lost exceeds the risk, and for an effective sample size below 10.
+
+        Raises:
+            TypeError, ValueError: ``risk`` breaks its rule.
+
+        Example:
+            >>> import gpusense as gs, numpy as np
+            >>> e = gs.Estimate(np.zeros(3), np.eye(3) * 0.01, 250.0, 0.0, "tracking", 0.9, 0.1, 1.0, False, 500)
+            >>> round(e.protection_level(risk=0.01), 3)
+            0.303
+        """
+        moments = self.covariance if self.moments is None else self.moments
+        if not self.effective_sample_size >= LEAST_SAMPLE:
+            moments = np.full((3, 3), math.inf)
+        return protection_level(risk, self.p_lost, moments, self.widening, self.distances)
 
 
 def covariance_of(numbers: np.ndarray) -> np.ndarray:

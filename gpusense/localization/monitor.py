@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 from gpusense.localization import starts
 from gpusense.localization.diagnosis import Diagnosis, diagnose
+from gpusense.localization.protection import WIDENING, protection_level
 from gpusense.localization.scoring import readings_of
 from gpusense.localization.sensors import sensors_of
 from gpusense.localization.spread import share_off, spread_of
@@ -33,6 +34,8 @@ class PoseVerdict:
             contradict the pose and p_lost is above 0.5.
         explained: Among the beams that the map could explain, the share that agrees with it at the pose; NaN without
             one.
+        covariance: (3, 3) covariance of the pose; None if the localiser states none.
+        widening: Factor of the spread in :meth:`protection_level`.
 
     Example:
         >>> import gpusense as gs
@@ -43,11 +46,36 @@ class PoseVerdict:
     p_lost: float
     verdict: Word
     explained: float
+    covariance: np.ndarray | None = field(default=None, repr=False, compare=False)
+    widening: float = field(default=1.0, repr=False)
 
     @property
     def lost(self) -> bool:
         """Tell whether p_lost is above 0.5."""
         return self.p_lost > LOST
+
+    def protection_level(self, risk: float) -> float:
+        """Return the radius that the error of the position exceeds with at most a stated probability [m].
+
+        It is the smallest r with ``p_lost + (1 - p_lost) P(|error| > r | not lost) <= risk``. P comes
+        from a normal density with the pose's covariance, and with the factor of this package's filter. If the localiser
+        states no covariance, the radius is 1 m: a pose that is not lost is off by at most that.
+
+        Args:
+            risk: The probability, from 0.01 to 1; logs support no lower one.
+
+        Returns:
+            The radius; infinite where p_lost exceeds the risk.
+
+        Raises:
+            TypeError, ValueError: ``risk`` breaks its rule.
+
+        Example:
+            >>> import gpusense as gs
+            >>> gs.PoseVerdict(0.002, "tracking", 0.9).protection_level(risk=0.01)
+            1.0
+        """
+        return protection_level(risk, self.p_lost, self.covariance, self.widening)
 
 
 class PoseMonitor:
@@ -116,7 +144,8 @@ class PoseMonitor:
         self._pose, self._last = place, readings
         wrong = self._verdict.wrong
         p_lost, beyond = wrong + (1 - wrong) * share_off(spread), spread_of(spread)
-        return PoseVerdict(p_lost, word_of(p_lost, wrong, wide=beyond.wide, apart=beyond.apart), explained)
+        word = word_of(p_lost, wrong, wide=beyond.wide, apart=beyond.apart)
+        return PoseVerdict(p_lost, word, explained, None if covariance is None else spread, WIDENING)
 
     @property
     def state(self) -> VerdictState:

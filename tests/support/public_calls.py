@@ -256,6 +256,7 @@ def _add_filters(s: SimpleNamespace, add: Any, made: Any) -> None:
     add("ParticleFilter.predict.velocity", lambda: _velocity(s), velocity=(0.3, 0.1), seconds=0.5)
     add("ParticleFilter.correct", lambda: _correct(s), readings=s.scan)
     add("ParticleFilter.estimate", method("estimate"), method="mean")
+    add("Estimate.protection_level", lambda: _filter(s).estimate().protection_level, risk=0.5)
     add("ParticleFilter.diagnose", method("diagnose"), search=False)
     add("ParticleFilter.restore", method("restore"), state=_filter(s).state())
     made(gs.OdometryMotion, alpha=(0.02, 0.02, 0.02, 0.02), reverse=0.02, least=(0.01, 0.005),
@@ -266,6 +267,7 @@ def _add_filters(s: SimpleNamespace, add: Any, made: Any) -> None:
     made(gs.PoseMonitor, models=field, seed=0)
     add("PoseMonitor.update", lambda: gs.PoseMonitor(field).update, pose=s.poses[0], ranges=s.scan,
         covariance=np.eye(3) / 100)  # fmt: skip
+    add("PoseVerdict.protection_level", lambda: gs.PoseVerdict(0.0, "tracking", 0.9).protection_level, risk=0.5)
     add("PoseMonitor.diagnose", lambda: _monitor(field, s).diagnose, search=False)
     add("normalize_weights", lambda: gs.normalize_weights, log_p=np.array([-1.0, -2.0, -3.0]))
     add("resample", lambda: gs.resample, weights=np.array([0.2, 0.3, 0.5]), count=5, rng=0, method="systematic")

@@ -89,9 +89,9 @@ def test_what_has_no_spread_promises_nothing() -> None:
 @pytest.mark.parametrize("judged", [estimate(np.eye(3)), gs.PoseVerdict(1.0, "lost", 0.1)], ids=["estimate", "verdict"])
 def test_a_risk_that_no_data_support_is_refused(judged, risk) -> None:
     kind = ValueError if type(risk) in (int, float) else TypeError
-    with pytest.raises(kind, match="^risk: must be"):
+    with pytest.raises(kind, match=r"^risk: must be"):
         judged.protection_level(risk)
-    with pytest.raises(ValueError, match="^risk: must be at least 0.01, .* supports, got 0.0001$"):
+    with pytest.raises(ValueError, match=r"^risk: must be at least 0.01, .* supports, got 0.0001$"):
         judged.protection_level(1e-4)
 
 

@@ -120,7 +120,7 @@ def normal_radius(covariance: Floats, beyond: float) -> float:
         return 0.0
     if beyond <= 0:
         return math.inf
-    (xx, xy, _), (_, yy, _), _ = (covariance / large / large).tolist()
+    (xx, _, _), (_, yy, _), _ = (covariance / large / large).tolist()
     small = min(max(xx + yy - 1, 0.0), 1.0)
     variances = small + (1 - small) * _COSINES
     low, high = 0.0, math.sqrt(-2 * math.log(beyond))

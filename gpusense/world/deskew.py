@@ -1,4 +1,4 @@
-"""Motion of the robot during a scan, whose beams are measured one after the other at equal intervals."""
+"""Correct scans for the robot's motion while the beams are measured, one after the other at equal intervals."""
 
 from __future__ import annotations
 
@@ -13,23 +13,17 @@ from gpusense.world.scanner import Scanner, classify_ranges, float64_readings
 
 Floats = NDArray[np.float64]
 
-# Two neighbouring readings lie on one surface if their ranges differ by less than this share of a range plus this
+# Neighbouring readings belong to one surface if their ranges differ by less than this share of a range plus this
 # length [m].
 _RATIO, _SLACK = 0.1, 0.05
-# A beam has a reading only if one was measured within this many steps between bearings.
+# A beam gets a reading only if a hit was measured within this many bearing steps.
 _FARTHEST = 1.5
 # Largest motion during a scan [m, rad].
 _LARGEST = 1e6
 
 
 def check_motion(name: str, motion: object, scans: int) -> Floats | None:
-    """Return the motions during S scans, (S, 3); None without motion.
-
-    Args:
-        name: The argument's name.
-        motion: (3,) for all scans, or (S, 3), or None.
-        scans: S.
-    """
+    """Return the (S, 3) motions of S scans from a common (3,) or from (S, 3) motions; None without motion."""
     if motion is None:
         return None
     read = checks.as_array(name, motion)
@@ -38,7 +32,7 @@ def check_motion(name: str, motion: object, scans: int) -> Floats | None:
 
 
 def part_of_arc(motion: Floats, share: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return x, y and heading after a share of a motion with constant velocities, which is an arc.
+    """Return x, y and heading after a share of a motion with constant velocities (an arc).
 
     For an arc that turns by theta, the chord to a fraction f of it has sin(f theta / 2) / sin(theta / 2) of the length
     of the whole chord, and is turned by (f - 1) theta / 2 from the whole chord.
@@ -71,15 +65,9 @@ def beam_poses(motion: Floats, beams: int) -> tuple[Floats, Floats]:
 
 
 def sensor_points(ranges: Floats, scanner: Scanner, motion: Floats) -> Floats:
-    """Return the end points of (S, K) readings in a frame at the sensor at the first beam, with the robot's axes.
+    """Return the (S, K, 2) end points of readings [m] relative to the sensor at the first beam, along the robot's axes.
 
-    Args:
-        ranges: Readings [m]; the end points of max and missing readings are meaningless.
-        scanner: The scanner.
-        motion: (S, 3) motions during the scans.
-
-    Returns:
-        (S, K, 2) [m].
+    End points of max and missing readings are meaningless.
     """
     place, heading = beam_poses(motion, scanner.count)
     mount = np.array(scanner.mount[:2])
@@ -92,11 +80,11 @@ def sensor_points(ranges: Floats, scanner: Scanner, motion: Floats) -> Floats:
 
 
 def deskew_scan(ranges: ArrayLike, scanner: Scanner, motion: ArrayLike) -> Floats:
-    """Return the readings that a robot at rest would have had where the first beam was measured.
+    """Return the readings of a robot at rest at its pose of the first beam.
 
-    Beams are measured in their order and evenly in time, and the robot's velocities are constant meanwhile. The end
-    points of the hits are moved into the frame of the first beam. Where two neighbours lie on one surface, a beam
-    between them meets the straight line through both; elsewhere it takes the nearest reading.
+    Beams are measured in order at equal intervals, at constant velocity. End points of hits are moved into the frame
+    of the first beam. A beam between two neighbours on one surface is intersected with the line through both; any other
+    beam takes the nearest reading.
 
     Args:
         ranges: (K,) readings [m], or (S, K).
@@ -105,7 +93,7 @@ def deskew_scan(ranges: ArrayLike, scanner: Scanner, motion: ArrayLike) -> Float
             odometry.
 
     Returns:
-        (K,) or (S, K) readings [m]; NaN for beams along which nothing was measured.
+        (K,) or (S, K) readings [m]; NaN for beams without a reading nearby.
 
     Raises:
         TypeError, ValueError: An argument has the wrong type or breaks its rule; the message names it.
@@ -146,7 +134,7 @@ def still_readings(ranges: Floats, scanner: Scanner, motion: Floats) -> Floats:
 
 
 def _resampled(measured: Floats, value: Floats, hit: NDArray[np.bool], wanted: Floats) -> Floats:
-    """Interpolate readings from the measured to the wanted bearings.
+    """Interpolate readings from the measured to the desired bearings.
 
     A straight line through points at ranges a and b, and bearings 0 and t, has 1 / r = (sin(t - u) / a + sin(u) / b) /
     sin(t) at the bearing u.

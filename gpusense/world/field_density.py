@@ -1,9 +1,10 @@
-"""Density of a likelihood field on the host, whose formula stands here alone (*Probabilistic Robotics* table 6.3).
+"""Evaluate the density of a likelihood field on the host (*Probabilistic Robotics* table 6.3).
 
     p(d) = z_hit f(d) + z_rand / range_max
 
 for the distance d [m] from the end point of a reading to the nearest obstacle, with f the density of a hit of scale
-sigma_hit around 0 (``world.hit_shapes``). Kernels have the same formula in their languages, and get their numbers here.
+sigma_hit around 0 (``world.hit_shapes``). This is the host's only copy of the formula; kernels repeat it in their
+languages and take their numbers from here.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FieldDensity:
-    """The density of a field's parameters.
+    """Density of a likelihood field with these parameters.
 
     Attributes:
         parameters: Parameters of the field.
@@ -90,11 +91,11 @@ class FieldDensity:
         return np.append(terms, np.array(self.shape.numbers, real))
 
     def capped(self, distance: Floats) -> Floats:
-        """Return distances, clamped to the largest one that the field distinguishes."""
+        """Return distances, clamped to ``max_distance``."""
         return np.minimum(distance, self.parameters.max_distance)
 
     def log(self, distance: Floats) -> Floats:
-        """Return the log density [log 1/m] of distances [m], which are not capped."""
+        """Return the log density [log 1/m] at distances [m], without clamping them."""
         with np.errstate(over="ignore"):
             exponent = self.shape.exponent(distance / self.sigma)
         return np.logaddexp(self.log_peak - exponent, self.log_rand)

@@ -21,7 +21,7 @@ Mount = tuple[float, float, float]
 
 
 class Cells(Protocol):
-    """Square cells in which poses are placed: an occupancy grid, or buckets of landmarks."""
+    """Square cells that hold poses: an occupancy grid, or buckets of landmarks."""
 
     @property
     def origin(self) -> tuple[float, float, float]:
@@ -70,7 +70,7 @@ def _cos_sin(angle: float) -> tuple[float, float]:
 
 
 def frame_of(grid: Cells, mount: Mount) -> structs.Frame:
-    """Return the frame of a grid and a scanner as kernels take it."""
+    """Return the struct ``Frame`` of a grid and a scanner for kernels."""
     x, y, yaw = grid.origin
     return structs.Frame(x, y, grid.resolution, mount[0], mount[1], *_cos_sin(yaw))
 

@@ -73,11 +73,11 @@ class OccupancyGrid:
 
     @classmethod
     def from_message(cls, message: Any, *, occupied_threshold: int = 65) -> OccupancyGrid:
-        """Make the map of a ``nav_msgs/OccupancyGrid``, without ROS.
+        """Make a map from a ``nav_msgs/OccupancyGrid``, without ROS.
 
         Args:
-            message: Any object or mapping with the message's fields ``data`` (H * W values, row by row) and ``info``,
-                which has ``resolution``, ``width``, ``height`` and ``origin``, a pose with position and orientation.
+            message: Any object or mapping with the fields of the message: ``data`` (H * W values, row by row), and
+                ``info`` with ``resolution``, ``width``, ``height`` and the pose ``origin``.
             occupied_threshold: Least occupancy of an occupied cell [per cent].
 
         Raises:
@@ -184,7 +184,7 @@ class OccupancyGrid:
 
         Args:
             cells: (h, w) integers, at least one: occupancy in per cent, 0 to 100, or -1 for unknown.
-            region: (row, col) of the cell that ``cells[0, 0]`` replaces. All of ``cells`` must lie in the grid.
+            region: (row, col) of the cell that ``cells[0, 0]`` replaces. The whole patch must be inside the grid.
 
         Raises:
             TypeError: ``cells`` or ``region`` does not hold integers.
@@ -211,7 +211,7 @@ class OccupancyGrid:
         """Return the centres of cells in the world.
 
         Args:
-            rows: (M,) integer rows. They may lie outside the grid.
+            rows: (M,) integer rows. Indices outside the grid are allowed.
             cols: (M,) integer columns.
 
         Returns:
@@ -228,8 +228,8 @@ class OccupancyGrid:
     def world_to_cells(self, xy: ArrayLike) -> NDArray[np.float64]:
         """Convert world points to the grid's frame, in cell units.
 
-        A point is taken relative to the origin, rotated by -yaw and divided by the resolution, all in float64. The
-        floor of the result is (col, row). A yaw of exactly 0 skips the rotation.
+        Points are translated by the origin, rotated by -yaw and divided by the resolution, all in float64; a yaw of
+        exactly 0 skips the rotation. The floor of the result is (col, row).
 
         Args:
             xy: (M, 2) x and y [m].
@@ -279,7 +279,7 @@ class OccupancyGrid:
         return card("OccupancyGrid", table, picture=thumbnail(self.unknown, self.occupied))
 
     def __reduce__(self) -> tuple[Callable[..., OccupancyGrid], tuple[Any, ...]]:
-        # Copies and pickles call the constructor, so that their cells are also read-only.
+        # Copies and pickles call the constructor, which makes their cells read-only.
         make = functools.partial(OccupancyGrid, occupied_threshold=self._occupied_threshold)
         return make, (self._cells, *self._frame)
 
@@ -287,7 +287,7 @@ class OccupancyGrid:
 def grid_of_checked(
     cells: NDArray[np.int8], resolution: object, origin: object, *, occupied_threshold: int
 ) -> OccupancyGrid:
-    """Make a map of (H, W) occupancies that are known to be valid; the array is not copied, and becomes read-only."""
+    """Make a map from valid (H, W) occupancies without copying; the array becomes read-only."""
     kept = np.ascontiguousarray(cells)
     kept.setflags(write=False)
     return object.__new__(OccupancyGrid)._place(kept, resolution, origin, occupied_threshold)

@@ -17,7 +17,7 @@ FARTHEST_ORIGIN = 1e9
 
 
 class GridFrame(NamedTuple):
-    """The frame of a grid.
+    """Frame of a grid.
 
     Attributes:
         resolution: Side of a cell [m].

@@ -1,12 +1,11 @@
-"""Densities of a correct range on the host; each formula stands here alone, with its numbers for kernels.
+"""Evaluate densities of a correct range on the host, and derive the numbers that kernels need.
 
 A hit of scale sigma has the density ``exp(-E(u)) / (width sigma)`` at u = (z - mean) / sigma; it is symmetric and falls
-with |u|. Models weight it, mix it with other causes, and may truncate it to [0, range_max]. Models, tables, searches,
-pictures, simulations and fits use it through :class:`HitShape` alone. Kernels have E in their file ``hit_shape`` and
-get all other numbers here.
+with |u|. Models weight it, mix it with other causes, and may truncate it to [0, range_max]. Host code uses it only
+through :class:`HitShape`. Kernels implement E in their file ``hit_shape`` and get all other numbers here.
 
-A shape is registered in :data:`SHAPES` under its name, the value of ``hit=`` in the parameters of scan models.
-CONTRIBUTING.md has the recipe for another shape.
+A shape is registered in :data:`SHAPES` under its name, the value of ``hit=`` in the parameters of scan models. The
+recipe for another shape is in CONTRIBUTING.md.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ from numpy.typing import NDArray
 Floats = NDArray[Any]
 HitName: TypeAlias = Literal["normal", "student"]
 
-# Smallest and largest degrees of freedom of Student's t; beyond the largest it equals the normal in float32.
+# Bounds of the degrees of freedom of Student's t; at the largest it equals the normal in float32.
 LEAST_DOF, MOST_DOF = 1.0, 1e6
-# For half of the degrees of freedom above this, the ratio of gamma functions is its asymptotic series.
+# Half degrees of freedom above which the ratio of gamma functions is computed by its asymptotic series.
 _SERIES_FROM = 30.0
-# From here on erf is 1 in float64.
+# erf(x) is 1 in float64 from this x on.
 _ERF_IS_ONE = 6.0
 # The largest number below one half.
 _MOST_HALF = math.nextafter(0.5, 0)
@@ -39,8 +38,8 @@ class HitShape(ABC):
 
     Attributes:
         flags: Flags of the kernels that evaluate it.
-        tabulated: Whether kernels look up the mass in a table, which the host makes of ``half_mass``.
-        fitted: Names of the parameters that a fit finds beside the scale.
+        tabulated: Whether kernels look up the mass in a table of ``half_mass``.
+        fitted: Names of the fitted parameters, without the scale.
         limits: (P, 2) smallest and largest coordinate of a fit; P is 0 or 1.
         starts: (S, P + 1) coordinates from which a fit starts, each with a factor for the scale of the fitted normal.
     """
@@ -113,11 +112,11 @@ class HitShape(ABC):
 
     @abstractmethod
     def drawn(self, share: Floats, low: Floats, high: Floats) -> Floats:
-        """Return the u below which a given share of the mass between -low <= 0 and high >= 0 lies."""
+        """Return the quantile u of a share of the mass between -low <= 0 and high >= 0."""
 
     @abstractmethod
     def quantile(self, level: Floats) -> Floats:
-        """Return the u >= 0 with the mass (1 - exp(-level)) / 2 between 0 and u."""
+        """Return the u >= 0 for which the mass between 0 and u is (1 - exp(-level)) / 2."""
 
     def peak(self, weight: float, sigma: float) -> float:
         """Return a weight times the density at the mean [1/m]."""
@@ -160,7 +159,7 @@ class NormalHit(HitShape):
     def half_mass(self, u: Floats) -> Floats:
         scaled = u * u.dtype.type(math.sqrt(0.5))
         if scaled.min(initial=np.inf) >= _ERF_IS_ONE:
-            # SciPy, which takes as long to load as a whole call of a model, is not needed.
+            # Avoid SciPy here: importing it takes as long as a call of a model.
             return np.full_like(scaled, 0.5)
         from scipy.special import erf
 
@@ -181,7 +180,7 @@ class NormalHit(HitShape):
 
 @dataclass(frozen=True)
 class StudentHit(HitShape):
-    """Student's t with ``dof`` degrees of freedom, whose heavy tails explain readings that a normal makes impossible.
+    """Student's t with ``dof`` degrees of freedom; its heavy tails explain readings that a normal makes impossible.
 
     E = (dof + 1) / 2 log(1 + u^2 / dof); with infinite dof it is the normal. It is a normal whose inverse variance is
     drawn from a gamma distribution (Lange, Little and Taylor, "Robust statistical modeling using the t distribution",
@@ -192,7 +191,7 @@ class StudentHit(HitShape):
 
     flags = frozenset({"STUDENT", "MASS_TABLE"})
     fitted = ("hit_dof",)
-    # The coordinate is 1 / dof: the normal lies at the end of a finite interval.
+    # The coordinate is 1 / dof, so that the normal is an end of a finite interval.
     limits = ((1 / MOST_DOF, 1 / LEAST_DOF),)
     starts = ((0.8, 0.4), (0.3, 0.7), (0.03, 1.0))
 
@@ -251,7 +250,7 @@ class StudentHit(HitShape):
     def quantile(self, level: Floats) -> Floats:
         from scipy.special import betaincinv
 
-        # Invert the incomplete beta function from its nearer end, which keeps the digits for small and large dof.
+        # Invert the incomplete beta function from its nearer end; this keeps all digits for small and large dof.
         middle = 3.0
         near = betaincinv(0.5, 0.5 * self.dof, -np.expm1(-np.minimum(level, middle)))
         far = betaincinv(0.5 * self.dof, 0.5, np.exp(-np.maximum(level, middle)))
@@ -280,7 +279,7 @@ SHAPE_PARAMETERS = ("hit", *dict.fromkeys(name for shape in SHAPES.values() for 
 
 
 def name_of(shape: HitShape) -> HitName:
-    """Return the name of a shape, as parameters have it."""
+    """Return the name of a shape in parameters."""
     return cast("HitName", next(name for name, kind in SHAPES.items() if kind is type(shape)))
 
 

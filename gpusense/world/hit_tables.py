@@ -1,8 +1,8 @@
 """Tables of mass and quantiles for hit shapes whose kernels have no closed form.
 
-A table has cells of equal width in the logarithmic coordinate log(1 + b), b = u / sqrt 2 for a distance of u scales, or
--log(1 - 2 m) for a mass m between the mean and a distance. Each cell has the coefficients, lowest power first, of a
-polynomial in the position within the cell; it is exact at the cell's start.
+Cells have equal width in the logarithmic coordinate log(1 + b), with b = u / sqrt 2 for a distance of u scales, or
+-log(1 - 2 m) for a mass m between the mean and a distance. A cell holds the coefficients, lowest power first, of a
+polynomial in the position within the cell; the polynomial is exact at the cell's start.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _ROOT_TWO = math.sqrt(2)
 
 
 class TabulatedHit:
-    """A shape whose masses are looked up in a table; everything else is delegated to the shape."""
+    """Look up the masses of a shape in a table, and delegate everything else to the shape."""
 
     def __init__(self, shape: HitShape) -> None:
         self._shape, self._table = shape, mass_table(shape, np.dtype(np.float64))
@@ -44,9 +44,9 @@ class TabulatedHit:
 
 
 def mass_tables(shapes: Sequence[HitShape], terms: list[np.ndarray], real: np.dtype) -> list[np.ndarray]:
-    """Return the tables of masses that follow the terms of all bins, and write their places into the terms.
+    """Return the mass tables that follow the terms of all bins, and write their offsets into the terms.
 
-    A place counts from the first term of its bin. Equal shapes share a table.
+    An offset counts from the first term of its bin. Equal shapes share a table.
     """
     tables: dict[HitShape, tuple[int, np.ndarray]] = {}
     begin = sum(map(len, terms))
@@ -62,14 +62,14 @@ def mass_tables(shapes: Sequence[HitShape], terms: list[np.ndarray], real: np.dt
 
 @functools.lru_cache(maxsize=32)
 def mass_table(shape: HitShape, real: np.dtype) -> np.ndarray:
-    """Return the table of masses between the mean and a distance, by log(1 + b); it is cached and read-only."""
+    """Return the cached, read-only table of the mass between the mean and a distance, by log(1 + b)."""
     table = _table(lambda at: shape.half_mass(_ROOT_TWO * np.expm1(at)), real)
     table.flags.writeable = False
     return table
 
 
 def looked_up(table: Floats, at: Floats) -> Floats:
-    """Return the numbers of a float64 table at logarithmic coordinates."""
+    """Return the values of a float64 table at logarithmic coordinates."""
     size = table.itemsize
     cells, powers, steps = TABLE_CELLS[size], TABLE_POWERS[size], at * TABLE_PER_LOG[size]
     cell = np.minimum(steps, cells - 1).astype(np.intp)
@@ -83,12 +83,12 @@ def looked_up(table: Floats, at: Floats) -> Floats:
 
 
 def quantile_table(shape: HitShape) -> Floats:
-    """Return log(1 + b) by -log(1 - 2 m)."""
+    """Return the table of log(1 + b) by -log(1 - 2 m)."""
     return _table(lambda at: np.log1p(shape.quantile(at) / _ROOT_TWO), np.dtype(np.float64))
 
 
 def _table(function: Callable[[Floats], Floats], real: np.dtype) -> np.ndarray:
-    """Return a table of a function that is 0 at 0."""
+    """Tabulate a function that is 0 at 0."""
     size = real.itemsize
     cells, per_log, powers = TABLE_CELLS[size], TABLE_PER_LOG[size], TABLE_POWERS[size]
     places = np.arange(cells)[:, None]

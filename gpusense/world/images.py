@@ -1,6 +1,6 @@
 """Read map images (PGM, PPM, PNG, BMP) as greys, strip by strip.
 
-Pixels, bytes and memory are checked before anything is decoded: memory is allocated only for data that the file holds.
+Pixels, bytes and memory are checked before decoding, so that memory is allocated only for data in the file.
 
 Greys equal those of nav2_map_server 1.4 to 1.5, which reads images with the 16-bit build of GraphicsMagick 1.3.
 """
@@ -23,13 +23,13 @@ from gpusense._util.memory import check_room
 
 _MAX_CELLS = 1 << 29
 _STRIP_CELLS = 1 << 20
-# Memory of the strips in work, of up to 16 bytes a pixel.
+# Memory for strips in progress, at up to 16 bytes a pixel.
 _STRIPS_BYTES = 1 << 24
 _MAX_PILLOW_WIDTH = 1 << 26  # keeps a strip of one row below Pillow's limit on pixels
 _DIGITS = b"0123456789 "
 _BLANKS_TO_SPACES = bytes.maketrans(b"\t\n\v\f\r", b"     ")
 
-# Bytes of a pixel decoded by Pillow, by colour type (grey, palette) and whether it has 16 bits; other types take 4.
+# Bytes of a pixel decoded by Pillow, by colour type (grey, palette) and 16 bits or less; other types take 4.
 _PNG_BYTES = {(0, False): 1, (3, False): 1, (0, True): 2}
 
 # Shares of red, green and blue in a grey, in thousandths (ITU-R BT.601).
@@ -41,7 +41,7 @@ _Strip = tuple[NDArray[np.uint8], NDArray[np.bool] | None]
 
 @dataclass(frozen=True)
 class Raster:
-    """An image that is read strip by strip.
+    """Image, read strip by strip.
 
     Attributes:
         rows: Rows of pixels.
@@ -85,7 +85,7 @@ def _check_size(file: Path, rows: int, cols: int) -> None:
 
 
 def _check_memory(file: Path, rows: int, cols: int, pixel: int = 0) -> None:
-    """Check that an image of ``pixel`` bytes a pixel, if it is decoded as a whole, and its cells fit into memory."""
+    """Check that the cells, and an image of ``pixel`` bytes a pixel that is decoded as a whole, fit into memory."""
     check_room(str(file), rows * cols * (1 + pixel) + _STRIPS_BYTES, f"{rows} x {cols} cells")
 
 
@@ -110,7 +110,7 @@ def _open_pnm(stream: BinaryIO, file: Path, size: int) -> Raster:
     needed = 2 * count - 1 if plain else width * count  # a plain value takes a digit and a blank
     stream.seek(0)
     header, next_byte = stream.read(begin), stream.read(1)
-    # CR LF ends the header if other lines of it end in CR LF, or if the size leaves one byte over.
+    # CR LF ends the header if its other lines end in CR LF, or if the file is one byte longer than the raster.
     crlf = header.endswith(b"\r") and next_byte == b"\n"
     begin += crlf and (b"\r\n" in header or size - begin == needed + 1)
     stream.seek(begin)
@@ -156,7 +156,7 @@ def _pnm_header(stream: BinaryIO, file: Path) -> list[int]:
 
 
 class _PlainValues:
-    """The decimal numbers of a stream, read strip by strip."""
+    """Decimal numbers of a stream, read strip by strip."""
 
     def __init__(self, stream: BinaryIO, file: Path, count: int) -> None:
         self._stream, self._file, self._count = stream, file, count
@@ -198,11 +198,11 @@ def _decoding(file: Path, kind: str) -> Iterator[None]:
 def _check_png(stream: BinaryIO, header: tuple[int, ...]) -> None:
     """Check, in little memory, that the image data of a PNG inflates to the size in its header.
 
-    Pillow allocates by the header, and leaves missing pixels black, which would become walls.
+    Pillow allocates by the header and leaves missing pixels black, as if they were walls.
     """
     cols, rows, depth, colour, _, _, interlace = header
     bits = depth * {2: 3, 4: 2, 6: 4}.get(colour, 1)
-    # The passes of Adam7: first column, first row, step along the columns, step along the rows.
+    # Passes of Adam7: first column, first row, column step, row step.
     adam7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
     claimed = 0
     for x, y, dx, dy in adam7 if interlace else ((0, 0, 1, 1),):
@@ -268,7 +268,7 @@ def _open_pillow(stream: BinaryIO, file: Path, size: int, kind: str) -> Raster:
 def _load_pillow(stream: BinaryIO, file: Path, size: int, kind: str) -> Any:
     """Load a PNG or BMP image after checking its size.
 
-    Image.open is avoided: its limit on pixels is a setting of the whole process, and smaller than large maps.
+    Image.open is avoided: its pixel limit is process-wide and too small for large maps.
     """
     from PIL.BmpImagePlugin import BmpImageFile
     from PIL.PngImagePlugin import PngImageFile
@@ -294,7 +294,7 @@ def _load_pillow(stream: BinaryIO, file: Path, size: int, kind: str) -> Any:
 
 
 def mapped(values: NDArray[Any], table: NDArray[Any]) -> NDArray[Any]:
-    """Return ``table[values]``; for single bytes as fast as memory allows."""
+    """Return ``table[values]``; bytes are mapped at the speed of memory."""
     if values.dtype != np.uint8 or table.itemsize != 1:
         return table[values]
     full = np.zeros(256, table.dtype)

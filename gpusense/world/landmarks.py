@@ -1,4 +1,4 @@
-"""Maps of landmarks, and the square buckets in which kernels search for nearby landmarks."""
+"""Define maps of landmarks, and the square buckets in which kernels search for nearby landmarks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _PER_BUCKET = 2
 
 
 class LandmarkMap:
-    """Landmarks in the plane, with optional signatures to tell them apart.
+    """Landmarks in the plane, with optional signatures that distinguish them.
 
     A signature is a number: an average colour, a height, or an id. Source: *Probabilistic Robotics*, section 6.6.
 
@@ -61,7 +61,7 @@ class LandmarkMap:
 
 @dataclass(frozen=True)
 class Buckets:
-    """Landmarks sorted into square buckets, row by row; a bucket keeps the order of the map.
+    """Landmarks sorted into square buckets, row by row, and within a bucket by index.
 
     Attributes:
         origin: (x, y, 0) of the first bucket's corner in the world; poses are placed as in a grid of such cells.

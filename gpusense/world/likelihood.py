@@ -14,7 +14,7 @@ from gpusense.world.scanner import Scanner
 
 @dataclass(frozen=True)
 class Likelihood:
-    """The book's likelihoods: the rules of models without ``compat``.
+    """Rules of the book's likelihoods, for models without ``compat``.
 
     Attributes:
         name: None.
@@ -25,10 +25,10 @@ class Likelihood:
         outside: ``"free"`` or ``"occupied"``: state of space outside the grid for the beam model.
         unknown: ``"free"`` or ``"occupied"``: state of unknown cells for the beam model.
         caster: Default caster of the beam model.
-        is_peer: True if weights are those of a peer.
+        is_peer: True if the model computes a peer's weights.
         cubes: Whether the likelihood field sums cubes of densities instead of logarithms.
-        overlaid: True if the likelihood field has cells of a fixed density.
-        neighbors: Cells around a cell on which its state in a mask depends.
+        overlaid: True if some cells of the likelihood field have a fixed density.
+        neighbors: Radius of the neighbourhood that determines a cell's state in a mask [cells].
     """
 
     name: ClassVar[Any] = None
@@ -61,16 +61,16 @@ class Likelihood:
         return 0
 
     def readings(self, ranges: np.ndarray, scanner: Scanner, field: bool) -> np.ndarray:
-        """Return readings as they are."""
+        """Return readings unchanged."""
         return ranges
 
     def without_readings(self, constant: float, first: float, *, cubes: bool) -> float:
-        """Return the logarithm of a scan without evaluated readings.
+        """Return the log-likelihood of a scan without evaluated readings.
 
         Args:
-            constant: The sum of its constant terms.
-            first: The first term of sums.
-            cubes: True if the model sums cubes, which have no constant terms.
+            constant: Sum of its constant terms.
+            first: First term of sums.
+            cubes: True if the model sums cubes, without constant terms.
         """
         with np.errstate(divide="ignore"):
             return float(np.log(first)) if cubes else constant

@@ -1,4 +1,4 @@
-"""Maps of lines: straight walls, with the sides from which they are visible."""
+"""Define maps of lines: straight walls, with the sides from which they are visible."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from gpusense._util import checks
 
 
 class LineMap:
-    """Straight walls in the plane: segments, each seen from its left or from both sides.
+    """Straight walls in the plane: segments that are visible from the left or from both sides.
 
     Source: Siegwart, Nourbakhsh and Scaramuzza, *Introduction to Autonomous Mobile Robots* (2011), section 4.7.
 
     Args:
         segments: (M, 4) ends x1, y1, x2, y2 in the world [m]; M may be 0.
-        two_sided: True if walls are seen from both sides, or only from the left of the direction from the first end to
-            the second: one bool for all, or (M,). The faces of a thick wall are two lines with one side each.
+        two_sided: True if walls are visible from both sides, False if only from the left of the direction from the
+            first end to the second: one bool for all, or (M,). The faces of a thick wall are two one-sided lines.
 
     Attributes:
         segments: (M, 4) float64, read-only.
@@ -59,7 +59,7 @@ class LineMap:
 
     @property
     def normals(self) -> np.ndarray:
-        """(M, 2) unit vectors at right angles to the lines, to the right: away from the side that is always seen."""
+        """(M, 2) unit normals of the lines to the right, away from the side that is always visible."""
         x, y = (self._along / self.lengths[:, None]).T
         return np.column_stack([y, -x])
 

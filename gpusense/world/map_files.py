@@ -1,4 +1,4 @@
-"""Read and write maps in the format of ROS map_server: a YAML file beside a PGM, PNG or BMP image; read BeeSoft's."""
+"""Read and write maps of ROS map_server (a YAML file and a PGM, PNG or BMP image), and read maps of BeeSoft."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gpusense.world.map_greys import MODES, UNKNOWN_GREY, MapMode, paint, write_
 from gpusense.world.wean_map import read_probabilities
 
 _ENDINGS = (".pgm", ".ppm", ".pnm", ".png", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff")
-# YAML files of a folder that are read to find the file of an image.
+# Most YAML files of a folder that are searched for the name of an image.
 _MOST = 50
 
 
@@ -39,10 +39,10 @@ class _MapYaml:
 
 
 def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> OccupancyGrid:
-    """Read a map in the format of ROS map_server, or the text of a BeeSoft map (``wean.dat``).
+    """Read a map of ROS map_server, or a text map of BeeSoft (``wean.dat``).
 
-    Cells have the bits of nav2_map_server 1.4 to 1.5 (``map_io.cpp``), which computes in float32; earlier versions
-    took the mean of the channels in float64. Let g be the grey of a pixel, 0 to 255: its value, or the luma
+    Cells equal those that nav2_map_server 1.4 to 1.5 reads (``map_io.cpp``), which computes in float32; earlier
+    versions took the mean of the channels in float64. Let g be the grey of a pixel, 0 to 255: its value, or the luma
     0.299 R + 0.587 G + 0.114 B of a colour. The occupancy is p = 1 - g / 255, or g / 255 with ``negate``.
 
     - Modes ``trinary`` (the default) and ``scale``: p >= ``occupied_thresh`` is 100, and p <= ``free_thresh`` is 0.
@@ -238,7 +238,7 @@ def _image(file: Path, name: str) -> Path:
 
 
 def _number(file: Path, key: str, value: object, **limits: float) -> float:
-    # map_server reads quoted numbers, and 5e-2, which is a string in YAML 1.1 and for PyYAML.
+    # map_server reads quoted numbers; it also reads 5e-2, a string in YAML 1.1 and for PyYAML.
     if isinstance(value, str) and re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", value.strip(), re.ASCII):
         value = float(value)
     try:
@@ -287,7 +287,7 @@ def _check_no_image(file: Path) -> None:
 
 
 def _yaml_files(image: Path) -> Iterator[Path]:
-    """Yield the YAML files in an image's folder that name the image, those with the same stem first."""
+    """Yield the YAML files in an image's folder that name the image, starting with files of the same stem."""
     named = [image.with_suffix(suffix) for suffix in (".yaml", ".yml")]
     others = sorted(path for path in image.parent.glob("*.y*ml") if path not in named)[:_MOST]
     for path in (*named, *others):

@@ -10,7 +10,7 @@ from gpusense.world.grid import OccupancyGrid
 
 MapMode = Literal["trinary", "scale", "raw"]
 MODES = ("trinary", "scale", "raw")
-# The greys that map_saver writes for free, occupied and unknown cells.
+# Greys that map_saver writes for free, occupied and unknown cells.
 FREE_GREY, OCCUPIED_GREY, UNKNOWN_GREY = 254, 0, 205
 _UNKNOWN = 255  # the byte of the cell -1
 
@@ -61,7 +61,7 @@ def paint(grid: OccupancyGrid, mode: MapMode | None) -> Painting:
 
 
 def write_image(stream: BinaryIO, painting: Painting, shape: tuple[int, int], image_format: str) -> None:
-    """Write the image of a painting as PGM or PNG; one with transparent cells as PNG only."""
+    """Write a painting as a PGM or PNG image; transparent cells need PNG."""
     size = shape[::-1]
     if image_format == "png":
         from PIL import Image

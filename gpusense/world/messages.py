@@ -1,4 +1,4 @@
-"""Fields of ROS messages from any object or mapping that has them, without ROS."""
+"""Read fields of ROS messages from any object or mapping, without ROS."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def field(name: str, message: object, path: str) -> Any:
     Args:
         name: Name of the argument, for errors.
         message: An object with attributes, or a mapping with keys.
-        path: The field's name, with dots before names of nested fields.
+        path: Name of the field; dots separate nested names.
     """
     value = message
     for part in path.split("."):
@@ -84,12 +84,12 @@ def planar_part(name: str, pose: object) -> tuple[tuple[float, float, float], fl
 
 
 def tilt_of(rotation: np.ndarray) -> float:
-    """Return the angle between the z axes of a rotated frame and of its parent [rad]."""
+    """Return the angle between the z axes of a rotated frame and its parent [rad]."""
     return math.acos(min(max(float(rotation[2, 2]), -1.0), 1.0))
 
 
 def planar_pose(name: str, pose: object) -> tuple[float, float, float]:
-    """Return (x, y, yaw) of a pose that must be level."""
+    """Return (x, y, yaw) of a pose, which must be level."""
     planar, tilt = planar_part(name, pose)
     if tilt > LEVEL:
         rule = "must be level, with a rotation about z only"
@@ -98,7 +98,7 @@ def planar_pose(name: str, pose: object) -> tuple[float, float, float]:
 
 
 def distinct_beams(step: float, count: int) -> int:
-    """Return the number of beams, less one if the last beam has the direction of the first."""
+    """Return the number of beams with distinct directions: one less if the last beam repeats the first."""
     return count - 1 if count > 2 and abs(abs(step) * (count - 1) - 2 * math.pi) < 0.5 * abs(step) else count
 
 
@@ -106,7 +106,7 @@ def nearest_beams(bearings: NDArray[np.float64], first: float, step: float, coun
     """Return the index of the beam nearest to each bearing; -1 where the nearest beam is over half a step away.
 
     Args:
-        bearings: (K,) bearings of any turn [rad].
+        bearings: (K,) bearings, any number of turns [rad].
         first: Bearing of beam 0 [rad].
         step: Step between beams [rad].
         count: Number of beams.
@@ -118,11 +118,11 @@ def nearest_beams(bearings: NDArray[np.float64], first: float, step: float, coun
 
 
 def spread_readings(message: object, places: int, upside_down: bool = False) -> NDArray[np.float64]:
-    """Return the readings of a ``sensor_msgs/LaserScan`` on evenly spaced bearings of a full turn; NaN in gaps.
+    """Map the readings of a ``sensor_msgs/LaserScan`` to evenly spaced bearings of a full turn; NaN in gaps.
 
     Args:
         message: The scan.
-        places: Number of bearings, from -pi on; each reading takes the nearest one.
+        places: Number of bearings, from -pi on; each reading goes to the nearest one.
         upside_down: Whether the beams run clockwise.
     """
     raw = checks.array("message.ranges", field("message", message, "ranges"), ("K",), finite=False)

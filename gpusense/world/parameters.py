@@ -15,7 +15,7 @@ _WEIGHT_SUM_TOLERANCE = 1e-6
 
 
 class _Parameters:
-    """Conversion and validation shared by the parameter classes."""
+    """Conversion and validation for all parameter classes."""
 
     _sum_is_one: ClassVar[bool] = True
 
@@ -25,7 +25,7 @@ class _Parameters:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Make parameters from the fields that :meth:`to_dict` returns; a missing field takes its default."""
+        """Make parameters from the result of :meth:`to_dict`; a missing field takes its default."""
         if not isinstance(values, Mapping):
             raise TypeError(f"values: must be a mapping, got {checks.show(values)}")
         names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
@@ -53,7 +53,7 @@ class _Parameters:
 
 
 class _HitParameters(_Parameters):
-    """Parameters with the shape of a correct range."""
+    """Parameters that include the shape of a correct range."""
 
     hit: HitName
     hit_dof: float
@@ -88,25 +88,25 @@ class BeamParameters(_HitParameters):
     """
 
     z_hit: float = 0.7
-    """The weight of a correct range with local noise, >= 0 [1] (6.3.1, item 1)."""
+    """Weight of a correct range with local noise, >= 0 [1] (6.3.1, item 1)."""
     z_short: float = 0.1
-    """The weight of an unexpected, nearer object, >= 0 [1] (6.3.1, item 2)."""
+    """Weight of an unexpected, nearer object, >= 0 [1] (6.3.1, item 2)."""
     z_max: float = 0.1
-    """The weight of no return, >= 0 [1] (6.3.1, item 3)."""
+    """Weight of no return, >= 0 [1] (6.3.1, item 3)."""
     z_rand: float = 0.1
-    """The weight of a random reading, >= 0 [1] (6.3.1, item 4)."""
+    """Weight of a random reading, >= 0 [1] (6.3.1, item 4)."""
     sigma_hit: float = 0.05
-    """The standard deviation of a correct range, > 0 [m] (equation 6.4)."""
+    """Standard deviation of a correct range, > 0 [m] (equation 6.4)."""
     lambda_short: float = 0.2
-    """The rate of unexpected objects along the beam, >= 0 [1/m] (equation 6.6)."""
+    """Rate of unexpected objects along the beam, >= 0 [1/m] (equation 6.6)."""
     range_bias: float = 0.0
-    """The offset of a correct range [m]: its mean is z* + range_bias, clamped to [0, range_max]."""
+    """Offset of a correct range [m]: its mean is z* + range_bias, clamped to [0, range_max]."""
     sigma_growth: float = 0.0
-    """The growth of the standard deviation with range, >= 0 [1]: it is sigma_hit + sigma_growth z*."""
+    """Growth of the standard deviation with range, >= 0 [1]: sigma_hit + sigma_growth z*."""
     hit: HitName = "normal"
-    """The density of a correct range: ``"normal"``, or ``"student"``, a Student t of scale sigma_hit."""
+    """Density of a correct range: ``"normal"``, or ``"student"``, a Student t of scale sigma_hit."""
     hit_dof: float = 4.0
-    """The degrees of freedom of ``hit="student"``, 1 to 1e6 [1]; few make heavy tails."""
+    """Degrees of freedom of ``hit="student"``, 1 to 1e6 [1]; few make heavy tails."""
 
     def __post_init__(self) -> None:
         self._check_weights("z_hit", "z_short", "z_max", "z_rand")
@@ -131,7 +131,7 @@ class IncidenceParameters:
 
     Raises:
         TypeError: A value has the wrong type for its field.
-        ValueError: The edges do not rise from 0 to pi / 2, or the number of parameters differs from that of bins.
+        ValueError: The edges do not rise from 0 to pi / 2, or bins and parameters differ in number.
 
     Example:
         >>> import gpusense as gs, math
@@ -146,7 +146,7 @@ class IncidenceParameters:
     parameters: tuple[BeamParameters, ...]
     """(B,) parameters of each bin."""
     no_surface: BeamParameters | None = None
-    """Parameters of beams that hit nothing, or nothing that returns; None uses those of the first bin."""
+    """Parameters of beams without a hit or a return; None copies the first bin."""
 
     def __post_init__(self) -> None:
         edges = tuple(float(edge) for edge in checks.array("edges", self.edges, ("B + 1",)))
@@ -175,7 +175,7 @@ class IncidenceParameters:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Make parameters from the fields that :meth:`to_dict` returns.
+        """Make parameters from the result of :meth:`to_dict`.
 
         Raises:
             TypeError: ``values`` is not a mapping, or a value has the wrong type for its field.
@@ -212,21 +212,21 @@ class LikelihoodFieldParameters(_HitParameters):
     """
 
     z_hit: float = 0.9
-    """The weight of a correct range with local noise, >= 0 [1] (6.4.1)."""
+    """Weight of a correct range with local noise, >= 0 [1] (6.4.1)."""
     z_max: float = 0.0
-    """The weight of no return, >= 0 [1]; 0 leaves such readings out, as the book does (6.4.1)."""
+    """Weight of no return, >= 0 [1]; 0 ignores such readings, as the book does (6.4.1)."""
     z_rand: float = 0.1
-    """The weight of a random reading, >= 0 [1] (6.4.1)."""
+    """Weight of a random reading, >= 0 [1] (6.4.1)."""
     sigma_hit: float = 0.2
-    """The standard deviation of an end point's distance to the nearest obstacle, > 0 [m] (table 6.3)."""
+    """Standard deviation of an end point's distance to the nearest obstacle, > 0 [m] (table 6.3)."""
     max_distance: float = 2.0
     """Largest distance to the nearest obstacle, > 0 [m]; larger ones are clamped."""
     interpolation: Literal["nearest", "bilinear"] = "nearest"
     """Interpolation between cell centres: the distance of the end point's cell, or bilinear."""
     hit: HitName = "normal"
-    """The density of a correct range's distance: ``"normal"``, or ``"student"``, a Student t of scale sigma_hit."""
+    """Density of a correct range's distance: ``"normal"``, or ``"student"``, a Student t of scale sigma_hit."""
     hit_dof: float = 4.0
-    """The degrees of freedom of ``hit="student"``, 1 to 1e6 [1]; few make heavy tails."""
+    """Degrees of freedom of ``hit="student"``, 1 to 1e6 [1]; few make heavy tails."""
 
     def __post_init__(self) -> None:
         self._check_weights("z_hit", "z_max", "z_rand")
@@ -240,7 +240,7 @@ class LikelihoodFieldParameters(_HitParameters):
 class LandmarkParameters(_Parameters):
     """Parameters of the landmark model, *Probabilistic Robotics* section 6.6.
 
-    A standard deviation of None ignores that component of every feature.
+    A standard deviation of None ignores that component of all features.
 
     Raises:
         TypeError: A value has the wrong type for its field.
@@ -254,23 +254,24 @@ class LandmarkParameters(_Parameters):
     """
 
     sigma_range: float | None = 0.2
-    """The standard deviation of a range, > 0 [m] (equation 6.40)."""
+    """Standard deviation of a range, > 0 [m] (equation 6.40)."""
     sigma_bearing: float | None = 0.05
-    """The standard deviation of a bearing, > 0 [rad] (equation 6.40)."""
+    """Standard deviation of a bearing, > 0 [rad] (equation 6.40)."""
     sigma_signature: float | None = None
-    """The standard deviation of a signature, > 0, in its own unit (equation 6.40); None ignores signatures."""
+    """Standard deviation of a signature, > 0, in its own unit (equation 6.40); None ignores signatures."""
     z_detect: float = 0.95
-    """The weight of a feature that is a landmark, >= 0 [1]."""
+    """Weight of a feature that comes from a landmark, >= 0 [1]."""
     z_false: float = 0.05
-    """The weight of a false positive, a feature that is no landmark, >= 0 [1]."""
+    """Weight of a false positive, >= 0 [1]."""
     range_max: float = 20.0
-    """The largest range of a feature, > 0 [m]."""
+    """Largest range of a feature, > 0 [m]."""
     field_of_view: float = 2 * math.pi
-    """The field of view, half to each side of the sensor's axis, in (0, 2 pi] [rad]."""
+    """Field of view, centred on the sensor's axis, in (0, 2 pi] [rad]."""
     signature_span: tuple[float, float] | None = None
-    """The smallest and largest signature of a feature; None widens the map's span by 4 standard deviations."""
+    """Smallest and largest signature of a feature; None extends the map's span by 4 standard deviations on each
+    side."""
     p_detect: float = 0.9
-    """The probability that a landmark in view is detected, in [0, 1] [1]; used for negative information only."""
+    """Probability of detecting a landmark in view, in [0, 1] [1]; used for negative information only."""
 
     def __post_init__(self) -> None:
         names = ("sigma_range", "sigma_bearing", "sigma_signature")

@@ -1,7 +1,7 @@
-"""Notice values that are legal but implausible: degrees for radians, millimetres for metres, places off the map.
+"""Warn of legal but implausible values: degrees for radians, millimetres for metres, places off the map.
 
-Results are those of the values. A warning names the likely cause, once. Geometry is checked at its construction, and
-readings in a scanner's first scans.
+Values are used unchanged. A warning names the likely cause, once. Geometry is checked at construction, and readings in
+a scanner's first scans.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from gpusense._util.notices import warn_user
 
 # A heading or bearing beyond a turn, with a margin for float32 rounding [rad].
 _TURN = 2 * math.pi * (1 + 1e-6)
-# Side of cells beyond which a map is probably in other units [m].
+# Larger cells suggest that a map is in other units [m].
 _LARGEST_CELL = 1.0
-# A range beyond any robot's scanner, and a range that is doubtful in a much smaller map [m].
+# Range beyond any robot's scanner, and range that is doubtful in a much smaller map [m].
 _FARTHEST, _FAR = 1e4, 1e3
 # Largest distance of a scanner from the robot's centre [m].
 _LARGEST_MOUNT = 100.0
-# Number of first calls with a scanner's scans that are checked.
+# Number of calls to check for each scanner.
 _CALLS = 32
-# Readings beyond these multiples of range_max or of the map are in other units; a single such value may be a code for
-# "no return".
+# Readings beyond these multiples of range_max or of the map's size are in other units; a single value may be a code
+# for "no return".
 _TIMES_RANGE, _TIMES_MAP, _VALUES = 10.0, 100.0, 3
 # Share of readings of exactly 0 beyond which 0 is probably a code.
 _ZEROS = 0.1
 
 
 class PlausibilityWarning(UserWarning):
-    """A value is legal, but likely in other units or another frame than it should be; results are those of the value.
+    """A value is legal, but probably in wrong units or in a wrong frame; it is used unchanged.
 
     ``warnings.simplefilter("error", gs.PlausibilityWarning)`` makes it an error, ``"ignore"`` silences it.
 
@@ -50,7 +50,7 @@ def _notice(text: str) -> None:
 
 
 def look_at_bearings(name: str, bearings: NDArray[np.float64] | None) -> None:
-    """Warn of bearings that span more than a turn, or lie more than two turns from 0 [rad]; None is skipped."""
+    """Warn of bearings that span more than a turn, or exceed two turns [rad]; None is skipped."""
     if bearings is None or not bearings.size:
         return
     low, high = float(bearings.min()), float(bearings.max())
@@ -76,7 +76,7 @@ def look_at_heading(name: str, heading: float) -> None:
 
 
 def look_at_scanner(range_max: float, mount: tuple[float, float, float]) -> None:
-    """Warn of a range or a mount that no scanner of a robot has."""
+    """Warn of an implausible range or mount of a scanner."""
     if range_max > _FARTHEST:
         _notice(f"range_max: is {range_max:.6g} m, farther than a range scanner sees: is it in millimetres?")
     if math.hypot(*mount[:2]) > _LARGEST_MOUNT:
@@ -85,7 +85,7 @@ def look_at_scanner(range_max: float, mount: tuple[float, float, float]) -> None
 
 
 def look_at_grid(resolution: float, origin: tuple[float, float, float]) -> None:
-    """Warn of cells larger than robots' maps have, and of an origin in degrees."""
+    """Warn of implausibly large cells, and of an origin in degrees."""
     if resolution > _LARGEST_CELL:
         _notice(
             f"resolution: is {resolution:.6g} m, the side of a cell: is it in centimetres or millimetres? Maps for "
@@ -95,7 +95,7 @@ def look_at_grid(resolution: float, origin: tuple[float, float, float]) -> None:
 
 
 def look_at_scene(range_max: float, size: float) -> None:
-    """Warn of a range that is far larger than a map.
+    """Warn of a range far larger than the map.
 
     Args:
         range_max: Largest range [m].
@@ -115,13 +115,13 @@ def look_at_readings(
 
     Args:
         name: Name of the argument.
-        ranges: Readings of one scan or of several, of any value [m].
+        ranges: Readings of one scan or several scans [m].
         range_max: Longest range of the scanner [m].
         size: Diagonal of the map [m]; None without a map.
         range_min: Shortest range of the scanner [m]; above 0, readings of 0 are missing.
 
     Returns:
-        Whether there was a reason for a warning.
+        Whether a reading was implausible.
     """
     finite = ranges[np.isfinite(ranges)]
     doubtful = False
@@ -151,7 +151,7 @@ def look_at_readings(
 
 
 class FirstScans:
-    """The first scans of a scanner, which are checked until one is doubtful; later scans cost nothing.
+    """Check of a scanner's first scans until one is doubtful; later scans cost nothing.
 
     Args:
         range_max: Longest range of the scanner [m].
@@ -183,7 +183,7 @@ def look_at_start(pose: NDArray[np.float64], inside: bool, bounds: tuple[float, 
 
     Args:
         pose: (3,) start [m, m, rad].
-        inside: True if it lies on the map.
+        inside: True if the start is on the map.
         bounds: (x_min, y_min, x_max, y_max) of the map [m].
     """
     x, y, theta = pose.tolist()

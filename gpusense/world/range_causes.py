@@ -1,7 +1,7 @@
 """Densities of the other causes of a range: an unexpected obstacle, no return, a random reading.
 
-On the host their formulas stand here alone (*Probabilistic Robotics*, equations 6.7 to 6.11); densities of correct
-ranges are in ``world.hit_shapes``. Models, tables, simulations and fits call them, and kernels get their numbers from
+This is the host's only copy of the formulas (*Probabilistic Robotics*, equations 6.7 to 6.11); densities of correct
+ranges are in ``world.hit_shapes``. Models, tables, simulations and fits call them, and kernels take their numbers from
 them. Arguments are floats or arrays that broadcast; float32 throughout gives float32.
 """
 
@@ -17,14 +17,14 @@ from gpusense.interface.terms import log_weight
 
 Floats = NDArray[Any]
 
-# Range of decays lambda z* in which the formula of an obstacle's mean distance is accurate to rounding.
+# Decays lambda z* for which the formula of an obstacle's mean distance is accurate to rounding.
 _LEAST_DECAY, _MOST_DECAY = 1e-9, 700.0
 # Below this decay the distribution is uniform within rounding.
 _UNIFORM = 1e-12
 
 
 class ShortDensity:
-    """An exponential density on [0, z*], of an unexpected obstacle before the expected range z*.
+    """Exponential density on [0, z*] of an unexpected obstacle in front of the expected range z*.
 
     Attributes:
         rate: lambda_short, >= 0 [1/m]; 0 is the uniform density. Kernels take the same number.
@@ -44,9 +44,9 @@ class ShortDensity:
     def log_pdf(self, z: Floats, expected: Floats) -> Floats:
         """Return the log density [log 1/m]; -inf outside [0, z*] and where z* <= 0.
 
-        With x = rate z*, it is ``log(x / (1 - exp(-x))) - log z* - rate z`` for x <= 1 and ``log(rate / (1 - exp(-x)))
-        - rate z`` above, where ``1 - exp(-x)`` is ``-expm1(-x)``: neither nearly equal numbers nor nearly equal
-        logarithms are subtracted. The first factor is 1 at x = 0.
+        Let x = rate z*. The result is ``log(x / (1 - exp(-x))) - log z* - rate z`` for x <= 1, and
+        ``log(rate / (1 - exp(-x))) - rate z`` above; ``1 - exp(-x)`` is computed as ``-expm1(-x)``. This never
+        subtracts nearly equal numbers or logarithms. The first factor is 1 at x = 0.
         """
         with np.errstate(all="ignore"):
             x = self.rate * expected
@@ -56,7 +56,7 @@ class ShortDensity:
         return np.where((z < 0) | (z > expected) | (expected <= 0), np.full_like(x, -np.inf), log_p)
 
     def mean(self, expected: Floats) -> Floats:
-        """Return the mean distance of the obstacle, times the rate."""
+        """Return the mean distance of the obstacle times the rate."""
         x = np.clip(self.rate * expected, _LEAST_DECAY, _MOST_DECAY)
         return np.asarray(1 - x / np.expm1(x))
 
@@ -73,13 +73,13 @@ class ShortDensity:
         return np.where(begin < expected, mass, -np.inf)
 
     def drawn(self, share: Floats, expected: Floats) -> Floats:
-        """Return the distance below which a share of the mass lies [m]."""
+        """Return the quantile of a share of the mass [m]."""
         x = np.maximum(self.rate * expected, _UNIFORM)
         return np.minimum(-np.log1p(share * np.expm1(-x)) / x * expected, expected)
 
 
 class RandomDensity:
-    """The uniform density on [0, range_max).
+    """Uniform density on [0, range_max).
 
     Attributes:
         range_max: Longest range Z [m].
@@ -102,12 +102,12 @@ class RandomDensity:
         return np.where((z < 0) | (z >= self.range_max), z.dtype.type(-np.inf), flat)
 
     def drawn(self, share: Floats) -> Floats:
-        """Return the range below which a share of the mass lies [m]."""
+        """Return the quantile of a share of the mass [m]."""
         return share * self.range_max
 
 
 class NoReturn:
-    """The probability of a reading without return, a point mass at range_max.
+    """Probability of a reading without return, a point mass at range_max.
 
     Attributes:
         weight: z_max, one or several.
@@ -124,5 +124,5 @@ class NoReturn:
 
     @property
     def number(self) -> float:
-        """Logarithm of one probability as kernels take it, rounded by the C library."""
+        """Logarithm of a single probability for kernels, rounded by the C library."""
         return log_weight(self.weight)

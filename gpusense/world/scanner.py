@@ -1,4 +1,4 @@
-"""The geometry of a range scanner and the classes of its readings."""
+"""Describe the geometry of a range scanner, and classify its readings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Reading(enum.IntEnum):
     """
 
     MISSING = 0
-    """No information: the beam is left out."""
+    """No information: the beam is ignored."""
     MAX = 1
     """No return within the scanner's range (REP-117)."""
     HIT = 2
@@ -36,10 +36,10 @@ class Reading(enum.IntEnum):
 class Scanner:
     """Immutable geometry of a planar range scanner; compared and hashed by value.
 
-    A sonar is a scanner whose beams are cones: its expected range is the nearest return among ``cone_rays`` rays,
-    spread evenly over the cone's width with both edges included. Smooth walls are mirrors to sound: with
-    ``critical_incidence``, a ray that meets a wall at a larger angle of incidence (see ``RayCaster.incidence``) has no
-    return. Only beam models use cones; a likelihood field scores the end point on each cone's axis.
+    A sonar is a scanner with cones as beams: its expected range is the nearest return among ``cone_rays`` rays, evenly
+    spaced over the cone's width, edges included. Smooth walls are mirrors to sound: with ``critical_incidence``, a ray
+    at a larger angle of incidence (see ``RayCaster.incidence``) does not return. Only beam models use cones; a
+    likelihood field scores the end point on the cone's axis.
 
     Args:
         bearings: (K,) beam directions in the scanner's frame, counter-clockwise from its x axis [rad]; K may be 0.
@@ -101,7 +101,7 @@ class Scanner:
         self._first_scans = plausible.FirstScans(self._range_max, self._range_min)
         plausible.look_at_bearings("bearings", directions)
         plausible.look_at_scanner(self._range_max, self._mount)
-        # Adding 0.0 makes -0.0 and 0.0, which are equal, hash alike.
+        # Adding 0.0 maps -0.0 to 0.0, so that equal scanners hash alike.
         self._hash = hash(((directions + 0.0).tobytes(), *self._scalars()))
 
     @classmethod
@@ -118,7 +118,7 @@ class Scanner:
         cone_rays: int = 9,
         critical_incidence: float | None = None,
     ) -> Scanner:
-        """Make a scanner of evenly spaced beams, as ``sensor_msgs/LaserScan`` describes it.
+        """Make a scanner with evenly spaced beams, as in ``sensor_msgs/LaserScan``.
 
         Args:
             angle_min: Bearing of beam 0 [rad].
@@ -155,15 +155,15 @@ class Scanner:
         range_max: float | None = None,
         range_min: float | None = None,
     ) -> Scanner:
-        """Make the scanner of a ``sensor_msgs/LaserScan``, without ROS.
+        """Make a scanner from a ``sensor_msgs/LaserScan``, without ROS.
 
         Beam k has the bearing ``angle_min + k angle_increment``. Each of ``ranges`` has a beam, even if the last beam
-        has the direction of the first, so that ``message.ranges`` are readings of this scanner. REP-117's infinities
-        and NaN are classified by :func:`classify`.
+        repeats the first one's direction, so that ``message.ranges`` are readings of this scanner. REP-117's
+        infinities and NaN are classified by :func:`classify`.
 
         Args:
-            message: Any object or mapping with the message's fields angle_min, angle_increment, range_min, range_max
-                and ranges. ``angle_max`` is not read, because it follows from the other fields.
+            message: Any object or mapping with the fields angle_min, angle_increment, range_min, range_max and ranges
+                of the message. ``angle_max`` follows from these and is not read.
             mount: Pose (x, y, theta) of the laser in the robot's frame [m, m, rad].
             range_max: Replaces the message's ``range_max`` [m], for drivers that state infinity, NaN or 0.
             range_min: Replaces the message's ``range_min`` [m].
@@ -247,7 +247,7 @@ class Scanner:
         )
 
     def __reduce__(self) -> tuple[Callable[..., Scanner], tuple[Any, ...]]:
-        # Copies and pickles call the constructor, so that their bearings are also read-only.
+        # Copies and pickles call the constructor, which makes their bearings read-only.
         sonar = functools.partial(
             Scanner, cone=self._cone, cone_rays=self._cone_rays, critical_incidence=self._critical
         )
@@ -297,10 +297,9 @@ def classify(ranges: ArrayLike, scanner: Scanner) -> NDArray[np.uint8]:
 def classify_ranges(
     z: NDArray[np.floating], range_min: float, range_max: float
 ) -> tuple[NDArray[np.bool], NDArray[np.bool]]:
-    """Return which readings of any shape are hits, and which are max readings; the others are missing.
+    """Return the masks of hits and of max readings, of any shape; all other readings are missing.
 
-    Kernels have the same rule in the file ``reading_class``. Calls of its functions would take longer than the
-    comparisons.
+    Kernels have the same rule in the file ``reading_class``; calling it would take longer than these comparisons.
     """
     nearest, farthest = range_limits(z.dtype, range_min, range_max)
     return (z >= nearest) & (z < farthest), z >= farthest
@@ -315,7 +314,7 @@ def reading_classes(z: NDArray[np.floating], range_min: float, range_max: float)
 
 
 def float64_readings(z: NDArray[Any], scanner: Scanner) -> NDArray[np.float64]:
-    """Convert readings to float64 and keep their classes, which depend on limits rounded to the original type."""
+    """Convert readings to float64 and keep their classes, although limits are rounded to the original type."""
     if z.dtype.kind != "f" or z.dtype == np.float64:
         return z.astype(np.float64, copy=False)
     hit, far = classify_ranges(z, scanner.range_min, scanner.range_max)

@@ -12,7 +12,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.world.parameters import _Parameters
 
-# Largest degrees of freedom: up to it the mass of Student's t is a short sum; beyond it the t is nearly normal.
+# Largest degrees of freedom: up to here the mass of Student's t is a short sum; beyond, the t is nearly normal.
 MOST_DEGREES = 100
 # Largest standard deviation of a line's angle [rad]: a ninth of half a turn.
 LARGEST_ANGLE_DEVIATION = 0.349
@@ -37,7 +37,7 @@ def _check_mount(parameters: object, value: object) -> None:
 
 @dataclass(frozen=True)
 class PositionParameters(_Parameters):
-    """Parameters of position fixes, such as those of a satellite receiver.
+    """Parameters of position fixes, for example from a satellite receiver.
 
     Raises:
         TypeError: A value has the wrong type for its field.
@@ -51,17 +51,18 @@ class PositionParameters(_Parameters):
     """
 
     sigma: float | None = None
-    """The standard deviation along x and along y, > 0 [m]."""
+    """Standard deviation along x and along y, > 0 [m]."""
     covariance: tuple[tuple[float, float], tuple[float, float]] | None = None
-    """The covariance matrix in the world, in place of sigma [m^2]. Without both, each measurement brings its own."""
+    """Covariance matrix in the world instead of sigma [m^2]; without either, each measurement states its
+    covariance."""
     z_hit: float = 1.0
-    """The weight of a correct fix, >= 0 [1]."""
+    """Weight of a correct fix, >= 0 [1]."""
     z_rand: float = 0.0
-    """The weight of an outlier, uniform in ``region``, >= 0 [1]."""
+    """Weight of an outlier, uniform in ``region``, >= 0 [1]."""
     region: tuple[float, float, float, float] | None = None
-    """The rectangle of outliers (x_min, y_min, x_max, y_max) in the world [m]; required if z_rand > 0."""
+    """Rectangle of outliers (x_min, y_min, x_max, y_max) in the world [m]; required if z_rand > 0."""
     mount: tuple[float, float] = (0.0, 0.0)
-    """The antenna's position (x, y) on the robot [m]."""
+    """Antenna's position (x, y) on the robot [m]."""
 
     def __post_init__(self) -> None:
         if self.sigma is not None:
@@ -84,7 +85,7 @@ class PositionParameters(_Parameters):
 
 @dataclass(frozen=True)
 class HeadingParameters(_Parameters):
-    """Parameters of heading readings, such as those of a compass.
+    """Parameters of heading readings, for example from a compass.
 
     Raises:
         TypeError: A value has the wrong type for its field.
@@ -97,17 +98,17 @@ class HeadingParameters(_Parameters):
     """
 
     sigma: float = 0.1
-    """The standard deviation before wrapping, > 0 [rad]; used by ``"wrapped_normal"``."""
+    """Standard deviation before wrapping, > 0 [rad]; used by ``"wrapped_normal"``."""
     kappa: float = 100.0
-    """The concentration, >= 0 [1]; used by ``"von_mises"``; if large, nearly a normal with sigma 1 / sqrt(kappa)."""
+    """Concentration, >= 0 [1]; used by ``"von_mises"``; a large one is nearly a normal with sigma 1 / sqrt(kappa)."""
     kind: Literal["wrapped_normal", "von_mises"] = "wrapped_normal"
-    """The distribution of correct readings around the true heading."""
+    """Distribution of correct readings around the true heading."""
     z_hit: float = 1.0
-    """The weight of a correct reading, >= 0 [1]."""
+    """Weight of a correct reading, >= 0 [1]."""
     z_rand: float = 0.0
-    """The weight of a random reading, uniform over the circle, >= 0 [1]."""
+    """Weight of a random reading, uniform over the circle, >= 0 [1]."""
     offset: float = 0.0
-    """The reading at a robot heading of 0: the mount's yaw less the magnetic declination [rad]."""
+    """Reading at a robot heading of 0: the mount's yaw less the magnetic declination [rad]."""
 
     def __post_init__(self) -> None:
         self._check("sigma", above=0)
@@ -119,7 +120,7 @@ class HeadingParameters(_Parameters):
 
 @dataclass(frozen=True)
 class BeaconParameters(_Parameters):
-    """Parameters of ranges to beacons, such as ultra-wideband radios.
+    """Parameters of ranges to beacons, for example ultra-wideband radios.
 
     Raises:
         TypeError: A value has the wrong type for its field.
@@ -132,25 +133,25 @@ class BeaconParameters(_Parameters):
     """
 
     sigma_range: float = 0.3
-    """The standard deviation of a correct range, or a Student t's scale, > 0 [m]."""
+    """Standard deviation of a correct range, or a Student t's scale, > 0 [m]."""
     bias: float | tuple[float, ...] = 0.0
-    """The mean error of ranges, one for all or one for each beacon; positive if they are too long [m]."""
+    """Mean error of ranges, common or per beacon; positive for ranges that are too long [m]."""
     kind: Literal["normal", "student_t", "mixture"] = "normal"
-    """The distribution of correct ranges: a normal, Student's t, or a mixture of a normal and a wide normal."""
+    """Distribution of correct ranges: a normal, Student's t, or a mixture of a normal and a wide normal."""
     nu: int = 4
-    """The degrees of freedom of ``"student_t"``, 1 to 100 [1]."""
+    """Degrees of freedom of ``"student_t"``, 1 to 100 [1]."""
     heavy_weight: float = 0.1
-    """The share of the wide normal of ``"mixture"``, 0 to 1 [1]."""
+    """Share of the wide normal of ``"mixture"``, 0 to 1 [1]."""
     sigma_heavy: float = 1.5
-    """The standard deviation of the wide normal of ``"mixture"``, > 0 [m]."""
+    """Standard deviation of the wide normal of ``"mixture"``, > 0 [m]."""
     z_hit: float = 0.95
-    """The weight of a correct range, >= 0 [1]."""
+    """Weight of a correct range, >= 0 [1]."""
     z_rand: float = 0.05
-    """The weight of a random range, uniform up to range_max, >= 0 [1]."""
+    """Weight of a random range, uniform up to range_max, >= 0 [1]."""
     range_max: float = 100.0
-    """The longest range that the radio can report, > 0 [m]."""
+    """Longest range that the radio can report, > 0 [m]."""
     mount: tuple[float, float] = (0.0, 0.0)
-    """The antenna's position (x, y) on the robot [m]."""
+    """Antenna's position (x, y) on the robot [m]."""
 
     def __post_init__(self) -> None:
         for name in ("sigma_range", "sigma_heavy", "range_max"):
@@ -182,11 +183,11 @@ class BumperParameters(_Parameters):
     """
 
     p_contact: float = 0.95
-    """The probability that a bumper in contact with an obstacle is pressed, 0 to 1 [1]."""
+    """Probability that a bumper in contact with an obstacle is pressed, 0 to 1 [1]."""
     p_false: float = 0.01
-    """The probability that a bumper without contact is pressed, 0 to 1 [1]."""
+    """Probability that a bumper without contact is pressed, 0 to 1 [1]."""
     sigma: float = 0.05
-    """The joint standard deviation of the outline and the map, > 0 [m]."""
+    """Joint standard deviation of outline and map, > 0 [m]."""
 
     def __post_init__(self) -> None:
         self._check("p_contact", low=0, high=1)
@@ -209,17 +210,17 @@ class LineParameters(_Parameters):
     """
 
     sigma_angle: float = 0.02
-    """The standard deviation of a line's angle, in (0, 0.349] [rad]."""
+    """Standard deviation of a line's angle, in (0, 0.349] [rad]."""
     sigma_distance: float = 0.05
-    """The standard deviation across the line, at the middle of the part that is seen, > 0 [m]."""
+    """Standard deviation across the line, at the middle of its visible part, > 0 [m]."""
     z_detect: float = 0.9
-    """The weight of a feature that is a line of the map, >= 0 [1]."""
+    """Weight of a feature that comes from a line of the map, >= 0 [1]."""
     z_false: float = 0.1
-    """The weight of a false positive, a feature that is no line of the map, >= 0 [1]."""
+    """Weight of a false positive, >= 0 [1]."""
     range_max: float = 20.0
-    """The largest distance of a line from the sensor, > 0 [m]."""
+    """Largest distance of a line from the sensor, > 0 [m]."""
     p_detect: float = 0.9
-    """The probability that a line in view is detected, in [0, 1] [1]; used for drawn features only."""
+    """Probability of detecting a line in view, in [0, 1] [1]; used for drawn features only."""
 
     def __post_init__(self) -> None:
         self._check("sigma_angle", above=0, high=LARGEST_ANGLE_DEVIATION)

@@ -36,7 +36,7 @@ class SensorScans:
         return len(self.sensor)
 
     def places(self) -> Integers:
-        """Return the index (S,) of each scan among those of its scanner."""
+        """Return the index (S,) of each scan among the scans of its scanner."""
         place = np.zeros(len(self), np.int64)
         for rows in self.rows:
             place[rows] = np.arange(len(rows))

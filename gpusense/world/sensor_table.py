@@ -20,7 +20,7 @@ class SensorTable(ABC):
     def sensor_table(self, dtype: DTypeLike) -> NDArray[Any]:
         """Return the (bins + 1, bins + 1) table of log densities by bin of the reading, then of the expected range.
 
-        Its last row, "no return", holds log probabilities.
+        The last row, "no return", holds log probabilities.
         """
 
     @abstractmethod

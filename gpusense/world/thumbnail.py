@@ -8,8 +8,7 @@ from gpusense._util.html import grey_png
 
 WIDEST = 240
 """Most pixels along a side."""
-# Greys of free, unknown and occupied cells; a pixel of several cells has the darkest of their greys, so that walls
-# remain.
+# Greys of free, unknown and occupied cells; a pixel takes the darkest of its cells, so that walls remain.
 _FREE, _UNKNOWN, _OCCUPIED = 255, 205, 60
 
 

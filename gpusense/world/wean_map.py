@@ -1,8 +1,8 @@
 """Read maps of Carnegie Mellon's robot software BeeSoft, such as ``wean.dat`` of Wean Hall.
 
 The text has a line for each x, with a number for each y: the probability that a cell is free, or -1 for unknown. A
-header may come first: lines ``robot_specifications->NAME VALUE``, among them ``resolution`` in centimetres, and
-``global_map[0]: COLUMNS ROWS``. Without a resolution cells have sides of 0.1 m. The corner of the first cell is (0, 0).
+header may come first: lines ``robot_specifications->NAME VALUE``, such as ``resolution`` in centimetres, and
+``global_map[0]: COLUMNS ROWS``. The default resolution is 0.1 m. The corner of the first cell is (0, 0).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def read_probabilities(file: Path, *, occupied_threshold: int) -> OccupancyGrid:
 
 
 def _fields(where: str, line: bytes) -> list[bytes]:
-    """Return the fields of a line; all must be short, since an array pads each to the longest."""
+    """Return the fields of a line; long fields are refused, because an array pads all to the longest."""
     fields = line.split()
     longest = max(fields, key=len)
     if len(longest) > _LONGEST_FIELD:

@@ -1,4 +1,4 @@
-"""Windows of a map: the part within reach of a cloud of particles. The rest is left out until the cloud moves there."""
+"""Choose windows of a map: the part within reach of a cloud of particles."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from gpusense.interface import structs
 from gpusense.world.frames import Cells, Mount
 from gpusense.world.grid import OccupancyGrid
 
-# Poses [m, m, rad] whose box holds all poses of a cloud.
+# Poses [m, m, rad] that span a box around a cloud.
 Corners = Sequence[tuple[float, float, float]]
 # A map with fewer cells is prepared as a whole.
 SMALLEST_CELLS = 1 << 20
 # Longest side of a window [cells]: distances in cells are squared in 32 bits.
 LONGEST_SIDE = (1 << 15) - 1
-# A window with a larger share of the map's cells is replaced by the whole map.
+# A larger share of the map's cells is replaced by the whole map.
 LARGEST_SHARE = 0.6
 # Margin for motion around a new window, as a share of the reach.
 SLACK = 0.5
@@ -77,12 +77,12 @@ class Window(structs.Window):
         return Window(self.row + rows, self.col + cols, self.rows, self.cols)
 
     def cut(self, array: np.ndarray) -> np.ndarray:
-        """Return the view of an (H, W) array in this window."""
+        """Return the part of an (H, W) array in this window, as a view."""
         return array[self.row : self.row + self.rows, self.col : self.col + self.cols]
 
 
 def box(cells: np.ndarray) -> Window | None:
-    """Return the smallest window that holds all True cells of an (H, W) array; None without any."""
+    """Return the smallest window around all True cells of an (H, W) array; None without any."""
     rows, cols = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
     if len(rows) == 0:
         return None
@@ -98,7 +98,7 @@ def whole(grid: OccupancyGrid) -> Window:
 def extent(grid: Cells, corners: Corners, mount: Mount) -> tuple[float, float, float, float]:
     """Return bounds of the sensor's position for poses within ``corners``.
 
-    A call has four corners, for which Python's numbers are faster than arrays.
+    For the four corners of a call, Python's numbers are faster than arrays.
 
     Returns:
         Least and largest column, least and largest row [cells].
@@ -122,7 +122,7 @@ def needed(grid: OccupancyGrid, corners: Corners, mount: Mount, reach: float, sl
 
     Args:
         grid: The map.
-        corners: Poses [m, m, rad], at least one; their box holds all poses.
+        corners: Poses [m, m, rad], at least one, that span a box around all poses.
         mount: The sensor's pose on the robot.
         reach: Longest distance that matters, ring and rounding included [cells].
         slack: Additional margin on every side [cells].
@@ -154,7 +154,7 @@ def choose(grid: OccupancyGrid, current: Window | None, corners: Corners, mount:
         roomy = least
     if current is not None:
         joined = roomy.joined(current)
-        # The old window is dropped after a jump, since the joint window would be much larger than both.
+        # Drop the old window after a jump, since the joint window would be much larger than both.
         near = joined.cells <= 2 * (roomy.cells + current.cells)
         roomy = joined if near and max(joined.rows, joined.cols) <= LONGEST_SIDE else roomy
     return everything if roomy.cells > LARGEST_SHARE * everything.cells and not long else roomy

@@ -1,1 +1,1 @@
-"""Intrinsic parameters of sensor models, learned from data: beam, landmark and discrete model."""
+"""Learn the intrinsic parameters of sensor models from data."""

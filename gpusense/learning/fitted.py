@@ -1,4 +1,4 @@
-"""Members, dictionary and tables that results of fits share."""
+"""Base class of results of fits: conversion to dictionaries, and tables."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class FitRow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Fitted(Generic[P]):
-    """Result of a fit, whose subclasses describe the attributes."""
+    """Result of a fit; subclasses describe the attributes."""
 
     parameters: P
     log_likelihood: float
@@ -38,7 +38,7 @@ class Fitted(Generic[P]):
     missing: int
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all attributes but arrays of readings as plain numbers, lists and strings; None if not finite."""
+        """Return all attributes except arrays of readings as plain numbers, lists and strings; None if not finite."""
         return {field.name: _plain(getattr(self, field.name)) for field in fields(self) if field.repr}
 
     def _rows(self) -> list[FitRow]:
@@ -50,7 +50,7 @@ class Fitted(Generic[P]):
         ]
 
     def _value(self, name: str) -> Any:
-        """Return a parameter, None if no reading has it."""
+        """Return a parameter; None without readings of it."""
         return getattr(self.parameters, name)
 
     def _repr_html_(self) -> str:
@@ -58,7 +58,7 @@ class Fitted(Generic[P]):
         return card(f"{type(self).__name__}: {self.status}", rows, head=FIT_HEAD, detail=str(self))
 
     def _table(self, units: dict[str, str], independent: dict[str, float]) -> list[str]:
-        """Return the lines of the table, with a column of errors of independent readings if there are any."""
+        """Return the lines of the table, including a column of errors for independent readings, if any."""
         lines = [
             f"{'parameter':16}{'value':>13}{'std. error':>13}{'if independent' if independent else '':>16}".rstrip()
         ]

@@ -1,4 +1,4 @@
-"""Standard errors and Newton steps from the observed information, for independent or correlated readings."""
+"""Compute standard errors and Newton steps from the observed information, for independent or correlated readings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _FLAT = 1e-10
 
 
 def scaled_axes(curve: Floats, least: float = 1e-300) -> tuple[Floats, Floats, Floats]:
-    """Return the eigenvalues and axes of a curvature in scaled coordinates, in which its diagonal is 1.
+    """Return the eigenvalues and axes of a curvature in coordinates that scale its diagonal to 1.
 
     Args:
         curve: (m, m) curvature.

@@ -1,12 +1,11 @@
-"""Scatter of the likelihood's gradient over blocks of readings, for standard errors of correlated readings.
+"""Compute the scatter of the likelihood's gradient over blocks, for standard errors of correlated readings.
 
 Errors within a scan and between neighbouring scans are correlated. The inverse of the observed information H then is
-not the covariance of the parameters. With G_b the gradient of the log-likelihood of block b, and independent blocks, it
-is
+not the covariance of the parameters. For independent blocks with gradients G_b of the log-likelihood, the covariance is
 
     H^-1 (sum_b G_b G_b') H^-1,
 
-which is also right if the mixture is not the true distribution. The sum is centred and multiplied by B / (B - 1).
+even if the mixture is not the true distribution. The sum is centred and multiplied by B / (B - 1).
 
 Source: White (1982), "Maximum likelihood estimation of misspecified models"; Liang and Zeger (1986), "Longitudinal data
 analysis using generalized linear models".
@@ -27,7 +26,7 @@ from gpusense.learning.point.densities import by_shape, truncated
 from gpusense.world.range_causes import ShortDensity
 from gpusense.world.scanner import Reading
 
-# Number of readings whose gradients are computed at once.
+# Number of readings per pass.
 _PART = 1 << 18
 
 
@@ -52,10 +51,7 @@ def count_blocks(pairs: Pairs) -> int:
 
 
 def block_scatter(problem: Problem, point: Point) -> Floats:
-    """Compute the scatter over blocks of the log-likelihood's gradient by the coordinates.
-
-    The scatter is NaN for fewer than 2 blocks.
-    """
+    """Return the scatter of the log-likelihood's gradient over blocks; NaN for fewer than 2 blocks."""
     sums, counts = block_gradients(problem, point)
     blocks = int(np.count_nonzero(counts))
     if blocks < 2:

@@ -1,4 +1,4 @@
-"""Sum over all pairs on a device: pairs are uploaded once, and each pass downloads one row of sums per block."""
+"""Sum over all pairs on a device. Pairs are uploaded once; each pass downloads one row of sums per block."""
 
 from __future__ import annotations
 
@@ -72,7 +72,8 @@ class DeviceSums:
         self._range_max = pairs.range_max
         self._flags = _FLAGS | flags_if(FLOAT64=real == np.float64)
         self.passes = 0
-        # The NumPy reference has the processor's layout: it loops over a block's places, over all blocks at once.
+        # The NumPy reference shares the processor's layout: it loops over the positions in a block, for all blocks at
+        # once.
         gpu = backend.info.kind == "gpu"
         most = min(_CHUNK, backend.info.max_buffer // (8 * real.itemsize))
         self._chunks = [
@@ -85,7 +86,7 @@ class DeviceSums:
     def _upload(self, reading: NDArray[np.floating], expected: NDArray[np.floating], gpu: bool) -> _Chunk:
         count = len(reading)
         length = max(_SHORTEST, -(-count // _BLOCKS["gpu" if gpu else "cpu"]))
-        # A processor's lanes take adjacent pairs and are always full.
+        # On a processor lanes take adjacent pairs and are always full.
         length += 0 if gpu else -length % LANES
         blocks = -(-count // length)
         padded = np.full((2, blocks * length), np.nan, self.real)
@@ -96,7 +97,7 @@ class DeviceSums:
         return _Chunk(z, z_expected, count, blocks, length, across, along)
 
     def of(self, pairs: Pairs) -> DeviceSums:
-        """Return the sums over other pairs on the same device."""
+        """Return the sums over ``pairs`` on the same device."""
         return DeviceSums(self._backend, self.real, pairs)
 
     @property
@@ -110,10 +111,6 @@ class DeviceSums:
 
     def sums(self, point: Point, *, information: bool = False) -> NDArray[np.float64]:
         """Sum over the hits, in a fixed order of addition.
-
-        Args:
-            point: The parameters.
-            information: Whether to also sum the terms of second derivatives.
 
         Returns:
             (13,) or, with second derivatives, (39,) float64.

@@ -1,19 +1,19 @@
 """Expectation maximisation with the exact M-step, and Newton steps once EM becomes slow.
 
-The book's M-step (table 6.2, lines 14 and 15) ignores that p_hit is truncated to [0, range_max] and p_short to [0, z*].
-It does not maximise the likelihood, which may fall. The exact M-step solves, for the responsibilities r,
+The book's M-step (table 6.2, lines 14 and 15) ignores the truncation of p_hit to [0, range_max] and of p_short to [0,
+z*]. It does not maximise the likelihood, and may lower it. For the responsibilities r the exact M-step solves
 
     sum r W u^2 = sum r (1 - T)         sigma_hit: weighted squares are as large as for a truncated hit
     lambda sum r z = sum r (1 - v)      lambda_short: lengths are as large as for a truncated exponential
 
-(W, T, v: see ``gpusense.reference.learning``). W is 1 for a normal. For Student's t it is the expected inverse variance
-of a reading that is normal with a random variance, the weight of its EM (Lange, Little and Taylor 1989). The logarithms
+(W, T, v: see ``gpusense.reference.learning``). W is 1 for a normal. For Student's t, a normal with a random variance,
+it is the expected inverse variance of a reading, the weight of its EM (Lange, Little and Taylor 1989). The logarithms
 of both sides are nearly linear in log sigma and log lambda, so one Newton step of their difference is a good solution;
 without truncation it is exact and equals the book's. The step is halved until the log-likelihood does not fall: a
 generalised EM (Dempster, Laird and Rubin 1977, theorem 1).
 
-EM is slow if causes are hard to distinguish. The same pass over the pairs yields the observed information, so that a
-Newton step of the log-likelihood itself is tried once EM gains little. It is accepted if the log-likelihood rises.
+EM is slow if causes are hard to distinguish. The same pass over the pairs yields the observed information; once EM
+gains little, a Newton step of the log-likelihood is tried, and accepted if the log-likelihood rises.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _LONGEST = 2.0
 # Newton steps begin once an EM step gains less than _LITTLE nats, or after _MANY EM steps.
 _LITTLE, _MANY = 0.5, 20
 _HALVINGS = 30
-# Iterations without progress after which the search ends, as at a kink where z* + b is clamped.
+# Iterations without progress after which the search ends, for example at a kink where z* + b is clamped.
 _STILL = 8
 # Remaining gain [nats] below which a Newton step is accepted despite rounding.
 _NEAR = 1e-4
@@ -62,7 +62,7 @@ def climb_em(problem: Problem, start: Point, *, max_iterations: int, tolerance: 
     """Climb until the remaining gain, estimated from the information matrix, is at most ``tolerance`` nats."""
     value = problem.value(start)
     trace = [value.objective]
-    # EM does not move the shape of hits: take Newton steps alone, as long as they gain.
+    # EM does not move the shape of hits: take only Newton steps, as long as they gain.
     has_form = bool(start.shape.limits)
     newton, gains, still = has_form, False, 0
     for iteration in range(1, max_iterations + 1):
@@ -106,7 +106,7 @@ def _shaped(problem: Problem, point: Point, weights: Floats, step: Floats) -> Po
 
 
 def m_step(problem: Problem, value: Value) -> Floats:
-    """Compute the M-step of sigma, rate and offset; a shape whose cause accounts for no reading does not move."""
+    """Return the M-step of sigma, rate and offset, 0 for a cause without readings."""
     sums, point, prior = value.sums, value.point, problem.prior
     free = problem.free(value)
     step = np.zeros(FORM + len(point.shape.limits))
@@ -142,7 +142,7 @@ def newton_step(problem: Problem, value: Value) -> tuple[Value, float]:
     """Take a Newton step if it raises the objective.
 
     Returns:
-        The new value, or the old one; and the gain [nats] that the quadratic model predicted.
+        The new or the old value, and the gain [nats] that the quadratic model predicted.
     """
     step, left = free_direction(problem, value)
     if left <= 0:
@@ -150,7 +150,7 @@ def newton_step(problem: Problem, value: Value) -> tuple[Value, float]:
     form = step[FORM:] / np.maximum(value.point.shape.coordinates, SMALL_FORM)
     longest = float(np.abs(np.append(step[: RATE + 1], form)).max())
     scale = min(1.0, _LONGEST / max(longest, 1e-300))
-    # Near the optimum the step is right even though its gain is less than rounding.
+    # Near the optimum the step is right even if its gain is below rounding.
     least = value.objective - (problem.noise(value) if left < max(_NEAR, problem.blur(value)) else 0.0)
     for _ in range(5):
         candidate = problem.value(value.point.moved(scale * step, problem.bounds), second=True)
@@ -168,7 +168,7 @@ def free_direction(problem: Problem, value: Value) -> tuple[Floats, float]:
 
 
 def without_needless(problem: Problem, value: Value) -> Value:
-    """Set the weights of causes that account for hardly any reading to 0, unless the objective falls."""
+    """Set the weights of causes with hardly any reading to 0, unless the objective falls."""
     weights = value.point.weights
     for cause in range(4):
         if weights[cause] > 0 and value.totals[cause] < NOTHING and problem.prior.counts[cause] == 0:

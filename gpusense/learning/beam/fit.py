@@ -59,19 +59,20 @@ def fit_beam_parameters(
 ) -> BeamFit:
     """Fit the parameters of the beam model by maximum likelihood (book section 6.3.3, table 6.2).
 
-    Readings are classified as by :func:`gpusense.classify`: missing readings are left out, "no return" has probability
-    z_max, and ranges have the mixture's density. The device computes the sums over all pairs.
+    :func:`gpusense.classify` classifies the readings: missing ones are ignored, "no return" has probability z_max, and
+    ranges have the mixture's density. The device sums over all pairs.
 
     Args:
         ranges: Readings z of any shape [m].
-        expected: Expected ranges z* of the same shape, in [0, range_max] [m]; any value beside a missing reading.
+        expected: Expected ranges z* of the same shape, in [0, range_max] [m]; ignored where the reading is missing.
         range_max: Readings of at least ``range_max`` are "no return" [m].
         method: ``"em"``: EM with the exact M-step and Newton steps; ``"em-book"``: the book's closed forms, with their
             failures; ``"gradient"``: L-BFGS-B; ``"hill_climb"``: Powell's method; ``"genetic"``: differential
             evolution, finished by gradients.
         range_min: Readings below ``range_min`` are missing [m].
         initial: Start of the search; None chooses the best of several from the readings. A cause of weight 0 stays
-            excluded; shapes beyond their bounds are clamped. The status says if a start from the readings is better.
+            excluded; shapes beyond their bounds are clamped. The status reports whether a start from the readings is
+            better.
         backend: The device, see :func:`gpusense.devices`.
         precision: ``"float64"`` or ``"float32"``; None is float64 if the device has it.
         max_iterations: Largest number of iterations of the method; None is 500 for ``"em"``, 60 for ``"em-book"``, 1000
@@ -81,17 +82,18 @@ def fit_beam_parameters(
         seed: Seed of the random starts and of ``"genetic"``.
         range_bias: Whether the parameters also contain an offset b of correct ranges: z = z* + b. p_hit then has its
             mean at z* + b, clamped to [0, range_max].
-        sigma_growth: True if the deviation of correct ranges also grows with range: it is sigma_hit + sigma_growth z*.
-            All parameters are then fitted together on the host, from the fit without growth.
-        hit: Shape of correct ranges: ``"normal"``, or ``"student"``, a Student t whose degrees of freedom ``hit_dof``
-            are also fitted. All parameters are then fitted together by EM and Newton steps, from the fit with a normal.
+        sigma_growth: Whether the deviation of correct ranges grows with range, as sigma_hit + sigma_growth z*. All
+            parameters are then fitted jointly on the host, starting from the fit without growth.
+        hit: Shape of correct ranges: ``"normal"``, or ``"student"``, a Student t with fitted degrees of freedom
+            ``hit_dof``. All parameters are then fitted jointly by EM and Newton steps, starting from the fit with a
+            normal.
         responsibilities: Whether to also return each reading's probabilities of the four causes.
-        blocks: Integer label of each reading's block, of the same shape, or None. Readings of different blocks are
-            independent; readings of one block (a scan, or several neighbouring scans) need not be. Standard errors are
-            then computed over blocks.
-        sigma_bounds: Smallest and largest sigma_hit [m]. None is from the rounding step of the readings over sqrt(12),
-            or without one from 1e-6 range_max, to range_max.
-        lambda_bounds: Smallest and largest lambda_short [1/m]. None is 1e-3 / range_max to 1e4 / range_max.
+        blocks: Integer label of each reading's block, of the same shape, or None. Readings within a block (a scan, or
+            neighbouring scans) may be correlated; blocks are independent. Standard errors are then computed over
+            blocks.
+        sigma_bounds: Smallest and largest sigma_hit [m]. The default is the rounding step of the readings over
+            sqrt(12), or 1e-6 range_max without a step, to range_max.
+        lambda_bounds: Smallest and largest lambda_short [1/m]. The default is 1e-3 / range_max to 1e4 / range_max.
         progress: Show a progress bar on standard error if that is a terminal.
         callback: Function called after each iteration with its number, the log-likelihood and the parameters.
 
@@ -145,17 +147,7 @@ def fit_pairs(
     *,
     chosen: bool = False,
 ) -> BeamFit:
-    """Fit pairs on a device from several starts, and report the best result.
-
-    Args:
-        device: Sums over the pairs.
-        pairs: The readings.
-        bounds: Bounds of the shapes.
-        start: The first start; its causes of weight 0 stay excluded.
-        options: Options of the fit.
-        prior: Pseudo-readings.
-        chosen: Whether the user chose the start, so that no other replaces it.
-    """
+    """Fit pairs on a device from several starts, and report the best result."""
     problem = Problem(device, pairs, bounds, prior, options.range_bias)
     if not math.isfinite(problem.value(start).objective):
         raise ValueError(f"initial: must make every reading possible, got {start.parameters()}")
@@ -190,7 +182,7 @@ def _climb(options: Options, problem: Problem, start: Point, watch: Watch) -> Cl
 
 @contextlib.contextmanager
 def _watcher(options: Options, starts: int) -> Iterator[Watch]:
-    """Yield the function called after each iteration, which moves the progress bar and calls the user's callback."""
+    """Yield the function called after each iteration: it moves the progress bar and calls the user's callback."""
     with contextlib.ExitStack() as stack:
         step = None
         if options.progress:

@@ -1,9 +1,9 @@
-"""Fit the growth of the deviation with range, together with all other parameters and the shape of hits.
+"""Fit the growth of the deviation with range, jointly with all other parameters and the shape of hits.
 
-A correct range has the scale ``sigma_hit + sigma_growth z*``. The device's sums have a single deviation, so this search
-computes the log p and gradient of every pair on the host in float64: Newton steps within bounds from the normal fit
-without growth, with shares of its deviation turned into growth, and with the starts of the shape. No step lowers the
-likelihood.
+A correct range has the scale ``sigma_hit + sigma_growth z*``, but the device's sums have a single deviation. This
+search therefore computes the log p and gradient of every pair on the host in float64. Newton steps within bounds start
+from the normal fit without growth, with shares of its deviation turned into growth, and from the starts of the shape.
+No step lowers the likelihood.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from gpusense.world.parameters import BeamParameters
 from gpusense.world.range_causes import NoReturn, RandomDensity, ShortDensity
 from gpusense.world.scanner import Reading
 
-# Shares of the deviation at the mean expected range that become growth in the starts; iterations of a search.
+# Shares of the deviation at the mean expected range that starts turn into growth; iterations of a search.
 _SHARES, _ITERATIONS = (0.02, 0.3, 0.7, 0.95), 200
 # Number of readings above which a table of masses is faster than the formula.
 _MANY = 2000
@@ -40,8 +40,8 @@ _TOP, _RAND, _SHORT, _SIGMA, _GROWTH, _RATE, _BIAS = range(7)
 class _Growing(Problem):
     """Likelihood by (z_max, share of rand, share of short in the rest, log sigma, growth, log rate[, bias][, shape]).
 
-    The first three split the weights: z_rand is the share of rand times 1 - z_max, and so on. The last ones are the
-    coordinates of the shape.
+    The first three split the weights: z_rand is the share of rand times 1 - z_max, and so on. The coordinates of the
+    shape come last.
     """
 
     per_reading: ClassVar[tuple[str, ...]] = ("reading", "expected", "none")
@@ -126,19 +126,19 @@ class _Growing(Problem):
             return np.where(self.none, NoReturn(top).log_mass, log_p + np.log1p(-top)), gradient
 
     def _by_shape(self, theta: Floats) -> list[Floats]:
-        """Return the derivatives of the log density of hits by the coordinates of the shape, as differences."""
+        """Return the derivatives of the log density of hits by the coordinates of the shape, by differences."""
         sigma, mean, u = self._hits_at(theta)
         ends = mean / sigma, (self.range_max - mean) / sigma
         return by_shape(u, *ends, self._shape_at(theta), self._shape_of, self.kind.limits)
 
     def _hits_at(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return the scale and the mean of hits, and the distances of readings from it in scales."""
+        """Return the scale and mean of hits, and the readings' distances from the mean in scales."""
         sigma = math.exp(theta[_SIGMA]) + theta[_GROWTH] * self.expected
         mean = np.clip(self.expected + (theta[_BIAS] if self.fit_bias else 0.0), 0, self.range_max)
         return sigma, mean, (self.reading - mean) / sigma
 
     def _shape_of(self, coordinates: Floats) -> HitShape:
-        """Return the shape at coordinates, with masses from a table where readings are many."""
+        """Return the shape at coordinates; many readings look up masses in a table."""
         shape = self.kind.at(coordinates)
         return TabulatedHit.of_shape(shape) if shape.tabulated and len(self.reading) > _MANY else shape
 
@@ -167,17 +167,7 @@ def fit_jointly(
     growth: bool,
     hit: HitName,
 ) -> BeamFit:
-    """Fit the growth of the deviation, and the shape of hits, from a normal fit without growth.
-
-    Args:
-        fit: The fit.
-        pairs: Its readings.
-        bounds: Bounds of the shapes.
-        tolerance: The search has converged once it expects to gain less than this [nats].
-        responsibilities: Whether to return each reading's probabilities of the causes.
-        growth: Whether to fit the growth.
-        hit: Name of the shape.
-    """
+    """Fit the growth of the deviation, and the shape of hits, from a normal fit without growth."""
     new = ("sigma_growth",) * growth + SHAPES[hit].fitted
     if not pairs.hits or not pairs.expected.any():
         return without_ranges(fit, hit, growth)
@@ -212,7 +202,7 @@ def fit_jointly(
 
 
 def _offset(problem: _Growing, end: Climb, tolerance: float, blocks: NDArray[np.int64] | None) -> tuple[float, float]:
-    """Return the offset from a fit that includes it, and its standard error; NaN if the search did not converge."""
+    """Fit the offset as well, and return it with its standard error; NaN if the search did not converge."""
     joint = replace(problem, fit_bias=True)
     best = climb(joint, np.insert(end.theta, _BIAS, 0.0), _ITERATIONS, tolerance)
     if not best.converged:

@@ -1,4 +1,4 @@
-"""Fit the parameters of the beam model by incidence bin, with the pooled fit as a prior for bins of few readings."""
+"""Fit the parameters of the beam model by incidence bin, with the pooled fit as a prior."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ class IncidenceFit:
 
     Attributes:
         parameters: Parameters of the bins, ready for a model.
-        pooled: Fit of all readings with a surface together: the prior of the bins.
-        fits: (B,) fit of each bin. Traces hold log-likelihood plus log prior; standard errors count pseudo-readings as
-            readings.
+        pooled: Pooled fit of all readings with a surface: the prior of the bins.
+        fits: (B,) fit of each bin. Traces hold log-likelihood plus log prior; standard errors include
+            pseudo-readings.
         counts: (B,) readings of each bin, hits and max readings.
         no_surface: Fit of the beams that hit no surface, with the same prior; None without readings and
             pseudo-readings.
         no_surface_count: Hits and max readings of the beams that hit no surface.
-        strength: Pseudo-readings of each fit, distributed as in the pooled fit.
+        strength: Number of pseudo-readings of each fit, distributed as in the pooled fit.
 
     Example:
         >>> import gpusense as gs
@@ -68,7 +68,7 @@ class IncidenceFit:
 
     @property
     def converged(self) -> bool:
-        """Tell whether every fit converged."""
+        """Return whether every fit converged."""
         return self.pooled.converged and all(fit.converged for fit in self._all_fits)
 
     @property
@@ -152,15 +152,15 @@ def fit_incidence_parameters(
 ) -> IncidenceFit:
     """Fit the parameters of the beam model for each incidence bin.
 
-    All readings with a surface are fitted together first. Then each bin is fitted with ``strength`` additional
-    pseudo-readings, distributed as in this pooled fit: a Dirichlet prior of the weights and its counterpart for the
-    shapes. They have little effect on a bin of thousands of readings; an empty bin keeps the pooled parameters.
+    A pooled fit of all readings with a surface comes first. Each bin is then fitted with ``strength`` pseudo-readings
+    distributed as in the pooled fit: a Dirichlet prior of the weights, and its counterpart for the shapes. Their effect
+    on a bin of thousands of readings is small; an empty bin keeps the pooled parameters.
 
-    A number of bins makes bins of equal width. Lost echoes and long tails change fastest with the angle near grazing
-    incidence, where readings are few; bins of equal count would merge them into one.
+    ``bins`` as a number makes bins of equal width. Bins of equal count would merge all angles near grazing incidence,
+    where readings are few but lost echoes and long tails change fastest.
 
-    Beams that hit no surface have separate parameters, fitted with the same prior. Their expected reading is "no
-    return"; counted in a bin, it would mimic walls that are often missed.
+    Beams that hit no surface get separate parameters, fitted with the same prior. In a bin, their expected "no return"
+    would look like walls that are often missed.
 
     Args:
         ranges: Readings z of any shape [m].
@@ -168,10 +168,10 @@ def fit_incidence_parameters(
         incidence: Angles of incidence of the same shape, in [0, pi / 2] [rad]; NaN for a beam that hits no surface.
         range_max: Readings of at least ``range_max`` are "no return" [m].
         bins: Number of bins of equal width, or (B + 1,) edges, rising from 0 to pi / 2 [rad].
-        strength: Pseudo-readings per bin, >= 0; 0 fits every bin independently. With 0, and without a reading of a beam
-            that hits no surface, such beams keep the first bin's parameters.
-        method: Method of :func:`fit_beam_parameters`, which describes all following arguments; not ``"em-book"``, which
-            has no prior.
+        strength: Pseudo-readings per bin, >= 0; 0 fits every bin independently. With 0, beams without a surface and
+            without readings take the first bin's parameters.
+        method: Method of :func:`fit_beam_parameters` except ``"em-book"``, which cannot use a prior. All following
+            arguments are described there.
         range_min: Readings below ``range_min`` are missing [m].
         initial: Start of the pooled fit.
         backend: The device.

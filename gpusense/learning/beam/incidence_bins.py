@@ -1,4 +1,4 @@
-"""Fits of the beam model in bins of the angle of incidence, with the pooled fit as their prior."""
+"""Fit the beam model in bins of the angle of incidence, with the pooled fit as prior."""
 
 from __future__ import annotations
 
@@ -18,15 +18,7 @@ from gpusense.learning.beam.result import BeamFit
 
 
 class Binned:
-    """Fits of the bins with the pooled fit as their prior.
-
-    Args:
-        device: The device and the precision of its kernels.
-        bounds: Bounds of the shapes.
-        options: Options of each fit.
-        pooled: Fit of all readings with a surface.
-        strength: Pseudo-readings per bin.
-    """
+    """Fits of bins with the pooled fit as prior."""
 
     def __init__(
         self, device: tuple[Backend, np.dtype], bounds: Bounds, options: Options, pooled: BeamFit, strength: float
@@ -68,7 +60,7 @@ class Binned:
             return None, 0
         start = self._start
         if count:
-            # These beams may have a cause that beams with a surface do not have.
+            # These beams may have causes that beams with a surface lack.
             start = replace(start, weights=0.5 * (start.weights + first_guess(pairs, self._bounds).weights))
         return self._fit(pairs, start), count
 

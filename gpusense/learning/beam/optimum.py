@@ -1,13 +1,13 @@
 """Search for the highest maximum: try several starts, and causes that a search dropped too early.
 
-A search may end at a maximum that is not the highest, or drive the weight of a cause to 0, from where no small step
-leads back. Three checks follow each search that begins at a start of our choice:
+A search may end at a lower maximum, or drive the weight of a cause to 0, from where no small step leads back. Three
+checks follow each search from an automatic start:
 
 - An unused start whose likelihood exceeds the end of the search begins another search.
-- A cause of weight 0 is given the weight of a hundredth of a reading, with each shape of a coarse list. If it then
-  accounts for more than this, the likelihood rises with its weight (it is concave in the weight), and the search
-  continues with this cause: the condition of optimality of Lindsay (1983) for the components of a mixture.
-- Searches that end lower are counted in the status.
+- A cause of weight 0 gets the weight of a hundredth of a reading, with each shape of a coarse list. If it then accounts
+  for more than this, the likelihood rises with its weight (it is concave in the weight), and the search continues with
+  this cause: Lindsay's condition of optimality (1983) for the components of a mixture.
+- The status counts searches that end lower.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from gpusense.learning.beam.starts import choose_starts
 _SAME = 1e-3
 # Largest number of continued searches.
 _MOST = 4
-# Number of shapes per cause, and of weights, that are tried.
+# Number of shapes to try per cause, and weights to try.
 _SHAPES, _WEIGHTS = 9, (1e-4, 1e-3, 1e-2, 0.1, 0.3)
 
 Method = Callable[[Problem, Point, Watch], Climb]
@@ -36,7 +36,7 @@ Method = Callable[[Problem, Point, Watch], Climb]
 
 @dataclass
 class Search:
-    """A search for the highest maximum by one method.
+    """Search for the highest maximum by one method.
 
     Attributes:
         problem: The problem.
@@ -54,7 +54,7 @@ class Search:
         Args:
             start: A start; starts of the same causes are chosen from the readings.
             more: Further starts, each followed to its maximum.
-            known: Another start, which may lack some of these causes, or None.
+            known: Another start, possibly without some of these causes, or None.
         """
         values = [self.problem.value(point) for point in (start, known) if point is not None] + self._others(start)
         values = sorted(values, key=lambda value: -value.objective)
@@ -103,7 +103,7 @@ class Search:
         return lambda iteration, value: self.watch(done + iteration, value)
 
     def _revived(self, value: Value, causes: NDArray[np.bool_]) -> Point | None:
-        """Return a likelier point with a cause of weight 0 that should have some weight, or None."""
+        """Return a likelier point where a cause of weight 0 gets some weight, or None."""
         best = value
         for cause in np.flatnonzero(causes & (value.point.weights == 0)):
             tried = [self._with(value.point, int(cause), shape, NOTHING / self.problem.total)

@@ -20,7 +20,7 @@ Callback = Callable[[int, float, BeamParameters], object]
 
 # Default lower bound of sigma_hit as a share of range_max, if readings are not rounded to a larger step.
 _SMALLEST_SIGMA = 1e-6
-# Bounds of a user, as multiples of the default ones.
+# Limits of a user's bounds, as multiples of the defaults.
 _WIDEST = 1e-9, 1e9
 # Default bounds of lambda_short range_max: nearly uniform, and readings within 1e-4 range_max.
 _RATES = (1e-3, 1e4)
@@ -112,14 +112,7 @@ def _bounds(name: str, value: tuple[float, float] | None, default: tuple[float, 
 
 
 def start_of(initial: BeamParameters, pairs: Pairs, bounds: Bounds, hit: str) -> Point:
-    """Make the start of a search with normal hits from a user's parameters, without causes that no reading admits.
-
-    Args:
-        initial: The parameters.
-        pairs: The readings.
-        bounds: Bounds of the shapes.
-        hit: Name of the shape of hits that is finally fitted.
-    """
+    """Make the start of a search with normal hits from a user's parameters, without impossible causes."""
     if initial.hit not in ("normal", hit):
         raise ValueError(f"initial: hit must be 'normal' or that of the fit, {hit!r}, got {checks.show(initial)}")
     if initial.sigma_growth:

@@ -1,4 +1,4 @@
-"""Pairs of readings and expected ranges, classified, from which parameters are learned."""
+"""Classify readings and pair them with expected ranges."""
 
 from __future__ import annotations
 
@@ -63,14 +63,7 @@ class Pairs:
 
 
 def make_pairs(ranges: ArrayLike, expected: ArrayLike, range_max: float, range_min: float = 0.0) -> Pairs:
-    """Classify the readings and select the hits.
-
-    Args:
-        ranges: Readings of any shape and value [m].
-        expected: Expected ranges of the same shape [m].
-        range_max: Longest range [m].
-        range_min: Shortest range [m].
-    """
+    """Classify the readings and select the hits."""
     range_max = checks.real("range_max", range_max, low=checks.SMALLEST, high=checks.FARTHEST)
     range_min = checks.real("range_min", range_min, low=0, below=range_max)
     z = checks.array("ranges", ranges, finite=False, dtype=None)
@@ -101,7 +94,7 @@ def quantum_of(reading: NDArray[np.floating]) -> float:
     """Estimate the rounding step of readings; 0 without one.
 
     A step exists if readings repeat and all gaps between different readings are integer multiples of the smallest gap.
-    Gaps of a few units in the last place of the readings' precision do not count.
+    Gaps of a few ulp are ignored.
     """
     sample = reading[:: max(1, len(reading) // _SAMPLE)]
     distinct = np.unique(sample).astype(np.float64)
@@ -119,14 +112,9 @@ def quantum_of(reading: NDArray[np.floating]) -> float:
 
 
 def impossible_ranges(kinds: NDArray[np.uint8], expected: NDArray[np.floating], range_max: float) -> NDArray[np.bool_]:
-    """Return (n,) whether each expected range is outside [0, range_max] while its reading is not missing.
+    """Return the (n,) mask of expected ranges outside [0, range_max] whose reading is not missing.
 
     A ray without an obstacle has the expected range range_max, possibly rounded to float32.
-
-    Args:
-        kinds: (n,) class of every reading.
-        expected: (n,) expected ranges [m].
-        range_max: Longest range [m].
     """
     limit = max(float(expected.dtype.type(range_max)), range_max)
     return (kinds != Reading.MISSING) & ~((expected >= 0) & (expected <= limit))

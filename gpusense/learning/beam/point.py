@@ -1,8 +1,8 @@
-"""Parameters during a search, and the coordinates in which they move.
+"""Represent parameters during a search by coordinates.
 
 Coordinates are (log z_hit, log z_short, log z_max, log z_rand, log sigma_hit, log lambda_short, range_bias). Weights
-are renormalised after every step. Therefore the logarithm of the largest weight stays fixed, and the other weights move
-relative to it. The coordinates of the shape of hits follow, if any.
+are renormalised after every step: the logarithm of the largest weight stays fixed, and the other weights move relative
+to it. The coordinates of the shape of hits follow, if any.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Point:
         return NAMES + self.shape.fitted
 
     def coordinates(self) -> Floats:
-        """Return the first (7,) coordinates, see the module's docstring; -inf for a weight of 0."""
+        """Return the first (7,) coordinates; -inf for a weight of 0."""
         with np.errstate(divide="ignore"):
             return np.array([*np.log(self.weights), math.log(self.sigma), np.log(self.rate), self.bias])
 

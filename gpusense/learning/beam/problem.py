@@ -1,16 +1,16 @@
-"""The log-likelihood of a set of parameters and its derivatives, with the pseudo-readings of a prior.
+"""Compute the log-likelihood and its derivatives, including the pseudo-readings of a prior.
 
 By Fisher's identity the log-likelihood has the same derivatives as EM's expected log-likelihood of readings *and*
 causes at the same parameters. By Louis's identity its second derivatives follow from products of the same terms. One
-pass over the pairs therefore suffices for EM, for a search by gradients and for Newton's method. With n readings, w the
-weights, R the sums of responsibilities, y the terms of the gradient for one pair, and c the cause of a shape:
+pass over the pairs therefore serves EM, a search by gradients and Newton's method. Let n be the number of readings, w
+the weights, R the sums of responsibilities, y the terms of the gradient for one pair, and c the cause of a shape:
 
     d / d log w_k                  R_k - n w_k
     d^2 / d log w_j d log w_k      [j = k] R_k - sum y_j y_k - n ([j = k] w_k - w_j w_k)
     d^2 / d log w_k d shape        [k = c] sum y_shape - sum y_k y_shape
     d^2 / d shape d shape'         sum r_c (d^2 log p_c + d log p_c d' log p_c) - sum y_shape y_shape'
 
-The derivatives by the coordinates of the shape of hits are differences of passes over the pairs.
+Derivatives by the coordinates of the shape of hits are differences between passes over the pairs.
 
 Source: Louis (1982), "Finding the observed information matrix when using the EM algorithm".
 """
@@ -40,7 +40,7 @@ def _levels() -> tuple[Floats, Floats]:
     return share.ravel() / share.sum(), level.ravel()
 
 
-# Shares of pseudo-hits, and levels of their distances (see ``HitShape.quantile``); the farthest distance in scales.
+# Shares of pseudo-hits and levels of their distances (see ``HitShape.quantile``); largest distance in scales.
 _LEVELS = _levels()
 _FARTHEST = 1e150
 # Step of differences by log sigma, and by the offset in units of sigma.
@@ -53,9 +53,9 @@ _PLACES = np.array([HIT, SHORT, RAND, SIGMA, BIAS, RATE])
 class Prior:
     """Pseudo-readings of each cause, with shapes for hits and short readings.
 
-    For the weights this is a Dirichlet density. For hits it is the density of ``counts[0]`` readings distributed by
-    their shape around the offset; for lambda_short, of ``counts[1]`` short readings with mean length 1 / rate.
-    Normalisers of truncated densities count as 1.
+    The prior is a Dirichlet density of the weights, the density of ``counts[0]`` readings distributed by their shape
+    around the offset, and the density of ``counts[1]`` short readings of mean length 1 / rate. Normalisers of truncated
+    densities count as 1.
 
     Attributes:
         counts: (4,) pseudo-readings of each cause.
@@ -109,7 +109,7 @@ class Prior:
         return float(pull @ u) - 1, float(pull.sum()) / point.sigma
 
     def _curves(self, point: Point) -> tuple[float, float, float]:
-        """Return the second derivatives of that mean: by log sigma, by log sigma and the offset, by the offset."""
+        """Return the second derivatives: by log sigma, by log sigma and the offset, by the offset."""
         if isinstance(point.shape, NormalHit):
             off = (point.bias - self.bias) / point.sigma**2
             return -2 * self._square(point), 2 * off, -1 / point.sigma**2
@@ -150,10 +150,11 @@ class Value:
 
     Attributes:
         point: The parameters.
-        log_likelihood: Log-likelihood of the readings alone.
+        log_likelihood: Log-likelihood of the readings without the prior.
         objective: Log-likelihood plus log prior.
         totals: (4,) readings that each cause accounts for, pseudo-readings included.
-        gradient: Derivatives of the objective by the coordinates; 0 by those of the shape of hits without ``hessian``.
+        gradient: Derivatives of the objective by the coordinates; without ``hessian``, 0 by coordinates of the shape
+            of hits.
         sums: The device's sums.
         hessian: Second derivatives, or None.
     """
@@ -168,7 +169,7 @@ class Value:
 
 
 class Problem:
-    """Readings, a prior and bounds: the function that a search maximises.
+    """Objective of a search: readings, a prior and bounds.
 
     Attributes:
         device: Sums over the pairs.
@@ -236,10 +237,10 @@ class Problem:
         return share * max(float(point.shape.coordinates[0]), SMALL_FORM)
 
     def blur(self, value: Value) -> float:
-        """Return the gain [nats] that rounding hides in the slope by the shape of hits; 0 without its derivatives."""
+        """Return the gain [nats] that rounding hides in the slope by the shape of hits; 0 without this slope."""
         if value.hessian is None or not value.point.shape.limits:
             return 0.0
-        # Rounded terms of the kernels change with the shape, and shift all readings alike.
+        # Rounded terms of the kernels depend on the shape, and shift all readings alike.
         slope = 16 * self.noise(value) / self._form_step(value.point)
         return 0.5 * slope**2 / max(abs(value.hessian[FORM, FORM]), 1e-300)
 
@@ -273,8 +274,8 @@ class Problem:
     def free(self, value: Value) -> NDArray[np.bool_]:
         """Return the mask of coordinates that may move at a point.
 
-        A weight of 0 stays 0. The largest weight follows from the other weights. A shape stays at a bound if the
-        gradient points across the bound. The shape of a cause that accounts for no reading also stays.
+        A weight of 0 stays 0, and the largest weight follows from the others. A shape stays at a bound that the
+        gradient points across, and where its cause accounts for no reading.
         """
         point, bounds = value.point, self.bounds
         free = np.append(point.weights > 0, [True, True, self.fit_bias])
@@ -298,8 +299,8 @@ class Problem:
         return bool(value.totals[HIT] > NOTHING and not held)
 
 
-# Coordinates of the shape of hits below this count as this; steps of differences by larger coordinates as shares of
-# them, in float32 and float64.
+# Lower limit of a coordinate of the shape of hits for steps of differences, and these steps as shares of the
+# coordinate in float32 and float64.
 SMALL_FORM, _FORM_STEPS = 0.05, (0.05, 1e-3)
 # A shape within this relative distance of a bound is at the bound.
 _AT = 1e-9

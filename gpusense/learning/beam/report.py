@@ -20,7 +20,7 @@ from gpusense.learning.beam.result import BeamFit
 from gpusense.learning.information import errors_of
 from gpusense.world.scanner import Reading
 
-# Largest number of iterations of the search for an offset that was not fitted.
+# Largest number of iterations of the search for an unfitted offset.
 _JOINT = 500
 # Relative step of numerical derivatives by a coordinate of the shape of hits.
 _STEP = 1e-5
@@ -82,7 +82,7 @@ def _status(problem: Problem, climb: Climb, value: Value, errors: dict[str, floa
 
 
 def _errors(problem: Problem, value: Value) -> tuple[dict[str, float], dict[str, float]]:
-    """Return standard errors by name: over blocks if there are any, and as if readings were independent."""
+    """Return standard errors by name: over blocks, if any, and for independent readings."""
     independent = _standard_errors(problem, value)
     if problem.pairs.block is None:
         return dict(independent), independent
@@ -93,8 +93,8 @@ def _standard_errors(problem: Problem, value: Value, scatter: Floats | None = No
     """Compute the standard error of each parameter by name.
 
     The covariance is the inverse of minus the second derivatives by the free coordinates, transformed to the parameters
-    by their derivatives. The error is NaN for a parameter that was not free (0, at a bound, or of a cause that accounts
-    for no reading), and infinite if the readings hold no information about it.
+    by their derivatives. The error is NaN for a held parameter (0, at a bound, or of a cause without readings), and
+    infinite if the readings hold no information about it.
 
     Args:
         problem: The problem.
@@ -158,7 +158,7 @@ def _held(problem: Problem, value: Value) -> dict[str, str]:
 def _bias(problem: Problem, value: Value, climb: Climb, options: Options, start: Point) -> tuple[float, float, float]:
     """Return the offset of correct ranges and its standard errors: over blocks, and for independent readings.
 
-    An offset that was not fitted comes from a search over all parameters; NaN if a search did not converge.
+    An unfitted offset comes from a further search over all parameters; NaN if a search did not converge.
     """
     if problem.fit_bias:
         errors, independent = _errors(problem, value)

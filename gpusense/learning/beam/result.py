@@ -30,22 +30,22 @@ class BeamFit(Fitted[BeamParameters]):
         status: Summary of the fit in words.
         standard_errors: Standard error of each parameter by name: with ``blocks=``, from the scatter over blocks; else
             from the observed information, for independent readings. NaN for a held parameter (the weight of a cause
-            that does not occur, a shape at a bound or of such a cause), infinite if the readings do not determine it;
-            ``held`` has the reasons.
-        independent_errors: Standard errors as if readings were independent, by name; those of ``standard_errors``
-            without blocks.
-        blocks: Number of blocks that ``standard_errors`` are computed over; 0 without blocks.
+            that does not occur, its shape, or a shape at a bound), infinite if the readings do not determine it; see
+            ``held``.
+        independent_errors: Standard errors for independent readings, by name; equal to ``standard_errors`` without
+            blocks.
+        blocks: Number of blocks behind ``standard_errors``; 0 without blocks.
         held: Reason why a parameter has no standard error, by name.
-        range_bias: Offset b of correct ranges, z = z* + b [m]: its estimate of maximum likelihood, together with the
-            other parameters. Without ``range_bias=True`` it comes from a second search and is not in
-            ``parameters``. NaN if a search did not converge, and with ``"em-book"``, which has no offset.
+        range_bias: Offset b of correct ranges, z = z* + b [m]: its maximum-likelihood estimate jointly with the other
+            parameters. Unless ``range_bias=True``, a second search estimates it, and ``parameters`` do not contain it.
+            NaN if a search did not converge, and for ``"em-book"``.
         range_bias_error: Standard error of ``range_bias`` [m], as in ``standard_errors``.
         bias_fitted: Whether the parameters were fitted together with the offset.
         iterations: Iterations of the method.
         passes: Passes over the pairs.
         hits: Number of readings that are ranges.
         max_readings: Number of readings that are "no return".
-        missing: Number of missing readings, left out.
+        missing: Number of missing readings.
         outliers: Number of hits whose likeliest cause is z_rand: unexplained readings.
         method: Name of the method.
         precision: ``"float64"`` or ``"float32"``, of the sums over pairs.

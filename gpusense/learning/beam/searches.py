@@ -1,4 +1,4 @@
-"""Maximise the log-likelihood with SciPy: by its gradient, without derivatives, and over a population."""
+"""Maximise the log-likelihood with SciPy: L-BFGS-B, Powell's method and differential evolution."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _TURNS = 5
 class _Coordinates:
     """The free coordinates of a search as a vector.
 
-    They are the logarithms of the weights, log sigma_hit, log lambda_short and the bias / range_max. The weight that is
-    largest at the start, the reference, follows from the normalisation. Causes of weight 0 at the start stay excluded.
+    They are the logarithms of the weights, log sigma_hit, log lambda_short and bias / range_max. The largest weight at
+    the start, the reference, follows from the normalisation. Causes of weight 0 at the start stay excluded.
     """
 
     def __init__(self, problem: Problem, start: Point) -> None:
@@ -92,7 +92,7 @@ class _Search:
 
 
 def climb_gradient(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
-    """Run L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995) with the analytic gradient, restarted while it still gains."""
+    """Run L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995) with the analytic gradient, restarted as long as it gains."""
     search = _Search(problem, start, watch)
     return _refine(search, max_iterations, tolerance)
 
@@ -132,11 +132,11 @@ def _refine(search: _Search, max_iterations: int, tolerance: float) -> Climb:
 
 
 def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
-    """Run Powell's method (1964), without derivatives and within bounds, restarted until it gains nothing.
+    """Run Powell's method (1964), without derivatives, restarted until it gains nothing.
 
-    Its line searches make progress in the long, narrow valleys of this likelihood, in which a simplex (Nelder and Mead)
-    collapses; it also accepts bounds. The first directions are the coordinates. If no direction gains but derivatives
-    show that the end is not an optimum, it restarts along randomly rotated directions.
+    Its line searches accept bounds and make progress in the long, narrow valleys of this likelihood, where a simplex
+    (Nelder and Mead) collapses. The first directions are the coordinates. If no direction gains although derivatives
+    exclude an optimum, the search restarts along randomly rotated directions.
     """
     from scipy.optimize import minimize
 
@@ -182,7 +182,7 @@ def climb_genetic(
     search = _Search(problem, start, watch)
     coordinates = search.coordinates
     if len(coordinates.places):
-        # Weights far below one reading are not searched; L-BFGS-B reaches them if they are better.
+        # Weights far below one reading are left to L-BFGS-B.
         narrow = np.log(10 * problem.total)
         middle = coordinates.vector(start)
         limits = coordinates.limits.copy()

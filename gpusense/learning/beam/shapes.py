@@ -1,8 +1,7 @@
-"""Fit the shape of hits together with all other parameters, on the device, from a fit with normal hits.
+"""Fit the shape of hits jointly with all other parameters, on the device, from a fit with normal hits.
 
-Student's t is a normal whose inverse variance is random. EM with its expected value, the weight of the shape, has the
-M-steps of a normal with weighted readings; the degrees of freedom move by Newton steps of the likelihood alone, ECME's
-choice.
+Student's t is a normal with a random inverse variance. EM with its expected value, the weight of the shape, has the
+M-steps of a normal with weighted readings; as in ECME, the degrees of freedom move by Newton steps of the likelihood.
 
 Source: Lange, Little and Taylor (1989), "Robust statistical modeling using the t distribution"; Liu and Rubin (1994),
 "The ECME algorithm".
@@ -25,7 +24,7 @@ from gpusense.learning.beam.result import BeamFit
 from gpusense.world.hit_shapes import SHAPES, HitName, shape_of
 from gpusense.world.parameters import BeamParameters
 
-# Number of readings for choosing between starts, and the gain [nats] below which the choice is made.
+# Number of readings for ranking the starts, and the remaining gain [nats] that suffices for the ranking.
 _SAMPLE, _ROUGHLY = 20_000, 1e-2
 
 
@@ -39,18 +38,7 @@ def fit_shape(
     first: Point,
     initial: BeamParameters | None,
 ) -> BeamFit:
-    """Fit the shape of hits as well, from a fit with normal hits.
-
-    Args:
-        fit: The fit.
-        device: Sums over the pairs.
-        pairs: The readings.
-        bounds: Bounds of the shapes.
-        options: Options of the fit.
-        hit: Name of the shape.
-        first: Start of the fit.
-        initial: The user's parameters, or None; if their shape is this one, it is also a start.
-    """
+    """Fit the shape of hits as well, from a fit with normal hits."""
     kind = SHAPES[hit]
     if not pairs.hits or not pairs.expected.any():
         return without_ranges(fit, hit)
@@ -75,7 +63,7 @@ def fit_shape(
 
 
 def without_ranges(fit: BeamFit, hit: HitName, growth: bool = False) -> BeamFit:
-    """Return the fit of readings without a range, which determine neither the shape of hits nor their growth."""
+    """Return the fit of readings without a range: they determine neither the shape of hits nor its growth."""
     new, reason = ("sigma_growth",) * growth + SHAPES[hit].fitted, "no range determines it"
     return replace(
         fit, parameters=fit.parameters.replace(hit=hit), status=f"{fit.status}; {', '.join(new)}: {reason}",
@@ -84,7 +72,7 @@ def without_ranges(fit: BeamFit, hit: HitName, growth: bool = False) -> BeamFit:
 
 
 def _sampled(problem: Problem) -> Problem:
-    """Return the problem of a sample of the readings if they are many."""
+    """Return the problem of a sample of the readings if there are many."""
     pairs = problem.pairs
     every = len(pairs.kinds) // _SAMPLE
     if every < 2:
@@ -94,7 +82,7 @@ def _sampled(problem: Problem) -> Problem:
 
 
 def _climb(problem: Problem, start: Point, options: Options) -> Climb:
-    """Search from a start, as far as needed to rank the starts."""
+    """Search from a start until the starts can be ranked."""
     tolerance = max(options.tolerance, _ROUGHLY)
     return climb_em(
         problem, start, max_iterations=options.max_iterations, tolerance=tolerance, watch=lambda iteration, value: None

@@ -1,13 +1,13 @@
 """Choose starts of a search from the readings, by short runs of EM on a sample.
 
 The likelihood of a mixture has several maxima. EM ends at the maximum whose basin contains its start, so the start
-decides. Short runs from several starts, followed by one long run from the best end, are a cheap remedy: the sample is
-small, and all runs are computed together.
+decides. Short runs from several starts on a small sample, all computed together, are a cheap remedy; one long run
+follows from the best end.
 
 The starts assume in turn that a share of the readings is correct: all, a half, a fifth, a twentieth. sigma_hit is then
-the median distance of the nearest readings of that share. lambda_short has four values: the inverse of the mean length
-of readings before the expected range, two steeper ones and a flat one. If the offset of correct ranges is free, the
-distances are taken from 0, from the median deviation and from the densest deviation.
+the median distance of this share of the nearest readings. lambda_short takes four values: the inverse mean length of
+readings in front of the expected range, two steeper values and a flat one. If the offset of correct ranges is free,
+distances count from 0, from the median deviation and from the densest deviation.
 
 Source: Biernacki, Celeux and Govaert (2003), "Choosing starting values for the EM algorithm for getting the highest
 likelihood in multivariate Gaussian mixture models".
@@ -36,7 +36,7 @@ _WEIGHT, _FACTOR = 0.1, 1.5
 
 @dataclass(frozen=True)
 class Sample:
-    """Hits from which starts are chosen.
+    """Sample of hits for choosing starts.
 
     Attributes:
         reading: (m,) readings [m].
@@ -61,14 +61,7 @@ class Sample:
 
 
 def choose_starts(pairs: Pairs, bounds: Bounds, causes: NDArray[np.bool_], fit_bias: bool) -> list[Point]:
-    """Return up to four different starts, the likeliest on a sample of the readings first.
-
-    Args:
-        pairs: The readings.
-        bounds: Bounds of the shapes.
-        causes: (4,) mask of the causes that take part.
-        fit_bias: True if the offset of correct ranges is free.
-    """
+    """Return up to four different starts, the likeliest on a sample of the readings first."""
     if not pairs.hits or not causes[[HIT, SHORT, RAND]].any():
         return []
     sample = Sample.of(pairs)
@@ -86,7 +79,7 @@ def choose_starts(pairs: Pairs, bounds: Bounds, causes: NDArray[np.bool_], fit_b
 
 
 def _biases(sample: Sample) -> list[float]:
-    """Return offsets to start from: none, the median deviation, and the middle of the narrowest half, repeatedly."""
+    """Return initial offsets: 0, the median deviation, and the middle of the narrowest half, by repeated halving."""
     off = np.sort(sample.reading - sample.expected)
     middle = float(np.median(off))
     while len(off) > 2:
@@ -97,7 +90,7 @@ def _biases(sample: Sample) -> list[float]:
 
 
 def _assume(sample: Sample, bounds: Bounds, causes: NDArray[np.bool_], bias: float, share: float) -> list[Point]:
-    """Return starts that assume a share of correct readings, one for each lambda_short."""
+    """Return starts for a share of correct readings, one per lambda_short."""
     z, top = sample.reading, sample.range_max
     off = np.abs(z - sample.expected - bias)
     sigma = 1.4826 * float(np.quantile(off, 0.5 * share))
@@ -118,8 +111,8 @@ def short_runs(
 ) -> tuple[list[Point], NDArray[np.float64]]:
     """Run a few steps of EM from each start on a sample.
 
-    The steps of sigma_hit and of the offset are the book's, without truncation: the long run corrects them. The step of
-    lambda_short is one fixed-point step of the exact M-step.
+    Steps of sigma_hit and of the offset are the book's, without truncation; the long run corrects them. lambda_short
+    takes one fixed-point step of the exact M-step.
 
     Returns:
         The ends, with weights of at least half a reading, and (C,) log-likelihoods of the sample.

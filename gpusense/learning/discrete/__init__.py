@@ -1,1 +1,1 @@
-"""The discrete model of proximity sensors: its table, and its causes learned from readings."""
+"""Discrete model of proximity sensors: its table, and learning its causes from readings."""

@@ -11,10 +11,10 @@ from gpusense.world.parameters import _Parameters
 
 @dataclass(frozen=True)
 class DiscreteCauses(_Parameters):
-    """Parameters of the independent causes of a reading; the first cause to trigger hides all later ones.
+    """Parameters of independent causes of a reading; the first cause to trigger hides all later ones.
 
-    In terms of Fox, Burgard and Thrun (1999), ``c_r = 1 - exp(-(lambda_short + lambda_rand) width)`` is the probability
-    that a step of the beam triggers without an obstacle of the map, and ``c_d = p_detect``.
+    In terms of Fox, Burgard and Thrun (1999), ``c_r = 1 - exp(-(lambda_short + lambda_rand) width)`` is the
+    probability that the beam triggers in a step without a mapped obstacle, and ``c_d = p_detect``.
 
     Raises:
         TypeError: A value is not a real number.
@@ -28,13 +28,13 @@ class DiscreteCauses(_Parameters):
     """
 
     lambda_short: float = 0.05
-    """The rate of unknown obstacles before the expected one, >= 0 [1/m]."""
+    """Rate of unknown obstacles in front of the expected one, >= 0 [1/m]."""
     lambda_rand: float = 0.01
-    """The rate of random triggers along the whole beam, also behind a missed obstacle, >= 0 [1/m]."""
+    """Rate of random triggers along the whole beam, also behind a missed obstacle, >= 0 [1/m]."""
     p_detect: float = 0.95
-    """The probability that the expected obstacle is detected if no cause triggers earlier, in [0, 1]."""
+    """Probability of detecting the expected obstacle if no cause triggers earlier, in [0, 1]."""
     sigma_hit: float = 0.05
-    """The standard deviation of the detected range, >= 0 [m]; 0 always detects the obstacle in its step."""
+    """Standard deviation of the detected range, >= 0 [m]; 0 always detects the obstacle in its step."""
 
     def __post_init__(self) -> None:
         self._check("lambda_short", low=0)
@@ -55,25 +55,25 @@ class DiscreteFit:
     """
 
     log_likelihood: float
-    """The log-likelihood of all readings: probabilities of bins, not densities; natural logarithm."""
+    """Log-likelihood of all readings: probabilities of bins, not densities; natural logarithm."""
     converged: bool
     """Return whether the gradient vanishes at the result, within the bounds of the search."""
     standard_errors: Mapping[str, float]
-    """The standard error of each parameter, in its unit, from the curvature of the likelihood; NaN if undetermined."""
+    """Standard error of each parameter, in its unit, from the curvature of the likelihood; NaN if undetermined."""
     trace: tuple[float, ...]
-    """The log-likelihood after each iteration of the successful search."""
+    """Log-likelihood after each iteration of the best search."""
     hits: int
-    """The number of readings with a range."""
+    """Number of readings with a range."""
     max: int
-    """The number of readings without a return."""
+    """Number of readings without a return."""
     missing: int
-    """The number of missing readings, left out."""
+    """Number of missing readings."""
     status: str
-    """The reason of the search's end and the undetermined parameters, in words."""
+    """Reason for the end of the search, and undetermined parameters, in words."""
     independent_errors: Mapping[str, float] = field(default_factory=dict)
-    """The standard errors as if readings were independent; those of ``standard_errors`` without blocks."""
+    """Standard errors for independent readings; equal to ``standard_errors`` without blocks."""
     blocks: int = 0
-    """The number of blocks over which ``standard_errors`` are computed; 0 without blocks."""
+    """Number of blocks behind ``standard_errors``; 0 without blocks."""
 
     def __repr__(self) -> str:
         return (

@@ -1,4 +1,4 @@
-"""Counts of readings in a table of (step of z*, step of z)."""
+"""Count readings in a table of (step of z*, step of z)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gpusense.learning.discrete.readings import MOST_BINS, bins_of, check_pairs
 
 Floats = NDArray[np.float64]
 
-# Number of readings that are counted at once.
+# Number of readings per pass.
 _BLOCK = 1 << 20
 
 
@@ -74,7 +74,7 @@ def count_pairs(ranges: object, expected: object, range_max: float, bins: int) -
         readings, expected_ranges = check_pairs(z[block], z_exp[block], range_max)
         i, j = bins_of(readings, range_max, bins), bins_of(expected_ranges, range_max, bins)
         missing += int(np.count_nonzero(i < 0))
-        # bincount's result ends with the last bin that occurs.
+        # bincount returns bins up to the last occupied one.
         counts = np.bincount((j * (bins + 1) + i)[i >= 0])
         table[: len(counts)] += counts
     cells = np.flatnonzero(table)

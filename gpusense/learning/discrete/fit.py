@@ -18,15 +18,15 @@ from gpusense.learning.information import errors_of, scatter_of
 Floats = NDArray[np.float64]
 
 NAMES = ("lambda_short", "lambda_rand", "p_detect", "sigma_hit")
-# Steps of first and second central differences of the mean log-likelihood, which balance rounding and truncation
+# Steps of first and second central differences of the mean log-likelihood; they balance rounding and truncation
 # errors.
 _FIRST, _SECOND = 1e-5, 1e-3
-# Largest gradient of the mean log-likelihood that counts as 0: it moves a parameter by less than a hundredth of its
-# standard error with ten million readings.
+# Largest gradient of the mean log-likelihood that counts as 0: with ten million readings it moves a parameter by less
+# than a hundredth of its standard error.
 _FLAT = 2e-6
-# Number of steps of the coarse search that precedes a search with many steps.
+# Number of beam steps of the coarse search in front of a search with many.
 _FEW = 100
-# Starts that are searched from; restarts of a search that ends before the gradient vanishes.
+# Number of starts to follow; restarts of a search that ends before the gradient vanishes.
 _BEST, _RESTARTS = 3, 3
 # Standard errors over fewer blocks are rough.
 _FEW_BLOCKS = 10
@@ -39,9 +39,9 @@ def learn_causes(
 ) -> tuple[DiscreteCauses, DiscreteFit]:
     """Learn the most likely causes; see ``DiscreteBeamModel.learn``.
 
-    The search is a quasi-Newton search over the logarithms of rates and sigma_hit and the log odds of detection, within
-    bounds beyond which the table does not change. It starts from the best few of several starts, and the highest end is
-    the result; for many steps, the ends of the same searches with few steps are further starts.
+    A quasi-Newton search moves the logarithms of rates and sigma_hit and the log odds of detection, within bounds
+    beyond which the table does not change. It follows the best of several starts, and returns the highest end. For many
+    beam steps, coarse searches provide further starts.
     """
     data = count_pairs(ranges, expected, range_max, bins)
     labels = None if blocks is None else _block_counts(data, ranges, expected, float(range_max), blocks)
@@ -58,7 +58,7 @@ def learn_causes(
 
 
 def _block_counts(data: Counts, ranges: object, expected: object, range_max: float, blocks: object) -> Floats:
-    """Return the (3, E) block, index of the cell among the counts, and number of readings of all cells that occur."""
+    """Return the (3, E) block, index among the counts, and number of readings of all occupied cells."""
     z, z_exp = (
         checks.as_array(name, value, masked=True) for name, value in (("ranges", ranges), ("expected", expected))
     )
@@ -76,7 +76,7 @@ def _block_counts(data: Counts, ranges: object, expected: object, range_max: flo
 
 
 def _block_errors(data: Counts, theta: Floats, free: NDArray[np.bool], labels: Floats) -> dict[str, float]:
-    """Compute standard errors over blocks, see ``learning.information``; NaN where independent ones are."""
+    """Compute standard errors over blocks; NaN where errors for independent readings are NaN."""
     (block, cell), times = labels[:2].astype(np.int64), labels[2]
     places = np.flatnonzero(free)
     slopes = []
@@ -109,7 +109,7 @@ def _search(data: Counts, start: Floats) -> tuple[float, Floats, list[float]]:
 
 
 def _pushed(data: Counts, theta: Floats) -> tuple[Floats, NDArray[np.bool]]:
-    """Return the gradient, and the mask of parameters at a bound across which the likelihood still rises."""
+    """Return the gradient, and the mask of parameters at a bound beyond which the likelihood rises."""
     low, high = np.transpose(_bounds(data))
     slope = _gradient(data, theta)
     return slope, ((theta <= low + 1e-9) & (slope > 0)) | ((theta >= high - 1e-9) & (slope < 0))
@@ -178,7 +178,7 @@ def _bounds(data: Counts) -> list[tuple[float, float]]:
 def _starts(data: Counts) -> list[Floats]:
     """Make starts from the shares of readings before, at and behind the expected step, the best first.
 
-    Each start counts readings within another number of steps as readings at the expected step.
+    Each start takes readings within another number of steps as correct.
     """
     reach, total = data.bins * data.width, data.total
     known, none = data.rows < data.bins, data.steps == data.bins
@@ -205,7 +205,7 @@ def _standard_errors(data: Counts, theta: Floats, free: NDArray[np.bool]) -> dic
 
 
 def _in_units(theta: Floats, errors: Floats) -> dict[str, float]:
-    """Return errors of the search's parameters in the units of the model's."""
+    """Convert errors of the search's coordinates to the model's parameters."""
     causes = _causes(theta)
     scale = {name: getattr(causes, name) for name in NAMES} | {"p_detect": causes.p_detect * (1 - causes.p_detect)}
     return {name: float(error * scale[name]) for name, error in zip(NAMES, errors, strict=True)}
@@ -231,10 +231,11 @@ def _information(data: Counts, theta: Floats, places: NDArray[np.intp]) -> Float
 def _errors(information: Floats) -> Floats:
     """Return (m,) standard errors from the (m, m) information; NaN for parameters in a flat direction.
 
-    Other parameters keep their standard errors: flat directions are found in the matrix scaled to a diagonal of 1.
+    Other parameters keep their standard errors: flat directions are eigenvectors of the matrix scaled to a diagonal of
+    1.
     """
     errors = np.full(len(information), np.nan)
-    # Without influence of a parameter, differences are rounding errors only.
+    # Differences by a parameter without influence contain only rounding errors.
     places = np.flatnonzero(np.diagonal(information) > 1e-8 * max(float(np.diagonal(information).max(initial=0)), 0))
     if not len(places):
         return errors

@@ -1,8 +1,8 @@
-"""Probabilities of the discrete model of proximity sensors: the first trigger along a beam hides all later ones.
+"""Compute probabilities of the discrete model of proximity sensors: the first trigger along a beam hides the others.
 
 A beam goes through ``bins`` steps. At each step every remaining cause may trigger a reading. The beam continues if none
-does; a beam without any trigger is a max reading. With ``h_k`` the probability that cause k triggers at a step which
-the beam has reached,
+does; a beam without any trigger is a max reading. Let ``h_k`` be the probability that cause k triggers at a step that
+the beam has reached. Then
 
     ``P_i = S_i (1 - prod_k (1 - h_ki))``, ``S_i = prod_{l < i} prod_k (1 - h_kl)``, ``P_max = S_bins``,
 
@@ -11,8 +11,8 @@ summed, and ``1 - prod (1 - h_k)`` is the sum of positive terms ``h_1 + (1 - h_1
 underflows.
 
 Source: Fox, Burgard and Thrun, *Markov localization for mobile robots in dynamic environments*, JAIR 11 (1999), the
-section on proximity sensors. Row j of a table is for an obstacle that the map expects in step j; the last row is for
-none within range.
+section on proximity sensors. Row j of a table assumes that the map's obstacle is in step j; the last row assumes none
+within range.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Integers = NDArray[np.int64]
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _LOG_ROOT_2PI = 0.5 * math.log(2 * math.pi)
-# Least x for which the series of 1 - x R(x) is more exact than the difference.
+# From this x on, the series of 1 - x R(x) is more precise than the difference.
 _FAR = 30.0
 # Steps narrower than this many standard deviations are integrated by quadrature, wider ones in closed form.
 _NARROW = 0.5
@@ -41,7 +41,8 @@ def log_table(log_trigger: Floats, log_pass: Floats) -> Floats:
 
     Args:
         log_trigger: (causes, rows, bins) ``log h_k``.
-        log_pass: (causes, rows, bins) ``log(1 - h_k)``, a separate argument because it is not exact from ``log h_k``.
+        log_pass: (causes, rows, bins) ``log(1 - h_k)``, a separate argument because ``log h_k`` does not determine it
+            exactly.
 
     Returns:
         (rows, bins + 1); the last column is the remainder.
@@ -61,10 +62,10 @@ def separate_causes(
 ) -> Floats:  # fmt: skip
     """Compute probabilities for independent causes; the first cause to trigger determines the reading.
 
-    Unknown obstacles have a constant rate along the beam up to the step of the expected obstacle, random triggers a
-    constant rate along the whole beam. The expected obstacle is detected with probability ``p_detect``, at a step that
-    :func:`log_spread` distributes around its step. Its trigger probability at a step is the share of this step in the
-    mass that is left: detections at this step and later, and misses. The products over causes have closed forms here.
+    Unknown obstacles have a constant rate up to the step of the expected obstacle, random triggers a constant rate
+    along the whole beam. The expected obstacle is detected with probability ``p_detect``, in a step distributed around
+    its own by :func:`log_spread`. Its trigger probability at a step is this step's share of the remaining mass:
+    detections at this step and later, and misses. The products over causes have closed forms.
 
     Args:
         bins: Steps along the beam.
@@ -103,8 +104,8 @@ def shared_causes(
     """Compute the table whose causes have the shares of the beam model's mixture among the readings.
 
     At step i cause k triggers with probability ``z_k m_ki / (mass of the mixture from step i on)``, where m_ki is the
-    share of its component in that step. Two causes that trigger at the same step make one reading. This is the only
-    difference between the table and the mixture's integrals over the steps; it vanishes with the steps' width.
+    share of its component in that step. Two causes that trigger at the same step make one reading: the only difference
+    from the mixture's integrals over the steps, which vanishes with their width.
 
     Args:
         bins: Steps along the beam.
@@ -135,12 +136,12 @@ def shared_causes(
 
 
 def _log_hits(bins: int, width: float, sigma: float, rows: Integers) -> Floats:
-    """Return (rows, bins) log masses of a correct range within [0, range_max]; each row has the sum 1.
+    """Return (rows, bins) log masses of a correct range within [0, range_max]; each row sums to 1.
 
-    An obstacle beyond range_max is expected in the step after the last one.
+    An obstacle beyond range_max belongs to the step after the last one.
     """
     spread = log_spread(bins, width, sigma)[np.abs(np.arange(bins) - rows[:, None])]
-    # If all masses of the last row underflow, the last step, which is nearest, takes the whole mass.
+    # If all masses of the last row underflow, the nearest step (the last one) takes the whole mass.
     spread[rows == bins, -1] = np.maximum(spread[rows == bins, -1], -np.finfo(np.float64).max)
     normalised: Floats = spread - logsumexp(spread, axis=1, keepdims=True)
     return normalised
@@ -149,7 +150,7 @@ def _log_hits(bins: int, width: float, sigma: float, rows: Integers) -> Floats:
 def _spread_from(spread: Floats, bins: int, steps: Integers, rows: Integers) -> Floats:
     """Return the log mass of :func:`log_spread` in steps ``steps`` to ``bins - 1``, from sums over its tail.
 
-    The tail decreases ever faster, so a difference of two such sums is at least ``1 / bins`` of the larger one.
+    The tail falls ever faster, so that the difference of two such sums is at least ``1 / bins`` of the larger one.
     """
     beyond = np.append(np.logaddexp.accumulate(spread[::-1])[::-1], -np.inf)
     above = _log_difference(beyond[np.maximum(steps - rows, 0)], beyond[bins - rows])
@@ -165,10 +166,10 @@ def _log_difference(larger: Floats, smaller: Floats) -> Floats:
 def log_spread(bins: int, width: float, sigma: float) -> Floats:
     """Return the log share of an obstacle's readings that fall d steps from its step, d = 0 to ``bins``.
 
-    The obstacle is uniformly distributed in its step, its readings are normal around it, and the beam has no ends. With
-    s = width / sigma the share is ``s`` times the integral of ``(1 - |u|) phi((d + u) s)`` over [-1, 1], or the second
-    difference ``(H(x - s) - 2 H(x) + H(x + s)) / s`` at x = d s of ``H(x) = phi(x) - x Q(x)``, with Q the normal's
-    upper tail. Gauss-Legendre quadrature is used for small s, the difference for large s or x; either keeps 14 digits.
+    The obstacle is uniform in its step, readings are normal around it, and the beam has no ends. For s = width / sigma
+    the share is ``s`` times the integral of ``(1 - |u|) phi((d + u) s)`` over [-1, 1], or the second difference ``(H(x
+    - s) - 2 H(x) + H(x + s)) / s`` at x = d s of ``H(x) = phi(x) - x Q(x)``, where Q is the normal's upper tail. Small
+    s use Gauss-Legendre quadrature, large s or x the difference; both keep 14 digits.
 
     Returns:
         (bins + 1,) natural logarithms.
@@ -203,7 +204,7 @@ def _log_h(x: Floats) -> Floats:
 
 
 def _log_decay(bins: int, decay: float, rows: Integers) -> Floats:
-    """Return (rows, bins) log masses of an exponential that ends with the expected step; each row has the sum 1."""
+    """Return (rows, bins) log masses of an exponential up to the expected step; each row sums to 1."""
     return ShortDensity(decay).log_mass(np.arange(bins), 1, np.minimum(rows + 1, bins)[:, None])
 
 
@@ -214,5 +215,5 @@ def _tails(log_mass: Floats, log_none: Floats) -> Floats:
 
 
 def _ratio(log_part: Floats, log_whole: Floats) -> Floats:
-    """Return the difference of logarithms, with 0 / 0 = 0: no cause triggers where no beam arrives."""
+    """Return the difference of logarithms, with 0 / 0 = 0: no cause triggers where the beam never arrives."""
     return np.where(np.isneginf(log_part), -np.inf, log_part - log_whole)

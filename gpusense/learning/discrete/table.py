@@ -18,7 +18,7 @@ from gpusense.peers.weights import check_weights
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.sensor_table import SensorTable
 
-# Entries of a table that are computed at once; each needs about twenty numbers.
+# Table entries per pass; each needs about twenty numbers.
 _BLOCK = 1 << 20
 
 
@@ -26,16 +26,15 @@ _BLOCK = 1 << 20
 class DiscreteBeamModel(SensorTable):
     """p(bin of z | bin of z*): the discrete model of proximity sensors (Fox, Burgard and Thrun, JAIR 11, 1999).
 
-    The beam goes through ``bins`` steps. The first cause to trigger determines the reading and hides all later ones; no
-    trigger is "no return". The causes are either
+    The beam goes through ``bins`` steps. The first cause to trigger determines the reading; no trigger is "no return".
+    The causes are either
 
     - :class:`DiscreteCauses`: unknown obstacles, the expected obstacle and random triggers, independent of each other.
       Far obstacles are hidden more often than near ones, and an empty map has no expected obstacle; or
-    - :class:`BeamParameters`: at each step the causes trigger with probabilities that give them the mixture's shares of
-      the readings. As bins shrink, probability over width tends to the mixture's density at first order in the width,
-      at every z* > 0 and z except z = z*, where p_short jumps; convergence is uniform where the mixture has mass
-      beyond z. The probability of no return tends to z_max. The remaining difference is due to two causes that trigger
-      in the same step, which make one reading.
+    - :class:`BeamParameters`: the causes trigger at rates that give them the mixture's shares of the readings. As bins
+      shrink, probability over width converges to the mixture's density, at first order in the width, for all z* > 0 and
+      z except z = z*, where p_short jumps; convergence is uniform where the mixture has mass beyond z. The probability
+      of no return converges to z_max. The difference arises when two causes trigger in the same step.
 
     The table belongs to a sensor, not to a map: ``gs.BeamModel(grid, scanner, table)`` scores with one look-up per
     beam.
@@ -52,13 +51,13 @@ class DiscreteBeamModel(SensorTable):
     """
 
     causes: DiscreteCauses | BeamParameters
-    """The causes of readings."""
+    """Causes of readings."""
     range_max: float
     """Readings of at least ``range_max`` are "no return", > 0 [m]."""
     bins: int = 100
-    """The number of steps along the beam, 1 to 4096."""
+    """Number of steps along the beam, 1 to 4096."""
     fit: DiscreteFit | None = None
-    """The result of learning; None if the causes were not learned."""
+    """Result of learning; None if the causes were not learned."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.causes, (DiscreteCauses, BeamParameters)):
@@ -86,20 +85,20 @@ class DiscreteBeamModel(SensorTable):
     ) -> Self:
         """Learn the :class:`DiscreteCauses` of maximum likelihood.
 
-        Readings are first counted in a table of ``bins`` times ``bins``, so that the search takes no longer for
-        millions of readings than for a few.
+        Readings are counted in a table of ``bins`` times ``bins`` first, so that the search takes equally long for a
+        few and for millions of readings.
 
         Args:
-            ranges: Readings of any shape [m]. NaN and values below 0, including -inf, are missing and left out; values
-                of at least range_max, including +inf, are "no return".
+            ranges: Readings of any shape [m]. NaN and values below 0, including -inf, are missing; values of at least
+                range_max, including +inf, are "no return".
             expected: Expected ranges of the same shape, >= 0 [m]; at least range_max if the map has no obstacle.
             range_max: Readings of at least ``range_max`` are "no return", > 0 [m].
             bins: Number of steps along the beam, 1 to 4096.
-            blocks: Integer label of each reading's block, of the same shape, or None. Readings of different blocks are
-                independent; readings of one block (a scan) need not be. Standard errors are then computed over blocks.
+            blocks: Integer label of each reading's block, of the same shape, or None. Readings within a block (a scan)
+                may be correlated; blocks are independent. Standard errors are then computed over blocks.
 
         Returns:
-            The model; its ``fit`` has standard errors and status.
+            The model; ``fit`` holds standard errors and status.
 
         Raises:
             TypeError: An argument does not hold real numbers.
@@ -117,7 +116,7 @@ class DiscreteBeamModel(SensorTable):
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Make the model from the fields that :meth:`to_dict` returns.
+        """Make the model from the result of :meth:`to_dict`.
 
         Raises:
             TypeError: ``values`` is not a mapping, or a value has the wrong type for its field.
@@ -142,8 +141,8 @@ class DiscreteBeamModel(SensorTable):
     def log_probabilities(self) -> NDArray[np.float64]:
         """(bins + 1, bins + 1) log probabilities; read-only.
 
-        Row j is for an obstacle expected in step j, uniformly distributed in it; the last row is for no obstacle within
-        range. Column i is for a range in step i; the last column is for no return. Only impossible readings have -inf.
+        Row j assumes an obstacle uniformly distributed in step j; the last row assumes no obstacle within range.
+        Column i is a range in step i; the last column is no return. Only impossible readings have -inf.
         """
         table = self._rows(np.float64, density=False)
         table.setflags(write=False)
@@ -168,8 +167,8 @@ class DiscreteBeamModel(SensorTable):
             probability of no return; 0 for a missing reading.
 
         Raises:
-            TypeError, ValueError: An array does not hold real numbers, the shapes differ, or an expected range is
-                negative or NaN beside a reading that is not missing.
+            TypeError, ValueError: An array does not hold real numbers, the shapes differ, or the expected range of a
+                reading that is not missing is negative or NaN.
         """
         z, z_exp = check_pairs(ranges, expected, self.range_max)
         i, j = bins_of(z, self.range_max, self.bins), bins_of(z_exp, self.range_max, self.bins)

@@ -1,1 +1,1 @@
-"""Parameters of the landmark model from features."""
+"""Learn the parameters of the landmark model from features."""

@@ -1,9 +1,9 @@
 """Expectation maximisation for the landmark model's parameters, and Newton steps once EM becomes slow.
 
-The E-step computes the probabilities that a feature is each of its possible landmarks, or a false positive. The M-step
-weights squared residuals by them. Closed forms of the M-step ignore the limits of the sensor, so a step is halved until
-the log-likelihood does not fall. Once EM gains little, Newton steps of the log-likelihood itself follow, as for the
-beam model (``gpusense.learning.beam.em``).
+The E-step computes the probability of each possible landmark of a feature, and of a false positive. The M-step weights
+squared residuals by these probabilities. Its closed forms ignore the limits of the sensor, so a step is halved until
+the log-likelihood does not fall. Once EM gains little, Newton steps of the log-likelihood follow, as for the beam
+model (``gpusense.learning.beam.em``).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ NOTHING = 1e-3
 # Newton steps begin once an EM step gains less than _LITTLE nats, or after _MANY EM steps.
 _LITTLE, _MANY = 0.5, 30
 _HALVINGS = 30
-# Pairs less probable than this after EM are left out of Newton steps; together they change less than rounding.
+# Newton steps omit pairs that are less probable after EM; their joint effect is below rounding.
 _FAR = 1e-18
 # Smallest standard deviation as a share of range_max, of a radian, and of the signatures' span.
 _SMALLEST = 1e-6
@@ -51,7 +51,7 @@ def bounds_of(pairs: Pairs) -> tuple[Floats, Floats]:
 def first_guess(pairs: Pairs, initial: LandmarkParameters | None) -> Point:
     """Make the start from the user's parameters, or from the typical residual of each feature's nearest landmark.
 
-    Without the user's parameters one feature in ten is a false positive.
+    The default assumes one false positive in ten features.
     """
     low, high = bounds_of(pairs)
     if initial is not None:
@@ -59,7 +59,7 @@ def first_guess(pairs: Pairs, initial: LandmarkParameters | None) -> Point:
         sigma = [float(np.clip(h / 10 if s is None else s, b, h)) for s, b, h in zip(start, low, high, strict=True)]
         z = min(max(initial.z_detect, 1e-6), 1 - 1e-6) if len(pairs.feature) else 0.0
         return Point((sigma[0], sigma[1], sigma[2]), z, (0.0, 0.0))
-    # Residuals across the line of sight are converted to metres, the unit of residuals along it.
+    # Convert residuals across the line of sight to metres, the unit along it.
     distance = np.minimum(np.nan_to_num(pairs.means), pairs.limits.range_max)[:, RANGE]
     size = np.nan_to_num(pairs.residuals)
     size[:, 1] *= np.maximum(distance, 0.1)
@@ -80,16 +80,9 @@ def climb(
 ) -> tuple[Pairs, Value, list[float], bool]:
     """Climb until the remaining gain, estimated from the second derivatives, is at most ``tolerance`` nats.
 
-    Args:
-        pairs: Features and landmarks.
-        start: Start of the search.
-        bias: Also fit offsets of ranges and bearings.
-        max_iterations: Largest number of iterations.
-        tolerance: Remaining gain [nats].
-
     Returns:
-        The pairs of non-negligible probability, the value at the end, the log-likelihoods at the start and after each
-        iteration, and whether the search converged.
+        The pairs of relevant probability, the final value, the log-likelihoods at the start and after each iteration,
+        and whether the search converged.
     """
     value = evaluate(pairs, start)
     trace, newton = [value.log_likelihood], False
@@ -146,7 +139,7 @@ def _clamped(pairs: Pairs, point: Point) -> Point:
 
 
 def _without_needless(pairs: Pairs, value: Value) -> Value:
-    """Remove a cause that accounts for hardly any feature, unless the log-likelihood falls."""
+    """Remove a cause with hardly any feature, unless the log-likelihood falls."""
     for total, z in ((float(value.false.sum()), 1.0), (float(value.responsibility.sum()), 0.0)):
         if 0 < value.point.z_detect < 1 and total < NOTHING:
             candidate = evaluate(pairs, replace(value.point, z_detect=z))
@@ -169,7 +162,7 @@ def _newton_step(pairs: Pairs, value: Value, bias: bool) -> tuple[Value, float]:
     """Take a Newton step if it raises the log-likelihood.
 
     Returns:
-        The new value, or the old one; and the gain [nats] that the quadratic model predicted.
+        The new or the old value, and the gain [nats] that the quadratic model predicted.
     """
     step, left = newton_direction(value.gradient, hessian(pairs, value.point), free(pairs, value, bias))
     if left <= 0:

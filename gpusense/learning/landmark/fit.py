@@ -32,7 +32,7 @@ from gpusense.world.parameters import LandmarkParameters
 
 @dataclass(frozen=True)
 class Sightings:
-    """Checked arguments of a fit: the features with at least one measured part, and the poses of all scans.
+    """Checked arguments of a fit: features with at least one measured part, and the poses of all scans.
 
     Attributes:
         sensors: (S, 3) poses of the sensor.
@@ -70,22 +70,22 @@ def fit_landmark_parameters(
     """Fit the parameters of the landmark model to features at known poses, by maximum likelihood (book section 6.6).
 
     A feature of known landmark j contributes ``log(z_detect p(f | j) + z_false p_uniform(f))``, as in
-    ``LandmarkModel``. For a feature of unknown landmark, ``sum_j p(f | j) / V`` over the V landmarks in view from its
-    pose replaces ``p(f | j)``. A known false positive contributes ``log(z_false p_uniform(f))``.
+    ``LandmarkModel``. If the landmark is unknown, ``sum_j p(f | j) / V`` over the V landmarks in view from the pose
+    replaces ``p(f | j)``. A known false positive contributes ``log(z_false p_uniform(f))``.
 
     Args:
         poses: (F, 3) pose of the robot for each feature, or (S, 3) with ``scan`` [m, m, rad].
         features: (F, 2) ranges [m] and bearings [rad], or (F, 3) with signatures; NaN for missing parts.
         landmarks: The map.
         correspondence: (F,) landmark of each feature, -1 for none; None if unknown.
-        scan: (F,) index of each feature's pose. With it, landmarks in view are counted, also at poses without a
+        scan: (F,) index of each feature's pose. If set, landmarks in view are counted, even at poses without a
             feature, and p_detect is their detected share.
         range_max: Largest range of a feature [m].
         field_of_view: Field of view of the sensor, in (0, 2 pi] [rad].
         signature_span: Smallest and largest signature; None is the span of the map's and the features' signatures.
         mount: The sensor's pose (x, y, yaw) on the robot [m, m, rad].
-        bias: Also fit offsets of ranges and bearings, which then do not increase the standard deviations.
-        initial: Start of the search, without its limits; None guesses it from the residuals.
+        bias: Also fit offsets of ranges and bearings, so that they do not increase the standard deviations.
+        initial: Start of the search; its limits are ignored. None guesses a start from the residuals.
         max_iterations: Largest number of iterations.
         tolerance: The search has converged once it expects to gain less than ``tolerance`` [nats].
 

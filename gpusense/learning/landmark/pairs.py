@@ -1,7 +1,7 @@
-"""Pairs of features and their possible landmarks: log-likelihood of the landmark model and its derivatives.
+"""Pair features with possible landmarks, and compute the log-likelihood of the landmark model and its derivatives.
 
-With residuals u = f - m and the mean m = f_j + bias of a part, a pair's derivatives are, by log sigma,
-``(u / sigma)^2 - 1 - d log mass / d log sigma`` and, by the bias, ``u / sigma^2 - d log mass / d m``. The mass is the
+A part has the residual u = f - m and the mean m = f_j + bias. A pair's derivative by log sigma is
+``(u / sigma)^2 - 1 - d log mass / d log sigma``, and by the bias ``u / sigma^2 - d log mass / d m``. The mass is the
 integral of the part's normal over the limits of the sensor (docs/landmarks.md). A landmark beyond a limit has the mass
 of a landmark at the limit, moved by the bias.
 """
@@ -22,9 +22,9 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 RANGE, BEARING, SIGNATURE, ODDS, RANGE_BIAS, BEARING_BIAS = range(6)
-# Distance within which a landmark has no bearing [m].
+# Distance below which a landmark has no bearing [m].
 _NO_BEARING = 1e-6
-# Pairs of poses and landmarks that are processed at once.
+# Pairs of poses and landmarks per pass.
 _BLOCK = 1 << 20
 
 
@@ -34,7 +34,7 @@ class Point:
 
     Attributes:
         sigma: Standard deviations of range [m], bearing [rad] and signature.
-        z_detect: Weight of a feature that is a landmark.
+        z_detect: Weight of a feature that comes from a landmark.
         bias: Offsets of range [m] and bearing [rad].
     """
 
@@ -68,7 +68,7 @@ class Limits:
 
     @property
     def full_circle(self) -> bool:
-        """Tell whether the field of view is a full circle."""
+        """Return whether the field of view is a full circle."""
         return self.half_field >= math.pi
 
 
@@ -79,7 +79,7 @@ class Pairs:
     Attributes:
         feature: (P,) feature of each pair.
         landmark: (P,) landmark of each pair.
-        prior: (P,) log probability of this landmark for a feature that is a landmark.
+        prior: (P,) log probability of this landmark, given that the feature comes from a landmark.
         residuals: (P, 3) residuals of range, bearing (in [-pi, pi]) and signature; NaN for missing parts.
         means: (P, 3) expected range, bearing and signature.
         in_view: (P,) whether the landmark is within the limits.
@@ -100,7 +100,7 @@ class Pairs:
 
     @property
     def measured(self) -> tuple[bool, bool, bool]:
-        """Return whether any pair has a residual of range, any of bearing, and any of signature."""
+        """Return whether any pair has a residual of range, of bearing, and of signature."""
         measured: NDArray[np.bool] = np.any(~np.isnan(self.residuals), axis=0)
         return bool(measured[0]), bool(measured[1]), bool(measured[2])
 
@@ -119,7 +119,7 @@ class Value:
         log_likelihood: Log-likelihood of all features.
         gradient: (6,) derivatives by the steps of :meth:`Point.moved`.
         responsibility: (P,) probability of each pair.
-        false: (F,) probability of each feature to be a false positive.
+        false: (F,) probability that each feature is a false positive.
     """
 
     point: Point
@@ -137,7 +137,7 @@ def sensor_poses(poses: Floats, mount: Mount) -> Floats:
 
 
 def expected(sensors: Floats, xy: Floats) -> tuple[Floats, Floats]:
-    """Return ranges and bearings of landmarks from sensors, broadcast; the bearing of a very near landmark is NaN."""
+    """Return broadcast ranges and bearings of landmarks from sensors; NaN for the bearing of a very near landmark."""
     away = xy - sensors[..., :2]
     d: Floats = np.hypot(away[..., 0], away[..., 1])
     bearing = wrapped(np.arctan2(away[..., 1], away[..., 0]) - sensors[..., 2])
@@ -253,7 +253,7 @@ def _part(pairs: Pairs, point: Point, part: int) -> tuple[Floats, Floats, Floats
         low, high = ends[0] - center, ends[1] - center
     mass, by_sigma, by_mean = _mass(low / sigma, high / sigma)
     if part == BEARING and not limits.full_circle:
-        # In a wide field of view, differences beyond half a turn wrap around to the other side.
+        # In a wide field of view, differences beyond half a turn wrap around.
         side = limits.half_field + np.abs(center)
         more, more_sigma, more_mean = _mass((2 * math.pi - side) / sigma, np.full_like(side, math.pi / sigma))
         wide = side > math.pi

@@ -22,19 +22,7 @@ def report(
     pairs: Pairs, indices: Integers, total: int, value: Value, trace: list[float], converged: bool, bias: bool,
     base: LandmarkParameters, counts: tuple[int, float] | None,
 ) -> LandmarkFit:  # fmt: skip
-    """Build the fit from the end of a search.
-
-    Args:
-        pairs: Features with their possible landmarks.
-        indices: Indices of these features among all features.
-        total: Number of all features.
-        value: Value at the end of the search.
-        trace: Log-likelihoods at the start and after each iteration.
-        converged: Whether the search converged.
-        bias: Whether offsets were fitted.
-        base: The limits, and p_detect if it cannot be counted.
-        counts: Numbers of landmarks in view and of detected ones, or None.
-    """
+    """Build the fit from the end of a search."""
     second = hessian(pairs, value.point)
     held = _held(pairs, value)
     errors = _standard_errors(pairs, value, second, bias, held)
@@ -120,7 +108,7 @@ def _errors(second: Floats, places: Integers) -> Floats:
 
 
 def _mean(pairs: Pairs, value: Value, part: int) -> float:
-    """Return the mean residual of the features that are landmarks: the offset of EM's next step."""
+    """Return the mean residual of features from landmarks: the offset of EM's next step."""
     measured = ~np.isnan(pairs.residuals[:, part])
     weight = value.responsibility[measured]
     return float(weight @ pairs.residuals[measured, part] / weight.sum()) if weight.sum() > 0 else math.nan

@@ -21,29 +21,29 @@ class LandmarkFit(Fitted[LandmarkParameters]):
     ``print(fit)`` shows a table of parameters and standard errors.
 
     Attributes:
-        parameters: The parameters. A standard deviation is None if no feature has this part; p_detect is the start's
-            unless it was counted.
+        parameters: The parameters. A standard deviation is None if no feature has this part; p_detect keeps its
+            initial value unless it was counted.
         log_likelihood: Log-likelihood of the features, natural log; densities in 1/m, 1/rad and 1/unit of the
             signature.
         trace: (iterations + 1,) log-likelihood at the start and after each iteration.
         converged: Whether the search ended at an optimum; ``status`` gives the reason for False.
         status: Summary of the fit in words.
         standard_errors: Standard errors of sigma_range, sigma_bearing, sigma_signature, z_detect, z_false and p_detect,
-            from the observed information (p_detect: of a share). NaN if there is none; ``held`` has the reasons.
+            from the observed information (p_detect: of a share). NaN for a held parameter; see ``held``.
         held: Reason why a parameter has no standard error, by name.
-        range_bias: Offset of ranges, r = d + offset: fitted with ``bias=True``, else the mean residual of the features
-            that are landmarks; NaN without ranges [m].
+        range_bias: Offset of ranges, r = d + offset: fitted with ``bias=True``, else the mean residual of features
+            from landmarks; NaN without ranges [m].
         range_bias_error: Standard error of ``range_bias`` [m].
         bearing_bias: Offset of bearings, as for ranges [rad].
         bearing_bias_error: Standard error of ``bearing_bias`` [rad].
         bias_fitted: Whether the parameters were fitted together with the offsets.
         iterations: Iterations of the search.
         features: Number of features with at least one measured part.
-        missing: Number of features without any measured part, left out.
+        missing: Number of features without any measured part.
         false_positives: Expected number of false positives.
         expected: Number of landmarks in view, over all poses; 0 without ``scan``.
         detected: Expected number of detected landmarks among these.
-        false: (F,) probability of each feature to be a false positive; NaN for missing features.
+        false: (F,) probability that each feature is a false positive; NaN for missing features.
 
     Example:
         >>> import gpusense as gs

@@ -17,32 +17,32 @@ from gpusense.world.parameters import LandmarkParameters
 
 @dataclass(frozen=True)
 class Exchange:
-    """Two landmarks that fit their readings better with positions exchanged."""
+    """Two landmarks that fit their readings better after exchanging their positions."""
 
     first: int
     """Index of the first landmark in the map."""
     second: int
     """Index of the second landmark in the map."""
     readings: tuple[int, int]
-    """The numbers of their features."""
+    """Their numbers of features."""
     gain: float
-    """The gain of the log-likelihood of these features [nats]."""
+    """Gain in log-likelihood of these features [nats]."""
     before: tuple[float, float]
-    """The share of each landmark's features that agree with its position: more likely it than a false positive."""
+    """Share of each landmark's features that agree with its position: likelier from it than a false positive."""
     after: tuple[float, float]
-    """The same shares with positions exchanged."""
+    """The same shares after the exchange."""
 
 
 @dataclass(frozen=True)
 class Misplaced:
-    """A landmark whose position disagrees with most of its readings, without an exchange that explains them."""
+    """Landmark that disagrees with most of its readings, without an exchange that explains them."""
 
     landmark: int
     """Index in the map."""
     readings: int
-    """The number of its features."""
+    """Number of its features."""
     agree: float
-    """The share of its features that agree with its position."""
+    """Share of its features that agree with its position."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +66,11 @@ def suspicious_landmarks(
     least_gain: float = 20.0,
     least_readings: int = 5,
 ) -> Suspicions:
-    """Find exchanged and misplaced landmarks, by comparing features with the positions of all landmarks.
+    """Find exchanged and misplaced landmarks by comparing features with the positions of all landmarks.
 
-    S[j, k] is the log-likelihood of the features labelled j with the position of landmark k, false positives included.
-    Landmarks j and k are reported as exchanged if each fits better at the other's position, S[j, k] > S[j, j] and
-    S[k, j] > S[k, k], and both gains together are at least ``least_gain``. The parameters may be fitted to the same
+    S[j, k] is the log-likelihood of the features labelled j at the position of landmark k, false positives included.
+    Landmarks j and k are reported as exchanged if each fits better at the other's position, S[j, k] > S[j, j] and S[k,
+    j] > S[k, k], and both gains together are at least ``least_gain``. The parameters may be fitted to the same
     features, since false positives absorb features that do not fit. Signatures are ignored.
 
     Args:
@@ -81,10 +81,10 @@ def suspicious_landmarks(
         parameters: Parameters of the sensor; a z_false or z_detect below 1e-3 counts as 1e-3.
         mount: The sensor's pose on the robot [m, m, rad].
         least_gain: Smallest gain of an exchange [nats], > 0.
-        least_readings: Least number of features of a landmark that is judged.
+        least_readings: Least number of features for judging a landmark.
 
     Returns:
-        Exchanged pairs, and misplaced landmarks, whose position agrees with less than half of their features.
+        Exchanged pairs, and landmarks that agree with less than half of their features.
 
     Raises:
         TypeError: An argument has the wrong type.

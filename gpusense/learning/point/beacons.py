@@ -70,7 +70,7 @@ class _Beacons(Problem):
         return starts
 
     def ordered(self, theta: Floats) -> Floats:
-        """See Problem.ordered: the narrow normal comes first; a normal without weight comes last and repeats sigma."""
+        """See Problem.ordered: the narrow normal is first; a normal of weight 0 is last and repeats sigma."""
         if self.kind != "mixture":
             return theta
         ordered = theta.copy()
@@ -147,9 +147,9 @@ def fit_beacon_parameters(
     """Fit the parameters of ranges to beacons to readings at known poses, by maximum likelihood.
 
     The likelihood is :class:`BeaconModel`'s. Deviations, weights and offsets are fitted; the degrees of freedom of a
-    Student t are fixed. In a mixture sigma_range is at most sigma_heavy. Where one normal suffices, heavy_weight is 0
-    and sigma_heavy equals sigma_range. Starts come from the median and the densest part of the residuals, which are
-    robust to outliers.
+    Student t are fixed. In a mixture sigma_range is at most sigma_heavy. If one normal suffices, heavy_weight is 0 and
+    sigma_heavy equals sigma_range. Starts come from the median and the densest part of the residuals, which resist
+    outliers.
 
     Args:
         poses: (S, 3) robot poses [m, m, rad], or (F, 3) with ``ids``.
@@ -157,10 +157,10 @@ def fit_beacon_parameters(
             [0, range_max], are missing.
         xy: (M, 2) positions of the beacons in the world [m].
         ids: None, or (F,) indices of the beacons that the ranges belong to.
-        range_max: The longest range that the radio can report, > 0 [m].
-        kind: The distribution of correct ranges, as in :class:`BeaconParameters`.
-        nu: The degrees of freedom of ``"student_t"``, 1 to 100 [1].
-        bias: ``"common"`` fits one offset of all ranges, ``"each"`` one for each beacon, ``"none"`` keeps it at 0.
+        range_max: Longest range that the radio can report, > 0 [m].
+        kind: Distribution of correct ranges, as in :class:`BeaconParameters`.
+        nu: Degrees of freedom of ``"student_t"``, 1 to 100 [1].
+        bias: ``"common"`` fits one offset of all ranges, ``"each"`` an offset per beacon, ``"none"`` keeps it at 0.
         mount: The antenna's position (x, y) on the robot [m].
         blocks: None, or (S,) or (F,) integer labels of poses whose errors are correlated, for standard errors.
         max_iterations: Largest number of iterations of a search.
@@ -232,7 +232,7 @@ def _parameters(problem: _Beacons, theta: Floats, nu: int, mount: tuple[float, f
 
 
 def _half_sample_mode(values: Floats) -> float:
-    """Return the centre of the densest part, by repeated halving: robust even if more than half are outliers.
+    """Return the centre of the densest part by repeated halving; robust even to more than half outliers.
 
     Source: Bickel and Fruehwirth (2006), "On a fast, robust estimator of the mode".
     """

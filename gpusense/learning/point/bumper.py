@@ -20,7 +20,7 @@ from gpusense.models.point.bumper import BumperModel
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.sensor_parameters import BumperParameters
 
-# Deviation with which gaps are read off a model [cells]; it gives the widest margin around the map.
+# Deviation for reading gaps off a model [cells]; it gives the widest margin around the map.
 _WIDE = 16.0
 
 
@@ -98,7 +98,7 @@ def fit_bumper_parameters(
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
 
     Returns:
-        The fit. Presses far from walls determine p_false, presses well within walls p_contact, and presses near the
+        The fit. Presses far from walls determine p_false, presses well within walls p_contact, presses near the
         surface sigma.
 
     Raises:
@@ -140,11 +140,11 @@ def fit_bumper_parameters(
 
 
 def outline_gaps(model: BumperModel, poses: Floats) -> Floats:
-    """Return the (F, B) gaps between each segment of the outline and the nearest obstacle, by the model [m].
+    """Return the (F, B) gaps from each segment of the outline to the nearest obstacle, by the model [m].
 
     Args:
-        model: A model with p_contact = 1 and p_false = 0: log p of a pressed bumper is log Phi(-gap / sigma), of one
-            that is not pressed log Phi(gap / sigma). The smaller of the two determines the gap precisely.
+        model: A model with p_contact = 1 and p_false = 0: log p is log Phi(-gap / sigma) for a pressed bumper, else
+            log Phi(gap / sigma). The smaller of the two determines the gap precisely.
         poses: (F, 3) robot poses.
     """
     from scipy.special import ndtri_exp

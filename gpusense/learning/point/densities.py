@@ -18,7 +18,7 @@ Limits: TypeAlias = tuple[tuple[float, float], ...]
 _SHAPE_STEP = 1e-4
 
 _LOG_ROOT_TWO_PI = 0.5 * math.log(2 * math.pi)
-# Up to this deviation a wrapped normal is a sum of normals, beyond it a Fourier series, as in ``HeadingModel``.
+# Up to this deviation a wrapped normal is a sum of normals, above it a Fourier series, as in ``HeadingModel``.
 _WIDEST_SUM, _WRAPS, _WAVES = 1.5, 3, 6
 
 
@@ -50,7 +50,7 @@ def truncated(
 def by_shape(
     u: Floats, near: Floats, far: Floats, at: Floats, make: Callable[[Floats], HitShape], limits: Limits
 ) -> list[Floats]:
-    """Return the derivatives of the log density of truncated hits by the coordinates of their shape, as differences.
+    """Return the derivatives of the log density of truncated hits by the coordinates of their shape, by differences.
 
     Args:
         u: (n,) distances from the mean, in scales.

@@ -83,7 +83,7 @@ def fit_heading_parameters(
     Args:
         poses: (F, 3) robot poses (x, y, theta) [m, m, rad].
         headings: (F,) readings [rad], any number of turns. NaN and infinities are missing.
-        kind: The distribution of correct readings, as in :class:`HeadingParameters`.
+        kind: Distribution of correct readings, as in :class:`HeadingParameters`.
         blocks: None, or (F,) integer labels of readings whose errors are correlated, for standard errors.
         max_iterations: Largest number of iterations of a search.
         tolerance: The search has converged once it expects to gain less than ``tolerance`` [nats].

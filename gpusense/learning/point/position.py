@@ -18,7 +18,7 @@ from gpusense.learning.point.search import maximize
 from gpusense.world.sensor_parameters import PositionParameters
 
 _LOG_TWO_PI = math.log(2 * math.pi)
-# Largest difference of fixes that are exact but for rounding [m].
+# Largest difference between fixes that are exact up to rounding [m].
 _EXACT = 1e-12
 
 
@@ -26,8 +26,8 @@ _EXACT = 1e-12
 class _Fixes(Problem):
     """Likelihood of fixes by z_rand, a whitening matrix ((a, 0), (b, c)), and the antenna's mount (x, y).
 
-    Coordinates are log a, b and log c, or log a alone for one deviation, where c = a and b = 0. b is in units of the
-    spread's inverse. Without a region z_rand stays 0; without a fit of the mount, the mount is fixed.
+    Coordinates are log a, b and log c, or only log a for one deviation, where c = a and b = 0. b is in units of the
+    spread's inverse. z_rand stays 0 without a region, and the mount stays fixed unless it is fitted.
     """
 
     per_reading: ClassVar[tuple[str, ...]] = ("errors", "cosines", "sines", "inside")
@@ -127,9 +127,9 @@ def fit_position_parameters(
     Args:
         poses: (F, 3) robot poses (x, y, theta) in the world [m, m, rad].
         fixes: (F, 2) measured x and y of the antenna [m]. A non-finite fix is missing.
-        correlated: Whether to fit a covariance matrix in place of one deviation along x and y.
-        region: The rectangle of outliers (x_min, y_min, x_max, y_max) in the world [m]; with it their weight is fitted.
-        mount: The antenna's position (x, y) on the robot [m], or the start of its fit.
+        correlated: Whether to fit a covariance matrix instead of one deviation along x and y.
+        region: Rectangle of outliers (x_min, y_min, x_max, y_max) in the world [m]; if set, their weight is fitted.
+        mount: Position (x, y) of the antenna on the robot [m], or the start of its fit.
         fit_mount: Whether to fit the mount, which requires varying headings.
         blocks: None, or (F,) integer labels of fixes whose errors are correlated, for standard errors.
         max_iterations: Largest number of iterations of a search.

@@ -1,4 +1,4 @@
-"""Base of the likelihoods of readings at known poses: coordinates with bounds, log p and gradient of each reading."""
+"""Base class of likelihoods of readings at known poses, with bounded coordinates, log p and gradients."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from gpusense._util import checks
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Share of a coordinate's scale by which derivatives are taken: their error is about its square.
+# Step of differences as a share of a coordinate's scale; the relative error is about its square.
 _STEP = 1e-5
 
 
 class Problem(ABC):
     """Likelihood of n independent readings by k coordinates.
 
-    A subclass is a frozen dataclass. Its attributes named in ``per_reading`` have the readings on the first axis.
+    A subclass is a frozen dataclass. The first axis of attributes named in ``per_reading`` is the reading.
     """
 
     per_reading: ClassVar[tuple[str, ...]]
@@ -42,7 +42,7 @@ class Problem(ABC):
 
     @abstractmethod
     def scales(self, theta: Floats) -> Floats:
-        """Return the (k,) sizes of a small change of each coordinate."""
+        """Return the (k,) step sizes of the coordinates."""
 
     @abstractmethod
     def log_p(self, theta: Floats) -> tuple[Floats, Floats]:
@@ -53,7 +53,7 @@ class Problem(ABC):
         """Return the parameters by name."""
 
     def ordered(self, theta: Floats) -> Floats:
-        """Return coordinates of the same likelihood with exchangeable parts in their order."""
+        """Return coordinates of the same likelihood with exchangeable parts in canonical order."""
         return theta
 
     def part(self, every: int) -> Problem:
@@ -67,7 +67,7 @@ class Problem(ABC):
         return float(log_p.sum()), gradient.sum(axis=0)
 
     def hessian(self, theta: Floats, free: NDArray[np.bool_]) -> Floats:
-        """Return the (m, m) second derivatives by the free coordinates, as differences of gradients."""
+        """Return the (m, m) second derivatives by the free coordinates, by differences of gradients."""
         places = np.flatnonzero(free)
         rows = [self._slope(lambda at: self.total(at)[1][places], theta, int(place)) for place in places]
         matrix = np.array(rows).reshape(len(places), len(places))
@@ -96,10 +96,10 @@ class Problem(ABC):
 
 
 def mix(parts: list[tuple[float, Floats]]) -> tuple[Floats, Floats, list[Floats]]:
-    """Return the log of a weighted sum of densities, shares of it, and ratios of each density to it.
+    """Return the log of a weighted sum of densities, the shares, and the ratio of each density to the sum.
 
     Args:
-        parts: Weight, and (n,) log density, of each component.
+        parts: Weight and (n,) log density of each component.
 
     Returns:
         (n,) log p; (c, n) shares of p, which sum to 1; c ratios (n,) density / p, the derivatives by the weights.
@@ -131,5 +131,5 @@ def number_blocks(labels: Integers | None) -> Integers | None:
 
 
 def of_weight(weight: float) -> float:
-    """Return the size of a small change of a weight in [0, 1]."""
+    """Return the step size for a weight in [0, 1]."""
     return max(min(weight, 1 - weight), 1e-4)

@@ -16,15 +16,7 @@ _FEW_BLOCKS = 10
 
 
 def report(problem: Problem, end: Climb, parameters: P, blocks: Integers | None, missing: int) -> PointFit[P]:
-    """Build the fit from the end of a search.
-
-    Args:
-        problem: The problem.
-        end: End of the search.
-        parameters: The parameters there.
-        blocks: (n,) numbers of the readings' blocks, or None.
-        missing: Number of readings left out.
-    """
+    """Build the fit from the end of a search."""
     values = problem.values(end.theta)
     count = 0 if blocks is None else int(blocks.max()) + 1
     independent = _errors(problem, end, None)
@@ -84,7 +76,7 @@ def _scatter(gradients: Floats, blocks: Integers) -> Floats:
 
 
 def _blocks_of(problem: Problem, end: Climb, blocks: Integers | None) -> dict[str, int]:
-    """Return the least number of blocks whose readings depend on a coordinate, by the parameters it determines."""
+    """Return the least number of blocks that depend on a coordinate, for each parameter that it determines."""
     names = list(problem.values(end.theta))
     if blocks is None:
         return dict.fromkeys(names, 0)

@@ -25,13 +25,13 @@ class PointFit(Fitted[P]):
         converged: Whether the search ended at an optimum; ``status`` gives the reason for False.
         status: Summary of the fit in words.
         standard_errors: Standard errors of the fitted parameters by name: over blocks if there are any. NaN for a
-            parameter at a bound, infinite for one that the readings do not determine; ``held`` has the reasons.
-        independent_errors: Standard errors as if the readings were independent.
+            parameter at a bound, infinite if the readings do not determine it; see ``held``.
+        independent_errors: Standard errors for independent readings.
         held: Reason why a parameter has no standard error, by name.
-        values: The fitted parameters by name, as they are named in ``standard_errors``.
+        values: Fitted parameters by the names in ``standard_errors``.
         iterations: Iterations of the search.
-        readings: Number of readings that were used.
-        missing: Number of readings left out.
+        readings: Number of used readings.
+        missing: Number of missing readings.
         blocks: Number of blocks; 0 without blocks.
 
     Example:

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from gpusense.learning.point.problem import Floats, Problem
 
-# Number of starts that are followed, and of readings for choosing them.
+# Number of starts to follow, and of readings for choosing them.
 _CLIMBED, _SAMPLE = 3, 20_000
-# Smallest share of the expected rise that a step must achieve, and largest number of halvings.
+# Smallest share of the expected gain that a step must achieve, and largest number of halvings.
 _ARMIJO, _HALVINGS = 1e-4, 50
-# Scaled curvature below this share of the largest counts as none; errors of differences stay below the second.
+# Scaled curvature below the first share of the largest counts as none; errors of differences stay below the second.
 _FLAT, _NEGATIVE = 1e-10, 1e-7
 
 
@@ -43,24 +43,24 @@ class Climb:
 
 
 def maximize(problem: Problem, max_iterations: int, tolerance: float, start: Floats | None = None) -> Climb:
-    """Search from the likeliest starts, and return the end with the problem's parts in their order.
+    """Search from the likeliest starts, and return the end with exchangeable parts in canonical order.
 
     Args:
         problem: The problem.
         max_iterations: Largest number of iterations of a search.
         tolerance: A search has converged once it expects to gain less than this [nats].
-        start: The only start; None for those of the problem.
+        start: The only start; None takes the problem's starts.
     """
     end = _best_end(problem, max_iterations, tolerance, start)
     theta = problem.ordered(end.theta)
     if np.array_equal(theta, end.theta):
         return end
-    # Which of several equal maxima a search reaches depends on rounding.
+    # Rounding decides which of several equal maxima a search reaches.
     return replace(end, theta=theta, free=_free(theta, problem.total(theta)[1], *problem.bounds()))
 
 
 def _best_end(problem: Problem, max_iterations: int, tolerance: float, start: Floats | None) -> Climb:
-    """Return the end of the likeliest search, first on a subset of many readings, then on all; see :func:`maximize`."""
+    """Return the end of the likeliest search, first on a subset of the readings, then on all."""
     if start is not None:
         return climb(problem, start, max_iterations, tolerance)
     every = max(1, problem.readings // _SAMPLE)
@@ -86,7 +86,7 @@ def climb(problem: Problem, start: Floats, max_iterations: int, tolerance: float
             break
         moved = _line_search(problem, theta, value, gradient, step)
         if moved is None:
-            # A gain below the rounding error of the sum cannot be measured.
+            # A gain below the sum's rounding error cannot be measured.
             converged = top and gain < 1e-12 * max(abs(value), 1.0)
             break
         theta, value, gradient = moved
@@ -99,7 +99,7 @@ def _free(theta: Floats, gradient: Floats, low: Floats, high: Floats) -> NDArray
 
 
 def _step(problem: Problem, theta: Floats, gradient: Floats, free: NDArray[np.bool_]) -> tuple[Floats, float, bool]:
-    """Return the (k,) step, the expected gain, and whether the curvature is that of a maximum."""
+    """Return the (k,) step, the expected gain, and whether the Hessian is negative semidefinite."""
     step = np.zeros(len(theta))
     if not free.any():
         return step, 0.0, True
@@ -111,7 +111,7 @@ def _step(problem: Problem, theta: Floats, gradient: Floats, free: NDArray[np.bo
     along: Floats = axes.T @ (scale * g)
     moves = along / np.maximum(np.abs(size), flat)
     step[free] = scale * (axes @ moves)
-    # A step of more than a few scales leaves the region where the curvature holds.
+    # Longer steps leave the region where the curvature is valid.
     limit = 4 * problem.scales(theta)
     step *= min(1.0, float((limit / np.maximum(np.abs(step), 1e-300)).min()))
     top = bool(size.min() >= -_NEGATIVE * float(np.abs(size).max()))

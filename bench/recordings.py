@@ -17,9 +17,8 @@ from pathlib import Path
 import numpy as np
 
 import gpusense as gs
-from gpusense.evaluation.coverage import coverage_report, rank_of
 from gpusense.evaluation.steps import read_steps
-from gpusense.evaluation.tracking import START
+from gpusense.evaluation.tracking import START, coverage_report, rank_of
 from gpusense.localization.defaults import DEFAULTS
 
 CARMEN = {name: name for name in ("intel", "csail", "aces", "belgioioso", "fhw", "seattle")} | {"fr079": "freiburg-079"}

@@ -18,7 +18,7 @@ import numpy as np
 import recordings
 from common import make_parser, note, parse, publish, table
 
-from gpusense.evaluation.coverage import coverage_report
+from gpusense.evaluation.tracking import coverage_report
 
 NATS = 100.0
 LOGS = (*recordings.CARMEN, "intel-raw", "olin", "jarvis-s3000", "jarvis-nav350")

@@ -7,8 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from gpusense._util.typing import CasterName
-from gpusense.commands.arguments import add_backend, add_json, add_seed, whole_number
-from gpusense.commands.model_options import add_model, add_parameters, parameters_of
+from gpusense.commands.arguments import (
+    add_backend,
+    add_json,
+    add_model,
+    add_parameters,
+    add_seed,
+    parameters_of,
+    whole_number,
+)
 from gpusense.commands.output import print_json
 from gpusense.commands.scans import OPTIONS, add_log, add_range_max, read_scan
 from gpusense.evaluation.machine import machine

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense._util.angles import wrapped
-from gpusense.features.beams import Beams
 from gpusense.features.hallways import first_apart, pairs_of
 from gpusense.features.lines import scores_of
 from gpusense.features.result import Found
-from gpusense.features.segments import Segments
+from gpusense.features.segments import Beams, Segments
 
 # Least and largest width of a door [m].
 _NARROWEST, _WIDEST = 0.5, 2.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Literal
 
@@ -9,28 +10,30 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
+from gpusense._util.angles import wrapped
 from gpusense._util.typing import AnyArray
 from gpusense.backends import Selection, get_backend
 from gpusense.backends.base import Backend
-from gpusense.features.beams import beams_of
-from gpusense.features.corners import find_corners
 from gpusense.features.device import ScanDevice
 from gpusense.features.doors import find_doors
 from gpusense.features.hallways import find_hallways
-from gpusense.features.lines import find_lines, straight
+from gpusense.features.lines import find_lines, scores_of, straight
 from gpusense.features.poles import find_poles
-from gpusense.features.reflectors import find_reflectors
-from gpusense.features.result import KINDS, Features, Found, check_kinds, features_of, joined
-from gpusense.features.segments import find_segments
+from gpusense.features.result import KINDS, Features, Found, check_kinds, features_of, joined, nothing
+from gpusense.features.segments import Segments, beams_of, find_segments
 from gpusense.matching.match import readings
 from gpusense.matching.noise import ASSUMED_NOISE, whole_noise
 from gpusense.matching.points import scan_points
-from gpusense.world.scanner import Scanner
+from gpusense.world.scanner import Scanner, classify_ranges
 
 # Least and largest noise with which scans are split [m].
 _LEAST_NOISE, _LARGEST_NOISE = 3e-3, 0.1
 # Most readings that are processed at once.
 _READINGS = 1 << 22
+# Largest step between the bearings of neighbouring beams [usual steps].
+_NEIGHBOURS = 1.5
+# Standard deviation of the common error of a reflector's ranges [m]: bright echoes are timed early or late.
+_TOGETHER = 0.01
 
 
 def extract_features(
@@ -127,3 +130,140 @@ def _shapes(
         "pole": lambda: find_poles(device, segments, beams, noise, scanner.mount),
     }
     return {kind: finder() for kind, finder in finders.items() if kind in kinds}
+
+
+# Least turn between two walls [rad], and most points between them.
+_LEAST_TURN, _BETWEEN = math.radians(25), 2
+# Lines meet if the vertex is at most this many beams and deviations from the end of each.
+_BEAMS, _DEVIATIONS = 1.5, 3.0
+
+
+def find_corners(segments: Segments, straight: np.ndarray, mount: tuple[float, float, float]) -> Found:
+    """Return the corners of scans: inner ones open by less than pi, outer ones by more."""
+    one, two, between = _neighbours(segments, straight)
+    alpha, beta = segments.angle[one], segments.angle[two]
+    turn = wrapped(beta - alpha)
+    clear = np.abs(np.sin(turn)) > math.sin(_LEAST_TURN)
+    one, two, between, turn, alpha, beta = (v[clear] for v in (one, two, between, turn, alpha, beta))
+    normals = np.stack([np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)], axis=1).reshape(-1, 2, 2)
+    inverse = np.linalg.inv(normals)
+    vertex = (inverse @ np.stack([segments.distance[one], segments.distance[two]], axis=1)[..., None])[..., 0]
+    along = np.stack([_along(vertex, alpha), _along(vertex, beta)], axis=1)
+    # Derivatives of the vertex's distance from each line by the angle and the distance of the line.
+    row = np.zeros((len(one), 2, 4))
+    row[:, 0, 0], row[:, 0, 1], row[:, 1, 2], row[:, 1, 3] = -along[:, 0], 1, -along[:, 1], 1
+    jacobian = np.zeros((len(one), 3, 4))
+    jacobian[:, :2] = inverse @ row
+    jacobian[:, 2, 0] = jacobian[:, 2, 2] = 0.5
+    both = np.zeros((len(one), 4, 4))
+    both[:, :2, :2], both[:, 2:, 2:] = segments.covariance[one], segments.covariance[two]
+    covariance = jacobian @ both @ jacobian.transpose(0, 2, 1)
+    spread = np.sqrt(np.einsum("cii->c", covariance[:, :2, :2]))
+    space = (_BEAMS + between)[:, None] * np.stack([segments.spacing[one, 1], segments.spacing[two, 0]], axis=1)
+    gap = np.stack([along[:, 0] - segments.ends[one, 1], segments.ends[two, 0] - along[:, 1]], axis=1)
+    # Within this distance of the vertex a point lies on both lines, up to noise.
+    noise = np.sqrt(np.maximum(segments.variance[one], segments.variance[two]))
+    reach = _DEVIATIONS * (spread + noise / np.abs(np.sin(turn)))
+    meets = (np.abs(gap) <= space + reach[:, None]).all(axis=1)
+    pose = np.column_stack([vertex + np.array(mount[:2]), alpha + 0.5 * turn + math.pi])
+    observed = np.broadcast_to(np.eye(3), (len(one), 3, 3))
+    score = scores_of(segments, one) * scores_of(segments, two)
+    return Found(segments.scan[one], pose, observed, covariance, math.pi - turn, score).only(meets)
+
+
+def _along(vertex: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Return the coordinates of points along lines."""
+    place: np.ndarray = -np.sin(angle) * vertex[:, 0] + np.cos(angle) * vertex[:, 1]
+    return place
+
+
+def _neighbours(segments: Segments, straight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return pairs of successive lines with at most a few points between them, and the number of these points."""
+    one = np.flatnonzero(straight)
+    two, between, linked = one, np.zeros(len(one), np.int64), np.ones(len(one), bool)
+    found = []
+    for _ in range(_BETWEEN + 1):
+        linked = linked & (two >= 0) & ~segments.apart[two]
+        two = np.where(linked, segments.successor[two], -1)
+        meets = linked & straight[two] & (two != one)
+        found.append((one[meets], two[meets], between[meets]))
+        between = between + np.where(two >= 0, segments.count[two], 0)
+        linked = linked & ~meets & (between <= _BETWEEN)
+    return tuple(np.concatenate(part) for part in zip(*found, strict=True))  # type: ignore[return-value]
+
+
+# Least intensity of a bright beam, and of a reflector's brightest beam [medians of the scan].
+_BRIGHT, _BRIGHTEST = 2.0, 3.0
+# Least beams, largest width [m], and largest step of ranges between neighbours [m].
+_LEAST_BEAMS, _WIDEST, _STEP = 2, 0.4, 0.2
+
+
+def find_reflectors(ranges: np.ndarray, intensities: np.ndarray, scanner: Scanner, noise: np.ndarray) -> Found:
+    """Return the reflectors of (S, K) readings: centre and radius, half the width of the bright front."""
+    angle = np.mod(scanner.bearings + scanner.mount[2], 2 * math.pi)
+    order = np.argsort(angle, kind="stable")
+    bearing = angle[order]
+    steps = np.mod(np.roll(bearing, -1) - bearing, 2 * math.pi)
+    step = float(np.median(steps)) if len(steps) else 0.0
+    hit = classify_ranges(ranges, scanner.range_min, scanner.range_max)[0][:, order] & (ranges[:, order] > 0)
+    bright = np.where(hit & np.isfinite(intensities[:, order]), intensities[:, order], 0.0)
+    rows: list[list[float]] = []
+    for scan, (light, r) in enumerate(zip(bright, ranges[:, order], strict=True)):
+        usual = float(np.median(light[light > 0])) if (light > 0).any() else 0.0
+        for run in _runs(light > _BRIGHT * usual, r, steps, step) if usual > 0 else ():
+            found = _reflector(light[run], r[run], bearing[run], usual, step)
+            if found is not None:
+                rows.append([scan, *found, noise[scan]])
+    return _found(np.array(rows), scanner.mount) if rows else nothing()
+
+
+def _runs(bright: np.ndarray, r: np.ndarray, steps: np.ndarray, step: float) -> list[np.ndarray]:
+    """Return runs of bright beams in the order of bearings, across the last beam if beams cover a full turn."""
+    count = len(bright)
+    # Only bright beams have finite ranges.
+    r = np.where(bright, r, 0.0)
+    linked = bright & np.roll(bright, -1) & (steps <= _NEIGHBOURS * step) & (np.abs(np.roll(r, -1) - r) < _STEP)
+    first = np.flatnonzero(bright & ~np.roll(linked, 1))
+    last = np.flatnonzero(bright & ~linked)
+    if not len(first):
+        return []
+    # The last run may continue at the first beams.
+    ends = last if last[0] >= first[0] else np.append(last[1:], last[0] + count)
+    return [np.arange(a, b + 1) % count for a, b in zip(first, ends, strict=True)]
+
+
+def _reflector(
+    light: np.ndarray, r: np.ndarray, bearing: np.ndarray, usual: float, step: float
+) -> tuple[float, float, float, float, float] | None:
+    """Return distance, bearing, width, variance of the bearing and number of beams of a run; None for other runs."""
+    peak = float(light.max())
+    inner = light >= 0.5 * (peak + usual)
+    count = int(np.count_nonzero(inner))
+    if peak < _BRIGHTEST * usual or count < _LEAST_BEAMS:
+        return None
+    weight = light[inner] - usual
+    weight = weight / weight.sum()
+    turn = wrapped(bearing[inner] - bearing[0])
+    distance = float(np.median(r[inner]))
+    width = distance * (float(turn.max() - turn.min()) + step)
+    if width > _WIDEST:
+        return None
+    variance = step**2 / 12 * max(float((weight**2).sum()) * 2, 0.25)
+    return distance, float(bearing[0] + weight @ turn), width, variance, float(count)
+
+
+def _found(rows: np.ndarray, mount: tuple[float, float, float]) -> Found:
+    """Return reflectors from rows: scan, distance, bearing, width, variance of the bearing, number of beams, noise."""
+    scan, distance, bearing, width, variance, count, noise = rows.T
+    c, s = np.cos(bearing), np.sin(bearing)
+    radius = 0.5 * width
+    pose = np.column_stack(
+        [(distance + radius) * c + mount[0], (distance + radius) * s + mount[1], np.zeros(len(rows))]
+    )  # fmt: skip
+    observed = np.zeros((len(rows), 2, 3))
+    observed[:, 0, 0], observed[:, 0, 1], observed[:, 1, 0], observed[:, 1, 1] = c, s, -s, c
+    covariance = np.zeros((len(rows), 2, 2))
+    covariance[:, 0, 0] = noise**2 / count + _TOGETHER**2
+    covariance[:, 1, 1] = distance**2 * variance
+    score = np.clip(1 - np.sqrt(covariance[:, 1, 1]) / np.maximum(radius, 1e-3), 0, 1)
+    return Found(scan.astype(np.int64), pose, observed, covariance, radius, score)

@@ -6,10 +6,9 @@ import math
 
 import numpy as np
 
-from gpusense.features.beams import Beams
 from gpusense.features.device import ScanDevice
 from gpusense.features.result import Found
-from gpusense.features.segments import Segments
+from gpusense.features.segments import Beams, Segments
 
 # Least and largest radius [m], and least points of a pole.
 _THINNEST, _THICKEST, _LEAST_POINTS = 0.015, 0.5, 4

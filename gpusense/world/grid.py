@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
-from gpusense._util.html import card
+from gpusense._util.html import card, grey_png
 from gpusense.world.grid_frame import GridFrame, check_origin, check_resolution
 from gpusense.world.messages import field, planar_pose, real_field
 from gpusense.world.plausible import look_at_grid
-from gpusense.world.thumbnail import thumbnail
+
+WIDEST = 240
+"""Most pixels along a side."""
 
 
 class OccupancyGrid:
@@ -309,3 +311,20 @@ def _checked_cells(cells: ArrayLike) -> NDArray[np.int8]:
     copy = np.array(values, dtype=np.int8, order="C")
     copy.setflags(write=False)
     return copy
+
+
+# Greys of free, unknown and occupied cells; a pixel takes the darkest of its cells, so that walls remain.
+_FREE, _UNKNOWN, _OCCUPIED = 255, 205, 60
+
+
+def thumbnail(unknown: np.ndarray, occupied: np.ndarray) -> bytes:
+    """Return a PNG of a map, given its (H, W) masks, with row 0 at the bottom; empty for a map without cells."""
+    if not occupied.size:
+        return b""
+    grey = np.full(occupied.shape, _FREE, np.uint8)
+    grey[unknown] = _UNKNOWN
+    grey[occupied] = _OCCUPIED
+    step = -(-max(occupied.shape) // WIDEST)
+    for axis in (0, 1):
+        grey = np.minimum.reduceat(grey, np.arange(0, grey.shape[axis], step), axis=axis)
+    return grey_png(grey[::-1])

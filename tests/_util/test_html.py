@@ -11,7 +11,7 @@ from PIL import Image
 
 import gpusense as gs
 from gpusense._util.html import LONGEST, card, grey_png
-from gpusense.world.thumbnail import WIDEST, thumbnail
+from gpusense.world.grid import WIDEST, thumbnail
 
 EMPTY = {"br", "img"}
 SCANNER = gs.Scanner(np.radians(np.arange(-120, 121, 3)), range_max=8.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from gpusense.evaluation import coverage
+from gpusense.evaluation import tracking
 
 
 def drawn(factor, count=4000):
@@ -14,15 +14,15 @@ def drawn(factor, count=4000):
     rng = np.random.default_rng(0)
     root = np.array([[0.1, 0, 0], [0.04, 0.05, 0], [0.01, 0, 0.02]])
     errors, clouds = rng.normal(size=(count, 3)) @ root.T, rng.normal(size=(200, 3)) @ root.T * np.sqrt(factor)
-    ranks = np.array([coverage.rank_of(clouds, np.full(200, 1 / 200), -error) for error in errors])
+    ranks = np.array([tracking.rank_of(clouds, np.full(200, 1 / 200), -error) for error in errors])
     return errors, np.tile(factor * root @ root.T, (count, 1, 1)), ranks, root
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.25, 4.0])
 def test_coverage_follows_the_covariance(factor):
     errors, covariances, ranks, root = drawn(factor)
-    found = coverage.coverage_report(errors, covariances, ranks)
-    for name, limit in coverage.REGIONS.items():
+    found = tracking.coverage_report(errors, covariances, ranks)
+    for name, limit in tracking.REGIONS.items():
         # Four deviations of a share of 4000.
         assert found[f"coverage_{name}"] == pytest.approx(chi2.cdf(factor * limit, 3), abs=0.032)
         assert chi2.cdf(limit, 3) == pytest.approx(int(name) / 100, abs=1e-4)
@@ -38,9 +38,9 @@ def test_coverage_follows_the_covariance(factor):
 def test_ranks_are_in_the_frame_of_the_true_pose():
     particles = np.array([[0.0, 0, 0], [1, 1, 0.2], [0, 2, 3.1]])
     # Facing +y at (0.5, 1.5): ahead is +y, left is -x.
-    found = coverage.rank_of(particles, np.array([0.5, 0.3, 0.2]), np.array([0.5, 1.5, np.pi / 2]))
+    found = tracking.rank_of(particles, np.array([0.5, 0.3, 0.2]), np.array([0.5, 1.5, np.pi / 2]))
     np.testing.assert_allclose(found, [0.8, 0.3, 0.8])
-    np.testing.assert_allclose(coverage.rank_of(particles[:1], np.ones(1), particles[0]), [0.5] * 3)
+    np.testing.assert_allclose(tracking.rank_of(particles[:1], np.ones(1), particles[0]), [0.5] * 3)
 
 
 def test_ranks_of_poses_beyond_all_particles_are_in_the_histogram():
@@ -49,9 +49,9 @@ def test_ranks_of_poses_beyond_all_particles_are_in_the_histogram():
     for count in rng.integers(1, 9000, 20):
         weights, ahead = rng.random(count), rng.uniform(0.1, 0.2, (count, 3))
         weights /= weights.sum()
-        ranks += [coverage.rank_of(side * ahead, weights, np.zeros(3)) for side in (1, -1)]
+        ranks += [tracking.rank_of(side * ahead, weights, np.zeros(3)) for side in (1, -1)]
     ranks = np.array(ranks)
     # Sums of weights are rounded, and a histogram leaves out what is beyond its ends.
     assert ranks.min() >= 0 and ranks.max() <= 1
-    found = coverage.coverage_report(np.zeros(ranks.shape), np.tile(np.eye(3), (len(ranks), 1, 1)), ranks)
+    found = tracking.coverage_report(np.zeros(ranks.shape), np.tile(np.eye(3), (len(ranks), 1, 1)), ranks)
     assert found["rank_histogram"] == [0.5, *[0.0] * 8, 0.5]

@@ -12,7 +12,7 @@ from support.command_line import error_of
 
 import gpusense as gs
 from gpusense.logs.bag_writer import write_bag
-from gpusense.logs.carmen_writer import write_carmen
+from gpusense.logs.carmen import write_carmen
 
 SCANNER = gs.Scanner.uniform(angle_min=-2.1, angle_increment=0.03, count=141, range_max=8.12345678)
 

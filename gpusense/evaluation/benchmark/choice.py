@@ -17,8 +17,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from gpusense.evaluation.benchmark.points import error_of, label, setting, time_of
-
 ALIKE = 1.25
 """Factor of the times below which two methods are equally fast."""
 CLOSE = 1.25
@@ -304,3 +302,25 @@ def choices(points: Sequence[Mapping[str, Any]], wish: Wish) -> Iterator[Choice]
             for one in front(listed)
         ]
         yield Choice(backend, f"{problem} on {backend}, {size}, {', '.join(wanted)}: {found}", rows)
+
+
+def label(point: Mapping[str, Any]) -> str:
+    """Name a point's method with its variant."""
+    return f"{point['method']}, {point['variant']}" if point["variant"] else str(point["method"])
+
+
+def setting(point: Mapping[str, Any]) -> str:
+    """Format a point's knob with its value; empty without a knob."""
+    return f"{point['knob']} = {point['value']:g}" if point["knob"] else ""
+
+
+def error_of(point: Mapping[str, Any], kind: str, name: str) -> float | None:
+    """Return an error of a point; None where the point failed or lacks that kind."""
+    value = ((point.get("errors") or {}).get(kind) or {}).get(name)
+    return None if value is None or point["status"] != "ok" else float(value)
+
+
+def time_of(point: Mapping[str, Any], timing: str) -> float | None:
+    """Return the least time of a point's calls or launches [s]; None where it was not measured."""
+    value = (point.get("time") or {}).get(f"{timing}_min_s")
+    return float(value) if value else None

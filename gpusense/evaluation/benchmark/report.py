@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from gpusense.evaluation.benchmark.points import label, setting
+from gpusense.evaluation.benchmark.choice import label, setting
 from gpusense.evaluation.benchmark.runner import Outcome, Plan
 
 SCHEMA = 2

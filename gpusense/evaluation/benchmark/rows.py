@@ -7,8 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from gpusense.evaluation.benchmark.choice import Entry
-from gpusense.evaluation.benchmark.points import error_of, label, setting
+from gpusense.evaluation.benchmark.choice import Entry, error_of, label, setting
 
 ALL = "all maps"
 NEEDS = {"ranges": "rays", "beam": "beam model", "field": "likelihood field"}

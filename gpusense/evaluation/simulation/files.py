@@ -12,7 +12,7 @@ from gpusense._util import checks
 from gpusense.evaluation.simulation.run import SimulatedRun
 from gpusense.localization.pose_algebra import compose_poses
 from gpusense.logs.bag_writer import write_bag
-from gpusense.logs.carmen_writer import write_carmen
+from gpusense.logs.carmen import write_carmen
 from gpusense.logs.records import Scan
 from gpusense.world.scanner import Scanner
 

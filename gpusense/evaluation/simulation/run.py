@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +14,6 @@ from gpusense._util import checks
 from gpusense.backends import Selection
 from gpusense.evaluation.simulation.changes import change_world, make_glass
 from gpusense.evaluation.simulation.crowd import Crowd
-from gpusense.evaluation.simulation.odometry import draw_odometry
 from gpusense.evaluation.simulation.roads import Roads, drive
 from gpusense.evaluation.worlds import sample_readings
 from gpusense.localization.motion import OdometryMotion, OmniMotion
@@ -272,3 +272,40 @@ def _readings(expected: Floats, range_max: float, parameters: BeamParameters, rn
     near = sample_readings(flat, range_max, p, rng)
     far = sample_readings(flat, range_max, nothing, rng)
     return np.where(flat >= range_max, far, near).reshape(expected.shape)
+
+
+def draw_odometry(
+    poses: Floats, motion: OdometryMotion | OmniMotion, rng: np.random.Generator, jumps: NDArray[np.bool]
+) -> Floats:
+    """Return the odometer's poses along true poses; the first one is 0.
+
+    Noise has the model's deviations at the true motion. The odometer has the model's systematic errors, which the model
+    corrects.
+
+    Args:
+        poses: (T, 3) true poses.
+        motion: The noise.
+        rng: Random generator.
+        jumps: (T,) whether the robot was carried to a pose, without motion of its odometer.
+    """
+    odometry = np.zeros_like(poses)
+    systematic = motion.systematic if isinstance(motion, OdometryMotion) else (0.0, 0.0, 0.0)
+    if isinstance(motion, OdometryMotion):
+        motion = dataclasses.replace(motion, systematic=(0.0, 0.0, 0.0))
+    noise, other = rng.standard_normal((len(poses), 4)), rng.random(len(poses))
+    for t in range(1, len(poses)):
+        if jumps[t]:
+            odometry[t] = odometry[t - 1]
+            continue
+        step = motion.sampled(poses[t - 1], poses[t])
+        first, ahead, left, second = (np.array(step.mean) + np.array(step.deviation) * noise[t]).tolist()
+        if other[t] < step.reverse:
+            ahead = -ahead
+        stretch, gain, drift = systematic
+        ahead = ahead / (1 + stretch)
+        drifted = drift * ahead / 2
+        first, second = (first - drifted) / (1 + gain), (second - drifted) / (1 + gain)
+        c, s = math.cos(first), math.sin(first)
+        moved = (c * ahead - s * left, s * ahead + c * left, first + second)
+        odometry[t] = compose_poses(odometry[t - 1], moved)
+    return odometry

@@ -12,6 +12,7 @@ checks follow each search from an automatic start:
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -20,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense.learning.beam.em import Climb, Watch
-from gpusense.learning.beam.point import HIT, SHORT, Floats, Point, possible_causes
+from gpusense.learning.beam.pairs import Pairs
+from gpusense.learning.beam.point import HIT, MAX, RAND, SHORT, Bounds, Floats, Point, possible_causes
 from gpusense.learning.beam.problem import NOTHING, Problem, Value
-from gpusense.learning.beam.starts import choose_starts
+from gpusense.world.range_causes import RandomDensity, ShortDensity
 
 # Gain [nats] below which two ends count as the same maximum.
 _SAME = 1e-3
@@ -32,6 +34,8 @@ _MOST = 4
 _SHAPES, _WEIGHTS = 9, (1e-4, 1e-3, 1e-2, 0.1, 0.3)
 
 Method = Callable[[Problem, Point, Watch], Climb]
+# Shares of correct readings that starts assume.
+_SHARES = (1.0, 0.5, 0.2, 0.05)
 
 
 @dataclass
@@ -145,3 +149,155 @@ def _lower(differences: list[float]) -> list[str]:
     if not lower:
         return []
     return [f"{len(lower)} of {len(differences)} starts ended lower, by up to {max(lower):.3g} nats"]
+
+
+# Readings in the sample, steps of each short run, and largest number of returned starts.
+_SAMPLE, _STEPS, _MOST = 1000, 20, 4
+# Points differ if a weight differs by more than this, or a shape by more than this factor.
+_WEIGHT, _FACTOR = 0.1, 1.5
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Sample of hits for choosing starts.
+
+    Attributes:
+        reading: (m,) readings [m].
+        expected: (m,) expected ranges [m].
+        share: Share of max readings among all readings.
+        range_max: Longest range [m].
+    """
+
+    reading: Floats
+    expected: Floats
+    share: float
+    range_max: float
+
+    @classmethod
+    def of(cls, pairs: Pairs) -> Sample:
+        """Draw hits at random with a fixed seed, so that a regular order of beams has no effect."""
+        chosen = np.arange(pairs.hits)
+        if pairs.hits > _SAMPLE:
+            chosen = np.random.default_rng(0).choice(pairs.hits, _SAMPLE, replace=False)
+        z, expected = (values[chosen].astype(np.float64) for values in (pairs.reading, pairs.expected))
+        return cls(z, expected, pairs.max_readings / (pairs.hits + pairs.max_readings), pairs.range_max)
+
+
+def choose_starts(pairs: Pairs, bounds: Bounds, causes: NDArray[np.bool_], fit_bias: bool) -> list[Point]:
+    """Return up to four different starts, the likeliest on a sample of the readings first."""
+    if not pairs.hits or not causes[[HIT, SHORT, RAND]].any():
+        return []
+    sample = Sample.of(pairs)
+    starts = [
+        point
+        for bias, share in itertools.product(_biases(sample) if fit_bias else [0.0], _SHARES)
+        for point in _assume(sample, bounds, causes, bias, share)
+    ]
+    ends, log_p = short_runs(sample, starts, bounds, fit_bias)
+    chosen: list[Point] = []
+    for i in np.argsort(-log_p, kind="stable"):
+        if math.isfinite(log_p[i]) and all(_different(ends[i], other) for other in chosen):
+            chosen.append(ends[i])
+    return chosen[:_MOST]
+
+
+def _biases(sample: Sample) -> list[float]:
+    """Return initial offsets: 0, the median deviation, and the middle of the narrowest half, by repeated halving."""
+    off = np.sort(sample.reading - sample.expected)
+    middle = float(np.median(off))
+    while len(off) > 2:
+        half = (len(off) + 1) // 2
+        first = int(np.argmin(off[half:] - off[:-half])) if len(off) > half else 0
+        off = off[first : first + half]
+    return [0.0, middle, float(off.mean())]
+
+
+def _assume(sample: Sample, bounds: Bounds, causes: NDArray[np.bool_], bias: float, share: float) -> list[Point]:
+    """Return starts for a share of correct readings, one per lambda_short."""
+    z, top = sample.reading, sample.range_max
+    off = np.abs(z - sample.expected - bias)
+    sigma = 1.4826 * float(np.quantile(off, 0.5 * share))
+    before = z[(z < sample.expected - 3 * sigma) & (off > 3 * sigma)]
+    length = float(before.mean()) if len(before) else 0.5 * top
+    early = len(before) / len(z)
+    weights = np.array([share, 0.5 * (1 - share) * early + 0.02, 0.0, (1 - share) * (1 - 0.5 * early) + 0.02])
+    weights = np.where(causes, np.append(weights[:2], [0.0, weights[RAND]]) + 1e-3, 0.0)
+    weights[MAX] = 0.0
+    weights *= (1 - sample.share * causes[MAX]) / weights.sum()
+    weights[MAX] = sample.share * causes[MAX]
+    rates = [0.1 / top, *(factor / max(length, 1e-3 * top) for factor in (1, 5, 25))]
+    return [bounds.hold(Point(weights, sigma, rate, bias)) for rate in rates]
+
+
+def short_runs(
+    sample: Sample, starts: list[Point], bounds: Bounds, fit_bias: bool
+) -> tuple[list[Point], NDArray[np.float64]]:
+    """Run a few steps of EM from each start on a sample.
+
+    Steps of sigma_hit and of the offset are the book's, without truncation; the long run corrects them. lambda_short
+    takes one fixed-point step of the exact M-step.
+
+    Returns:
+        The ends, with weights of at least half a reading, and (C,) log-likelihoods of the sample.
+    """
+    z, expected = sample.reading[:, None], sample.expected[:, None]
+    weights = np.array([point.weights for point in starts])
+    sigma, rate, bias = (np.array([getattr(point, name) for point in starts]) for name in ("sigma", "rate", "bias"))
+    off = z - expected
+    used = weights > 0
+    for step in range(_STEPS + 1):
+        log_p = _log_components(sample, z, expected, sigma, rate, bias)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            log_p += np.log(weights.T[[HIT, SHORT, RAND], None, :])
+            total = np.logaddexp.reduce(log_p, axis=0)
+            parts = np.where(np.isneginf(log_p), 0.0, np.exp(log_p - total))
+        if step == _STEPS:
+            break
+        sums = parts.sum(axis=1)
+        weights[:, [HIT, SHORT, RAND]] = (1 - weights[:, MAX, None]) * sums.T / len(sample.reading)
+        hits = np.maximum(sums[0], 1e-9)
+        if fit_bias:
+            bias = np.clip((parts[0] * off).sum(axis=0) / hits, -bounds.bias, bounds.bias)
+        sigma = np.clip(np.sqrt((parts[0] * (off - bias) ** 2).sum(axis=0) / hits), *bounds.sigma)
+        rate = _next_rate(parts[1], z, expected, rate, bounds)
+    count = len(sample.reading)
+    weights = np.where(used, weights * count + 0.5, 0.0)
+    weights /= weights.sum(axis=1, keepdims=True)
+    ends = [Point(w, float(s), float(r), float(b)) for w, s, r, b in zip(weights, sigma, rate, bias, strict=True)]
+    return ends, total.sum(axis=0)
+
+
+def _next_rate(parts: Floats, z: Floats, expected: Floats, rate: Floats, bounds: Bounds) -> Floats:
+    """Return lambda_short at which the mean length of short readings equals the mean of the truncated exponentials.
+
+    Args:
+        parts: (m, C) responsibilities of short readings.
+        z: (m, 1) readings [m].
+        expected: (m, 1) expected ranges [m].
+        rate: (C,) lambda_short [1/m]; kept where no reading is short.
+        bounds: Bounds of the shapes.
+    """
+    lengths = (parts * z).sum(axis=0)
+    likely = (parts * ShortDensity(rate).mean(expected)).sum(axis=0)
+    known = (lengths > 0) & (likely > 0)
+    with np.errstate(over="ignore"):
+        return np.where(known, np.clip(likely / np.where(known, lengths, 1.0), *bounds.rate), rate)
+
+
+def _log_components(sample: Sample, z: Floats, expected: Floats, sigma: Floats, rate: Floats, bias: Floats) -> Floats:
+    """Return (3, m, C) log densities of hit, short and rand; -inf where a cause is impossible."""
+    from scipy.special import ndtr
+
+    mean = np.clip(expected + bias, 0, sample.range_max)
+    mass = ndtr((sample.range_max - mean) / sigma) - ndtr(-mean / sigma)
+    hit = -0.5 * ((z - mean) / sigma) ** 2 - np.log(math.sqrt(2 * math.pi) * sigma * np.maximum(mass, 1e-300))
+    rand = np.full_like(hit, RandomDensity(sample.range_max).log_peak(1.0))
+    return np.stack([hit, ShortDensity(rate).log_pdf(z, expected), rand])
+
+
+def _different(one: Point, other: Point) -> bool:
+    """Return whether two points are far enough apart to lead to different maxima."""
+    ratios = math.log(one.sigma / other.sigma), math.log(one.rate / other.rate)
+    shapes = max(map(abs, ratios)) > math.log(_FACTOR)
+    moved = abs(one.bias - other.bias) > min(one.sigma, other.sigma)
+    return shapes or moved or bool((np.abs(one.weights - other.weights) > _WEIGHT).any())

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from gpusense._util import checks
 from gpusense.learning.discrete.causes import DiscreteCauses, DiscreteFit
-from gpusense.learning.discrete.readings import MOST_BINS, bins_of, check_pairs
+from gpusense.learning.discrete.probabilities import MOST_BINS, bins_of, check_pairs
 from gpusense.peers.weights import check_weights
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.sensor_table import SensorTable

@@ -11,8 +11,16 @@ from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense.learning.point.densities import truncated
-from gpusense.learning.point.poses import places_of
-from gpusense.learning.point.problem import Floats, Integers, Problem, check_labels, mix, number_blocks, of_weight
+from gpusense.learning.point.problem import (
+    Floats,
+    Integers,
+    Problem,
+    check_labels,
+    mix,
+    number_blocks,
+    of_weight,
+    places_of,
+)
 from gpusense.learning.point.report import report
 from gpusense.learning.point.result import PointFit
 from gpusense.learning.point.search import maximize

@@ -13,8 +13,7 @@ import pytest
 from support.oracles import Mixture
 
 import gpusense as gs
-from gpusense.learning.discrete.probabilities import log_spread
-from gpusense.learning.discrete.readings import bins_of
+from gpusense.learning.discrete.probabilities import bins_of, log_spread
 
 RANGE = 6.0
 CAUSES = {

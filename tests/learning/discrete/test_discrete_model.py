@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense.learning.discrete.counts import count_pairs
-from gpusense.learning.discrete.fit import NAMES
+from gpusense.learning.discrete.fit import NAMES, count_pairs
 
 RANGE, BINS = 4.0, 37
 NAN, INF = math.nan, math.inf
@@ -191,7 +190,7 @@ def test_readings_are_counted_by_class_and_step(monkeypatch):
             wanted[cell] = wanted.get(cell, 0) + 1
     found = dict(zip(zip(whole.rows.tolist(), whole.steps.tolist(), strict=True), whole.counts.tolist(), strict=True))
     assert found == wanted and whole.missing == np.count_nonzero(~(z >= 0)) and whole.total + whole.missing == 500
-    monkeypatch.setattr("gpusense.learning.discrete.counts._BLOCK", 64)
+    monkeypatch.setattr("gpusense.learning.discrete.fit._BLOCK", 64)
     for one, two in zip(
         dataclasses.astuple(whole),
         dataclasses.astuple(count_pairs(z.reshape(20, 25), expected.reshape(20, 25), RANGE, 5)),

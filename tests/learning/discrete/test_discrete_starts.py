@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense.learning.discrete.counts import count_pairs
+from gpusense.learning.discrete.fit import count_pairs
 
 BINS = 989
 

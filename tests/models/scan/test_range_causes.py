@@ -18,7 +18,7 @@ from gpusense.backends import get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.benchmark.accuracy import score_ranges
 from gpusense.evaluation.range_data import RangeData
-from gpusense.learning.beam import blocks, growth, starts
+from gpusense.learning.beam import blocks, growth, optimum
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.options import make_bounds
 from gpusense.learning.beam.pairs import make_pairs
@@ -84,9 +84,9 @@ def learned(at):
     """Return the quantities that fits compute of parameters: numbers of kernels, terms of starts, growth and blocks."""
     pairs = make_pairs(WITH_MAX, EXPECTED, RANGE)
     device = DeviceSums(get_backend("numpy"), np.dtype(np.float64), pairs)
-    sample = starts.Sample.of(pairs)
+    sample = optimum.Sample.of(pairs)
     z, expected = sample.reading[:, None], sample.expected[:, None]
-    parts = starts._log_components(sample, z, expected, *(np.array([each]) for each in (at.sigma, at.rate, 0.0)))
+    parts = optimum._log_components(sample, z, expected, *(np.array([each]) for each in (at.sigma, at.rate, 0.0)))
     bounds, shares = make_bounds(pairs), np.linspace(0.1, 1, len(z))[:, None]
     hit, short, top, rand = at.weights
     joint = growth._Growing(
@@ -98,7 +98,7 @@ def learned(at):
     log_p, gradient = joint.log_p(theta)
     return {
         "terms": device.terms(at), "components": parts[..., 0], "density": log_p, "derivatives": gradient[:, 3:],
-        "rate": starts._next_rate(shares, z, expected, np.array([at.rate]), bounds),
+        "rate": optimum._next_rate(shares, z, expected, np.array([at.rate]), bounds),
         "blocks": blocks._terms(pairs.reading, pairs.expected, device.causes(at)[:, 1:], at, RANGE)[5],
         "objective": np.array(Problem(device, pairs, bounds, NO_PRIOR, False).value(at).log_likelihood),
     }  # fmt: skip

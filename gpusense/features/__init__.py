@@ -1,1 +1,1 @@
-"""Features of scans: lines, corners, doors, hallways and poles."""
+"""Extract features from scans: lines, corners, doors, hallways, poles and reflectors."""

@@ -1,4 +1,4 @@
-"""Straight segments and circles of scans, found by the kernels of a device."""
+"""Run the kernels that find straight segments and circles of scans."""
 
 from __future__ import annotations
 
@@ -17,14 +17,7 @@ _INT = np.dtype(np.int32)
 
 
 class ScanDevice:
-    """Points of scans on a device, and their noise.
-
-    Args:
-        backend: The device.
-        real: Precision of its kernels.
-        points: The points.
-        noise: (S,) standard deviations of ranges [m].
-    """
+    """Points of scans on a device, and their noise."""
 
     def __init__(self, backend: Backend, real: np.dtype, points: ScanPoints, noise: np.ndarray) -> None:
         self._backend, self._real = backend, real
@@ -38,8 +31,8 @@ class ScanDevice:
         """Return, for each point, the end of the segment that begins there, or -1.
 
         Args:
-            penalty: Reduction of the cost from which two lines replace one.
-            point: (P, 4) points of the scans in the order in which they are split, see ``ScanPoints``.
+            penalty: Least reduction of the cost for replacing a line by two.
+            point: (P, 4) points of the scans in splitting order, see ``ScanPoints``.
         """
         points = self._sizes["points"]
         stop = np.empty(points, _INT)
@@ -64,7 +57,7 @@ class ScanDevice:
     def _parts(
         self, kernel: str, name: str, numbers: int, part: np.ndarray, scan: np.ndarray, **more: np.ndarray
     ) -> np.ndarray:
-        """Return the (P, numbers) array that a kernel writes, a row for each part."""
+        """Return the (P, numbers) array that a kernel writes, one row per part."""
         count = len(part)
         found = np.empty((count, numbers), self._real)
         if count:

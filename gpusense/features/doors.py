@@ -1,4 +1,4 @@
-"""Doors: gaps in a straight wall wide enough for a person or robot, open at least in part."""
+"""Find doors: gaps in a straight wall that are wide enough for a person or robot, and at least partly open."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from gpusense.features.segments import Beams, Segments
 
 # Least and largest width of a door [m].
 _NARROWEST, _WIDEST = 0.5, 2.0
-# Largest offset [m] and turn [rad] between both sides of one wall, to which this many deviations are added.
+# Largest offset [m] and angle [rad] between both sides of a wall, plus this many deviations.
 _ASIDE, _PARALLEL, _DEVIATIONS = 0.03, math.radians(4), 3.0
-# Least length of a wall and of its other side; largest uncertainty of a jamb across and along the wall [m].
+# Least lengths of a wall and its other side; largest uncertainty of a jamb across and along the wall [m].
 _WALL, _OTHER, _VAGUE, _COARSE = 0.5, 0.1, 0.08, 0.4
 # Uncertainty of a jamb at grazing incidence [standard deviations of ranges].
 _REVEAL = 4.0
-# Least shares of the beams between the jambs that reach the wall, without and with a leaf, and that pass through it;
-# the distance behind the wall that counts as through [m].
+# Least shares of the beams between the jambs that reach the wall, without and with a leaf, and that pass through;
+# distance behind the wall that counts as through [m].
 _UNSTOPPED, _UNSTOPPED_BESIDE_LEAF, _THROUGH, _DEEP = 0.6, 0.25, 0.25, 0.4
-# Length of a leaf in widths of its door, its least turn from the wall [rad], and the gap beside its hinge [m].
+# Length of a leaf in widths of its door, its least angle to the wall [rad], and the gap at its hinge [m].
 _LEAF, _LEAST_TURN, _TOUCHING = (0.6, 1.25), math.radians(15), 0.12
 
 
@@ -35,8 +35,8 @@ class _Gaps:
     Attributes:
         before: (D,) segment before the gap.
         after: (D,) segment after it.
-        wall: (D,) the segment of these two that lies on the wall.
-        other: (D,) the second segment: a part of the wall, or the leaf of a door.
+        wall: (D,) the segment on the wall, one of these two.
+        other: (D,) the other segment: a part of the wall, or a door leaf.
         ends: (D, 4) positions of both jambs along the wall, and the distances between beams there [m].
     """
 
@@ -55,7 +55,7 @@ def find_doors(segments: Segments, straight: np.ndarray, beams: Beams, mount: tu
     """Return the doors of scans: centre of the gap, direction across, and width."""
     sides = np.flatnonzero(np.isfinite(segments.distance) & (segments.count >= 3))
     one, two = pairs_of(segments.scan[sides])
-    # Also across the end of a scan.
+    # Include pairs across the end of a scan.
     before, after = sides[np.concatenate([one, two])], sides[np.concatenate([two, one])]
     kinds = _between_walls(segments, straight, before, after), _beside_leaves(segments, straight, before, after)
     names = ("before", "after", "wall", "other", "ends")
@@ -70,7 +70,7 @@ def find_doors(segments: Segments, straight: np.ndarray, beams: Beams, mount: tu
 
 def _between_walls(segments: Segments, straight: np.ndarray, before: np.ndarray, after: np.ndarray) -> _Gaps:
     """Return the gaps between two parts of a straight wall."""
-    # The more certain line is the wall, and the second one must lie on it.
+    # The more certain line is the wall; the other one must continue it.
     wall = np.where(segments.covariance[before, 0, 0] <= segments.covariance[after, 0, 0], before, after)
     other = np.where(wall == before, after, before)
     left, right = _jambs(segments, before, after, wall)
@@ -105,7 +105,7 @@ def _beside_leaves(segments: Segments, straight: np.ndarray, before: np.ndarray,
 
 
 def _is_wide(segments: Segments, straight: np.ndarray, gaps: _Gaps) -> np.ndarray:
-    """Return which gaps are as wide as doors, in a wall of sufficient length, with jambs at known positions."""
+    """Return which gaps are as wide as doors, in a long enough wall, with well-located jambs."""
     width = gaps.ends[:, 1] - gaps.ends[:, 0]
     good = straight[gaps.wall] & (segments.length[gaps.wall] >= _WALL) & (segments.length[gaps.other] >= _OTHER)
     result: np.ndarray = good & (width >= _NARROWEST) & (width <= _WIDEST) & (gaps.ends[:, 2:] <= _COARSE).all(axis=1)
@@ -113,7 +113,7 @@ def _is_wide(segments: Segments, straight: np.ndarray, gaps: _Gaps) -> np.ndarra
 
 
 def _one_each(segments: Segments, gaps: _Gaps, sure: np.ndarray) -> np.ndarray:
-    """Choose one of each set of overlapping doors: one with long walls on both sides, or else the narrowest."""
+    """Choose a door from each overlapping set: long walls on both sides take precedence, then the narrowest."""
     wall, ends = gaps.wall, gaps.ends
     order = np.lexsort((ends[:, 1] - ends[:, 0], ~sure, segments.scan[wall]))
     middle = segments.place(wall, ends[:, :2].mean(axis=1))
@@ -136,13 +136,13 @@ def _jambs(
         turn = np.where(np.abs(turn) < 1.55, turn, np.nan)
         step = segments.distance[wall] * segments.step / np.square(np.cos(turn))
         place = segments.distance[wall] * np.tan(turn) + side * 0.5 * step
-        # The part of a jamb's reveal within noise of the wall is taken for wall.
+        # The part of a jamb's reveal within noise of the wall looks like wall.
         found.append((place, np.hypot(step, _REVEAL * np.sqrt(segments.variance[wall]) * np.sin(turn))))
     return found[0], found[1]
 
 
 def _on_wall(segments: Segments, wall: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return whether the other side lies on the wall."""
+    """Return whether the other side continues the wall."""
     c, s, d = np.cos(segments.angle[wall]), np.sin(segments.angle[wall]), segments.distance[wall]
     good = np.ones(len(wall), bool)
     deviation = np.sqrt(segments.covariance[wall, 0, 0] + segments.covariance[other, 0, 0])
@@ -178,8 +178,8 @@ def _openness(segments: Segments, beams: Beams, gaps: _Gaps) -> tuple[np.ndarray
     def count(chosen: np.ndarray) -> np.ndarray:
         return np.bincount(which[chosen], minlength=len(wall))
 
-    # Beams beside a jamb pass the wall. An object before the wall hides the jamb, unless it begins there: then it is a
-    # leaf.
+    # Beams next to a jamb pass the wall. An object in front of the wall hides the jamb; an object that begins at the
+    # jamb is a leaf.
     beside = np.stack([last, first], axis=1)[which]
     at_end = np.stack([number == 0, number == inside[which] - 1], axis=1) & (depth < -margin)[:, None]
     apart = np.hypot(*np.moveaxis(place[index][:, None] - place[beside], 2, 0))
@@ -201,7 +201,7 @@ def _found(
     angle, middle = segments.angle[wall], ends[:, :2].mean(axis=1)
     c, s = np.cos(angle), np.sin(angle)
     mine = segments.covariance[wall]
-    # Twice the variance of an edge between two beams: beams beside a jamb may be taken for its reveal.
+    # Twice the variance of an edge between two beams: the neighbours of a jamb may be mistaken for its reveal.
     along = np.square(ends[:, 2:]).sum(axis=1) / 24
     across = mine[:, 1, 1] - 2 * middle * mine[:, 0, 1] + middle**2 * mine[:, 0, 0]
     mixed = mine[:, 0, 1] - middle * mine[:, 0, 0]

@@ -26,9 +26,9 @@ from gpusense.matching.noise import ASSUMED_NOISE, whole_noise
 from gpusense.matching.points import scan_points
 from gpusense.world.scanner import Scanner, classify_ranges
 
-# Least and largest noise with which scans are split [m].
+# Least and largest noise for splitting scans [m].
 _LEAST_NOISE, _LARGEST_NOISE = 3e-3, 0.1
-# Most readings that are processed at once.
+# Most readings per pass.
 _READINGS = 1 << 22
 # Largest step between the bearings of neighbouring beams [usual steps].
 _NEIGHBOURS = 1.5
@@ -47,28 +47,28 @@ def extract_features(
 ) -> Features:
     """Extract lines, corners, doors, hallways and poles from scans, and reflectors where intensities are known.
 
-    A scan is split into straight pieces where two lines explain its readings better than one, by more than noise does
-    (split and merge, Pavlidis and Horowitz 1974), and a line is fitted to the ranges of each by maximum likelihood.
-    Pieces that a circle explains as well are round walls rather than lines. Corners are vertices of neighbouring lines.
-    Doors are gaps of 0.5 to 2 m in a wall, between two jambs, through which beams pass; hallways are parallel walls 0.6
-    to 3.2 m apart on both sides of the scanner, beside each other for twice their distance; poles are circles with
-    radii of 1.5 to 50 cm in front of their background. Reflectors are short runs of beams at least three times as
-    bright as the median of their scan; they count as cylinders.
+    A scan is split where two lines explain its readings better than one, by more than noise does (split and merge,
+    Pavlidis and Horowitz 1974). A line is fitted to the ranges of each piece by maximum likelihood; pieces that a
+    circle explains equally well are round walls. Corners are vertices of neighbouring lines. Doors are gaps of 0.5 to 2
+    m in a wall, between two jambs, that beams pass through. Hallways are parallel walls 0.6 to 3.2 m apart on both
+    sides of the scanner, facing each other over twice their distance. Poles are circles with radii of 1.5 to 50 cm in
+    front of their background. Reflectors are cylinders: short runs of beams at least three times as bright as the
+    median of their scan.
 
-    Covariances follow from the standard deviation of ranges, which is estimated from each scan, from the residuals of
-    each line, and from the distance between beams at edges. The device computes in float64 where it can, and in float32
-    elsewhere.
+    Covariances follow from the standard deviation of ranges, estimated for each scan, the residuals of each line, and
+    the distance between beams at edges. The device computes in float64 if it can, else in float32.
 
     Args:
-        ranges: (K,) readings of a scan [m], or (S, K) of several. They are classed by :func:`gpusense.classify`. A
-            reading of "no return" shows that its beam passes through a gap.
+        ranges: (K,) readings of a scan [m], or (S, K) of several. A beam without a return passes through a gap, see
+            :func:`gpusense.classify`.
         scanner: The scanner; its mount is the sensor's pose on the robot. The robot is at rest during a scan:
             :func:`gpusense.deskew_scan` corrects a scan taken in motion.
         kinds: Kinds to extract: one, or several of "line", "corner", "door", "hallway", "pole" and "reflector".
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
-        noise: Standard deviation of ranges [m]. ``"auto"``: that of each scan, from its deviations from straight
+        noise: Standard deviation of ranges [m]. ``"auto"`` estimates it from the deviations of each scan from straight
             walls; scans with more than 10 cm of noise have no lines.
-        intensities: Intensities of the readings, of their shape, in any unit; NaN where unknown. None: no reflectors.
+        intensities: Intensities of the readings, of the same shape, in any unit; NaN where unknown. None: no
+            reflectors.
 
     Returns:
         The features of all scans, by scan and kind; see :class:`gpusense.Features`.
@@ -114,7 +114,7 @@ def extract_features(
 def _shapes(
     backend: Backend, real: np.dtype, scans: np.ndarray, scanner: Scanner, noise: np.ndarray, kinds: tuple[str, ...]
 ) -> dict[str, Found]:
-    """Return the features of (S, K) readings by kind, except reflectors."""
+    """Return the features of (S, K) readings by kind, without reflectors."""
     points = scan_points(scans, scanner, np.dtype(np.float64))
     if not len(points.point) or set(kinds) <= {"reflector"}:
         return {}

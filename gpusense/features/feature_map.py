@@ -1,4 +1,4 @@
-"""Landmarks and lines made of features, and their files."""
+"""Maps of landmarks and lines from features, and their files."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.line_map import LineMap
 
 LANDMARK_KINDS = ("corner", "door", "pole", "reflector")
-"""Kinds of features whose positions do not depend on the robot's pose."""
+"""Kinds of features with positions independent of the robot's pose."""
 MAP_KINDS = ("line", *LANDMARK_KINDS)
-"""Kinds of features from which maps are made."""
+"""Kinds of features in maps."""
 
 _COLUMNS = (
     "x", "y", "signature", "kind", "theta", "size", "covariance_xx", "covariance_xy", "covariance_yy", "count",
 )  # fmt: skip
-# Largest coordinate [m]; those of UTM reach 1e7.
+# Largest coordinate [m]; UTM reaches 1e7.
 _LARGEST = 1e9
-# Largest size of a landmark: a line of 100 km.
+# Largest size of a landmark: a line of 100 km [m].
 _LARGEST_SIZE = 1e5
 
 
 @dataclass(frozen=True, eq=False)
 class FeatureMap:
-    """Landmarks and lines made of features by :func:`gpusense.map_features`.
+    """Landmarks and lines from features, made by :func:`gpusense.map_features`.
 
     Attributes:
         kind: (M,) "line", "corner", "door", "pole" or "reflector".
-        pose: (M, 3) x, y [m] and theta [rad] in the world, as in :class:`gpusense.Features`: of a line its middle, and
-            the direction with the free side on its left.
-        covariance: (M, 2, 2) of x and y [m^2]; larger where its features scatter more than their covariances say. For a
-            line only the variance across it, since its ends are free.
+        pose: (M, 3) x, y [m] and theta [rad] in the world, as in :class:`gpusense.Features`: for a line its middle,
+            and the direction with the free side on the left.
+        covariance: (M, 2, 2) of x and y [m^2], enlarged where features scatter more than their covariances. A line has
+            only the variance across it, since its ends are free.
         size: (M,) length [m], opening angle [rad], width or radius [m].
         count: (M,) number of features.
 
@@ -81,7 +81,7 @@ class FeatureMap:
         return LineMap(np.hstack([middle - half, middle + half]), two_sided=False)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a CSV file with a line for each landmark: x, y, signature, kind, theta, size, covariance, count.
+        """Write a CSV file with one line per landmark: x, y, signature, kind, theta, size, covariance, count.
 
         Raises:
             OSError: the file cannot be written.
@@ -97,9 +97,9 @@ class FeatureMap:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> FeatureMap:
-        """Return the landmarks of a file that :meth:`save` or ``gpusense features --map-out`` wrote.
+        """Read the landmarks of a file from :meth:`save` or ``gpusense features --map-out``.
 
-        The file may be compressed by gzip.
+        The file may be gzipped.
 
         Raises:
             FileNotFoundError: the file is missing.
@@ -127,7 +127,7 @@ class FeatureMap:
 
 
 def kinds_of(kinds: str | Sequence[str], allowed: tuple[str, ...]) -> tuple[str, ...]:
-    """Return kinds as a tuple, checked."""
+    """Return the checked kinds as a tuple."""
     try:
         names = (kinds,) if isinstance(kinds, str) else tuple(kinds)
     except TypeError:

@@ -1,4 +1,4 @@
-"""Hallways: pairs of parallel walls with the scanner between them, longer than their distance."""
+"""Find hallways: pairs of parallel walls with the scanner between them, longer than their distance."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from gpusense.features.lines import in_robot_frame, scores_of
 from gpusense.features.result import Found
 from gpusense.features.segments import Segments
 
-# Least and largest width [m], and least length over which both walls face each other [widths].
+# Least and largest width [m], and least length over which the walls face each other [widths].
 _NARROWEST, _WIDEST, _LEAST_LENGTH = 0.6, 3.2, 2.0
-# Walls are parallel up to this angle [rad] plus this many deviations; lines of one wall have at most this offset [m].
+# Parallel walls differ by at most this angle [rad] plus this many deviations; lines of one wall by at most this offset
+# [m].
 _PARALLEL, _DEVIATIONS, _SAME = math.radians(2), 3.0, 0.06
-# Hallways of a scan whose axes differ by less are one hallway [rad].
+# Hallways of a scan with axes within this angle are one hallway [rad].
 _ONE_AXIS = math.radians(15)
 
 
@@ -31,7 +32,7 @@ def pairs_of(scan: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_hallways(segments: Segments, straight: np.ndarray, mount: tuple[float, float, float]) -> Found:
-    """Return the hallways of scans: the axis point abreast of the robot, observed across the axis and in direction."""
+    """Return the hallways of scans: axis point abreast of the robot, with observed offset and direction."""
     lines = np.flatnonzero(straight)
     low, high = _extents(segments, lines)
     one, two = pairs_of(segments.scan[lines])
@@ -40,7 +41,7 @@ def find_hallways(segments: Segments, straight: np.ndarray, mount: tuple[float, 
     off = wrapped(segments.angle[a] - segments.angle[b] - math.pi)
     deviation = np.sqrt(segments.covariance[a, 0, 0] + segments.covariance[b, 0, 0])
     width = frame.distance[a] + frame.distance[b]
-    # Positions along the second wall run in the opposite direction.
+    # Positions along the second wall run the opposite way.
     overlap = np.minimum(high[one], -low[two]) - np.maximum(low[one], -high[two])
     good = (np.abs(off) <= _PARALLEL + _DEVIATIONS * deviation) & (width >= _NARROWEST) & (width <= _WIDEST)
     good &= overlap >= _LEAST_LENGTH * width
@@ -66,7 +67,7 @@ def find_hallways(segments: Segments, straight: np.ndarray, mount: tuple[float, 
 
 
 def _extents(segments: Segments, lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ends of the wall of each line along it, other lines of the same wall included."""
+    """Return the ends of each line's wall along it, including other lines of the same wall."""
     one, two = pairs_of(segments.scan[lines])
     a, b = lines[one], lines[two]
     low, high = segments.ends[lines, 0].copy(), segments.ends[lines, 1].copy()
@@ -82,7 +83,7 @@ def _extents(segments: Segments, lines: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _one_each(scan: np.ndarray, angle: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Choose the pair of each scan and axis whose shorter wall (2, P) is longest; of equal ones the longest pair."""
+    """Choose the pair of each scan and axis with the longest shorter wall (2, P), then the longest pair."""
 
     def on_another_axis(k: int, j: int) -> bool:
         return abs(math.remainder(angle[k] - angle[j], math.pi)) > _ONE_AXIS
@@ -91,7 +92,7 @@ def _one_each(scan: np.ndarray, angle: np.ndarray, length: np.ndarray) -> np.nda
 
 
 def first_apart(order: np.ndarray, scan: np.ndarray, are_apart: Callable[[int, int], bool]) -> np.ndarray:
-    """Choose in an order, scan after scan, each index that is apart from those chosen before in its scan."""
+    """Choose, in ``order`` and scan after scan, each index apart from all previous choices of its scan."""
     kept: list[int] = []
     taken: list[int] = []
     for k in order.tolist():

@@ -1,4 +1,4 @@
-"""Maps of landmarks and lines, from features of scans along a trajectory or from an occupancy grid."""
+"""Make maps of landmarks and lines from features of scans at known poses, or from an occupancy grid."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from gpusense.models.scan.caster import RayCaster
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
 
-# Scans cast in a map: beams, range [m], distance between their positions [m] and from obstacles [m].
+# Scans to cast in a map: beams, range [m], spacing [m], and distance from obstacles [m].
 _BEAMS, _RANGE, _SPACING, _CLEARANCE = 720, 12.0, 1.0, 0.3
-# Most scans cast in a map, and least number of them that must show a landmark.
+# Most scans to cast in a map, and least number of scans that show a landmark.
 _MOST_SCANS, _VIEWS = 4000, 3
 _SIZES = {"corner": 0.5, "door": 0.4, "pole": 0.1, "reflector": 0.1}
 # Kinds without a direction.
@@ -38,14 +38,14 @@ def map_features(
 ) -> FeatureMap:
     """Make landmarks and lines from the features of scans at known poses.
 
-    Features of one kind, direction and size form one landmark if they lie within four standard deviations of each
-    other. Its position is the mean of theirs, weighted by their information. Lines are joined if they agree in
-    direction and offset within four standard deviations, and overlap or nearly do. Hallways have no position.
+    Features of one kind, direction and size within four standard deviations of each other form one landmark, at their
+    mean position weighted by information. Lines are joined if they agree in direction and offset within four standard
+    deviations, and overlap or nearly do. Hallways have no position.
 
     Args:
         features: Features of S scans.
         poses: (S, 3) poses of the robot at the scans [m, m, rad].
-        kinds: Kinds out of "line", "corner", "door", "pole" and "reflector".
+        kinds:         kinds: Kinds out of "line", "corner", "door", "pole" and "reflector".
         pose_deviation: Standard deviations of the poses: position [m] and heading [rad].
         least: Least number of features of a landmark, in different scans.
 
@@ -86,16 +86,16 @@ def landmarks_of_map(
     spacing: float = _SPACING,
     backend: Selection = "auto",
 ) -> FeatureMap:
-    """Make landmarks and lines from the features that a scanner would see in a map.
+    """Make landmarks and lines from the features of scans cast in a map.
 
-    Scans of 720 beams are cast from free places all over the map, and their features are clustered as by
-    :func:`map_features`. The rounding of walls to cells counts as noise.
+    Scans of 720 beams are cast from free positions all over the map, and :func:`map_features` clusters their features.
+    The rounding of walls to cells counts as noise.
 
     Args:
         grid: The map.
         kinds: Kinds out of "line", "corner", "door", "pole" and "reflector".
         range_max: Range of the scans [m].
-        spacing: Distance between neighbouring scans [m]; enlarged where there would be more than 4000 of them.
+        spacing: Distance between neighbouring scans [m]; enlarged to keep the number of scans at 4000.
         backend: The device, see ``gpusense.devices()``.
 
     Raises:
@@ -122,7 +122,7 @@ def landmarks_of_map(
 
 
 def _free_places(grid: OccupancyGrid, spacing: float) -> Floats:
-    """Return (S, 3) poses with heading 0 on a lattice of free cells away from obstacles."""
+    """Return (S, 3) poses of heading 0 on a lattice of free cells away from obstacles."""
     from scipy.ndimage import distance_transform_edt
 
     blocked = np.pad(grid.occupied | grid.unknown, 1, constant_values=True)

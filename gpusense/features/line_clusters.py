@@ -1,4 +1,4 @@
-"""Merge lines of scans that agree in direction and offset, and overlap or nearly do, into lines of a map."""
+"""Merge lines of scans that agree in direction and offset, and nearly overlap, into lines of a map."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from gpusense._util.angles import wrapped
 from gpusense.features.feature_map import FeatureMap
 from gpusense.features.result import KIND_TYPE, Features, Floats, across_lines
 
-# Pieces belong to one line within this many deviations, widened by this offset [m] and turn [rad]; the gap between them
-# is at most this [m].
+# Pieces of one line agree within this many deviations plus this offset [m] and angle [rad], with at most this gap
+# [m].
 _DEVIATIONS, _FLOOR, _TURN, _GAP = 4.0, 0.03, 0.02, 0.3
-# Only lines whose directions differ by less than this are compared [rad].
+# Largest difference in direction between compared lines [rad].
 _ALIKE = 0.15
-# Most passes that join lines which have grown together.
+# Most passes that join lines after they have grown.
 _PASSES = 4
 
 
@@ -38,14 +38,7 @@ class _Pieces:
 
 
 def lines_of(features: Features, poses: Floats, spread: Floats, least: int) -> FeatureMap:
-    """Merge lines of scans into the lines of a map.
-
-    Args:
-        features: Features of the kind "line".
-        poses: (S, 3) poses of the robot.
-        spread: Standard deviations of the poses: position [m] and heading [rad].
-        least: Least number of scans that show a line.
-    """
+    """Merge lines of scans into the lines of a map."""
     own = _in_world(features, poses, spread)
     pieces, label = own, np.arange(len(features))
     for _ in range(_PASSES):
@@ -67,16 +60,16 @@ def lines_of(features: Features, poses: Floats, spread: Floats, least: int) -> F
 
 
 def _in_world(features: Features, poses: Floats, spread: Floats) -> _Pieces:
-    """Return lines of scans in the world, with the errors of poses added to their covariances."""
+    """Return lines of scans in the world; covariances include the errors of poses."""
     at = poses[features.scan]
     c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
     off = np.stack([c * features.pose[:, 0] - s * features.pose[:, 1],
                     s * features.pose[:, 0] + c * features.pose[:, 1]], axis=1)  # fmt: skip
     theta = at[:, 2] + features.pose[:, 2]
-    # An error of the heading moves the middle across by that error times its distance along the line.
+    # A heading error moves the middle across by the error times its distance along the line.
     lever = np.cos(theta) * off[:, 0] + np.sin(theta) * off[:, 1]
     turned = np.stack([lever, np.ones_like(lever)], axis=1) * spread[1]
-    # To the left, which is towards the scanner.
+    # Positive to the left, towards the scanner.
     covariance = across_lines(features) * ((1, -1), (-1, 1)) + turned[:, :, None] * turned[:, None, :]
     covariance[:, 0, 0] += spread[0] ** 2
     return _Pieces(at[:, :2] + off, theta, 0.5 * features.size, covariance)
@@ -92,7 +85,7 @@ class _Lines:
         self._state, self._covariance = np.zeros((most, 2)), np.zeros((most, 2, 2))
 
     def nearest(self, pieces: _Pieces, i: int) -> int:
-        """Return the line to which a piece may belong, or -1."""
+        """Return the nearest line that a piece may belong to, or -1."""
         n = self.count
         turn = wrapped(pieces.theta[i] - self._theta[:n])
         near = np.flatnonzero(np.abs(turn) < _ALIKE)
@@ -137,7 +130,7 @@ def _place(origin: np.ndarray, theta: np.ndarray, point: np.ndarray) -> tuple[np
 
 
 def _rows(along: np.ndarray) -> np.ndarray:
-    """Return the matrices (P, 2, 2) that take a line's offset and direction at 0 to those at positions along it."""
+    """Return the matrices (P, 2, 2) that propagate a line's offset and direction from 0 to positions along it."""
     rows = np.zeros((len(along), 2, 2))
     rows[:, 0, 0] = rows[:, 1, 1] = 1
     rows[:, 0, 1] = along
@@ -155,7 +148,7 @@ def _labels(pieces: _Pieces) -> np.ndarray:
 
 
 def _fused(own: _Pieces, label: np.ndarray, count: int) -> _Pieces:
-    """Return each line as the mean of its pieces, weighted by their information, from end to end."""
+    """Return each line as the mean of its pieces, weighted by information, from end to end."""
     middle, theta, half = np.zeros((count, 2)), np.zeros(count), np.zeros(count)
     covariance = np.zeros((count, 2, 2))
     order = np.argsort(label, kind="stable")

@@ -1,4 +1,4 @@
-"""Lines: straight segments that are long enough to have a direction, and not part of a round wall."""
+"""Select lines: straight segments that are long enough for a direction, and not part of a round wall."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from gpusense.features.segments import PENALTY, Segments
 
 # Least points and length [m] of a line, and largest deviation of its direction [rad].
 LEAST_POINTS, LEAST_LENGTH, LARGEST_DEVIATION = 6, 0.3, 0.06
-# The same limits for a side of a corner.
+# Limits for a side of a corner.
 SIDE_POINTS, SIDE_LENGTH, SIDE_DEVIATION = 4, 0.15, 0.1
 # Largest mean squared deviation per degree of freedom of a line.
 POOR = 3.0
-# Amount by which a circle may cost more than two lines, which have more parameters; the same beside a round part;
-# passes.
+# Additional cost of a circle that still beats two lines with their additional parameters; the same next to a round
+# part; passes.
 _ROUND, _ROUND_BESIDE, _ROUNDS = 12.0, 35.0, 4
-# A round wall turns by at least and at most this between two segments [rad].
+# Least and largest turn of a round wall between two segments [rad].
 _LEAST_TURN, _LARGEST_TURN = 0.02, 1.4
 
 
@@ -34,7 +34,7 @@ class Frame(NamedTuple):
 
 
 def straight(device: ScanDevice, segments: Segments) -> tuple[np.ndarray, np.ndarray]:
-    """Return which segments (G,) are lines, and which may be sides of corners, where shorter ones suffice."""
+    """Return which segments (G,) are lines, and which may be (shorter) sides of corners."""
     deviation = np.sqrt(segments.covariance[:, 0, 0])
     free = np.maximum(segments.count - 2, 1)
     good = np.isfinite(segments.distance) & (segments.cost <= POOR * free + PENALTY) & ~_is_round(device, segments)
@@ -44,7 +44,7 @@ def straight(device: ScanDevice, segments: Segments) -> tuple[np.ndarray, np.nda
 
 
 def _is_round(device: ScanDevice, segments: Segments) -> np.ndarray:
-    """Return which segments (G,) a circle explains together with a neighbour as well as two lines do."""
+    """Return which segments (G,) a common circle with a neighbour explains as well as two lines."""
     number = np.arange(len(segments.scan))
     other = segments.successor
     usable = np.isfinite(segments.distance) & (segments.count >= 3)
@@ -62,7 +62,7 @@ def _is_round(device: ScanDevice, segments: Segments) -> np.ndarray:
     for _ in range(_ROUNDS):
         found[one[sure]] = True
         found[two[sure]] = True
-        # Beside a round part, weaker evidence suffices.
+        # Weaker evidence suffices next to a round part.
         sure = arc & (found[one] | found[two]) & (circle[:, 3] <= apart + _ROUND_BESIDE)
     return found
 
@@ -89,7 +89,7 @@ def scores_of(segments: Segments, which: np.ndarray) -> np.ndarray:
 
 
 def find_lines(segments: Segments, which: np.ndarray, mount: tuple[float, float, float]) -> Found:
-    """Return the lines of some segments: midpoint and direction, observed across the line and in direction."""
+    """Return the lines of some segments: midpoint and direction, with observed offset and direction."""
     angle, middle = segments.angle[which], segments.ends[which].mean(axis=1)
     c, s = np.cos(angle), np.sin(angle)
     xy = segments.place(which, middle) + np.array(mount[:2])

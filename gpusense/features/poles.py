@@ -1,4 +1,4 @@
-"""Poles: round objects in front of their background, such as columns, posts, legs and cylindrical reflectors."""
+"""Find poles: round objects in front of their background, such as columns, posts, legs and cylindrical reflectors."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from gpusense.features.segments import Beams, Segments
 _THINNEST, _THICKEST, _LEAST_POINTS = 0.015, 0.5, 4
 # Least distance between a pole and its background: this [m] plus this many deviations.
 _BEHIND, _DEVIATIONS = 0.08, 6.0
-# Larger poles must fit a circle more clearly than lines: radius that counts as one deviation [m].
+# Larger poles must clearly fit a circle better than lines: radius that counts as one deviation [m].
 _USUAL = 0.1
-# Squared deviations per reading and edge of a pole, and how much more than its segments' lines it may cost.
+# Largest squared deviations per reading and edge of a pole, and its largest cost beyond its segments' lines.
 _POOR, _ROUND = 2.5, 6.0
-# Least evidence for a pole; beams on each side that chance is measured on, per beam of the pole and at least; and the
-# distance of ranges that are near [deviations].
+# Least evidence for a pole; beams on each side for estimating chance, per beam of the pole and at least; and the
+# distance between near ranges [deviations].
 _LEAST_EVIDENCE, _AROUND, _FEWEST_AROUND, _NEAR = 7.0, 2, 20, 3.0
-# Reduction of the cost by which each line after the first fits noise.
+# Expected noise gain of each further line.
 _EACH = 8.0
 
 
@@ -30,7 +30,7 @@ def find_poles(
 ) -> Found:
     """Return the poles of scans: centre and radius."""
     first, count, scan, edges = _objects(segments, beams, noise)
-    # By bearing from the first segment on, whatever the heading of the scan.
+    # Sort by bearing from the first segment on, independent of the scan's heading.
     begin = segments.first[np.searchsorted(segments.scan, scan)]
     order = np.lexsort((np.mod(first - begin, segments.points.counts[scan]), scan))
     first, count, scan, edges = first[order], count[order], scan[order], edges[order]
@@ -59,10 +59,10 @@ def find_poles(
 def _evidence(
     segments: Segments, first: np.ndarray, count: np.ndarray, scan: np.ndarray, cost: np.ndarray, noise: np.ndarray
 ) -> np.ndarray:
-    """Return the log-likelihood ratios (P,) of circles to chance, less the logarithm of a scan's number of places.
+    """Return the log-likelihood ratios (P,) of circles to chance, less the logarithm of the candidates per scan.
 
     By chance, the ranges of an object are independent, with the density of the ranges around it. The density at a range
-    is the share of the beams on both sides whose ranges are near, plus one beam.
+    is the share of near ranges among the beams on both sides, plus one beam.
     """
     points, result = segments.points, np.zeros(len(first))
     for k, (one, number, of) in enumerate(zip(first.tolist(), count.tolist(), scan.tolist(), strict=True)):
@@ -80,7 +80,7 @@ def _evidence(
 
 
 def _covariance(circle: np.ndarray) -> np.ndarray:
-    """Return the covariances (P, 2, 2) of centres, with the radius unknown."""
+    """Return the covariances (P, 2, 2) of centres for an unknown radius."""
     information = np.zeros((len(circle), 3, 3))
     rows, cols = np.triu_indices(3)
     information[:, rows, cols] = information[:, cols, rows] = circle[:, 4:10]
@@ -120,10 +120,10 @@ def _runs(
     start: np.ndarray, scan: np.ndarray, starts: np.ndarray, stops: np.ndarray, ends: np.ndarray, bearing: np.ndarray,
     step: float, counts: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Return the objects from starting points to their next stops that are ends, if they are narrow enough."""
+    """Return the narrow objects from starting points to the next stops, if these are ends."""
     place = np.searchsorted(stops, starts)
     last = np.where(place < len(stops), stops[np.minimum(place, len(stops) - 1)], -1)
-    # Across the end of a scan.
+    # Continue across the end of a scan.
     same = (last >= 0) & (scan[np.maximum(last, 0)] == scan[starts])
     head = np.searchsorted(stops, start[scan[starts]])
     wrapped = stops[np.minimum(head, len(stops) - 1)]

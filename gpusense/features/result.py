@@ -1,4 +1,4 @@
-"""Features of scans: kinds, poses, covariances, sizes."""
+"""Hold features of scans: kinds, poses, covariances, sizes."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ KIND_TYPE = "<U9"
 KINDS = ("line", "corner", "door", "hallway", "pole", "reflector")
 """Kinds of features; reflectors need intensities."""
 
-# Distance between the signatures of successive kinds; sizes are smaller.
+# Step between signatures of successive kinds; sizes are smaller.
 SIGNATURE_STEP = 10.0
 _LARGEST_SIZE = 9.0
-# A coordinate is unobserved if an unobserved direction has a larger component along it.
+# Largest component of an unobserved direction along an observed coordinate.
 _PARALLEL = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Features of scans from :func:`gpusense.extract_features`, in the order of scans and, in a scan, of kinds.
+    """Features of scans from :func:`gpusense.extract_features`, ordered by scan, then by kind.
 
     Attributes:
         kind: (F,) names: "line", "corner", "door", "hallway", "pole" or "reflector".
         scan: (F,) index of the scan.
-        pose: (F, 3) x, y [m] and theta [rad, in -pi to pi] in the robot's frame. Line: midpoint and direction, with
-            the scanner on its left. Corner: vertex and bisector into the free space. Door: centre and direction
-            across, away from the scanner. Hallway: point of the axis abreast of the robot and direction of the axis,
-            within pi / 2 of the robot's. Pole and reflector: centre and 0.
-        covariance: (F, 3, 3) of the pose; infinite in each unobserved coordinate: along a line or a hallway's axis, and
+        pose: (F, 3) x, y [m] and theta [rad, in -pi to pi] in the robot's frame. Line: midpoint and direction, with the
+            scanner on its left. Corner: vertex and bisector into the free space. Door: centre and direction across,
+            away from the scanner. Hallway: axis point abreast of the robot and direction within pi / 2 of the robot's.
+            Pole and reflector: centre and 0.
+        covariance: (F, 3, 3) of the pose; infinite for unobserved coordinates: along a line or a hallway's axis, and
             the heading of a pole or reflector.
-        information: (F, 3, 3) inverse of the covariance, finite: exactly 0 along directions that are not observed.
-        size: (F,) length of a line [m], opening angle of the free space in a corner [rad], width of a door and of a
-            hallway [m], radius of a pole and of a reflector [m].
-        score: (F,) quality in 0 to 1: agreement of the readings with the shape, times how well they place it.
+        information: (F, 3, 3) inverse of the covariance, finite: exactly 0 along unobserved directions.
+        size: (F,) length of a line [m], opening angle of a corner's free space [rad], width of a door or hallway [m],
+            radius of a pole or reflector [m].
+        score: (F,) quality in 0 to 1: agreement of the readings with the shape, times certainty of its position.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -68,7 +68,7 @@ class Features:
         return len(self.scan)
 
     def __iter__(self) -> Iterator[Features]:
-        """Return the features one by one."""
+        """Iterate over single features."""
         return (self[i : i + 1] for i in range(len(self)))
 
     def __getitem__(self, index: slice | NDArray[np.bool] | NDArray[np.int64] | str) -> Features:
@@ -90,10 +90,10 @@ class Features:
         return self[self.scan == checks.integer("scan", scan, low=0)]
 
     def range_bearing(self, kind: str | Sequence[str] | None = None) -> Floats:
-        """Return features as :class:`gpusense.LandmarkModel` takes them.
+        """Return features in the form of :class:`gpusense.LandmarkModel`.
 
         Args:
-            kind: A kind or several; None for all. Lines and hallways are no landmarks, since their poses move with the
+            kind: One or several kinds; None for all. Lines and hallways are no landmarks: their poses move with the
                 robot.
 
         Returns:
@@ -107,12 +107,12 @@ class Features:
         return np.column_stack([np.hypot(x, y), np.arctan2(y, x), chosen.signatures])
 
     def lines(self) -> Floats:
-        """Return the lines as :class:`gpusense.LineModel` takes them; features of other kinds are left out.
+        """Return the lines in the form of :class:`gpusense.LineModel`; other features are omitted.
 
         Returns:
-            (F, 7) angle of the normal away from the scanner [rad] and distance [m], places of both ends along the line
-            from the foot of the normal, positive to the left of it [m], variance of the angle [rad^2], covariance
-            [rad m] and variance of the distance [m^2], in the robot's frame.
+            (F, 7) angle of the normal away from the scanner [rad] and distance [m], positions of both ends along the
+            line from the foot of the normal, positive to the left [m], variance of the angle [rad^2], covariance [rad
+            m] and variance of the distance [m^2], in the robot's frame.
 
         Example:
             >>> import gpusense as gs, numpy as np
@@ -126,7 +126,8 @@ class Features:
         c, s = np.cos(angle), np.sin(angle)
         x, y = chosen.pose[:, 0], chosen.pose[:, 1]
         middle, half = c * y - s * x, 0.5 * chosen.size
-        # The offset at the foot of the normal is that at the middle plus the angle times the distance between both.
+        # The offset at the foot of the normal equals the offset at the middle plus the angle times the distance
+        # between them.
         across = across_lines(chosen)
         variance, both = across[:, 1, 1], across[:, 0, 1] + middle * across[:, 1, 1]
         far = across[:, 0, 0] + 2 * middle * across[:, 0, 1] + middle**2 * variance
@@ -144,7 +145,7 @@ class Features:
 
 
 def across_lines(lines: Features) -> Floats:
-    """Return the (F, 2, 2) covariances of offset, at the middle and away from the scanner, and direction of lines."""
+    """Return the (F, 2, 2) covariances of lines: offset of the middle away from the scanner, and direction."""
     rows = np.zeros((len(lines), 2, 3))
     rows[:, 0, 0], rows[:, 0, 1], rows[:, 1, 2] = np.sin(lines.pose[:, 2]), -np.cos(lines.pose[:, 2]), 1
     result = np.asarray(np.linalg.inv(rows @ lines.information @ rows.transpose(0, 2, 1)), np.float64)
@@ -159,9 +160,9 @@ def joined(parts: Sequence[Features], scans: int) -> Features:
 
 
 def signature_of(kind: NDArray[np.str_], size: Floats) -> Floats:
-    """Return the signatures (F,) of features: ten times the place of the kind among ``KINDS``, plus the size up to 9.
+    """Return the signatures (F,) of features: ten times the index of the kind in ``KINDS``, plus the size up to 9.
 
-    Sizes are compared by ``sigma_signature`` of :class:`gpusense.LandmarkParameters`; kinds are never confused.
+    ``sigma_signature`` of :class:`gpusense.LandmarkParameters` compares sizes; kinds are never confused.
     """
     place = np.zeros(len(kind))
     for number, name in enumerate(KINDS):
@@ -171,7 +172,7 @@ def signature_of(kind: NDArray[np.str_], size: Floats) -> Floats:
 
 
 def check_kinds(name: str, kinds: str | Sequence[str]) -> tuple[str, ...]:
-    """Return kinds as a tuple, checked."""
+    """Return the checked kinds as a tuple."""
     if isinstance(kinds, str):
         return (checks.choice(name, kinds, KINDS),)
     try:
@@ -188,7 +189,7 @@ class Found:
     Attributes:
         scan: (F,) index of the scan.
         pose: (F, 3) in the robot's frame.
-        observed: (F, M, 3) orthonormal rows: the observed directions in x, y and theta.
+        observed: (F, M, 3) observed directions in x, y and theta, as orthonormal rows.
         covariance: (F, M, M) covariances along the observed directions.
         size: (F,) see ``Features``.
         score: (F,) see ``Features``.

@@ -1,4 +1,4 @@
-"""Straight segments of scans, with their lines, neighbours and noise."""
+"""Split scans into straight segments, with their lines, neighbours and noise."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from gpusense.matching.points import GAP, ScanPoints
 from gpusense.world.scanner import Reading, Scanner, reading_classes
 
 _FULL_TURN = 2 * math.pi
-# Reduction of the cost from which two lines replace one [squared deviations].
+# Least reduction of the cost for replacing a line by two [squared deviations].
 PENALTY = 25.0
-# Degrees of freedom of a scan's noise as prior for the noise of each segment.
+# Degrees of freedom of the scan's noise as a prior for each segment's noise.
 _PRIOR = 20.0
 # Least standard deviation of ranges in a covariance [m].
 LEAST_NOISE = 2e-4
@@ -38,8 +38,9 @@ class Segments:
         variance: (G,) variance of ranges, from the scan and from the segment's residuals [m^2].
         ends: (G, 2) positions of the first and last point along the line, from the foot of the normal [m].
         spacing: (G, 2) distances between neighbouring beams along the line at its ends [m].
-        successor: (G,) next segment of the scan, or -1; after the last one the first if no gap is between them.
-        apart: (G,) whether something may be hidden before the successor.
+        successor: (G,) next segment of the scan, or -1; the first one follows the last one unless a gap separates
+            them.
+        apart: (G,) whether an object may be hidden in front of the successor.
     """
 
     points: ScanPoints
@@ -73,7 +74,7 @@ class Segments:
         return begin + (self.first - begin + self.count - 1) % self.points.counts[self.scan]
 
     def place(self, which: np.ndarray, along: np.ndarray) -> np.ndarray:
-        """Return the points (P, 2) at places along lines."""
+        """Return the points (P, 2) at positions along lines."""
         c, s, d = np.cos(self.angle[which]), np.sin(self.angle[which]), self.distance[which]
         return np.stack([d * c - along * s, d * s + along * c], axis=1)
 
@@ -81,7 +82,7 @@ class Segments:
 def find_segments(device: ScanDevice, points: ScanPoints, noise: np.ndarray) -> Segments:
     """Split scans into segments, and fit lines to them.
 
-    The segments of a scan come by bearing, from its cut on; see :func:`_cut`.
+    The segments of a scan are sorted by bearing from its cut on, see :func:`_cut`.
     """
     if not len(points.point):
         nothing = np.zeros(0, np.int64)
@@ -92,7 +93,7 @@ def find_segments(device: ScanDevice, points: ScanPoints, noise: np.ndarray) -> 
     first = np.flatnonzero(stop >= 0)
     scan = np.searchsorted(points.start, first, side="right") - 1
     count = stop[first] - first
-    # The first point by bearing of a segment of a mirrored scan is its last one.
+    # In a mirrored scan, the first point of a segment by bearing is its last point.
     first = place[np.where(mirrored[scan], first + count - 1, first)]
     order = np.lexsort((np.mod(first - cut[scan], points.counts[scan]), scan))
     first, count, scan = first[order], count[order], scan[order]
@@ -102,14 +103,14 @@ def find_segments(device: ScanDevice, points: ScanPoints, noise: np.ndarray) -> 
 
 
 def _cut(points: ScanPoints, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where to cut scans open, by their readings alone, so that segments turn and mirror with their scans.
+    """Return where to cut scans open, from their readings only, so that segments turn and mirror with their scans.
 
-    A scan is cut at its widest gap, or else where a range deviates most from the range that its neighbours predict:
-    at an edge or a corner.
+    A scan is cut at its widest gap, or at the range that deviates most from its neighbours' prediction: an edge or a
+    corner.
 
     Returns:
-        (S,) the first point after the cut; whether the cut is at no gap; and whether to split the scan against the
-        sense of its bearings: if the sum of the cubes of the steps of the logarithms of ranges is negative.
+        (S,) the first point after the cut; whether the cut is not at a gap; and whether to split against the sense of
+        bearings, where the sum of cubed steps of log ranges is negative.
     """
     counts, total = points.counts, len(points.point)
     scan = np.repeat(np.arange(len(counts)), counts)
@@ -124,7 +125,7 @@ def _cut(points: ScanPoints, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     with np.errstate(all="ignore"):
         expected = (two / r[before] + one / r[following]) / np.sin(step[before] + step)
         off = np.nan_to_num(np.abs(expected * r - 1) * r / noise[scan], posinf=0.0)
-    # Gaps of as many beams are equally wide.
+    # Gaps of equally many beams are equally wide.
     beams = np.minimum(np.rint(step * GAP / max(points.gap, 1e-9)), 1e9)
     score = np.where(is_gap, 1e9 * beams, np.minimum(off + off[following], 1e8))
     some = np.flatnonzero(counts)
@@ -137,7 +138,7 @@ def _cut(points: ScanPoints, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 
 def _in_cut_order(points: ScanPoints, cut: np.ndarray, mirrored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices of points (P,) from the cut on, and the points with bearings from the cut, as kernels take."""
+    """Return the indices of points (P,) from the cut on, and the points for kernels, with bearings from the cut."""
     counts = points.counts
     scan = np.repeat(np.arange(len(counts)), counts)
     begin = points.start[scan]
@@ -152,7 +153,7 @@ def _in_cut_order(points: ScanPoints, cut: np.ndarray, mirrored: np.ndarray) -> 
 def _joined_around(
     device: ScanDevice, closed: np.ndarray, first: np.ndarray, count: np.ndarray, scan: np.ndarray, line: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Join the last segment of a scan with its first one where a single line explains both."""
+    """Join the last and first segment of a scan where a single line explains both."""
     begin = np.searchsorted(scan, np.arange(len(closed)))
     end = np.searchsorted(scan, np.arange(len(closed)), side="right") - 1
     rows = np.flatnonzero(closed & (end > begin))
@@ -172,7 +173,7 @@ def _described(
     points: ScanPoints, closed: np.ndarray, noise: np.ndarray, first: np.ndarray, count: np.ndarray,
     scan: np.ndarray, line: np.ndarray,
 ) -> Segments:  # fmt: skip
-    """Return segments with the attributes that follow from their lines."""
+    """Return segments with all attributes derived from their lines."""
     a, b, r11, r12, r22, cost = line.T
     size = np.hypot(a, b)
     valid = (cost >= 0) & (r22 > 0) & (count >= 3) & np.isfinite(line).all(axis=1) & (size > 0)
@@ -217,7 +218,7 @@ def _variances(
 def _successors(
     points: ScanPoints, closed: np.ndarray, scan: np.ndarray, first: np.ndarray, last: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the next segment of each, or -1, and whether something may be hidden in between."""
+    """Return the successor of each segment, or -1, and whether an object may be hidden in between."""
     number = np.arange(len(scan))
     head = np.searchsorted(scan, scan)
     is_last = np.append(scan[1:] != scan[:-1], True)[: len(scan)]

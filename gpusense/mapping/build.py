@@ -21,8 +21,8 @@ from gpusense.world.sensor_scans import check_scans
 from gpusense.world.windows import LONGEST_SIDE, Window
 
 BAND_CELLS = 1 << 22
-"""Most cells of a band of rows, whose counts are on the device at once."""
-# Most readings of scans whose rays are kept after the search for the map's extent.
+"""Most cells of a band of rows that the device counts at once."""
+# Most readings for keeping rays after the search for the map's extent.
 _KEPT_RAYS = 1 << 20
 
 
@@ -48,30 +48,31 @@ def build_map(
 
     Each ray adds ``log(p_miss / (1 - p_miss))`` to the log-odds of the cells that it crosses, and ``log(p_hit / (1 -
     p_hit))`` to the cell where it ends at an obstacle (*Probabilistic Robotics* tables 9.1 and 9.2, with an obstacle of
-    one cell's thickness). The device counts hits and misses in integers by an exact walk from cell to cell, so all
-    backends build the same map. Cells without a ray are unknown. Rays may start or end far outside the map.
-    A large map is built in bands of rows, so that it takes little more memory than its result, a byte a cell.
+    one cell's thickness). The device counts hits and misses in integers by an exact walk from cell to cell, so that
+    all backends build the same map. Cells without a ray are unknown. Rays may start or end far outside the map. Large
+    maps are built in bands of rows, to need little more memory than the result, a byte a cell.
 
     Args:
-        scans: (S, K) readings [m]; missing readings are ignored. A ray may span 524 288 cells along an axis. With
-            several scanners S readings, each of its scanner's length.
+        scans: (S, K) readings [m]; missing readings are ignored. A ray may span 524 288 cells along an axis. For
+            several scanners, S readings of each scanner's length.
         poses: (S, 3) poses of the robot in the world [m, m, rad].
         scanner: The scanner's geometry, or several scanners.
-        sensor: (S,) index of the scanner of each scan; with several scanners only.
+        sensor: (S,) index of the scanner of each scan; only for several scanners.
         resolution: Side of a cell [m], 1e-4 to 1e3.
-        origin: Pose (x, y, yaw) of the map's first corner [m, m, rad]; requires ``shape``. None: the map holds all
-            rays, and its origin is a multiple of the resolution.
-        shape: Rows and columns; requires ``origin``. Cells of rays outside are left out.
-        range_limit: Ranges beyond it clear cells up to it and mark no obstacle [m]. None: ``scanner.range_max``.
-        clear_max: Whether max readings clear cells up to ``range_limit``. By default they are ignored, since dark and
+        origin: Pose (x, y, yaw) of the map's first corner [m, m, rad]; requires ``shape``. None fits the map to all
+            rays, with an origin at a multiple of the resolution.
+        shape: Rows and columns; requires ``origin``. Cells outside are ignored.
+        range_limit: Longer ranges clear cells up to ``range_limit`` and mark no obstacle [m]. None:
+            ``scanner.range_max``.
+        clear_max: Whether max readings clear cells up to ``range_limit``. The default ignores them, since dark and
             oblique surfaces also return nothing.
         p_hit: Occupancy after one hit and an even prior, in (0.5, 1).
         p_miss: Occupancy after one miss and an even prior, in (0, 0.5).
         p_prior: Occupancy before any ray, in (0, 1).
         occupied_threshold: Least occupancy of an occupied cell [per cent].
         motion: (S, 3) motion of the robot during each scan, from odometry: its pose at the last beam in its frame at
-            the first one [m, m, rad]. Beams are measured in their order, evenly in time, and ``poses`` are those at
-            the first beam. None: the robot is at rest.
+            the first one [m, m, rad]. Beams are measured in order at equal intervals, and ``poses`` belong to the first
+            beam. None: the robot is at rest.
         backend: The device, see :func:`gpusense.devices`.
 
     Returns:
@@ -99,9 +100,9 @@ def build_map(
 
 
 class MapBuilder:
-    """Builds a map incrementally; the map so far can be read at any time. See :func:`build_map`.
+    """Incremental :func:`build_map`; the map so far can be read at any time.
 
-    Counts take eight bytes a cell, and the map itself one. So large maps are built in bands of rows, each from all
+    Counts take eight bytes a cell, the map itself one. Large maps are therefore built in bands of rows, each from all
     scans that meet it.
     """
 
@@ -146,9 +147,9 @@ class MapBuilder:
         self._cells = np.full(self._shape, -1, np.int8)
 
     def _place(self, resolution: float, origin: ArrayLike | None, shape: tuple[int, int] | None) -> None:
-        """Choose the map's frame and shape, and find the rows that the rays of each scan meet."""
+        """Choose the map's frame and shape, and find the rows that each scan's rays meet."""
         placed = _frame(origin, shape)
-        # Without a frame, boxes are in metres until all are known.
+        # Until a frame is known, boxes are in metres.
         frame = GridFrame(1.0, (0.0, 0.0, 0.0)) if placed is None else GridFrame(resolution, placed[0])
         boxes = np.empty((len(self._survey.poses), 4))
         self._kept: dict[bytes, RayEnds] = {}
@@ -165,7 +166,7 @@ class MapBuilder:
         self._frame = GridFrame(resolution, check_origin(origin))
 
     def steps(self) -> Iterator[float]:
-        """Count rays, some scans at a time, and yield the share of the work that is done."""
+        """Count rays, some scans at a time, and yield the finished share of the work."""
         chosen = [batches(self._scans_of(band), self._each) for band in self._bands]
         total, done = max(sum(len(part) for parts in chosen for part in parts), 1), 0
         for band, parts in zip(self._bands, chosen, strict=True):
@@ -185,7 +186,7 @@ class MapBuilder:
         return np.flatnonzero((high >= band.row - 1) & (low <= band.row + band.rows + 1))
 
     def _rays_of(self, part: np.ndarray) -> RayEnds:
-        """Return the rays of some scans, and drop the stored ones."""
+        """Return the rays of some scans, and drop stored rays."""
         key = part.tobytes()
         return self._kept.pop(key) if key in self._kept else self._survey.rays(part)
 
@@ -194,17 +195,17 @@ class MapBuilder:
 
     @property
     def rays(self) -> int:
-        """Number of rays counted so far, without rays beside the map."""
+        """Number of rays counted so far, without rays that miss the map."""
         return self._rays + (0 if self._counts is None else self._counts.rays)
 
     @property
     def parts(self) -> int:
-        """Number of launches, each of some scans and a band."""
+        """Number of launches, each for some scans and a band."""
         return sum(-(-len(self._scans_of(band)) // self._each) for band in self._bands)
 
     @property
     def bands(self) -> int:
-        """Bands of rows, counted one after another; a map of a single band is complete after each step."""
+        """Number of bands, counted one after another; a map of a single band is complete after each step."""
         return len(self._bands)
 
     def grid(self) -> OccupancyGrid:
@@ -233,7 +234,7 @@ def _occupancy(p_hit: float, p_miss: float, p_prior: float) -> tuple[float, floa
 def _frame(
     origin: ArrayLike | None, shape: tuple[int, int] | None
 ) -> tuple[tuple[float, float, float], tuple[int, int]] | None:
-    """Return the map's origin and shape; None if they follow from the rays."""
+    """Return the map's origin and shape; None if the rays determine them."""
     if (origin is None) != (shape is None):
         missing, present = ("origin", "shape") if origin is None else ("shape", "origin")
         raise ValueError(f"{missing}: must be given with {present}, got None")

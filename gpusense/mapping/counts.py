@@ -1,4 +1,4 @@
-"""Count hits and misses of cells on a device ray by ray, and compute the occupancies."""
+"""Count hits and misses of cells on a device, and compute the occupancies."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from gpusense.world.grid_frame import GridFrame
 from gpusense.world.windows import Window
 
 _INT = np.dtype(np.int32)
-# Cells whose counts the host processes at once.
+# Number of cells that the host processes at once.
 _CHUNK = 1 << 20
-# Counts below this have their occupancies in a table.
+# Occupancies of lower counts are tabulated.
 _FEW = 256
-# exp(40) needs no larger exponent: the occupancy is 0 or 100 per cent by then.
+# Larger log-odds also round to 0 or 100 per cent.
 _LARGEST_ODDS = 40.0
 
 
 def bands(shape: tuple[int, int], most: int) -> list[Window]:
-    """Return the bands of rows of a map, each of at most ``most`` cells or one row, whose counts fit a device."""
+    """Return the bands of rows of a map, each of at most ``most`` cells or a single row."""
     rows, cols = shape
     count = -(-rows // max(most // cols, 1))
     edges = [rows * i // count for i in range(count + 1)]
@@ -33,10 +33,10 @@ def bands(shape: tuple[int, int], most: int) -> list[Window]:
 
 
 class BandCounts:
-    """Hits and misses of the cells of a band of a map on a device.
+    """Hits and misses of a band's cells on a device.
 
     Attributes:
-        rays: Rays that were counted and end in the band, or beside it outside the map.
+        rays: Number of counted rays that end in the band, or in its rows outside the map.
     """
 
     def __init__(self, backend: Backend, frame: GridFrame, shape: tuple[int, int], band: Window) -> None:

@@ -1,4 +1,4 @@
-"""Rays of scans at known poses: their starts and ends, and the part of a map that they meet."""
+"""Convert scans at known poses to rays, and clip rays to windows of a map."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from gpusense.world.scanner import Reading, Scanner, classify
 from gpusense.world.sensor_scans import SensorScans
 from gpusense.world.windows import LONGEST_SIDE, Window
 
-# Scans whose rays are counted in one launch.
+# Number of scans per launch.
 SCANS = 1024
 LONGEST_RAY = 1 << 19
-"""Most cells that a ray may span along an axis of the map: products of lengths in 1/4096 cell fit in 64 bits."""
+"""Most cells of a ray along an axis of the map: products of lengths in 1/4096 cell fit in 64 bits."""
 
 
 @dataclass(frozen=True)
 class Survey:
-    """Scans at known poses, and the rule by which readings become rays.
+    """Scans at known poses, and the rules for converting readings to rays.
 
     Attributes:
         data: The scans and their scanners.
         poses: (S, 3) poses of the robot [m, m, rad].
-        range_limit: Readings beyond it clear cells up to it and mark no obstacle [m]; at most that of each scanner.
-        clear_max: Whether max readings clear cells up to ``range_limit``; otherwise they are left out.
-        motion: (S, 3) motions of the robot during the scans, see ``gpusense.world.deskew``; None: it is at rest.
+        range_limit: Longer readings clear cells up to ``range_limit`` and mark no obstacle [m]; each scanner's
+            range_max is an upper limit.
+        clear_max: True if max readings clear cells up to ``range_limit``; otherwise they have no effect.
+        motion: (S, 3) motions of the robot during the scans, see ``gpusense.world.deskew``; None at rest.
     """
 
     data: SensorScans
@@ -44,7 +45,7 @@ class Survey:
         return sum(readings.size for readings in self.data.readings)
 
     def rays(self, chosen: np.ndarray) -> RayEnds:
-        """Return the rays of some scans by their indices."""
+        """Return the rays of the scans with these indices."""
         parts, sensor, place = [], self.data.sensor[chosen], self.data.places()[chosen]
         for one in np.unique(sensor):
             some = np.flatnonzero(sensor == one)
@@ -60,7 +61,7 @@ class Survey:
 
 
 class RayEnds:
-    """Start and end in the world of each ray of scans that carries information about the map.
+    """Start and end in the world of each ray that carries information about the map.
 
     Args:
         scans: (S, K) readings [m].
@@ -106,13 +107,13 @@ class RayEnds:
         return result
 
     def boxes(self, count: int, frame: GridFrame) -> np.ndarray:
-        """Return the (S, 4) least column and row and largest column and row of the rays of each scan [cells].
+        """Return the (S, 4) least column and row and largest column and row of each scan's rays [cells].
 
-        Scans without a ray have infinite ones in reverse order.
+        Scans without rays get infinite bounds in reverse order.
         """
         both = np.stack([frame.to_cells(xy) for xy in (self.start, self.end)])
         boxes = np.tile([np.inf, np.inf, -np.inf, -np.inf], (count, 1))
-        # Rays lie in the order of their scans.
+        # Rays are sorted by scan.
         first = np.flatnonzero(np.diff(self.scan, prepend=-1))
         if len(first):
             of = self.scan[first]
@@ -122,7 +123,7 @@ class RayEnds:
 
 
 def _poses_of_beams(poses: np.ndarray, motion: np.ndarray, beams: int) -> np.ndarray:
-    """Return the (S, K, 3) poses in the world of a robot that moves during S scans."""
+    """Return the (S, K, 3) poses of a moving robot at each beam of S scans."""
     place, heading = beam_poses(motion, beams)
     cos, sin = np.cos(poses[:, 2])[:, None], np.sin(poses[:, 2])[:, None]
     x = poses[:, 0, None] + cos * place[..., 0] - sin * place[..., 1]
@@ -131,15 +132,15 @@ def _poses_of_beams(poses: np.ndarray, motion: np.ndarray, beams: int) -> np.nda
 
 
 class CellRays:
-    """The rays that meet a window of a map, in its cells.
+    """Rays that meet a window of a map, in cells of the window.
 
     Attributes:
         start_cell: (R, 2) int32 column and row of the start, relative to the window.
-        start_inside: (R, 2) int32 place of the start in its cell [1/4096 cell].
+        start_inside: (R, 2) int32 position of the start in its cell [1/4096 cell].
         end_cell: (R, 2) int32 column and row of the end.
-        end_inside: (R, 2) int32 place of the end in its cell.
+        end_inside: (R, 2) int32 position of the end in its cell.
         hit: (R,) int32, 1 where an obstacle is at the end.
-        ending: Number of rays whose end, or the map's cell nearest to it, lies in the rows of the window.
+        ending: Number of rays that end, after clamping to the map, in the rows of the window.
     """
 
     def __init__(self, ends: RayEnds, frame: GridFrame, window: Window, shape: tuple[int, int]) -> None:
@@ -147,7 +148,7 @@ class CellRays:
             start, end = frame.to_cells(ends.start), frame.to_cells(ends.end)
             low, high = np.minimum(start, end), np.maximum(start, end)
             first, last = (window.col, window.row), (window.col + window.cols, window.row + window.rows)
-            # Enlarge the window by a fraction of a cell for the rounding of coordinates.
+            # Enlarge the window by a cell for rounded coordinates.
             meets = ((high >= np.subtract(first, 1)) & (low <= np.add(last, 1))).all(axis=1)
             row = np.clip(end[:, 1], 0, shape[0] - 1)
             self.ending = int(np.count_nonzero(meets & (row >= first[1]) & (row < last[1])))
@@ -162,13 +163,7 @@ class CellRays:
 
 
 def check_lengths(ends: RayEnds, resolution: float, first: int) -> None:
-    """Refuse rays that span more cells than a walk can count.
-
-    Args:
-        ends: The rays.
-        resolution: Side of a cell [m].
-        first: Index of the first scan, for the message.
-    """
+    """Refuse rays that span more cells than a walk can count."""
     if len(ends.hit) == 0:
         return
     with np.errstate(over="ignore", invalid="ignore"):
@@ -180,12 +175,7 @@ def check_lengths(ends: RayEnds, resolution: float, first: int) -> None:
 
 
 def extent(boxes: np.ndarray, resolution: float) -> tuple[tuple[float, float, float], tuple[int, int]]:
-    """Return origin and shape of the smallest map of whole cells that holds all rays, with a margin of one cell.
-
-    Args:
-        boxes: (S, 4) least x and y and largest x and y of the rays of each scan [m].
-        resolution: Side of a cell [m].
-    """
+    """Return origin and shape of the smallest map of whole cells around all rays, with a margin of one cell."""
     low, high = boxes[:, :2].min(axis=0, initial=np.inf), boxes[:, 2:].max(axis=0, initial=-np.inf)
     if not (low <= high).all():
         raise ValueError("scans: must have a range, got none")
@@ -203,5 +193,5 @@ def extent(boxes: np.ndarray, resolution: float) -> tuple[tuple[float, float, fl
 
 
 def batches(scans: np.ndarray, each: int) -> list[np.ndarray]:
-    """Split the scans with these indices into launches."""
+    """Split the indices of scans into launches."""
     return [scans[first : first + each] for first in range(0, len(scans), each)]

@@ -1,1 +1,1 @@
-"""The weights that other implementations give a scan, and their parameters."""
+"""Reproduce the weights that other implementations give a scan."""

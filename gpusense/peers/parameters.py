@@ -10,7 +10,7 @@ from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 
 @dataclass(frozen=True)
 class BeamWeights(BeamParameters):
-    """Parameters of the peers' beam models, whose weights need not sum to 1; the defaults are both nodes'.
+    """Parameters of the peers' beam models; weights need not sum to 1. The defaults are those of both nodes.
 
     Raises:
         TypeError: A value is not a real number.
@@ -29,7 +29,7 @@ class BeamWeights(BeamParameters):
 
 @dataclass(frozen=True)
 class FieldWeights(LikelihoodFieldParameters):
-    """Parameters of the peers' likelihood fields, whose weights need not sum to 1; the defaults are both nodes'.
+    """Parameters of the peers' likelihood fields; weights need not sum to 1. The defaults are those of both nodes.
 
     Raises:
         TypeError: A value is not a real number.

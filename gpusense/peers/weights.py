@@ -1,7 +1,7 @@
-"""The weights of nav2_amcl and Beluga, for ``compat="amcl"`` and ``compat="beluga"``.
+"""Compute the weights of nav2_amcl and Beluga, for ``compat="amcl"`` and ``compat="beluga"``.
 
 ``BeamModel(..., compat="amcl")`` and ``LikelihoodFieldModel(..., compat="beluga")`` return the logarithm of the factor
-by which these programs multiply a particle's weight. These factors are not likelihoods:
+that these programs apply to a particle's weight. These factors are not likelihoods:
 
 ========  ======================  =====================================================================
 peer      model                   weight
@@ -14,25 +14,23 @@ beluga    likelihood field        ``1 + sum p^3``, the normal density normalised
 beluga    likelihood field, prob  ``product p``, the normal density normalised for an unbounded range
 ========  ======================  =====================================================================
 
-*Readings.* amcl: a reading of at most range_min, including -inf, is a max reading, and NaN is left out. Its beam model
-scores a reading of exactly range_max as ``z_hit exp(...) + z_max``, and a longer one as ``z_hit exp(...)``, which is 0
-for +inf; its likelihood field leaves out both. Beluga: a reading outside [range_min, range_max] is left out, also +inf.
-Its beam model scores a reading of exactly range_max as ``z_hit p_hit + z_max``; its likelihood field treats it as a
-range.
+*Readings.* amcl: a reading of at most range_min, including -inf, is a max reading, and NaN is ignored. Its beam model
+scores a reading of exactly range_max as ``z_hit exp(...) + z_max``, and a longer one as ``z_hit exp(...)``, 0 for +inf;
+its likelihood field ignores both. Beluga ignores readings outside [range_min, range_max], including +inf. Its beam
+model scores a reading of exactly range_max as ``z_hit p_hit + z_max``; its likelihood field treats it as a range.
 
-*Cells.* 0 is free and 100 is occupied. All other values (-1, and intermediate ones of maps in mode ``scale``) are
-neither: they stop beams in the beam models but are not obstacles in the likelihood fields. ``occupied_threshold`` has
-no effect.
+*Cells.* 0 is free and 100 is occupied. All other values (-1, and intermediate occupancies of maps in mode ``scale``)
+stop beams in the beam models, but are no obstacles in the likelihood fields. ``occupied_threshold`` has no effect.
 
 *Beams* of the beam models follow Bresenham's lines, see ``gpusense.casters.Bresenham``. amcl's lines extend one cell
 beyond the ray's end, and distances between cells may exceed range_max; the map's edge stops them, and a particle off
-the map has ranges of 0. Beluga's ranges are range_max beyond the map's edge and for a particle off the map.
+the map measures 0. Beluga's ranges are range_max beyond the map's edge and for a particle off the map.
 
 *Likelihood fields.* An end point off the map counts as ``max_distance`` for amcl and as a density of ``1 / range_max``
 for Beluga. Cells hold float32 numbers: amcl's distances, Beluga's densities.
 
-*Not reproduced:* errors of the peers' distance transforms; amcl's shift of map look-ups by half a cell, which a grid
-with an origin half a cell lower in x and y has; Beluga's beams from the robot's origin in place of the sensor's.
+*Not reproduced:* errors of the peers' distance transforms; amcl's shift of map look-ups by half a cell, equivalent to
+an origin half a cell lower in x and y; Beluga's beams from the robot's origin instead of the sensor's.
 
 Versions: nav2_amcl 1.5.0 and Beluga 2.1.1, with the default parameters of their nodes.
 """
@@ -55,13 +53,13 @@ from gpusense.world.range_causes import RandomDensity
 from gpusense.world.scanner import Scanner
 
 _OCCUPIED, _UNKNOWN = 100, -1
-# In a likelihood field's mask: a cell of a fixed density.
+# Mark of a cell of fixed density in a likelihood field's mask.
 OVERLAID = 2
 
 
 @dataclass(frozen=True)
 class Peer(Likelihood, ABC):
-    """A program whose weights ``compat`` reproduces.
+    """Weights of another program, reproduced by ``compat``.
 
     Args:
         prob: True if the likelihood field is the peer's ``likelihood_field_prob``, a product of densities.
@@ -91,7 +89,7 @@ class Peer(Likelihood, ABC):
     def field_values(
         self, squared: np.ndarray, p: LikelihoodFieldParameters, resolution: float, range_max: float
     ) -> np.ndarray:
-        """Return the densities of cells at squared distances [cells^2] from the nearest obstacle."""
+        """Return densities at squared distances [cells^2] from the nearest obstacle."""
 
     @abstractmethod
     def beyond(self, p: LikelihoodFieldParameters, range_max: float) -> float:
@@ -105,7 +103,7 @@ class Peer(Likelihood, ABC):
 
 @dataclass(frozen=True)
 class Amcl(Peer):
-    """The weights of nav2_amcl 1.5.0.
+    """Weights of nav2_amcl 1.5.0.
 
     Args:
         prob: True if the likelihood field is ``likelihood_field_prob`` without beam skipping, a product of densities.
@@ -127,12 +125,7 @@ class Amcl(Peer):
     outside = "occupied"
 
     def readings(self, ranges: np.ndarray, scanner: Scanner, field: bool) -> np.ndarray:
-        """Convert readings to the peer's classes: NaN and inf are left out, all other readings are ranges.
-
-        Args:
-            ranges: Readings of any shape and value [m].
-            scanner: The scanner.
-            field: True if the readings are for the likelihood field, not for the beam model.
+        """Convert readings to the peer's classes: NaN and inf are ignored, all other readings are ranges.
 
         Returns:
             float64 readings of the same shape.
@@ -156,15 +149,15 @@ class Amcl(Peer):
 
 @dataclass(frozen=True)
 class Beluga(Peer):
-    """The weights of Beluga 2.1.1 with the defaults of its node ``beluga_amcl``.
+    """Weights of Beluga 2.1.1 with the defaults of its node ``beluga_amcl``.
 
     Args:
         prob: True if the likelihood field is ``likelihood_field_prob``, a product of densities.
         model_unknown_space: True if unknown cells have the density ``1 / range_max`` in the likelihood field, if that
-            exceeds the density of a cell at ``max_distance``; with ``only_obstacle_boundaries`` also occupied cells
-            without a free neighbour.
-        only_obstacle_boundaries: True if only occupied cells beside a free cell are obstacles of the likelihood field.
-            None is the node's default: True, but False with ``prob``, to which the node does not pass the option.
+            exceeds the density at ``max_distance``; with ``only_obstacle_boundaries`` so do occupied cells without a
+            free neighbour.
+        only_obstacle_boundaries: True if only occupied cells next to a free cell are obstacles of the likelihood
+            field. None is the node's default: True, but False with ``prob``, which does not receive the option.
 
     Raises:
         TypeError: An option has the wrong type.
@@ -193,7 +186,7 @@ class Beluga(Peer):
 
     @property
     def boundaries(self) -> bool:
-        """Tell whether only occupied cells beside a free cell are obstacles of the likelihood field."""
+        """Return whether only occupied cells next to a free cell are obstacles of the likelihood field."""
         return not self.prob if self.only_obstacle_boundaries is None else self.only_obstacle_boundaries
 
     @property
@@ -207,14 +200,14 @@ class Beluga(Peer):
         return int(self.boundaries)
 
     def readings(self, ranges: np.ndarray, scanner: Scanner, field: bool) -> np.ndarray:
-        """See Amcl.readings; readings outside [range_min, range_max] are left out."""
+        """See Amcl.readings; readings outside [range_min, range_max] are ignored."""
         nearest, farthest = _limits(scanner, ranges.dtype)
         inside = (ranges >= nearest) & (ranges <= farthest)
         z = np.where(ranges == farthest, scanner.range_max, ranges.astype(np.float64))
         return np.where(inside, z, np.nan)
 
     def field_obstacles(self, grid: OccupancyGrid, unknown: str) -> np.ndarray:
-        """See Likelihood.field_obstacles; with model_unknown_space OVERLAID marks the cells of a fixed density."""
+        """See Likelihood.field_obstacles; with model_unknown_space, OVERLAID marks cells of a fixed density."""
         occupied = self.obstacles(grid, unknown)
         obstacles = occupied & _beside(grid.cells == 0) if self.boundaries else occupied
         if not self.model_unknown_space:
@@ -233,11 +226,11 @@ class Beluga(Peer):
         return float(np.float32(RandomDensity(range_max).peak(1)))
 
     def overlay(self, p: LikelihoodFieldParameters, range_max: float) -> float:
-        """Return the density of OVERLAID cells, by the squared distance that Beluga computes from ``1 / range_max``."""
+        """Return the density of OVERLAID cells from Beluga's squared distance for ``1 / range_max``."""
         farthest = np.float32(p.max_distance * p.max_distance)
         rand = RandomDensity(range_max)
         share = (rand.peak(1) - rand.peak(p.z_rand)) / _amplitude(p) if p.z_hit > 0 else 0.0
-        # Without a normal part in the mixture no such distance exists.
+        # A mixture without a normal part has no such distance.
         background = np.float32(-2 * p.sigma_hit * p.sigma_hit * math.log(share)) if share > 0 else farthest
         return float(_normalised(np.minimum(background, farthest), p, range_max))
 
@@ -254,7 +247,7 @@ def choose(compat: object) -> Likelihood:
 
 
 def check_weights(parameters: BeamParameters | LikelihoodFieldParameters, compat: object) -> None:
-    """Check that peers' weights are used only with ``compat``, and only normal hits with it."""
+    """Check that peers' weights come with ``compat``, and ``compat`` with normal hits."""
     if compat is not None and parameters.hit != "normal":
         raise ValueError(f"hit: must be 'normal' with compat, as in that program, got {parameters.hit!r}")
     if compat is None and isinstance(parameters, (BeamWeights, FieldWeights)):
@@ -269,7 +262,7 @@ def _limits(scanner: Scanner, kind: np.dtype) -> tuple[np.floating, np.floating]
 
 
 def _beside(free: np.ndarray) -> np.ndarray:
-    """Return the mask of cells with one of four neighbours in a mask."""
+    """Return the mask of cells that have one of four neighbours in ``free``."""
     near = np.zeros_like(free)
     near[1:] |= free[:-1]
     near[:-1] |= free[1:]

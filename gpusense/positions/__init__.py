@@ -1,1 +1,1 @@
-"""Positions from beacons without a filter: closed forms, least squares, and the covariance of their solutions."""
+"""Compute positions from beacons without a filter: closed forms, least squares and covariances."""

@@ -24,11 +24,11 @@ def triangulate(
 ) -> PositionFix:
     """Compute the position, and the heading if it is unknown, from bearings of beacons.
 
-    With a known heading two beacons suffice: their lines of sight intersect in closed form. Without it three suffice,
-    see :func:`triangulate_triangle`. With more beacons the solution is the global minimum of ``sum of rho(weight
-    (residual / sigma)^2)``, reached by Gauss-Newton steps from linear solutions and from closed forms of pairs or
-    triples. Lines of sight are rays: a beacon behind its bearing is no solution. With ``sigma``, all minima are
-    returned whose costs the noise cannot distinguish from the best.
+    If the heading is known, two beacons suffice: their lines of sight intersect in closed form. Otherwise three
+    suffice, see :func:`triangulate_triangle`. More beacons determine the global minimum of ``sum of rho(weight
+    (residual / sigma)^2)``: Gauss-Newton steps start from linear solutions and from closed forms of pairs or triples.
+    Lines of sight are rays: a beacon behind its bearing is no solution. If ``sigma`` is known, all minima are returned
+    that the noise cannot distinguish from the best.
 
     A call takes one set of measurements. Coordinates may be as large as in UTM.
 
@@ -37,16 +37,16 @@ def triangulate(
         bearings: (M,) directions to the beacons in the robot's frame, counter-clockwise from straight ahead [rad], any
             real numbers.
         heading: The robot's heading in the world [rad], or None if unknown.
-        sigma: Standard deviation of the bearings [rad], one or (M,), > 0. None if unknown: the covariance is then for
-            sigma = 1 rad, to be multiplied by the variance.
-        weights: (M,) factors >= 0 of the squared residuals; 0 leaves a beacon out. By default 1.
-        loss: "linear", "soft_l1", "huber", "cauchy" or "arctan", as in ``scipy.optimize.least_squares``. It is ignored
-            if there are no more bearings than unknowns.
+        sigma: Standard deviation of the bearings [rad], one or (M,), > 0. None if unknown: the covariance
+            then assumes 1 rad; multiply it by the variance.
+        weights: (M,) factors >= 0 of the squared residuals; 0 ignores a beacon. The default is 1.
+        loss: "linear", "soft_l1", "huber", "cauchy" or "arctan", as in ``scipy.optimize.least_squares``. It has no
+            effect without redundant bearings.
         loss_scale: Residual at which a robust loss bends [sigma, or rad without sigma], > 0.
 
     Returns:
         Positions (S, 2) for a known heading, else poses (S, 3). Statuses: "unique", "ambiguous", "at a beacon",
-        "singular"; without solutions "parallel", "in line", "coincident", "circle" and "behind". With more bearings
+        "singular"; without solutions "parallel", "in line", "coincident", "circle" and "behind". For more bearings
         than unknowns, "behind" has a solution.
 
     Raises:
@@ -89,15 +89,15 @@ def triangulate_triangle(xy: ArrayLike, bearings: ArrayLike, *, sigma: ArrayLike
     """Compute position and heading from the bearings of exactly three beacons, in closed form.
 
     The lectures solve the triangles robot-beacon-beacon by the law of cosines, D_ij^2 = z_i^2 + z_j^2 - 2 z_i z_j
-    cos(b_j - b_i). This function obtains the same pose from linear equations, without iterations and without special
-    cases for beacons in line: see :func:`gpusense.positions.closed_forms.three_bearings`.
+    cos(b_j - b_i). This function solves linear equations for the same pose, without iterations or special cases for
+    beacons in line: see :func:`gpusense.positions.closed_forms.three_bearings`.
 
     Args:
         xy: (3, 2) positions of the beacons [m].
         bearings: (3,) directions to the beacons in the robot's frame, counter-clockwise from straight ahead [rad], any
             real numbers.
-        sigma: Standard deviation of the bearings [rad], one or (3,), > 0. None if unknown: the covariance is then for
-            sigma = 1 rad, to be multiplied by the variance.
+        sigma: Standard deviation of the bearings [rad], one or (3,), > 0. None if unknown: the covariance
+            then assumes 1 rad; multiply it by the variance.
 
     Returns:
         One pose (1, 3) with status "unique" or "at a beacon", or no pose with status "circle", "in line", "coincident"
@@ -129,7 +129,7 @@ def triangulate_triangle(xy: ArrayLike, bearings: ArrayLike, *, sigma: ArrayLike
 
 
 def _angle_rounding(problem: Problem) -> float:
-    """Return the rounding error of the bearings, often reduced by whole turns or differences of larger angles."""
+    """Return the rounding error of the bearings, which may be reduced by whole turns."""
     assert problem.bearings is not None
     return EPS * (4 * ROUNDINGS + float(np.abs(problem.bearings).max()))
 
@@ -145,11 +145,11 @@ def _triple_blur(problem: Problem, triples: NDArray[np.intp], state: Floats | No
     Args:
         problem: The measurements.
         triples: (N, 3) beacons.
-        state: A pose; None for a robot as far from the beacons as these are from each other. The rounding of
-            coordinates has the largest effect on the direction to a near beacon.
+        state: A pose, where rounded coordinates affect the direction to a near beacon most; None assumes a robot at
+            the beacons' distance from each other.
 
-    The terms m_i exp(-i b_i) sin(b_j - b_k) change with the sines by |m_i| cos(b_j - b_k) times the error of an angle.
-    This is larger than the terms themselves where the beacons are seen in nearly one direction.
+    The error of an angle, times |m_i| cos(b_j - b_k), changes the terms m_i exp(-i b_i) sin(b_j - b_k). For beacons in
+    nearly one direction this exceeds the terms.
 
     Returns:
         (N,) errors.
@@ -175,9 +175,9 @@ def _line_or_circle(problem: Problem) -> str:
 
 
 def _on_circle(problem: Problem, triples: NDArray[np.intp], clarity: Floats, fix: PositionFix) -> PositionFix:
-    """Return a result, or an empty one with status "circle" if one circle holds the beacons and the robot.
+    """Return ``fix``, or an empty result with status "circle" if beacons and robot share a circle.
 
-    Bearings of unknown heading have a singular Jacobian only there.
+    Only there is the Jacobian of bearings of unknown heading singular.
     """
     if problem.heading is not None or fix.status not in ("singular", "unique"):
         return fix
@@ -187,7 +187,7 @@ def _on_circle(problem: Problem, triples: NDArray[np.intp], clarity: Floats, fix
 
 
 def _no_solution(problem: Problem) -> str:
-    """Return the status if beacons or lines of sight determine no point or infinitely many, else ""."""
+    """Return the status of beacons or lines of sight that determine no point or infinitely many, else ""."""
     assert problem.bearings is not None
     places = np.unique(problem.xy, axis=0)
     if len(places) == 1 or (problem.heading is None and len(places) == 2):
@@ -195,7 +195,7 @@ def _no_solution(problem: Problem) -> str:
     turned = problem.bearings - problem.bearings[0]
     if np.abs(np.sin(turned)).max() > _blur(problem):
         return ""
-    # All lines of sight are parallel. They may coincide.
+    # All lines of sight are parallel, and may coincide.
     line = in_line(problem.xy, problem.noise)
     if problem.heading is None:
         return "behind" if line is None else "in line"
@@ -221,7 +221,7 @@ def _triples(problem: Problem, triples: NDArray[np.intp]) -> tuple[Floats, Float
 
 
 def _exact(problem: Problem, states: Floats, rho: Floats) -> PositionFix:
-    """Make the result for as many bearings as unknowns: the closed form's solution, if it is valid."""
+    """Make the result without redundant bearings: the closed form's solution, if it is valid."""
     if problem.at_beacon(states[0]):
         return problem.fix(states, "at a beacon")
     return problem.fix([], "behind") if rho.min() < 0 else problem.fix(states, "unique")
@@ -238,8 +238,8 @@ def _nearest_point(problem: Problem) -> Floats:
 def _linear_pose(problem: Problem) -> Floats:
     """Return (2, 3) poses of opposite headings, by Im((m_i q - s) exp(-i b_i)) = 0 with q = exp(-i theta), s = p q.
 
-    The equations are linear and homogeneous in q and s. The right singular vector of the least singular value is their
-    solution in least squares.
+    The equations are linear and homogeneous in q and s; the right singular vector of the least singular value solves
+    them in least squares.
     """
     assert problem.bearings is not None
     turn, length = np.exp(-1j * problem.bearings), problem.spread

@@ -15,7 +15,7 @@ Complexes = NDArray[np.complex128]
 Words = NDArray[np.str_]
 
 EPS = float(np.finfo(np.float64).eps)
-# Lengths or sines count as equal if they differ by at most this number of roundings.
+# Lengths or sines that differ by at most this number of roundings are equal.
 ROUNDINGS = 16
 
 
@@ -30,9 +30,9 @@ def two_circles(
     """Intersect pairs of circles ("Distances Only, No Uncertainty").
 
     With the beacons at 0 and a on the x axis, x = (a^2 + d1^2 - d2^2) / 2a and y = +-sqrt(d1^2 - x^2). These formulas
-    lose digits if the triangle of the beacons and the robot is flat. Here x is measured from the beacon with the
-    smaller range, as ((a - d2)(a + d2) + d1^2) / 2a, and y is the height of the triangle, 2 area / a, with Kahan's area
-    ("Miscalculating Area and Angles of a Needle-like Triangle", 2014), in which only the sides themselves cancel.
+    lose digits for flat triangles of beacons and robot. Here x counts from the beacon with the smaller range, as ((a -
+    d2)(a + d2) + d1^2) / 2a, and y is the height of the triangle, 2 area / a, with Kahan's area ("Miscalculating Area
+    and Angles of a Needle-like Triangle", 2014), which subtracts only the sides.
 
     Args:
         first: (N,) centres of the first circles.
@@ -45,8 +45,8 @@ def two_circles(
     Returns:
         (N, 2) points, beginning with the point to the left of the direction from ``first`` to ``second``; and (N,)
         statuses: "two" (the circles intersect), "tangent", "disjoint", "contained" (one inside the other) or
-        "coincident" (one centre). Without an intersection both points are the nearest one on the line of centres (least
-        squares); NaN for one centre.
+        "coincident" (one centre). For circles that do not intersect, both points are the nearest point on the line of
+        centres (least squares); NaN for one centre.
     """
     base = second - first
     a = np.abs(base)
@@ -62,13 +62,13 @@ def two_circles(
         x = np.where(swap, a - x, x)
         gap = a - d1 - d2
         apart = d1 + gap * share
-        # Contained: seen from the larger circle's centre, the nearest points lie beyond the smaller circle's centre.
+        # Contained: from the larger circle's centre, the nearest points are beyond the smaller circle's centre.
         inside = np.where(swap, d1 - (d1 - d2 - a) * share, -(d1 + (d2 - d1 - a) * share))
         status = np.where(gap > tolerance, "disjoint", np.where(slack < -tolerance, "contained", "two"))
         status = np.where((status == "two") & (slack <= tolerance), "tangent", status)
         status = np.where(a <= noise, "coincident", status)
         crossing = status == "two"
-        # A tangent point is also a nearest point: gap and slack are rounding errors.
+        # A tangent point is a nearest point: gap and slack are rounding errors.
         x = np.where(crossing, x, np.where(high == a, apart, inside))
         y = np.where(crossing, y, 0.0)
         along = np.where(a > noise, base / a, np.nan)
@@ -103,15 +103,15 @@ def two_rays(first: Complexes, second: Complexes, angle1: Floats, angle2: Floats
 def three_bearings(beacons: Complexes, bearings: Floats) -> tuple[Complexes, Floats, Floats, Floats]:
     """Compute position and heading from three bearings ("Bearings Only").
 
-    (m_i - p) exp(-i (b_i + theta)) is real and positive. With beacon 2 as origin its imaginary parts are three linear
-    equations in exp(-i theta) and p exp(-i theta). Eliminating p leaves
+    (m_i - p) exp(-i (b_i + theta)) is real and positive. Let beacon 2 be the origin: the imaginary parts are three
+    linear equations in exp(-i theta) and p exp(-i theta). Eliminating p leaves
 
         w = sum of m_i exp(-i b_i) sin(b_j - b_k) over the cyclic (i, j, k),   exp(i theta) = +-w / |w|,
 
-    and the position follows from the two lines of sight with the largest angle between them. Unlike laws of cosines or
+    and the two lines of sight with the largest angle between them determine the position. Unlike laws of cosines or
     cotangents (Pierlot and Van Droogenbroeck, "A New Three Object Triangulation Algorithm for Mobile Robot
-    Positioning", 2014) this form has no special cases for beacons in line, or for a robot in line with two beacons.
-    w = 0 on the circle through the beacons.
+    Positioning", 2014) this form needs no special cases for beacons in line, or for a robot in line with two beacons. w
+    = 0 on the circle through the beacons.
 
     Args:
         beacons: (N, 3) positions.
@@ -123,7 +123,7 @@ def three_bearings(beacons: Complexes, bearings: Floats) -> tuple[Complexes, Flo
     """
     terms = np.empty(beacons.shape, np.complex128)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        # The sum does not depend on the origin; the middle of the beacons keeps most digits.
+        # The sum is independent of the origin; the middle of the beacons keeps most digits.
         terms[:, i] = (beacons[:, i] - beacons.mean(axis=1)) * np.exp(-1j * bearings[:, i])
         terms[:, i] *= np.sin(bearings[:, j] - bearings[:, k])
     w, size = terms.sum(axis=1), np.abs(terms).sum(axis=1)
@@ -138,7 +138,7 @@ def three_bearings(beacons: Complexes, bearings: Floats) -> tuple[Complexes, Flo
     point, _, _ = two_rays(beacons[row, i], beacons[row, j], angle[row, i], angle[row, j])
     with np.errstate(invalid="ignore"):
         rho = ((beacons - point[:, None]) * np.exp(-1j * angle)).real
-    # A turn by pi changes the signs of all distances and keeps the position.
+    # A turn by pi changes the signs of all distances, but not the position.
     turned = np.nansum(np.sign(rho), axis=1) < 0
     heading = np.where(turned, heading + np.pi, heading)
     return point, wrap(heading), np.where(turned[:, None], -rho, rho), clarity

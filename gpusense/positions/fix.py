@@ -28,7 +28,7 @@ STATUSES = {
     "at a beacon": "the robot stands at a beacon: the bearing to it, and the direction of its range, have no meaning",
     "singular": "the measurements do not fix the position: the information matrix is singular",
 }
-"""The meaning of each status."""
+"""Meaning of each status."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +39,14 @@ class PositionFix:
         solutions: (S, 2) x and y [m], or (S, 3) with theta [rad] in [-pi, pi]; S is 0 if there are none or infinitely
             many.
         covariance: (S, 2, 2) or (S, 3, 3) [m^2, m rad, rad^2] to first order in the noise; NaN if the information
-            matrix is singular. Without sigma it is for sigma = 1: multiply it by the variance.
+            matrix is singular. Unless sigma is known it assumes sigma = 1: multiply it by the variance.
         residuals: (S, M) measured less expected ranges [m] or bearings [rad, within +-pi]; (S, M, 2) for both.
         cost: (S,) sum of the weighted squared residuals in sigmas, under the loss; chi-squared for the linear loss.
         condition: (S,) condition number of the Jacobian in sigmas, with the heading in units that balance the position;
             1 is best, inf is singular.
         status: One of :data:`gpusense.positions.fix.STATUSES`.
-        degenerate: Whether the geometry, not the noise, leaves the best solution undetermined: no solution exists, or
-            its information matrix is singular.
+        degenerate: True if the geometry leaves the best solution undetermined: no solution exists, or its information
+            matrix is singular.
 
     Example:
         >>> import gpusense as gs

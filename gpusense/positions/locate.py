@@ -33,9 +33,9 @@ def locate(
     """Compute the pose from ranges and bearings of beacons.
 
     Two beacons suffice, or one if the heading is known. The solution is the minimum of ``sum of rho(weight (residual /
-    sigma)^2)`` over ranges and bearings. Gauss-Newton steps reach it from the rigid motions that map the measured
-    points onto the beacons, of all beacons and of pairs, and from the intersections of pairs of circles. All minima are
-    returned whose costs the noise cannot distinguish from the best.
+    sigma)^2)`` over ranges and bearings. Gauss-Newton steps start from the rigid motions that map the measured points
+    onto the beacons, all or in pairs, and from the intersections of pairs of circles. All minima are returned that the
+    noise cannot distinguish from the best.
 
     A call takes one set of measurements. Coordinates may be as large as in UTM.
 
@@ -47,7 +47,7 @@ def locate(
         heading: The robot's heading in the world [rad], or None if unknown.
         sigma_range: Standard deviation of the ranges [m], one or (M,), > 0.
         sigma_bearing: Standard deviation of the bearings [rad], one or (M,), > 0.
-        weights: (M,) factors >= 0 of the squared residuals; 0 leaves a beacon out. By default 1.
+        weights: (M,) factors >= 0 of the squared residuals; 0 ignores a beacon. The default is 1.
         loss: "linear", "soft_l1", "huber", "cauchy" or "arctan", as in ``scipy.optimize.least_squares``; applied to
             each range and to each bearing.
         loss_scale: Residual at which a robust loss bends [sigma], > 0.
@@ -78,7 +78,7 @@ def locate(
     if heading is None and np.hypot(*(problem.xy - problem.xy[0]).T).max() <= problem.noise:
         return problem.fix([], "coincident")
     assert problem.ranges is not None
-    # A beacon at range 0 has no bearing: a huge standard deviation removes it from the cost.
+    # A huge standard deviation removes the meaningless bearing to a beacon at range 0.
     problem = replace(
         problem, sigma_bearing=np.where(problem.ranges <= problem.touch, NO_BEARING, problem.sigma_bearing)
     )
@@ -93,7 +93,7 @@ def _starts(problem: Problem) -> Floats:
     assert problem.ranges is not None and problem.bearings is not None
     world, count = problem.points, len(problem.xy)
     if problem.heading is not None:
-        # With a known heading each beacon determines a position.
+        # Each beacon and a known heading determine a position.
         positions = world - problem.ranges * np.exp(1j * (problem.bearings + problem.heading))
         points, headings = np.append(positions, positions.mean()), np.full(count + 1, problem.heading)
     else:
@@ -111,13 +111,13 @@ def _starts(problem: Problem) -> Floats:
 def _rigid(problem: Problem, sets: NDArray[np.intp]) -> tuple[NDArray[np.complex128], Floats]:
     """Return (N,) positions and headings that map the measured points of (N, K) beacons onto the beacons.
 
-    In least squares the heading is the angle of sum conj(z_i - z) (m_i - m), with means z and m (Horn 1987, in the
+    The heading of least squares is the angle of sum conj(z_i - z) (m_i - m), with means z and m (Horn 1987, in the
     plane).
     """
     assert problem.ranges is not None and problem.bearings is not None
     seen = (problem.ranges * np.exp(1j * problem.bearings))[sets]
     world = problem.points[sets]
-    # The error of a measured point, along the ray and across it.
+    # Error of a measured point, along and across the ray.
     variance = problem.sigma_range**2 + (problem.ranges * problem.sigma_bearing) ** 2
     share = (problem.weights / variance)[sets]
     share = share / share.sum(axis=1, keepdims=True)

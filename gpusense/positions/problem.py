@@ -18,7 +18,7 @@ from gpusense.world.plausible import look_at_bearings
 
 Floats = NDArray[np.float64]
 
-# rho(z), rho'(z) and rho''(z) of the squared residual z, as scipy.optimize.least_squares names them.
+# rho(z), rho'(z) and rho''(z) of the squared residual z, by the names of scipy.optimize.least_squares.
 LOSSES: dict[str, Callable[[Floats], tuple[Floats, Floats, Floats]]] = {
     "linear": lambda z: (z, np.ones_like(z), np.zeros_like(z)),
     "soft_l1": lambda z: (2 * z / (np.sqrt(1 + z) + 1), (1 + z) ** -0.5, -0.5 * (1 + z) ** -1.5),
@@ -30,16 +30,15 @@ LOSSES: dict[str, Callable[[Floats], tuple[Floats, Floats, Floats]]] = {
     "cauchy": lambda z: (np.log1p(z), 1 / (1 + z), -1 / (1 + z) ** 2),
     "arctan": lambda z: (np.arctan(z), 1 / (1 + z * z), -2 * z / (1 + z * z) ** 2),
 }
-# Condition number from which on a Jacobian counts as singular, as it is rounded to about 1e-16.
+# Least condition number of a singular Jacobian, given rounding errors of about 1e-16.
 SINGULAR = 1e12
-# A robot nearer to a beacon than this share of the scene's spread stands at it: in bad geometry rounding of 1e-15 grows
-# to this.
+# A robot within this share of the scene's spread is at the beacon: bad geometry amplifies rounding of 1e-15 to this.
 TOUCH = 1e-12
-# Limits of deviations, of the scale of a loss and of weights, whose squares stay far within float64.
+# Limits of deviations, scales of losses and weights; their squares stay far within float64.
 _SMALL, _LARGE = 1e-12, 1e12
 # Differences of coordinates below this are 0 [m].
 _SAME_PLACE = 1e-100
-# Largest number of subsets of the beacons whose closed forms are starts.
+# Largest number of subsets of beacons whose closed forms are starts.
 STARTS = 300
 
 
@@ -49,7 +48,7 @@ class Problem:
 
     Attributes:
         xy: (M, 2) beacons relative to ``origin`` [m].
-        origin: (2,) origin in the world, which keeps the digits of beacons at UTM coordinates [m].
+        origin: (2,) origin in the world [m]; it keeps all digits of UTM coordinates.
         ranges: (M,) or None [m].
         bearings: (M,) or None [rad].
         heading: The known heading, or None [rad].
@@ -85,17 +84,17 @@ class Problem:
 
     @property
     def spread(self) -> float:
-        """Length scale of the scene: the largest distance of a beacon from their mean, or the largest range."""
+        """Length scale of the scene: the largest distance of a beacon from the mean, or the largest range."""
         reach = float(np.hypot(*(self.xy - self.xy.mean(axis=0)).T).max())
         return max(reach, 0.0 if self.ranges is None else float(self.ranges.max()))
 
     @functools.cached_property
     def touch(self) -> float:
-        """Distance up to which the robot stands at a beacon, where its direction is rounding error."""
+        """Largest distance of a robot at a beacon; closer, the beacon's direction is rounding error."""
         return max(TOUCH * self.spread, 4 * self.noise)
 
     def at_beacon(self, state: Floats) -> bool:
-        """Return whether the robot stands at a beacon."""
+        """Return whether the robot is at a beacon."""
         return bool(np.hypot(*(self.xy - state[:2]).T).min() <= self.touch)
 
     @property
@@ -115,7 +114,7 @@ class Problem:
         return np.concatenate(parts, axis=1)
 
     def jacobian(self, state: Floats) -> Floats:
-        """Return the (R, d) derivatives of the expected measurements at a state; zero for a robot at the beacon."""
+        """Return the (R, d) derivatives of the expected measurements at a state; 0 for a robot at the beacon."""
         dx, dy = (self.xy - state[:2]).T
         rho = np.hypot(dx, dy)
         known = rho > self.touch
@@ -152,8 +151,8 @@ class Problem:
     def information(self, state: Floats) -> tuple[Floats, float]:
         """Return the covariance of a solution and the condition number of its Jacobian.
 
-        Noise e in sigmas moves the estimate by A^-1 J^T V e, with the weights V and A = J^T V J. Its covariance is
-        therefore A^-1 J^T V^2 J A^-1, for V = 1 the inverse of the information matrix. The weights of a robust loss
+        Noise e in sigmas moves the estimate by A^-1 J^T V e, with the weights V and A = J^T V J. The covariance is
+        therefore A^-1 J^T V^2 J A^-1; for V = 1 it is the inverse of the information matrix. Weights of a robust loss
         count as constants.
         """
         scaled = self.residuals(state[None])[0] * self.scales
@@ -177,8 +176,8 @@ class Problem:
 
         Args:
             states: (S, d) solutions, the best first.
-            status: Status of the best; "unique" and the like become "singular" if its information is.
-            flat: True if the information is known to be singular, despite rounding.
+            status: Status of the best; "unique" and the like become "singular" if the information matrix is.
+            flat: True if the information matrix is known to be singular, despite rounding.
         """
         solutions = np.asarray(states, np.float64).reshape(-1, self.dimension)
         assert status in STATUSES
@@ -190,7 +189,7 @@ class Problem:
             status = "singular"
         residuals = self.residuals(solutions)
         kinds = residuals.shape[1] // len(self.xy)
-        # Beacons of weight 0 have residuals of NaN.
+        # Residuals of beacons of weight 0 are NaN.
         blocks = np.full((len(solutions), kinds, len(self.used)), np.nan)
         blocks[:, :, self.used] = residuals.reshape(len(solutions), kinds, len(self.xy))
         world = solutions.copy()
@@ -245,22 +244,7 @@ def make_problem(
     least: int = 1,
     reason: str = "",
 ) -> Problem:
-    """Check the arguments of a public function and make a problem without the beacons of weight 0.
-
-    Args:
-        xy: (M, 2) positions of the beacons [m].
-        ranges: (M,) distances [m], or None.
-        bearings: (M,) bearings [rad], or None.
-        heading: The known heading [rad], or None.
-        sigma_range: Standard deviations of the ranges [m].
-        sigma_bearing: Standard deviations of the bearings [rad].
-        names: Names of these two arguments, for messages.
-        weights: (M,) factors of the squared residuals.
-        loss: Name of the loss.
-        loss_scale: Residual at which the loss bends.
-        least: Least number of beacons of positive weight.
-        reason: Reason of that number, for messages.
-    """
+    """Check the arguments of a public function and make a problem without the beacons of weight 0."""
     positions = checks.array("xy", xy, ("M", 2), largest=checks.FARTHEST)
     count = len(positions)
     distances = None if ranges is None else _not_negative("ranges", ranges, count, checks.FARTHEST)
@@ -278,7 +262,7 @@ def make_problem(
     used = factors > 0
     _check_number(used, least, reason)
     positions, factors = positions[used], factors[used]
-    # The middle of the box is rounded as finely as the beacons; differences of near numbers are exact.
+    # The middle of the box has the same spacing of floats as the beacons, so that differences are exact.
     origin = positions.min(axis=0) / 2 + positions.max(axis=0) / 2
     relative = positions - origin
     relative[np.abs(relative) < _SAME_PLACE] = 0.0
@@ -317,7 +301,7 @@ def _check_number(used: NDArray[np.bool], least: int, reason: str) -> None:
 
 
 def subsets(count: int, size: int) -> NDArray[np.intp]:
-    """Return (N, size) index subsets of ``count`` beacons: all of them, or STARTS drawn with a fixed seed."""
+    """Return (N, size) index subsets of ``count`` beacons: all, or STARTS drawn with a fixed seed."""
     if math.comb(count, size) <= STARTS:
         return np.array(list(itertools.combinations(range(count), size)), np.intp).reshape(-1, size)
     rng = np.random.default_rng(0)

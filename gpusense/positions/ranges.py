@@ -23,20 +23,20 @@ def trilaterate(
 ) -> PositionFix:
     """Compute the position from distances to beacons.
 
-    With two beacons the solutions are both intersections of their circles, in closed form; if the circles do not
-    intersect, the solution is the point of least squares between them. With three or more beacons the solution is the
-    global minimum of ``sum of rho(weight (residual / sigma)^2)``, reached by Gauss-Newton steps from the linearised
-    solution and from the intersections of pairs of circles. For beacons in line the mirror image is the second
-    solution. With ``sigma``, all minima are returned whose costs the noise cannot distinguish from the best.
+    For two beacons the solutions are both intersections of their circles, in closed form, or the least-squares point
+    between circles that do not intersect. Three or more beacons determine the global minimum of ``sum of rho(weight
+    (residual / sigma)^2)``: Gauss-Newton steps start from the linearised solution and from the intersections of pairs
+    of circles. For beacons in line the mirror image is the second solution. If ``sigma`` is known, all minima are
+    returned that the noise cannot distinguish from the best.
 
     A call takes one set of measurements. Coordinates may be as large as in UTM.
 
     Args:
         xy: (M, 2) positions of the beacons [m], M >= 2.
         ranges: (M,) measured distances [m], >= 0.
-        sigma: Standard deviation of the ranges [m], one or (M,), > 0. None if unknown: the covariance is then for sigma
-            = 1 m, to be multiplied by the variance.
-        weights: (M,) factors >= 0 of the squared residuals; 0 leaves a beacon out. By default 1.
+        sigma: Standard deviation of the ranges [m], one or (M,), > 0. None if unknown: the covariance then assumes 1
+            m; multiply it by the variance.
+        weights: (M,) factors >= 0 of the squared residuals; 0 ignores a beacon. The default is 1.
         loss: "linear" (least squares), "soft_l1", "huber", "cauchy" or "arctan", as in
             ``scipy.optimize.least_squares``. It is ignored for two beacons, which cannot show an outlier.
         loss_scale: Residual at which a robust loss bends [sigma, or m without sigma], > 0.
@@ -47,8 +47,7 @@ def trilaterate(
 
     Raises:
         TypeError: An argument has the wrong type.
-        ValueError: A shape or value breaks its rule, or fewer than two beacons are left, which leaves a circle of
-            solutions.
+        ValueError: A shape or value breaks its rule, or fewer than two beacons remain, with a circle of solutions.
 
     Source: lectures, "Distances Only, No Uncertainty"; Thrun, Burgard and Fox, *Probabilistic Robotics*, section 6.6.
 
@@ -92,10 +91,10 @@ def _pairs(problem: Problem, pairs: NDArray[np.intp]) -> tuple[Floats, NDArray[n
 
 
 def _linearised(problem: Problem) -> Floats:
-    """Solve the differences of the circles' equations, which are linear in the position, for a (1, 2) point.
+    """Solve the differences of the circles' equations, linear in the position, for a (1, 2) point.
 
-    Each equation is |p|^2 - 2 m p + |m|^2 = d^2, less the weighted mean of all. For beacons in line the point lies on
-    their line.
+    Each equation is |p|^2 - 2 m p + |m|^2 = d^2, less the weighted mean of all. Beacons in line put the point on their
+    line.
     """
     assert problem.ranges is not None
     share = problem.scales**2 / np.sum(problem.scales**2)
@@ -106,17 +105,17 @@ def _linearised(problem: Problem) -> Floats:
 
 
 def _beside_line(problem: Problem, starts: Floats, line: tuple[Floats, Floats], *, known_sigma: bool) -> PositionFix:
-    """Solve for beacons in line: return a solution and its mirror image, or one on the line itself."""
+    """Solve for beacons in line: return a solution and its mirror image, or a solution on the line."""
     point, direction = line
     normal = np.array([-direction[1], direction[0]])
     assert problem.ranges is not None
     along = ((problem.xy - point) @ direction)[:, None] + problem.ranges[:, None] * (-1, 1)
     on, on_cost = minima(problem, point + along.reshape(-1, 1) * direction, line)
-    # Mirror images have equal costs, so that the left side suffices.
+    # Mirror images cost the same: search the left side only.
     left = starts + (np.abs(aside := (starts - point) @ normal) - aside)[:, None] * normal
     states, costs = minima(problem, left)
     aside = (states - point) @ normal
-    # A solution nearer to the line than the root of the rounding error is its own image.
+    # A solution nearer to the line than the root of the rounding error coincides with its image.
     off = np.abs(aside) > 1e-7 * problem.spread
     states, costs = distinct(problem, states[off] + (np.abs(aside) - aside)[off, None] * normal)
     rounding = (1e-14 * problem.spread * problem.scales.max()) ** 2 * len(problem.xy)

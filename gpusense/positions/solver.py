@@ -1,4 +1,4 @@
-"""Find the lowest minima of a problem's cost by least squares from several starts, good or bad."""
+"""Find the lowest minima of a problem's cost by least squares from several starts."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ import numpy as np
 from gpusense.positions.closed_forms import wrap
 from gpusense.positions.problem import LOSSES, Floats, Problem
 
-# Largest number of starts followed to their minima, and the least distance between them, in spreads of the scene (or
-# radians).
+# Largest number of starts to follow, and the least distance between them, in spreads of the scene (or radians).
 FOLLOWED = 8
 APART = 0.05
-# Minima nearer to each other than this count as the same.
+# Minima within this distance count as the same.
 SAME = 1e-6
-# Relative changes at which the search stops: coarse from the starts, then down to rounding from the lowest minima.
+# Relative changes at which the search stops: coarse from the starts, then at rounding from the lowest minima.
 COARSE, FINE = 1e-4, 1e-15
 # Minima whose costs differ by less are ambiguous: 3 sigma of a likelihood ratio.
 AMBIGUOUS = 9.0
@@ -33,14 +32,14 @@ def descend(problem: Problem, start: Floats, line: tuple[Floats, Floats] | None,
     Args:
         problem: The measurements.
         start: (d,) state.
-        line: Point and direction (2,) of the line that the position must stay on; None for no constraint.
+        line: Point and direction (2,) of a line that constrains the position, or None.
         step: Relative change of the cost and of the state at which the search stops.
     """
     from scipy.optimize import least_squares
 
     unit = np.ones(problem.dimension)
     unit[:2] = problem.spread or 1.0
-    # Columns are the directions in which the state may move, in comparable units.
+    # Columns are the free directions of the state, in comparable units.
     base, moves = np.zeros(problem.dimension), np.diag(unit)
     if line is not None:
         base[:2] = line[0]
@@ -73,12 +72,12 @@ def minima(
 
     Args:
         problem: The measurements.
-        starts: (N, d) states; non-finite states are left out. The best states are followed, each at least APART from
-            the previous ones.
+        starts: (N, d) states; non-finite states are ignored. The search follows the best states, each at least APART
+            from the previous ones.
         line: See :func:`descend`.
 
     Returns:
-        (S, d) minima whose costs are near the lowest, the lowest first, and (S,) their costs; S is 0 if no start is
+        (S, d) minima with costs near the lowest, the lowest first, and their (S,) costs; S is 0 if no start is
         finite.
     """
     pending = np.asarray(starts, np.float64).reshape(-1, problem.dimension)
@@ -114,8 +113,8 @@ def distinct(problem: Problem, states: Floats) -> tuple[Floats, Floats]:
 def pick(states: Floats, costs: Floats, *, known_sigma: bool) -> tuple[Floats, str]:
     """Pick the solutions among minima, the lowest first, and the status.
 
-    Without known noise the lowest minimum is the solution. With it, all minima that the noise cannot distinguish from
-    the lowest are solutions.
+    If the noise is unknown, the lowest minimum is the solution; otherwise all minima that the noise cannot distinguish
+    from it are.
     """
     if not known_sigma or len(states) < 2:
         return states[:1], "unique"
@@ -133,7 +132,7 @@ def in_line(points: Floats, noise: float) -> tuple[Floats, Floats] | None:
     far = int(np.argmax(away))
     direction = offset[far] / away[far]
     aside = np.abs(offset[:, 1] * direction[0] - offset[:, 0] * direction[1])
-    # Both ends of an offset are rounded, and the rounding of the farthest point turns the line.
+    # Rounding affects both ends of an offset, and the farthest point's rounding turns the line.
     return (points[0], direction) if aside.max() <= 8 * noise else None
 
 

@@ -1,7 +1,7 @@
 """Options, scenes, timings and reports that the scripts of ``bench/`` share.
 
 A script runs from a checkout, with an installed gpusense: ``python bench/speed/limits.py ...``. Its line
-``sys.path.insert(0, str(Path(__file__).resolve().parents[1]))`` makes this file and the folders beside it importable.
+``sys.path.insert(0, str(Path(__file__).resolve().parents[1]))`` makes this file and its sibling folders importable.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def make_parser(
     """Make a parser with the options that the scripts share.
 
     Args:
-        doc: The script's docstring, which is its help.
+        doc: The script's docstring, shown as its help.
         backend: The default of ``--backend``: "present" for every device of the machine, "kernels" for every one but
             NumPy, the selection string of a single device, "" for no such option.
         data: Whether the script reads recorded data.
@@ -412,7 +412,7 @@ def publish(script: str, arguments: argparse.Namespace, text: str, report: dict[
         script: The script's ``__file__``.
         arguments: Those of :func:`parse`.
         text: The tables.
-        report: The contents of the .json file beside machine and command.
+        report: The contents of the .json file, without machine and command.
         remark: Sentences before the machine.
     """
     command = command_line(Path(script).resolve().relative_to(ROOT).as_posix())

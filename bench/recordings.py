@@ -136,7 +136,7 @@ def _olin():
 
 
 def wean(log):
-    """Return a log of wean_hall, which has no reference poses."""
+    """Return a log of wean_hall, without reference poses."""
     folder = data() / "wean_hall"
     steps = read_steps(folder / f"{log}.log.gz")
     events = [Event(0, s.scan.ranges, np.array(s.odometry), np.full(3, np.nan)) for s in steps]

@@ -28,7 +28,7 @@ def read(files):
 
 
 def labelled(job, rows):
-    """Return which scans have a right pose, which have a wrong one by the definition of p_lost, and which for long."""
+    """Return masks of scans with a right pose, with a wrong one as p_lost defines it, and with a long-wrong one."""
     known = np.isfinite(rows[:, ERROR])
     wrong = np.full(len(rows), job["case"] == "wrong")
     near = known & ~wrong & (rows[:, ERROR] < 1) & (rows[:, HEADING] < 0.5)

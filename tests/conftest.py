@@ -17,7 +17,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from gpusense.backends import Backend, arrays, get_backend
 from gpusense.backends.base import Adopted
 
-# Failed assertions of helpers show their values, like those of tests.
+# Failed assertions of helpers show their values, as in tests.
 pytest.register_assert_rewrite("support")
 from support.array_libraries import Array, counted_copies, installed  # noqa: E402
 from support.map_files import yaml_text  # noqa: E402
@@ -27,7 +27,7 @@ from support.selection import BACKENDS, NO_FLOAT64, lacks_float64, present, skip
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 
-# Folders and files of the five-minute subset, ``-m quick``; CONTRIBUTING.md says what it covers.
+# Folders and files of the five-minute subset, ``-m quick``; see CONTRIBUTING.md.
 QUICK = (
     "commands/test_cli.py", "commands/test_first_hour.py", "commands/test_output.py", "evaluation/test_score.py",
     "interface", "kernels/test_kernel_casts.py", "kernels/test_kernel_flags.py", "kernels/test_kernel_signatures.py",
@@ -137,7 +137,7 @@ def device(request: pytest.FixtureRequest, needs: Callable[[str], str]) -> Backe
 def as_gpu(backend: str) -> Iterator[Callable[..., Backend]]:
     """Return a function that makes each tested backend pretend to be a GPU (True) or a processor (False).
 
-    With ``scalar`` the processor's kernels compute one particle or beam at once, as those of a GPU do.
+    With ``scalar`` the processor's kernels compute one particle or beam at a time, like a GPU's kernels.
     """
     device = get_backend(backend)
     before = device.info

@@ -12,7 +12,7 @@ are wall time without the first call's compilation.
 "error" is the root mean square distance from the reference after alignment. "drift" is the mean error of relative
 poses over a path of 5, 20 and 100 m, per length. "contradicted" closures differ from the reference by more than 0.5 m
 or 0.15 rad. "wrong motions" from scan to scan differ by more than 0.3 m or 0.1 rad; those "said" lie in doubtful
-stretches. The references have errors as well. Therefore "fit better" counts the contradicted closures that put more end
+stretches. The references also have errors. Therefore "fit better" counts the contradicted closures that put more end
 points of five scans around one place within 10 cm of those around the other than the reference does. The reference of
 jarvis is a track by reflectors with a clock of its own, that of olin takes scans as instantaneous: each is shifted in
 time by up to 0.25 s, to where the error of a row is least.

@@ -145,7 +145,7 @@ def remounted(poses: np.ndarray, mount: np.ndarray, off: np.ndarray) -> np.ndarr
 
 
 def fitted(log: Log, poses: np.ndarray, part: slice, steps: tuple[float, ...]) -> np.ndarray:
-    """Return the offsets of mount and clock (4,) with the least drift on a part; those with a step of 0 stay 0."""
+    """Return the offsets of mount and clock (4,) with the least drift on a part; offsets with a step of 0 stay 0."""
     free = np.flatnonzero(steps)
     start = np.array([0.0, 0.0, 0.0, 0.05])
 

@@ -101,7 +101,7 @@ def olin(folder: Path) -> Log:
 
 
 def jarvis(folder: Path, laser: str) -> Log:
-    """Return the log of one of the bag's lasers; the navigation scanner turns once in an eighth of a second."""
+    """Return the log of a laser of the bag; the navigation scanner turns once in an eighth of a second."""
     topic = {"s3000": "security", "nav350": "navigation"}[laser]
     bag = folder / "jarvis_complex_path_fast.bag"
     scans = list(gs.read_log(bag, topic=f"/driver_laser_{topic}/laser_scan"))

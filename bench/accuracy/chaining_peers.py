@@ -18,7 +18,7 @@ import gpusense as gs
 
 CODE = Path(__file__).resolve().parent / "peer_code" / "csm.c"
 VOXELS = (0.1, 0.3, 1.0)
-# Files of CSM that draw, need other libraries, or are programs of their own.
+# Files of CSM that draw, need other libraries, or are programs.
 _LEFT_OUT = ("test", "cairo", "drawing", "mbicp", "_load")
 _CONFIGURATION = "#define STDC_HEADERS 1\n" + "\n".join(
     f"#define HAVE_{name} 1"

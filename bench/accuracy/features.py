@@ -11,7 +11,7 @@
 - ``chance``: poles in scans of independent ranges, which have no shape.
 - ``ransac``: lines by scikit-image's RANSAC, one after another, beside gpusense's.
 - ``real``: the share of features of recorded scans that are found again from another place, and their distances in
-  standard deviations. The reference poses are not exact: their deviations are taken as 3 cm and 0.01 rad (jarvis 1 cm
+  standard deviations. Reference poses are inexact: their deviations are taken as 3 cm and 0.01 rad (jarvis 1 cm
   and 0.004 rad).
 - ``localisation``: a filter with points (corners, doors and poles), with lines, and with both, on a map made of the
   other half of the scans, beside the same filter with the likelihood field.
@@ -276,7 +276,7 @@ def real(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
 
 
 def followed(models: list[Any], events: list[Any], readings: list[list[Any]], seed: int) -> dict[str, float]:
-    """Return errors and time of a filter over events, which have readings for each of its models."""
+    """Return errors and time of a filter over events with readings for each of its models."""
     pf = gs.ParticleFilter(models, particles=1000, seed=seed)
     pf.initialize(mean=events[0].truth, covariance=np.diag([0.25, 0.25, 0.04]))
     errors, seconds = [], 0.0

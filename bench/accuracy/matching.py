@@ -83,7 +83,7 @@ def row(kind: str, name: str, guess: str, backend: str, truth: np.ndarray, call:
 def one_by_one(
     first: np.ndarray, second: np.ndarray, scanner: gs.Scanner, guess: np.ndarray, backend: str, times: list[float]
 ) -> ScanMatch:
-    """Return the matches of pairs, each from a call of its own, and append the time of each call [s]."""
+    """Return the matches of pairs, each from a separate call, and append the time of each call [s]."""
     matches = []
     for before, after, start in zip(first, second, guess, strict=True):
         begun = time.perf_counter()

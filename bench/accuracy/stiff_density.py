@@ -220,7 +220,7 @@ def grid_rows(backends: list[str], families: list[dict[str, Any]]) -> list[dict[
 
 
 def bilinear_rows() -> list[list[Any]]:
-    """Measure the float32 error of the interpolated field beside a cliff, which rounding a position causes."""
+    """Measure the float32 error of the interpolated field next to a cliff, from rounding a position."""
     from gpusense.evaluation.replay import Recorder, replay
     from gpusense.evaluation.tolerances import beam_tolerance
 

@@ -225,7 +225,7 @@ RIVALS: dict[str, Callable[[Backend], Iterator[Setting]]] = {
 
 
 def measure(need: str, device: Backend, arguments: argparse.Namespace, *, peers: bool = False) -> list[dict[str, Any]]:
-    """Run all settings of a need in rounds, with ``peers`` also those of other programs; return their rows."""
+    """Run all settings of a need in rounds, with ``peers`` also other programs'; return their rows."""
     settings = [*(RIVALS[need](device) if peers and need in RIVALS else ()), *SETTINGS[need](device)]
     begin = time.perf_counter()
     for number in range(arguments.rounds * max((one.repeats for one in settings), default=0)):
@@ -295,7 +295,7 @@ def report_of(arguments: argparse.Namespace, backends: Sequence[str], command: s
 
 
 def measured(need: str, devices: Sequence[Backend], arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """Return the rows of a need on some devices; other programs are measured beside the first one."""
+    """Return the rows of a need on some devices; other programs are measured with the first one."""
     return [
         row
         for i, device in enumerate(devices)

@@ -105,7 +105,7 @@ def _time(row: Row | None) -> str:
 
 
 def peers(rows: Sequence[Row]) -> list[str]:
-    """Return the table of other implementations beside the rows of gpusense that they compare with."""
+    """Return the table of other implementations and of comparable rows of gpusense."""
     outside = [row for row in rows if row.outside and row.scene == ALL]
     lines = []
     for need in ("rays", "beam model", "likelihood field"):
@@ -124,7 +124,7 @@ def peers(rows: Sequence[Row]) -> list[str]:
 
 
 def rivals(rows: Sequence[Row], need: str, of: str) -> list[str]:
-    """Return the table of other programs for a task, beside gpusense's rows of the same settings."""
+    """Return the table of other programs for a task and of gpusense's rows of the same settings."""
     outside = [row for row in rows if row.outside and row.need == need]
     lines = []
     for device in dict.fromkeys(row.device for row in outside):

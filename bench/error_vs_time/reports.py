@@ -116,7 +116,7 @@ def commit_trouble(commit: str, *, root: Path = ROOT, limit: int = LIMIT, folder
 
 
 def sources(folder: Path = RESULTS) -> list[Source]:
-    """Read all reports of a folder, those of processors first.
+    """Read all reports of a folder, processors first.
 
     Raises:
         ValueError: A report is damaged, or of uncommitted changes, or two are of the same device.

@@ -149,7 +149,7 @@ if numba is not None:
 
 
 def numba_field(kind: str) -> Callable[[Scene, None, str], Runner]:
-    """Make a runner of one of the three scores with a precomputed grid."""
+    """Make a runner of a score with a precomputed grid."""
 
     def make(scene: Scene, backend: None, precision: str) -> Runner:
         p, chosen = scene.field, hits(scene)

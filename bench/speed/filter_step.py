@@ -4,7 +4,7 @@ Where a step is one recorded program, replays in a row show its time on the devi
 
 The scene is a generated building with the cloud of a tracked robot. One stage is the plain filter; the default is up to
 four stages, of which a step on a processor takes those that the cloud needs. Steps of three filters run in turns:
-without recovery and verdict, with the verdict and ``estimate``, and the default filter with recovery as well.
+without recovery and verdict, with the verdict and ``estimate``, and the default filter, also with recovery.
 
 ``--peers`` measures instead, in turns on one simulated run, the default filter with its estimate and those filters of
 nav2_amcl and Beluga that filters.py can compile. Their field has the same parameters, its densities multiplied.

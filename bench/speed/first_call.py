@@ -5,7 +5,7 @@
 
 A new process imports the package, opens the device, and calls the likelihood field and then the beam model for the
 first time. "Cold" begins with an empty cache folder, so that the device is also proved; "warm" is the next process with
-the same folder. Modules have their bytecode, as those of an installed package. Trees (checkouts, with a name each) take
+the same folder. Modules have bytecode, as in an installed package. Trees (checkouts, with a name each) take
 turns, so that their ratio is valid on a busy machine.
 """
 

@@ -8,7 +8,7 @@
 A row is one option: parameters that remove or add a part of the density, another precision, caster or table, or the
 weights of another program. Its ratio is its time over the default's with the same particles and scan: whole calls with
 NumPy arrays in and out, medians of several rounds of all options. With --launches it is the time of a call's launches
-without its copies, ten calls in a row, as for arrays that stay on a GPU. The intended upper bound stands beside it. The
+without its copies, ten calls in a row, as for arrays that stay on a GPU. The next column is the aim. The
 quartiles of the rounds show how reliable the ratio is.
 """
 

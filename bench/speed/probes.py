@@ -153,7 +153,7 @@ def probe(selection: str, quick: bool = False) -> Figures:
 
 
 def _launches(one: Callable[[], None], wait: Callable[[], None]) -> tuple[float, float]:
-    """Return the seconds of a launch in a row of many, and of one with a wait."""
+    """Return the seconds of a launch in a long row, and of a single launch with a wait."""
 
     def many() -> None:
         for _ in range(200):
@@ -168,7 +168,7 @@ def _launches(one: Callable[[], None], wait: Callable[[], None]) -> tuple[float,
 
 
 class _OpenCL:
-    """Probes through pyopencl, in a context of their own."""
+    """Probes through pyopencl, in a separate context."""
 
     name, threads = "OpenCL probes", 1
 

@@ -30,7 +30,7 @@ def load() -> tuple[ctypes.CDLL | None, str]:
         return None, f"not compiled: {SOURCE} must name a copy of its sources"
     _kept.append(tempfile.TemporaryDirectory())
     library = Path(_kept[-1].name) / "range_libc.so"
-    # lodepng is a header with a source beside it.
+    # lodepng is a header and a source.
     sources = [str(CODE), str(Path(source) / "vendor" / "lodepng" / "lodepng.cpp")]
     command = ["g++", *_FLAGS, f"-I{source}", "-DUSE_CUDA=0", "-o", str(library), *sources]
     try:

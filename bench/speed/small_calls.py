@@ -254,7 +254,7 @@ class Bench:
         self.add_several(what, ways, shared=shared)
 
     def models(self, what: str, models: list[Any], poses: np.ndarray, scan: np.ndarray) -> None:
-        """Add a row of several models, whose launches are queued one after the other."""
+        """Add a row of several models with launches queued in sequence."""
         ways = {
             "queued": Way(lambda _: gs.log_likelihoods(models, poses, scan)),
             "calls": Way(lambda _: [model.log_likelihood(poses, scan) for model in models]),

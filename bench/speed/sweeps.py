@@ -71,7 +71,7 @@ def swept(
 
 
 def measure(arguments: Any, folder: Path) -> list[dict[str, Any]]:
-    """Return a row for each number of workers, whose sweeps run in turns."""
+    """Return a row for each number of workers; sweeps run in turns."""
     options = {"particles": arguments.particles, "range_max": 20.0}
 
     def jobs_of(first: int, count: int) -> list[Any]:

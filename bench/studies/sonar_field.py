@@ -212,7 +212,7 @@ def weighted_error(log_p: np.ndarray, cloud: np.ndarray, truth: np.ndarray) -> f
 def scores(
     place: Place, model: Any, window: int, particles: int, every: int, rng: np.random.Generator
 ) -> dict[str, list[float]]:
-    """Score windows of consecutive frames, whose motion is known, around a guess and over the whole map."""
+    """Score windows of consecutive frames with known motion, around a guess and over the whole map."""
     poses, z = place.scored
     found: dict[str, list[float]] = {name: [] for name in ("rank", "information", "error", "global rank", "prior")}
     for last in range(window - 1, len(poses), every):

@@ -142,7 +142,7 @@ def expect(case: Case) -> Outcome:
 
 
 def score_large(case: Case) -> Outcome:
-    """Score the number of particles from which GPUs sort them; skip devices that are not GPUs, which are too slow."""
+    """Score the number of particles from which GPUs sort them; skip other devices, which are too slow."""
     rays = max(case.world.scanner.count, 1)
     if not case.device.gpu or "slow" in case.config or rays < 64:
         yield from score(case)
@@ -182,7 +182,7 @@ SCAN_ACTIONS: dict[Callable[[Case], Outcome], float] = {
 
 
 def act_scan(case: Case) -> Outcome:
-    """Run one of the actions of scan models."""
+    """Run an action of scan models."""
     action = case.rng.choice(np.array(list(SCAN_ACTIONS)), p=list(SCAN_ACTIONS.values()))
     if case.device.there is not None and case.rng.random() < 0.3:
         action = score_there
@@ -293,7 +293,7 @@ def act_tables(case: Case) -> Outcome:
 
 
 def act_rays(case: Case) -> Outcome:
-    """Cast rays by one of the casters; most of them by the exact one in float32."""
+    """Cast rays by a random caster, mostly by the exact one in float32."""
     rng = case.rng
     ways = ["exact", "dda", "march", knobs("March", tolerance=0.01, rule="centre"), "bresenham", "cddt", "lookup"]
     ways += [knobs("March", tolerance=1.0), knobs("Cddt", bins=36, pruned=True), knobs("Lookup", bins=48)]

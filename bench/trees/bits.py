@@ -16,7 +16,7 @@ configuration and its number, and the cases of a configuration share models, so 
 run at the same time; ``compare old.json new-0.json new-1.json ...`` joins the parts. Run both sides on one machine with
 the same options. ``--as-gpu`` (OpenCL) makes a processor pass for a GPU, whose launches differ; only this option uses a
 name that is not public, ``gpusense.backends.get_backend``. ``--only`` selects the configurations with these words in
-their names; rays, filters and matches are configurations as well.
+their names; rays, filters and matches are also configurations.
 """
 
 from __future__ import annotations
@@ -191,7 +191,7 @@ def differences(old: list[list[Any]], new: list[list[Any]], messages: bool) -> I
 
 
 def compare_command(arguments: argparse.Namespace) -> int:
-    """Compare a record with another one, which may consist of parts."""
+    """Compare a record with another, possibly in parts."""
     head, old = read(arguments.old)
     new: dict[str, Any] = {}
     for path in arguments.new:

@@ -51,7 +51,7 @@ def warp_device(selection: str, info: Any) -> Device | None:
 
 
 def devices_of(selection: str, as_gpu: bool) -> tuple[Device, Device, Any]:
-    """Return the device of most cases, the one for cases with arrays on the device, and its description."""
+    """Return the device of most cases, the device for cases with device arrays, and its description."""
     info = gs.RayCaster(gs.OccupancyGrid([[0]]), 1.0, backend=selection).device
     there = None
     if info.backend == "opencl":

@@ -10,7 +10,7 @@ in one call, steps of filters with 500 and 4000 particles (predict, correct, est
 Arrays are NumPy's; on GPUs, rows with poses and results on the device time the launches alone.
 
 Each tree runs in its own process (calls.py) on the same arrays. The processes take turns in the order old, new, new,
-old, so that a machine that slows down favours neither. A turn takes --seconds; its time is that of its shortest call.
+old, so that a machine that slows down favours neither. A turn takes --seconds; its shortest call counts.
 Each pair of neighbouring turns gives a ratio. A block is a new pair of processes, since processes of the same tree also
 differ.
 

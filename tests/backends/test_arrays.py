@@ -107,7 +107,7 @@ def test_a_batch_of_another_library(backend):
 @pytest.mark.parametrize("wrap", [lambda array: array, Array])
 @pytest.mark.parametrize("method", METHODS)
 def test_arrays_that_can_be_used_as_they_are_are_not_copied(method, wrap, backend, monkeypatch):
-    """Poses are read where they lie, and results are written where they are wanted."""
+    """Poses are read in place, and results are written in place."""
     call, shape = call_of(method, backend)
     seen, before = {}, Workspace.upload
 

@@ -19,7 +19,7 @@ def fake_devices(*rows: tuple[str, str, str]) -> list[backends.Device]:
 
 
 def use_devices(monkeypatch, listed: list[backends.Device], verdicts: dict[str, Verdict] | None = None) -> None:
-    """Pretend that devices are present beside NumPy, and proved unless a verdict says otherwise."""
+    """Pretend that devices other than NumPy are present, and proved unless a verdict says otherwise."""
     rows = [*listed, backends.Device("numpy", "NumPy reference", "cpu", True, "", "numpy")]
     monkeypatch.setattr(listing, "present", lambda entry: ([d for d in rows if d.backend == entry.name], []))
     proved = Verdict(True, 1, True, rate=100.0)

@@ -1,4 +1,4 @@
-"""Runs with damaged, locked, full, unsafe or shared caches; files beside a cache."""
+"""Runs with damaged, locked, full, unsafe or shared caches, and with foreign files next to a cache."""
 
 from __future__ import annotations
 

@@ -355,7 +355,7 @@ def test_a_fake_that_fails_nowhere_is_usable(needs, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("mode", "end"), [("load", "SIGABRT"), ("exit", "exit code 0, without an answer")])
 def test_a_driver_that_dies_when_it_is_loaded_is_left_out_and_the_others_work(needs, tmp_path, mode, end):
-    """PoCL, which comes beside pyopencl, is still present."""
+    """PoCL, installed with pyopencl, is still present."""
     needs("opencl")
     icd = fake_driver.build(tmp_path, mode)
     found, errors = default_of(tmp_path, OCL_ICD_VENDORS=str(icd.parent))

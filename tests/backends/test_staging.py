@@ -111,7 +111,7 @@ def test_memory_of_few_results_waits(monkeypatch):
 
 
 def test_bounds_of_many_poses_are_those_of_columns(monkeypatch):
-    """Bounds by rows and threads are those of each column, NaN where a column holds a NaN."""
+    """Bounds by rows and threads equal the columns' bounds; a column with a NaN has NaN bounds."""
     monkeypatch.setattr(arrays, "_SHARE", 1 << 10)
     for count in (arrays._FEW - 1, arrays._FEW + 7, 40_001):
         poses = np.random.default_rng(count).normal(size=(count, 3))

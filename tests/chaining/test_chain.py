@@ -269,7 +269,7 @@ def test_a_failed_match_is_bridged_over(needs) -> None:
     good = np.arange(10) != 5
     assert errors(chain, truth)[good].max() < 0.05
     assert chain.doubtful[5:7].all() and not chain.doubtful[:5].any() and not chain.doubtful[7:9].any()
-    # The scans beside it are linked.
+    # Its neighbours are linked.
     assert ((chain.links.first <= 4) & (chain.links.second >= 6)).any()
     # Both steps may be breaks, as may a step with an unsure match, or with a single match after a jump in time.
     (front,) = chainer.fronts

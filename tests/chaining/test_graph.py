@@ -148,7 +148,7 @@ def test_the_cost_never_rises(settle: bool) -> None:
 
 @pytest.mark.parametrize("fixed", [0, 40])
 def test_a_long_chain_that_turns_settles_in_a_few_steps(fixed: int) -> None:
-    # Firm links over one and two steps, whose headings disagree: the ends of the chain turn far.
+    # Firm links over one and two steps disagree in heading: the ends of the chain turn far.
     rng, count = np.random.default_rng(2), 400
     steps = np.tile([0.5, 0.0, 0.02], (count - 1, 1))
     truth = chained(np.zeros(3), steps)

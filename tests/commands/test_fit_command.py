@@ -111,7 +111,7 @@ def test_held_out_scans_are_likelier_by_the_fit_than_by_defaults(capsys, recorde
 
 
 def test_the_fit_by_incidence_is_scored_on_held_out_pairs(capsys, tmp_path):
-    """The deviation rises with the angle: the mixtures of the bins are scored beside the one for all angles."""
+    """The deviation rises with the angle: the mixtures of the bins and the mixture for all angles are scored."""
     random = np.random.default_rng(1)
     angle, expected = random.uniform(0, 1.5, 4000), random.uniform(2, 8, 4000)
     angle[::50] = math.nan
@@ -149,7 +149,7 @@ def test_a_bias_is_fitted_and_taken_off_held_out_readings(capsys, recorded, tmp_
     document = json.loads(text)
     fit = document["fit"]
     assert abs(fit["range_bias"] - 0.3) < 4 * fit["range_bias_error"] + 0.005
-    # The mean of the held-out half is that of the fitted one, within the error by blocks.
+    # The means of the held-out and the fitted half agree within the error by blocks.
     fitted = document["held_out"][0]
     assert abs(fitted["per_beam"] - fit["log_likelihood"] / document["readings"]) < 5 * fitted["error"]
 
@@ -161,7 +161,7 @@ def test_log_likelihoods_are_those_of_the_model(recorded):
     model = gs.BeamModel(grid, scans[0].scanner, TRUTH, backend="numpy", precision="float64")
     wanted = [model.log_likelihood([scan.pose], scan.ranges)[0] for scan in scans]
     found = held_out.log_densities(TRUTH, data).reshape(SCANS, BEAMS).sum(axis=1)
-    # Ranges of one are cast in float32, those of the other in float64.
+    # One casts in float32, the other in float64.
     np.testing.assert_allclose(found, wanted, atol=0.05)
     assert data.block.tolist() == [i // 7 for i in range(SCANS) for _ in range(BEAMS)]
     even, odd = data.halves()
@@ -200,7 +200,7 @@ def test_impossible_readings_are_counted(capsys, tmp_path):
     _, text, _ = run(capsys, "--pairs", tmp_path / "some.csv", "--range-max", 4, "--holdout", "--json")
     fitted, soft, amcl, _ = json.loads(text)["held_out"]
     assert fitted["impossible"] == 10 and fitted["per_beam"] is None and fitted["gain"] is None
-    # Half a reading of no return beside 100 ranges.
+    # Half a reading of no return added to 100 ranges.
     assert soft["name"] == "fitted, softened" and soft["gain"] == 0 and soft["parameters"]["z_max"] == 0.5 / 102
     assert amcl["gain"] == pytest.approx(soft["per_beam"] - amcl["per_beam"])
     _, text, _ = run(capsys, "--pairs", tmp_path / "some.csv", "--range-max", 4, "--holdout")

@@ -47,7 +47,7 @@ def log(truth: np.ndarray, odometry: np.ndarray, tmp_path_factory: pytest.TempPa
 
 @pytest.fixture(scope="module")
 def bare(truth: np.ndarray, odometry: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write a log of Wean Hall's format, which has no poses."""
+    """Write a log in Wean Hall's format, without poses."""
     rng, lines = np.random.default_rng(0), []
     scanner = gs.Scanner(np.radians(np.arange(-90, 90)), range_max=81.83)
     for k, (pose, wheels) in enumerate(zip(truth, odometry, strict=True)):

@@ -18,7 +18,7 @@ SCANNER = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / 180, 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    """Write a CARMEN log of eight scans on an arc, whose odometry is a little off."""
+    """Write a CARMEN log of eight scans on an arc with slightly wrong odometry."""
     path = tmp_path_factory.mktemp("log") / "run.log"
     lines = []
     for i in range(8):

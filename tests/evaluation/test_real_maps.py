@@ -86,7 +86,7 @@ def test_distance_transform_is_scipys(data_dir, opencl, name):
 
 
 def scene_of(data_dir, name):
-    """Return a scene in a map, and the backends that are present except NumPy, which is slow in wide open space."""
+    """Return a scene in a map, and the backends that are present, without NumPy: it is slow in wide open space."""
     scanner = gs.Scanner.uniform(
         angle_min=-2.0, angle_increment=0.05, count=81, range_max=20.0, mount=(0.1, -0.05, 0.02)
     )  # fmt: skip
@@ -133,7 +133,7 @@ def test_ranges_are_numpys(data_dir, name):
 
 
 def test_yaw_of_a_map_turns_its_poses(data_dir):
-    """Compare stata_basement, whose origin has a yaw of 3.14, with the same cells without it."""
+    """Compare stata_basement (yaw of the origin 3.14) with the same cells without it."""
     grid = gs.read_map(data_dir / "ros_maps/stata_basement.yaml")
     assert grid.origin[2] == 3.14
     plain = gs.OccupancyGrid(grid.cells, grid.resolution)

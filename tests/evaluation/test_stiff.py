@@ -23,7 +23,7 @@ from gpusense.models.scan.densities import log_mixture
 
 PRECISIONS = ("float32", "float64")
 PAGE = ROOT / "docs" / "numerics.md"
-# In eps (1 + |log p|). In float64, processors and NVIDIA's GPUs are far below the tolerance, which is for all drivers.
+# In eps (1 + |log p|). In float64, processors and NVIDIA's GPUs are far below the tolerance for all drivers.
 BOUND = {"float32": 16, "float64": 16}
 
 make_density_grid = stiff.density_grid

@@ -224,7 +224,7 @@ def test_a_square_room_has_four_walls_and_corners(backend, beams, turn):
     assert {(round(x, 3) + 0.0, round(y, 3) + 0.0) for x, y in corners.pose[:, :2]} == {
         (round(x, 3), round(y, 3)) for x, y in expected
     }
-    # In float32 a beam beside a corner may count as one of the second wall, by less than the least noise of 3 mm.
+    # In float32 a beam next to a corner may be assigned to the second wall, by less than the least noise of 3 mm.
     np.testing.assert_allclose(corners.size, math.pi / 2, atol=3e-4)
     # Bisectors point into the room.
     inward = corners.pose[:, :2] + 0.5 * np.column_stack([np.cos(corners.pose[:, 2]), np.sin(corners.pose[:, 2])])
@@ -233,7 +233,7 @@ def test_a_square_room_has_four_walls_and_corners(backend, beams, turn):
 
 @pytest.mark.parametrize(("swing", "least"), [(-70, 0.97), (-45, 0.97), (60, 0.6), (90, 0.6)])
 def test_doors_have_leaves(swing, least):
-    """A leaf opens out of the room (-) or into it (+), where it hides a jamb or the wall beside it from many places."""
+    """A leaf opens out of the room (-) or into it (+), where it hides a jamb or the adjacent wall from many places."""
     near, far, angle = 1.5, 2.4, math.radians(swing)
     leaf = (0, near, 0.9 * math.sin(angle), near + 0.9 * math.cos(angle))
     room = [(0, 0, 6, 0), (6, 0, 6, 4), (6, 4, 0, 4), (0, 4, 0, far), (0, near, 0, 0), leaf]

@@ -1,4 +1,4 @@
-"""Reflectors: bright runs of beams in simulated scans, and those of a recording against the sensor's own positions."""
+"""Reflectors: bright runs of beams in simulated scans, and in a recording against the sensor's positions."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_bad_intensities_are_named():
 
 
 def test_reflectors_of_a_recording(data_dir):
-    """Most scans show the six reflectors by which the AGV of jarvis_lab localises, at their places on its map."""
+    """Most scans show the six reflectors that the AGV of jarvis_lab navigates by, at their places on its map."""
     folder = data_dir / "jarvis_lab"
     bag = folder / "jarvis_complex_path_fast.bag"
     scans = list(gs.read_log(bag, topic="/driver_laser_navigation/laser_scan"))[::10]

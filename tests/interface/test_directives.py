@@ -1,4 +1,4 @@
-"""The preprocessor of kernel sources: branches against those of a generator, and all that it refuses."""
+"""The preprocessor of kernel sources: branches against a generator, and refused directives."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from gpusense.interface.kernel_files import warp_module
 from gpusense.interface.signatures import KERNELS
 from gpusense.interface.sources import assemble, relevant
 
-# Kernel, the flag, flags beside it, and patterns of the flag's code in OpenCL and in Warp's C++.
+# Kernel, the flag, further flags, and patterns of the flag's code in OpenCL and in Warp's C++.
 TRACES = [
     ("cast_ranges", "FLOAT64", (), r"\bdouble\b", r"\bfloat64\b"),
     ("cast_ranges", "ORIGINS_OUTSIDE", (), r"\benter_x\b", r"\bwp::neg\("),

@@ -1,4 +1,4 @@
-"""Kernels that score several scans in one launch agree with the reference, which takes them one by one."""
+"""Kernels that score several scans in one launch agree with the reference, scan by scan."""
 
 from __future__ import annotations
 

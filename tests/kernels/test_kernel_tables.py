@@ -300,7 +300,7 @@ def test_updated_rectangles_are_those_made_anew(
 def test_a_cell_that_comes_and_goes_is_seen_as_far_as_rectangles_reach(
     form: Planes, kind: str, as_kind: Callable[[str], Backend]
 ) -> None:
-    """In an empty map, 255 cells from the borders, the change reaches as far as possible."""
+    """In an empty map, 255 cells from the borders, the change has its longest reach."""
     device, shape, place = as_kind(kind), (520, 530), (257, 262)
     occupied = np.zeros(shape, bool)
     rectangles = empty_rectangles(device, occupied, form)

@@ -127,7 +127,7 @@ def test_beacons(kind, changes, in_lanes, compiled_lanes):
     "changes", [{}, {"kind": "von_mises"}, {"sigma": 1.4}, {"sigma": 1.8}, {"z_hit": 1.0, "z_rand": 0.0}]
 )
 def test_headings_and_positions(changes, in_lanes, compiled_lanes):
-    """Sums of turns, Fourier series and von Mises densities, with and without outliers; a position beside each."""
+    """Sums of turns, Fourier series and von Mises densities, with and without outliers, each with a position."""
     p, poses, found = gs.HeadingParameters(**{"sigma": 0.3, "z_hit": 0.9, "z_rand": 0.1, **changes}), cloud(9.0), {}
     q = gs.PositionParameters(
         covariance=((0.3, 0.1), (0.1, 0.2)), z_hit=p.z_hit, z_rand=p.z_rand, region=(-10.0, -10.0, 10.0, 10.0)

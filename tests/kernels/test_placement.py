@@ -219,7 +219,7 @@ def test_positions_and_headings_against_60_digits(name):
     resolution, origin, mount = FRAMES[name]
     poses = poses_of(name)[500:800]
     found = place_poses(poses, grid_of(name), mount, np.dtype(np.float64))
-    # A sum of world coordinates in cells is rounded to one of their ulps.
+    # A sum of world coordinates in cells is rounded to an ulp of the coordinates.
     slack = 1e-12 + 8 * np.finfo(float).eps * (2000 + math.hypot(*origin[:2]) / resolution)
     for pose, cell, high, low in zip(poses, found.cell, found.pose, found.low, strict=True):
         x, y, cos, sin = placed(pose, origin, resolution, mount)

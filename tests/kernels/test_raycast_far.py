@@ -29,7 +29,7 @@ from gpusense.tables.rectangles import Planes
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_long_corridors(backend, precision):
-    """Rays of 20 000 cells, parallel to an axis or oblique, end at the far wall, whatever lies beside them."""
+    """Rays of 20 000 cells, parallel to an axis or oblique, end at the far wall, whatever cells they pass."""
     length = 20_000
     occupied = np.zeros((9, length), bool)
     occupied[:, -1] = True
@@ -88,7 +88,7 @@ def test_counts_of_boundaries_near_the_longest_range(precision):
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_origins_nearly_as_far_off_as_a_range_may_be_long(precision, backend):
-    """float64 ranges are those of a rational walk; float32 has the bits of NumPy's walk from cell to cell."""
+    """float64 ranges equal a rational walk's; float32 has the bits of NumPy's walk from cell to cell."""
     rng = np.random.default_rng(19)
     occupied = rng.random((50, 60)) < 0.02
     target = rng.uniform((0, 0), (60, 50), (600, 2))

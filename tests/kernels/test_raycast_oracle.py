@@ -73,7 +73,7 @@ def test_every_backend_has_the_bits_of_numpy_for_any_number_of_sectors(family, b
 def unexplained(
     scene: Scene, found: np.ndarray, suspects: np.ndarray, move: float, turn: float, tolerance: float
 ) -> list[int]:
-    """Return the rays whose range is not that of a nearby ray either."""
+    """Return the rays that differ from all nearby rays, too."""
     cells = scene.occupied.tolist()
     return [
         i
@@ -108,7 +108,7 @@ def test_no_pair_of_walls_leaks_at_any_slope(precision, backend):
     for number in range(40):
         sign = rng.choice([-1, 1], 2)
         occupied = np.zeros((41, 41), bool)
-        # The corner is (20, 20). Along the ray, the cells before and behind it are free; the two beside it are walls.
+        # The corner is (20, 20). Along the ray, the cells before and behind it are free; the lateral two are walls.
         occupied[20 if sign[1] < 0 else 19, 20 if sign[0] > 0 else 19] = True
         occupied[20 if sign[1] > 0 else 19, 20 if sign[0] < 0 else 19] = True
         if number % 2:

@@ -19,7 +19,7 @@ OPENCL, WARP, NUMPY = LANGUAGES = "OpenCL", "Warp", "NumPy"
 FOLDERS = {WARP: kernel_root() / "warp", NUMPY: Path(gpusense.reference.__file__).parent}
 # Functions that make a file's Warp functions and kernels for a set of flags; they are no part of the concept.
 FACTORIES = {"functions", "make"}
-# Files of a single language, which are no concepts.
+# Files of a single language that are not concepts.
 OTHER_FILES = {
     WARP: {"__init__": "makes the folder a package", "prelude": "types and decorators of all Warp kernels"},
     NUMPY: {

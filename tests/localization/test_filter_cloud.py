@@ -89,7 +89,7 @@ def test_a_correction_has_the_bits_of_a_cloud_with_more_room(cloud, other, drawn
     np.testing.assert_allclose(host(cloud.moments(COUNT)), cloud.estimate(COUNT)[:9], rtol=1e-9, atol=1e-15)
     one, two = cloud.summary(), other.summary()
     assert one[:4] == two[:4] and 1 <= one.effective_sample_size <= COUNT and not one.degenerate
-    # Weights are those of the scores: the likeliest particle is the heaviest.
+    # Weights follow the scores: the likeliest particle is the heaviest.
     log_p = field("numpy").log_likelihood(cloud.host_poses(cloud.places.shown, COUNT), scans(4)[1][0])
     assert np.argmax(cloud.host_weights(COUNT)) == np.argmax(log_p) or one.stages > 1
 

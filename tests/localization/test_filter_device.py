@@ -34,7 +34,7 @@ def test_a_stage_on_a_gpu_is_one_recorded_program(warp_as_gpu):
         pf, pose = tracked(stages)
         numbers, covariance = pf.mean_and_covariance()
         assert np.hypot(*(numbers - pose)[:2]) < 0.1 and covariance[0, 0] < 0.01
-        # The first corrections, which leave the estimate to launches of its own.
+        # The first corrections, which leave the estimate to separate launches.
         programs = {key: program.recording for key, program in pf._cloud._recordings.items() if not key[3]}
         found = {key[1].number: recording.explain() for key, recording in programs.items()}
         # A move, 3 launches for the scores, 4 for weights, and the draw.
@@ -63,7 +63,7 @@ def test_corrections_compute_an_estimate_that_each_step_asks_for(backend, monkey
 
     always, launches = run(range(8))
     once, _ = run([7])
-    # Those of the first corrections, and the one of the last motion; corrections of more stages may add two.
+    # Launches of the first corrections and of the last motion; corrections of more stages may add two.
     assert 4 <= launches <= 6
     for pair in zip(always, once, strict=True):
         np.testing.assert_array_equal(*pair)
@@ -96,7 +96,7 @@ def test_corrections_judge_the_pose_that_each_step_asks_for(backend, monkeypatch
     for readings in (np.ones(60, bool), np.arange(60) % 3 == 0):
         (together, few), (apart, many) = run(True, readings), run(False, readings)
         assert together == apart and min(one[-1] for one in together) > 0.8
-        # The first ones of a filter are judged alone.
+        # A filter's first scans are judged alone.
         assert many == 10 and few <= 5
 
 

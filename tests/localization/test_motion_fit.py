@@ -51,7 +51,7 @@ def test_systematic_errors_and_slips_of_the_odometry_are_learned():
 
 
 def _drive(motion, steps, rng):
-    """Return the poses of an odometer, and true ones with the noise of a model."""
+    """Return odometer poses, and true poses with a model's noise."""
     truth, odometry = [np.zeros(3)], [np.zeros(3)]
     for _ in range(steps):
         odometry.append(_step(odometry[-1], rng.normal(0.1, 0.15), rng.uniform(0, 0.6), rng.normal(0, 0.15)))

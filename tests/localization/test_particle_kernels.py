@@ -60,7 +60,7 @@ def test_deviates_are_uniform_and_standard_normal():
     one, two = normal_pair(found[0], found[1])
     assert stats.kstest(one, "norm").pvalue > 1e-3 and stats.kstest(two, "norm").pvalue > 1e-3
     assert abs(np.corrcoef(one, two)[0, 1]) < 0.01
-    # Steps and streams are independent as well.
+    # Steps and streams are independent, too.
     other = normal_pair(*random_words((n, zero + 1, zero, zero), 7, 9)[:2])[0]
     assert abs(np.corrcoef(one, other)[0, 1]) < 0.01
 
@@ -211,7 +211,7 @@ def test_deep_ladders_have_the_bits_of_the_reference(backend, lanes):
         assert np.array_equal(values, found[name]), name
     state = found["state"]
     assert state[c.RUNG] == 2.0**-14 and state[c.LEFT] == 1 - 2.0**-14
-    # The evidence is that of the whole temperature.
+    # The evidence is computed at the whole temperature.
     assert state[c.EVIDENCE] == 0 and state[c.SLOW] == 0.9
 
 
@@ -285,7 +285,7 @@ def test_estimates_are_the_moments_of_the_cloud(backend, name):
     assert numbers[c.WIDE_HEADINGS] == (turn > 1)
 
 
-# Deviations of turns: none, that of a jump of 100 m, and the largest that a filter uses.
+# Deviations of turns: none, of a jump of 100 m, and the largest that a filter uses.
 @pytest.mark.parametrize("deviation", [0.1, 14.2, 1e5])
 @pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
 @pytest.mark.parametrize("kind", [c.STRAIGHT, c.VELOCITY_MODEL])

@@ -99,7 +99,7 @@ def test_a_robot_that_is_carried_away_is_lost_until_its_rival_has_won(model):
     found = track(poses, scans(poses), pf, odometry)
     wrong = np.array([error(e, pose) > 1 for e, pose in zip(found, poses, strict=True)])
     assert wrong[12] and not wrong[:12].any() and not wrong[-10:].any()
-    # Until the rival has scans of its own, a crowd might hide the walls.
+    # Until the rival has scans, a crowd might hide the walls.
     assert sum(e.verdict == "tracking" for e, off in zip(found, wrong, strict=True) if off) <= 6
     without = track(poses, scans(poses), begun(model, poses[0], recovery=None), odometry)
     assert error(without[-1], poses[-1]) > 1 and without[-1].verdict != "tracking"

@@ -110,7 +110,7 @@ def test_scans_that_do_not_follow_and_few_beams_are_not_compared():
 
 
 def test_models_of_scans_are_calibrated():
-    """Errors of beam models of a room are independent, or moving averages of 6 beams, whose inflation is 6."""
+    """Errors of beam models of a room are independent, or moving averages of 6 beams (inflation 6)."""
     grid = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
     scanner = gs.Scanner.uniform(angle_min=-np.pi, angle_increment=np.pi / 180, count=360, range_max=10.0)
     model = gs.BeamModel(grid, scanner, gs.BeamParameters(0.97, 0.0, 0.0, 0.03, sigma_hit=0.05), backend="numpy")

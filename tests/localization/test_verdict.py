@@ -180,7 +180,7 @@ def test_comparisons_are_a_second_series_of_the_belief():
     wide = Belief().compared_with((0.0, 0.0, 0.0), 1.2).widened()
     repeated = wide.compared_with((9.0, 9.0, 0.0), -4.0).log_odds
     assert repeated == pytest.approx(wide._changed(-4.0 * (1 - STAYS) / (1 + STAYS)).log_odds)
-    # A pose that looks alike beats other places as well.
+    # A pose that looks alike also beats other places.
     assert Belief(0.0).compared_with((0.0, 0.0, 0.0), -40.0).log_odds == pytest.approx(math.log(ALIKE))
 
 

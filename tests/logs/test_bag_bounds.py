@@ -22,7 +22,7 @@ COMPRESSED = {
 
 
 def written(folder: Path, kind: str, size: int = 3) -> Path:
-    """Write a compressed bag of two scans, and texts of some length beside them."""
+    """Write a compressed bag of two scans and of texts of some length."""
     form, mode, compression = COMPRESSED[kind]
     bag = Writer(folder, form)
     if form == "ros1":

@@ -36,7 +36,7 @@ def times(path: Path, **options: Any) -> list[float]:
 
 
 def recorded(folder: Path, mode: str) -> Path:
-    """Write a database whose recorder was killed, beside which its journal lies."""
+    """Write a database with the journal of a killed recorder."""
     whole, live = bag_of(folder, "sqlite3", "whole"), folder / "live.db3"
     source, target = sqlite3.connect(whole), sqlite3.connect(live)
     target.execute(f"PRAGMA journal_mode = {'wal' if 'wal' in mode else 'delete'}")
@@ -260,7 +260,7 @@ def test_the_last_static_transform_wins(tmp_path: Path, kind: str) -> None:
 
 
 def turning(folder: Path, kind: str, amplitude: float, turns: float) -> Path:
-    """Write a bag of a laser on a mast that moves on the base, beside a link that is fixed."""
+    """Write a bag of a laser on a mast that moves on the base, and a fixed link."""
     with Writer(folder, kind) as bag:
         bag.transform(1.0, "mast", LASER, (0.1, 0.0), 0.0)
         for k in range(5):

@@ -162,7 +162,7 @@ BEAMS, FIRST, STEP = 361, -1.5, 3.0 / 360
 
 
 def wall(first: float, step: float, count: int) -> np.ndarray:
-    """Return ranges to a wall 2 m ahead and a wall 3 m beside."""
+    """Return ranges to walls 2 m ahead and 3 m to the side."""
     angle = first + step * np.arange(count)
     with np.errstate(divide="ignore"):
         return np.minimum(2 / np.maximum(np.cos(angle), 1e-9), 3 / np.maximum(np.abs(np.sin(angle)), 1e-9))

@@ -100,7 +100,7 @@ def test_pairs_of_different_noise_share_a_launch_and_keep_their_rules(device):
 
 
 def test_the_search_by_bearing_finds_the_nearest_of_all_points(device):
-    """One iteration from far-off guesses: pairs and their sums are those of the comparison of all points."""
+    """One iteration from far-off guesses: pairs and their sums equal a comparison of all points."""
     rng = np.random.default_rng(1)
     guesses = np.column_stack([rng.uniform(-3, 3, (400, 2)), rng.uniform(-3, 3, 400)]).reshape(4, 100, 3)
     rules = RULES._replace(iterations=1, capture=5.0)
@@ -113,7 +113,7 @@ def test_the_search_by_bearing_finds_the_nearest_of_all_points(device):
 
 
 def test_lines_are_total_least_squares():
-    """Normals and offsets are those of the smallest singular vector of the centred neighbours."""
+    """Normals and offsets follow from the smallest singular vector of the centred neighbours."""
     rng = np.random.default_rng(0)
     z = 2 + 0.02 * rng.normal(size=(1, 360))
     points = scan_points(z, RING, np.dtype(np.float64))

@@ -1,4 +1,4 @@
-"""Matches of a log's scans share points and lines, and are those of the pairs."""
+"""Matches of a log's scans share points and lines, and equal matches of the pairs."""
 
 from __future__ import annotations
 

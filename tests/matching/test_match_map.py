@@ -56,7 +56,7 @@ def test_a_part_of_a_map_is_found(backend, resolution):
 
 @pytest.mark.parametrize("moved", [(0.03, -0.04, 0.0), (0.05, 0.05, 0.004), (-0.012, 0.001, -0.008)])
 def test_a_guess_between_cells_is_aligned(moved):
-    """The cells of both maps coincide, those of the search around the guess do not."""
+    """The cells of both maps coincide; the cells searched around the guess do not."""
     grid = gs.OccupancyGrid(house(), 0.1, (2.0, 1.0, 0.3))
     local = gs.OccupancyGrid(grid.cells[5:45, 10:60], 0.1)
     truth = np.array([*grid.cell_centers([4, 5], [9, 10]).mean(axis=0), 0.3])

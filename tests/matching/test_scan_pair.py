@@ -1,4 +1,4 @@
-"""A match of a single pair, whose noise and points the device makes, is that of a call with several pairs."""
+"""A match of a single pair, prepared on the device, equals a match among several pairs."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_a_single_match_is_that_of_several(device, case, precision, noise, guess
     scanner, (first, second) = CASES[case]
     options = {"backend": device, "precision": precision, "noise": noise}
     alone = gs.match_scan(first, second, scanner, guess, **options)
-    # Two pairs, which are repeated by a launch of their own.
+    # Two pairs, repeated by another launch.
     among = gs.match_scan(*(np.stack([scan, scan]) for scan in (first, second)), scanner, guess, **options)[1]
     assert_same(alone, among)
 
@@ -152,7 +152,7 @@ def test_icp_alone_and_moving_scans_are_those_of_several(device):
 
 @pytest.mark.parametrize("guess", [(0.1, -0.05, 0.05), (-0.05, 0.05, 0.0)], ids=["near", "poor"])
 def test_a_match_without_a_search_takes_a_single_wait(device, monkeypatch, guess):
-    """The kernel repeats a match whose guess was poor, without a launch of its own."""
+    """The kernel repeats a match with a poor guess, without another launch."""
     first, second = scans(RING, 0.005)
     reads = []
     read = Workspace.read

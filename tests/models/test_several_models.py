@@ -85,7 +85,7 @@ def test_all_is_started_before_the_wait(needs, monkeypatch):
     models = models_of(needs("opencl"))[:3]
     given, z = poses(1, 50), [scans(model.scanner) for model in models]
     expected = gs.log_likelihoods(models, given, z)
-    # Released memory of other models waits for the device as well.
+    # Released memory of other models also waits for the device.
     gc.collect()
     done: list[str] = []
     kind = type(device)

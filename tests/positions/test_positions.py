@@ -52,7 +52,7 @@ def test_truth_is_found(case):
 
 @each_case
 def test_covariance_is_that_of_the_derivatives(case):
-    """It is G S G^T with derivatives G of the whole solution by central differences, for unequal weights as well."""
+    """It is G S G^T with derivatives G of the whole solution by central differences, also for unequal weights."""
     xy, clean = XY[: case.beacons], case.measure(XY[: case.beacons], POSE)
     sigma = case.sigmas(case.beacons)
     options = {} if case.kind == "triangle" else {"weights": 0.5 + np.arange(case.beacons)}
@@ -121,7 +121,7 @@ def test_turn_shift_scale_and_order(case):
 
 @pytest.mark.parametrize("case", [c for c in CASES if c.kind != "ranges"], ids=lambda case: case.name)
 def test_whole_turns_change_nothing(case):
-    """Bearings and headings have any size; those of a robot that looks along -x lie on both sides of pi."""
+    """Bearings and headings have any size; for a robot that looks along -x they are on both sides of pi."""
     xy = XY[: case.beacons] - (20.0, 0.0)
     pose = np.array([2.5, 0.5, 0.01])
     values = case.measure(xy, pose)

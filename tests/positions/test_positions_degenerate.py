@@ -107,7 +107,7 @@ def test_beacons_in_line_leave_the_mirror_image(place, beacons):
     assert fix.status == ("two" if len(beacons) == 2 else "mirror") and not fix.degenerate
     first = np.argmin(ranges_to(fix.solutions, point))
     assert near(fix, *[(point, image), (image, point)][first])
-    # The covariances of the images are mirrored as well.
+    # The covariances of the images are mirrored, too.
     np.testing.assert_allclose(np.linalg.eigvalsh(fix.covariance[0]), np.linalg.eigvalsh(fix.covariance[1]), rtol=1e-6)
 
 
@@ -201,7 +201,7 @@ def test_three_bearings_in_bad_places(place):
     robot = place(np.array([(-2.0, -1.0)]))[0]
     fix = gs.triangulate_triangle(line, bearings_to(line, (*robot, 0.4)))
     assert (fix.status, len(fix)) == ("in line", 0)
-    # Seen from beside their line, beacons are not degenerate.
+    # Seen from off their line, beacons are not degenerate.
     robot = place(np.array([(1.0, 3.0)]))[0]
     fix = gs.triangulate_triangle(line, bearings_to(line, (*robot, 0.4)))
     assert fix.status == "unique" and near(fix, (*robot, 0.4), atol=1e-5)

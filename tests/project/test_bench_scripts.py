@@ -100,7 +100,7 @@ def test_small_calls_runs(selection: str, needs: Callable[[str], str], tmp_path:
     names = [row["what"] for row in report["rows"]]
     assert {"field, 50 x 12, NumPy in and out", "beam model, 90 x 12, NumPy in and out"} <= set(names)
     assert {"field, 50 x 12, bound, a wait each", "beam model, 90 x 12, bound, 20 calls a wait"} <= set(names)
-    # GPUs have arrays of their own: both clouds, both models, four ordinary calls and two bound ones.
+    # GPUs hold arrays in their memory: both clouds, both models, four ordinary calls and two bound ones.
     count = 16 if get_backend(needs(selection)).info.kind == "cpu" else 16 + 2 * 2 * (4 + 2)
     assert len(names) == count and all(row["differing_bits"] == 0 for row in report["rows"])
     assert all(0 < row["least_s"] <= row["median_s"] <= row["most_s"] and row["plain_s"] > 0 for row in report["rows"])

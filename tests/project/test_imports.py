@@ -1,4 +1,4 @@
-"""Imports of the package form no circle, those in functions, under TYPE_CHECKING and by ``importlib`` included.
+"""Imports of the package form no circle, including imports in functions, under TYPE_CHECKING and by ``importlib``.
 
 The linter enforces the order of rooms, but does not see names of modules in strings. Here a string that names a module,
 as in a table of modules that are imported on use, counts as its import, and an f-string as imports of all that it fits.
@@ -95,7 +95,7 @@ def circles(graph: Graph) -> list[set[str]]:
 
 
 def rooms_of(graph: Graph) -> Graph:
-    """Return the rooms that each room imports; a module beside the rooms counts as one."""
+    """Return the rooms that each room imports; a module outside the rooms counts as one."""
     rooms: Graph = {}
     for name, found in graph.items():
         room, others = name.split(".")[1], {other.split(".")[1] for other in found}
@@ -105,7 +105,7 @@ def rooms_of(graph: Graph) -> Graph:
 
 @pytest.fixture(scope="module")
 def graph() -> Graph:
-    """Return the imports of the package's modules, without those of the root, which names all rooms."""
+    """Return the imports of the package's modules, without the root's, which names all rooms."""
     files = {module_of(file): file for file in (ROOT / PACKAGE).rglob("*.py")}
     packages = [name for name, file in files.items() if file.name == "__init__.py"]
     found = imports_of({name: file.read_text(encoding="utf-8") for name, file in files.items()}, packages)

@@ -177,7 +177,7 @@ def editable_python(checkout: Path, tmp_path_factory: pytest.TempPathFactory) ->
     python = scripts / ("python.exe" if os.name == "nt" else "python")
     where = "import sysconfig; print(sysconfig.get_path('purelib'))"
     site = run([python, "-c", where], cwd=environment).strip()
-    # Use this environment's libraries; by its name, the file is read after that of the editable install.
+    # Use this environment's libraries; by its name, the file is read after the editable install's.
     paths = dict.fromkeys([sysconfig.get_path("purelib"), sysconfig.get_path("platlib")])
     Path(site, "zz_borrowed.pth").write_text("\n".join(paths), encoding="utf-8")
     pip = [sys.executable, "-m", "pip", "--python", python, "install", "--no-index", "--no-deps"]

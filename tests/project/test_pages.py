@@ -1,4 +1,4 @@
-"""Blocks of README.md and of the pages run as they are printed, in their order, in a folder with nothing else."""
+"""Blocks of README.md and of the pages run as printed, in order, in an empty folder."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_blocks_run(page, tmp_path, needs):
     run_page(page, tmp_path)
 
 
-# At most one block in this number may be skipped, under a condition as well.
+# At most one block in this number may be skipped, also under a condition.
 SKIPPED = 20
 
 

@@ -98,7 +98,7 @@ def test_templates_are_yaml(path):
     assert isinstance(yaml.safe_load(path.read_text(encoding="utf-8")), dict)
 
 
-# Largest sizes [bytes]: twice those of the first release.
+# Largest sizes [bytes]: twice the first release's.
 SIZES = {".whl": 2.6e6, ".gz": 10.5e6}
 
 

@@ -20,7 +20,7 @@ COMMIT = re.compile(
 )
 COMMAND = re.compile(r"(?:python )?bench/[\w/]+\.py")
 SCRIPT = re.compile(r"(?:python |\"script\": \")(bench/[\w/]+\.py)")
-# Scripts of older reports, by today's; bench/RESULTS.md says so.
+# Scripts of older reports, by today's names (see bench/RESULTS.md).
 FORMER = {
     "absolute": "point_models", "landmarks": "point_models", "localization": "localization_logs",
     "several_scans": "small_calls", "speed": "limits",
@@ -34,7 +34,7 @@ def published() -> str:
 
 
 def test_each_report_is_published(published: str) -> None:
-    """A page links to it, or the table of a report links to the file beside it."""
+    """A page links to it, or the table of a report links to its data file."""
     names = {Path(name).stem for name in re.findall(r"results/([\w.-]+)", published)}
     assert [file.name for file in REPORTS if file.stem not in names] == []
 

@@ -1,4 +1,4 @@
-"""Docstrings, comments, messages and pages use plain words; CONTRIBUTING.md has the rules."""
+"""Docstrings, comments, messages and pages use plain words; See CONTRIBUTING.md for the rules."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ BEFORE = " \t\n\"'`*#|-_()"
 
 
 def python_passages(text: str) -> Iterator[tuple[int, str]]:
-    """Yield the first line and the text of each string and of each comment, whose lines are one passage."""
+    """Yield the first line and the text of each string and of each block of comments."""
     comment: list[str] = []
     last = 0
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
@@ -47,7 +47,7 @@ def python_passages(text: str) -> Iterator[tuple[int, str]]:
 
 
 def opencl_passages(text: str) -> Iterator[tuple[int, str]]:
-    """Yield the first line and the text of each comment, whose lines are one passage."""
+    """Yield the first line and the text of each block of comments."""
     for match in re.finditer(r"/\*.*?\*/|//[^\n]*(?:\n[ \t]*//[^\n]*)*", text, re.DOTALL):
         yield text.count("\n", 0, match.start()) + 1, re.sub(r"//|/\*|\*/", "", match.group())
 
@@ -100,7 +100,7 @@ def test_prose_has_no_banned_words():
 
 
 def test_no_sentence_of_a_page_ends_with_too():
-    """Notes and the changelog are pages as well."""
+    """Notes and the changelog are pages, too."""
     found = [
         f"{file.relative_to(ROOT).as_posix()}:{text.count(chr(10), 0, match.start()) + 1}"
         for file in scanned_files()

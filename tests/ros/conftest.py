@@ -11,7 +11,7 @@ import pytest
 
 @pytest.fixture
 def robot(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Yield a robot in a domain of its own, on the loopback."""
+    """Yield a robot in a separate domain, on the loopback."""
     from support.ros_robot import Robot
 
     monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))

@@ -1,4 +1,4 @@
-"""The node as a process inside ROS 2: its poses of a recording are those of the filter offline."""
+"""The node as a process inside ROS 2: its poses of a recording equal the offline filter's."""
 
 from __future__ import annotations
 

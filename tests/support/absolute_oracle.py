@@ -104,7 +104,7 @@ def bump(squared_cells: int, side: float, radius: float, pressed: bool, p: Any) 
     """Return log P of a bumper, from the squared distance between the outline's cell and the nearest obstacle."""
     gap = mp.sqrt(int(squared_cells)) * number(side) - number(side) / 2 - number(radius)
     x = gap / number(p.sigma) / mp.sqrt(2)
-    # Beyond a few thousand nats mpmath's erfc is slow, and negligible beside other terms.
+    # Beyond a few thousand nats mpmath's erfc is slow, and negligible against other terms.
     touching, clear = mp.erfc(x) / 2, mp.erfc(-x) / 2
     contact, false = number(p.p_contact), number(p.p_false)
     if not pressed:

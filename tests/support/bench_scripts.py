@@ -1,4 +1,4 @@
-"""Run a script of bench/, which is no part of the wheel."""
+"""Run a script of bench/ (not in the wheel)."""
 
 from __future__ import annotations
 

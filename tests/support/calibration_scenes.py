@@ -98,7 +98,7 @@ def _point(model: Any) -> Scene:
 def _landmarks(narrow: bool, options: dict[str, Any]) -> Scene:
     poses, parameters = _points((-1.0, 0.0, -3.1), (5.0, 5.0, 3.1)), _FEATURES
     if narrow:
-        # Poses that see all landmarks: a reading beyond a limit is left out, which is also information.
+        # Poses that see all landmarks: a reading beyond a limit is left out, and that is information.
         parameters = parameters.replace(field_of_view=4.0, range_max=6.0)
         poses[:, :2] = _MAP.xy.mean(axis=0) + (-3.0, 0.0) + 0.3 * poses[:, :2]
         poses[:, 2] = -0.3 + 0.05 * poses[:, 2]

@@ -18,7 +18,7 @@ def by_name(kind: object) -> str:
 
 
 def each_caster(bins: int) -> list[Caster]:
-    """Return one of each caster with default knobs, except for fewer angle bins."""
+    """Return each caster with default knobs, except for fewer angle bins."""
     options = {name: {knob.name for knob in dataclasses.fields(kind)} for name, kind in CASTERS.items()}
     return [kind(**({"bins": bins} if "bins" in options[name] else {})) for name, kind in CASTERS.items()]
 

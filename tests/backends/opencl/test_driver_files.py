@@ -1,4 +1,4 @@
-"""Which OpenCL drivers the loader gets: the system's, those beside pyopencl, and Intel's from its wheel."""
+"""Which OpenCL drivers the loader gets: the system's, pyopencl's, and Intel's from its wheel."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _CHOICE = drivers.choice
 
 @pytest.fixture
 def machine(tmp_path, monkeypatch):
-    """Imitate a machine with one driver of the system, one beside pyopencl, and no child processes."""
+    """Imitate a machine with one driver of the system, one of pyopencl, and no child processes."""
     vendors, beside = tmp_path / "vendors", tmp_path / "pyopencl" / ".libs"
     for folder in (vendors, beside):
         folder.mkdir(parents=True)
@@ -67,7 +67,7 @@ def test_intels_runtime_joins_the_drivers_that_the_loader_finds_by_itself(machin
     choice = drivers.choice()
     assert choice.drivers is not None and choice.failure == "" and choice.left_out == ()
     variables = drivers._variables(choice.drivers)
-    # A library beside its file is named by its path; the system's are found as before.
+    # A library next to its file is named by its path; the system's are found as before.
     assert named(variables) == ["libgpu.so.1", str(machine / "pyopencl" / ".libs" / "libpocl.so"), str(intel)]
     assert not (Path(variables["PYOPENCL_HOME"]) / ".libs").exists()
 

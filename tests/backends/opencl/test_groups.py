@@ -30,7 +30,7 @@ def test_groups_fill_the_vectors_of_llvmpipe(as_gpu, monkeypatch):
     """Lanes without a work-item would go on in loops; see ``group_multiple``."""
     import pyopencl as cl
 
-    # Scalar kernels of a processor, whose groups have 1, 16 and 64 work-items.
+    # Scalar kernels of a processor in groups of 1, 16 and 64 work-items.
     monkeypatch.setattr(as_gpu, "info", dataclasses.replace(as_gpu.info, kind="cpu"))
     expected = gs.BeamModel(GRID, SCANNER, backend=as_gpu).log_likelihood(cloud(1, 100), scan(1))
     as_gpu._launchers.clear()

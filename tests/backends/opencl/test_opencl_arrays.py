@@ -232,7 +232,7 @@ def test_a_pose_that_is_not_finite(queue, there):
 
 
 def test_backends_of_queues(queue):
-    """A queue has one backend, for as long as it is referenced."""
+    """A queue keeps one backend while it is referenced."""
     import pyopencl as cl
 
     device = get_backend(queue)

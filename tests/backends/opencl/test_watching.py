@@ -1,4 +1,4 @@
-"""Waits for short launches of PoCL, whose end the calling thread watches."""
+"""The calling thread polls for the end of short launches of PoCL."""
 
 from __future__ import annotations
 

@@ -135,7 +135,7 @@ def test_thinned_beams_count_as_often_as_they_stand_for():
 
 
 def test_fine_posterior_of_a_normal_density():
-    """Its deviations and its mean are those of the density, however narrow that is, up to the grid's spacing."""
+    """Deviations and mean equal the density's, however narrow, up to the grid's spacing."""
     mean, sigma = np.array([3.01, -2.0, 0.4]), np.array([0.004, 0.03, 0.001])
     fine = fine_posterior.fine_posterior(lambda x: -0.5 * np.square((x - mean) / sigma).sum(axis=1), (3.0, -2.0, 0.41))
     np.testing.assert_allclose(fine.deviation, sigma, rtol=0.01)

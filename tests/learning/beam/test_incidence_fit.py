@@ -107,7 +107,7 @@ def test_beams_that_hit_nothing_have_parameters_of_their_own() -> None:
     assert (
         with_nothing.parameters.parameters == fit.parameters.parameters and with_nothing.pooled.hits == fit.pooled.hits
     )
-    # A bin has 30 pseudo-readings beside 50 without return; one without readings has only the former.
+    # A bin adds 30 pseudo-readings to 50 readings without return; an empty bin has only the pseudo-readings.
     found, pooled = with_nothing.parameters.no_surface, fit.pooled.parameters
     assert found.z_max == pytest.approx((50 + 30 * pooled.z_max) / 80, rel=1e-6)
     assert found.sigma_hit == pytest.approx(pooled.sigma_hit, rel=1e-6)

@@ -125,7 +125,7 @@ def test_derivatives_are_those_of_the_log_likelihood(name: str, prior: Prior | N
 
 
 def alike(found: np.ndarray, truth: np.ndarray, precision: type) -> bool:
-    """Return whether sums are those of the reference, within the tolerance."""
+    """Return whether sums agree with the reference within the tolerance."""
     # Terms have either sign; their magnitudes are at most some 30 times those of r u^2.
     scale = np.maximum(np.abs(truth), np.abs(truth[7]))[: len(found)]
     tolerance = TOLERANCES[f"{np.dtype(precision).name} sums to learn from"]
@@ -155,7 +155,7 @@ def test_pseudo_readings_of_a_student_are_distributed_as_its_density() -> None:
         assert first[place] * unit == pytest.approx((after - before) / (2 * step), rel=1e-4)
         bend = (after - 2 * value(0.2, 0.05) + before) / step**2
         assert second[place, place] * unit**2 == pytest.approx(bend, rel=1e-2)
-    # The prior is highest where the density is that of the pseudo-readings.
+    # The prior is highest at the density of the pseudo-readings.
     same = point(1.0, 0.0, 0.0, 0.0, sigma=0.3, rate=1.0, bias=0.01, shape=StudentHit(2.5))
     np.testing.assert_allclose(prior.derivatives(same)[0], 0, atol=1e-7)
     assert prior.of_hits(same) == (3.0, pytest.approx(3.0))
@@ -176,7 +176,7 @@ def test_sums_are_alike_on_every_backend(precision: type, name: str, backend: st
 @pytest.mark.parametrize("lanes", [1, 16])
 def test_lanes_of_pairs_sum_to_the_same(lanes: int, needs: Callable[[str], str]) -> None:
     opencl = get_backend(needs("opencl"))
-    # Nothing near, range_max ahead, both ends and what is just before them beside ordinary pairs; not a multiple of 16.
+    # Nothing near, range_max ahead, both ends and values just before them, and ordinary pairs; not a multiple of 16.
     z, expected = draw(TYPICAL, 1003, 8, low=0, high=1)
     expected[:40:4], expected[1:40:4], z[2:40:4] = 0, RANGE_MAX, 0
     z[3:40:4] = expected[3:40:4]

@@ -120,6 +120,6 @@ def test_hill_climbing_does_not_warn_where_all_readings_are_0(count: int, range_
     fit = gs.fit_beam_parameters(
         np.zeros(count), np.full(count, 5.0), range_max, method="hill_climb", backend=backend, max_iterations=50
     )
-    # Readings of exactly 0 are implausible, and a warning says so.
+    # Readings of exactly 0 raise a warning.
     others = [warning for warning in recwarn.list if not issubclass(warning.category, gs.PlausibilityWarning)]
     assert np.isfinite(fit.log_likelihood) and not others

@@ -37,7 +37,7 @@ MIXTURES = {
 
 
 def exact(number) -> Fraction:
-    """Return a number of mpmath as a fraction, to its last digit; 0 for one with thousands of leading zeros."""
+    """Return a number of mpmath as a fraction, to its last digit; 0 if it has thousands of leading zeros."""
     if abs(number) < mp.mpf(10) ** -2000:
         return Fraction(0)
     sign, man, exponent, _ = mp.mpf(number)._mpf_
@@ -49,7 +49,7 @@ def spread_exactly(d: int, s: float):
     """Return the share of readings d steps from the obstacle: the integral of a triangle times a normal density."""
     if s == math.inf:
         return mp.mpf(d == 0)
-    # The integral is split at a narrow peak, so that nodes lie in it.
+    # The integral is split at a narrow peak, so that nodes sample it.
     points = sorted({d - 1, d, d + 1, *(mp.mpf(u) / s for u in (-40, -6, 6, 40) if d - 1 < u / s < d + 1)})
     return mp.quad(lambda v: s * (1 - abs(v - d)) * mp.npdf(v * s), points)
 

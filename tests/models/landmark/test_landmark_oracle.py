@@ -68,7 +68,7 @@ def test_features_against_mpmath(backend, name, precision, how):
     log_p, parts = scored(name, backend, precision, how)
     assert_within(parts if how != "known" else parts[:, [0, 1, 3, 4]],
                   expected if how != "known" else expected[:, [0, 1, 3, 4]])  # fmt: skip
-    # The sum's terms may cancel: its bound is that of the terms.
+    # The sum's terms may cancel: the terms bound its error.
     eps = np.finfo(precision).eps
     possible = np.isfinite(expected).all(axis=1)
     assert not np.isnan(log_p).any()
@@ -103,7 +103,7 @@ def test_features_as_the_caller_gave_them(backend, precision):
         model, oracle.table(model, oracle.exact_inputs(model, poses, features, rounded=False))
     )
     found = model.associate(poses, features)[1]
-    # float64 positions of up to 300 m, of which 16 eps are rounding, beside deviations of 0.2.
+    # float64 positions of up to 300 m, of which 16 eps are rounding; deviations are 0.2.
     allowed = (TOLERANCES["landmark"].value + (3e4 if precision == "float64" else 0)) * np.finfo(precision).eps
     assert (np.abs(found.astype(np.float64) - expected) <= allowed * (1 + np.abs(expected))).all()
 
@@ -111,7 +111,7 @@ def test_features_as_the_caller_gave_them(backend, precision):
 @pytest.mark.parametrize("name", ["ordinary", "everything", "wide field", "narrow field", "flat", "ranges", "bearings"])
 @pytest.mark.parametrize("place", [(0.0, 0.0), (2.9, 0.9), (3.0, 1.0)])
 def test_the_mixture_integrates_to_1(name, place):
-    """The integral is over all features of a known landmark, at zero range and near the sensor's limits as well."""
+    """The integral is over all features of a known landmark, also at zero range and near the sensor's limits."""
     landmarks, p, _, _, options = scenes.make(name)
     model = gs.LandmarkModel(landmarks, p, backend="numpy", precision="float64", **{**options, "mount": (0, 0, 0)})
     half, (low, high), j = p.field_of_view / 2, model._sensor.span, 0 if place == (3.0, 1.0) else 2

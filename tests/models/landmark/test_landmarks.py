@@ -171,14 +171,14 @@ def test_laws(backend, precision):
     np.testing.assert_array_equal(
         [model.log_likelihood(poses[n : n + 1], features)[0] for n in range(len(poses))], found
     )
-    # Errors of positions of 5e6 m and of turned ones in float64, beside deviations of 0.2 m and 0.05 rad at |u| < 100.
+    # Errors of positions of 5e6 m and of turned ones in float64, with deviations of 0.2 m and 0.05 rad at |u| < 100.
     lost = 1e-5 if precision == "float32" else 1e-6
     for angle, shift in ((0.0, (5e6, -3e6)), (2.0, (0.0, 0.0)), (-1.0, (1e3, 2e3))):
         c, s = np.cos(angle), np.sin(angle)
         turn = np.array([[c, s], [-s, c]])
         moved = np.concatenate([poses[:, :2] @ turn + shift, poses[:, 2:] + angle], axis=1)
         other = gs.LandmarkModel(gs.LandmarkMap(scenes.XY @ turn + shift), **own)
-        near = np.arange(len(poses)) != 1  # The pose on a landmark; the turned one may lie beside it.
+        near = np.arange(len(poses)) != 1  # The pose is on a landmark; the turned one may be a little off.
         apart = np.abs(other.log_likelihood(moved, features) - found)
         assert (apart <= eps + lost * (1 + np.abs(found)))[near].all()
     around = features + np.array([0, 2 * np.pi])
@@ -241,7 +241,7 @@ def test_wrong_signatures_are_other_landmarks(backend):
     model = gs.LandmarkModel(landmarks, gs.LandmarkParameters(sigma_signature=0.5), backend=backend)
     which, _ = model.associate([[0, 0, 0]], [[5.0, 0.0, 20.0], [5.0, 0.02, 10.0], [5.0, 0.0, NAN], [5.0, 0.0, 15.0]])
     assert which.tolist() == [[1, 0, 0, -1]]
-    # Without a deviation, which is the default, signatures are ignored.
+    # By default signatures have no deviation and are ignored.
     which, _ = gs.LandmarkModel(landmarks, backend=backend).associate([[0, 0, 0]], [[5.0, 0.0, 20.0]])
     assert which.tolist() == [[0]]
 
@@ -281,7 +281,7 @@ def test_100_000_landmarks_by_brute_force(needs, association):
         for z, bearing in features:
             turn = (bearing - b + np.pi) % (2 * np.pi) - np.pi
             density = np.exp(-0.5 * ((z - d) / p.sigma_range) ** 2 - 0.5 * (turn / p.sigma_bearing) ** 2)
-            # Mass of a range on [0, range_max], for farther landmarks that of one there; a bearing's is nearly 1.
+            # Mass of a range on [0, range_max], for farther landmarks of one there; a bearing's is nearly 1.
             near = np.minimum(d, p.range_max) / p.sigma_range
             mass = ndtr(near) - ndtr(near - p.range_max / p.sigma_range)
             density /= 2 * np.pi * p.sigma_range * p.sigma_bearing * mass

@@ -89,7 +89,7 @@ def test_overlapping_lines_by_way_of_others_have_one_group():
 @pytest.mark.parametrize("far", [(0.0, 3.0), (0.05, 3.0), (4.0, 8.0)])
 @pytest.mark.parametrize(("lever", "two_sided"), [(0.0, True), (6.0, True), (6.0, False)])
 def test_the_mixture_integrates_to_1(far, lever, two_sided):
-    """The integral is over all angles and distances to a known wall: near the sensor, far from it, beside its foot."""
+    """The integral is over all angles and distances to a known wall: near the sensor, far from it, off its foot."""
     distance, range_max = far
     p = gs.LineParameters(sigma_angle=0.15, sigma_distance=0.4, range_max=range_max)
     model = gs.LineModel(gs.LineMap([(9, distance, -9, distance)], two_sided), p, backend="numpy", precision="float64")
@@ -127,7 +127,7 @@ def test_a_line_through_the_sensor_has_two_forms():
 
 
 def test_parallel_walls_10_cm_apart_are_distinguished_where_both_are_seen():
-    """The nearer of two faces is in front for x > 0 only; beside its end the farther one is seen."""
+    """The nearer of two faces is in front for x > 0 only; past its end the farther one is seen."""
     model = gs.LineModel(gs.LineMap([(-5, 2.1, 5, 2.1), (0, 2, 5, 2)]), gs.LineParameters(sigma_distance=0.015),
                          backend="numpy")  # fmt: skip
     lines = [(np.pi / 2, 2.1, 0.3, 3.0), (np.pi / 2, 2.0, -3.0, -0.3)]
@@ -169,11 +169,11 @@ def test_an_empty_map_has_false_positives_only():
 
 
 def test_drawn_lines_have_the_covariance_of_the_density():
-    """Far beside the foot of the normal, angle and distance are correlated; the ends are those of the visible part."""
+    """Far from the foot of the normal, angle and distance are correlated; the ends bound the visible part."""
     p = gs.LineParameters(sigma_angle=0.02, sigma_distance=0.05, z_detect=1.0, z_false=0.0, p_detect=1.0, range_max=10)
     model = gs.LineModel(gs.LineMap([(4, 3, 20, 3), (-2, -1, 2, -1), (2, -2, -2, -2)], False), p, backend="numpy")
     z = model.sample(np.tile([(0, 0, 0.5)], (20000, 1)), seed=3)
-    # The free sides of the first two are above them, that of the last one is below: the robot is above two of them.
+    # The first two are free above, the last one below: the robot is above two of them.
     assert np.isnan(z[:, 0]).all() and np.isnan(z[:, 2]).all() and np.isfinite(z[:, 1]).all()
     turned = gs.LineModel(gs.LineMap([(20, 3, 4, 3)], False), p, backend="numpy")
     z = turned.sample(np.tile([(0, 0, 0.5)], (20000, 1)), seed=3)[:, 0]

@@ -123,7 +123,7 @@ def test_what_a_radio_cannot_report_is_missing():
     p = gs.BeaconParameters(sigma_range=0.5, z_hit=1.0, z_rand=0.0, range_max=4.0)
     at = np.tile((5.0, 0.0, 0.0), (20_000, 1))
     z = gs.BeaconModel([(0.0, 0.0)], p, backend="numpy").sample(at, seed=1)[:, 0]
-    # Mass of the normal around 5 m below 4 m, over that of a mean at 4 m.
+    # Mass of the normal around 5 m below 4 m, over the same mass for a mean at 4 m.
     seen = (stats.norm(5, 0.5).cdf(4) - stats.norm(5, 0.5).cdf(0)) / (0.5 - stats.norm(4, 0.5).cdf(0))
     assert stats.binomtest(int(np.isfinite(z).sum()), len(z), seen).pvalue > FALSE_ALARM
     assert np.nanmax(z) <= 4.0

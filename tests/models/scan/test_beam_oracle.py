@@ -44,7 +44,7 @@ def readings_around(expected: float, p: gs.BeamParameters, range_max: float, rea
 
 
 def error_in_eps(found: float, mixture: Mixture, z: float, expected: float, eps: float) -> float:
-    """Return the error over eps (1 + |log p|); infinite where exactly one of the two is, or where it is NaN."""
+    """Return the error over eps (1 + |log p|); infinite where only one value is infinite, or on NaN."""
     truth = exact_log_density(mixture, float(z), float(expected))
     if mp.isinf(truth) or not math.isfinite(found):
         return 0.0 if truth == -mp.inf and found == -math.inf else math.inf

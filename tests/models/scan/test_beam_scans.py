@@ -192,7 +192,7 @@ def test_sums_of_many_beams(count, nats, shared, precision, backend):
 
 
 def test_classes_of_readings():
-    """The classes of readings are those of the table above."""
+    """Readings have the classes of the table above."""
     last = np.nextafter(RANGE, 0)
     for range_min in (0.0, 0.5):
         scan = [NAN, -INF, INF, -1.0, -0.0, 0.0, 0.2, np.nextafter(0.5, 0), 0.5, 3.0, last, RANGE, 7.0]

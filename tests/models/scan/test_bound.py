@@ -41,7 +41,7 @@ def test_a_bound_call_has_the_bits_of_an_ordinary_one(case, batching):
                 assert np.allclose(found.numpy(), expected.numpy(), rtol=2e-7)
             else:
                 assert differing(found.numpy(), expected.numpy()) == 0, (seed, real)
-    # The first call starts its launches one by one, later calls a graph.
+    # The first call starts each launch, later calls a graph.
     assert len(started) >= 2 * len(SCANS) - 2
 
 
@@ -153,7 +153,7 @@ def test_nothing_is_allocated_compiled_or_copied(batching, monkeypatch):
 
 
 def test_without_graphs_launches_are_started_one_by_one(batching, monkeypatch):
-    """Graphs are absent if a driver refuses them, and beside other threads, since Warp cannot wait while it records."""
+    """Graphs are absent if a driver refuses them or other threads run, since Warp cannot wait while it records."""
     import warp as wp
 
     device, started = batching

@@ -17,7 +17,7 @@ from gpusense.models.scan import binding, packed_call
 @pytest.mark.sampled(0.25)
 @pytest.mark.parametrize("case", CASES)
 def test_short_calls_of_the_host_are_one_graph(case, batching, monkeypatch):
-    """Copies in both directions and all launches are one graph; the bits are those of the ordinary call."""
+    """Copies in both directions and all launches are one graph; the bits equal the ordinary call's."""
     device, started = batching
     model = CASES[case](backend=device)
     # Ordinary calls of any size.
@@ -81,7 +81,7 @@ def test_ordinary_calls_that_repeat_a_size(case, batching):
         model.log_likelihood(cloud(1), ranges, out=np.zeros(3, model.precision))
 
 
-# Limits that float32 rounds, one up and one down, and readings beside them.
+# Limits that float32 rounds, one up and one down, and readings next to them.
 ROUNDED = gs.Scanner(np.linspace(-3, 3, BEAMS), 5.6, 0.06)
 BESIDE = np.array(
     [5.6, 0.06, np.nextafter(np.float32(5.6), np.float32(0)), 2.0, np.nextafter(np.float32(0.06), np.float32(0))]

@@ -52,7 +52,7 @@ def test_ranges_in_a_disc_of_pixels(precision, backend):
     grid = gs.OccupancyGrid(cells, 0.1)
     caster = gs.RayCaster(grid, 40.0, backend=backend, precision=precision)
     rng = np.random.default_rng(4)
-    # From the middle all ranges are equal; from elsewhere they are those of secants.
+    # From the middle all ranges are equal; from elsewhere they are secants.
     distance, turn = np.append(0.0, rng.uniform(0, 140, 40)), rng.uniform(-4, 4, 41)
     x, y = distance * np.cos(turn), distance * np.sin(turn)
     poses = np.stack([(centre + x) * 0.1, (centre + y) * 0.1, rng.uniform(-4, 4, 41)], axis=1)

@@ -56,7 +56,7 @@ def test_explain_of_a_model_that_leaves_nothing_out(kind):
 
 
 def test_explain_of_a_full_beam_model(backend):
-    """Needed parts are not listed; the other tests check host code, which is the same for every backend."""
+    """Needed parts are not listed; the other tests check host code shared by all backends."""
     grid = room()
     model = make("beam", grid, backend, precision="float64")
     model.log_likelihood(cloud(grid, 100), scan())

@@ -51,14 +51,14 @@ def scene(resolution: float, origin: tuple[float, float, float], density: float 
 
 
 def scaled(names: dict[str, float], resolution: float, interpolation: str) -> gs.LikelihoodFieldParameters:
-    """Return parameters with lengths in units of 4 cells as well."""
+    """Return parameters, also with lengths in units of 4 cells."""
     p = gs.LikelihoodFieldParameters(**names, interpolation=interpolation)
     unit = 4 * resolution
     return p.replace(sigma_hit=p.sigma_hit * unit, max_distance=p.max_distance * unit)
 
 
 def compare(field: Field, model, poses, ranges, bearings, range_min=0.0) -> None:
-    """Compare parts and sums; a beam whose end point lies on an edge to rounding may take either nearest cell."""
+    """Compare parts and sums; a beam that ends on an edge up to rounding may take either nearest cell."""
     expected, clear = field.parts(poses, ranges, bearings, range_min)
     log_p, parts = model.log_likelihood(poses, ranges, per_beam=True)
     assert parts.dtype == log_p.dtype == np.dtype(model.precision)
@@ -200,7 +200,7 @@ def lattice(resolution: float) -> tuple:
 
 @pytest.mark.parametrize("resolution", [0.05, 0.25])
 def test_float32_look_ups_on_the_edges_of_cells(resolution, backend):
-    """Most of 40 000 end points lie on an edge up to the rounding of cosines: their cells are the same."""
+    """Most of 40 000 end points are on an edge up to the rounding of cosines: their cells are the same."""
     wrong = differing_cells(*lattice(resolution), ("float64", "numpy"), ("float32", backend))
     assert not len(wrong), (len(wrong), wrong[:3])
 

@@ -101,7 +101,7 @@ class Scene:
 def scene(kind: str, seed: int, **changes: Any) -> Scene:
     """Return poses in the map, in walls and off it; half of the readings are those that the first pose expects.
 
-    For a likelihood field they end in the wall and not on its face, which is the edge of two cells.
+    For a likelihood field they end in the wall and not on its face, an edge of two cells.
     """
     rng = np.random.default_rng(seed)
     walls = rng.random(rng.integers(4, 16, 2)) < rng.choice([0.03, 0.15])

@@ -139,7 +139,7 @@ def test_defaults_are_those_of_the_nodes():
     ids=repr,
 )
 def test_a_changed_map(compat, backend):
-    """Boundaries of obstacles and modelled cells around a change are those of a model of the changed map."""
+    """Boundaries of obstacles and modelled cells around a change equal a new model's of the changed map."""
     rng = np.random.default_rng(4)
     cells = np.where(rng.random((40, 50)) < 0.1, 100, 0)
     cells[10:20, 10:20], cells[30:, 40:] = 100, -1

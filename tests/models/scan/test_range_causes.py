@@ -130,7 +130,7 @@ def table(p):
 
 
 def mixture(weights, rate=BASE.lambda_short):
-    """Return log densities of the host's mixture, whose weights need not have the sum 1."""
+    """Return log densities of the host's mixture; weights need not have the sum 1."""
     hit, short, top, rand = weights
     shape = dict(sigma_hit=0.3, lambda_short=rate, range_max=RANGE)
     return {"mixture": log_mixture(WITH_MAX, EXPECTED, z_hit=hit, z_short=short, z_max=top, z_rand=rand, **shape)}
@@ -190,7 +190,7 @@ def test_a_made_up_random_density_is_followed(monkeypatch):
     assert after[4] == pytest.approx(before[4] - math.log(2))
     assert numbers(steep)["terms of logarithms"][1] == pytest.approx(log_term - math.log(2))
     np.testing.assert_allclose(far_ranges(), 2 * ranges)
-    # The joint fit's density is that of the host's mixture.
+    # The joint fit's density equals the host's mixture.
     growing = {**dict(zip(("z_hit", "z_short", "z_max", "z_rand"), weights, strict=True)), "sigma_growth": 0.01}
     truth = log_mixture(WITH_MAX, EXPECTED, sigma_hit=0.3, lambda_short=0.4, range_max=RANGE, **growing)
     np.testing.assert_allclose(after[0]["density"], truth, rtol=1e-9)

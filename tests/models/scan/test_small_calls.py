@@ -103,12 +103,12 @@ def test_graphs_change_no_bit(kind, batching, monkeypatch):
         expected = plainly(device, monkeypatch, lambda p=poses, z=ranges: model.log_likelihood(p, z))
         assert differing(model.log_likelihood(poses, ranges), expected) == 0
         if kind is gs.BeamModel:
-            # Code of stored calls counts as well.
+            # Code of stored calls also counts.
             inside = np.full((50, 3), 3.0)
             assert "ORIGINS_OUTSIDE" in model._last.flags
             model.log_likelihood(inside, ranges)
             assert "ORIGINS_OUTSIDE" not in model._last.flags
-    # Of each of three sizes the first calls are plain, and so are those of other code.
+    # First calls of each of three sizes, and of other code, are plain.
     assert len(started) >= 3
     # A changed map updates the table or rebuilds it.
     for place in ((5, 6), (30, 30)):
@@ -253,7 +253,7 @@ def test_threads_have_batches_of_their_own(batching, monkeypatch):
     for thread in threads:
         thread.join()
     assert len(same) == 30 and all(same)
-    # Warp records for the whole process, so nothing is recorded beside other threads.
+    # Warp records for the whole process, so nothing is recorded while other threads run.
     assert not started
     for _ in range(3):
         models[0].log_likelihood(cloud(0), scan(0))

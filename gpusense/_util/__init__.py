@@ -1,1 +1,1 @@
-"""Checks of arguments, atomic file writes and progress bars; nothing of the domain."""
+"""Utilities without domain knowledge: checks of arguments, atomic file writes, progress bars."""

@@ -1,4 +1,4 @@
-"""Angles."""
+"""Wrap angles."""
 
 from __future__ import annotations
 

@@ -20,9 +20,9 @@ from gpusense._util import masks
 T = TypeVar("T")
 
 FARTHEST = 1e9
-"""Largest coordinate of a place, and of a motion [m]; coordinates of UTM reach 1e7."""
+"""Largest coordinate of a position or motion [m]; UTM reaches 1e7."""
 SMALLEST = 1e-9
-"""Smallest length that a sensor measures [m]."""
+"""Smallest length of a sensor [m]."""
 _DOUBLE = np.dtype(np.float64)
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = 120
@@ -112,7 +112,7 @@ def boolean(name: str, value: object) -> bool:
 
 
 def instance(name: str, value: object, kind: type[T], *, optional: bool = False) -> T:
-    """Return ``value`` after checking that it is an instance of ``kind``, or with ``optional`` None."""
+    """Return ``value`` after checking that it is an instance of ``kind``, or None if ``optional``."""
     if not isinstance(value, kind) and not (optional and value is None):
         word = kind.__name__
         article = "" if word.endswith("s") else "an " if word[0] in "AEIOU" else "a "
@@ -121,7 +121,7 @@ def instance(name: str, value: object, kind: type[T], *, optional: bool = False)
 
 
 def or_default(name: str, value: object, kind: Callable[[], T]) -> T:
-    """Return ``value`` after checking that it is an instance of ``kind``; for None, one with default values."""
+    """Return ``value`` after checking that it is an instance of ``kind``; None becomes an instance with defaults."""
     return kind() if value is None else instance(name, value, cast("type[T]", kind))
 
 
@@ -131,7 +131,7 @@ def as_array(name: str, value: object, *, masked: bool = False) -> NDArray[Any]:
     Args:
         name: Name of the argument.
         value: Anything that ``numpy.asarray`` accepts.
-        masked: Whether values may be masked; these become NaN, and integers with them float64.
+        masked: Whether values may be masked; they become NaN, and integers become float64.
     """
     check_values(name, value)
     try:
@@ -164,7 +164,7 @@ def array(
             machine's byte order) and converts integers to float64.
     """
     if type(value) is np.ndarray and value.dtype == _DOUBLE and (dtype is None or dtype is np.float64):
-        # Most arguments are such arrays, and the other checks take five times as long.
+        # Fast path for most arguments: the other checks take five times as long.
         fits = shape is None or _fits(value.shape, shape)
         if fits and (not finite or np.logical_and.reduce(np.isfinite(value), axis=None)):
             return value if largest == math.inf else _limited(name, value, largest)
@@ -214,7 +214,7 @@ def indices(name: str, value: object, size: int, shape: Sequence[int | str] | No
 
 
 def broadcast(named: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
-    """Return arrays by their names as views of one shape."""
+    """Return named arrays as views of one shape."""
     try:
         return list(np.broadcast_arrays(*named.values()))
     except ValueError:
@@ -225,7 +225,7 @@ def broadcast(named: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
 
 
 def check_values(name: str, array: object) -> None:
-    """Refuse an array without values, which JAX traces."""
+    """Refuse an array that JAX traces and that has no values."""
     if type(array).__module__.partition(".")[0] == "jax" and isinstance(array, sys.modules["jax"].core.Tracer):
         raise TypeError(
             f"{name}: must have values, got an array that JAX traces (jit, grad, vmap); only the poses of "
@@ -234,7 +234,7 @@ def check_values(name: str, array: object) -> None:
 
 
 def check_gradients(array: object, name: str, error: Exception) -> None:
-    """Raise a clear error if ``array`` could not be exported because its library records its gradients."""
+    """Raise a clear error if ``array`` cannot be exported because its library records gradients."""
     if getattr(array, "requires_grad", False) is True:
         raise TypeError(
             f"{name}: must not require gradients, which are not computed here, got a "
@@ -243,9 +243,9 @@ def check_gradients(array: object, name: str, error: Exception) -> None:
 
 
 def nested(name: str, value: object, *, deepest: int, most: int) -> int:
-    """Count the values in nested mappings, lists and tuples; a value that occurs twice counts twice.
+    """Count the values in nested mappings, lists and tuples, with repetitions.
 
-    Keys of mappings count as values. A string counts once more for every 64 characters.
+    Keys of mappings are values. A string counts once more for every 64 characters.
     """
     count = 0
     inner: list[Iterator[Any]] = [iter([value])]
@@ -278,7 +278,7 @@ def path(name: str, value: object) -> Path:
 
 def existing_file(file: Path) -> Path:
     """Return ``file`` after checking that it is an existing regular file."""
-    # For an impossible name os.path reports a missing file, where Path raises another error.
+    # For an impossible name os.path reports a missing file; Path raises another error.
     if not os.path.exists(file):
         found = "a link that leads to no file" if os.path.islink(file) else "no such file"
         raise FileNotFoundError(f"{file}: must exist, got {found}")

@@ -1,4 +1,4 @@
-"""Read documents of settings and reports, YAML and JSON, within bounds; nothing in them is executed."""
+"""Read YAML and JSON documents within bounds, without executing their contents."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from gpusense._util import checks
 
 _LARGEST_YAML_BYTES, _LARGEST_JSON_BYTES = 1 << 20, 1 << 28
 DEEPEST = 100
-"""Levels of lists and mappings in each other."""
+"""Largest depth of nested lists and mappings."""
 MOST_REPEATED = 100_000
-"""Values that the aliases of a document may repeat, counted as if each were written out."""
+"""Most values repeated by aliases of a document, counted as if written out."""
 _TOO_DEEP = f"its parts must be nested at most {DEEPEST} deep, got more"
 
 
 @functools.cache
 def _base() -> Any:
-    """Return PyYAML's safe loader: the compiled one where the installation has it."""
+    """Return PyYAML's safe loader, compiled if available."""
     import yaml
 
     return getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -31,7 +31,8 @@ def _base() -> Any:
 def _loader() -> Any:
     """Return the safe loader with decimal numbers.
 
-    YAML 1.1 reads 010 as octal and 1:30 as sexagesimal. ROS reads them by YAML 1.2 with yaml-cpp: as ten and as text.
+    YAML 1.1 reads 010 as octal and 1:30 as sexagesimal. ROS reads them by YAML 1.2, with yaml-cpp, as ten and as
+    text.
     """
 
     class DecimalLoader(_base()):  # type: ignore[misc]
@@ -54,9 +55,9 @@ def _loader() -> Any:
 
 
 def check_yaml(text: str | bytes) -> None:
-    """Refuse YAML whose parts are nested too deeply, contain themselves, or grow without bound by aliases.
+    """Refuse YAML with parts that are nested too deeply, contain themselves, or grow without bound by aliases.
 
-    The parser's events are read one by one, so that no alias is expanded.
+    Only the parser's events are read, so that aliases are never expanded.
     """
     import yaml
 
@@ -88,7 +89,7 @@ def check_yaml(text: str | bytes) -> None:
 
 
 def _events(text: str | bytes) -> Iterator[Any]:
-    """Return the events of a document; some versions of the parser also limit the nesting."""
+    """Return the events of a document; some versions of the parser also limit nesting."""
     import yaml
 
     try:
@@ -123,7 +124,7 @@ def read_mapping(file: Path) -> dict[Any, Any]:
 
 
 def _check_keys(loader: Any, root: Any) -> None:
-    """Refuse mappings with a doubled key, of which PyYAML would silently keep the last value."""
+    """Refuse mappings with a doubled key; PyYAML would silently keep its last value."""
     import yaml
 
     nodes, seen = [root], set[int]()
@@ -147,7 +148,7 @@ def _check_keys(loader: Any, root: Any) -> None:
 
 
 def _problem(error: Exception) -> str:
-    """Return the error of a document in the words of the parsing library."""
+    """Return the parsing library's text of an error."""
     for name in ("problem", "reason"):
         if text := getattr(error, name, None):
             return " ".join(str(text).split())
@@ -170,7 +171,7 @@ def read_json(file: Path, kind: str) -> Any:
 
 
 def _bounded(file: Path, most: int, kind: str) -> bytes:
-    """Return the content of a file."""
+    """Return the bytes of a file, up to a bound."""
     with file.open("rb") as stream:
         text = stream.read(most + 1)
     if len(text) > most:

@@ -1,4 +1,4 @@
-"""Import libraries that an installation may lack, with an error of one line that names the command to install them."""
+"""Import optional libraries, with one-line errors that name the command to install them."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 
 class Requirement(NamedTuple):
-    """A library that gpusense imports late.
+    """Library that gpusense imports late.
 
     Attributes:
         package: Name of its package for pip.
-        extra: The extra of gpusense that installs it; empty for a required dependency.
+        extra: Extra of gpusense that installs it; empty for a required dependency.
     """
 
     package: str
@@ -52,7 +52,7 @@ def library(module: str, purpose: str) -> ModuleType:
 
     Args:
         module: The module, such as ``"pyarrow.parquet"``, of a library in ``REQUIREMENTS``.
-        purpose: The subject of the message, such as ``"a Parquet table"``.
+        purpose: Subject of the message, such as ``"a Parquet table"``.
 
     Raises:
         MissingLibraryError: The library is absent, or cannot be imported.
@@ -68,7 +68,7 @@ def check_library(module: str, purpose: str) -> None:
     name = module.partition(".")[0]
     try:
         absent = importlib.util.find_spec(name) is None
-    except ValueError:  # the module is None in sys.modules, or has no specification
+    except ValueError:  # the module is None in sys.modules or has no spec
         absent = sys.modules.get(name) is None
     if absent:
         raise missing(name, purpose, ModuleNotFoundError(f"No module named {name!r}", name=name))
@@ -93,14 +93,14 @@ def explained(error: ImportError) -> MissingLibraryError | None:
 
 
 def install_command(module: str) -> str:
-    """Return the command that installs a library for the running Python, and the variant for a checkout."""
+    """Return the command that installs a library for the running Python, with a variant for a checkout."""
     needed, pip = REQUIREMENTS[module.partition(".")[0]], _pip()
     command = f"{pip} install {shlex.quote(needed.package)}"
     return f"{command}, or in a checkout of gpusense {pip} install '.[{needed.extra}]'" if needed.extra else command
 
 
 def _pip() -> str:
-    """Return the command that runs this Python's pip: ``pip`` if the shell finds the same one."""
+    """Return the command that runs this Python's pip: ``pip`` if the shell finds it."""
     pip = shutil.which("pip")
     folder = Path(sys.executable).parent if sys.executable else None
     if folder is None or (pip is not None and Path(pip).parent == folder):

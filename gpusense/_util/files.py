@@ -10,13 +10,13 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, BinaryIO
 
-# Unfinished files of this process: entered before they are created, removed after they are deleted.
+# Unfinished files of this process: added before creation, removed after deletion.
 _UNFINISHED: set[Path] = set()
 
 
 @contextlib.contextmanager
 def naming(path: object) -> Iterator[None]:
-    """Name a file in errors of the operating system that lack a name; a full disk raises one."""
+    """Name a file in errors of the operating system that lack a name, such as for a full disk."""
     try:
         yield
     except OSError as error:
@@ -33,13 +33,8 @@ def check_writable(path: Path) -> None:
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write a file atomically: it is either complete or, after any failure, as it was before.
-
-    Args:
-        path: The file; replaced if it exists.
-        write: Function that writes the contents to a binary stream.
-    """
-    # A symbolic link is kept; its target is replaced.
+    """Write a file atomically: it is complete or, after any failure, unchanged."""
+    # Keep a symbolic link, and replace its target.
     target = Path(os.path.realpath(path))
     if os.path.lexists(target) and not target.is_file():
         raise ValueError(f"{path}: must be a regular file, got another kind")
@@ -47,11 +42,7 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def write_several(writers: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
-    """Write several files atomically: either all are replaced or, after any failure, none is.
-
-    Args:
-        writers: Functions that write the contents to a binary stream, by file.
-    """
+    """Write several files atomically: all are replaced or, after any failure, none."""
     tag = _tag(4)
     fresh = {target: target.with_name(f".{target.name}.{tag}.new") for target in writers}
     backup = {target: target.with_name(f".{target.name}.{tag}.old") for target in writers}
@@ -67,7 +58,7 @@ def write_several(writers: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
             backup[target].unlink(missing_ok=True)
             _discard(fresh[target])
 
-    # Twice, as an interrupt may come before the first clean-up or end it.
+    # Twice: an interrupt may precede or end the first clean-up.
     try:
         try:
             for target, write in writers.items():
@@ -87,16 +78,16 @@ def write_several(writers: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
 
 def _tag(size: int) -> str:
     """Return a random word of ``size`` bytes in hexadecimal digits."""
-    # Imported on use, since first calls do not need it.
+    # Imported on use, to keep imports fast.
     import secrets
 
     return secrets.token_hex(size)
 
 
 def _write_fresh(path: Path, write: Callable[[BinaryIO], object], target: Path | None) -> None:
-    """Write a new file in the folder of ``path``, and rename it to the target, or delete it."""
+    """Write a new file in the folder of ``path``, and rename it to the target or delete it."""
     fresh = path.parent / f".gpusense-{_tag(6)}.new"
-    # An interrupt may come before the first clean-up.
+    # An interrupt may precede the first clean-up.
     try:
         try:
             _UNFINISHED.add(fresh)
@@ -113,21 +104,21 @@ def _write_fresh(path: Path, write: Callable[[BinaryIO], object], target: Path |
 
 
 def _discard(fresh: Path) -> None:
-    """Delete an unfinished file, if it is there."""
+    """Delete an unfinished file, if it exists."""
     fresh.unlink(missing_ok=True)
     _UNFINISHED.discard(fresh)
 
 
 @atexit.register
 def _remove_unfinished(process: int = os.getpid()) -> None:
-    """Delete the files that several interrupts in a row have left; a forked child does not touch its parent's files."""
+    """Delete files left by repeated interrupts; a forked child keeps its parent's files."""
     for fresh in tuple(_UNFINISHED) if os.getpid() == process else ():
         with contextlib.suppress(OSError):
             _discard(fresh)
 
 
 def unnamed_file() -> IO[bytes]:
-    """Open a temporary file without a name; in memory if no folder can hold it."""
+    """Open an unnamed temporary file, in memory if no folder can hold it."""
     try:
         return tempfile.TemporaryFile()
     except OSError:

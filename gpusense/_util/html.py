@@ -1,4 +1,4 @@
-"""Small HTML tables for ``_repr_html_``, which notebooks show; their contents are escaped."""
+"""Make small HTML tables for ``_repr_html_`` in notebooks, with escaped contents."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 FIT_HEAD = ("parameter", "value", "standard error", "")
 """Headings of the table of a fit."""
 LONGEST = 2000
-"""Most characters of a cell or of a detail; the rest is left out."""
+"""Most characters of a cell or detail; the rest is omitted."""
 
 
 def card(
@@ -22,10 +22,10 @@ def card(
 
     Args:
         title: The title, usually the name of a class.
-        rows: Cells of each row. The first cell is the row's heading; floats have five digits.
-        head: Headings of the columns; none by default.
-        detail: Text below the table that a click opens.
-        picture: A PNG beside the table.
+        rows: Cells of each row, starting with its heading; floats have five digits.
+        head: Headings of the columns, if any.
+        detail: Text below the table that opens on a click.
+        picture: A PNG next to the table.
     """
     parts = [f"<b>{_text(title)}</b>"]
     if picture:
@@ -44,7 +44,7 @@ def card(
 
 
 def split_options(options: Iterable[str]) -> list[tuple[str, str]]:
-    """Return names and values of options as ``repr`` shows them, such as ``caster=Exact()``."""
+    """Split options in the form of ``repr``, such as ``caster=Exact()``, into names and values."""
     pairs = []
     for option in options:
         name, equals, value = option.partition("=")
@@ -62,7 +62,7 @@ def pose_rows(pose: NDArray[np.floating], covariance: NDArray[np.floating]) -> l
 def grey_png(pixels: NDArray[np.uint8]) -> bytes:
     """Return (H, W) grey values as a PNG."""
     rows, cols = pixels.shape
-    lines = np.zeros((rows, cols + 1), np.uint8)  # each begins with its filter, none
+    lines = np.zeros((rows, cols + 1), np.uint8)  # each begins with its filter byte, 0
     lines[:, 1:] = pixels
     chunks = (
         (b"IHDR", struct.pack(">IIBBBBB", cols, rows, 8, 0, 0, 0, 0)),

@@ -6,23 +6,17 @@ from collections.abc import Callable
 from typing import Any
 
 FLOOR, RATIO = 1 << 28, 100
-"""A compressed stream may hold ``FLOOR`` bytes, and ``RATIO`` more for each of its compressed bytes."""
+"""Limit of a stream: ``FLOOR`` bytes, plus ``RATIO`` per compressed byte."""
 _PIECE = 1 << 20
 
 
 def most_bytes(compressed: int) -> int:
-    """Return the largest allowed size of a stream from its compressed size, both in bytes."""
+    """Return the largest size of a stream from its compressed size [bytes]."""
     return FLOOR + RATIO * compressed
 
 
 def inflated(make: Callable[[], Any], data: bytes, most: int) -> bytes:
-    """Decompress one frame or several consecutive ones.
-
-    Args:
-        make: Constructor of a decompressor with the interface of :class:`bz2.BZ2Decompressor`.
-        data: The compressed bytes.
-        most: Largest size of the result [bytes].
-    """
+    """Decompress consecutive frames."""
     parts: list[bytes] = []
     total = 0
     while data:

@@ -1,4 +1,4 @@
-"""Interrupts in destructors, where Python would lose them as it ignores exceptions there."""
+"""Defer interrupts raised in destructors, where Python ignores exceptions."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from types import FrameType
 
 # Delay after which the destructor has ended [s].
 _LATER = 0.002
-# Name of functions that are installed as ``sys.unraisablehook``.
+# Name of functions installed as ``sys.unraisablehook``.
 HOOK = "report_unraisable"
 
 
 def undisturbed(work: Callable[[], object]) -> None:
-    """Run the work of a destructor to its end, and deliver an interrupt that came meanwhile after it.
+    """Run a destructor's work to its end, then raise any pending interrupt.
 
     Args:
-        work: A function that may be repeated, such as the wait for a device.
+        work: Repeatable function, such as a wait for a device.
     """
     interrupt: KeyboardInterrupt | None = None
     while True:
@@ -34,11 +34,11 @@ def undisturbed(work: Callable[[], object]) -> None:
 
 
 def deliver_later(number: int) -> None:
-    """Send a signal to the main thread once it has left its destructor or the hook that reports errors in destructors.
+    """Send a signal to the main thread once it has left a destructor, or the hook for errors in destructors.
 
-    Python handles signals between bytecodes of the main thread, which may still be the destructor's.
+    Python handles signals between bytecodes of the main thread, perhaps still in the destructor.
     """
-    # ``threading.Thread`` would wait for its start.
+    # ``threading.Thread`` would wait until it starts.
     _thread.start_new_thread(_deliver, (number,))
 
 
@@ -52,12 +52,12 @@ def _deliver(number: int) -> None:
     if sys.platform == "win32":
         _thread.interrupt_main(number)
     else:
-        # Only a signal to the main thread interrupts the system call in which it may wait.
+        # Only a signal to the main thread interrupts its system calls.
         signal.pthread_kill(main, number)
 
 
 def _is_lost_in(frame: FrameType | None) -> bool:
-    """Return whether an exception in a call would be ignored."""
+    """Return whether Python would ignore an exception in a frame."""
     while frame is not None:
         if frame.f_code.co_name in ("__del__", HOOK):
             return True

@@ -1,4 +1,4 @@
-"""Read the lines of a text file with their numbers; the file may be compressed by gzip."""
+"""Read the numbered lines of a text file, plain or gzipped."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from gpusense._util.inflate import most_bytes
 T = TypeVar("T")
 
 MOST_BYTES = 1 << 24
-"""Lines have fewer bytes; a longer one is an error before it is read as a whole."""
-# Lines that a compressed file may have in addition to one for each compressed byte.
+"""Length limit of lines [bytes], checked before a line is read completely."""
+# Most lines of a compressed file beyond one line per compressed byte.
 _LINES = 1 << 22
 
 
 def numbered_lines(file: Path) -> Iterator[tuple[int, bytes]]:
-    """Read a file line by line; its first bytes show whether it is compressed.
+    """Read a file line by line; its first bytes decide whether it is compressed.
 
     Yields:
         The line's number, from 1 on, and the line with its end.
 
-    A byte order mark is left out. A truncated compressed file is read up to its end, with a warning.
+    A byte order mark is skipped. A truncated compressed file is read up to its end, with a warning.
     """
     number = 0
     mark = b"\xef\xbb\xbf"  # byte order mark of UTF-8
@@ -54,7 +54,7 @@ def numbered_lines(file: Path) -> Iterator[tuple[int, bytes]]:
 
 
 def _bounds(file: Path, compressed: bool) -> tuple[float, float]:
-    """Return the limits of a compressed file's lines and bytes; infinity for a plain file."""
+    """Return the limits of a compressed file's lines and bytes, infinite for a plain file."""
     if not compressed:
         return float("inf"), float("inf")
     size = file.stat().st_size
@@ -64,8 +64,8 @@ def _bounds(file: Path, compressed: bool) -> tuple[float, float]:
 def until_cut(file: Path, read: Callable[[Iterator[tuple[int, bytes]]], Iterator[T]]) -> Iterator[T]:
     """Yield the records that a function reads from the lines of a file.
 
-    A last line that has no line break and breaks the format was truncated, by a killed recorder or an interrupted copy.
-    It is left out with a warning, unless it is the first record.
+    A last line without a line break that breaks the format was truncated by a killed recorder or an interrupted copy.
+    It is skipped with a warning, unless it is the first record.
 
     Args:
         file: The file.

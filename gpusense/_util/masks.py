@@ -1,4 +1,4 @@
-"""Masked arrays of NumPy: a masked reading is missing, and a masked pose or cell is an error."""
+"""Convert NumPy's masked arrays: a masked reading is missing, a masked pose or cell is an error."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ _NUMBERS = {int, float, np.float32, np.float64}
 
 
 def is_masked(value: object) -> bool:
-    """Return whether a value is a masked array, or a list or tuple that holds one at any depth."""
+    """Return whether a value is a masked array, or a list or tuple that contains one at any depth."""
     if type(value) is np.ndarray:
         return False
     library = sys.modules.get("numpy.ma")
     if library is None:
         return False
     if isinstance(value, (list, tuple)):
-        # Lists of numbers are long: only their types are inspected.
+        # Lists of numbers are long: inspect only types.
         kinds = set(map(type, value))
         if kinds <= _NUMBERS:
             return False
@@ -29,9 +29,9 @@ def is_masked(value: object) -> bool:
 
 
 def filled(value: Any) -> Any:
-    """Return a masked array, or nested lists with one in them, as an array with NaN where it is masked.
+    """Return a masked array, or nested lists that contain one, as an array with NaN where masked.
 
-    Integers and booleans become float64 if any of them is masked. Other values are returned as they are.
+    Masked integers and booleans become float64. Other values are returned unchanged.
     """
     if not is_masked(value):
         return value
@@ -44,7 +44,7 @@ def filled(value: Any) -> Any:
 
 
 def unmasked(name: str, value: Any) -> Any:
-    """Return a masked array without masked values as a plain one; other values as they are."""
+    """Return a masked array without masked values as a plain array, and other values unchanged."""
     if not is_masked(value):
         return value
     data, mask = _parts(value)
@@ -56,7 +56,7 @@ def unmasked(name: str, value: Any) -> Any:
 
 
 def _parts(value: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers and the mask of a masked array, or of nested lists with one in them."""
+    """Return the numbers and the mask of a masked array, or of nested lists that contain one."""
     if isinstance(value, (list, tuple)):
         datas, masks = zip(*map(_parts, value), strict=True)
         return np.stack(datas), np.stack(masks)

@@ -1,4 +1,4 @@
-"""The memory that is free for this process, and checks before large allocations."""
+"""Find the free memory of this process, and check it before large allocations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def available() -> int | None:
 
 
 def check_room(name: str, needed: int, what: str) -> None:
-    """Refuse work that needs more memory than is free, before it begins.
+    """Refuse work that needs more than the free memory, before it begins.
 
     Args:
         name: Name of the file or argument.

@@ -1,4 +1,4 @@
-"""Warn at the user's line of code, at whatever depth of this package the reason lies."""
+"""Warn at the user's line of code, from any depth of this package."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _PACKAGE = __name__.partition(".")[0]
 
 
 def warn_user(message: str, category: type[Warning] = UserWarning) -> None:
-    """Warn at the nearest frame outside this package, so that Python shows a message once for each calling line."""
+    """Warn at the nearest frame outside this package, so that Python shows a message once per calling line."""
     level, frame = 2, sys._getframe(1)
     while frame.f_back is not None and _is_own(str(frame.f_globals.get("__name__", ""))):
         frame, level = frame.f_back, level + 1

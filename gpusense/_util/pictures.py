@@ -1,4 +1,4 @@
-"""Pictures of results: a result names its picture, and the root of the package registers a drawing function by name."""
+"""Draw pictures of results: results name pictures, and the package's root registers drawing functions by name."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Folders in which other users cannot replace files, and bounded reads of regular files.
+"""Make folders that other users cannot change, and read regular files within bounds.
 
-Code that is loaded from a folder is as trustworthy as everyone who can write there. Writers are the folder's owner,
-users whom its mode lets write, and users who can rename a folder above it. Windows and other systems without such
-owners protect users' folders by other rules; there only the file type is checked.
+Code in a folder is as trustworthy as everyone who can write there: its owner, users with write permission, and users
+who can rename a folder above it. Windows and other systems without such owners protect users' folders by other rules;
+only file types are checked there.
 """
 
 from __future__ import annotations
@@ -18,14 +18,11 @@ _HAS_OWNERS = hasattr(os, "geteuid")
 
 
 class UnsafeFolderError(PermissionError):
-    """A folder that another user could change; the message names the folder and the rule."""
+    """A folder that other users can change; the message names the folder and the rule."""
 
 
 def make_private(folder: Path) -> None:
-    """Make a folder and its missing parents, each for this user alone, and check it.
-
-    Args:
-        folder: As for :func:`check_private`. Nothing is made where another user could replace it.
+    """Make a folder and its missing parents, each private to this user, and check it.
 
     Raises:
         UnsafeFolderError: As for :func:`check_private`.
@@ -35,14 +32,14 @@ def make_private(folder: Path) -> None:
     if absent and _HAS_OWNERS:
         _check_parents(absent[-1])
     for path in reversed(absent):
-        # Another process may have made it.
+        # Another process may have made the folder.
         with contextlib.suppress(FileExistsError):
             path.mkdir(mode=0o700)
     check_private(folder)
 
 
 def check_private(folder: Path) -> None:
-    """Check that only this user can change the files of a folder, or put another folder in its place.
+    """Check that only this user can change a folder's files or replace the folder.
 
     Args:
         folder: An absolute path without symbolic links above it, as ``os.path.realpath`` returns.
@@ -67,13 +64,13 @@ def check_private(folder: Path) -> None:
 
 
 def _check_parents(folder: Path) -> None:
-    """Check that other users can rename neither a folder nor any folder above it."""
+    """Check that other users cannot rename a folder or any folder above it."""
     for child, parent in zip((folder, *folder.parents), folder.parents, strict=False):
         _check_parent(parent, child.name)
 
 
 def _check_parent(folder: Path, child: str) -> None:
-    """Check that only this user and root can rename the files that they own in a folder."""
+    """Check that only this user and root can rename their files in a folder."""
     status = os.stat(folder)
     if not _is_trusted(status.st_uid):
         owner = f"this user ({os.geteuid()}) or root, got owner {status.st_uid}"
@@ -90,7 +87,7 @@ def _check_parent(folder: Path, child: str) -> None:
 def _is_trusted(owner: int) -> bool:
     """Return whether a file's owner is this user or root.
 
-    In a user namespace all owners outside it, including root, appear as one user that has no processes.
+    In a user namespace all outside owners, including root, appear as one user without processes.
     """
     if owner in (0, os.geteuid()):
         return True
@@ -105,7 +102,7 @@ def _is_trusted(owner: int) -> bool:
 
 
 def _is_group_of_one(group: int) -> bool:
-    """Return whether a group is root's, or this user's private group, which has the user's name."""
+    """Return whether a group is root's, or this user's private group of the same name."""
     if group == 0:
         return True
     import grp
@@ -119,22 +116,21 @@ def _is_group_of_one(group: int) -> bool:
 
 
 def read_regular(path: Path, most: int, *, touch: bool = False, head: int | None = None) -> bytes:
-    """Read a regular file that this user owns; anything else in its place is not read.
+    """Read a regular file of this user, and refuse any other file.
 
     Args:
         path: The file. Symbolic links are not followed, and a FIFO does not block.
         most: Largest size of the file [bytes].
-        touch: Whether to set the file's times to now, where that is possible.
+        touch: Set the file's times to now, if possible.
         head: Number of leading bytes to read; all by default.
     """
-    # Opening some devices has side effects, so the file type is checked before; the check afterwards holds for the
-    # opened file itself.
+    # Check the file type before, since opening some devices has side effects, and again for the opened file.
     _check_regular(os.lstat(path), path, most)
     flags = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
     with os.fdopen(os.open(path, os.O_RDONLY | flags), "rb") as file:
         _check_regular(os.fstat(file.fileno()), path, most)
         if touch and os.utime in os.supports_fd:
-            # On a read-only file system the times stay.
+            # A read-only file system keeps the times.
             with contextlib.suppress(OSError):
                 os.utime(file.fileno())
         data = file.read(most + 1 if head is None else head)

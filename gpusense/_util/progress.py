@@ -18,7 +18,7 @@ def progress(total: int) -> Iterator[Callable[[str], None]]:
     """Show a progress bar of ``total`` steps on standard error if that is a terminal.
 
     Yields:
-        A function that starts the next step and shows its text.
+        Function that starts the next step and shows its text.
     """
     if not is_terminal(sys.stderr):
         yield lambda text: None

@@ -1,4 +1,4 @@
-"""Types of arguments: literal names, and arrays of any library."""
+"""Types of arguments: literal names, and arrays of other libraries."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Loss: TypeAlias = Literal["linear", "soft_l1", "huber", "cauchy", "arctan"]
 
 
 class SupportsDLPack(Protocol):
-    """An array of PyTorch, JAX, CuPy or another library that exports DLPack."""
+    """Array of PyTorch, JAX, CuPy or another library that exports DLPack."""
 
     def __dlpack__(self, *args: Any, **options: Any) -> Any:
         """Export the array."""
 
 
 class SupportsCuda(Protocol):
-    """An array on a CUDA device."""
+    """Array on a CUDA device."""
 
     @property
     def __cuda_array_interface__(self) -> dict[str, Any]:

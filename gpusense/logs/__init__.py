@@ -1,4 +1,4 @@
-"""Recorded sensor data: readers of log formats, and the records that they return."""
+"""Read recorded sensor data in several formats."""
 
 from gpusense.logs.reader import read_log
 from gpusense.logs.records import LandmarkRun, Odometry, Pose, Scan

@@ -1,4 +1,4 @@
-"""Choose the beams that the scans of a bag's laser share, and place the readings of other scans on them."""
+"""Choose common beams for the scans of a bag's laser, and map readings of other scans to them."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from gpusense.world.scanner import Scanner
 Angles = tuple[float, float, int]
 """angle_min, angle_increment, and number of beams."""
 Geometry = tuple[Angles, float, float]
-"""Angles, range_min and range_max as stated."""
-# Beams of the common scanner of scans whose beams vary, and its largest multiple for lasers with finer steps.
+"""Stated angles, range_min and range_max."""
+# Number of common beams where beams vary, and its largest multiple for lasers with finer steps.
 _PLACES, _FINER = 1440, 16
-# Angles that are counted as equal differ by less than this share of a step.
+# Equal angles differ by less than this share of a step.
 _SAME = 0.05
-# Number of the most frequent angles that are candidates for the common ones.
+# Number of frequent angles that are candidates for the common beams.
 _CANDIDATES = 10
 # Longest plausible time of a scan [s].
 _LONGEST = 2.0
@@ -36,7 +36,7 @@ def geometry_of(message: object) -> Geometry:
 
 
 def _limits(message: object) -> tuple[float, float]:
-    """Return range_min and range_max as stated; all NaN are one object, so that they count as equal."""
+    """Return the stated range_min and range_max; all NaN are one object, so that they compare equal."""
     values = (float(field_of("message", message, name)) for name in ("range_min", "range_max"))
     near, far = (math.nan if math.isnan(value) else value for value in values)
     return near, far
@@ -44,7 +44,7 @@ def _limits(message: object) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Beams:
-    """Beams that the scans of one laser share, in the laser's frame.
+    """Common beams of a laser's scans, in the laser's frame.
 
     Attributes:
         first: Bearing of beam 0 [rad].
@@ -53,7 +53,7 @@ class Beams:
         range_min: Lower limit of ranges [m].
         range_max: Upper limit of ranges [m].
         overridden: Whether options replace the messages' range_min and range_max.
-        varied: Whether the beams vary from scan to scan, so that the shared ones lie all round.
+        varied: Whether beams vary from scan to scan, so that the common beams cover a full turn.
     """
 
     first: float
@@ -65,13 +65,13 @@ class Beams:
     varied: bool
 
     def scanner(self, mount: Pose, upside_down: bool) -> Scanner:
-        """Return the scanner at a mount; the bearings of an upside-down laser run clockwise."""
+        """Return the scanner at a mount; bearings of an upside-down laser run clockwise."""
         sign = -1 if upside_down else 1
         return Scanner.uniform(angle_min=sign * self.first, angle_increment=sign * self.step, count=self.count,
                                range_max=self.range_max, range_min=self.range_min, mount=mount)  # fmt: skip
 
     def take(self, message: object) -> tuple[Floats, NDArray[np.float32] | None, float]:
-        """Return readings [m], intensities or None, and the duration [s] of a scan on these beams; arrays read-only."""
+        """Return read-only readings [m], intensities or None, and the duration [s] of a scan on these beams."""
         first, step, count = laser_beams(message)
         ranges = np.array(field_of("message", message, "ranges"), np.float64)[: distinct_beams(step, count)]
         ranges[ranges == 0] = math.nan
@@ -97,7 +97,7 @@ class Beams:
         return placed
 
     def _duration(self, message: object, step: float) -> float:
-        """Return the time from the first beam to the last one [s]; 0 if the message states no plausible one."""
+        """Return the time from the first beam to the last one [s]; 0 unless the message states a plausible one."""
         try:
             lasted = real_field("message", message, "time_increment") * (self.count - 1)
         except (TypeError, ValueError):
@@ -108,7 +108,7 @@ class Beams:
 
 
 def _intensities(message: object, beams: int) -> NDArray[np.float32] | None:
-    """Return the intensities of a scan; None if it has none, or if all are equal or not finite."""
+    """Return the intensities of a scan; None if absent, all equal, or not finite."""
     try:
         light = np.array(field_of("message", message, "intensities"), np.float32)
     except (TypeError, ValueError):
@@ -120,11 +120,11 @@ def _intensities(message: object, beams: int) -> NDArray[np.float32] | None:
 
 
 def shared_beams(place: str, found: Counter[Geometry], range_min: float | None, range_max: float | None) -> Beams:
-    """Choose the beams of a laser: those of most scans, or beams all round if they vary from scan to scan.
+    """Choose the beams of most scans of a laser, or beams of a full turn if they vary from scan to scan.
 
     Args:
         place: The bag and the topic, for messages.
-        found: Numbers of its scans by geometry.
+        found: Numbers of scans by geometry.
         range_min: Replaces the messages' value [m]; None for the most frequent one.
         range_max: Replaces the messages' value [m]; None for the most frequent one.
 
@@ -165,7 +165,7 @@ def shared_beams(place: str, found: Counter[Geometry], range_min: float | None, 
 
 
 def _most_frequent(place: str, name: str, stated: Counter[float], given: float | None) -> float:
-    """Return the most frequent limit, the larger one of equally frequent ones."""
+    """Return the most frequent limit; ties go to the larger one."""
     if given is not None:
         return given
     value = max(stated, key=lambda each: (stated[each], math.isfinite(each), each))
@@ -182,7 +182,7 @@ def _remedy(name: str) -> str:
 
 
 def _common_angles(found: Counter[Angles]) -> Angles | None:
-    """Return the angles that more than half of the scans share; empty scans count only if no other exists."""
+    """Return the angles of more than half of the scans; empty scans count only without others."""
     full = Counter({angles: scans for angles, scans in found.items() if angles[2] > 0}) or found
     best, most = None, 0
     for candidate, _ in full.most_common(_CANDIDATES):
@@ -193,7 +193,7 @@ def _common_angles(found: Counter[Angles]) -> Angles | None:
 
 
 def _alike(one: Angles, other: Angles) -> bool:
-    """Return whether two scans have as many beams, and no bearing differs by more than a small share of a step."""
+    """Return whether two scans have equally many beams, and bearings that agree within a small share of a step."""
     (first, step, count), (begin, stride, number) = one, other
     apart = max(abs(first - begin), abs(first + step * (count - 1) - begin - stride * (number - 1)))
     return one == other or (count == number and apart < _SAME * abs(step))

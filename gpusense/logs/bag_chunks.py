@@ -1,8 +1,8 @@
-"""Read the messages of MCAP files and of bags of ROS 1, as bytes, whole or cut off.
+"""Read the messages of MCAP files and ROS 1 bags as bytes, even if the file is cut off.
 
-A file that is cut off has no index, or the index of a longer file. Chunks are therefore found by walking over the file.
-Lengths in headers are compared with the file before anything is allocated, and a chunk is decompressed up to the size
-that its header states.
+A file that is cut off has no index, or the index of a longer file. Chunks are therefore found by walking through the
+file. Lengths in headers are compared with the file before memory is allocated, and a chunk is decompressed up to the
+size in its header.
 
 Formats: https://wiki.ros.org/Bags/Format/2.0, https://mcap.dev/spec.
 """
@@ -32,7 +32,7 @@ _R_MESSAGE, _R_BAG, _R_INDEX, _R_CHUNK, _R_CONNECTION = 2, 3, 4, 5, 7
 
 
 class _Chunk(NamedTuple):
-    """A chunk of messages, or a message outside chunks: its place in the file, and the time of its first message."""
+    """A chunk of messages, or a message outside chunks: offset in the file, and time of the first message."""
 
     start: int
     place: int
@@ -44,7 +44,7 @@ class _Chunk(NamedTuple):
 
 
 class _Chunked(Storage):
-    """A file of chunks, which hold messages and may hold the descriptions of their topics."""
+    """File of chunks that contain messages, and possibly descriptions of their topics."""
 
     def __init__(self, file: Path) -> None:
         super().__init__(file)
@@ -70,7 +70,7 @@ class _Chunked(Storage):
                 yield Raw(time, topic, data)
 
     def _sorted(self, at: int, chunk: _Chunk, chosen: dict[int, Topic]) -> Iterator[tuple[int, int, int, Topic, bytes]]:
-        """Yield the messages of a chunk in the order of time, after an entry that delays the chunk to its time."""
+        """Yield the messages of a chunk by time, after an entry that delays the chunk until its time."""
         yield chunk.start, at, -1, Topic("", ""), b""
         found = [
             (time, at, place, chosen[number], data)
@@ -79,7 +79,7 @@ class _Chunked(Storage):
         yield from sorted(found, key=lambda each: each[:3])
 
     def _within(self, chunk: _Chunk) -> Iterator[tuple[int, int, bytes]]:
-        """Yield topic, time [ns] and bytes of the messages in a chunk; note the topics that it describes."""
+        """Yield topic, time [ns] and bytes of the messages in a chunk, and record the topics that it describes."""
         with self.file.open("rb") as stream:
             stream.seek(chunk.place)
             data = _decompressed(stream.read(chunk.length), chunk)
@@ -95,7 +95,7 @@ class _Chunked(Storage):
 
 
 def _decompressed(data: bytes, chunk: _Chunk) -> bytes:
-    """Decompress a chunk; of a chunk that is cut off, as much as possible."""
+    """Decompress a chunk, or as much as possible of a chunk that is cut off."""
     if chunk.compression in (b"", b"none"):
         return data
     makers: dict[bytes, Callable[[], Any]] = {
@@ -153,7 +153,7 @@ class Mcap(_Chunked):
                 self._chunks.append(_Chunk(start, begin, packed, compression, size, checksum, whole))
 
     def _take(self, kind: int, data: bytes) -> None:
-        """Take the description of a topic, or the number of messages of a topic in a chunk."""
+        """Record the description of a topic, or the number of messages of a topic in a chunk."""
         if kind == _M_HEADER and data[4:8] != b"ros2":
             raise ValueError(f"must have the profile ros2, got {data[4:24]!r}")
         if kind == _M_SCHEMA:
@@ -185,7 +185,7 @@ class Mcap(_Chunked):
 
 
 def _text(data: bytes, at: int) -> tuple[str, int]:
-    """Return a text, and the place after it."""
+    """Return a text and the offset behind it."""
     (length,) = struct.unpack_from("<I", data, at)
     return data[at + 4 : at + 4 + length].decode(), at + 4 + length
 
@@ -223,7 +223,7 @@ class Ros1(_Chunked):
         self.cut = self.cut or stream.tell() < size or not 0 < index < size
 
     def _take(self, fields: dict[bytes, bytes], data: bytes) -> None:
-        """Take a connection."""
+        """Record a connection."""
         package, _, name = _fields(data)[b"type"].decode().rpartition("/")
         topic = fields[b"topic"].decode()
         topic = "/" * topic.startswith("/") + "/".join(part for part in topic.split("/") if part)
@@ -241,7 +241,7 @@ class Ros1(_Chunked):
 
 
 def _ros1_records(stream: BinaryIO, end: int) -> Iterator[tuple[int, dict[bytes, bytes], int, bool]]:
-    """Yield kind, fields, length of the data, and whether they are whole, before the data of each record."""
+    """Yield kind, fields, length of the data, and whether the data are complete, at the data of each record."""
     while len(head := stream.read(4)) == 4:
         (length,) = struct.unpack("<I", head)
         header = stream.read(min(length, end - stream.tell()))

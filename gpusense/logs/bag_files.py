@@ -1,7 +1,7 @@
 """Find the files of a bag.
 
-A database with a journal, and a file that is compressed as a whole, are copied into a temporary folder that is deleted
-at the end of the process. The recording itself is never written.
+A database with a journal, or a file that is compressed as a whole, is copied to a temporary folder that exists until
+the end of the process. The recording is never written.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from gpusense._util.inflate import most_bytes
 from gpusense.logs.bag_chunks import Mcap, Ros1
 from gpusense.logs.bag_storage import MCAP, ROS1, SQLITE, ZSTD, Sqlite, Storage, zstd
 
-# Suffixes of a database's journals of pages to add and of pages to restore, and first bytes of the latter in use.
+# Suffixes of a database's write-ahead log and of its rollback journal, and first bytes of the latter in use.
 _WAL, _ROLLBACK, _IN_USE = "-wal", "-journal", b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
-# Files in the list of metadata.yaml, and the part of it that is searched [bytes].
+# Files listed in metadata.yaml, and the searched part of it [bytes].
 _LISTED = re.compile(r"""^ *- +['"]?([^\s'"]+\.(?:db3|mcap)(?:\.zstd)?)['"]? *\r?$""", re.MULTILINE)
 _LARGEST_METADATA = 1 << 24
 _PIECE = 1 << 20
@@ -34,7 +34,7 @@ def begins(file: Path, *firsts: bytes) -> bool:
 
 
 def is_ros1(path: Path) -> bool:
-    """Return whether a bag is one of ROS 1, by its first bytes, or by its suffix if they are of no kind of bag."""
+    """Return whether a bag is from ROS 1, by its first bytes, or by its suffix if the bytes are unknown."""
     if path.is_dir() or begins(path, MCAP, SQLITE, ZSTD):
         return False
     return begins(path, ROS1) or path.suffix.lower() == ".bag"
@@ -61,7 +61,7 @@ def storages(path: Path) -> list[Storage]:
 
 
 def _check_parts(metadata: Path, files: list[Path]) -> None:
-    """Check that a folder holds the files that its metadata list; nothing else in them is read."""
+    """Check that a folder holds all files listed in its metadata."""
     with metadata.open("rb") as stream:
         text = stream.read(_LARGEST_METADATA).decode(errors="replace")
     known = {file.name for file in files} | {file.with_suffix("").name for file in files}
@@ -71,7 +71,7 @@ def _check_parts(metadata: Path, files: list[Path]) -> None:
 
 
 def _parts(folder: Path) -> list[Path]:
-    """Return the files of messages in a folder, by name; a compressed file only if its plain one is absent."""
+    """Return the files of messages in a folder by name; a compressed file only if the plain one is absent."""
     files = [file for file in sorted(folder.iterdir()) if file.is_file() and begins(file, MCAP, SQLITE, ZSTD)]
     return [file for file in files if not begins(file, ZSTD) or file.with_suffix("") not in files]
 
@@ -83,7 +83,7 @@ def _storage(file: Path) -> Storage:
 
 @functools.lru_cache(maxsize=16)
 def _read(file: Path, stats: tuple[tuple[int, int], ...]) -> Storage:
-    """Find the records of a file; the sizes and times of change of the file and its journals are part of the key."""
+    """Find the records of a file; ``stats``, sizes and modification times, belong to the cache key."""
     if begins(file, ZSTD):
         file = _decompressed(file)
     if begins(file, MCAP):
@@ -118,14 +118,14 @@ def _decompressed(file: Path) -> Path:
 
 
 def _journals(file: Path) -> list[Path]:
-    """Return the journals of a database that have pages which it lacks."""
+    """Return the journals with pages that a database lacks."""
     wal, rollback = file.with_name(file.name + _WAL), file.with_name(file.name + _ROLLBACK)
     found = [wal] if wal.is_file() and wal.stat().st_size else []
     return [*found, rollback] if rollback.is_file() and begins(rollback, _IN_USE) else found
 
 
 def _with_journal(file: Path) -> Path:
-    """Return a copy of a database with all its committed messages, to which SQLite applies the journal."""
+    """Return a copy of a database with all committed messages; SQLite applies the journal to it."""
     import sqlite3
 
     folder = _folder()

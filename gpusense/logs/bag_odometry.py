@@ -1,4 +1,4 @@
-"""The odometry of a bag: a topic of messages, or the motion of the robot's base by transforms."""
+"""Read the odometry of a bag from a topic, or from transforms of the robot's base."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _APART = 1.0
 
 @dataclass
 class Times:
-    """Times of messages: the stamps of their headers, or the log's times if all stamps are 0.
+    """Times of messages: stamps of headers, or the log's times if all stamps are 0.
 
     Attributes:
         stamps: Stamps [s].
         clock: Times in the log [s].
-        from_zero: True if a stamp of 0 is a time although all stamps are 0.
+        from_zero: True if stamps of 0 are times although all stamps are 0.
     """
 
     stamps: list[float] = field(default_factory=list)
@@ -41,7 +41,7 @@ class Times:
 
     @property
     def stamped(self) -> bool:
-        """True if stamps are times."""
+        """True if the stamps are valid times."""
         return self.from_zero or any(self.stamps)
 
     def __iter__(self) -> Iterator[float]:
@@ -89,7 +89,7 @@ def odometry_pose(message: object) -> tuple[Pose, float]:
 
 
 def odometry_topic(known: Sequence[str], scans: str, wanted: str | None) -> str:
-    """Return the wanted topic, else a topic in the scans' namespace, ``/odom``, or the first topic by name."""
+    """Return the requested topic, else a topic in the scans' namespace, ``/odom``, or the first topic by name."""
     if wanted is not None:
         return next((name for name in known if name.strip("/") == wanted.strip("/")), "")
     beside = scans.rpartition("/")[0] + "/"
@@ -103,18 +103,18 @@ def odometry_topic(known: Sequence[str], scans: str, wanted: str | None) -> str:
 def chosen_track(
     place: str, track: Track, topics: Sequence[str], transforms: TransformBuffer, laser: str, wanted: str | None
 ) -> Track:
-    """Choose the odometry: the messages of a topic, else the motion of the robot's base in a frame of odometry.
+    """Choose the messages of a topic as odometry, else the motion of the robot's base in an odometry frame.
 
     Args:
         place: The bag, for messages.
-        track: The odometry of the chosen topic, which may be empty.
+        track: Odometry of the chosen topic; may be empty.
         topics: Topics of odometry.
         transforms: Transforms of the bag.
         laser: Frame of the laser.
-        wanted: Topic or frame that the user wants.
+        wanted: Topic or frame that the user requests.
 
     Warns:
-        UserWarning: There are several.
+        UserWarning: Several choices exist.
     """
     parents = {link.parent for link in transforms.links()}
     frames = sorted(each for each in parents if "odom" in each.rpartition("/")[2])
@@ -138,7 +138,7 @@ def chosen_track(
 
 
 def _below(transforms: TransformBuffer, frame: str) -> list[str]:
-    """Return the frames below a frame, near ones first."""
+    """Return the descendants of a frame, the nearest first."""
     found, at = [frame], 0
     while at < len(found):
         children = {link.child for link in transforms.links() if link.parent == found[at]}
@@ -148,7 +148,7 @@ def _below(transforms: TransformBuffer, frame: str) -> list[str]:
 
 
 def _track_of(transforms: TransformBuffer, frame: str) -> Track:
-    """Return the motion of the robot's base in a frame of odometry."""
+    """Return the motion of the robot's base in an odometry frame."""
     below = _below(transforms, frame)
     base = min(below, key=lambda each: (base_order(each)[0], below.index(each)))
     times, poses = transforms.history(frame, base)
@@ -160,13 +160,13 @@ def _track_of(transforms: TransformBuffer, frame: str) -> Track:
 
 
 def base_order(frame: str) -> tuple[int, str]:
-    """Return a key that sorts usual names of a robot's base before other frames."""
+    """Return a sort key that puts usual names of a robot's base first."""
     name = frame.rpartition("/")[2]
     return (BASES.index(name) if name in BASES else len(BASES)), frame
 
 
 def check_track(place: str, track: Track, scans_at: Times) -> None:
-    """Warn of odometry that is not level, or has other times than the scans."""
+    """Warn of odometry that is not level, or does not overlap with the scans in time."""
     if not track.poses:
         return
     tilted = [tilt for tilt in track.tilts if tilt > LEVEL]
@@ -176,7 +176,7 @@ def check_track(place: str, track: Track, scans_at: Times) -> None:
             f"to {math.degrees(max(tilted)):.3g} deg: their x, y and yaw are used"
         )
     for one, other in ((scans_at, track.times), (track.times, scans_at)):
-        # The only message of a simulation that begins at 0.
+        # A simulation that begins at 0 may have a single message.
         one.from_zero = len(one.stamps) == 1 and other.stamped and min(other.stamps) <= _APART
     scans, poses = list(scans_at), list(track.times)
     if min(scans) > max(poses) + _APART or max(scans) < min(poses) - _APART:

@@ -1,7 +1,7 @@
-"""Read the messages of a bag's file, as bytes: the interface, and databases of SQLite.
+"""Read the messages of a bag's file as bytes: the interface, and SQLite databases.
 
-A database that is cut off, by a killed recorder, a full disk or an interrupted copy, is read up to the cut. Its header
-states its size; see https://www.sqlite.org/fileformat.html.
+A killed recorder, a full disk or an interrupted copy cuts a database off; it is read up to the cut. The header states
+its size; see https://www.sqlite.org/fileformat.html.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from typing import Any, NamedTuple
 from gpusense._util.inflate import inflated
 
 MCAP, ROS1, SQLITE = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n", b"SQLite format 3\0"
-"""First bytes of the files of bags."""
+"""First bytes of bag files."""
 ZSTD = b"\x28\xb5\x2f\xfd"
 LARGEST = 1 << 29
-"""Most bytes of a chunk or a message [bytes]."""
+"""Largest chunk or message [bytes]."""
 
 
 class Topic(NamedTuple):
-    """A topic: the type of its messages, and its name."""
+    """A topic: message type and name."""
 
     kind: str
     name: str
 
 
 class Raw(NamedTuple):
-    """An encoded message: time in the log [ns], topic, and bytes."""
+    """An encoded message: time in the log [ns], topic and bytes."""
 
     time: int
     topic: Topic
@@ -45,7 +45,7 @@ class Storage:
     """A file of a bag.
 
     Attributes:
-        counts: Number of messages by topic; 0 if the file does not state it.
+        counts: Number of messages by topic; 0 if unknown.
         start: Time of the first message [ns].
         cut: True if the file is cut off.
     """
@@ -56,12 +56,12 @@ class Storage:
         self.start, self.cut = 0, False
 
     def messages(self, wanted: Callable[[Topic], bool]) -> Iterator[Raw]:
-        """Yield the messages of some topics in the order of time; of a file that is cut off, up to the cut."""
+        """Yield the messages of some topics by time, up to the cut of a file that is cut off."""
         raise NotImplementedError
 
 
 def zstd() -> Any:
-    """Import the module that decompresses zstd: Python's from 3.14 on, else a library's."""
+    """Import a module for zstd: Python's from 3.14 on, else a library's."""
     try:
         return importlib.import_module("compression.zstd")
     except ImportError:
@@ -74,7 +74,7 @@ def unpacked(message: bytes) -> bytes:
 
 
 class Sqlite(Storage):
-    """A database of ROS 2."""
+    """Database of ROS 2."""
 
     def __init__(self, file: Path, scratch: Callable[[], Path]) -> None:
         super().__init__(file)
@@ -83,7 +83,7 @@ class Sqlite(Storage):
         page, pages = struct.unpack(">H", header[16:18])[0], struct.unpack(">I", header[28:32])[0]
         size = (65536 if page == 1 else page) * pages
         if file.stat().st_size < size:
-            # SQLite reads a copy of the stated size, with a hole at the end.
+            # SQLite reads a copy that a hole extends to the stated size.
             self.cut, self.file = True, scratch() / file.name
             shutil.copyfile(file, self.file)
             os.truncate(self.file, size)
@@ -121,7 +121,7 @@ class Sqlite(Storage):
                 yield Raw(time, chosen[number], data)
 
     def _up_to_the_cut(self, database: Any, chosen: dict[int, Topic]) -> Iterator[Raw]:
-        """Yield messages in the order of their rows, up to the first one that is not whole."""
+        """Yield messages by row, up to the first incomplete one."""
         with contextlib.suppress(importlib.import_module("sqlite3").DatabaseError):
             for time, number, data in database.execute("SELECT timestamp, topic_id, data FROM messages ORDER BY id"):
                 if number not in self._topics:

@@ -1,4 +1,4 @@
-"""Survey a bag: which laser and which odometry are read, and everything but the readings of the scans."""
+"""Survey a bag: choose laser and odometry, and read everything except the readings of scans."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from gpusense.world.messages import stamp_of
 
 @dataclass
 class Bag:
-    """Contents of a bag, without the readings of its scans.
+    """Contents of a bag, except the readings of scans.
 
     Attributes:
         path: The bag.
         topic: Topic of the scans.
-        lasers: Numbers of scans by geometry, for each frame of a laser.
-        unnamed: Frame of the scans that name none.
+        lasers: Numbers of scans by geometry, for each laser frame.
+        unnamed: Frame of scans without a frame name.
         times: Times of the scans.
         track: Odometry.
         transforms: Transforms between frames.
@@ -43,7 +43,7 @@ class Bag:
 
 
 class _Skipped:
-    """Messages and transforms that are skipped because their numbers break a rule."""
+    """Skipped messages and transforms with invalid numbers."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
@@ -63,10 +63,10 @@ class _Skipped:
 
 
 def survey(path: Path, topic: str | None, frame: str | None, odometry_from: str | None) -> Bag:
-    """Read everything but readings; arguments as for :func:`gpusense.read_log`.
+    """Read everything except readings; arguments as for :func:`gpusense.read_log`.
 
     Warns:
-        UserWarning: Messages are skipped, a choice was made, or odometry is not level or has other times than scans.
+        UserWarning: Messages are skipped, a choice was made, or odometry is not level or does not overlap in time.
     """
     topics = topics_of(path)
     chosen = _scan_topic(path, topics, topic)
@@ -95,7 +95,7 @@ def survey(path: Path, topic: str | None, frame: str | None, odometry_from: str 
 
 
 def scans_on(topic: str) -> dict[str, set[str] | None]:
-    """Return the types of messages with scans, each with their topic."""
+    """Return the message types of scans, each with the topic."""
     return {SCAN: {topic}, ECHOES: {topic}}
 
 
@@ -125,7 +125,7 @@ def _scan_topic(path: Path, topics: dict[str, list[str]], topic: str | None) -> 
 
 
 def _parts(message: Message) -> Iterator[tuple[Callable[[Bag, Message, Any], None], Any]]:
-    """Yield the parts of a message that count on their own, each with the function that takes it."""
+    """Yield the independent parts of a message, each with the function that records it."""
     if message.kind == TRANSFORMS:
         yield from ((_take_transform, each) for each in message.fields.transforms)
     else:
@@ -154,7 +154,7 @@ def _is_static(message: Message) -> bool:
 
 
 class _TransformStamps:
-    """Search for a transform with a stamp."""
+    """Search for a stamped transform."""
 
     def __init__(self) -> None:
         self._count, self._any = 0, False
@@ -170,7 +170,7 @@ class _TransformStamps:
 
 
 def _by_the_clock(path: Path) -> TransformBuffer:
-    """Read the transforms of a bag without stamps, at the times of the log."""
+    """Read the transforms of a bag without stamps at the log's times."""
     buffer = TransformBuffer()
     for message in messages(path, {TRANSFORMS: None}):
         seconds, rest = divmod(round(message.time * 1e9), 10**9)
@@ -183,7 +183,7 @@ def _by_the_clock(path: Path) -> TransformBuffer:
 
 
 def _name_frames(bag: Bag, frame: str | None) -> None:
-    """Keep the lasers of a wanted frame; scans without a frame belong to the first one."""
+    """Keep the lasers of a requested frame; scans without a frame belong to the first one."""
     unnamed = bag.lasers.pop("", Counter())
     bag.unnamed = next(iter(bag.lasers), "")
     bag.lasers.setdefault(bag.unnamed, Counter()).update(unnamed)

@@ -29,8 +29,8 @@ def write_bag(path: Path, scans: Iterable[Scan], *, first: bool) -> None:
 
     Args:
         path: The bag: a file for ROS 1, or a folder for ROS 2 (sqlite3), which must not exist.
-        scans: Scans with the robot's odometry; their poses are not written.
-        first: Whether the bag is for ROS 1.
+        scans: Scans with odometry; their poses are not written.
+        first: True for ROS 1.
 
     Raises:
         ValueError: the folder exists, or a scanner's bearings have uneven steps.
@@ -72,7 +72,7 @@ def _write(writer: _Writer, scans: Iterable[Scan]) -> None:
 
 
 class _Writer:
-    """A bag that is written message by message."""
+    """Bag writer, message by message."""
 
     def __init__(self, path: Path, *, first: bool) -> None:
         from rosbags.rosbag1 import Writer as Writer1
@@ -112,7 +112,7 @@ class _Writer:
         )  # fmt: skip
 
     def odometry(self, time: float, pose: Pose) -> None:
-        """Write an Odometry message with velocities 0 and unknown covariances."""
+        """Write an Odometry message with zero velocities and unknown covariances."""
         place = self._make("Pose", position=self._make("Point", x=pose[0], y=pose[1], z=0.0),
                            orientation=self._quaternion(pose[2]))  # fmt: skip
         still = self._make("Vector3", x=0.0, y=0.0, z=0.0)

@@ -1,7 +1,7 @@
-"""Yield the messages of known types in a bag, decoded by the library rosbags, with errors that name file and place.
+"""Decode the messages of known types in a bag by the library rosbags, with errors that name file and place.
 
-A bag's message definitions are never used, because a library would turn them into code: messages are decoded by the
-layouts that come with rosbags, and by one layout that is defined here.
+The library would turn a bag's message definitions into code, so they are never used: messages are decoded by the
+layouts of rosbags, and by one layout that is defined here.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from gpusense.logs.bag_storage import Topic, unpacked
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 ECHOES = "sensor_msgs/msg/MultiEchoLaserScan"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-# ROS 1's first version of transforms has the layout of the second.
+# ROS 1's two versions of transforms have one layout.
 _SAME_LAYOUT = {"tf/msg/tfMessage": TRANSFORMS}
 
 
 class Message(NamedTuple):
-    """A message: its place for errors, type, topic, time in the log [s], and fields."""
+    """A message: place for errors, type, topic, time in the log [s], and fields."""
 
     where: str
     kind: str
@@ -56,11 +56,11 @@ def topics_of(path: Path) -> dict[str, list[str]]:
 
 
 def messages(path: Path, wanted: Mapping[str, set[str] | None]) -> Iterator[Message]:
-    """Read messages in the bag's order. Scans with several echoes become scans of the first echo.
+    """Read messages in the bag's order; multi-echo scans become scans of the first echo.
 
     Args:
         path: The bag.
-        wanted: Wanted topics of each type of message; None for all topics.
+        wanted: Requested topics of each message type; None for all topics.
     """
 
     def chosen(topic: Topic) -> bool:
@@ -94,7 +94,7 @@ def _known(topic: Topic) -> Topic:
 
 
 def _first_echo(message: Any) -> Any:
-    """Return a scan with several echoes as a scan of the first one; a beam without echoes has NaN."""
+    """Return a multi-echo scan as a scan of the first echo; a beam without echoes is NaN."""
     firsts = {}
     for name in ("ranges", "intensities"):
         values = [each.echoes[0] if len(each.echoes) else math.nan for each in getattr(message, name)]
@@ -104,7 +104,7 @@ def _first_echo(message: Any) -> Any:
 
 @contextmanager
 def errors_at(where: str) -> Iterator[None]:
-    """Turn errors of decoding into a ValueError of one line that begins with a place."""
+    """Turn decoding errors into a ValueError of one line that begins with a place."""
     try:
         yield
     except (ImportError, KeyboardInterrupt, GeneratorExit):

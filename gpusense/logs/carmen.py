@@ -14,13 +14,13 @@ Each message ends with the time of measurement, the host and the logger's time. 
 front laser, RLASER and ROBOTLASER2 from the rear laser. Every other line is skipped.
 
 * ``Scan.time`` and ``Odometry.time`` are the time of measurement.
-* ``Scan.pose`` is the laser's pose. In a log processed by SLAM it is the corrected pose, in a raw log the odometry's.
-    The file does not distinguish them.
-* The scanner's mount is (0, 0, 0), since the poses are those of the laser.
+* ``Scan.pose`` is the laser's pose. It is corrected in a log processed by SLAM, and odometry in a raw log; the file
+  does not distinguish them.
+* The scanner's mount is (0, 0, 0), since the poses are the laser's.
 * FLASER and RLASER state no bearings. They start at -90 degrees, counter-clockwise, in steps of 180/n degrees, or of 1,
   0.5 or 0.25 degrees if that is within 1 %: 1 degree for 180 or 181 beams, 0.5 for 360 or 361.
 * ROBOTLASER states angles with six decimals. If field of view and resolution agree within this rounding, bearings are
-    spaced by the field of view over n - 1, which multiplies no rounding error; otherwise by the resolution.
+  spaced by the field of view over n - 1, without multiplying rounding errors; otherwise by the resolution.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def _robot_laser(
 
 
 def _count(where: str, fields: Sequence[bytes], index: int) -> int:
-    """Return the count in ``fields[index]``, after a check that this many values follow."""
+    """Return the count in ``fields[index]`` after checking that as many values follow."""
     name = fields[0].decode()
     left = len(fields) - index - 1
     text = fields[index].decode(errors="replace") if left >= 0 else ""
@@ -147,7 +147,7 @@ def _message_numbers(where: str, fields: Sequence[bytes], count: int) -> NDArray
         values = np.fromiter(map(float, body), np.float64, count)
     except ValueError:
         values = None
-    if values is None or b"_" in b"".join(body):  # unlike C, Python reads 1_000 as a number
+    if values is None or b"_" in b"".join(body):  # Python, unlike C, reads 1_000 as a number
         return np.array([_number(where, fields, index) for index in range(1, 1 + count)])
     return values
 

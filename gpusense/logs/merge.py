@@ -1,4 +1,4 @@
-"""Read the scans of several lasers of one log in the order of their times."""
+"""Read the scans of several lasers of a log by time."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ def read_lasers(
 
     Args:
         path: The log, as for :func:`gpusense.read_log`.
-        sensors: Topics of the lasers of a ROS bag, whose transforms give their mounts; ``"front"`` or ``"rear"`` for a
-            CARMEN log, which states no mounts. None for the laser that ``read_log`` takes.
+        sensors: Topics of a ROS bag's lasers, with mounts from transforms; ``"front"`` or ``"rear"`` for a CARMEN log,
+            which states no mounts. None for the laser that ``read_log`` takes.
         options: See :func:`gpusense.read_log`.
 
     Yields:
-        The index of a laser in ``sensors`` with its scan, or 0 with a reading of the odometry.
+        The index of a laser in ``sensors`` with its scan, or 0 with an odometry reading.
     """
     for index, name in enumerate(sensors):
         if name in sensors[:index]:

@@ -10,10 +10,10 @@ RobotN_Measurement.dat      time [s], barcode, range [m], bearing [rad]
 RobotN_Groundtruth.dat      time [s], x, y [m], heading [rad]
 ==========================  ===========================================================================
 
-Each file may be compressed by gzip, with .gz after its name. Measurements have barcodes instead of subjects. Subjects
-that are no landmarks are robots. Readings of robots and of unlisted barcodes are left out and counted. Readings at one
-time form a scan. Logged poses and odometry are interpolated at this time, headings along the shorter arc. Readings
-before the first logged pose or after the last are left out.
+Files may be gzipped, with .gz after the name. Measurements name barcodes instead of subjects. Subjects that are no
+landmarks are robots. Readings of robots and of unlisted barcodes are counted and ignored. Readings at one time form a
+scan. Logged poses and odometry are interpolated at this time, headings along the shorter arc. Readings before the first
+or after the last logged pose are ignored.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from gpusense._util.lines import until_cut
 from gpusense.logs.records import Floats, Integers, LandmarkRun
 from gpusense.world.landmarks import LandmarkMap
 
-# Indices of subjects that are no landmarks: another robot, and the owner of an unlisted barcode.
+# Indices of subjects that are no landmarks: a robot, and the owner of an unlisted barcode.
 _ROBOT, _UNKNOWN = -1, -2
 
 
@@ -84,7 +84,7 @@ def read_mrclam(
 
 
 def _landmarks_by_code(subjects: Integers, codes: Floats, lines: list[str]) -> dict[int, int]:
-    """Return the landmark of each barcode; _ROBOT for the barcode of a robot.
+    """Return the landmark of each barcode; _ROBOT for a robot's.
 
     Args:
         subjects: (M,) subject of each landmark.
@@ -124,7 +124,7 @@ def _at(time: Floats, track: Floats) -> Floats:
 
 
 def _file(path: Path) -> Path:
-    """Return the path of a file, or of its compressed copy if only that exists."""
+    """Return the path of a file, or of its compressed copy if only the copy exists."""
     packed = path.with_name(f"{path.name}.gz")
     return packed if not path.exists() and packed.exists() else path
 

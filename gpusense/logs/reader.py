@@ -26,7 +26,7 @@ class Format:
     Attributes:
         name: Name of the format in messages, with an article.
         module: The module whose function ``read(file, *, range_max, odometry, rear)`` yields its records.
-        magic: First bytes of its binary files, which decide before any suffix does.
+        magic: First bytes of its binary files; they take precedence over suffixes.
         suffixes: Suffixes of its files without these bytes.
         begins: First bytes of its text files.
         topics: Whether ``read`` also takes the options of bags.
@@ -41,7 +41,7 @@ class Format:
 
 
 BAG2 = Format("a ROS 2 bag", "gpusense.logs.ros", (MCAP, SQLITE, ZSTD), (".db3", ".mcap"), topics=True)
-# Files that no other format claims have the last format.
+# The last format takes all files that no other format claims.
 FORMATS = (
     Format("a ROS 1 bag", "gpusense.logs.ros", (b"#ROSBAG V",), (".bag",), topics=True),
     BAG2,
@@ -104,27 +104,27 @@ def read_log(
 ) -> Iterator[Scan] | Iterator[Scan | Odometry]:
     """Read a log, one record at a time and in the file's order.
 
-    Formats are CARMEN and Wean Hall logs, plain or compressed by gzip, rosbags of ROS 1, and of ROS 2 with sqlite3 or
-    MCAP storage, as a folder or a single file; the first bytes of a file decide, then its suffix. ROS is not needed.
-    The module of each format describes how messages become records, such as :mod:`gpusense.logs.carmen` and
+    Formats are CARMEN and Wean Hall logs, plain or gzipped, rosbags of ROS 1, and rosbags of ROS 2 with sqlite3 or
+    MCAP storage, as a folder or a single file. The first bytes of a file decide, then its suffix. ROS is not needed.
+    The module of each format describes how messages become records, for example :mod:`gpusense.logs.carmen` and
     :mod:`gpusense.logs.ros`.
 
     Args:
         path: The file, or the folder of a ROS 2 bag.
-        range_max: Readings of at least ``range_max`` are "no return" [m]. None takes the limit from the log: the value
-            stated in each message, or, for old messages without one, the largest reading of the log. If that reading
-            occurs at least three times, it is the scanner's code for "no return"; else the limit is the next float64
-            above it, so that every reading is a return. This requires a first pass over the file. In a ROS bag it
-            replaces the messages' value, whatever that is.
+        range_max: Readings of at least ``range_max`` are "no return" [m]. None takes the value of each message; for
+            old messages without one it takes the largest reading of the log, in a first pass over the file. If this
+            reading occurs at least three times, it is the scanner's code for "no return"; otherwise the limit is the
+            next float64 above it, so that every reading is a return. In a ROS bag ``range_max`` replaces the messages'
+            value.
         odometry: Whether to also yield :class:`Odometry` records.
-        rear: Whether to yield the scans of the rear laser of a CARMEN log instead of those of the front laser.
+        rear: Whether to yield the rear laser's scans of a CARMEN log instead of the front laser's.
         range_min: Readings below ``range_min`` are missing [m]; None takes the messages' value in a ROS bag, else 0.
         topic: Topic of the scans in a ROS bag; None takes ``/scan``, or the only one.
-        frame: Frame of the laser, if several lasers of a ROS bag share the topic; None reads all of them, each with the
+        frame: Frame of the laser, if several lasers of a ROS bag share the topic; None reads all lasers, each with the
             mount of its frame.
         mount: Pose (x, y, theta) of a ROS bag's laser on the robot [m, m, rad]; None takes it from the bag's
-            transforms. A warning reports that these contradict ``mount``, or that there are none and (0, 0, 0) is
-            assumed; see also :func:`check_mount`.
+            transforms. A warning reports transforms that contradict ``mount``, or missing transforms, for which (0, 0,
+            0) is assumed; see also :func:`check_mount`.
         odometry_from: Topic of the odometry in a ROS bag, or the frame of the transforms that move the robot's base;
             None takes a topic in the scans' namespace, ``/odom``, the first topic by name, or a frame such as ``odom``.
             A warning lists the alternatives.
@@ -165,7 +165,7 @@ def read_log(
 
 
 def _with_range_min(records: Iterator[Scan | Odometry], range_min: float) -> Iterator[Scan | Odometry]:
-    """Yield the records of a format that states no lower limit of ranges, with scanners that have one."""
+    """Yield the records of a format without a lower limit of ranges, with scanners that have one."""
     scanners: dict[Scanner, Scanner] = {}
     for record in records:
         if isinstance(record, Scan):

@@ -32,12 +32,11 @@ class Scan:
     ranges: NDArray[np.float64]
     """(K,) readings [m], NaN where masked; read-only. :func:`gpusense.classify` classifies them."""
     scanner: Scanner
-    """The geometry; one object for all scans of the same geometry."""
+    """The geometry; scans of one geometry share an object."""
     odometry: Pose
     """The robot's pose in the odometry frame [m, m, rad]."""
     pose: Pose | None
-    """The robot's corrected pose in the world [m, m, rad]; the laser's in a CARMEN log, which has no mount. None if the
-    log has none."""
+    """The robot's corrected pose in the world [m, m, rad], or the laser's in a CARMEN log; None if unknown."""
     duration: float = 0.0
     """Time from the first beam to the last one [s]; 0 if the log does not state it."""
 
@@ -52,7 +51,7 @@ class Scan:
 
 
 def check_scanner(scan: Scan, scanner: Scanner, where: str) -> None:
-    """Check that a scan of a log comes from the scanner of the scans before."""
+    """Check that a scan of a log has the scanner of the previous scans."""
     if scan.scanner != scanner:
         remedy = ""
         if scan.scanner.mount != scanner.mount:
@@ -85,14 +84,14 @@ class LandmarkRun:
         landmarks: The map.
         labels: (M,) labels of the landmarks in the recording.
         time: (S,) times of the scans [s].
-        odometry: (S, 3) poses by odometry alone, in the odometry frame [m, m, rad].
+        odometry: (S, 3) poses by odometry, in the odometry frame [m, m, rad].
         truth: (S, 3) logged poses in the world [m, m, rad].
         features: (F, 2) ranges [m] and bearings [rad].
         scan: (F,) scan of each feature, ascending.
         ids: (F,) landmark of each feature according to the recording.
         range_max: Largest range of the sensor [m].
         field_of_view: Field of view of the sensor [rad].
-        left_out: Numbers of readings that belong to no landmark of the map, by reason.
+        left_out: Numbers of readings without a landmark of the map, by reason.
     """
 
     landmarks: LandmarkMap

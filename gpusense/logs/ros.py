@@ -11,22 +11,23 @@ tf2_msgs/TFMessage             transforms from the robot's base to the laser giv
                                the motion of the base in a frame such as ``odom`` gives odometry
 =============================  ========================================================================================
 
-All other messages are skipped without being decoded; message definitions within a bag are not used.
+All other messages are skipped without decoding; message definitions within a bag are not used.
 
-* Times come from the header, or from the log if all headers of a topic have the stamp 0. Odometry is interpolated at
-  a scan's time, headings along the shorter arc; before the first and after the last message, the nearest message
-  counts. A log without odometry has (0, 0, 0). ``Scan.pose`` is None.
-* The robot's base is the child frame of odometry, else ``base_footprint`` or ``base_link``. Each frame of a laser has
-  a mount. The last static transform counts for the whole log. A laser that moves on the robot by more than 2 cm or 2
-  degrees has the mount of each scan's time. The mount is (0, 0, 0), with a warning, if transforms are absent. The
-  bearings of a laser that is mounted upside down run clockwise.
-* x, y and yaw are taken from poses that are not level, with a warning.
-* A message or a transform whose numbers are not finite, or whose quaternion is 0, is skipped; one warning counts them.
-* A last beam with the direction of the first one is dropped. A reading of exactly 0 becomes NaN, as it means "none" to
-  all drivers. Other readings are copied: infinities are "no return", NaN is missing (REP-117).
-* The beams and limits of most scans are the scanner. The readings of other scans take its nearest beams, half a step
-  away at most, and a warning counts these scans. If beams vary from scan to scan, all scans share a scanner with
-  bearings every 0.25 degrees all round, or finer; bearings move by half that step at most.
+* Times come from the header, or from the log if all headers of a topic have the stamp 0. Odometry is interpolated at a
+  scan's time, headings along the shorter arc; before the first and after the last message, the nearest message counts.
+  Odometry is (0, 0, 0) in a log without it. ``Scan.pose`` is None.
+* The robot's base is the child frame of odometry, else ``base_footprint`` or ``base_link``. Each laser frame has a
+  mount. The last static transform holds for the whole log. A laser that moves on the robot by more than 2 cm or 2
+  degrees has a mount for each scan. The mount is (0, 0, 0), with a warning, if transforms are absent. The bearings of
+  a laser that is mounted upside down run clockwise.
+* Poses that are not level keep only x, y and yaw, with a warning.
+* Messages and transforms with numbers that are not finite, or a quaternion of 0, are skipped; one warning counts
+  them.
+* A last beam that repeats the first beam's direction is dropped. A reading of exactly 0, "none" to all drivers,
+  becomes NaN. Other readings are copied: infinities are "no return", NaN is missing (REP-117).
+* The scanner has the beams and limits of most scans. Readings of other scans move to its nearest beams, at most half a
+  step away, and a warning counts these scans. If beams vary from scan to scan, all scans share a scanner with bearings
+  every 0.25 degrees of a full turn, or finer; bearings move by at most half that step.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ from gpusense.logs.transforms import planar_mount
 from gpusense.world.messages import LEVEL, stamp_of
 from gpusense.world.scanner import Scanner
 
-# Mounts that are further apart than this contradict each other [m, rad].
+# Mounts that differ by more than this contradict each other [m, rad].
 _APART = (0.02, math.radians(2))
 
 
@@ -118,8 +119,8 @@ class _Laser:
         mount: Its mount.
         upside_down: Whether its beams run clockwise.
         tilt: Its largest tilt [rad].
-        moves: Largest distance [m] and turn [rad] between its mounts; None if it is fixed to the robot.
-        at: Function of the time that returns its pose on the base; None if one mount serves.
+        moves: Largest distance [m] and turn [rad] between its mounts; None for a fixed laser.
+        at: Function that returns its pose on the base at a time; None for a fixed laser.
     """
 
     mount: Pose = (0.0, 0.0, 0.0)
@@ -144,7 +145,7 @@ def _lasers(bag: Bag, given: Pose | None, range_min: float | None, range_max: fl
     for frame, laser in found.items():
         place = f"{bag.path}: {bag.topic}" + (f" in {frame}" if len(found) > 1 else "")
         laser.beams = shared_beams(place, bag.lasers[frame], range_min, range_max)
-        # Limits that break a rule are errors before the first record.
+        # Invalid limits raise an error before the first record.
         laser.scanner(next(iter(bag.times)))
     return found
 
@@ -224,7 +225,7 @@ def _by_transforms(bag: Bag, base: str, frame: str) -> _Laser:
 
 
 def _bases(bag: Bag) -> list[str]:
-    """Return the frames that may be the robot's base, the likeliest first."""
+    """Return candidates for the robot's base frame, the likeliest first."""
     if bag.track.base:
         return [bag.track.base]
     names = {name for link in bag.transforms.links() for name in (link.parent, link.child)}

@@ -1,8 +1,8 @@
 """Transforms between frames over time, from ``tf2_msgs/TFMessage``, without ROS.
 
-Look-ups follow tf2: chains in both directions, positions interpolated linearly and rotations along the shorter arc.
-Unlike tf2, a transform whose stamp goes back by more than 2 s drops everything later, as when a recording starts again
-or one stamp was far ahead.
+Look-ups follow tf2: chains in both directions, linear interpolation of positions, and rotations along the shorter arc.
+Unlike tf2, a stamp that goes back by more than 2 s drops all later transforms of this link, as after a restarted
+recording or a single stamp far ahead.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from gpusense.world.messages import field as field_of
 from gpusense.world.messages import real_field, rotation_matrix, stamp_of, unit_quaternion
 
 BACK = 2.0
-"""Step back in time that is no disorder of messages [s]."""
+"""Largest step back in time of messages out of order [s]."""
 # Largest change of a transform that still counts as fixed [m, 1].
 _FIXED = 1e-5
 # Translation and quaternion (x, y, z, w).
@@ -30,10 +30,10 @@ Vector = tuple[float, ...]
 
 
 class TransformError(LookupError):
-    """A transform is not known, or not at the time.
+    """A transform is unknown, or unknown at the requested time.
 
     Attributes:
-        early: Whether the time is later than the known transforms, so that waiting helps.
+        early: True if the time is later than all known transforms, so that waiting helps.
     """
 
     def __init__(self, text: str, early: bool = False) -> None:
@@ -43,16 +43,17 @@ class TransformError(LookupError):
 
 @dataclass
 class Link:
-    """The transform between a frame and its parent.
+    """Transform between a frame and its parent.
 
     Attributes:
         parent: The parent.
         child: The frame.
         static: Whether the transform holds at all times.
-        moved: Whether a transform that is not static has changed.
+        moved: True if a moving transform has changed.
         times: Stamps in increasing order [s].
         values: Translation [m] and quaternion at each stamp, in one row.
-        stray: Time and value of a single transform whose stamp went back; dropped if the next stamp does not.
+        stray: Time and value of a single transform with a stamp that went back; dropped unless the next stamp follows
+            it.
     """
 
     parent: str
@@ -80,7 +81,7 @@ class Link:
             self.values[at * _SIZE : at * _SIZE] = array("d", value)
 
     def keep(self, oldest: float, newest: float) -> None:
-        """Forget the transforms outside an interval of time, save for the last one before it."""
+        """Forget the transforms outside an interval of time, except the last one before it."""
         if self.static or not self.times:
             return
         last = bisect_left(self.times, math.nextafter(newest, math.inf))
@@ -114,8 +115,8 @@ class TransformBuffer:
     """Transforms between frames over time. A slash before a frame's name is ignored.
 
     Args:
-        cache: Time for which moving transforms are kept [s]. If infinite, as for a log, a single stamp that goes back
-            drops nothing.
+        cache: Time to keep moving transforms [s]. If infinite, as for a log, a single stamp that goes back drops
+            nothing.
     """
 
     def __init__(self, cache: float = math.inf) -> None:
@@ -123,7 +124,7 @@ class TransformBuffer:
         self._links: dict[tuple[str, str], Link] = {}
 
     def add(self, message: object, static: bool = False) -> bool:
-        """Add a ``geometry_msgs/TransformStamped``; return whether its stamp went back, so that later ones are dropped.
+        """Add a ``geometry_msgs/TransformStamped``; return whether its stamp went back and dropped later transforms.
 
         Args:
             message: The transform, read by its fields.
@@ -167,12 +168,12 @@ class TransformBuffer:
         yield from self._links.values()
 
     def look_up(self, target: str, source: str, time: float | None = None) -> NDArray[np.float64]:
-        """Return the (4, 4) pose of a frame in another one.
+        """Return the (4, 4) pose of ``source`` in ``target``.
 
         Args:
-            target: The frame in which the pose is given.
-            source: The frame whose pose it is.
-            time: The time [s]; None for the latest time that all links of the chain know.
+            target: Frame of reference.
+            source: Frame to locate.
+            time: The time [s]; None for the latest time known to all links of the chain.
 
         Raises:
             TransformError: The frames are not connected, or not at this time.
@@ -184,7 +185,7 @@ class TransformBuffer:
         try:
             return _product((link.at(time), ahead) for link, ahead in chain)
         except TransformError as error:
-            # A frame may have changed its parent.
+            # A frame may have changed parents.
             known = [link for link in self._links.values() if _covers(link, time)]
             try:
                 return _product((link.at(time), ahead) for link, ahead in self._chain(target, source, known))
@@ -192,7 +193,7 @@ class TransformBuffer:
                 raise error from None
 
     def fixed(self, target: str, source: str) -> NDArray[np.float64]:
-        """Return the (4, 4) pose of a frame in another one that does not move in it.
+        """Return the (4, 4) pose of ``source`` in ``target``, which must be constant.
 
         Raises:
             TransformError: The frames are not connected, or move in each other.
@@ -207,7 +208,7 @@ class TransformBuffer:
         raise TransformError(f"the transform from {moving.parent} to {moving.child} changes")
 
     def history(self, target: str, source: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the (N,) times of a frame's motion in another one [s], and its (N, 4, 4) poses.
+        """Return the (N,) times [s] and (N, 4, 4) poses of the motion of ``source`` in ``target``.
 
         Raises:
             TransformError: The frames are not connected.
@@ -221,7 +222,7 @@ class TransformBuffer:
         return np.array(times), np.array(poses).reshape(-1, 4, 4)
 
     def _chain(self, target: str, source: str, links: Iterable[Link]) -> list[tuple[Link, bool]]:
-        """Return the shortest chain of links from target to source, each with whether it is passed to its child."""
+        """Return the shortest chain of links from target to source, each with whether it leads to its child."""
         ways: dict[str, list[tuple[str, Link, bool]]] = {}
         for link in links:
             ways.setdefault(link.parent, []).append((link.child, link, True))
@@ -252,7 +253,7 @@ def _apart(first: Vector, second: Vector) -> float:
 
 
 def _between(first: Vector, second: Vector, share: float) -> Vector:
-    """Return the transform at a share of the way."""
+    """Interpolate between two transforms."""
     place = (a + share * (b - a) for a, b in zip(first[:3], second[:3], strict=True))
     cosine = sum(a * b for a, b in zip(first[3:], second[3:], strict=True))
     sign, cosine = (-1.0, -cosine) if cosine < 0 else (1.0, cosine)
@@ -267,7 +268,7 @@ def _between(first: Vector, second: Vector, share: float) -> Vector:
 
 
 def _product(chain: Iterable[tuple[Vector, bool]]) -> NDArray[np.float64]:
-    """Return the product of the matrices of a chain, inverted where it is passed to the parent."""
+    """Return the product of the matrices of a chain, inverted where a link leads to its parent."""
     product = np.eye(4)
     for value, ahead in chain:
         rotation, place = rotation_matrix(*value[3:]), np.array(value[:3])

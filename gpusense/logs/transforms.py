@@ -1,4 +1,4 @@
-"""The pose of a laser on its robot by a transform, and a check of it against data."""
+"""Convert a transform to a laser's mount, and check a mount against data."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from gpusense.world.messages import tilt_of
 
 # Least tilt of a laser whose beams run clockwise [rad].
 _UPSIDE_DOWN = 2 * math.pi / 3
-# Check of a mount: headings tried, most pairs of scans, distance and turn between two scans of a pair.
+# Check of a mount: number of headings, most pairs of scans, distance and turn between the scans of a pair.
 _HEADINGS, _PAIRS = 24, 12
 _SHIFT, _TURN = (0.15, 1.0), 0.2
 
 
 def planar_mount(matrix: Floats) -> tuple[Pose, bool, float]:
-    """Return a laser's mount, whether it is upside down, so that its bearings run clockwise, and its tilt [rad]."""
+    """Return a laser's mount, whether it is upside down (with clockwise bearings), and its tilt [rad]."""
     pose = float(matrix[0, 3]), float(matrix[1, 3]), math.atan2(matrix[1, 0], matrix[0, 0])
     tilt = tilt_of(matrix)
     upside_down = tilt > _UPSIDE_DOWN
@@ -30,15 +30,15 @@ def planar_mount(matrix: Floats) -> tuple[Pose, bool, float]:
 def check_mount(scans: Sequence[Scan]) -> str | None:
     """Describe how the scans of a moving robot contradict their scanner's mount; None if they agree with it.
 
-    Pairs of scans between which the robot drove without much turning are overlaid by odometry, for 24 headings of the
-    laser. If a heading other than the mount's brings end points at least twice as close, and closer than 5 cm in the
-    median, the mount contradicts the data. The laser's position is not checked.
+    Odometry overlays pairs of scans between which the robot drove without much turning, for 24 headings of the laser.
+    The mount contradicts the data if another heading brings end points at least twice as close, and within 5 cm in the
+    median. The laser's position is not checked.
 
     Args:
         scans: Scans in the order of time, with odometry.
 
     Raises:
-        TypeError: ``scans`` holds something else.
+        TypeError: ``scans`` does not hold scans.
 
     Example:
         >>> import gpusense as gs
@@ -67,7 +67,7 @@ def check_mount(scans: Sequence[Scan]) -> str | None:
 
 
 def _pairs(scans: Sequence[Scan]) -> list[tuple[Scan, Scan]]:
-    """Return pairs of scans, the second some distance ahead of the first with nearly the same heading."""
+    """Return pairs of scans of nearly the same heading, the second some distance ahead of the first."""
     pairs, first = [], 0
     for k in range(1, len(scans)):
         x, y, theta = np.subtract(scans[k].odometry, scans[first].odometry)
@@ -91,7 +91,7 @@ def _gap(first: Scan, second: Scan, turn: float) -> float:
 
 
 def _end_points(scan: Scan, turn: float) -> Floats:
-    """Return end points of the hits in the odometry frame, for a laser turned on the robot."""
+    """Return end points of the hits in the odometry frame, for a laser turned by ``turn`` on the robot."""
     scanner = scan.scanner
     hit = np.isfinite(scan.ranges) & (scan.ranges > max(scanner.range_min, 0.05)) & (scan.ranges < scanner.range_max)
     x, y, theta = scanner.mount

@@ -7,9 +7,9 @@ L        robot x y theta, laser x y theta, 180 ranges, time [s]
 O        robot x y theta, time [s]
 =======  ===========================================================================
 
-Beam k has the bearing -90 + k degrees. Readings of 8183 cm and more are "no return". The poses of robot and laser give
-the scanner's mount, rounded to 1 mm and 1e-3 rad. The robot has a single laser, so all scans share the mount of the
-first one. The odometry frame is arbitrary, and ``Scan.pose`` is None. Results are in metres.
+Beam k has the bearing -90 + k degrees. Readings of 8183 cm and more are "no return". The poses of robot and laser
+determine the scanner's mount, rounded to 1 mm and 1e-3 rad. All scans share the mount of the first one. The odometry
+frame is arbitrary, and ``Scan.pose`` is None. Results are in metres.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from gpusense.world.scanner import Scanner
 
 _BEAMS, _RANGE_MAX = 180, 81.83
 _NAMES = {b"L": 6 + _BEAMS + 1, b"O": 4}
-# Largest change of the laser's mount from the first scan; more is an error [m, rad].
+# Largest change of the laser's mount after the first scan [m, rad].
 _MOVED = 0.02
 
 

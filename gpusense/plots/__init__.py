@@ -1,4 +1,4 @@
-"""Draw maps, scans, particles, fits and positions, each onto a Matplotlib ``Axes``."""
+"""Draw maps, scans, particles, fits and positions onto a Matplotlib ``Axes``."""
 
 from gpusense.plots.chains import chain_figure
 from gpusense.plots.drawing import (

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from gpusense.evaluation.tracking import Track
     from gpusense.localization.filter import ParticleFilter
 
-# Most frames and particles of a frame; time of a frame [ms]; longer side [inches], at dots per inch.
+# Most frames, and particles per frame; time of a frame [ms]; longer side [inches], dots per inch.
 FRAMES, PARTICLES, DURATION, SIDE, DPI = 100, 2000, 100, 7.0, 80
 _VERDICTS: dict[Word, str] = {"tracking": "#2a7f3f", "uncertain": "#b26b00", "lost": "#b3261e"}
 # Colours of all frames.
@@ -29,11 +29,11 @@ _COLOURS = (
 
 
 class Animation:
-    """Frames of a run, in memory until they are written.
+    """Frames of a run, in memory until written.
 
     Args:
         grid: The map.
-        scans: Number of scans of the run, of which at most ``FRAMES`` become frames.
+        scans: Number of scans of the run; at most ``FRAMES`` become frames.
     """
 
     def __init__(self, grid: OccupancyGrid, scans: int) -> None:
@@ -52,7 +52,7 @@ class Animation:
         self._each, self._scans, self._frames = -(-scans // FRAMES), 0, list[Any]()
 
     def add(self, pf: ParticleFilter, track: Track, step: Step) -> None:
-        """Draw the last scan of a track, if it is one of the frames."""
+        """Draw the last scan of a track, if it is due for a frame."""
         self._scans += 1
         if (self._scans - 1) % self._each:
             return
@@ -72,10 +72,10 @@ class Animation:
         self._frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
 
     def write(self, track: Track, path: Path) -> None:
-        """Write the frames atomically as a GIF that repeats."""
+        """Write the frames atomically as a repeating GIF."""
         from PIL import Image, ImageColor
 
-        # Each colour, and its mixtures with white along the edges of shapes.
+        # All colours, and their mixtures with white along the edges of shapes.
         colours = [ImageColor.getrgb(name) for name in _COLOURS]
         mixed = [255 + (np.array(colours) - 255) * share for share in (1, 0.75, 0.5, 0.25)]
         palette = Image.new("P", (1, 1))

@@ -1,4 +1,4 @@
-"""Draw a chain of scans: its map, trajectory, links that close loops, and doubtful stretches."""
+"""Draw a chain of scans: map, trajectory, loop closures and doubtful stretches."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PATH, CLOSED, DOUBTED, KEY = "#4c78a8", "#3c8d4f", "#e4572e", "#1f3552"
-# Number of ellipses that are drawn.
+# Number of ellipses.
 _ELLIPSES = 40
 
 

@@ -1,6 +1,6 @@
-"""Draw maps, scans and poses, each onto a Matplotlib ``Axes``.
+"""Draw maps, scans and poses onto a Matplotlib ``Axes``.
 
-Matplotlib is imported on first use. ``pyplot`` and its global state are never touched: make a figure with
+Matplotlib is imported on first use. ``pyplot`` and its global state are never used: make a figure with
 :func:`new_figure`, draw, and write it with :func:`save`.
 """
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 FREE, UNKNOWN, OCCUPIED = "#ffffff", "#dfe3e8", "#4a5568"
 BEAM, ROBOT, FRAME = "#0077b6", "#d7263d", "#9aa5b1"
-# Colours from unlikely to likely with falling lightness, readable on paper, in grey and under colour blindness.
+# Colours from unlikely to likely with falling lightness, readable on paper, in grey and with colour blindness.
 SCALE = ("#eef1f5", "#ffd166", "#f3722c", "#b5179e", "#3a0ca3")
 # Dots per inch of a saved image; clouds of points are also rasterised in vector formats.
 DPI = 150
@@ -77,7 +77,7 @@ def draw_map(ax: Axes, grid: OccupancyGrid) -> AxesImage:
     palette = np.array([to_rgba(FREE), to_rgba(UNKNOWN), to_rgba(OCCUPIED)], dtype=np.float32)
     kinds = np.where(grid.occupied, 2, np.where(grid.unknown, 1, 0))
     _over_grid(ax, grid, palette[kinds], zorder=0)
-    palette[0, 3] = 0  # free cells of the upper layer are transparent to the layers in between
+    palette[0, 3] = 0  # free cells of the upper layer show the layers in between
     image = _over_grid(ax, grid, palette[kinds], zorder=2)
     x_min, y_min, x_max, y_max = grid.bounds()
     ax.set(xlim=(x_min, x_max), ylim=(y_min, y_max), aspect="equal", xlabel="x [m]", ylabel="y [m]")
@@ -90,17 +90,17 @@ def draw_map(ax: Axes, grid: OccupancyGrid) -> AxesImage:
 def draw_scan(ax: Axes, grid: OccupancyGrid, scanner: Scanner, pose: ArrayLike, ranges: ArrayLike) -> int:
     """Draw a scan at a pose: thin beams, their end points, the robot.
 
-    Readings without a range ("no return" and missing ones) are not drawn.
+    Only readings with a range are drawn.
 
     Args:
-        ax: Axes to draw onto, usually those of :func:`draw_map`.
+        ax: Axes to draw onto, usually after :func:`draw_map`.
         grid: The map; its size sets the length of the robot's arrow.
         scanner: The scanner's geometry, mount included.
         pose: (3,) the robot's x, y and theta in the world [m, m, rad].
         ranges: (K,) readings [m].
 
     Returns:
-        The number of readings that were drawn.
+        The number of drawn readings.
 
     Example:
         >>> import gpusense as gs
@@ -150,11 +150,11 @@ def draw_pose(ax: Axes, pose: ArrayLike, *, length: float, colour: str = ROBOT) 
 
 
 def add_colour_bar(ax: Axes, mappable: Any, label: str) -> None:
-    """Add a colour bar beside an axes, with an arrow at its low end for values below the scale.
+    """Add a colour bar to axes, with an arrow at its low end for values below the scale.
 
     Args:
         ax: The axes.
-        mappable: Image or collection with the colours, as the drawing functions return it.
+        mappable: Image or collection with the colours, from a drawing function.
         label: The bar's label.
 
     Example:

@@ -15,13 +15,13 @@ _PAGES = Path(__file__).parent / "pages"
 def error_page(rows: Sequence[Row], shown: Mapping[str, Sequence[str]] | None = None, text: str = "") -> str:
     """Return the page: a figure of time over error, a budget, and performance profiles.
 
-    A reader chooses need, device, map and error. The most exact method within the budget is marked, as
-    :func:`~gpusense.evaluation.benchmark.choice.choose` chooses it. The other view is the performance profile of Dolan
-    and More (2002): the share of scenes that a method solves to a largest error within a factor of the best time.
+    A reader chooses need, device, map and error. The page marks the most exact method within the budget, by
+    :func:`~gpusense.evaluation.benchmark.choice.choose`. The other view is the performance profile of Dolan and More
+    (2002): the share of scenes that a method solves to a largest error within a factor of the best time.
 
     Args:
         rows: Rows of reports.
-        shown: By need the texts of the measures that the page offers; None for all.
+        shown: Texts of the measures on the page, by need; None for all.
         text: Line about the machine below the title.
     """
     origins = list(dict.fromkeys(row.origin for row in rows))
@@ -51,12 +51,12 @@ def _plain(row: Row, origins: Sequence[str], shown: Mapping[str, Sequence[str]] 
 
 
 def _preference(row: Row) -> tuple[Any, ...]:
-    """Return the place of a row among equal ones."""
+    """Return the sort key of a row among equal rows."""
     return row.entry(next(iter(row.errors))).preference
 
 
 def _json(value: Any) -> str:
-    """Format a value as JSON that no HTML parser takes for the end of its element."""
+    """Format a value as JSON that cannot end its HTML element."""
     return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 

@@ -1,4 +1,4 @@
-"""Draw features of scans, and landmarks made from them."""
+"""Draw features of scans, and landmarks from features."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _draw_one(ax: Axes, kind: str, pose: tuple[float, float, float], size: float
 
 
 def draw_landmarks(ax: Axes, landmarks: FeatureMap) -> None:
-    """Draw landmarks at their places in the world, with their directions.
+    """Draw landmarks at their positions in the world, with directions.
 
     Args:
         ax: Axes to draw onto, for example from :func:`draw_map`.
@@ -136,7 +136,7 @@ def features_figure(features: Features, ranges: ArrayLike, scanner: Scanner) -> 
 
 
 def landmarks_figure(landmarks: FeatureMap, grid: OccupancyGrid | None = None) -> Figure:
-    """Draw landmarks, over a map if there is one, as a figure.
+    """Draw landmarks as a figure, over a map if any.
 
     Args:
         landmarks: The landmarks.

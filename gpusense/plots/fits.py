@@ -1,4 +1,4 @@
-"""Draw a fit: readings, the density over their histogram, the log-likelihood's trace, the density's surface.
+"""Draw a fit: readings, density over their histogram, trace of the log-likelihood, surface of the density.
 
 Book figures 6.5 and 6.6. Matplotlib is imported on first use; see :mod:`gpusense.plots.drawing`.
 """
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 
 # Cells of the histograms over (z, z*) and over z.
 _CELLS, _BARS = 200, 80
-# Largest number of readings drawn one by one; more are thinned.
+# Largest number of drawn readings; more are thinned.
 _DRAWN = 10_000
 
 
 def distances_of(data: RangeData, count: int = 3) -> list[float]:
-    """Choose distinct expected ranges with many readings around each, as quantiles of the expected ranges [m]."""
+    """Choose distinct expected ranges [m] with many readings, as quantiles of all expected ranges."""
     known = data.expected[(data.kinds != Reading.MISSING) & (data.expected < data.range_max)]
     if not len(known):
         return []
@@ -65,7 +65,7 @@ def readings_figure(data: RangeData, distances: list[float]) -> Figure:
     edge = min(data.range_max, 2.5 * max(distances, default=data.range_max))
     for place, distance in enumerate(distances):
         near, width = _near(data, distance)
-        # Readings beyond the axis, and readings without return, are drawn on its upper edge.
+        # Draw readings beyond the axis, and readings without return, on its upper edge.
         z = np.minimum(np.where(data.kinds == Reading.MAX, edge, data.ranges)[near], edge)
         z = z[:: max(-(-len(z) // _DRAWN), 1)]
         right.plot(
@@ -108,7 +108,7 @@ def _density_panel(ax: Axes, data: RangeData, parameters: BeamParameters, distan
     ax.stairs(counts / (max(total, 1) * wide), edges, fill=True, color=FRAME, label=f"{total} readings")
     z = np.unique(np.concatenate([np.linspace(0, top * (1 - 1e-9), 800), distance + np.linspace(-0.5, 0.5, 201)]))
     z = z[(z >= 0) & (z < min(top, data.range_max))]
-    # The density is the mean over the expected ranges of these readings.
+    # The curve is the mean density over the expected ranges of these readings.
     expected = _spaced(data.expected[near], 60)
     log_p = log_mixture(z, expected[:, None], range_max=data.range_max, **parameters.to_dict())
     ax.plot(
@@ -146,7 +146,7 @@ def trace_figure(trace: NDArray[np.float64], method: str) -> Figure:
 
 
 def surface_figure(data: RangeData, parameters: BeamParameters) -> Figure:
-    """Draw log p(z | z*) over readings and expected ranges; the title has log p of a reading without return."""
+    """Draw log p(z | z*) over readings and expected ranges; the title states log p of no return."""
     from gpusense.models.scan.densities import log_mixture
 
     figure = new_figure(6.6, 5.2)
@@ -181,21 +181,21 @@ def incidence_figure(fit: IncidenceFit) -> Figure:
 
 
 def _near(data: RangeData, distance: float) -> tuple[NDArray[np.bool], float]:
-    """Select readings that are not missing with expected ranges near a distance; return also half the interval [m]."""
+    """Select valid readings with expected ranges near a distance; also return half the interval [m]."""
     width = max(0.03 * distance, 0.02)
     near: Any = (np.abs(data.expected - distance) <= width) & (data.kinds != Reading.MISSING)
     return near, width
 
 
 def _spaced(values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Return at most ``count`` of the values, evenly spaced in rank, from the least to the largest."""
+    """Return at most ``count`` values, evenly spaced in rank from least to largest."""
     if not len(values):
         return values
     return np.sort(values)[np.linspace(0, len(values) - 1, min(count, len(values))).astype(int)]
 
 
 def _top(data: RangeData) -> float:
-    """Return an upper limit for axes that includes most ranges [m]; an office is small compared with a laser's 80 m."""
+    """Return an upper limit of axes for most ranges [m]; an office is small compared with a laser's 80 m."""
     ranges = data.ranges[data.kinds == Reading.HIT]
     known = np.concatenate([ranges, data.expected[data.expected < data.range_max]])
     return min(1.1 * float(np.quantile(known, 0.995)), data.range_max) if len(known) else data.range_max

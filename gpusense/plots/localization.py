@@ -43,10 +43,10 @@ def localization_figure(
         scanner: The scanner's geometry.
         ranges: (K,) readings [m].
         truth: (3,) the robot's true pose in the world [m, m, rad].
-        best: (3,) the pose at which the scan is drawn [m, m, rad].
+        best: (3,) the pose for drawing the scan [m, m, rad].
         poses: (N, 3) particles [m, m, rad].
         log_p: (N,) log-likelihoods of the particles.
-        densities: Two (R, C) log-likelihoods over a :func:`pose_lattice`, by their titles.
+        densities: Two (R, C) log-likelihoods over a :func:`pose_lattice`, by title.
         extent: (W, H) of that lattice [m].
     """
     figure = new_figure(15.0, 9.8)
@@ -68,7 +68,7 @@ def localization_figure(
 def _draw_zoomed_particles(
     ax: Axes, grid: OccupancyGrid, truth: tuple[float, float], poses: ArrayLike, log_p: ArrayLike
 ) -> None:
-    """Draw particles onto a map, with an inset of the surroundings of the true position."""
+    """Draw particles onto a map, with an inset around the true position."""
     x, y = truth
     zoom = ax.inset_axes((0.735, 0.655, 0.255, 0.325))
     draw_map(zoom, grid)

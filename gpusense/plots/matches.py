@@ -1,4 +1,4 @@
-"""Draw matches of scans: the points of both before and after."""
+"""Draw matches of scans: both scans' points before and after."""
 
 from __future__ import annotations
 

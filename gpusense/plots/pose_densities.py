@@ -25,9 +25,9 @@ def draw_particles(
     Args:
         ax: Axes to draw onto.
         poses: (N, 3) x, y and theta in the world [m, m, rad].
-        log_p: (N,) log-likelihoods, natural logarithm; -inf has the colour of the scale's low end.
+        log_p: (N,) log-likelihoods, natural logarithm; -inf takes the colour of the scale's low end.
         size: Area of a particle [points squared].
-        depth: Extent of the colour scale below the best value [nats]; by default half of the particles lie on it.
+        depth: Extent of the colour scale below the best value [nats]; the default covers half of the particles.
 
     Returns:
         The collection, for :func:`add_colour_bar`.
@@ -56,12 +56,12 @@ def pose_lattice(
 
     Args:
         grid: The map.
-        spacing: Distance between neighbours [m], > 0; it is rounded to whole cells.
+        spacing: Distance between neighbours [m], > 0; rounded to whole cells.
         theta: The heading of all poses in the world [rad].
 
     Returns:
         (R C, 3) poses row by row, (R, C) whether the pose's tile has a free cell, and the lattice's extent (W, H)
-        along the grid's axes [m], for :func:`draw_pose_density`. A pose lies in the free cell nearest to the middle of
+        along the grid's axes [m], for :func:`draw_pose_density`. A pose is in the free cell nearest to the middle of
         its tile.
 
     Raises:
@@ -94,11 +94,11 @@ def draw_pose_density(
     """Draw P(z | x, m) over a lattice of poses with one heading, as log-likelihood below the best.
 
     Args:
-        ax: Axes to draw onto, usually those of :func:`draw_map`.
-        grid: The map, whose frame the lattice has.
-        log_p: (R, C) log-likelihoods from the grid's first row and column on, natural logarithm; NaN is left blank.
-        extent: (W, H) of the lattice along the grid's axes [m], as :func:`pose_lattice` returns it.
-        depth: Extent of the colour scale below the best value [nats]; by default half of the values lie on it.
+        ax: Axes to draw onto, usually after :func:`draw_map`.
+        grid: The map; the lattice has its frame.
+        log_p: (R, C) log-likelihoods from the grid's first row and column on, natural logarithm; NaN stays blank.
+        extent: (W, H) of the lattice along the grid's axes [m], from :func:`pose_lattice`.
+        depth: Extent of the colour scale below the best value [nats]; the default covers half of the values.
 
     Returns:
         The image, for :func:`add_colour_bar`.

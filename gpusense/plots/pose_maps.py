@@ -32,9 +32,9 @@ def draw_pose_likelihood(ax: Axes, likelihood: PoseLikelihood, *, depth: float |
     """Draw the likelihood of each position at its best heading: the darker a position, the larger P(z | x, m).
 
     Args:
-        ax: Axes to draw onto, usually those of :func:`draw_map`.
+        ax: Axes to draw onto, usually after :func:`draw_map`.
         likelihood: A result of :func:`gpusense.pose_likelihood`.
-        depth: Extent of the grey scale below the best value [nats]; by default half of the positions lie on it.
+        depth: Extent of the grey scale below the best value [nats]; the default covers half of the positions.
 
     Returns:
         The image, for :func:`add_colour_bar`.
@@ -58,7 +58,7 @@ def draw_pose_likelihood(ax: Axes, likelihood: PoseLikelihood, *, depth: float |
 
 
 def pose_likelihood_figure(likelihood: PoseLikelihood, path: str | os.PathLike[str]) -> None:
-    """Draw likelihoods over the map's outlines, with the modes near the best likelihood, and write the picture.
+    """Draw likelihoods over the map's outlines, with all modes near the best one, and write the picture.
 
     Args:
         likelihood: A result of :func:`gpusense.pose_likelihood`.

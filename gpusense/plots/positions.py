@@ -1,7 +1,7 @@
-"""Draw possible positions from ranges or bearings of beacons, without uncertainty and with it.
+"""Draw possible positions from ranges or bearings of beacons, with and without uncertainty.
 
 The pictures follow the lectures' "Distances Only" and "Bearings Only". As in ``drawing``, Matplotlib is imported on
-first use, and each function draws onto a Matplotlib ``Axes``.
+first use.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def position_log_density(
 ) -> Floats:
     """Compute log p(ranges, bearings | x, y): the sum over beacons of the logarithms of Gaussian densities.
 
-    Without a heading, bearings are scored with the heading that fits best at each point (profile likelihood).
+    If the heading is unknown, bearings are scored with the best heading at each point (profile likelihood).
 
     Args:
         points: (..., 2) x and y [m].
@@ -126,20 +126,20 @@ def draw_solution_set(
     bearings: ArrayLike | None = None,
     heading: float | None = None,
 ) -> int:
-    """Draw the set of positions that each measurement allows without uncertainty: circles, rays or arcs.
+    """Draw the exact solution set of each measurement: circles, rays or arcs.
 
-    A range allows a circle around its beacon. A bearing with a known heading allows a ray that ends in the beacon.
-    Without a heading, the angle between two bearings allows an arc of a circle through both beacons.
+    A range allows a circle around its beacon. A bearing and a known heading allow a ray that ends in the beacon. If
+    the heading is unknown, the angle between two bearings allows an arc of a circle through both beacons.
 
     Args:
-        ax: Axes to draw onto; rays are as long as its diagonal, so set its limits first.
+        ax: Axes to draw onto; set the limits first, since rays are as long as the diagonal.
         xy: (M, 2) beacons [m].
         ranges: (M,) [m], or None.
         bearings: (M,) [rad], or None.
         heading: The robot's heading [rad], or None.
 
     Returns:
-        The number of curves that were drawn.
+        The number of drawn curves.
 
     Example:
         >>> import gpusense as gs
@@ -158,7 +158,7 @@ def draw_solution_set(
 
 
 def _solution_curves(problem: Problem, reach: float) -> list[NDArray[np.complex128]]:
-    """Return the curves of positions that the measurements allow, as complex numbers; rays have length ``reach``."""
+    """Return the curves of possible positions as complex numbers; rays have length ``reach``."""
     world = problem.points + complex(*problem.origin)
     curves: list[NDArray[np.complex128]] = []
     if problem.ranges is not None:
@@ -179,9 +179,9 @@ def draw_fix(ax: Axes, fix: PositionFix, *, length: float = 0.0, ellipses: bool 
 
     Args:
         ax: Axes to draw onto.
-        fix: The fix; covariances that are not finite are not drawn.
+        fix: The fix; only finite covariances are drawn.
         length: Length of a heading's arrow [m]; 0 draws none.
-        ellipses: Whether to draw ellipses; small points then mark the solutions instead of rings.
+        ellipses: Whether to draw ellipses; points instead of rings then mark the solutions.
 
     Example:
         >>> import gpusense as gs
@@ -269,7 +269,7 @@ def set_view(ax: Axes, extent: tuple[float, float, float, float], title: str) ->
 
 
 def _arc(first: complex, second: complex, angle: float, reach: float) -> NDArray[np.complex128]:
-    """Return points p with second - p = k exp(i angle) (first - p), k > 0, which see both beacons at this angle."""
+    """Return points p that see both beacons at this angle: second - p = k exp(i angle) (first - p), k > 0."""
     # k = tan(t / 2) is 0 at the second beacon and infinite at the first one.
     t = np.linspace(0, np.pi, FINE)
     turn = np.exp(1j * angle)

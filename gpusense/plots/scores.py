@@ -15,7 +15,7 @@ LOGGED, MEAN, PERCENTILE = "#8fa3b8", "#e4572e", "#4c78a8"
 
 
 def scores_figure(grid: OccupancyGrid, score: BackendScore, pose: str = "logged pose") -> Figure:
-    """Draw the map with the poses of the scans and weighted means, and histograms of percentiles and errors."""
+    """Draw the map with poses of the scans and weighted means, and histograms of percentiles and errors."""
     figure = new_figure(11.0, 6.0)
     axes = figure.subplot_mosaic([["map", "percentile"], ["map", "error"]], width_ratios=(1.6, 1.0))
     ax, upper, lower = (axes[name] for name in ("map", "percentile", "error"))

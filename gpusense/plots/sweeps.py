@@ -1,4 +1,4 @@
-"""Draw a sweep: error against run time, with a point for each job."""
+"""Draw a sweep: error against run time, one point per job."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _LABELS = {
 
 
 def sweep_figure(columns: Mapping[str, Sequence[Any]]) -> Figure:
-    """Draw the jobs of a table, with a colour for each model and a shape for each value of a second axis.
+    """Draw the jobs of a table; models have colours, values of a second axis have shapes.
 
     Args:
-        columns: Columns of a table, as :func:`gpusense.sweep.read_table` returns them.
+        columns: Columns of a table from :func:`gpusense.sweep.read_table`.
     """
     tasks = [TASKS[task].error for task in dict.fromkeys(columns.get("task", ())) if task in TASKS]
     error = next((name for name in tasks if name in columns), None)
@@ -59,7 +59,7 @@ def sweep_figure(columns: Mapping[str, Sequence[Any]]) -> Figure:
 
 
 def _axes(columns: Mapping[str, Sequence[Any]]) -> tuple[str, str]:
-    """Return the columns that colours and shapes represent: models, labelled axes, particles, or empty."""
+    """Return the columns for colours and shapes: models, labelled axes, particles, or ""."""
     labelled = {name: 1 for name in columns if name.startswith("axis.")}
     candidates = {"model": 0, **labelled, "axis.log": 2, "particles": 3}
     varied = {name: len(set(columns[name])) for name in candidates if name in columns}

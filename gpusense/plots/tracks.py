@@ -1,4 +1,4 @@
-"""Draw a track: map, particles, estimated and reference poses, and errors with their deviations."""
+"""Draw a track: map, particles, estimated and reference poses, and errors with deviations."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def track_figure(pf: ParticleFilter, track: Track) -> Figure:
     draw_map(ax, pf.grid)
     poses, references = np.array(track.poses).reshape(-1, 3), track.references
     if references is not None:
-        # Single known poses among unknown ones have no line.
+        # A line cannot show single known poses.
         style = "-" if np.isfinite(references).all() else "."
         ax.plot(references[:, 0], references[:, 1], style, color=LOGGED, lw=1.6, label="reference pose")
     ax.plot(poses[:, 0], poses[:, 1], "-", color=ESTIMATED, lw=0.8, label="estimate")

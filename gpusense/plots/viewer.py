@@ -18,7 +18,7 @@ from gpusense.localization.pose_algebra import compose_poses
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, Scanner, classify
 
-# Most particles of a scan that are recorded; length of the robot's arrow [m].
+# Most particles per scan; length of the robot's arrow [m].
 _PARTICLES, _ARROW = 2000, 0.7
 # Red, green, blue.
 _WALL, _CLOUD, _SCAN = (90, 90, 90), (76, 120, 168), (242, 184, 72)
@@ -26,7 +26,7 @@ _ESTIMATE, _REFERENCE = (228, 87, 46), (143, 163, 184)
 
 
 class Recording:
-    """Recording of a run, in memory until it is written.
+    """Recording of a run, in memory until written.
 
     Raises:
         ImportError: rerun-sdk is not installed.
@@ -77,7 +77,7 @@ class Recording:
 
 
 def end_points(scanner: Scanner, ranges: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (M, 2) ends of the beams that hit something, in the world.
+    """Return the (M, 2) end points of the hits in the world.
 
     Args:
         scanner: The scanner.
@@ -91,5 +91,5 @@ def end_points(scanner: Scanner, ranges: NDArray[np.float64], pose: NDArray[np.f
 
 
 def _flat(xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return points of the plane as points of space."""
+    """Embed points of the plane in space."""
     return np.column_stack([xy, np.zeros(len(xy))])

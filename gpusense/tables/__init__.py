@@ -1,1 +1,1 @@
-"""Tables made of a map on a device: distances, rectangles, directional tables, look-ups, field and normals."""
+"""Compute tables of a map on a device: distances, rectangles, directional tables, look-ups, field and normals."""

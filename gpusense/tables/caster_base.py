@@ -1,4 +1,4 @@
-"""Interface of the casters: their input, their table, and the base class."""
+"""Define the interface of casters: input, table and base class."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gpusense.world.windows import Window
 
 @dataclass(frozen=True)
 class CasterInput:
-    """A window of a map, from which a caster makes its table.
+    """Window of a map, the input of a caster's table.
 
     Attributes:
         obstacles: (rows, cols) bool.
@@ -33,7 +33,7 @@ class CasterInput:
 
 @dataclass(frozen=True)
 class Table:
-    """A caster's table on a device.
+    """Table of a caster on a device.
 
     Attributes:
         buffer: The table.
@@ -47,19 +47,19 @@ class Table:
 
 
 class Caster(ABC):
-    """A method of computing expected ranges.
+    """Method of computing expected ranges.
 
     Attributes:
-        name: Name that selects the caster with its default knobs, and its entry in the registry.
-        exact: True if its ranges are exact.
+        name: Name of the caster in the registry; it selects default knobs.
+        exact: True for exact ranges.
         error: ``"exact"``, or the bound on its error.
         memory: Memory on the device, in words.
         precomputation: Work on the map before the first ray, in words.
         knobs: Parameters that trade error for time, in words.
-        backends: Backends that have it.
-        whole: Whether the table needs the whole map at once.
-        ring: True if the table has a ring of cells that stands for space outside the grid.
-        stops: Whether a ray may end before the longest range.
+        backends: Backends that implement it.
+        whole: True if the table needs the whole map at once.
+        ring: True if a ring of cells in the table represents space outside the grid.
+        stops: True if a ray may end before the longest range.
     """
 
     name: ClassVar[str]
@@ -75,7 +75,7 @@ class Caster(ABC):
 
     @property
     def beyond(self) -> int:
-        """Number of cells beyond the longest range that can change a result."""
+        """Number of cells beyond the longest range that affect a result."""
         return 0
 
     @property
@@ -94,13 +94,13 @@ class Caster(ABC):
             backend: The device.
             inputs: The window after the change.
             table: Its table before the change.
-            changed: Part of the window that holds all changed obstacles.
+            changed: Part of the window with all changed obstacles.
 
         Returns:
-            False if the caster cannot update its table, which must then be made again.
+            False if the caster must make its table again.
         """
         return False
 
     def struct(self) -> structs.Caster:
-        """Return the knobs as kernels take them."""
+        """Return the knobs for kernels."""
         return structs.Caster(0, 0.0, 0.0)

@@ -1,6 +1,6 @@
-"""The casters: methods of computing expected ranges, with their error, memory and knobs.
+"""Define the casters: methods of computing expected ranges, with error, memory and knobs.
 
-``RayCaster(method=...)`` and ``BeamModel(caster=...)`` take one of these, or its name for its default knobs.
+``RayCaster(method=...)`` and ``BeamModel(caster=...)`` take a caster, or a name for default knobs.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from gpusense.world import windows
 __all__ = ["CASTERS", "Bresenham", "Caster", "Cddt", "Dda", "Exact", "Lookup", "March"]
 
 _BYTE, _SHORT, _SINGLE = (np.dtype(name) for name in (np.uint8, np.uint16, np.float32))
-# Rays per launch that fills a look-up table, so that a launch takes about a second.
+# Rays per launch when filling a look-up table, for launches of about a second.
 _TILE = {"cpu": 1 << 22, "gpu": 1 << 30}
 # Flags of other programs' lines.
 _LINES = {"amcl": "AMCL_LINES", "beluga": "BELUGA_LINES"}
@@ -34,7 +34,7 @@ _LINES = {"amcl": "AMCL_LINES", "beluga": "BELUGA_LINES"}
 
 @dataclass(frozen=True)
 class Exact(Caster):
-    """Traversal that crosses a whole empty rectangle per step."""
+    """Traversal that crosses an empty rectangle per step."""
 
     name = "exact"
     exact = True
@@ -71,9 +71,8 @@ class Bresenham(Caster):
     """Bresenham's line from cell to cell.
 
     Args:
-        lines: None; ``"amcl"`` for the lines of nav2_amcl, which extend one cell beyond the ray's end and may be longer
-            than range_max; or ``"beluga"`` for Beluga's, which go straight midway between two cells, and meet nothing
-            from outside the grid.
+        lines: None; ``"amcl"`` for lines that extend one cell beyond the ray's end and may exceed range_max; or
+            ``"beluga"`` for lines that go straight midway between two cells, and meet nothing from outside the grid.
     """
 
     lines: str | None = None
@@ -107,8 +106,8 @@ class March(Caster):
 
     Args:
         tolerance: Least step [cells], 0.001 to 10: smaller steps are more exact and slower.
-        rule: ``"safe"`` shortens steps by sqrt(2) cells, so that only the least step can pass an obstacle. ``"centre"``
-            steps by the distance between cell centres, as range_libc and f1tenth_gym do: it is faster, but misses
+        rule: ``"safe"`` shortens steps by sqrt(2) cells, so that only the least step can pass an obstacle.
+            ``"centre"`` steps by the distance between cell centres, like range_libc and f1tenth_gym: faster, but misses
             corners.
     """
 
@@ -127,7 +126,7 @@ class March(Caster):
         checks.choice("rule", self.rule, ("safe", "centre"))
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
-        # Walls outside the grid are also obstacles.
+        # Walls outside the grid are obstacles.
         ring = int(inputs.outside == "occupied")
         obstacles = np.pad(inputs.obstacles, ring, constant_values=True)
         squares = backend.download(squared_distances(backend, obstacles), np.empty(obstacles.shape, np.int32))
@@ -145,8 +144,8 @@ class Cddt(Caster):
 
     Args:
         bins: Angle bins of a full turn, 4 to 4096: more bins are more exact and take more memory.
-        pruned: Whether to leave out obstacles that begin inside another obstacle of their line. The table is smaller;
-            rays from free origins beside that other obstacle may then pass through walls of one cell's thickness.
+        pruned: Whether to omit obstacles that begin inside another obstacle of their line, for a smaller table. Rays
+            from free origins next to the other obstacle may then pass through walls of one cell's thickness.
     """
 
     bins: int = 216
@@ -179,7 +178,7 @@ class Lookup(Caster):
 
     Args:
         bins: Angle bins of a full turn, 4 to 4096: more bins are more exact and take more memory.
-        file: Table written by ``RayCaster.save_table`` for the same map, range and number of bins; None makes it.
+        file: Table from ``RayCaster.save_table`` for the same map, range and number of bins; None computes it.
     """
 
     bins: int = 108
@@ -238,7 +237,7 @@ CASTERS = {caster.name: caster for caster in _ALL}
 
 
 def choose(argument: str, value: object, lines: str | None = None) -> Caster:
-    """Return a caster by name, Bresenham with the lines of a program; a caster is returned unchanged."""
+    """Return a caster by name, or a caster unchanged; Bresenham takes another program's ``lines``."""
     if isinstance(value, Caster):
         return value
     caster = CASTERS[checks.choice(argument, value, tuple(CASTERS))]

@@ -1,4 +1,4 @@
-"""Occupied cells in the layouts of the kernels, as bytes or packed bits, and the limit of their number."""
+"""Convert occupied cells to the kernels' layouts, bytes or packed bits, and limit their number."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ _MOST_CELLS = (1 << 31) // 4 - 1
 
 
 def check_size(rows: int, cols: int) -> None:
-    """Check that the tables of a window can be indexed."""
+    """Check that kernels can index the tables of a window."""
     if (rows + 4) * (cols + 4) > _MOST_CELLS:
         raise ValueError(f"grid: the part in use must have at most {_MOST_CELLS} cells, got {rows} x {cols}")
 
 
 def as_bytes(obstacles: np.ndarray) -> np.ndarray:
-    """Return a contiguous array with byte 1 for an obstacle; a contiguous array of bool is not copied."""
+    """Return a contiguous array with byte 1 for an obstacle; contiguous bools are not copied."""
     return np.ascontiguousarray(obstacles, dtype=bool).view(_BYTE)
 
 

@@ -12,12 +12,12 @@ _LIMIT = (1 << 31) - 1
 
 
 def directional_table(obstacles: np.ndarray, bins: int, *, pruned: bool, outside: bool) -> np.ndarray:
-    """Build the table: for each angle bin, lines along its direction with the sorted beginnings of obstacles.
+    """Build the table: for each angle bin, lines along its direction with sorted beginnings of obstacles.
 
     Args:
         obstacles: (rows, cols) bool.
         bins: Angle bins of a full turn.
-        pruned: Whether to leave out obstacles that begin inside another obstacle of the same line.
+        pruned: Whether to omit obstacles that begin inside another obstacle of the same line.
         outside: True if space outside the grid is a wall.
 
     Returns:
@@ -25,7 +25,7 @@ def directional_table(obstacles: np.ndarray, bins: int, *, pruned: bool, outside
     """
     rows, cols = obstacles.shape
     row, col = _exposed(np.pad(obstacles, 1, constant_values=outside), outside)
-    # One extra line at each end, since corners of cells lie on borders of lines.
+    # One extra line at each end, since corners of cells may be on borders of lines.
     lines = math.ceil(math.hypot(rows + 2, cols + 2)) + 3
     firsts, cosines = np.empty((bins, lines), np.int64), np.empty((bins, 3), np.int64)
     begins, total = [], 0
@@ -74,11 +74,11 @@ def _projected(col: np.ndarray, row: np.ndarray, cos: float, sin: float) -> tupl
     """Project cells onto lines.
 
     Returns:
-        The line of each projection, and its beginning and end along the middle of the cell's part of that line.
+        Line, beginning and end of each projection, along the middle of the cell's part of the line.
     """
     along, across = (col + 0.5) * cos + (row + 0.5) * sin, (row + 0.5) * cos - (col + 0.5) * sin
     half = (abs(cos) + abs(sin)) / 2
-    # A cell that only touches a line with a corner is not on the line.
+    # A cell that touches a line only with a corner is not on the line.
     low, high = np.floor(across - half + 1e-9).astype(np.int64), np.floor(across + half - 1e-9).astype(np.int64)
     lines, begins, ends = [], [], []
     for i in range(int(np.max(high - low, initial=0)) + 1):
@@ -100,7 +100,7 @@ def _projected(col: np.ndarray, row: np.ndarray, cos: float, sin: float) -> tupl
 def _begin_outside(line: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the mask of obstacles that do not begin inside an earlier obstacle of their line.
 
-    Obstacles are in the order of lines and beginnings.
+    Obstacles are sorted by line, then by beginning.
     """
     # Running maximum of the ends within each line: an offset lifts each line above the previous one.
     lift = (np.max(end) - np.min(begin) + 1) * (line - line[0])

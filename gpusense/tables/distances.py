@@ -1,7 +1,7 @@
-"""Squared distances to the nearest obstacle, computed on a device.
+"""Compute squared distances to the nearest obstacle on a device.
 
-Processors run few long work-items, one per line. GPUs run one work-item per cell, on bits that the host packs, which is
-an eighth of the bytes to transfer.
+Processors run few long work-items, one per line. GPUs run one work-item per cell, on bits that the host packs to save
+seven eighths of the transfer.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def squared_distances(backend: Backend, obstacles: np.ndarray, most: int = NO_OB
     Args:
         backend: The device.
         obstacles: (rows, cols) bool.
-        most: Largest squared distance that matters; a larger one may be any number above ``most``, which shortens the
+        most: Largest squared distance that matters; larger distances may be any number above ``most``, for a shorter
             search on GPUs.
 
     Returns:
@@ -50,7 +50,7 @@ def squared_distances(backend: Backend, obstacles: np.ndarray, most: int = NO_OB
 
 
 def _by_lines(backend: Backend, obstacles: np.ndarray, squared: Buffer, most: int) -> None:
-    """Run one work-item per line: columns first, then rows, which are contiguous in memory."""
+    """Run one work-item per line: first columns, then rows, contiguous in memory."""
     rows, cols = obstacles.shape
     occupied = backend.upload(as_bytes(obstacles))
     along, starts = (backend.empty(rows * cols, _INT) for _ in range(2))
@@ -77,15 +77,15 @@ def distance_transform(
     """Compute the exact Euclidean distance from each cell's centre to the nearest obstacle's centre.
 
     Args:
-        obstacles: (H, W) bool or integers; any cell that is not 0 is an obstacle.
-        resolution: Side of a cell [m], > 0. With 1, distances are in cells.
-        squared: Return squared distances in cells, which are integers and do not depend on ``resolution``.
+        obstacles: (H, W) bool or integers; nonzero cells are obstacles.
+        resolution: Side of a cell [m], > 0; 1 for distances in cells.
+        squared: Return squared distances in cells: integers, independent of ``resolution``.
         backend: The device, see :func:`gpusense.devices`.
 
     Returns:
-        (H, W) float64 distances [m], inf everywhere if there is no obstacle: ``resolution`` times those of
-        ``scipy.ndimage.distance_transform_edt(~obstacles)``. With ``squared`` (H, W) int32 squared distances [cells^2],
-        2^31 - 1 everywhere if there is no obstacle.
+        (H, W) float64 distances [m], equal to ``resolution * scipy.ndimage.distance_transform_edt(~obstacles)``; inf
+        everywhere without obstacles. If ``squared``, (H, W) int32 squared distances [cells^2]; 2^31 - 1 everywhere
+        without obstacles.
 
     Raises:
         ValueError: The array is not two-dimensional, is empty, or is too large; or ``resolution`` is not > 0.

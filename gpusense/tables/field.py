@@ -1,4 +1,4 @@
-"""The likelihood field's table on a device: a value per cell of a window, made as a whole or refreshed in a part."""
+"""Compute the likelihood field's table on a device: a value per cell of a window, made or partly refreshed."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from gpusense.world.likelihood import Likelihood
 from gpusense.world.parameters import LikelihoodFieldParameters
 from gpusense.world.windows import Window
 
-# Width of the ring around the window whose cells stand for space outside the grid [cells].
+# Width of the ring of cells around the window that represents space outside the grid [cells].
 RING = 2
-# Most entries of the table from squared distances to values; with more, values are computed on the host.
+# Most entries of the table from squared distances to values; beyond, the host computes values.
 _LONGEST_DENSITY = 1 << 22
-# Largest share of a window's cells that is refreshed; a larger change rebuilds the table.
+# Largest share of a window's cells to refresh; a larger change rebuilds the table.
 _LARGEST_REFRESH = 0.5
 
 
 class FieldTable:
-    """The table of one likelihood field model.
+    """Table of a likelihood field model.
 
     Args:
         real: Precision.
@@ -34,8 +34,8 @@ class FieldTable:
         range_max: Longest range [m].
         outside: ``"free"`` or ``"occupied"``: state of space outside the grid.
         weights: The book's likelihood, or the peer whose terms the cells hold.
-        log_table: Whether cells hold terms of the sum, not distances [m].
-        flags: Flags of the model's kernel, so that both kernels are in one program.
+        log_table: Whether cells hold terms of the sum instead of distances [m].
+        flags: Flags of the model's kernel, to share a program.
     """
 
     def __init__(
@@ -53,11 +53,11 @@ class FieldTable:
         self._real, self._parameters, self._resolution, self._range_max = real, parameters, resolution, range_max
         self._log_table, self._flags = log_table, flags
         self._peer = weights if isinstance(weights, Peer) else None
-        # Term of the cells of a fixed density.
+        # Term of cells with a fixed density.
         self._overlay: float | None = None
         if isinstance(weights, Beluga) and weights.overlaid:
             self._overlay = float(weights.terms(weights.overlay(parameters, range_max)))
-        # Space outside the grid is an obstacle for the cells inside, or has no effect on them.
+        # Space outside the grid is an obstacle for the cells inside, or has no effect.
         self._margin = RING if outside == "occupied" else 0
         outside_value = self._values(np.array([0.0 if self._margin else np.inf]))
         if self._peer is not None and not self._margin:
@@ -66,7 +66,7 @@ class FieldTable:
         self._density: np.ndarray | None = None
 
     def make(self, backend: Backend, obstacles: np.ndarray) -> Buffer:
-        """Make the padded table of a window from its (rows, cols) mask; the ring stands for space outside."""
+        """Make the padded table of a window from its (rows, cols) mask; the ring represents space outside."""
         rows, cols = obstacles.shape
         check_size(rows, cols)
         overlaid = None if self._overlay is None else obstacles == OVERLAID
@@ -89,13 +89,13 @@ class FieldTable:
         return table
 
     def refresh(self, backend: Backend, obstacles: np.ndarray, table: Buffer, changed: Window) -> bool:
-        """Update ``table`` in place after obstacles changed, as far as clamped distances can differ.
+        """Update ``table`` in place after obstacles changed, where clamped distances can differ.
 
         Args:
             backend: The device.
             obstacles: (rows, cols) mask of the window after the change.
             table: Its table before the change.
-            changed: Part of the window that holds all changed obstacles.
+            changed: Part of the window with all changed obstacles.
 
         Returns:
             False if rebuilding the table is faster.
@@ -129,7 +129,7 @@ class FieldTable:
     def _density_of(self, rows: int, cols: int) -> np.ndarray | None:
         """Return the cell values of the squared distances 0, 1, ... and infinity; None if there are too many.
 
-        The largest squared distance is the map's diagonal or ``max_distance``, squared, whichever is smaller.
+        The largest squared distance is the square of the map's diagonal or of ``max_distance``, whichever is smaller.
         """
         reach, diagonal = self._parameters.max_distance / self._resolution, rows * rows + cols * cols
         farthest = diagonal if reach * reach >= diagonal else math.floor(reach * reach) + 1
@@ -154,7 +154,7 @@ class FieldTable:
 
         Args:
             backend: The device.
-            obstacles: (rows, cols) bool, which hold all obstacles within the clamp distance of the part.
+            obstacles: (rows, cols) bool, with all obstacles within the clamp distance of the part.
             density: Cell values by squared distance.
             table: The table.
             part: Part of ``obstacles`` to fill.
@@ -171,7 +171,7 @@ class FieldTable:
 
 
 def _walled(obstacles: np.ndarray, margin: int, part: Window) -> np.ndarray:
-    """Cut a part of a window with a margin of obstacles around it; (0, 0) of ``part`` is the margin's corner."""
+    """Cut a part out of a window with a margin of obstacles; (0, 0) of ``part`` is the margin's corner."""
     if margin == 0:
         return part.cut(obstacles)
     walled = np.ones((part.rows, part.cols), bool)

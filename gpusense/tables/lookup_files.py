@@ -1,6 +1,6 @@
 """Read and write look-up tables of expected ranges.
 
-A file is a line of JSON, which describes the table's inputs and has the SHA-256 of its numbers, then the numbers.
+A file begins with a line of JSON, with the table's inputs and the SHA-256 of the numbers that follow.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gpusense._util.files import write_whole
 _LONGEST_HEADER = 4096
 _DTYPE = np.dtype("<u2")
 _FORMAT = "gpusense lookup 2"
-# First line of the old format, which has no checksum.
+# First line of the old format without a checksum.
 _OLD_FORMAT = "gpusense lookup 1"
 
 
@@ -32,7 +32,7 @@ def describe(obstacles: np.ndarray, limit: float, outside: str, bins: int) -> di
         bins: Angle bins of a full turn.
 
     Returns:
-        The header of its file.
+        The header of the file.
     """
     cells = hashlib.sha256(np.packbits(obstacles).tobytes()).hexdigest()
     rows, cols = obstacles.shape
@@ -60,7 +60,7 @@ def write_lookup(path: Path, entries: np.ndarray, description: dict[str, object]
 
 
 def read_lookup(path: Path, obstacles: np.ndarray, limit: float, outside: str, bins: int) -> np.ndarray:
-    """Read a table after checking that it belongs to these inputs; see :func:`describe`."""
+    """Read a table, and check that it belongs to these inputs; see :func:`describe`."""
     required = describe(obstacles, limit, outside, bins)
     count = obstacles.size * bins
     with path.open("rb") as stream:

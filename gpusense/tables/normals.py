@@ -1,14 +1,13 @@
-"""Normals of a map's walls, for angles of incidence.
+"""Compute normals of a map's walls, for angles of incidence.
 
-The outline of a wall is followed from side to side of its cells. Where the outline is straight, the normal is
-perpendicular to a line through the sides of the cell's piece of outline, which ends at corners (``outlines``).
+The outline of a wall is followed from side to side of its cells. The normal of a straight outline is perpendicular to a
+line through the sides of the cell's piece of outline, which ends at corners (``outlines``).
 
 Elsewhere, on tight bends and in clutter, the occupied cells within RADIUS cells of a cell have a mean and a covariance.
-A wall is long and thin, so its normal is the direction of least variance. Where the variance is alike in all
-directions, as at a post, the normal is the direction in which occupied cells become fewer: the gradient of occupancy
-smoothed by the same disc.
+A wall is long and thin, so that its normal is the direction of least variance. A post varies equally in all directions:
+its normal is the direction of falling occupancy, the gradient of occupancy smoothed by the same disc.
 
-Normals are computed on the host, once per map: 0.2 s for a building of 1300 x 1730 cells.
+The host computes normals once per map, in 0.2 s for a building of 1300 x 1730 cells.
 """
 
 from __future__ import annotations
@@ -23,32 +22,31 @@ from gpusense.tables.outlines import REACH, SPANS, Outlines
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.windows import Window, whole
 
-# Radius of the disc of cells [cells]. A square has longer diagonals. On slanted walls the mean error of a disc's normal
-# is 1.5 degrees; a radius of 3 gives 2.5.
+# Radius of the disc of cells [cells]; a square would favour its diagonals. On slanted walls the mean error of a disc's
+# normal is 1.5 degrees, or 2.5 with a radius of 3.
 RADIUS = 4
-# Largest ratio of the smaller to the larger variance for which a principal direction is used.
+# Largest ratio of the smaller to the larger variance for a principal direction.
 _ROUND = 0.5
-# Fewest occupied cells in the disc, including the cell itself, that form a surface.
+# Fewest occupied cells of a surface in the disc, including the cell itself.
 _FEWEST = 3
-# Cells per strip that is computed at once.
+# Cells per strip.
 _STRIP = 1 << 21
 # Farthest cell that a normal depends on.
 _MARGIN = REACH + 2
-# Two straight sides of a cell with a smaller cosine between their normals are the two sides of a thin wall.
+# Straight sides of a cell with a smaller cosine between their normals are the two sides of a thin wall.
 _OPPOSITE = -0.5
 
 
 def surface_normals(grid: OccupancyGrid, *, unknown: Space = "free", outside: Space = "free") -> np.ndarray:
     """Compute the normals of a map's walls.
 
-    The face of a cell that a beam hits does not have the direction of a slanted wall. A cell's normal is therefore
-    perpendicular to a line through up to 17 sides of the surrounding wall cells. The line ends at corners, so normals
-    are right up to the cell next to a corner: within 4 cells of a corner their mean error is 2 degrees. Elsewhere on
-    straight walls it is 0.8 degrees at any angle, and at most 5. A cell in a corner has the normal of one wall, or one
-    between both. Where the outline is not straight, the normal is the direction of least variance (principal
-    components) of the occupied cells within 4 cells, or without one, as at posts, the direction in which occupied cells
-    become fewer. A cell has no normal if fewer than two other occupied cells are nearby, if no such direction exists
-    either, or if no free cell touches one of its sides.
+    The hit face of a cell does not follow a slanted wall. A cell's normal is therefore perpendicular to a line through
+    up to 17 sides of the surrounding wall cells. The line ends at corners: within 4 cells of a corner the mean error of
+    normals is 2 degrees. Elsewhere on straight walls it is 0.8 degrees at any angle, and at most 5. A cell in a corner
+    has the normal of one wall, or a normal between both. On a curved outline the normal is the direction of least
+    variance (principal components) of the occupied cells within 4 cells or, as at posts without such a direction, the
+    direction of falling occupancy. A cell has no normal if it has fewer than two other occupied cells nearby, neither
+    direction, or no side next to a free cell.
 
     Args:
         grid: The map.
@@ -79,7 +77,7 @@ def surface_normals(grid: OccupancyGrid, *, unknown: Space = "free", outside: Sp
 
 
 def normal_table(obstacles: np.ndarray, window: Window, outside: str, real: np.dtype) -> np.ndarray:
-    """Compute normals in a window of a map and the ring around it, in the layout of the kernel file ``echo``.
+    """Compute normals in a window of a map and a ring around it, in the layout of the kernel file ``echo``.
 
     Args:
         obstacles: (H, W) bool, the whole map.
@@ -105,7 +103,7 @@ def normal_table(obstacles: np.ndarray, window: Window, outside: str, real: np.d
 
 
 def _surrounded(obstacles: np.ndarray, part: Window, outside: bool) -> np.ndarray:
-    """Return a part of a map that may extend beyond the map, where every cell is ``outside``."""
+    """Return a part of a map; every cell beyond the map is ``outside``."""
     result = np.full((part.rows, part.cols), outside)
     inside = part.shared(Window(0, 0, *obstacles.shape))
     if inside is not None:
@@ -114,14 +112,14 @@ def _surrounded(obstacles: np.ndarray, part: Window, outside: bool) -> np.ndarra
 
 
 def _disc_normals(obstacles: np.ndarray) -> np.ndarray:
-    """Compute unit normals of exposed cells: occupied cells with a free cell at one of their sides.
+    """Compute unit normals of exposed cells: occupied cells that share a side with a free cell.
 
     Args:
         obstacles: (H + 2 RADIUS, W + 2 RADIUS) bool: a map and its surroundings.
 
     Returns:
-        (H, W, 2) float64, x and y in the grid's frame, towards the side with fewer obstacles: 0 for free cells, NaN for
-        occupied cells that are not exposed or have no direction.
+        (H, W, 2) float64, x and y in the grid's frame, towards the side with fewer obstacles: 0 for free cells, NaN
+        for occupied cells without exposure or direction.
     """
     height, width = (side - 2 * RADIUS for side in obstacles.shape)
     inner = obstacles[RADIUS : RADIUS + height, RADIUS : RADIUS + width]
@@ -150,8 +148,8 @@ def _disc_normals(obstacles: np.ndarray) -> np.ndarray:
 def _replace_straight(normals: np.ndarray, obstacles: np.ndarray) -> None:
     """Replace the normals of cells at straight pieces of an obstacle's outline, up to its corners.
 
-    The sides of a cell with the longest straight piece count. At the corner of a block two sides count, and the normal
-    lies between their normals.
+    A cell takes the side with the longest straight piece. At the corner of a block two sides are equally long, and the
+    normal is between theirs.
 
     Args:
         normals: (H, W, 2) normals.
@@ -167,7 +165,7 @@ def _replace_straight(normals: np.ndarray, obstacles: np.ndarray) -> None:
     np.minimum.at(best, cell, place)
     counts = (place == best[cell]) & (place < len(SPANS))
     cell, normal = cell[counts], normal[counts]
-    # The first of a cell's sides is written last.
+    # Write the first of a cell's sides last.
     first, total = np.zeros((2, height * width, 2))
     first[cell[::-1]] = normal[::-1]
     opposite = (first[cell] * normal).sum(axis=1) < _OPPOSITE
@@ -185,7 +183,7 @@ def _moments(obstacles: np.ndarray, row: np.ndarray, col: np.ndarray) -> np.ndar
     """
     bits = np.arange(2 * RADIUS + 1)
     width = obstacles.shape[1] - 2 * RADIUS
-    # Bit i of a word is the i-th cell of a row of the disc's box.
+    # Bit i of a word is cell i of a row of the disc's box.
     words = np.zeros((len(obstacles), width), np.uint16)
     for bit in bits:
         words |= obstacles[:, bit : bit + width].astype(np.uint16) << np.uint16(bit)

@@ -1,8 +1,8 @@
-"""Outlines of obstacles: the sides between occupied and free cells, in the order in which they surround obstacles.
+"""Follow outlines of obstacles: the sides between occupied and free cells, in order around obstacles.
 
 A side is a step along the outline, one cell long. Obstacles that touch at a corner share an outline. Lines are fitted
-by orthogonal least squares to the middles of consecutive sides. Along a straight wall these lie in a strip of less than
-a cell, at any angle of the wall.
+by orthogonal least squares to the middles of consecutive sides. Along a straight wall of any angle the middles stay in
+a strip narrower than a cell.
 """
 
 from __future__ import annotations
@@ -11,21 +11,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Outward directions of a cell's sides (column, row). The outline follows a side in the next direction, with obstacles
-# to the left.
+# Outward directions of a cell's sides (column, row). The outline runs along a side in the next direction, with
+# obstacles to the left.
 _DIRECTIONS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
 
 
 @dataclass(frozen=True)
 class Span:
-    """Windows of consecutive sides to which a line may be fitted.
+    """Windows of consecutive sides for fitting a line.
 
     Attributes:
         count: Sides of a window.
-        least: Fewest sides before and after the side in question.
-        residual: Largest mean square distance of their middles to the line [cells^2].
-        advance: The outline must turn at the window's nearer end: the next CORNER sides advance by less than this
-            along the line [cells]. None for windows that need no corner.
+        least: Fewest sides before and after the side.
+        residual: Largest mean square distance of the middles to the line [cells^2].
+        advance: For windows at corners, upper limit of the advance of the next CORNER sides along the line at the
+            nearer end [cells]; None for all windows.
     """
 
     count: int
@@ -34,14 +34,14 @@ class Span:
     advance: float | None = None
 
 
-# Earlier spans are preferred, and within a span the window with the least residual. Nearly symmetric windows come
-# first. One-sided windows are for corners only: on a bend they would have the direction of another place. A straight
-# strip of cells has residuals up to 0.09. Discs from a radius of 5 cells on pass as bends.
+# Earlier spans take precedence, then the least residual. Nearly symmetric windows come first. One-sided windows are
+# for corners only: on a bend their direction would be another point's. A straight strip of cells has residuals up to
+# 0.09. Discs of a radius of at least 5 cells pass as bends.
 SPANS = (Span(17, 8, 0.1), Span(11, 5, 0.1), Span(13, 0, 0.1, 2.0), Span(9, 0, 0.05, 1.2), Span(5, 0, 0.01, 0.8))
 CORNER = 5
-# Farthest side along the outline that a normal depends on.
+# Farthest side along the outline that affects a normal.
 REACH = max(span.count - 1 - span.least for span in SPANS) + CORNER
-# Sides that are computed at once.
+# Sides per pass.
 _PART = 1 << 15
 
 
@@ -59,16 +59,16 @@ class Line:
 
 
 class Outlines:
-    """The outlines of a map.
+    """Outlines of a map.
 
     Attributes:
         cell: (F,) flat index of the cell of each side.
         outward: (F, 2) outward direction of each side.
-        following, preceding: (F,) number of the next side, and of the one before; the side itself at the map's edge.
+        following, preceding: (F,) number of the next and the previous side; the side itself at the map's edge.
     """
 
     def __init__(self, obstacles: np.ndarray) -> None:
-        """Find the sides of (H, W) bool obstacles; cells at the map's edge have none."""
+        """Find the sides of (H, W) bool obstacles; cells at the map's edge have no sides."""
         sides, self._width = _exposed_sides(obstacles), obstacles.shape[1]
         direction, row, col = np.nonzero(sides)
         self.cell = row * self._width + col
@@ -78,15 +78,15 @@ class Outlines:
         self.following = _following(obstacles, number, direction, row, col)
         self.preceding = np.arange(len(row), dtype=np.int32)
         self.preceding[self.following] = np.arange(len(row))
-        # Doubled coordinates, so that sums are exact.
+        # Double the coordinates for exact sums.
         self._middle = 2 * np.stack([col, row], axis=1) + self.outward
 
     def straight_normals(self, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute the normals of the straight pieces of outline that contain M sides.
 
         Returns:
-            (M, 2) unit vectors towards the free side, NaN where the outline is not straight, and (M,) the index of the
-            span in SPANS, its length there.
+            (M, 2) unit vectors towards the free side, NaN on a curved outline, and (M,) the index of the span in
+            SPANS, or their number.
         """
         normal, place = np.full((len(sides), 2), np.nan), np.full(len(sides), len(SPANS))
         for first in range(0, len(sides), _PART):
@@ -112,11 +112,11 @@ class Outlines:
                 place[remaining[better]] = index
 
     def _moments(self, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Sum the moments of the sides behind and ahead of M sides.
+        """Sum moments of the sides behind and ahead of M sides.
 
         Returns:
-            Two arrays (7, REACH + 1, M): of the k preceding sides, and of the k following ones; sums of x, y, x^2, x y
-            and y^2 of the middles relative to the side's own [half cells], and of the outward directions.
+            Two arrays (7, REACH + 1, M), for the k preceding and the k following sides: sums of x, y, x^2, x y and y^2
+            of the middles relative to the side's middle [half cells], and of the outward directions.
         """
         start = self._middle[sides]
         result = []
@@ -135,7 +135,7 @@ def _fit_line(sums: np.ndarray, count: int) -> Line:
     """Fit lines to M windows.
 
     Args:
-        sums: (7, M) moments as of ``Outlines._moments``.
+        sums: (7, M) moments from ``Outlines._moments``.
         count: Sides of each window.
     """
     x, y, xx, xy, yy = sums[:5] / np.array([2, 2, 4, 4, 4])[:, None] / count
@@ -147,7 +147,7 @@ def _fit_line(sums: np.ndarray, count: int) -> Line:
 
 
 def _advance(line: Line, behind: np.ndarray, ahead: np.ndarray, back: int, front: int) -> np.ndarray:
-    """Return how far the CORNER sides beyond the nearer end of M windows advance along their lines [cells].
+    """Return the advance of the CORNER sides beyond the nearer end of M windows along their lines [cells].
 
     In the middle of a window it is the smaller advance of both ends.
     """
@@ -161,7 +161,7 @@ def _advance(line: Line, behind: np.ndarray, ahead: np.ndarray, back: int, front
 
 
 def _exposed_sides(obstacles: np.ndarray) -> np.ndarray:
-    """Return (4, H, W) whether the side of a cell in each direction lies between an obstacle and free space."""
+    """Return the (4, H, W) mask of cell sides in each direction between an obstacle and free space."""
     sides = np.zeros((4, *obstacles.shape), bool)
     inner = obstacles[1:-1, 1:-1]
     neighbours = (obstacles[1:-1, 2:], obstacles[2:, 1:-1], obstacles[1:-1, :-2], obstacles[:-2, 1:-1])
@@ -173,9 +173,9 @@ def _exposed_sides(obstacles: np.ndarray) -> np.ndarray:
 def _following(
     obstacles: np.ndarray, number: np.ndarray, direction: np.ndarray, row: np.ndarray, col: np.ndarray
 ) -> np.ndarray:
-    """Return the number of the side that follows each side."""
+    """Return the number of each side's successor."""
     (ox, oy), (tx, ty) = _DIRECTIONS[direction].T, _DIRECTIONS[(direction + 1) % 4].T
-    # Cells are at least one cell away from the edge.
+    # Cells are at least one cell from the edge.
     ahead, beside = (row + ty, col + tx), (row + ty + oy, col + tx + ox)
     concave = obstacles[beside]
     straight = ~concave & obstacles[ahead]

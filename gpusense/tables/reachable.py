@@ -1,4 +1,4 @@
-"""A table of the reachable window of a map, held on a device and rebuilt when the cloud leaves the window."""
+"""Keep a table of the reachable window of a map on a device, and rebuild it when the cloud leaves the window."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.windows import Corners, Window
 
 ObstaclesOf = Callable[[OccupancyGrid, str], np.ndarray]
-"""A function of a grid and of the state of unknown cells, which returns an (H, W) mask."""
+"""Function that returns an (H, W) mask from a grid and the state of unknown cells."""
 
 
 def obstacles_of(grid: OccupancyGrid, unknown: str) -> np.ndarray:
@@ -28,21 +28,21 @@ _NOWHERE = Window(0, 0, 0, 0)
 
 
 class TableMemoryError(MemoryError):
-    """Error of a device that cannot hold a map's table, whatever the size of the cloud."""
+    """A device cannot hold a map's table, for any size of the cloud."""
 
 
 @dataclass(frozen=True)
 class MapState:
-    """The map and its table; a single assignment replaces both, so that no interrupt can separate them.
+    """Map and table; a single assignment replaces both, so that no interrupt can separate them.
 
     Attributes:
         grid: The map.
         obstacles: (H, W) mask of the map; None if an interrupted update may have written to it.
         shared: True if the array of obstacles belongs to the grid and is read-only.
-        table: The table; None without one.
-        window: The table's window; empty without one.
+        table: The table, or None.
+        window: The table's window; empty without a table.
         preparations: Number of tables made.
-        version: Number that grows with every change.
+        version: Counter of changes.
     """
 
     grid: OccupancyGrid
@@ -57,20 +57,20 @@ class MapState:
 class ReachableMap:
     """A map and the table of its reachable window on a device.
 
-    After an interrupt or an error the map is as before or as after the call, never in between.
+    An interrupt or an error leaves the map as before or as after the call, never in between.
 
     Args:
         backend: The device.
         grid: The map.
         unknown: Treatment of unknown cells: ``"free"`` or ``"occupied"``.
         mount: The sensor's pose on the robot [m, m, rad].
-        reach: Longest distance from a sensor that matters [cells].
+        reach: Longest relevant distance from a sensor [cells].
         prepare: Function that makes the table of a window from its (rows, cols) obstacles.
-        crop: Whether to prepare the reachable window only; False prepares the whole map.
+        crop: True to prepare only the reachable window, False for the whole map.
         refresh: Function that updates a table in place after obstacles changed in a part of its window, and returns
-            whether it did; otherwise the table is rebuilt.
-        obstacles_of: Function that returns the mask of a grid's obstacles, from the grid and ``unknown``.
-        neighbors: Cells around a cell on which its state in the mask depends.
+            whether it could; otherwise the table is rebuilt.
+        obstacles_of: Function that returns the mask of obstacles from the grid and ``unknown``.
+        neighbors: Radius of the neighbourhood that determines a cell's state in the mask [cells].
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class ReachableMap:
 
     @property
     def version(self) -> int:
-        """Number that grows whenever the map changes, or the table is dropped or rebuilt."""
+        """Counter of changes to the map, and of dropped or rebuilt tables."""
         return self._state.version
 
     def drop(self) -> None:
@@ -130,7 +130,7 @@ class ReachableMap:
         """Return the map with its table; rebuild the table if a sensor can reach beyond its window.
 
         Args:
-            corners: Poses whose box holds all poses; None for poses anywhere.
+            corners: Corners of a box around all poses; None for poses anywhere.
 
         Raises:
             TableMemoryError: The device cannot hold the table.
@@ -143,7 +143,7 @@ class ReachableMap:
             window = self._whole
         window = self._whole if window == self._whole else window
         if window != self.window or self._state.table is None:
-            # The device may not hold both tables at once.
+            # The device may not have room for both tables.
             self._state = replace(self._state, table=None, window=_NOWHERE)
             try:
                 table = self._prepare(self._backend, window.cut(self.obstacles))
@@ -172,7 +172,7 @@ class ReachableMap:
             return grid
         obstacles = self.obstacles.copy() if self._state.shared else self.obstacles
         table = self._state.table
-        # Drop obstacles and table of the old map first: both are written in place, and an interrupt would leave them
+        # Drop the old map's obstacles and table first: both are written in place, and an interrupt would leave them
         # half written.
         self._state = replace(self._state, obstacles=None, table=None, version=self.version + 1)
         part.cut(obstacles)[...] = patched
@@ -181,7 +181,7 @@ class ReachableMap:
         return grid
 
     def _refreshed(self, table: Buffer, obstacles: np.ndarray, changed: Window) -> Buffer:
-        """Return a table after obstacles changed in a part of the map; None if it must be rebuilt."""
+        """Return a table after obstacles changed in a part of the map; None to rebuild it."""
         window = self.window
         if window is None or table is None or (near := window.shared(changed)) is None:
             return table
@@ -192,7 +192,7 @@ class ReachableMap:
         return table if current else None
 
     def _patched(self, grid: OccupancyGrid, changed: Window) -> tuple[np.ndarray, Window]:
-        """Return the mask of all cells that depend on cells of a window, and the window that they fill."""
+        """Return the mask of all cells that depend on cells of a window, and the window of these cells."""
         part = changed.grown(self._neighbors, grid.shape)
         around = part.grown(self._neighbors, grid.shape)
         patch = OccupancyGrid(around.cut(grid.cells), occupied_threshold=grid.occupied_threshold)
@@ -202,7 +202,7 @@ class ReachableMap:
         return self._mask_of(grid, self._unknown)
 
     def omission(self, bytes_per_cell: float) -> Omission | None:
-        """Describe the part of the map outside the window; None if it is empty, or before the first cloud."""
+        """Describe the part of the map outside the window; None if it is empty or before the first cloud."""
         everything = windows.whole(self.grid)
         if self.window is None or self.window == everything:
             return None

@@ -1,4 +1,4 @@
-"""Empty rectangles of a map, computed on a device and refreshed where the map changes; the exact caster reads them.
+"""Compute empty rectangles of a map on a device for the exact caster, and refresh them after changes.
 
 Processors run few long work-items, one per row. GPUs run one work-item per cell, on bits that the host packs.
 """
@@ -23,14 +23,14 @@ RECTANGLE_REACH = 254
 _STACK = 1024
 # Rows of a group.
 ROWS = 8
-# Cells of the largest map whose planes have single rows, and of the largest one with four sectors, on GPUs.
+# Largest maps on GPUs with planes of single rows, and with four sectors [cells].
 _CACHED = 1 << 24
 _FOUR_SECTORS = 1 << 25
 
 
 @dataclass(frozen=True)
 class Planes:
-    """How empty rectangles are stored: sectors per quadrant, and rows of a group.
+    """Storage layout of empty rectangles.
 
     Attributes:
         sectors: Sectors per quadrant: 1, 2 or 4. More sectors make steps longer and tables larger.
@@ -51,7 +51,7 @@ class Planes:
         return frozenset({f"SECTORS_{self.sectors}", *groups} if self.sectors > 1 else groups)
 
     def lines(self, rows: int) -> int:
-        """Return the number of rows of a plane of a map with ``rows`` rows, the ring and whole groups included."""
+        """Return the number of rows of a plane for a map of ``rows`` rows, including the ring and whole groups."""
         return -(-(rows + 2) // self.group) * self.group
 
     def entries(self, rows: int, cols: int) -> int:
@@ -62,9 +62,9 @@ class Planes:
 def planes_of(backend: Backend, rows: int, cols: int) -> Planes:
     """Return the planes of a map on a device.
 
-    GPUs gain most from sectors, since neighbouring rays wait for the slowest one. Where a GPU's caches do not hold the
-    planes, its memory limits rays, and groups of rows halve what is read; on larger maps four sectors are no faster
-    than two and take twice the memory. Kernels index the cells of all planes in 32 bits, which limits the sectors.
+    GPUs gain most from sectors, since a warp waits for its slowest ray. Memory limits rays once planes exceed a GPU's
+    caches, and groups of rows halve the reads; on larger maps four sectors are no faster than two and take twice the
+    memory. Kernels index the cells of all planes in 32 bits, which limits the sectors.
     """
     gpu, cells = backend.info.kind == "gpu", rows * cols
     sectors = 1 if backend.info.backend == "numpy" else 4 if gpu and cells <= _FOUR_SECTORS else 2
@@ -83,15 +83,7 @@ def empty_rectangles(
     rectangles: Buffer | None = None,
     changed: Window | None = None,
 ) -> Buffer:
-    """Compute or refresh the padded planes of empty rectangles; the kernel file ``rectangles`` defines them.
-
-    Args:
-        backend: The device.
-        obstacles: (rows, cols) bool.
-        planes: How the rectangles are stored.
-        rectangles: Planes of the map before the change, refreshed in place; None makes new planes.
-        changed: Window whose obstacles changed; None for the whole map.
-    """
+    """Compute or refresh the padded planes of empty rectangles; the kernel file ``rectangles`` defines them."""
     if planes.group > 1 and backend.info.kind == "cpu":
         raise ValueError(f"planes: must have single rows on a processor, got groups of {planes.group}")
     rows, cols = obstacles.shape
@@ -100,8 +92,8 @@ def empty_rectangles(
         rectangles = backend.empty(planes.entries(rows, cols), _SHORT, zero=True)
         changed = Window(0, 0, rows, cols)
     top, left, bottom, right = changed.row, changed.col, changed.row + changed.rows, changed.col + changed.cols
-    # A rectangle that changes begins at most RECTANGLE_REACH cells before the changed obstacles and ends at most as far
-    # behind them, in both directions.
+    # In both directions, changed rectangles begin at most RECTANGLE_REACH cells before the changed obstacles, and end
+    # at most as far behind them.
     first, begin = max(top - RECTANGLE_REACH, 0), max(left - RECTANGLE_REACH, 0)
     end = min(right + RECTANGLE_REACH, cols)
     near = obstacles[first : bottom + RECTANGLE_REACH]

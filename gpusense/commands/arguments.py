@@ -1,4 +1,4 @@
-"""Arguments that the commands share: options, types of values, and the backends that ``--backend`` selects."""
+"""Define options and value types for several commands, and open the backends of ``--backend``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BACKEND_HELP = (
 )
 
 _LONGEST_RANGE = 10_000.0
-# Library that writes files with a suffix, and the subject of the message if it is absent.
+# Library that writes files of a suffix, and the subject of the message if it is missing.
 _PICTURE = ("matplotlib", "a picture")
 _WRITERS = {".png": _PICTURE, ".pdf": _PICTURE, ".svg": _PICTURE, ".rrd": ("rerun", "a recording for Rerun")}
 _SHARED = ("z_hit", "z_max", "z_rand", "sigma_hit", "hit", "hit_dof")
@@ -45,7 +45,7 @@ def add_backend(parser: argparse.ArgumentParser, *, default: str = "auto") -> No
 
 
 def add_temperature(parser: argparse.ArgumentParser, automatic: str) -> None:
-    """Add ``--temperature``: a number, or ``DEFAULTS.temperature``, which ``automatic`` explains."""
+    """Add ``--temperature``: a number, or ``DEFAULTS.temperature``, explained by ``automatic``."""
     parser.add_argument(
         "--temperature", type=_temperature, default=DEFAULTS.temperature, metavar="T",
         help=f"factor of log-likelihoods in (0, 1], or {automatic} (default: %(default)s)",
@@ -57,7 +57,7 @@ def _temperature(text: str) -> float | str:
 
 
 def add_json(parser: argparse.ArgumentParser, *, verbose: bool = False) -> None:
-    """Add ``--json``, and ``--verbose`` in place of it where the command has more to print."""
+    """Add ``--json``, and as its alternative ``--verbose`` where the command has more to print."""
     group = parser.add_mutually_exclusive_group()
     group.add_argument(
         "--json", action="store_true", help="print one JSON document, and nothing else, on standard output"
@@ -81,7 +81,7 @@ def open_backends(selections: Sequence[str] | None) -> tuple[list[Backend], list
         selections: Selection strings, or None.
 
     Returns:
-        Distinct backends, and the errors of devices that were not selected by name.
+        Distinct backends, and the errors of devices that no name selected.
     """
     from gpusense.backends import devices, get_backend
 
@@ -122,7 +122,7 @@ def positive_number(text: str) -> float:
 
 
 def range_number(text: str) -> float:
-    """Convert an argument to a range that a scanner may have [m]."""
+    """Convert an argument to a valid range of a scanner [m]."""
     number = _finite(text)
     if not 0 < number <= _LONGEST_RANGE:
         raise argparse.ArgumentTypeError(f"must be a number > 0 and <= {_LONGEST_RANGE:g} (metres), got {text!r}")
@@ -154,7 +154,7 @@ def number(text: str) -> float:
 
 
 def _finite(text: str) -> float:
-    """Convert a text to a finite number; NaN if it is none."""
+    """Convert a text to a finite number, else NaN."""
     try:
         value = float(text)
     except ValueError:
@@ -163,7 +163,7 @@ def _finite(text: str) -> float:
 
 
 class Output:
-    """A type for ``add_argument``: a file to write, which must not be one of the command's other files."""
+    """A type for ``add_argument``: a file to write, different from the command's other files."""
 
     def __init__(self, convert: Callable[[str], Path] = Path) -> None:
         self._convert = convert
@@ -174,9 +174,9 @@ class Output:
 
 
 def output_path(*suffixes: str) -> Output:
-    """Make a type for ``add_argument``: a file that can be written, which is checked before any work is done.
+    """Make a type for ``add_argument``: a file that can be written, checked before any work.
 
-    The library that writes the file must also be installed.
+    The library that writes the file must be installed.
 
     Args:
         suffixes: Allowed suffixes, such as ``".png"``; none allows every suffix.
@@ -198,7 +198,7 @@ def output_path(*suffixes: str) -> Output:
 
 
 def check_writer(suffix: str) -> None:
-    """Check that the library that writes files with a suffix is installed."""
+    """Check that the library for writing files of a suffix is installed."""
     if suffix not in _WRITERS:
         return
     try:

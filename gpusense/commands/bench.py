@@ -26,11 +26,11 @@ PROBLEMS = ("ranges", "beam", "field")
 PRECISIONS = ("float32", "float64")
 DEFAULTS: dict[str, Any] = {"particles": None, "checked": 512, "beams": 360, "repeats": 20, "seed": 0}
 QUICK: dict[str, Any] = {"particles": 128, "checked": 128, "beams": 60, "repeats": 10, "seed": 0}
-# Measuring time after which a quick run begins no further point, and its longest time to build a table [s].
+# Measuring time after which a quick run starts no further point, and its longest time to build a table [s].
 _QUICK_DEADLINE, _QUICK_BUILD = 40.0, 3.0
-# Longest time of a point's calls in a quick run, and of its launches alone [s].
+# Longest time of a point's calls in a quick run, and of its launches [s].
 _QUICK_SECONDS = 0.02
-# Tables that take longer [s] are built once in a quick run; their times then include compiling.
+# Slower tables [s] are built once in a quick run, and their times include compiling.
 _QUICK_TWICE = 0.03
 
 EPILOG = """\
@@ -96,7 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _limit(parse: Callable[[str], Any]) -> Callable[[str], Any]:
-    """Make a type for ``add_argument`` of a function that raises ``ValueError`` with the option's name."""
+    """Make a type for ``add_argument`` from a function that raises ``ValueError`` with the option's name."""
 
     def convert(text: str) -> Any:
         try:
@@ -178,7 +178,7 @@ def _absent_devices(selections: Sequence[str] | None) -> list[str]:
 
 
 def arguments_of(args: argparse.Namespace, plan: Plan) -> dict[str, Any]:
-    """Return the arguments that affect the measurements; of files only their names."""
+    """Return the arguments that affect the measurements; files are reduced to names."""
     return {
         "quick": plan.deadline < float("inf"), "scenes": [source.name for source in plan.sources],
         "particles": plan.particles, "checked": plan.checked, "beams": plan.beams,
@@ -190,7 +190,7 @@ def arguments_of(args: argparse.Namespace, plan: Plan) -> dict[str, Any]:
 
 
 def command_of(words: Sequence[str]) -> str:
-    """Write a command line of this program, absolute paths by their names."""
+    """Format a command line of this program, with names instead of absolute paths."""
     return shlex.join(["gpusense", *(Path(word).name if Path(word).is_absolute() else word for word in words)])
 
 
@@ -202,7 +202,7 @@ def _check_folder(folder: Path) -> None:
 
 
 def write_report(folder: Path, report: Mapping[str, Any]) -> None:
-    """Write the report as Markdown and as JSON, each file atomically; create an absent folder."""
+    """Write the report as Markdown and as JSON, each file atomically; create the folder if missing."""
     from gpusense.evaluation.benchmark.report import markdown, to_json
 
     folder.mkdir(exist_ok=True)
@@ -211,7 +211,7 @@ def write_report(folder: Path, report: Mapping[str, Any]) -> None:
 
 
 def write_page(file: Path, report: Mapping[str, Any]) -> None:
-    """Write the interactive page of a report, whole or not at all."""
+    """Write the interactive page of a report atomically."""
     from gpusense.evaluation.benchmark.rows import model_rows
     from gpusense.plots.error_page import error_page
 

@@ -46,16 +46,16 @@ keeps and prints the results so far."""
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that reports an error as one line."""
+    """Parser that reports an error in one line."""
 
     _command: str | None = None
 
     def error(self, message: str) -> NoReturn:
-        """Print the message without the usage but with a likely correction, and exit."""
+        """Print the message with a likely correction instead of the usage, and exit."""
         self.exit(BAD_INPUT, _error_line(message + self._correction(message)))
 
     def _correction(self, message: str) -> str:
-        """Return the name that an unknown command, choice or option resembles; empty without one."""
+        """Return the name that an unknown command, choice or option resembles, or ""."""
         wrong = re.match(r"argument (\S+): invalid choice: '([^']*)'|unrecognized arguments: (-\S+)", message)
         if wrong is None:
             return ""
@@ -83,14 +83,14 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(  # type: ignore[override]
         self, args: Any = None, namespace: Any = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse arguments as the base class does, and check that no output is another file of the command."""
+        """Parse arguments like the base class, and check that no output is another file of the command."""
         found, rest = super().parse_known_args(args, namespace)
         self._command = getattr(found, "command", None)
         self._check_outputs(found)
         return found, rest
 
     def _check_outputs(self, found: argparse.Namespace) -> None:
-        """Report an output that would replace another output, or a file that the command reads."""
+        """Report an output that would replace another output or an input."""
         values = [(action, getattr(found, action.dest, None)) for action in self._actions]
         files = [(action, os.path.realpath(value)) for action, value in values if isinstance(value, os.PathLike)]
         if not files:
@@ -107,7 +107,7 @@ class Parser(argparse.ArgumentParser):
 
 
 class Layout(argparse.RawDescriptionHelpFormatter):
-    """Help with verbatim texts, and a column wide enough for indented command names, which argparse miscounts."""
+    """Help with verbatim texts, and a column wide enough for indented command names, miscounted by argparse."""
 
     def add_argument(self, action: argparse.Action) -> None:
         """Add an argument to the help."""
@@ -119,9 +119,9 @@ class Layout(argparse.RawDescriptionHelpFormatter):
 
 @contextlib.contextmanager
 def _short_warnings() -> Iterator[None]:
-    """Print a warning as one line, without the place in the source that raised it, and once.
+    """Print each warning once, in one line, without its source location.
 
-    Python forgets its shown warnings when a library changes the filters, as some do on import.
+    Python forgets its shown warnings when a library changes the filters, as some libraries do on import.
     """
     shown: set[tuple[str, type[Warning]]] = set()
 
@@ -148,12 +148,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments after the program's name; ``sys.argv[1:]`` by default.
 
     Returns:
-        The exit code: 0 success, 2 bad input, 130 interrupted, 143 terminated, 129 after a hang-up of the terminal, 141
-        when the reader of standard output is gone, or a code of the command.
+        The exit code: 0 success, 2 bad input, 130 interrupted, 143 terminated, 129 after a hang-up of the terminal,
+        141 after the reader of standard output has gone, or a code of the command.
     """
     _open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
-        # A device's name may have characters outside the terminal's encoding.
+        # Device names may contain characters outside the terminal's encoding.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
@@ -179,14 +179,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _open_closed_streams() -> None:
-    """Discard the output to a stream that the caller closed, as by ``>&-``; Python has None for it."""
+    """Discard output to a stream that the caller closed, as by ``>&-``; Python sets it to None."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
 
 
 def _failed(error: Exception) -> int:
-    """Print an error as one line, with its traceback if the environment requests it."""
+    """Print an error in one line, with its traceback if the environment requests it."""
     if os.environ.get(TRACEBACK):
         raise error
     _settle()
@@ -195,7 +195,7 @@ def _failed(error: Exception) -> int:
 
 
 def _settle() -> None:
-    """Flush standard output, and redirect it if that fails, so that Python's flush at exit succeeds."""
+    """Flush standard output, and redirect it on failure, so that Python's flush at exit succeeds."""
     try:
         print(end="", flush=True)
     except (OSError, ValueError):
@@ -204,7 +204,7 @@ def _settle() -> None:
 
 
 def _dispatch(argv: list[str]) -> int:
-    # Import only the chosen command, so that an import error in another command does not affect it.
+    # Import only the chosen command: an import error in another command must not affect it.
     argv = [ALIASES.get(argv[0], argv[0]), *argv[1:]] if argv else argv
     names = (argv[0],) if argv and argv[0] in COMMANDS else COMMANDS
     parser = _build(names)
@@ -239,7 +239,7 @@ def _build(names: Sequence[str]) -> Parser:
 
 
 def _message(error: Exception) -> str:
-    """Return an exception's message, without the error numbers of the operating system."""
+    """Return an exception's message, without error numbers of the operating system."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
     if isinstance(error, MemoryError) and not str(error):

@@ -117,7 +117,7 @@ def _score_all(
     scene: Scene, backends: list[Backend], scores: list[Score], failures: list[str], *, selected: bool,
     step: Callable[[str], None],
 ) -> None:  # fmt: skip
-    """Score the scene with both models on all backends; add the scores, and the errors of unselected backends."""
+    """Score the scene with both models on all backends; append scores, and errors of unselected backends."""
     for name in (BEAM, FIELD):
         step(f"{name}, float64 reference")
         truth = make_model(scene, name, "numpy", "float64")
@@ -201,7 +201,7 @@ devices    {", ".join(f"{backend.info.selection} ({backend.info.name})" for back
 
 
 def _explain(scores: list[Score]) -> None:
-    """Print the rank of the true pose, and what the kernels of the fastest device leave out."""
+    """Print the rank of the true pose, and the work that the fastest device's kernels omit."""
     for name in dict.fromkeys(score.name for score in scores):
         fastest = _fastest(scores, name)
         print(f"\nRank of the true pose by the {name}: {grouped(fastest.rank)} (1: no particle scores better)")

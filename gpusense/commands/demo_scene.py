@@ -1,4 +1,4 @@
-"""The scene of ``gpusense demo``, and the scores and times of its models."""
+"""Make the scene of ``gpusense demo``, and score and time its models."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Model = BeamModel | LikelihoodFieldModel
 
 @dataclass(frozen=True)
 class Scene:
-    """A map, a scan in it, the poses to score with the true pose last, and the number of beams that models use."""
+    """A map, a scan, the poses to score with the true pose last, and the number of beams for models."""
 
     grid: OccupancyGrid
     scanner: Scanner
@@ -45,13 +45,13 @@ class Scene:
 
     @property
     def checked(self) -> slice:
-        """Return the slice of the poses that NumPy scores too."""
+        """Return the slice of poses that NumPy also scores."""
         return slice(None, None, -(-len(self.poses) // REFERENCE_PARTICLES))
 
 
 @dataclass(frozen=True)
 class Score:
-    """Scores and times of one model on one device; the true pose is the last of its poses."""
+    """Scores and times of a model on a device; the true pose is last."""
 
     name: str
     model: Model
@@ -86,7 +86,7 @@ class Score:
 
 
 def make_world(seed: int) -> tuple[OccupancyGrid, Scanner]:
-    """Make a building and the scanner that measures in it."""
+    """Make a building and a scanner."""
     first, step = -math.radians(FIELD_OF_VIEW) / 2, math.radians(FIELD_OF_VIEW) / (BEAMS - 1)
     scanner = Scanner.uniform(angle_min=first, angle_increment=step, count=BEAMS, range_max=RANGE_MAX)
     return worlds.building(seed, SIZE), scanner
@@ -112,7 +112,7 @@ def make_model(scene: Scene, name: str, backend: Selection, precision: Precision
 def score_scene(scene: Scene, name: str, backend: Backend, reference: np.ndarray) -> Score:
     """Time the first call, model included, and up to ``REPETITIONS`` steady calls within ``PATIENCE`` seconds.
 
-    NumPy scores the poses ``scene.checked`` and the true one.
+    NumPy scores the poses ``scene.checked`` and the true pose.
 
     Args:
         scene: The scene.
@@ -131,7 +131,7 @@ def score_scene(scene: Scene, name: str, backend: Backend, reference: np.ndarray
         begin = time.perf_counter()
         log_p = np.asarray(model.log_likelihood(poses, scene.ranges))
         calls.append(time.perf_counter() - begin)
-    # A reading without return has the same probability at every pose, and is not evaluated.
+    # Readings without return have the same probability at every pose, and are not evaluated.
     evaluated = evaluated_beams(model, scene.ranges)
     scored = log_p[:-1] if on_numpy else log_p[:-1][scene.checked]
     errors = np.abs(scored - reference)

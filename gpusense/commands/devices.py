@@ -1,4 +1,4 @@
-"""Run ``gpusense devices``: list the devices, and the remedy for each that is absent or unusable."""
+"""Run ``gpusense devices``: list the devices, with remedies for absent or unusable devices."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _with_failures(listed: list[Device]) -> list[Device]:
-    """Return the devices; devices that ``"auto"`` failed to open count as unusable, with the reason."""
+    """Return the devices; a device that ``"auto"`` failed to open counts as unusable, with the reason."""
     from gpusense.backends import default_failures
 
     reasons = {selection: reason for selection, reason in default_failures() if selection}
@@ -82,13 +82,13 @@ def _status(device: Device) -> str:
 
 
 def _auto() -> tuple[str | None, str | None]:
-    """Return the selection of 'auto', or the error of opening it; this command reports it instead of failing."""
+    """Return the selection of 'auto', or the error of opening it, which this command only reports."""
     from gpusense.backends import get_backend, notices
 
     try:
         with notices.held() as lines:
             backend = get_backend("auto")
-            # The table says which devices failed, and why.
+            # The table lists the failed devices with reasons.
             lines.clear()
         return backend.info.selection, None
     except Exception as error:

@@ -1,4 +1,4 @@
-"""Run ``gpusense features``: extract features from the scans of a recorded log, and make landmarks of them."""
+"""Run ``gpusense features``: extract features from the scans of a log, and make landmarks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 NAME = "features"
 HELP = "Extract lines, corners, doors, hallways, poles and reflectors from the scans of a log."
 
-# Scans of one call: a step of the progress bar.
+# Scans per call and step of the progress bar.
 _CALL = 256
 
 EPILOG = """\
@@ -190,7 +190,7 @@ def _write_landmarks(args: argparse.Namespace, landmarks: FeatureMap, grid: Any)
 
 
 def _write(path: Path, features: Features, scans: list[tuple[int, Scan]]) -> None:
-    """Write a line for each feature: scan, kind, pose, deviations, size and score."""
+    """Write one line per feature: scan, kind, pose, deviations, size and score."""
     from gpusense._util.files import write_whole
 
     deviation = np.sqrt(np.einsum("fii->fi", features.covariance))

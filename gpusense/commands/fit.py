@@ -1,4 +1,4 @@
-"""Run ``gpusense fit``: fit the beam model's parameters to a recorded log in a map, or to pairs of ranges."""
+"""Run ``gpusense fit``: fit the beam model's parameters to a log in a map, or to pairs of ranges."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ examples:
   gpusense fit --pairs readings.csv --range-max 8 --range-bias"""
 
 UNFINISHED = 1
-# Pictures that --out writes.
+# Pictures of --out.
 _PICTURES = ("readings.png", "density.png", "trace.png", "surface.png")
 _PAIRS_BLOCK = 100
-# A fit with less weight of correct ranges or a larger deviation of them [m] is doubtful.
+# Least weight and largest deviation [m] of correct ranges in a credible fit.
 _LEAST_HIT, _MOST_DEVIATION = 0.3, 0.5
 
 
@@ -225,7 +225,7 @@ def _document(args: argparse.Namespace, result: FitResult, files: list[Path]) ->
 
 
 def _doubt(parameters: BeamParameters, what: str) -> None:
-    """Warn on standard error if readings are far from their expected ranges, with likely causes."""
+    """Warn of readings far from their expected ranges on standard error, with likely causes."""
     z_hit, sigma_hit = parameters.z_hit, parameters.sigma_hit
     if z_hit < _LEAST_HIT or sigma_hit > _MOST_DEVIATION:
         found = f"z_hit {z_hit:.2f}, sigma_hit {sigma_hit:.2f} m"
@@ -300,7 +300,7 @@ def _folder(text: str) -> Path:
     check_writer(".png")
     folder = Path(text)
     try:
-        # The folder is created once the fit has succeeded.
+        # The folder is created after the fit.
         there = next(each for each in (folder, *folder.absolute().parents) if os.path.lexists(each))
         if not there.is_dir():
             raise ValueError("not a folder")

@@ -1,4 +1,4 @@
-"""Results of ``gpusense fit``: complete ones, and partial ones after an interrupt."""
+"""Results of ``gpusense fit``, complete or partial after an interrupt."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class PartialFit:
     """Results before an interrupt.
 
     Attributes:
-        iteration, log_likelihood, parameters: The likeliest parameters of the search, None before its first iteration.
-        fit: The fit, once it has ended.
+        iteration, log_likelihood, parameters: The likeliest parameters so far; None before the first iteration.
+        fit: The fit, after its end.
     """
 
     iteration: int = 0
@@ -53,12 +53,12 @@ class PartialFit:
     fit: BeamFit | None = None
 
     def see(self, iteration: int, log_likelihood: float, parameters: BeamParameters) -> None:
-        """Note an iteration of the search."""
+        """Record an iteration of the search."""
         if log_likelihood > self.log_likelihood:
             self.iteration, self.log_likelihood, self.parameters = iteration, log_likelihood, parameters
 
     def print(self, *, json: bool) -> None:
-        """Print the results, if there are any."""
+        """Print the results, if any."""
         best = self.parameters if self.fit is None else self.fit.parameters
         if best is None:
             return

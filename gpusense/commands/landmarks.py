@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError(f"--field-of-view: must be in (0, 2 pi], got {args.field_of_view:g}")
     recorded = read_mrclam(args.folder, args.robot, range_max=args.range_max, field_of_view=args.field_of_view)
     recorded_run = landmark_runs.first_scans(recorded, args.scans)
-    # Suspicions need the recorded landmarks, also with --unknown.
+    # Suspicions need the recorded landmarks even with --unknown.
     known_fit = landmark_runs.fit_run(recorded_run)
     suspicions = landmark_runs.suspicions(recorded_run, known_fit)
     fit = known_fit if args.known else landmark_runs.fit_run(recorded_run, known=False)
@@ -131,7 +131,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print_fit(args: argparse.Namespace, fit: LandmarkFit) -> None:
-    """Print the fit of a run whose localisation was interrupted."""
+    """Print the fit of a run with an interrupted localisation."""
     if args.json:
         print_json({"interrupted": True, "fit": fit.to_dict(), "machine": machine()})
     else:

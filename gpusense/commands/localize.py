@@ -143,7 +143,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _recorders(args: argparse.Namespace, pf: ParticleFilter, scans: int) -> dict[Path, Recorder]:
-    """Return what records the run, by the files that the options name."""
+    """Return the recorders of the run by their files."""
     recorders: dict[Path, Recorder] = {}
     if args.record is not None:
         from gpusense.plots.viewer import Recording

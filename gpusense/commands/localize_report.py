@@ -1,4 +1,4 @@
-"""Reports of ``gpusense localize``: files, and the results as text or JSON."""
+"""Report ``gpusense localize``: write files, and print results as text or JSON."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     Recorder = Recording | Animation
 
 
-# Figures that are not a single number.
+# Results other than a single number.
 _NO_NUMBER = ("rank_histogram", "verdict", "evidence")
 _PARTS = ("predict", "score", "resample", "estimate")
 
@@ -36,11 +36,11 @@ def report(
         args: Options of the command.
         pf: The filter after the last scan.
         track: Estimates of the scans so far.
-        chosen: Number of scans chosen by the options.
-        recorders: Recordings of the run by their files.
+        chosen: Number of scans that the options choose.
+        recorders: Recorders of the run by their files.
 
     Returns:
-        The figures of :func:`gpusense.evaluation.tracking.summary`.
+        The results of :func:`gpusense.evaluation.tracking.summary`.
     """
     from gpusense.evaluation.tracking import summary
     from gpusense.evaluation.trajectory_files import write_tum
@@ -72,7 +72,7 @@ def report(
 
 
 def _left_out(track: Track) -> int:
-    """Return the number of scans before the filter has converged, and print it unless it is 0."""
+    """Return the number of scans before convergence, and print it unless it is 0."""
     first = len(track.poses) if track.converged is None else track.converged
     if first:
         rule = f"the first {first} of {len(track.poses)} scans, before the verdict is 'tracking', are left out"
@@ -102,7 +102,7 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track
 
 
 def _print_errors(result: dict[str, Any]) -> None:
-    """Print the errors of poses, those before and after convergence apart."""
+    """Print the errors of poses, separately before and after convergence."""
     some = "" if result["references"] == result["scans"] else f" (reference poses of {result['references']} scans)"
     if result["converged_at"] is None:
         print(f"error      never within 1 m and 20 degrees for long; median {length(result['error_median'])}{some}")
@@ -136,7 +136,7 @@ def _print_details(pf: ParticleFilter, result: dict[str, Any]) -> None:
 
 
 def length(metres: float) -> str:
-    """Format a length with two digits and the unit that suits it."""
+    """Format a length with two digits in a suitable unit."""
     if metres < 0.01:
         return f"{metres * 1000:.2g} mm"
     return f"{metres * 100:.2g} cm" if metres < 0.995 else f"{metres:.1f} m"
@@ -156,7 +156,7 @@ def _ranks(histogram: list[float]) -> str:
 
 
 def _verdict(result: dict[str, Any], deviations: list[float]) -> str:
-    """Return the verdict with its evidence, and the likely cause if there is one."""
+    """Return the verdict with its evidence, and the likely cause if any."""
     verdict = f"{result['verdict'].upper()} (p_lost {result['p_lost']:.2g})"
     # A spread-out cloud is uncertain even without a reading.
     if result["explained_at_end"] is None and result["p_lost"] <= 0.5:

@@ -1,4 +1,4 @@
-"""Prepare ``gpusense localize``: the scans of the log, the filter with its models, and its start."""
+"""Prepare ``gpusense localize``: scans of the log, the filter with its models, and its start."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def read_parameters(args: argparse.Namespace) -> Localization:
-    """Read ``--parameters``, and print which parameters of a nav2 file have no effect."""
+    """Read ``--parameters``, and print the parameters of a nav2 file that have no effect."""
     if args.parameters is None:
         if args.node is not None:
             raise ValueError(f"--node: must come with --parameters, got {args.node} alone")
@@ -36,7 +36,7 @@ def read_parameters(args: argparse.Namespace) -> Localization:
 
 
 def read_chosen(args: argparse.Namespace, read: Localization) -> list[Step]:
-    """Read the chosen scans, with the poses of ``--reference`` if it is given."""
+    """Read the chosen scans, with the poses of ``--reference`` if set."""
     from gpusense.evaluation.steps import read_steps, with_references
     from gpusense.evaluation.trajectory_files import read_tum
 
@@ -52,12 +52,12 @@ def read_chosen(args: argparse.Namespace, read: Localization) -> list[Step]:
     steps = with_references(steps, *read_tum(args.reference))
     if args.everywhere or start_of(args, read.nav2) is not None:
         return steps
-    # The run begins around the first reference pose.
+    # The run begins at the first reference pose.
     return steps[next(i for i, step in enumerate(steps) if step.reference is not None) :]
 
 
 def _limited(steps: list[Step], near: float | None, far: float | None) -> list[Step]:
-    """Return steps with scanners limited to a range_min and a range_max, as nav2_amcl limits scans."""
+    """Return steps with scanners limited to a range_min and a range_max, like nav2_amcl's."""
     scanners: dict[Scanner, Scanner] = {}
     for step in steps:
         if (one := step.scan.scanner) not in scanners:
@@ -68,7 +68,7 @@ def _limited(steps: list[Step], near: float | None, far: float | None) -> list[S
 
 
 def start_of(args: argparse.Namespace, nav2: Nav2Options | None) -> tuple[Any, Any] | None:
-    """Return pose and covariance of a start by ``--start``, or by nav2's file; None for the first reference pose."""
+    """Return pose and covariance of the start from ``--start`` or nav2's file; None for the first reference pose."""
     usual = np.diag(np.square(DEFAULTS.start))
     if args.start is not None:
         return args.start, usual
@@ -112,7 +112,7 @@ def make_filter(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step]
 
 
 def _motion(args: argparse.Namespace, steps: list[Step], read: Localization) -> MotionModel:
-    """Return the motion model from the options, or from the file of parameters for missing options."""
+    """Return the motion model from the options, or else from the file of parameters."""
     from gpusense.evaluation.steps import references_to_learn_from
     from gpusense.localization.motion import OdometryMotion
     from gpusense.localization.motion_fit import fit_odometry_motion

@@ -1,4 +1,4 @@
-"""Run ``gpusense map``: build an occupancy grid from a log, with its poses or with those of a chain of matches."""
+"""Run ``gpusense map``: build an occupancy grid from a log, with logged poses or a chain of matches."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 NAME = "map"
 HELP = "Build an occupancy grid from the scans of a log."
 
-# Scans of a step of the progress bar.
+# Scans per step of the progress bar.
 _SCANS = 64
 
 EPILOG = """\
@@ -151,7 +151,7 @@ def _report(
 
 
 def _build(builder: MapBuilder) -> tuple[float, KeyboardInterrupt | None]:
-    """Count all rays; return the finished share of the work, and the signal that stopped it or None."""
+    """Count all rays; return the finished share of the work, and the signal that stopped it, or None."""
     done = 0.0
     with progress(max(builder.parts, 1)) as step:
         try:

@@ -1,4 +1,4 @@
-"""Poses of a log's scans by a chain of matches, for ``gpusense map``: options, run, files and report."""
+"""Find the poses of a log's scans by a chain of matches, for ``gpusense map``."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
     Scans = list[tuple[int, Scan]]
 
-# Steps of the progress bar for the search for loops.
+# Steps of the progress bar during the search for loops.
 _ROUNDS = 20
-# Names of the columns of a file of poses.
+# Columns of a file of poses.
 _COLUMNS = "scan,time,x,y,theta,var_x,cov_xy,cov_xtheta,var_y,cov_ytheta,var_theta,doubtful,laser"
 
 
@@ -34,10 +34,10 @@ class ChainedScans:
     """Scans with poses from a chain.
 
     Attributes:
-        scans: The scans that were chained, with their poses.
+        scans: The chained scans, with their poses.
         chain: The chain.
         seconds: Time of the chain [s].
-        stop: Signal that interrupted the chain; None if it is complete.
+        stop: Signal that interrupted the chain; None for a complete chain.
     """
 
     scans: Scans
@@ -68,7 +68,7 @@ def check_chain(args: argparse.Namespace) -> None:
 
 
 def is_chained(args: argparse.Namespace, scans: Scans) -> bool:
-    """Return whether the poses are found by a chain, and check the options that need one."""
+    """Return whether a chain finds the poses, and check the options that need a chain."""
     chained = args.chain or (args.reference is None and any(scan.pose is None for _, scan in scans))
     for name in ("tum", "poses", "plot", "no_odometry", "no_loops"):
         if not chained and getattr(args, name):
@@ -113,7 +113,7 @@ def chain_log(args: argparse.Namespace, scans: Scans, sensor: list[int]) -> Chai
 
 
 def _odometry(scans: Scans) -> np.ndarray | None:
-    """Return the odometry of scans; None, with a message, if the log has none or it never changes."""
+    """Return the odometry of scans; None, with a message, if it is absent or constant."""
     poses = np.array([scan.odometry for _, scan in scans])
     if len(poses) > 1 and (poses == poses[0]).all():
         sys.stderr.write("gpusense: the odometry of the log never changes: the scans are chained without it\n")
@@ -126,11 +126,11 @@ def write_chain(args: argparse.Namespace, chained: ChainedScans, grid: Occupancy
     from gpusense.evaluation.trajectory_files import write_tum
 
     if args.tum is not None:
-        # If beams are listed in reverse, poses are those at the end of scans.
+        # If beams are in reverse order, poses belong to the end of scans.
         at = np.array([scan.time for _, scan in chained.scans]) + chained.chain.later
         rows = np.arange(len(at))
         if len(np.unique(chained.chain.sensor)) > 1:
-            # Write one pose for each time of several lasers.
+            # Write one pose per time of several lasers.
             rows = np.unique(at, return_index=True)[1]
         times, indices = scan_times(at[rows].tolist())
         write_tum(args.tum, times, chained.chain.poses[rows], indices=indices)
@@ -144,7 +144,7 @@ def write_chain(args: argparse.Namespace, chained: ChainedScans, grid: Occupancy
 
 
 def _write_poses(path: Path, chained: ChainedScans) -> None:
-    """Write a line for each scan: index, time, pose, upper triangle of the covariance, whether doubtful, laser."""
+    """Write one line per scan: index, time, pose, upper triangle of the covariance, whether doubtful, laser."""
     from gpusense._util.files import write_whole
 
     lines, chain = [_COLUMNS], chained.chain
@@ -172,7 +172,7 @@ def document(args: argparse.Namespace, chained: ChainedScans) -> dict[str, Any]:
 
 
 def words(args: argparse.Namespace, chained: ChainedScans) -> str:
-    """Describe a chain in words, with the written files."""
+    """Describe a chain and the written files in words."""
     lines = [f"{chained.chain.explain()}\nchained in {chained.seconds:.1f} s"]
     lines += [f"written: {getattr(args, name)}" for name in ("tum", "poses") if getattr(args, name)]
     lines += [f"drawn: {args.plot}"] if args.plot else []

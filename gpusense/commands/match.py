@@ -1,4 +1,4 @@
-"""Run ``gpusense match``: match the scans of a recorded log to each other, or to a map."""
+"""Run ``gpusense match``: match the scans of a log to each other, or to a map."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def _document(args: argparse.Namespace, matches: LogMatches, total: dict[str, An
 
 
 def _write(path: Path, matches: LogMatches) -> None:
-    """Write a line for each match: indices, pose, standard deviations, score and status."""
+    """Write one line per match: indices, pose, standard deviations, score and status."""
     from gpusense._util.files import write_whole
 
     match = matches.match
@@ -174,7 +174,7 @@ def _write(path: Path, matches: LogMatches) -> None:
 
 
 def _write_tum(path: Path, scans: list[tuple[int, Scan]], matches: LogMatches) -> None:
-    """Write the trajectory of the matched scans, starting at the first one's logged pose or odometry."""
+    """Write the trajectory of the matched scans from the first scan's logged pose or odometry."""
     from gpusense.evaluation.matching import trajectory
     from gpusense.evaluation.trajectory_files import write_tum
 

@@ -1,4 +1,4 @@
-"""Output of the commands: JSON, tables, and texts of numbers and drivers."""
+"""Print JSON and tables, and format numbers and drivers."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def print_result(text: str) -> None:
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[str] = ()) -> None:
-    """Print a table: by rich on a terminal, as plain text elsewhere.
+    """Print a table by rich on a terminal, otherwise as plain text.
 
-    On a terminal that is too narrow, each row becomes a paragraph with one value per line.
+    On a narrow terminal, each row becomes a paragraph with one value per line.
 
     Args:
         columns: Names of the columns.
@@ -70,19 +70,19 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right:
 
 
 class TableStream:
-    """A table that is printed row by row, on terminals with as many columns as fit.
+    """Table that is printed row by row; a terminal gets as many columns as fit.
 
     Attributes:
-        kept: Names of the columns that are printed.
+        kept: Names of the printed columns.
     """
 
     def __init__(self, columns: Mapping[str, int], *, left: Sequence[str] = (), optional: Sequence[str] = ()) -> None:
         """Choose the columns.
 
         Args:
-            columns: Names of the columns, each with its least width.
-            left: Names of the columns that are left-aligned.
-            optional: Names of the columns that are left out on narrow terminals, in this order.
+            columns: Names and least widths of the columns.
+            left: Names of left-aligned columns.
+            optional: Names of columns to omit on narrow terminals, in this order.
         """
         self._widths = {name: max(width, len(name)) for name, width in columns.items()}
         self._left = left
@@ -92,7 +92,7 @@ class TableStream:
         self.kept, self._begun = tuple(self._widths), False
 
     def add(self, row: Mapping[str, str]) -> None:
-        """Print a row, given by the names of all columns."""
+        """Print a row of values by column."""
         if not self._begun:
             self._begun = True
             self._print({name: name for name in self.kept})
@@ -136,7 +136,7 @@ def table_lines(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right:
 
 
 def counted(number: int, noun: str) -> str:
-    """Return a number of things in words: ``"1 scan"``, ``"3 scans"``."""
+    """Return a number with a noun: ``"1 scan"``, ``"3 scans"``."""
     return f"{number} {noun}{'s' * (number != 1)}"
 
 

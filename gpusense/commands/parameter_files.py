@@ -1,4 +1,4 @@
-"""Files of parameters: ``gpusense fit`` writes them, other commands read them."""
+"""Read and write files of parameters: ``gpusense fit`` writes them, other commands read them."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Localization:
     """Parameters for a localisation, from a file.
 
     Attributes:
-        sensor: Parameters of the beam model or the likelihood field; None if the file has none.
-        noise: Arguments of :class:`OdometryMotion`; empty if the file has none.
-        nav2: The options of nav2_amcl's node, if the file is one of nav2.
+        sensor: Parameters of the beam model or the likelihood field, or None.
+        noise: Arguments of :class:`OdometryMotion`; may be empty.
+        nav2: Options of nav2_amcl's node from a file of nav2, or None.
     """
 
     sensor: BeamParameters | LikelihoodFieldParameters | None
@@ -40,7 +40,7 @@ def read_localization(path: Path, node: str | None = None) -> Localization:
 
     Args:
         path: The file.
-        node: Name of the node in a file of nav2; None for the only amcl.
+        node: Name of the node in a file of nav2; None for its only amcl.
     """
     from gpusense._util import checks
     from gpusense.localization.motion import OdometryMotion

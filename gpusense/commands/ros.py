@@ -1,4 +1,4 @@
-"""Run ``gpusense ros``: a node of ROS 2 that localises, or one that watches another localiser."""
+"""Run ``gpusense ros``: a ROS 2 node that localises, or that watches another localiser."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         from gpusense.ros.nodes.localization import main
     else:
         from gpusense.ros.nodes.watching import main
-    # The user's own arguments come last, and win.
+    # The user's arguments come last, and take precedence.
     return main(["gpusense", *ros, *args.ros_args])
 
 

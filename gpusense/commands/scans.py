@@ -1,4 +1,4 @@
-"""Scans of a log for a command: the choice of lasers, and poses from the log or a trajectory."""
+"""Read the scans of a log for a command, with poses from the log or a trajectory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ OPTIONS = {
     "topic": "topic", "sensors": "topic", "mount": "mount", "node": "node", "frame": "frame",
     "odometry_from": "odometry", "range_min": "range-min", "range_max": "range-max",
 }  # fmt: skip
-"""Options of the command line by the arguments of the library that they set."""
+"""Command line options by the library's arguments."""
 
 
 def add_log(parser: argparse.ArgumentParser, what: str, *, required: bool = True, several: str | None = None) -> None:
@@ -31,9 +31,9 @@ def add_log(parser: argparse.ArgumentParser, what: str, *, required: bool = True
 
     Args:
         parser: The parser of a command.
-        what: The log and its contents in words, with an article.
-        required: Whether the option is required.
-        several: The use of lasers in words, if the command takes several.
+        what: Description of the log, with an article.
+        required: True if the option is required.
+        several: Description of the lasers' use, if the command takes several.
     """
     add = parser.add_argument
     add("--log", required=required, type=Path, metavar="FILE", help=f"{what}: {FORMATS}")
@@ -74,7 +74,7 @@ def add_range_max(parser: argparse.ArgumentParser) -> None:
 
 
 def log_options(args: argparse.Namespace) -> LogOptions:
-    """Return the options of the log as the library's readers take them."""
+    """Return the options of the log for the library's readers."""
     return {
         "range_max": args.range_max, "range_min": args.range_min, "frame": args.frame, "mount": args.mount,
         "odometry_from": args.odometry_from,
@@ -92,7 +92,7 @@ def add_reference(parser: argparse.ArgumentParser) -> None:
 
 @contextlib.contextmanager
 def options_named() -> Iterator[None]:
-    """Name the options of the command line in errors about arguments of the library."""
+    """Name command line options in errors about the library's arguments."""
     try:
         yield
     except ValueError as error:
@@ -107,7 +107,7 @@ def read_scans(args: argparse.Namespace, *, posed: bool = True) -> list[tuple[in
 
     Args:
         args: Arguments of a command with the options of :func:`add_log` and :func:`add_reference`.
-        posed: Whether each scan must have a pose.
+        posed: True if each scan must have a pose.
     """
     from gpusense.evaluation.scoring import chosen_scans, with_one_scanner, with_poses
 
@@ -134,7 +134,7 @@ def read_scan(args: argparse.Namespace) -> Scan:
 
 
 def read_scans_of_lasers(args: argparse.Namespace) -> tuple[list[tuple[int, Scan]], list[int]]:
-    """Read the chosen scans of the lasers of ``--topic`` in the order of their times, and the laser of each."""
+    """Read the chosen scans of all lasers of ``--topic`` by time, and the laser of each."""
     from gpusense.evaluation.steps import read_steps
 
     if len(args.topic) < 2:
@@ -157,7 +157,7 @@ def read_scans_of_lasers(args: argparse.Namespace) -> tuple[list[tuple[int, Scan
 
 
 def scanners_of(scans: list[tuple[int, Scan]], sensor: list[int]) -> dict[str, Any]:
-    """Return the arguments ``scanner`` and ``sensor`` of the library for scans of one laser or of several."""
+    """Return the library's arguments ``scanner`` and ``sensor`` for scans of one or several lasers."""
     scanners = {one: scan.scanner for one, (_, scan) in zip(sensor, scans, strict=True)}
     if len(scanners) == 1:
         return {"scanner": scans[0][1].scanner}
@@ -181,7 +181,7 @@ def _referenced(args: argparse.Namespace, scans: list[Scan]) -> list[tuple[int, 
 
 
 def scan_times(times: list[float]) -> tuple[list[float], bool]:
-    """Return the times of scans for a trajectory; if they do not increase, as readers require, indices and True."""
+    """Return the times of scans for a trajectory, or indices and True unless times increase."""
     if all(one < two for one, two in itertools.pairwise(times)):
         return times, False
     rule = "the times of the log do not increase: the trajectory has the indices of the scans instead"

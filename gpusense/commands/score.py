@@ -1,4 +1,4 @@
-"""Run ``gpusense score``: rank the logged poses of a recorded log among particles, on one backend or several."""
+"""Run ``gpusense score``: rank the poses of a log among particles, on one or several backends."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def _score(
     scoring: LogScoring,
     fitness: FitnessOfLog,
 ) -> None:
-    """Score the scans, and print a row for each as soon as it is ready."""
+    """Score the scans, and print rows immediately."""
     # Rows on a terminal show the progress.
     shown = not args.json and is_terminal(sys.stdout)
     optional = (*(("backend",) if len(models) == 1 else ()), "beams", "effective", "error [rad]")
@@ -204,7 +204,7 @@ def print_report(
 
 
 def pose_name(args: argparse.Namespace) -> str:
-    """Return the report's name of a scan's pose, which comes from the log or from ``--reference``."""
+    """Return the report's name for the scans' poses, from the log or from ``--reference``."""
     return "logged pose" if args.reference is None else "reference pose"
 
 

@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_stiff(args: argparse.Namespace) -> int:
-    """Run the catalogue of stiff cases and print its rows; each must keep its bound."""
+    """Run and print the catalogue of stiff cases; each must keep its bound."""
     from gpusense.evaluation import selftest, stiff
 
     backends = selftest.chosen_backends(args.backend)
@@ -110,14 +110,14 @@ def _run_stiff(args: argparse.Namespace) -> int:
 
 
 def _kept(stop: KeyboardInterrupt, results: Sequence[object]) -> KeyboardInterrupt:
-    """Return the interrupt that stopped the comparisons, to be raised after the results so far are printed."""
+    """Return the interrupt that stopped the comparisons, to raise after printing the results so far."""
     if not results:
         raise stop
     return stop
 
 
 def _print_head(backends: Sequence[Backend]) -> None:
-    """Print the backends under test, with the kernels that their proofs excluded."""
+    """Print the tested backends, with the kernels that their proofs excluded."""
     from gpusense.backends import devices
 
     reasons = {device.selection: device.reason for device in devices()}

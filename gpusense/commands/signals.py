@@ -1,7 +1,7 @@
-"""Signals that end a command, which keeps its results so far, reports the end in one line, and leaves no partial file.
+"""Handle signals that end a command with its results so far, a one-line report and no partial file.
 
-Ctrl-C, a hang-up of the terminal, and the signal by which containers and ``timeout`` end a program all raise
-exceptions. Only the command line installs handlers, in the main thread, and puts the old ones back.
+Ctrl-C, a hang-up of the terminal, and the signal of containers and ``timeout`` raise exceptions. Only the command line
+installs handlers, in the main thread, and restores the old ones.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from typing import Any
 
 from gpusense._util import interrupts
 
-# Signals that end a command, with the word for the end. Signals that the caller ignores, as nohup does, stay ignored.
+# Signals that end a command, and words for the end. Signals ignored by the caller, as by nohup, stay ignored.
 _WORDS = {name: word for name, word in (("SIGINT", "interrupted"), ("SIGTERM", "terminated"), ("SIGHUP", "hung up"))
           if hasattr(signal, name)}  # fmt: skip
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal that requests the end of the command.
+    """Signal that requests the end of the command.
 
     Attributes:
         number: The signal.
@@ -46,9 +46,9 @@ def word_of(stop: KeyboardInterrupt) -> str:
 
 @contextlib.contextmanager
 def stopping() -> Iterator[None]:
-    """Turn the signals that end a command into :class:`Stopped`; in other threads than the main one do nothing.
+    """Turn signals that end a command into :class:`Stopped`, in the main thread only.
 
-    Python ignores an exception in a destructor or a callback. A signal that arrives there is delivered again.
+    Python ignores exceptions in destructors and callbacks; a signal that arrives there is delivered again.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -57,7 +57,7 @@ def stopping() -> Iterator[None]:
 
     def stop(number: int, frame: FrameType | None) -> None:
         if os.getpid() != process:
-            # A forked child ends as without this handler.
+            # A forked child ends as if there were no handler.
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
             return

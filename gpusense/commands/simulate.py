@@ -1,4 +1,4 @@
-"""Run ``gpusense simulate``: make a log of a robot that drives through a map, for tests and teaching."""
+"""Run ``gpusense simulate``: simulate the log of a robot that drives through a map, for tests and teaching."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_output(args: argparse.Namespace) -> str:
-    """Return the format of the log, and check that it can be written before any work is done."""
+    """Return the format of the log, after checking that it can be written."""
     from gpusense._util.files import check_writable
     from gpusense.evaluation.simulation.files import kind_of
     from gpusense.logs.bag_writer import check_bag

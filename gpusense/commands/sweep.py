@@ -144,7 +144,7 @@ def _swept(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Sweep:
 
 @contextlib.contextmanager
 def _executor(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Iterator[Executor]:
-    """Make the executor of the options, and end it afterwards."""
+    """Make the executor from the options, and end it afterwards."""
     from gpusense.sweeps.executors import ProcessExecutor
 
     devices: list[str] = args.device or []
@@ -206,7 +206,7 @@ def _report(args: argparse.Namespace, ended: Sweep, seconds: float) -> None:
 
 
 def _drawn(table: str, path: Path) -> bool:
-    """Draw the picture; tell whether there was anything to draw."""
+    """Draw the picture; return whether any job could be drawn."""
     from gpusense.plots.drawing import save
     from gpusense.plots.sweeps import sweep_figure
     from gpusense.sweeps.table import read_table

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import threading
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple, cast
 
@@ -36,6 +36,8 @@ from gpusense.world.scanner import classify_ranges
 _BLOCK, _MOST_LEVELS = 0.8, 5
 # Tiles along a side of a cell for bilinear fields, if this many table cells suffice.
 _TILES, _MOST_TABLE_CELLS = (4, 2, 1), 1 << 28
+# Most poses of scans that are searched together.
+_MOST_POSES = 1 << 33
 # Rounding of a log-likelihood, in steps for each hit.
 _ROUNDING = 2e-3
 
@@ -47,7 +49,7 @@ class Candidates(NamedTuple):
         poses: (M, 3) in the world.
         score: (M,) from 0 to 1, the mean of the end points.
         best: Index of the likeliest.
-        evaluated: Poses and blocks of poses that were evaluated.
+        evaluated: Poses and blocks of poses that were evaluated, on average over the scans of a search.
     """
 
     poses: np.ndarray
@@ -62,11 +64,16 @@ class FieldSearch:
     Args:
         model: A likelihood field.
         stride: Cells between neighbouring positions.
+
+    Attributes:
+        free: Positions in free cells.
     """
 
     def __init__(self, model: LikelihoodFieldModel, stride: int) -> None:
         self.lock = threading.Lock()
         self.grid, self.stride = model.grid, stride
+        self._free = model.grid.free
+        self.free = self._free[::stride, ::stride]
         self._model = weakref.ref(model)
         backend = get_backend(model.device.selection)
         p, cell = model.parameters, model.grid.resolution
@@ -118,30 +125,66 @@ class FieldSearch:
     def _step(self) -> float:
         return max(self._high - self._low, 1e-300)
 
+    def is_free(self, pose: np.ndarray) -> bool:
+        """Return whether a pose is in a free cell."""
+        col, row = np.floor(self.grid.world_to_cells(pose[None, :2])[0]).astype(int)
+        inside = 0 <= row < self.grid.shape[0] and 0 <= col < self.grid.shape[1]
+        return bool(inside and self._free[row, col])
+
     def find(
-        self, ranges: np.ndarray, points: np.ndarray, searched: PoseGrid, allowed: np.ndarray | None, depth: float
-    ) -> Candidates:
-        """Return the poses that score nearly as well as the best one, and the likeliest by the model.
+        self, ranges: np.ndarray, points: Sequence[np.ndarray], searched: PoseGrid, allowed: np.ndarray | None,
+        depth: float,
+    ) -> list[Candidates]:  # fmt: skip
+        """Return the best poses of each scan by score, and the likeliest of them by the model.
 
         Args:
-            ranges: (K,) readings [m].
-            points: (M, 2) end points of the hits on the robot [m], at least one.
-            searched: The poses.
+            ranges: (S, K) readings [m].
+            points: (M, 2) end points of the hits of each scan on the robot [m], at least one.
+            searched: The poses, the same for all scans.
             allowed: Positions that may be found; None: all.
             depth: Largest difference from the best score.
         """
         model = self._model()
         assert model is not None
-        cells = points / self.grid.resolution
-        most = math.ceil(depth * TOP * len(points))
+        cells = [part / self.grid.resolution for part in points]
+        most = [math.ceil(depth * TOP * len(part)) for part in points]
         if self._tiles:
-            return self._find_between(model, ranges, cells, searched, allowed, most)
-        found = self._search.find([cells], searched, slack=max(len(points), most), allowed=allowed)
-        poses = to_world(self.grid, searched.poses(found, self.stride))
+            return [
+                self._find_between(model, scan, part, searched, allowed, slack)
+                for scan, part, slack in zip(ranges, cells, most, strict=True)
+            ]
+        each = max(_MOST_POSES // searched.count, 1)
+        parts = [slice(begin, begin + each) for begin in range(0, len(points), each)]
+        return [
+            one
+            for part in parts
+            for one in self._find_on(model, ranges[part], cells[part], most[part], searched, allowed)
+        ]
+
+    def _find_on(
+        self, model: LikelihoodFieldModel, ranges: np.ndarray, cells: Sequence[np.ndarray], most: Sequence[int],
+        searched: PoseGrid, allowed: np.ndarray | None,
+    ) -> list[Candidates]:  # fmt: skip
+        """Return the best poses of scans in a field of the nearest cell's distance."""
+        scans, hits = len(cells), np.array([len(part) for part in cells])
+        start, headings = searched.start.repeat(scans, axis=0), searched.headings.repeat(scans, axis=0)
+        grid = PoseGrid(start, headings, searched.height, searched.width)
+        found = self._search.find(cells, grid, slack=np.maximum(hits, most), allowed=allowed)
+        poses = to_world(self.grid, grid.poses(found, self.stride))
+        first = np.append(found.best, len(poses))
         # Rounding moves a score by half a step for each hit.
-        near = np.flatnonzero(found.score >= found.score[0] - len(points))
-        best = near[_first_of_largest(model.log_likelihood(poses[near], ranges), found, near)]
-        return Candidates(poses, found.score / (TOP * len(points)), int(best), found.evaluated)
+        near = [
+            np.flatnonzero(found.score[begin:end] >= found.score[begin] - count) + begin
+            for begin, end, count in zip(first[:-1], first[1:], hits, strict=True)
+        ]
+        log_p = log_likelihoods_of(model, [poses[rows] for rows in near], ranges)
+        return [
+            Candidates(
+                poses[begin:end], found.score[begin:end] / (TOP * count),
+                int(rows[_first_of_largest(values, found, rows)] - begin), found.evaluated // scans,
+            )
+            for begin, end, count, rows, values in zip(first[:-1], first[1:], hits, near, log_p, strict=True)
+        ]  # fmt: skip
 
     def _find_between(
         self, model: LikelihoodFieldModel, ranges: np.ndarray, cells: np.ndarray, searched: PoseGrid,
@@ -191,6 +234,15 @@ class FieldSearch:
         return steps
 
 
+def log_likelihoods_of(
+    model: LikelihoodFieldModel, poses: Sequence[np.ndarray], ranges: np.ndarray
+) -> list[np.ndarray]:
+    """Return the log-likelihoods of the poses (M_s, 3) of each of S scans, by one call."""
+    longest = max(map(len, poses))
+    padded = np.stack([np.concatenate([part, part[:1].repeat(longest - len(part), axis=0)]) for part in poses])
+    return [values[: len(part)] for values, part in zip(model.log_likelihood(padded, ranges), poses, strict=True)]
+
+
 def _complete(run: Callable[[slice, int], Found], headings: slice, floor: int) -> Iterator[tuple[slice, Found]]:
     """Yield searches of parts of the headings, in which every pose that reaches the floor is found."""
     found = run(headings, floor)
@@ -202,14 +254,17 @@ def _complete(run: Callable[[slice, int], Found], headings: slice, floor: int) -
         yield from _complete(run, part, floor)
 
 
-_SEARCHES: weakref.WeakKeyDictionary[LikelihoodFieldModel, FieldSearch] = weakref.WeakKeyDictionary()
+_SEARCHES: weakref.WeakKeyDictionary[LikelihoodFieldModel, dict[int, FieldSearch]] = weakref.WeakKeyDictionary()
 
 
 def field_search(model: LikelihoodFieldModel, stride: int) -> FieldSearch:
-    """Return the search of a model, rebuilt after a change of its map."""
-    search = _SEARCHES.get(model)
-    if search is None or search.grid is not model.grid or search.stride != stride:
-        search = _SEARCHES[model] = FieldSearch(model, stride)
+    """Return the search of a model at a stride, rebuilt after a change of its map."""
+    kept = _SEARCHES.setdefault(model, {})
+    for other in [other for other, search in kept.items() if search.grid is not model.grid]:
+        kept.pop(other, None)
+    search = kept.get(stride)
+    if search is None:
+        search = kept[stride] = FieldSearch(model, stride)
     return search
 
 

@@ -34,15 +34,14 @@ def likely_poses(model: LikelihoodFieldModel, ranges: NDArray[np.float64], count
     """
     grid = model.grid
     stride = max(round(_RESOLUTION / grid.resolution), 1)
-    allowed = grid.free[::stride, ::stride]
     points = end_points_of(model, ranges)[1]
+    search = field_search(model, stride)
     # Within a single cell no end point depends on the heading, and all free cells far from walls are alike.
-    if not len(points) or not allowed.any() or grid.resolution > np.hypot(*points.T).max():
+    if not len(points) or not search.free.any() or grid.resolution > np.hypot(*points.T).max():
         return np.empty((0, 3))
     turns = 4 * math.ceil(math.pi / 2 / _ANGLE)
     rows, columns = (-(-size // stride) for size in grid.shape)
     searched = PoseGrid(np.array([[0.5, 0.5]]), 2 * math.pi / turns * np.arange(turns)[None], rows, columns)
-    search = field_search(model, stride)
     with search.lock:
-        poses = search.find(ranges, points, searched, allowed, _DEPTH).poses
+        poses = search.find(ranges[None], [points], searched, search.free, _DEPTH)[0].poses
     return poses[distinct_poses(poses, count, _NEAR, _TURNED)]

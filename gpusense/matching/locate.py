@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from collections.abc import Sequence
+from typing import Any, Literal, overload
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks, masks
-from gpusense.matching.field_search import Candidates, FieldSearch, field_search
+from gpusense._util.angles import wrapped
+from gpusense.matching.field_search import Candidates, FieldSearch, field_search, log_likelihoods_of
 from gpusense.matching.location import Location, PoseMode, Status
 from gpusense.matching.location_evidence import NAMES, location_evidence, probability_right
 from gpusense.matching.pose_grid import PoseGrid, distinct_poses
@@ -18,7 +20,6 @@ from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.models.scan.rules import BeamChoice
 from gpusense.world.frames import ray_vectors
-from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, classify, float64_readings
 
 # Side of the largest block with one bound, relative to the field's max_distance, and most levels.
@@ -31,9 +32,37 @@ _MODE_RADIUS, _MODE_ANGLE = 0.5, math.radians(15)
 _AGREE_SIGMAS, _AGREE_CELLS = 1.5, 3
 
 
+@overload
 def locate_scan(
     model: LikelihoodFieldModel,
-    ranges: ArrayLike,
+    ranges: NDArray[Any] | Sequence[float],
+    *,
+    resolution: float = ...,
+    angle: float = ...,
+    positions: Literal["free", "all"] = ...,
+    modes: int = ...,
+    min_probability: float = ...,
+    refine: bool = ...,
+) -> Location: ...
+
+
+@overload
+def locate_scan(
+    model: LikelihoodFieldModel,
+    ranges: Sequence[ArrayLike],
+    *,
+    resolution: float = ...,
+    angle: float = ...,
+    positions: Literal["free", "all"] = ...,
+    modes: int = ...,
+    min_probability: float = ...,
+    refine: bool = ...,
+) -> tuple[Location, ...]: ...
+
+
+def locate_scan(
+    model: LikelihoodFieldModel,
+    ranges: Any,
     *,
     resolution: float = 0.05,
     angle: float = 0.0175,
@@ -41,7 +70,7 @@ def locate_scan(
     modes: int = 10,
     min_probability: float = 0.7,
     refine: bool = True,
-) -> Location:
+) -> Any:
     """Find the likeliest pose of a scan on a grid of poses over the whole map, without a guess.
 
     Positions are centres of map cells, and headings are multiples of an angle from the map's x axis. Branch and bound
@@ -56,7 +85,7 @@ def locate_scan(
 
     Args:
         model: A likelihood field; its beams, parameters and device are used.
-        ranges: (K,) readings [m].
+        ranges: (K,) readings [m], or (S, K) of S scans, which are searched together.
         resolution: Distance between neighbouring positions [m], > 0; rounded to whole cells, at least one.
         angle: Angle between neighbouring headings [rad], up to a right angle; lowered to the next that divides
             a right angle.
@@ -64,6 +93,9 @@ def locate_scan(
         modes: Largest number of modes.
         min_probability: Least ``p_right`` of a pose that counts as found, from 0 to 1.
         refine: Whether ``pose`` may lie between the poses of the grid, up to two steps from the likeliest of them.
+
+    Returns:
+        The pose; for S scans, a tuple of S.
 
     Raises:
         TypeError: the model is not a LikelihoodFieldModel, or an argument is of the wrong kind.
@@ -90,31 +122,51 @@ def locate_scan(
     checks.integer("modes", modes, low=1)
     checks.boolean("refine", refine)
     checks.real("min_probability", min_probability, low=0, high=1)
-    grid = model.grid
-    headings = 2 * math.pi / turns * np.arange(turns)[None]
-    allowed = _allowed(grid, stride) if positions == "free" else None
-    rows, cols = (-(-size // stride) for size in grid.shape)
-    searched = PoseGrid(np.array([[0.5, 0.5]]), headings, rows, cols)
-    values = checks.array("ranges", ranges, (model.scanner.count,), finite=False, dtype=None)
-    values = float64_readings(values, model.scanner)
-    hits, points = end_points_of(model, values)
-    options = dict(resolution=stride * cell, angle=2 * math.pi / turns, poses=searched.count)
-    if not len(points):
-        nothing = np.full(3, np.nan)
-        said = 0.0, np.full(len(NAMES), np.nan), "no match"
-        return Location(nothing, 0.0, 0.0, 0.0, (), *said, evaluated=0, **options)  # type: ignore[arg-type]
+    several = np.ndim(ranges) == 2
+    shape = ("S", model.scanner.count) if several else (model.scanner.count,)
+    values = checks.array("ranges", ranges, shape, finite=False, dtype=None)
+    values = np.atleast_2d(float64_readings(values, model.scanner))
     search = field_search(model, stride)
-    with search.lock:
-        found = search.find(values, points, searched, allowed, _DEPTH)
-    chosen = _modes(model, values, hits, search, found, modes)
-    top = chosen[0]
-    pose = top.pose
-    if refine:
-        near = _refined(search.smooth, values, pose, 2 * stride * cell, 4 * math.pi / turns)
-        pose = near if positions == "all" or _is_free(grid, near) else pose
+    if positions == "free" and not search.free.any():
+        raise ValueError("positions: 'free' needs a position in a free cell, got none; use positions='all'")
+    rows, cols = (-(-size // stride) for size in model.grid.shape)
+    headings = 2 * math.pi / turns * np.arange(turns)[None]
+    searched = PoseGrid(np.array([[0.5, 0.5]]), headings, rows, cols)
+    hits, points = zip(*(end_points_of(model, scan) for scan in values), strict=True) if len(values) else ((), ())
+    options = dict(resolution=stride * cell, angle=2 * math.pi / turns, poses=searched.count)
+    located: list[Location] = [_nothing(options)] * len(values)
+    chosen = [number for number, part in enumerate(points) if len(part)]
+    if chosen:
+        with search.lock:
+            found = search.find(
+                values[chosen], [points[n] for n in chosen], searched, search.free if positions == "free" else None,
+                _DEPTH,
+            )  # fmt: skip
+        best = _modes(model, values[chosen], [hits[n] for n in chosen], search, found, modes)
+        poses = np.array([one[0].pose for one in best])
+        if refine:
+            near = _refined(search.smooth, values[chosen], poses, 2 * stride * cell, 4 * math.pi / turns)
+            kept = [positions == "all" or search.is_free(pose) for pose in near]
+            poses = np.where(np.array(kept)[:, None], near, poses)
+        for number, pose, said, result in zip(chosen, poses, best, found, strict=True):
+            located[number] = _location(pose if refine else said[0].pose, said, min_probability, result, options)
+    return tuple(located) if several else located[0]
+
+
+def _nothing(options: dict[str, Any]) -> Location:
+    """Return the result of a scan without hits."""
+    none = np.full(len(NAMES), np.nan)
+    return Location(np.full(3, np.nan), 0.0, 0.0, 0.0, (), 0.0, none, "no match", evaluated=0, **options)
+
+
+def _location(
+    pose: np.ndarray, modes: tuple[PoseMode, ...], least: float, found: Candidates, options: dict[str, Any]
+) -> Location:
+    """Return the result of a scan with modes."""
+    top = modes[0]
     return Location(
-        pose, top.score, top.log_likelihood, top.agreement, chosen, *_said(chosen, min_probability),
-        evaluated=found.evaluated, **options,  # type: ignore[arg-type]
+        pose, top.score, top.log_likelihood, top.agreement, modes, *_said(modes, least), evaluated=found.evaluated,
+        **options,
     )  # fmt: skip
 
 
@@ -127,57 +179,55 @@ def end_points_of(model: LikelihoodFieldModel, ranges: np.ndarray) -> tuple[np.n
     return hits, ranges[hits, None] * vectors[hits] + np.array(scanner.mount[:2])
 
 
-def _allowed(grid: OccupancyGrid, stride: int) -> np.ndarray:
-    """Return which positions are in free cells."""
-    allowed = grid.free[::stride, ::stride]
-    if not allowed.any():
-        raise ValueError("positions: 'free' needs a position in a free cell, got none; use positions='all'")
-    return allowed
-
-
 def _modes(
-    model: LikelihoodFieldModel, ranges: np.ndarray, hits: np.ndarray, search: FieldSearch, found: Candidates, most: int
-) -> tuple[PoseMode, ...]:
-    """Return the best pose and the other local maxima among the poses, by falling score."""
-    poses, radius = found.poses, max(_MODE_RADIUS, 2 * search.stride * search.grid.resolution)
-    chosen = distinct_poses(poses, most, radius, _MODE_ANGLE, found.best)
-    log_p = model.log_likelihood(poses[chosen], ranges)
-    shares = _shares(model, ranges, hits, search.caster, poses[chosen])
-    return tuple(
-        PoseMode(poses[i], float(found.score[i]), float(log_p[n]), *(float(share) for share in shares[n]))
-        for n, i in enumerate(chosen)
-    )
+    model: LikelihoodFieldModel, ranges: np.ndarray, hits: Sequence[np.ndarray], search: FieldSearch,
+    found: Sequence[Candidates], most: int,
+) -> list[tuple[PoseMode, ...]]:  # fmt: skip
+    """Return the best pose of each scan and the other local maxima among its poses, by falling score."""
+    radius = max(_MODE_RADIUS, 2 * search.stride * search.grid.resolution)
+    chosen = [distinct_poses(one.poses, most, radius, _MODE_ANGLE, one.best) for one in found]
+    poses = [one.poses[rows] for one, rows in zip(found, chosen, strict=True)]
+    log_p = log_likelihoods_of(model, poses, ranges)
+    shares = _shares(model, ranges, hits, search.caster, poses)
+    return [
+        tuple(
+            PoseMode(pose, float(one.score[row]), float(value), *map(float, share))
+            for row, pose, value, share in zip(rows, *parts, strict=True)
+        )
+        for one, rows, *parts in zip(found, chosen, poses, log_p, shares, strict=True)
+    ]
 
 
 def _refined(
-    smooth: LikelihoodFieldModel, ranges: np.ndarray, pose: np.ndarray, farthest: float, most: float
+    smooth: LikelihoodFieldModel, ranges: np.ndarray, poses: np.ndarray, farthest: float, most: float
 ) -> np.ndarray:
-    """Return the pose of maximal likelihood near a start, or the start if the maximum is too far away [m, rad]."""
-    near: np.ndarray = climb(smooth, ranges[None], pose[None])[0][0]
-    near[2] = math.remainder(near[2], 2 * math.pi)
-    turn = abs(math.remainder(near[2] - pose[2], 2 * math.pi))
-    return near if math.hypot(*(near - pose)[:2]) <= farthest and turn <= most else pose
-
-
-def _is_free(grid: OccupancyGrid, pose: np.ndarray) -> bool:
-    """Return whether a pose is in a free cell."""
-    col, row = np.floor(grid.world_to_cells(pose[None, :2])[0]).astype(int)
-    inside = 0 <= row < grid.shape[0] and 0 <= col < grid.shape[1]
-    return inside and bool(grid.free[row, col])
+    """Return (S, 3) poses of maximal likelihood near starts, or starts that are too far from the maximum [m, rad]."""
+    near: np.ndarray = climb(smooth, ranges, poses)[0]
+    near[:, 2] = [math.remainder(heading, 2 * math.pi) for heading in near[:, 2]]
+    off = near - poses
+    kept = (np.hypot(off[:, 0], off[:, 1]) <= farthest) & (np.abs(wrapped(off[:, 2])) <= most)
+    return np.where(kept[:, None], near, poses)
 
 
 def _shares(
-    model: LikelihoodFieldModel, ranges: np.ndarray, hits: np.ndarray, caster: RayCaster, poses: np.ndarray
-) -> np.ndarray:
-    """Return shares (M, 3) of the hits at poses that are as long as expected ranges, longer, and shorter."""
+    model: LikelihoodFieldModel, ranges: np.ndarray, hits: Sequence[np.ndarray], caster: RayCaster,
+    poses: Sequence[np.ndarray],
+) -> list[np.ndarray]:  # fmt: skip
+    """Return shares (M, 3) of each scan's hits at poses: as long as expected ranges, longer, and shorter."""
     x, y, yaw = model.scanner.mount
-    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    sensors = poses + np.stack([cos * x - sin * y, sin * x + cos * y, np.full(len(poses), yaw)], axis=1)
-    expected = caster.cast(sensors, model.scanner.bearings[hits])
+    everywhere = np.concatenate(poses)
+    cos, sin = np.cos(everywhere[:, 2]), np.sin(everywhere[:, 2])
+    sensors = everywhere + np.stack([cos * x - sin * y, sin * x + cos * y, np.full(len(cos), yaw)], axis=1)
+    used = np.unique(np.concatenate(hits))
+    expected = caster.cast(sensors, model.scanner.bearings[used])
     tolerance = max(_AGREE_SIGMAS * model.parameters.sigma_hit, _AGREE_CELLS * model.grid.resolution)
-    off = ranges[hits] - expected
-    longer, shorter = (off > tolerance).mean(axis=1), (off < -tolerance).mean(axis=1)
-    return np.stack([1 - longer - shorter, longer, shorter], axis=1)
+    shares = []
+    ends = np.cumsum([len(part) for part in poses])
+    for scan, hit, rays in zip(ranges, hits, np.split(expected, ends[:-1]), strict=True):
+        off = scan[hit] - rays[:, np.searchsorted(used, hit)]
+        longer, shorter = (off > tolerance).mean(axis=1), (off < -tolerance).mean(axis=1)
+        shares.append(np.stack([1 - longer - shorter, longer, shorter], axis=1))
+    return shares
 
 
 def _said(modes: tuple[PoseMode, ...], least: float) -> tuple[float, np.ndarray, Status]:

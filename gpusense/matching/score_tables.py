@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,10 @@ _BYTE = np.dtype(np.uint8)
 _NO_FLAGS: frozenset[str] = frozenset()
 # Columns that a kernel with lanes reads at once; the kernel file ``search`` has the same number.
 RUN = 16
+# Rows of shifts of a work-item, as in the kernel file.
+SHIFT_ROWS = 8
+# Levels between the blocks of a level and the steps of their first cells.
+_STEP = 2
 # Largest score of a cell.
 TOP = 255
 # Cells of a table and of its copies, which kernels index in 32 bits.
@@ -34,6 +39,24 @@ def field_scores(distances: np.ndarray, sigma: float, max_distance: float) -> np
     """Return scores of distances [m], which fall like a normal density from 255 to 0 at ``max_distance``."""
     values = np.exp(-0.5 * (np.minimum(distances, max_distance) / sigma) ** 2)
     return quantized(values, math.exp(-0.5 * (max_distance / sigma) ** 2), 1.0)
+
+
+class Folded(NamedTuple):
+    """Tables of a level as images, one for each first cell of blocks.
+
+    Attributes:
+        table: The images.
+        shape: Their sizes.
+        period: Cells of the tables between neighbouring cells of an image.
+        step: Cells between first cells of neighbouring images.
+        offset: Column and row of the tables' first cell in the images' source.
+    """
+
+    table: Buffer
+    shape: ScoreTable
+    period: int
+    step: int
+    offset: int
 
 
 class ScoreTables:
@@ -59,14 +82,14 @@ class ScoreTables:
         tables, rows, cols = stack.shape
         self.backend, self.levels, self.stride, self._beyond = backend, levels, stride, beyond
         # The margin holds all pooled cells that a table's cells reach, and a run of cells beyond them.
-        self.shape = ScoreTable(tables, rows, cols, ((1 << levels) - 1) * stride + RUN)
+        self.shape = ScoreTable(tables, rows, cols, ((1 << levels) - 1) * stride + self.step(levels) - 1 + RUN)
         if self._cells(self.shape) > _MOST_CELLS:
             raise ValueError(f"scores: must have at most {_MOST_CELLS} cells with margins, got {stack.shape}")
         padded = np.full((tables, rows + 2 * self.shape.margin, cols + 2 * self.shape.margin), beyond, _BYTE)
         inside = slice(self.shape.margin, -self.shape.margin)
         padded[:, inside, inside] = stack
         self._levels: list[Buffer] = [backend.upload(padded)]
-        self._folded: dict[int, tuple[Buffer, ScoreTable]] = {}
+        self._folded: dict[int, Folded] = {}
 
     @staticmethod
     def _cells(shape: ScoreTable) -> int:
@@ -75,33 +98,47 @@ class ScoreTables:
     @property
     def table_bytes(self) -> int:
         """Bytes of all tables made on the device so far."""
-        folded = sum(self._cells(shape) for _, shape in self._folded.values())
+        folded = sum(self._cells(one.shape) for one in self._folded.values())
         return len(self._levels) * self._cells(self.shape) + folded
+
+    @staticmethod
+    def step(level: int) -> int:
+        """Return the cells between neighbouring first cells of the folded tables of a level."""
+        return 1 << max(level - _STEP, 0)
 
     def level(self, level: int) -> Buffer:
         """Return the tables of a level; a cell is the largest score of ``2^level`` positions along each axis."""
         while len(self._levels) <= level:
-            made = self.backend.empty(self._cells(self.shape), _BYTE)
-            reach = (1 << (len(self._levels) - 1)) * self.stride
-            size = (self.shape.cols + 2 * self.shape.margin, self.shape.rows + 2 * self.shape.margin, self.shape.tables)
-            pool = self.backend.compile("pool_scores", _NO_FLAGS)
-            pool(size, self._levels[-1], made, self.shape, reach)
-            self._levels.append(made)
+            self._levels.append(self._pooled(self._levels[-1], (1 << (len(self._levels) - 1)) * self.stride))
         return self._levels[level]
 
-    def folded(self, level: int) -> tuple[Buffer, ScoreTable, int]:
-        """Return the tables of a level in which blocks of positions are neighbours, their sizes, and the period."""
-        period = self.stride << level
+    def _pooled(self, table: Buffer, reach: int) -> Buffer:
+        """Return tables of the largest score of each cell and the cells up to ``reach`` further."""
+        made = self.backend.empty(self._cells(self.shape), _BYTE)
+        size = (self.shape.cols + 2 * self.shape.margin, self.shape.rows + 2 * self.shape.margin, self.shape.tables)
+        self.backend.compile("pool_scores", _NO_FLAGS)(size, table, made, self.shape, reach)
+        return made
+
+    def folded(self, level: int) -> Folded:
+        """Return the tables of a level in which blocks of positions are neighbours.
+
+        Their cells begin at multiples of a step, so a cell covers as many more cells as points may lie beside them.
+        """
+        period, step = self.stride << level, self.step(level)
         if period == 1:
-            return self.level(0), self.shape, 1
+            return Folded(self.level(0), self.shape, 1, 1, 0)
         if level not in self._folded:
             lines, stride = self.shape.rows + 2 * self.shape.margin, self.shape.cols + 2 * self.shape.margin
-            shape = ScoreTable(self.shape.tables * period**2, -(-lines // period), -(-stride // period), RUN)
+            images = self.shape.tables * (period // step) ** 2
+            shape = ScoreTable(images, -(-lines // period), -(-stride // period), RUN)
             if self._cells(shape) > _MOST_CELLS:
                 raise ValueError(f"scores: a search must fold at most {_MOST_CELLS} cells, got {self._cells(shape)}")
             made = self.backend.empty(self._cells(shape), _BYTE)
             size = (shape.cols + 2 * RUN, shape.rows + 2 * RUN, shape.tables)
+            source = self._pooled(self.level(level), step - 1) if step > 1 else self.level(level)
             fold = self.backend.compile("fold_scores", _NO_FLAGS)
-            fold(size, self.level(level), made, self.shape, shape, period, self._beyond)
-            self._folded[level] = made, shape
-        return *self._folded[level], period
+            fold(size, source, made, self.shape, shape, period, step, self._beyond)
+            # The pooled copy lives until the launch has ended.
+            self.backend.synchronize()
+            self._folded[level] = Folded(made, shape, period, step, self.shape.margin)
+        return self._folded[level]

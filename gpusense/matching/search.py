@@ -8,25 +8,38 @@ best score so far (Hess et al., Real-time loop closure in 2D lidar SLAM, ICRA 20
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
+from gpusense.backends import get_backend
+from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.lanes import with_lanes_flag
-from gpusense.matching.pose_grid import Found, PoseGrid, end_cells
-from gpusense.matching.score_tables import ScoreTables
+from gpusense.matching.pose_grid import Found, PoseGrid
+from gpusense.matching.score_tables import SHIFT_ROWS, ScoreTables
 
 __all__ = ["Found", "PoseGrid", "Search"]
 
 _INT = np.dtype(np.int32)
 _NO_FLAGS: frozenset[str] = frozenset()
-# Blocks of the first round, and growth from round to round; the best descendants of the first round give the first
-# lower bound.
-_FIRST, _GROWTH = 16, 8
-# Most sums of one launch, and most poses that are kept.
-_MOST_SUMS, _MOST_KEPT = 1 << 27, 1 << 18
+# Blocks of a scan that the first lower bound comes from, and growth of their number from round to round.
+_FIRST, _GROWTH = 128, 16
+# Above all bounds.
+_HIGHEST = np.iinfo(np.int32).max
+# Blocks of a round some of which are followed first.
+_CROWDED = 1 << 13
+# Sums of a scan's bounds that a level of smaller blocks may take.
+_MOST_SUMS = 1 << 29
+# Blocks for which a round has room at first, most blocks of a launch that divides them, and most poses that are kept.
+_ROOM, _MOST_BLOCKS, _MOST_KEPT = 1 << 17, 1 << 17, 1 << 18
 # Most items of one launch: some drivers allow 65535 groups along the last axis.
 _MOST_ITEMS = 1 << 15
+# Counts between two uploads of zeros.
+_COUNTS = 64
+# Arrays that place end points, and arrays of placed points.
+_GIVEN = ("end", "heading", "start", "first", "image")
+_MADE = ("point", "run", "run image", "weight", "runs")
 
 
 class Search:
@@ -38,15 +51,15 @@ class Search:
 
     def __init__(self, tables: ScoreTables) -> None:
         self.tables = tables
-        self._backend = tables.backend
-        self._space = Workspace(tables.backend)
+        self.space = Workspace(tables.backend)
+        self._masks: tuple[np.ndarray | None, tuple[int, ...], list[Buffer]] = (None, (), [])
 
     def find(
         self,
         points: Sequence[np.ndarray],
         grid: PoseGrid,
         *,
-        slack: int = 0,
+        slack: int | np.ndarray = 0,
         level: int | None = None,
         allowed: np.ndarray | None = None,
         images: Sequence[np.ndarray] | None = None,
@@ -57,38 +70,53 @@ class Search:
         Args:
             points: (K_s, 2) end points of each of S scans in the robot's frame [cells of the tables].
             grid: The poses.
-            slack: Largest difference from the best score of the scan. At most 262 144 poses are kept; of equal ones,
-                the first by row, column and heading.
-            level: Blocks of ``2^level`` x ``2^level`` positions are bounded first; 0 is brute force. None: all levels
-                of the tables.
-            allowed: (height, width) bool: positions that may be found. None: all.
+            slack: Largest difference from the best score of the scan, or (S,) of each. At most 262 144 poses of a scan
+                are kept; of equal ones, the first by row, column and heading.
+            level: Blocks of ``2^level`` x ``2^level`` positions are bounded first; 0 is brute force. None: the
+                tables' last level, or the one before it if its bounds take few sums.
+            allowed: (height, width) bool: positions that may be found; it must not change while it is in use. None:
+                all.
             images: (K_s,) table of each point, or (A, K_s) at each heading. None: the scans'.
             floor: Least score of a pose that is found.
 
         Returns:
             The poses. A scan without points scores 0 everywhere. No pose is returned without an allowed position.
         """
-        level = self.tables.levels if level is None else level
-        run = _Run(self, grid, slack, allowed, level, floor)
-        run.upload(points, images)
-        bounds = run.block_bounds()
+        level = self._first_level(points, grid) if level is None else level
+        run = _Run(self, grid, slack, self.masks(grid, allowed), level, floor)
+        run.place(points, images)
         if level == 0:
-            run.keep_all(bounds)
+            run.keep_all()
         else:
-            run.descend_best(bounds)
-            run.descend_all(bounds)
+            run.dive()
+            run.descend_all()
         return run.found()
+
+    def _first_level(self, points: Sequence[np.ndarray], grid: PoseGrid) -> int:
+        """Return the level whose blocks are bounded first."""
+        level = self.tables.levels
+        sums = max(map(len, points)) * grid.headings.shape[1] * grid.height * grid.width
+        return level - 1 if level > 1 and sums >> (2 * level - 2) <= _MOST_SUMS else level
+
+    def masks(self, grid: PoseGrid, allowed: np.ndarray | None) -> list[Buffer]:
+        """Return masks of each level on the device; the last ones are kept."""
+        shape = (grid.height, grid.width)
+        if self._masks[0] is not allowed or self._masks[1] != shape:
+            host = _pooled_masks(np.ones(shape, bool) if allowed is None else allowed, self.tables.levels)
+            self._masks = allowed, shape, [self.tables.backend.upload(mask.astype(np.uint8)) for mask in host]
+        return self._masks[2]
 
 
 class _Run:
     """One search: its items, the lower bounds of scans, and the poses so far."""
 
     def __init__(
-        self, search: Search, grid: PoseGrid, slack: int, allowed: np.ndarray | None, level: int, floor: int
+        self, search: Search, grid: PoseGrid, slack: int | np.ndarray, allowed: list[Buffer], level: int, floor: int
     ) -> None:
-        self._tables, self._backend, self._space = search.tables, search._backend, search._space
-        self._grid, self._slack, self._level = grid, slack, level
+        self._tables, self._backend, self._space = search.tables, search.tables.backend, search.space
+        self._grid, self._slack, self._level, self._allowed = grid, slack, level, allowed
         scans, self._turns = grid.headings.shape
+        self._height, self._width = (-(-size >> level) for size in (grid.height, grid.width))
         self._best = np.full(scans, -1, np.int64)
         # Poses with lower scores are dropped.
         self._least = floor
@@ -96,205 +124,247 @@ class _Run:
         self._complete = np.ones(scans, bool)
         # True if all kept poses of a scan have the best score.
         self._full = np.zeros(scans, bool)
-        self._kept: list[tuple[np.ndarray, np.ndarray]] = []
+        self._kept: list[np.ndarray] = []
         self._evaluated = 0
-        self._allowed = None if allowed is None else _pooled_masks(allowed, level)
+        self._bounds_made: Buffer | None = None
+        # The lower bounds on the device, and the counts of launches.
+        self._low: Buffer | None = None
+        self._floor_there: np.ndarray | None = None
+        self._counts, self._slot = None, -1
 
-    def upload(self, points: Sequence[np.ndarray], images: Sequence[np.ndarray] | None) -> None:
-        """Place the end points of all scans at all headings, and copy them to the device."""
-        grid, tables = self._grid, self._tables
-        cells = [
-            end_cells(part, headings, start)
-            for part, headings, start in zip(points, grid.headings, grid.start, strict=True)
-        ]
+    def place(self, points: Sequence[np.ndarray], images: Sequence[np.ndarray] | None) -> None:
+        """Place the end points of all scans at all headings on the device."""
+        grid, space, folded = self._grid, self._space, self._tables.folded(self._level)
         counts = np.repeat([len(part) for part in points], self._turns)
-        self._first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-        flat = np.concatenate([part.reshape(-1, 2) for part in cells]) if cells else np.empty((0, 2), np.int32)
+        first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
         if images is None:
-            several = tables.shape.tables > 1
+            several = self._tables.shape.tables > 1
             images = [np.full(len(part), scan if several else 0) for scan, part in enumerate(points)]
         each = [np.tile(part, self._turns) if part.ndim == 1 else part.reshape(-1) for part in images]
-        image = np.concatenate(each).astype(np.int32)
-        self._host = flat, image
-        upload = self._space.upload
-        self._points = (
-            upload("point", _filled(flat)), upload("image", _filled(image)), upload("first", self._first)
+        turned = np.stack([np.cos(grid.headings), np.sin(grid.headings)], axis=-1)
+        given = (
+            _filled(np.concatenate([*points, np.empty((0, 2))])), turned.reshape(-1), grid.start.astype(np.float64),
+            first, _filled(np.concatenate(each).astype(np.int32)),
         )  # fmt: skip
+        total = max(int(first[-1]), 1)
+        sizes = 2 * total, 2 * total, total, total, len(counts)
+        made: list[Any]
+        uploaded: list[Any]
+        if self._backend.info.float64:
+            uploaded = [space.upload(name, array) for name, array in zip(_GIVEN, given, strict=True)]
+            made = [space.empty(name, size, _INT) for name, size in zip(_MADE, sizes, strict=True)]
+            place = self._backend.compile("place_ends", _NO_FLAGS)
+        else:
+            uploaded = [array.reshape(-1) for array in given]
+            made = [np.zeros(size, np.int32) for size in sizes]
+            place = get_backend("numpy").compile("place_ends", _NO_FLAGS)
+        place((len(counts),), *uploaded, *made, len(counts), self._turns, folded.period, folded.step, folded.offset)
+        if not self._backend.info.float64:
+            uploaded = [space.upload(name, array) for name, array in zip(_GIVEN, given, strict=True)]
+            made = [space.upload(name, array) for name, array in zip(_MADE, made, strict=True)]
+        self._first, self._images = uploaded[-2:]
+        self._points, self._runs = made[0], made[1:]
 
-    def block_bounds(self) -> np.ndarray:
-        """Return (S * A, rows, cols) int32 bounds of all blocks; blocks without an allowed position have -1."""
-        table, shape, period = self._tables.folded(self._level)
-        items = self._grid.headings.size
-        height, width = (-(-size >> self._level) for size in (self._grid.height, self._grid.width))
-        point, image = self._folded_points(period)
-        bounds = np.empty((items, height, width), np.int32)
-        each = min(max(_MOST_SUMS // (height * width), 1), _MOST_ITEMS)
-        flags = with_lanes_flag(self._backend.info.lanes, "shift_scores", _NO_FLAGS)
-        for begin in range(0, items, each):
-            count = min(each, items - begin)
-            first = self._space.upload("part", np.ascontiguousarray(self._first[begin : begin + count + 1]))
-            score = self._space.empty("bounds", count * height * width, _INT)
+    def _bounds(self) -> Buffer:
+        """Start bounding all blocks, and return their scores (S * A, rows, cols) on the device; others have -1."""
+        if self._bounds_made is None:
+            folded, space, items = self._tables.folded(self._level), self._space, self._grid.headings.size
+            run, image, weight, runs = self._runs
+            score = space.empty("bounds", items * self._height * self._width, _INT)
+            flags = with_lanes_flag(self._backend.info.lanes, "shift_scores", _NO_FLAGS)
             shift = self._backend.compile("shift_scores", flags)
-            shift((width, height, count), table, point, image, first, score, shape, count, height, width)
-            self._space.download(score, bounds[begin : begin + count])
-            self._space.wait()
-        self._evaluated += bounds.size
-        if self._allowed is not None:
-            bounds[:, ~self._allowed[self._level]] = -1
-        return bounds
+            for begin in range(0, items, _MOST_ITEMS):
+                end = min(begin + _MOST_ITEMS, items)
+                shift(
+                    (self._width, -(-self._height // SHIFT_ROWS), end - begin), folded.table, run, image, weight,
+                    self._first, runs, self._allowed[self._level], score, folded.shape, begin, end, self._height,
+                    self._width,
+                )  # fmt: skip
+            self._evaluated += items * self._height * self._width
+            self._bounds_made = score
+        return self._bounds_made
 
-    def _folded_points(self, period: int) -> tuple[object, object]:
-        """Return points and images on the device for tables that are folded with a period."""
-        if period == 1:
-            return self._points[0], self._points[1]
-        cells, image = self._host
-        padded = cells + self._tables.shape.margin
-        phase = padded % period
-        folded_image = (image * period + phase[:, 1]) * period + phase[:, 0]
-        return (
-            self._space.upload("folded point", _filled(padded // period)),
-            self._space.upload("folded image", _filled(folded_image.astype(np.int32))),
-        )
-
-    def above(self, bounds: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (M, 3) candidates (item, row, col) with bounds of at least ``floor`` of their scan, and the bounds."""
-        least = np.maximum(np.repeat(floor, len(bounds) // len(floor)), 0).astype(np.int32)
-        flat = np.flatnonzero(bounds >= least[:, None, None])
-        item, rest = np.divmod(flat, bounds[0].size)
-        row, col = np.divmod(rest, bounds.shape[2])
-        candidates = np.stack([item, row << self._level, col << self._level], axis=1).astype(np.int32)
-        return candidates, bounds.reshape(-1)[flat]
-
-    def descend_best(self, bounds: np.ndarray) -> None:
+    def dive(self) -> None:
         """Find first lower bounds: follow the best blocks of each scan, and the best of their parts, down to poses."""
-        scans = len(self._best)
-        flat = bounds.reshape(bounds.shape[0], -1)
-        place = flat.argmax(axis=1)
-        top = np.take_along_axis(flat, place[:, None], axis=1).reshape(scans, self._turns)
-        item = np.argsort(-top, axis=1, kind="stable")[:, :_FIRST] + self._turns * np.arange(scans)[:, None]
-        row, col = np.divmod(place[item.ravel()], bounds.shape[2])
-        candidates = np.stack([item.ravel(), row << self._level, col << self._level], axis=1).astype(np.int32)
-        for level in range(self._level - 1, -1, -1):
-            candidates, score = self._divide(candidates, level)
-            if not len(candidates):
-                return
-            rank = _ranks(candidates[:, 0] // self._turns, score)
-            candidates, score = candidates[rank < _FIRST], score[rank < _FIRST]
-        self._raise(candidates, score)
+        rows, scans = self._grid.headings.size * self._height, len(self._best)
+        self._maxima = self._space.empty("row maxima", 2 * rows, _INT)
+        self._backend.compile("row_maxima", _NO_FLAGS)((rows,), self._bounds(), self._maxima, rows, self._width)
+        best = np.empty((rows, 2), np.int32)
+        self._space.read(self._maxima, best)
+        of_scan = best[:, 0].reshape(scans, -1)
+        # In rising order: the k-th largest of a scan bounds the blocks of a round.
+        self._ladder = np.sort(of_scan, axis=1)
+        least = np.maximum(self._ladder[:, -min(_FIRST, of_scan.shape[1])], 0)
+        flat = np.concatenate([
+            _thinned(np.flatnonzero(values >= low), _FIRST) + scan * of_scan.shape[1]
+            for scan, (values, low) in enumerate(zip(of_scan, least, strict=True))
+        ])  # fmt: skip
+        item, row = np.divmod(flat, self._height)
+        blocks = np.stack([item, row << self._level, best[flat, 1] << self._level, best[flat, 0]], axis=1)
+        self._follow(blocks, _FIRST)
 
-    def descend_all(self, bounds: np.ndarray) -> None:
+    def _follow(self, blocks: np.ndarray, most: int) -> None:
+        """Raise lower bounds: follow the best parts of blocks, ``most`` of each scan and level, down to poses."""
+        none = np.full(len(self._best), -1)
+        for level in range(self._level - 1, -1, -1):
+            here = self._space.upload("followed", np.ascontiguousarray(blocks, np.int32))
+            made, count = self._divide(here, len(blocks), level, none)
+            if not count:
+                return
+            blocks = self._read(made, count)
+            blocks = blocks[_ranks(blocks[:, 0] // self._turns, blocks[:, 3]) < most]
+        self._raise(blocks)
+
+    def descend_all(self) -> None:
         """Divide all blocks whose bounds reach the floor, each scan's best blocks first."""
-        candidates, bound = self.above(bounds, self._floor)
-        rank = _ranks(candidates[:, 0] // self._turns, bound)
-        most = _FIRST
-        while len(candidates):
-            now = rank < most
-            self._descend(candidates[now])
-            rest = ~now & (bound >= self._floor[candidates[:, 0] // self._turns])
-            candidates, bound, rank = candidates[rest], bound[rest], rank[rest]
-            most *= _GROWTH
-
-    def _descend(self, candidates: np.ndarray) -> None:
-        """Divide blocks down to poses, and keep those that reach the floor."""
-        for level in range(self._level - 1, -1, -1):
-            candidates, score = self._divide(candidates, level)
-            reached = score >= self._floor[candidates[:, 0] // self._turns]
-            candidates, score = candidates[reached], score[reached]
-            if not len(candidates):
+        most, high = _FIRST, np.full(len(self._best), _HIGHEST)
+        room = _ROOM
+        while True:
+            # Blocks without an allowed position have -1.
+            floor = np.maximum(self._floor, 0)
+            most = min(most * _GROWTH, self._ladder.shape[1])
+            low = floor if most == self._ladder.shape[1] else np.maximum(self._ladder[:, -most], floor)
+            blocks, count = self._choose(low, high, room)
+            if count > room:
+                room = count
+                blocks, count = self._choose(low, high, room)
+            if count > _CROWDED and high[0] == _HIGHEST:
+                # Many equal bounds: some of the blocks raise the floor before all are divided.
+                self._follow(_thinned(self._read(blocks, count), _CROWDED // 8), _CROWDED // 8)
+            self._descend(blocks, count, self._level)
+            if (low <= floor).all():
                 return
-        self._raise(candidates, score)
-        self.keep(candidates, score)
+            high = low
 
-    def _divide(self, candidates: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the allowed quarters of blocks of a level, with their bounds."""
-        half = 1 << level
-        parts = (candidates[:, None] + np.array([[0, i, j] for i in (0, half) for j in (0, half)])).reshape(-1, 3)
-        parts = parts[(parts[:, 1] < self._grid.height) & (parts[:, 2] < self._grid.width)]
-        if self._allowed is not None:
-            parts = parts[self._allowed[level][parts[:, 1] >> level, parts[:, 2] >> level]]
-        parts = parts.astype(np.int32)
-        return parts, self._scores(parts, level)
+    def _choose(self, low: np.ndarray, high: np.ndarray, room: int) -> tuple[Buffer, int]:
+        """Return the blocks whose bounds lie between two scores of their scan, and their number."""
+        space, rows = self._space, self._grid.headings.size * self._height
+        made = space.empty("blocks", 4 * room, _INT)
+        limits = [space.upload(name, part.astype(np.int32)) for name, part in (("low", low), ("high", high))]
+        self._floor_there = low
+        count, slot = self._counter()
+        self._backend.compile("choose_blocks", _NO_FLAGS)(
+            (rows,), self._bounds(), self._maxima, *limits, made, count, rows, self._height, self._width, self._turns,
+            self._level, room, slot,
+        )  # fmt: skip
+        return made, self._counted()
 
-    def _scores(self, candidates: np.ndarray, level: int) -> np.ndarray:
-        """Return the scores of candidates in the tables of a level."""
-        count = len(candidates)
-        score = np.empty(count, np.int32)
-        if count:
-            shifts = candidates * np.array([1, self._tables.stride, self._tables.stride], np.int32)
-            chosen = self._space.upload("candidate", shifts)
-            sums = self._space.empty("sums", count, _INT)
-            kernel = self._backend.compile("candidate_scores", _NO_FLAGS)
-            kernel((count,), self._tables.level(level), *self._points, chosen, sums, self._tables.shape, count)
-            self._space.download(sums, score)
-            self._space.wait()
-            self._evaluated += count
-        return score
+    def _descend(self, blocks: Buffer, count: int, level: int) -> None:
+        """Divide blocks of a level down to poses, and keep those that reach the floor."""
+        for begin in range(0, count, _MOST_BLOCKS):
+            part = self._backend.part(blocks, 4 * begin, 4 * min(_MOST_BLOCKS, count - begin), _INT)
+            made, some = self._divide(part, min(_MOST_BLOCKS, count - begin), level - 1, self._floor)
+            if some and level > 1:
+                self._descend(made, some, level - 1)
+            elif some:
+                poses = self._read(made, some)
+                self._raise(poses)
+                self.keep(poses)
 
-    def _raise(self, candidates: np.ndarray, score: np.ndarray) -> None:
+    def _divide(self, blocks: Buffer, count: int, level: int, low: np.ndarray) -> tuple[Buffer, int]:
+        """Return the allowed quarters of blocks whose bounds reach ``low`` of their scan, and their number."""
+        if not count:
+            return blocks, 0
+        space, tables = self._space, self._tables
+        made = space.empty(f"parts {level}", 16 * count, _INT)
+        if self._floor_there is None or not np.array_equal(self._floor_there, low):
+            self._low = space.upload("low", low.astype(np.int32))
+            self._floor_there = low.copy()
+        counter, slot = self._counter()
+        self._backend.compile("divide_blocks", _NO_FLAGS)(
+            (count,), tables.level(level), self._points, self._images, self._first, blocks, self._allowed[level],
+            self._low, made, counter, tables.shape, count, self._grid.height, self._grid.width,
+            -(-self._grid.width >> level), self._turns, level, tables.stride, slot,
+        )  # fmt: skip
+        self._evaluated += 4 * count
+        return made, self._counted()
+
+    def _counter(self) -> tuple[Buffer, int]:
+        """Return the buffer of counts, and the index of one that is 0."""
+        self._slot = (self._slot + 1) % _COUNTS
+        if self._slot == 0:
+            self._counts = self._space.upload("count", np.zeros(_COUNTS, np.int32))
+        return self._counts, self._slot
+
+    def _counted(self) -> int:
+        """Wait, and return the last count."""
+        counts = np.empty(self._slot + 1, np.int32)
+        self._space.read(self._counts, counts)
+        return int(counts[-1])
+
+    def _read(self, blocks: Buffer, count: int) -> np.ndarray:
+        """Return blocks (M, 4), items, rows, columns and scores, by item, row and column."""
+        host = np.empty((count, 4), np.int32)
+        self._space.read(blocks, host)
+        order = np.lexsort((host[:, 2], host[:, 1], host[:, 0]))
+        ordered: np.ndarray = host[order]
+        return ordered
+
+    def _raise(self, poses: np.ndarray) -> None:
         """Raise the lower bounds of scans."""
-        np.maximum.at(self._best, candidates[:, 0] // self._turns, score)
+        np.maximum.at(self._best, poses[:, 0] // self._turns, poses[:, 3])
         np.maximum(self._floor, np.where(self._best >= 0, self._best - self._slack, -1), out=self._floor)
 
-    def keep_all(self, scores: np.ndarray) -> None:
+    def keep_all(self) -> None:
         """Keep the best of all poses of each scan."""
+        height, width = self._height, self._width
+        scores = np.empty((self._grid.headings.size, height, width), np.int32)
+        self._space.read(self._bounds(), scores)
         self._best = scores.reshape(len(self._best), -1).max(axis=1, initial=-1).astype(np.int64)
         self._floor = np.maximum(np.where(self._best >= 0, self._best - self._slack, -1), self._least)
         # In the order of equal poses: where most poses score alike, a few rows have enough of them.
-        height, width = scores.shape[1:]
         rows = max(_MOST_KEPT // (self._turns * width), 1)
         for scan in range(len(self._best)):
             part = scores[scan * self._turns : (scan + 1) * self._turns]
             for row in range(0, height, rows):
-                candidates, score = self.above(part[:, row : row + rows], self._floor[scan : scan + 1])
-                self.keep(candidates + np.array([scan * self._turns, row, 0], np.int32), score)
+                block = part[:, row : row + rows]
+                item, line, col = np.nonzero(block >= max(self._floor[scan], 0))
+                poses = np.stack([item + scan * self._turns, line + row, col, block[item, line, col]], axis=1)
+                self.keep(poses)
                 if self._full[scan]:
                     break
 
-    def keep(self, candidates: np.ndarray, score: np.ndarray) -> None:
+    def keep(self, poses: np.ndarray) -> None:
         """Keep poses that reach the floor; with too many of them, raise the floor."""
-        reached = score >= self._floor[candidates[:, 0] // self._turns]
-        self._kept.append((candidates[reached], score[reached]))
-        if sum(len(part) for _, part in self._kept) > _MOST_KEPT:
+        self._kept.append(poses[poses[:, 3] >= self._floor[poses[:, 0] // self._turns]])
+        if sum(map(len, self._kept)) > _MOST_KEPT * len(self._best):
             self._compact()
 
     def _compact(self) -> None:
         """Drop poses below the floor, raise it for scans with too many poses, and keep the first of equal poses."""
-        candidates, score = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
-        scan = candidates[:, 0] // self._turns
-        share = max(_MOST_KEPT // len(self._best), 1)
-        crowded = (_ranks(scan, score) == share) & (score >= self._floor[scan])
+        poses = np.concatenate(self._kept)
+        scan, score = poses[:, 0] // self._turns, poses[:, 3]
+        crowded = (_ranks(scan, score) == _MOST_KEPT) & (score >= self._floor[scan])
         np.maximum.at(self._floor, scan[crowded], np.minimum(score[crowded] + 1, self._best[scan[crowded]]))
         self._complete[scan[crowded]] = False
         self._full[scan[crowded]] = score[crowded] == self._best[scan[crowded]]
-        order = self._order(candidates, score)
-        candidates, score, scan = candidates[order], score[order], scan[order]
-        reached = (score >= self._floor[scan]) & (_ranks(scan, score) < share)
-        self._kept = [(candidates[reached], score[reached])]
+        poses = self._ordered(poses)
+        scan, score = poses[:, 0] // self._turns, poses[:, 3]
+        self._kept = [poses[(score >= self._floor[scan]) & (_ranks(scan, score) < _MOST_KEPT)]]
 
-    def _order(self, candidates: np.ndarray, score: np.ndarray) -> np.ndarray:
-        """Return the order of scans, falling scores, rows, columns and headings."""
-        scan, heading = np.divmod(candidates[:, 0], self._turns)
-        order: np.ndarray = np.lexsort((heading, candidates[:, 2], candidates[:, 1], -score, scan))
-        return order
+    def _ordered(self, poses: np.ndarray) -> np.ndarray:
+        """Return poses by scan, falling score, row, column and heading."""
+        scan, heading = np.divmod(poses[:, 0], self._turns)
+        ordered: np.ndarray = poses[np.lexsort((heading, poses[:, 2], poses[:, 1], -poses[:, 3], scan))]
+        return ordered
 
     def found(self) -> Found:
         """Return the poses in falling order of score."""
-        self._kept.append((np.empty((0, 3), np.int32), np.empty(0, np.int32)))
-        candidates, score = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
-        reached = score >= self._floor[candidates[:, 0] // self._turns]
-        candidates, score = candidates[reached], score[reached]
-        order = self._order(candidates, score)
-        scan, heading = np.divmod(candidates[:, 0], self._turns)
-        row, col = candidates[:, 1], candidates[:, 2]
-        return Found(
-            scan[order], row[order], col[order], heading[order], score[order], self._evaluated, self._complete
-        )  # fmt: skip
+        poses = np.concatenate([np.empty((0, 4), np.int32), *self._kept])
+        poses = self._ordered(poses[poses[:, 3] >= self._floor[poses[:, 0] // self._turns]])
+        scan, heading = np.divmod(poses[:, 0], self._turns)
+        return Found(scan, poses[:, 1], poses[:, 2], heading, poses[:, 3], self._evaluated, self._complete)
 
 
 def _filled(array: np.ndarray) -> np.ndarray:
-    """Return an array with at least one row, since buffers are never empty."""
-    array = np.ascontiguousarray(array, np.int32)
-    return array if len(array) else np.zeros((1, *array.shape[1:]), np.int32)
+    """Return a flat array of at least two numbers, since buffers are never empty."""
+    flat = np.ascontiguousarray(array).reshape(-1)
+    return flat if len(flat) else np.zeros(2, flat.dtype)
+
+
+def _thinned(index: np.ndarray, most: int) -> np.ndarray:
+    """Return at most ``most`` of the rows, evenly spaced: many bounds are equal, most of all the largest."""
+    return index if len(index) <= most else index[np.arange(most) * len(index) // most]
 
 
 def _ranks(scan: np.ndarray, score: np.ndarray) -> np.ndarray:

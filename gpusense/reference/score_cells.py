@@ -6,9 +6,6 @@ import numpy as np
 
 from gpusense.interface.structs import ScoreTable
 
-# Columns of a run that a kernel in lanes reads at once; the margin holds one run.
-RUN = 16
-
 
 def padded_lines(scores: ScoreTable) -> int:
     """Return the rows of a table with its margin."""
@@ -23,5 +20,5 @@ def padded_stride(scores: ScoreTable) -> int:
 def cell_index(scores: ScoreTable, row: np.ndarray, col: np.ndarray) -> np.ndarray:
     """Return the index of a cell in its table; cells beyond the margin have the value of the margin's outer cells."""
     line = np.minimum(np.maximum(row, -scores.margin), scores.rows + scores.margin - 1) + scores.margin
-    begin = np.minimum(np.maximum(col, -scores.margin), scores.cols + scores.margin - RUN) + scores.margin
+    begin = np.minimum(np.maximum(col, -scores.margin), scores.cols + scores.margin - 1) + scores.margin
     return line * padded_stride(scores) + begin

@@ -2,6 +2,8 @@
 
 // Columns of a run that a kernel in lanes reads at once; the margin holds one run.
 #define RUN 16
+// Neighbouring rows of shifts that a work-item sums; the margin holds as many.
+#define SHIFT_ROWS 8
 
 // Return the rows of a table with its margin.
 int padded_lines(const ScoreTable scores) { return scores.rows + 2 * scores.margin; }
@@ -9,11 +11,12 @@ int padded_lines(const ScoreTable scores) { return scores.rows + 2 * scores.marg
 // Return the columns of a table with its margin.
 int padded_stride(const ScoreTable scores) { return scores.cols + 2 * scores.margin; }
 
-// Return the index of a cell in its table; cells beyond the margin have the value of the margin's outer cells.
-int cell_index(const ScoreTable scores, const int row, const int col) {
+// Return the index of a cell in its table, from which cells up to rows lines and cols columns further are read; cells beyond
+// the margin have the value of the margin's outer cells.
+int block_index(const ScoreTable scores, const int row, const int col, const int rows, const int cols) {
     // Comparisons, since PoCL compiles min and max as calls.
-    const int low = -scores.margin, last_line = scores.rows + scores.margin - 1;
-    const int last_col = scores.cols + scores.margin - RUN;
+    const int low = -scores.margin, last_line = scores.rows + scores.margin - 1 - rows;
+    const int last_col = scores.cols + scores.margin - 1 - cols;
     const int line = (row < low ? low : row > last_line ? last_line : row) + scores.margin;
     const int begin = (col < low ? low : col > last_col ? last_col : col) + scores.margin;
     return line * padded_stride(scores) + begin;

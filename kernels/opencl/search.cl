@@ -7,7 +7,8 @@
 //
 // Tables are consecutive, each with a margin of cells around the map. An item is a scan at a heading; its points are
 // first[item] to first[item + 1] - 1, each of which names the table (image) that it reads. A folded table holds every
-// period-th cell of a table as a separate image: shifts by whole periods read neighbours.
+// period-th cell of a table as a separate image: shifts by whole periods read neighbours. A run is a number of neighbouring
+// points that read the same cell.
 // requires: score_cells
 
 // Write the maximum of each cell and the cells up to reach rows and columns further. One work-item takes a cell.
@@ -22,42 +23,104 @@ kernel void pool_scores(ARGUMENTS) {
     pooled[(image * lines + line) * stride + col] = (uchar)max(upper, lower);
 }
 
-// Write every period-th row and column of each padded table as an image, for each of period^2 first cells. One work-item
-// takes a cell of an image.
+// Write every period-th row and column of each padded table as an image, for each of (period / step)^2 first cells, step
+// apart. One work-item takes a cell of an image.
 kernel void fold_scores(ARGUMENTS) {
     const int col = get_global_id(0), line = get_global_id(1), image = get_global_id(2);
     const int lines = padded_lines(folded), stride = padded_stride(folded);
     if (col >= stride || line >= lines || image >= folded.tables) return;
-    const int source = image / (period * period), phase = image % (period * period);
-    const int from_line = (line - folded.margin) * period + phase / period;
-    const int from_col = (col - folded.margin) * period + phase % period;
+    const int side = period / step, source = image / (side * side), phase = image % (side * side);
+    const int from_line = (line - folded.margin) * period + phase / side * step;
+    const int from_col = (col - folded.margin) * period + phase % side * step;
     const int rows = padded_lines(scores), cols = padded_stride(scores);
     const bool within = line >= folded.margin && col >= folded.margin && from_line < rows && from_col < cols;
     out[(image * lines + line) * stride + col] =
         within ? table[(source * rows + from_line) * cols + from_col] : (uchar)beyond;
 }
 
-// Sum the cells of each item's points at all shifts by less than height rows and width columns. One work-item takes a
-// shift of an item.
+// Sum the cells of each item's runs at all shifts by less than height rows and width columns; a shift that is not allowed
+// has -1. One work-item takes SHIFT_ROWS rows of a column of an item.
 kernel void shift_scores(ARGUMENTS) {
-    const int col = get_global_id(0), row = get_global_id(1), item = get_global_id(2);
+    const int col = get_global_id(0), row = SHIFT_ROWS * get_global_id(1), item = begin + get_global_id(2);
     if (col >= width || row >= height || item >= items) return;
-    const int size = padded_lines(scores) * padded_stride(scores), last = first[item + 1];
-    int total = 0;
-    for (int k = first[item]; k < last; ++k)
-        total += table[image[k] * size + cell_index(scores, point[k].y + row, point[k].x + col)];
-    score[(item * height + row) * width + col] = total;
+    int some = 0;
+    for (int i = 0; i < SHIFT_ROWS && row + i < height; ++i) some |= allowed[(row + i) * width + col];
+    const int stride = padded_stride(scores), size = padded_lines(scores) * stride;
+    const int last = first[item] + (some ? runs[item] : 0);
+    int total[SHIFT_ROWS] = {0};
+    for (int k = first[item]; k < last; ++k) {
+        global const uchar *cells =
+            table + image[k] * size + block_index(scores, run[k].y + row, run[k].x + col, SHIFT_ROWS - 1, 0);
+        for (int i = 0; i < SHIFT_ROWS; ++i) total[i] += weight[k] * cells[i * stride];
+    }
+    for (int i = 0; i < SHIFT_ROWS && row + i < height; ++i)
+        score[(item * height + row + i) * width + col] = allowed[(row + i) * width + col] ? total[i] : -1;
 }
 
-// Sum the cells of candidates' points; a candidate is an item, and the row and column of its shift. One work-item takes a
-// candidate.
-kernel void candidate_scores(ARGUMENTS) {
+// Find the largest score of each row of shifts, and its first column. One work-item takes a row of an item.
+kernel void row_maxima(ARGUMENTS) {
     const int n = get_global_id(0);
-    if (n >= candidates) return;
-    const int item = candidate[3 * n], row = candidate[3 * n + 1], col = candidate[3 * n + 2];
-    const int size = padded_lines(scores) * padded_stride(scores), last = first[item + 1];
-    int total = 0;
-    for (int k = first[item]; k < last; ++k)
-        total += table[image[k] * size + cell_index(scores, point[k].y + row, point[k].x + col)];
-    score[n] = total;
+    if (n >= rows) return;
+    int most = -1, place = 0;
+    for (int col = 0; col < width; ++col)
+        if (score[n * width + col] > most) {
+            most = score[n * width + col];
+            place = col;
+        }
+    best[2 * n] = most;
+    best[2 * n + 1] = place;
+}
+
+// Collect the shifts whose scores are at least low and less than high of their scan, in no certain order: item, first
+// row and column of each block, and score. count[slot], which the caller clears, may exceed room: then some are left out.
+// best is the result of row_maxima. One work-item takes a row of an item.
+kernel void choose_blocks(ARGUMENTS) {
+    const int k = get_global_id(0);
+    if (k >= rows) return;
+    const int item = k / height, least = low[item / turns], most = high[item / turns];
+    if (best[2 * k] < least) return;
+    for (int col = 0; col < width; ++col) {
+        const int value = score[k * width + col];
+        if (value < least || value >= most) continue;
+        const int n = atomic_add(&count[slot], 1);
+        if (n >= room) continue;
+        block[4 * n] = item;
+        block[4 * n + 1] = k % height << level;
+        block[4 * n + 2] = col << level;
+        block[4 * n + 3] = value;
+    }
+}
+
+// Divide blocks of positions into quarters of 2^level x 2^level, and collect the allowed ones whose scores are at least low
+// of their scan, in no certain order. The caller clears count[slot]. One work-item takes a block.
+kernel void divide_blocks(ARGUMENTS) {
+    const int n = get_global_id(0);
+    if (n >= blocks) return;
+    const int item = block[4 * n], row = block[4 * n + 1], col = block[4 * n + 2], quarter = 1 << level;
+    const int stride = padded_stride(scores), size = padded_lines(scores) * stride, reach = spacing * quarter;
+    const int last = first[item + 1], least = low[item / turns], below = reach * stride;
+    int total[4] = {0, 0, 0, 0};
+    for (int k = first[item]; k < last; ++k) {
+        global const uchar *cells = table + image[k] * size +
+                                    block_index(scores, point[k].y + spacing * row, point[k].x + spacing * col, reach, reach);
+        total[0] += cells[0];
+        total[1] += cells[reach];
+        total[2] += cells[below];
+        total[3] += cells[below + reach];
+        // No sum of the remaining points can reach the least score.
+        if (k % 32 == 31) {
+            const int upper = total[0] > total[1] ? total[0] : total[1], lower = total[2] > total[3] ? total[2] : total[3];
+            if ((upper > lower ? upper : lower) + 255 * (last - k - 1) < least) return;
+        }
+    }
+    for (int i = 0; i < 4; ++i) {
+        const int part_row = row + i / 2 * quarter, part_col = col + i % 2 * quarter;
+        if (part_row >= height || part_col >= width || total[i] < least) continue;
+        if (!allowed[(part_row >> level) * columns + (part_col >> level)]) continue;
+        const int m = atomic_add(&count[slot], 1);
+        part[4 * m] = item;
+        part[4 * m + 1] = part_row;
+        part[4 * m + 2] = part_col;
+        part[4 * m + 3] = total[i];
+    }
 }

@@ -4,8 +4,8 @@ import warp as wp
 
 from .prelude import precision
 
-# Columns of a run that a kernel in lanes reads at once; the margin holds one run.
-RUN = wp.constant(16)
+# Neighbouring rows of shifts that a work-item sums; the margin holds as many.
+SHIFT_ROWS = 8
 # The struct has integers only, and so is the same in both precisions.
 ScoreTable = precision(frozenset()).ScoreTable
 
@@ -22,9 +22,10 @@ def padded_stride(scores: ScoreTable):
     return scores.cols + 2 * scores.margin
 
 
-# Return the index of a cell in its table; cells beyond the margin have the value of the margin's outer cells.
+# Return the index of a cell in its table, from which cells up to rows lines and cols columns further are read; cells
+# beyond the margin have the value of the margin's outer cells.
 @wp.func
-def cell_index(scores: ScoreTable, row: wp.int32, col: wp.int32):
-    line = wp.min(wp.max(row, -scores.margin), scores.rows + scores.margin - 1) + scores.margin
-    begin = wp.min(wp.max(col, -scores.margin), scores.cols + scores.margin - RUN) + scores.margin
+def block_index(scores: ScoreTable, row: wp.int32, col: wp.int32, rows: wp.int32, cols: wp.int32):
+    line = wp.min(wp.max(row, -scores.margin), scores.rows + scores.margin - 1 - rows) + scores.margin
+    begin = wp.min(wp.max(col, -scores.margin), scores.cols + scores.margin - 1 - cols) + scores.margin
     return line * padded_stride(scores) + begin

@@ -8,13 +8,17 @@ integers, so a bound is never below a score that it bounds.
 
 Tables are consecutive, each with a margin of cells around the map. An item is a scan at a heading; its points are
 first[item] to first[item + 1] - 1, each of which names the table (image) that it reads. A folded table holds every
-period-th cell of a table as a separate image: shifts by whole periods read neighbours.
+period-th cell of a table as a separate image: shifts by whole periods read neighbours. A run is a number of
+neighbouring points that read the same cell.
 """
 
 import warp as wp
 
 from .prelude import kernel
-from .score_cells import cell_index, padded_lines, padded_stride
+from .score_cells import SHIFT_ROWS, block_index, padded_lines, padded_stride
+
+# Sums of neighbouring rows.
+Rows = wp.types.vector(length=SHIFT_ROWS, dtype=wp.int32)
 
 
 # Write the maximum of each cell and the cells up to reach rows and columns further. One work-item takes a cell.
@@ -33,19 +37,20 @@ def pool_scores(table, pooled, scores, reach):
     pooled[begin + line * stride + col] = wp.max(upper, lower)
 
 
-# Write every period-th row and column of each padded table as an image, for each of period^2 first cells. One work-item
-# takes a cell of an image.
+# Write every period-th row and column of each padded table as an image, for each of (period / step)^2 first cells, step
+# apart. One work-item takes a cell of an image.
 @kernel()
-def fold_scores(table, out, scores, folded, period, beyond):
+def fold_scores(table, out, scores, folded, period, step, beyond):
     image, line, col = wp.tid()
     lines = padded_lines(folded)
     stride = padded_stride(folded)
     if col >= stride or line >= lines or image >= folded.tables:
         return
-    source = image // (period * period)
-    phase = image % (period * period)
-    from_line = (line - folded.margin) * period + phase // period
-    from_col = (col - folded.margin) * period + phase % period
+    side = period // step
+    source = image // (side * side)
+    phase = image % (side * side)
+    from_line = (line - folded.margin) * period + phase // side * step
+    from_col = (col - folded.margin) * period + phase % side * step
     rows = padded_lines(scores)
     cols = padded_stride(scores)
     value = wp.uint8(beyond)
@@ -54,37 +59,120 @@ def fold_scores(table, out, scores, folded, period, beyond):
     out[(image * lines + line) * stride + col] = value
 
 
-# Sum the cells of each item's points at all shifts by less than height rows and width columns. One work-item takes a
-# shift of an item.
+# Sum the cells of each item's runs at all shifts by less than height rows and width columns; a shift that is not
+# allowed has -1. One work-item takes SHIFT_ROWS rows of a column of an item.
 @kernel()
-def shift_scores(table, point, image, first, score, scores, items, height, width):
-    item, row, col = wp.tid()
+def shift_scores(table, run, image, weight, first, runs, allowed, score, scores, begin, items, height, width):
+    part, block, col = wp.tid()
+    item = begin + part
+    row = SHIFT_ROWS * block
     if col >= width or row >= height or item >= items:
         return
-    size = padded_lines(scores) * padded_stride(scores)
-    total = int(0)
-    for k in range(first[item], first[item + 1]):
-        cell = point[k]
-        total += int(table[image[k] * size + cell_index(scores, cell.y + row, cell.x + col)])
-    score[(item * height + row) * width + col] = total
+    some = int(0)
+    for i in range(wp.min(SHIFT_ROWS, height - row)):
+        some = some + int(allowed[(row + i) * width + col])
+    stride = padded_stride(scores)
+    size = padded_lines(scores) * stride
+    last = first[item]
+    if some > 0:
+        last = first[item] + runs[item]
+    total = Rows()
+    for k in range(first[item], last):
+        cell = run[k]
+        place = image[k] * size + block_index(scores, cell.y + row, cell.x + col, SHIFT_ROWS - 1, 0)
+        for i in range(SHIFT_ROWS):
+            total[i] = total[i] + weight[k] * int(table[place + i * stride])
+    for i in range(SHIFT_ROWS):
+        if row + i < height:
+            n = (row + i) * width + col
+            value = int(-1)
+            if allowed[n] > wp.uint8(0):
+                value = total[i]
+            score[item * height * width + n] = value
 
 
-# Sum the cells of candidates' points; a candidate is an item, and the row and column of its shift. One work-item takes
-# a candidate.
+# Find the largest score of each row of shifts, and its first column. One work-item takes a row of an item.
 @kernel()
-def candidate_scores(table, point, image, first, candidate, score, scores, candidates):
+def row_maxima(score, best, rows, width):
     n = wp.tid()
-    if n >= candidates:
+    if n >= rows:
         return
-    item = candidate[3 * n]
-    row = candidate[3 * n + 1]
-    col = candidate[3 * n + 2]
-    size = padded_lines(scores) * padded_stride(scores)
-    total = int(0)
-    for k in range(first[item], first[item + 1]):
+    most = int(-1)
+    place = int(0)
+    for col in range(width):
+        if score[n * width + col] > most:
+            most = score[n * width + col]
+            place = col
+    best[2 * n] = most
+    best[2 * n + 1] = place
+
+
+# Collect the shifts whose scores are at least low and less than high of their scan, in no certain order: item, first
+# row and column of each block, and score. count[slot], which the caller clears, may exceed room: then some are left
+# out. best is the result of row_maxima. One work-item takes a row of an item.
+@kernel()
+def choose_blocks(score, best, low, high, block, count, rows, height, width, turns, level, room, slot):
+    k = wp.tid()
+    if k >= rows:
+        return
+    item = k // height
+    least = low[item // turns]
+    most = high[item // turns]
+    if best[2 * k] < least:
+        return
+    for col in range(width):
+        value = score[k * width + col]
+        if value >= least and value < most:
+            n = wp.atomic_add(count, slot, 1)
+            if n < room:
+                block[4 * n] = item
+                block[4 * n + 1] = (k % height) << level
+                block[4 * n + 2] = col << level
+                block[4 * n + 3] = value
+
+
+# Divide blocks of positions into quarters of 2^level x 2^level, and collect the allowed ones whose scores are at least
+# low of their scan, in no certain order. The caller clears count[slot]. One work-item takes a block.
+@kernel()
+def divide_blocks(
+    table, point, image, first, block, allowed, low, part, count, scores, blocks, height, width, columns, turns, level,
+    spacing, slot,
+):  # fmt: skip
+    n = wp.tid()
+    if n >= blocks:
+        return
+    item = block[4 * n]
+    row = block[4 * n + 1]
+    col = block[4 * n + 2]
+    quarter = 1 << level
+    stride = padded_stride(scores)
+    size = padded_lines(scores) * stride
+    reach = spacing * quarter
+    last = first[item + 1]
+    least = low[item // turns]
+    below = reach * stride
+    total = wp.vec4i()
+    for k in range(first[item], last):
         cell = point[k]
-        total += int(table[image[k] * size + cell_index(scores, cell.y + row, cell.x + col)])
-    score[n] = total
+        begin = image[k] * size
+        begin += block_index(scores, cell.y + spacing * row, cell.x + spacing * col, reach, reach)
+        total[0] = total[0] + int(table[begin])
+        total[1] = total[1] + int(table[begin + reach])
+        total[2] = total[2] + int(table[begin + below])
+        total[3] = total[3] + int(table[begin + below + reach])
+        # No sum of the remaining points can reach the least score.
+        if k % 32 == 31 and wp.max(total) + 255 * (last - k - 1) < least:
+            return
+    for i in range(4):
+        part_row = row + i // 2 * quarter
+        part_col = col + i % 2 * quarter
+        if part_row < height and part_col < width and total[i] >= least:
+            if allowed[(part_row >> level) * columns + (part_col >> level)] > wp.uint8(0):
+                m = wp.atomic_add(count, slot, 1)
+                part[4 * m] = item
+                part[4 * m + 1] = part_row
+                part[4 * m + 2] = part_col
+                part[4 * m + 3] = total[i]
 
 
 def make(name, flags):

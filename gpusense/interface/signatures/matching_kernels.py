@@ -8,7 +8,6 @@ from gpusense.interface.signatures.rows import PLACED, WINDOW, Kernel, kernel
 # Points of all scans, sorted by bearing in each scan: x, y [m], bearing in [0, 2 pi), range [m].
 _POINTS = ("real4 point [points]", "int start [scans + 1]")
 _CELLS = "uchar table [scores.tables * (scores.rows + 2 * scores.margin) * (scores.cols + 2 * scores.margin)]"
-_CELL_POINTS = ("int2 point [points]", "int image [points]", "int first [items + 1]")
 
 KERNELS: dict[str, Kernel] = {
     "field_gradient": kernel(
@@ -44,14 +43,32 @@ KERNELS: dict[str, Kernel] = {
     "fold_scores": kernel(
         "search", "col line image", _CELLS,
         "out uchar out [folded.tables * (folded.rows + 2 * folded.margin) * (folded.cols + 2 * folded.margin)]",
-        "ScoreTable scores", "ScoreTable folded", "int period", "int beyond",
+        "ScoreTable scores", "ScoreTable folded", "int period", "int step", "int beyond",
+    ),
+    "place_ends": kernel(
+        "search_ends", "item", "double end [2 * ends]", "double heading [2 * items]", "double start [2 * scans]",
+        "int first [items + 1]", "int image [points]", "out int2 point [points]", "out int2 run [points]",
+        "out int run_image [points]", "out int weight [points]", "out int runs [items]", "int items", "int turns",
+        "int period", "int step", "int offset",
     ),
     "shift_scores": kernel(
-        "search", "col row item", _CELLS, *_CELL_POINTS, "out int score [items * height * width]", "ScoreTable scores",
-        "int items", "int height", "int width", in_lanes=True,
+        "search", "col rows item", _CELLS, "int2 run [points]", "int image [points]", "int weight [points]",
+        "int first [items + 1]", "int runs [items]", "uchar allowed [height * width]",
+        "out int score [items * height * width]", "ScoreTable scores", "int begin", "int items", "int height",
+        "int width", in_lanes=True,
     ),
-    "candidate_scores": kernel(
-        "search", "candidate", _CELLS, *_CELL_POINTS, "int candidate [3 * candidates]", "out int score [candidates]",
-        "ScoreTable scores", "int candidates",
+    "row_maxima": kernel(
+        "search", "row", "int score [rows * width]", "out int best [2 * rows]", "int rows", "int width",
+    ),
+    "choose_blocks": kernel(
+        "search", "row", "int score [rows * width]", "int best [2 * rows]", "int low [scans]", "int high [scans]",
+        "out int block [4 * room]", "out int count [counts]", "int rows", "int height", "int width", "int turns",
+        "int level", "int room", "int slot",
+    ),
+    "divide_blocks": kernel(
+        "search", "block", _CELLS, "int2 point [points]", "int image [points]", "int first [items + 1]",
+        "int block [4 * blocks]", "uchar allowed [rows * columns]", "int low [scans]", "out int part [16 * blocks]",
+        "out int count [counts]", "ScoreTable scores", "int blocks", "int height", "int width", "int columns",
+        "int turns", "int level", "int spacing", "int slot",
     ),
 }  # fmt: skip

@@ -1,31 +1,45 @@
-// Exhaustive search over poses: sums at LANES neighbouring shifts at once. The other kernels are those of search.cl.
+// Exhaustive search over poses: sums at LANES neighbouring shifts at once. search.cl has the other kernels.
 // requires: lanes/types score_cells
 
-// Sum the cells of each item's points at all shifts by less than height rows and width columns. One work-item takes
-// LANES shifts of an item. A sum of 256 cells fits 16 bits.
+// Sum the cells of each item's runs at all shifts by less than height rows and width columns; a shift that is not allowed
+// has -1. One work-item takes SHIFT_ROWS rows of LANES shifts of an item. A sum of 256 cells fits 16 bits.
 kernel void shift_scores(ARGUMENTS) {
-    const int col = LANES * get_global_id(0), row = get_global_id(1), item = get_global_id(2);
+    const int col = LANES * get_global_id(0), row = SHIFT_ROWS * get_global_id(1), item = begin + get_global_id(2);
     if (col >= width || row >= height || item >= items) return;
-    const int size = padded_lines(scores) * padded_stride(scores), last = first[item + 1];
-    uint total[LANES] = {0};
-    for (int begin = first[item]; begin < last; begin += 256) {
-        const int end = begin + 256 < last ? begin + 256 : last;
-        // Two neighbouring bytes are one number of 16 bits, so that no byte is converted.
-        ushort8 even = (ushort8)0, odd = (ushort8)0;
-        for (int k = begin; k < end; ++k) {
-            global const uchar *cells = table + image[k] * size;
-            const ushort8 two = as_ushort8(vload16(0, cells + cell_index(scores, point[k].y + row, point[k].x + col)));
-            even += two & (ushort8)0xff;
-            odd += two >> (ushort8)8;
+    int some = 0;
+    for (int i = 0; i < SHIFT_ROWS && row + i < height; ++i)
+        for (int j = 0; j < LANES && col + j < width; ++j) some |= allowed[(row + i) * width + col + j];
+    const int stride = padded_stride(scores), size = padded_lines(scores) * stride;
+    const int last = first[item] + (some ? runs[item] : 0);
+    uint total[SHIFT_ROWS][LANES] = {{0}};
+    for (int k = first[item]; k < last;) {
+        ushort8 even[SHIFT_ROWS], odd[SHIFT_ROWS];
+        for (int i = 0; i < SHIFT_ROWS; ++i) even[i] = odd[i] = (ushort8)0;
+        for (int summed = 0; k < last && summed + weight[k] <= 256; ++k) {
+            const ushort8 times = (ushort8)(ushort)weight[k];
+            global const uchar *cells = table + image[k] * size +
+                                        block_index(scores, run[k].y + row, run[k].x + col, SHIFT_ROWS - 1, LANES - 1);
+            // Two neighbouring bytes are one number of 16 bits, so that no byte is converted.
+            for (int i = 0; i < SHIFT_ROWS; ++i) {
+                const ushort8 two = as_ushort8(vload16(0, cells + i * stride));
+                even[i] += times * (two & (ushort8)0xff);
+                odd[i] += times * (two >> (ushort8)8);
+            }
+            summed += weight[k];
         }
-        ushort evens[8], odds[8];
-        vstore8(even, 0, evens);
-        vstore8(odd, 0, odds);
-        for (int i = 0; i < 8; ++i) {
-            total[2 * i] += evens[i];
-            total[2 * i + 1] += odds[i];
+        for (int i = 0; i < SHIFT_ROWS; ++i) {
+            ushort evens[8], odds[8];
+            vstore8(even[i], 0, evens);
+            vstore8(odd[i], 0, odds);
+            for (int j = 0; j < 8; ++j) {
+                total[i][2 * j] += evens[j];
+                total[i][2 * j + 1] += odds[j];
+            }
         }
     }
-    global int *out = score + (item * height + row) * width + col;
-    for (int i = 0; i < LANES && col + i < width; ++i) out[i] = total[i];
+    for (int i = 0; i < SHIFT_ROWS && row + i < height; ++i)
+        for (int j = 0; j < LANES && col + j < width; ++j) {
+            const int n = (row + i) * width + col + j;
+            score[item * height * width + n] = allowed[n] ? (int)total[i][j] : -1;
+        }
 }

@@ -52,21 +52,6 @@ class Place:
     scored: tuple[np.ndarray, np.ndarray]
 
 
-def moved(poses: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Move poses by steps in their frames."""
-    c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
-    x, y = steps[..., 0], steps[..., 1]
-    turned = poses[..., 2] + steps[..., 2]
-    return np.stack([poses[..., 0] + c * x - s * y, poses[..., 1] + s * x + c * y, turned], axis=-1)
-
-
-def steps_from(pose: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the steps from a pose to other ones."""
-    off = others - pose
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    return np.stack([c * off[:, 0] + s * off[:, 1], c * off[:, 1] - s * off[:, 0], off[:, 2]], axis=-1)
-
-
 # ---- places
 
 
@@ -81,7 +66,7 @@ def simulated(frames: int, rng: np.random.Generator) -> Place:
         pose = free_pose(grid, rng, 0.4)
         path = [pose]
         while len(path) < 8:
-            path.append(moved(path[-1], np.array([0.15, 0.0, rng.normal(0, 0.15)])))
+            path.append(gs.compose_poses(path[-1], (0.15, 0.0, rng.normal(0, 0.15))))
         places = np.array(path)
         col, row = ((places[:, :2] - grid.origin[:2]) / grid.resolution).astype(int).T
         if grid.free[row, col].all():
@@ -151,10 +136,7 @@ def mixtures(name: str, quick: bool) -> list[tuple[dict[str, float], Any]]:
     if name == FIELD:
         pairs = [(0.1, 0.5)] if quick else itertools.product((0.1, 0.05, 0.2, 0.4), (0.5, 0.1, 0.3, 0.7, 0.9))
         return [
-            (
-                dict(sigma_hit=sigma, z_rand=rand),
-                gs.LikelihoodFieldParameters(z_hit=1 - rand, z_rand=rand, sigma_hit=sigma),
-            )
+            (one := {"sigma_hit": sigma, "z_rand": rand}, gs.LikelihoodFieldParameters(z_hit=1 - rand, **one))
             for sigma, rand in pairs
         ]
     weights = ((0.2, 0.2),) if quick else ((0.2, 0.2), (0.4, 0.2), (0.1, 0.4), (0.4, 0.4))
@@ -217,12 +199,13 @@ def scores(
     found: dict[str, list[float]] = {name: [] for name in ("rank", "information", "error", "global rank", "prior")}
     for last in range(window - 1, len(poses), every):
         frames = slice(last - window + 1, last + 1)
-        truth, back = poses[last], steps_from(poses[last], poses[frames])
+        truth, back = poses[last], gs.pose_difference(poses[last], poses[frames])
         guess = cloud_around(truth, 1, SPREAD_XY, SPREAD_THETA, rng)[0]
         near = np.vstack([truth, cloud_around(guess, particles, SPREAD_XY, SPREAD_THETA, rng)])
         far = np.vstack([truth, cloud_uniform(place.grid, particles, rng)])
         log_near, log_far = (
-            model.log_likelihood(moved(cloud[None], back[:, None]), z[frames]).sum(axis=0) for cloud in (near, far)
+            model.log_likelihood(gs.compose_poses(cloud[None], back[:, None]), z[frames]).sum(axis=0)
+            for cloud in (near, far)
         )
         found["rank"].append(better(log_near))
         found["information"].append(information(log_near))
@@ -379,7 +362,9 @@ def draw_run(place: Place, path: Path) -> None:
 def main() -> int:
     """Measure, draw and write."""
     parser = make_parser(__doc__, backend="auto")
-    parser.add_argument("--data", type=Path, default=os.environ.get("GPUSENSE_DATA"), help="default: GPUSENSE_DATA")
+    parser.add_argument(
+        "--data", dest="recorded", type=Path, default=os.environ.get("GPUSENSE_DATA"), help="default: GPUSENSE_DATA"
+    )
     parser.add_argument("--places", default="building,sonar_pioneer8", help="names, separated by commas")
     parser.add_argument(
         "--scans", type=int, default=100, help="about the number of poses that are scored at each place"
@@ -396,8 +381,8 @@ def main() -> int:
             place = simulated(4 * arguments.scans, np.random.default_rng(3))
             if arguments.figures:
                 draw_scene(place, arguments.figures / "sonar-scene.png", device)
-        elif name == "sonar_pioneer8" and arguments.data is not None:
-            place = recorded(Path(arguments.data) / name, arguments.scans)
+        elif name == "sonar_pioneer8" and arguments.recorded is not None:
+            place = recorded(Path(arguments.recorded) / name, arguments.scans)
             if arguments.figures:
                 draw_run(place, arguments.figures / "sonar-map.png")
         else:

@@ -184,6 +184,7 @@ def test_rectangles_of_small_maps_are_the_best_there_are(form: Planes, as_kind: 
                 np.testing.assert_array_equal(score(planes), best)
 
 
+@pytest.mark.long
 def test_long_rectangles_end_at_255_cells(as_kind: Callable[[str], Backend]) -> None:
     for shape in ((300, 310), (1, 600), (600, 2)):
         occupied = np.zeros(shape, bool)
@@ -200,6 +201,7 @@ def test_long_rectangles_end_at_255_cells(as_kind: Callable[[str], Backend]) -> 
                 assert width.max() == min(255, shape[1]) or height.max() == min(255, shape[0])
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])
 def test_rectangles_of_maps_with_more_rows_or_columns_than_16_bits_count(
@@ -294,6 +296,7 @@ def test_updated_rectangles_are_those_made_anew(
         np.testing.assert_array_equal(planes, np.frombuffer(zlib.decompress(anew), np.uint16).reshape(planes.shape))
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])
 @pytest.mark.parametrize("form", PLANES, ids=repr)

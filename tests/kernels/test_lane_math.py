@@ -161,6 +161,7 @@ def test_ends(in_either):
     assert at("erf_lanes", 0.0, 4.0, 1e9, np.inf) == [0, 1, 1, 1]
 
 
+@pytest.mark.long
 def test_constants_are_those_that_were_derived():
     made, expected = derived("lane_constants"), {}
     with mp.workdps(50):

@@ -114,6 +114,7 @@ FIELD_OPTIONS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.03)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize(

@@ -88,6 +88,7 @@ def test_landmarks(name, side, in_lanes, compiled_lanes):
             assert_alike(wide, one, len(FEATURES))
 
 
+@pytest.mark.long
 def test_unseen_landmarks_have_the_bits_of_one(in_lanes):
     """Without features that could be landmarks, log p is only the count of unseen ones."""
     p, poses = gs.LandmarkParameters(range_max=12.0, field_of_view=3.0), cloud(30.0)

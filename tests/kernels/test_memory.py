@@ -200,6 +200,7 @@ def test_every_warp_kernel_runs_clean_and_right_with_bounds_checks(needs):
     check(run(_WORK, "warp:cpu"))
 
 
+@pytest.mark.long
 def test_warp_detects_a_write_out_of_bounds(needs, tmp_path):
     needs("warp")
     result = run(_WARP_OUT_OF_BOUNDS, "warp:cpu", str(tmp_path))

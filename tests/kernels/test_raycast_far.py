@@ -59,6 +59,7 @@ def rounded(value: Fraction, real: np.dtype) -> Fraction:
     return round(value / unit_in_last_place) * unit_in_last_place
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_counts_of_boundaries_near_the_longest_range(precision):
@@ -86,6 +87,7 @@ def test_counts_of_boundaries_near_the_longest_range(precision):
             assert found[1][i] == low + sum(one <= at for one in far)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_origins_nearly_as_far_off_as_a_range_may_be_long(precision, backend):
     """float64 ranges equal a rational walk's; float32 has the bits of NumPy's walk from cell to cell."""
@@ -114,6 +116,7 @@ def test_origins_nearly_as_far_off_as_a_range_may_be_long(precision, backend):
             )
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_the_longest_corridor(precision, backend):

@@ -14,6 +14,8 @@ from support.bench_scripts import BENCH, run_script
 import gpusense as gs
 from gpusense.chaining.links import CLOSURE, Links
 
+pytestmark = pytest.mark.long
+
 ROWS = 6
 
 

@@ -19,7 +19,7 @@ from gpusense.backends import get_backend
 from gpusense.evaluation.benchmark.runner import Outcome
 
 FOLDER = ROOT / "bench" / "error_vs_time"
-pytestmark = pytest.mark.usefixtures("no_data")
+pytestmark = [pytest.mark.usefixtures("no_data"), pytest.mark.long]
 
 
 @pytest.fixture

@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from support.bench_scripts import BENCH, run_script
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.slow
 def test_features_are_measured(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:

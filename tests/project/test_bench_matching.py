@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from support.bench_scripts import run_here, run_script
 
+pytestmark = pytest.mark.long
+
 
 def test_global_matching_runs(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:
     report = run_here(

@@ -14,6 +14,8 @@ from support.paths import ROOT
 
 from gpusense.backends import get_backend
 
+pytestmark = pytest.mark.long
+
 BENCH = ROOT / "bench"
 
 

@@ -11,6 +11,8 @@ from types import ModuleType
 import pytest
 from support.bench_scripts import BENCH, run_script
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def scaling(monkeypatch: pytest.MonkeyPatch) -> ModuleType:

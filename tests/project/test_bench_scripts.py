@@ -16,6 +16,8 @@ from support.paths import ROOT
 
 from gpusense.backends import get_backend
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.parametrize("selection", ["opencl"])
 def test_limits_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:

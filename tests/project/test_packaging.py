@@ -232,6 +232,7 @@ def test_kernels_are_found(layout: Layout, checkout: Path, tmp_path: Path) -> No
     assert any(name.startswith("lanes/") for name in sources)
 
 
+@pytest.mark.long
 @needs_warp
 def test_warp_kernels_are_imported_under_one_name(layout: Layout, checkout: Path, tmp_path: Path) -> None:
     report = json.loads(layout.run(IMPORT, cwd=tmp_path))
@@ -241,6 +242,7 @@ def test_warp_kernels_are_imported_under_one_name(layout: Layout, checkout: Path
     assert Path(report["library"]).parent != folder
 
 
+@pytest.mark.long
 @needs_warp
 def test_warp_compiles_kernels(layout: Layout, tmp_path: Path) -> None:
     parts = {"probe_part.py": PROBE_PART, "probe_kernel.py": PROBE_KERNEL}

@@ -7,6 +7,8 @@ from support.pages import commands, is_ours, parsed, run_page, visible
 from support.paths import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+# Pages whose blocks take several seconds.
+DEAR = ("getting-started", "localization", "logs", "sweeps")
 
 
 def name_of(page):
@@ -14,7 +16,9 @@ def name_of(page):
     return page.relative_to(ROOT).as_posix()
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, marks=pytest.mark.long) if page.stem in DEAR else page for page in PAGES], ids=name_of
+)
 def test_blocks_run(page, tmp_path, needs):
     needs("opencl")
     needs("warp")

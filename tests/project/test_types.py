@@ -83,10 +83,12 @@ def errors(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[int, str]]:
     return [(int(line), text) for _, line, text in found]
 
 
+@pytest.mark.long
 def test_right_calls_pass(errors):
     assert [each for each in errors if each[0] <= (HEAD + GOOD).count("\n")] == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("call", BAD)
 def test_a_mistake_is_seen(errors, call):
     line = (HEAD + GOOD).count("\n") + 1 + BAD.index(call)

@@ -152,6 +152,7 @@ def test_the_mixture_integrates_to_1(name, place):
             assert abs(np.exp(parts[0]) @ axes[axis][1] - 1) < 1e-11
 
 
+@pytest.mark.long
 def test_the_sum_over_landmarks_integrates_to_1():
     landmarks, _, poses, _, _ = scenes.make("ordinary")
     p = gs.LandmarkParameters(sigma_range=2.0, sigma_bearing=0.8)

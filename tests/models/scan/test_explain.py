@@ -143,6 +143,7 @@ def test_the_text_of_the_kernel_lacks_what_is_left_out(part, needs):
         assert (part in marked(model, "+")) != listed
 
 
+@pytest.mark.long
 @pytest.mark.sampled(1, without="warp:cpu")
 def test_measured_savings(backend):
     grid = room()

@@ -32,6 +32,7 @@ def look_around(beams: int, range_max: float = 20.0) -> gs.Scanner:
     return gs.Scanner(np.linspace(-math.pi, math.pi, beams, endpoint=False), range_max)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("beams", "particles"), [(100_000, 50), (200, 20_000)])
 @pytest.mark.parametrize("name", MODELS)
 def test_weights_of_long_scans_and_of_many_particles(backend, name, beams, particles):
@@ -60,6 +61,7 @@ def test_weights_of_long_scans_and_of_many_particles(backend, name, beams, parti
         assert ((product == 0) | np.isinf(product)).all()
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("name", MODELS)
 def test_ten_million_particles(name, needs):
@@ -75,6 +77,7 @@ def test_ten_million_particles(name, needs):
     assert 1 <= made.effective_sample_size <= len(poses)
 
 
+@pytest.mark.long
 def test_a_map_of_20_000_x_20_000_cells(needs):
     side, cell, reach, range_max = 20_000, 0.125, 100, 10.0
     cells = np.zeros((side, side), np.int8)

@@ -89,6 +89,7 @@ def test_equal_bins_are_the_plain_model(weights, backend):
             assert differing(parts, plain_parts) == 0 and differing(found, expected) == 0
 
 
+@pytest.mark.long
 def test_tiles_and_orders_change_nothing(as_gpu, backend, monkeypatch):
     _, poses, _ = place()
     model, z = model_of(as_gpu(False, scalar=True)), a_scan()
@@ -123,6 +124,7 @@ def test_max_readings_where_their_probability_depends_on_the_pose(backend):
     assert np.isneginf(never.log_likelihood(poses, z)).all()
 
 
+@pytest.mark.long
 @pytest.mark.sampled(1, without="warp:cpu")
 def test_omissions_change_nothing(backend):
     _, poses, _ = place()

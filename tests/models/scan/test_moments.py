@@ -108,6 +108,7 @@ def test_models_have_the_densities_on_every_backend(shape, real, backend):
         assert (log_p == model.log_likelihood(poses, z)).all() or backend.startswith("warp:cuda")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("growth", [0.0, 0.1])
 def test_small_offsets_of_narrow_densities_keep_all_digits(growth, backend):
     """The offset has digits beyond the last one of z - z*, which is as large as it."""
@@ -124,6 +125,7 @@ def test_small_offsets_of_narrow_densities_keep_all_digits(growth, backend):
         assert (np.abs(parts[0] - truth) <= per_beam(truth, np.float32))[within].all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shape", ["normal", "student"])
 def test_means_near_the_longest_range_keep_all_digits(shape, backend):
     """The distance from there to range_max has digits beyond the last one of the mean."""
@@ -186,6 +188,7 @@ def test_the_code_for_them_changes_nothing_where_they_are_0(name, real):
     assert (same | (np.abs(np.where(same, 0, plain) - np.where(same, 0, found)) <= 2 * eps * np.abs(plain))).all()
 
 
+@pytest.mark.long
 @pytest.mark.sampled(1, without="warp:cpu")
 def test_tables_and_angles_of_incidence_have_them(backend):
     grid, scanner, poses, expected = scene("float32")

@@ -118,6 +118,7 @@ def test_scores_are_the_mixture_at_what_a_sonar_hears(incidence, backend):
     assert "cones of 7 rays, no return beyond 0.6 rad of incidence" in title and "CONES" in model.explain()
 
 
+@pytest.mark.long
 def test_tiles_and_shared_cones_change_nothing(as_gpu, backend, monkeypatch):
     """Two sensors that look the same way share a cone."""
     grid, poses, _ = place()

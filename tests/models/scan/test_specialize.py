@@ -84,6 +84,7 @@ def test_leaving_out_components_of_the_beam_model(weights, backend):
         assert_same_numbers("beam", backend, precision, scene, BEAM_WEIGHTS[weights])
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("kind", ["field", "bilinear"])
 @pytest.mark.parametrize("weights", FIELD_WEIGHTS)

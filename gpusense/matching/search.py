@@ -142,7 +142,7 @@ class _Run:
             images = [np.full(len(part), scan if several else 0) for scan, part in enumerate(points)]
         each = [np.tile(part, self._turns) if part.ndim == 1 else part.reshape(-1) for part in images]
         turned = np.stack([np.cos(grid.headings), np.sin(grid.headings)], axis=-1)
-        given = (
+        given: tuple[np.ndarray, ...] = (
             _filled(np.concatenate([*points, np.empty((0, 2))])), turned.reshape(-1), grid.start.astype(np.float64),
             first, _filled(np.concatenate(each).astype(np.int32)),
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Number of particles by KLD sampling.
+"""Choose the number of particles by KLD sampling.
 
 Fox, *KLD-sampling: adaptive particle filters* (2001); *Probabilistic Robotics* table 8.4.
 """
@@ -9,13 +9,13 @@ import math
 
 import numpy as np
 
-# Bins of the cloud [m, rad], error bound of its density, and the normal quantile of the bound's probability.
+# Bins of the cloud [m, rad], error bound of its density, and normal quantile of the bound's probability.
 BIN, BIN_TURN = 0.5, math.radians(10)
 ERROR, QUANTILE = 0.02, 2.326
 
 
 def kld_count(poses: np.ndarray, least: int, most: int) -> int:
-    """Return the particles at which the Kullback-Leibler distance to the cloud's density is at most ``ERROR``.
+    """Return the number of particles that bounds the Kullback-Leibler distance to the cloud's density by ``ERROR``.
 
     Args:
         poses: (N, 3) particles.

@@ -1,4 +1,4 @@
-"""The estimate of a filter: its pose, the probability of being lost by scans and particles, and the verdict."""
+"""Compute a filter's estimate: pose, probability of being lost by scans and particles, and verdict."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import Verdict
 from gpusense.localization.words import word_of
 
-# Most particles whose spread is counted one by one; larger narrow clouds are approximated by a normal density.
+# Most particles for counting the spread; a normal density approximates larger narrow clouds.
 _MOST_LOOKED_AT = 100_000
 
 
@@ -54,12 +54,12 @@ def estimate_of(tracker: Tracker, verdict: Verdict, recovery: Recovery, method: 
 
 
 def _spread_about(tracker: Tracker, pose: np.ndarray, about: np.ndarray) -> tuple[float, Distances | None]:
-    """Return the share of the particles that is far off a pose, and their distances where they lie apart.
+    """Return the share of particles far off a pose, and distances of spread-out particles.
 
     Args:
         tracker: The particles.
         pose: (3,) pose.
-        about: (3, 3) second moments of the particles about it.
+        about: (3, 3) second moments of the particles about the pose.
     """
     if spread_of(about).narrow or tracker.shown > _MOST_LOOKED_AT:
         return share_off(about), None

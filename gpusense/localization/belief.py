@@ -1,36 +1,36 @@
-"""Belief that a localiser follows a wrong pose: a hidden Markov model with the states right and wrong.
+"""Estimate the belief that a localiser follows a wrong pose, by a hidden Markov model.
 
-The two states are "right" (the robot is where the localiser's distribution says) and "wrong" (it is elsewhere). The
-prior probability of "wrong" is ``START``. From one scan to the next a right pose becomes wrong, by a silent divergence
-or because the robot is carried away, with probability ``1 - exp(-(PER_SCAN n + PER_METRE d))`` after n scans and d
-metres, and a wrong pose becomes right with probability ``FOUND`` per scan. While the distribution is wide enough to
+The states are "right" (the robot is inside the localiser's distribution) and "wrong" (it is elsewhere). The prior
+probability of "wrong" is ``START``. Over n scans and d metres a right pose becomes wrong, by a silent divergence or a
+carried robot, with probability ``1 - exp(-(PER_SCAN n + PER_METRE d))``; a wrong pose becomes right with probability
+``FOUND`` per scan. While the distribution is wide enough to cover several places, both happen with probability ``WIDE``
+per scan. While the distribution is wide enough to
 cover several places, both happen with probability ``WIDE`` per scan.
 
-A scan gives a log-likelihood ratio r of "wrong" against "right". Consecutive ratios are dependent: the same furniture
-is wrong in all scans of a room. They are modelled as an autoregressive process of first order whose correlation
-``rho = STAYS exp(-d / LENGTH - turn / TURN)`` falls with the motion between two scans. For normal ratios of one
-variance the exact increment of the log odds is then
+A scan yields a log-likelihood ratio r of "wrong" against "right". Consecutive ratios are dependent: moved furniture is
+wrong in all scans of a room. The ratios are modelled as a first-order autoregressive process; the correlation ``rho =
+STAYS exp(-d / LENGTH - turn / TURN)`` falls with the motion between two scans. For normal ratios of equal variance the
+exact increment of the log odds is then
 
     (r_t - rho r_{t-1}) / (1 + rho),
 
 so a standing robot gains almost nothing from its hundredth scan, and a change is detected at once (Hamilton, "A new
 approach to the economic analysis of nonstationary time series", *Econometrica* 57 (1989), treats such regimes).
 
-Some wrong places look like the right one: scans agree there as well, and none of them is evidence. ``ALIKE`` is the
-prior share of such places among wrong ones. A place ceases to look alike at the rates of ``ALIKE_LENGTH`` and
-``ALIKE_TURN``. So with the share a that still looks alike, an increment i of the log odds becomes
+Some wrong places look like the right one: scans agree there equally, and are no evidence. ``ALIKE`` is the prior share
+of such places among wrong ones. Places stop looking alike at the rates of ``ALIKE_LENGTH`` and ``ALIKE_TURN``. If a
+share a still looks alike, an increment i of the log odds becomes
 
     log(a + (1 - a) e^i),   a <- a / (a + (1 - a) e^i),
 
-and a short log leaves the probability of "wrong" at or above a share ``ALIKE`` of its prior odds, however well scans
-agree.
+and even perfect scans of a short log leave "wrong" at least a share ``ALIKE`` of its prior odds.
 
-A search, as after a start anywhere, chooses a place because the scans agree with it. So this agreement is no new
-evidence: it counts as repeated from the previous scan. A contradiction counts in full.
+A search, for example after a start anywhere, chooses a place because the scans agree with it. This agreement is no new
+evidence and counts as repeated from the previous scan. A contradiction counts in full.
 
-Comparisons of the pose with other places of the map (:func:`gpusense.localization.ratio.ratio_of_places`) are a second
-series of ratios. Given right or wrong, they count as independent of the scans' ratios, with which as an offset they
-were fitted. Among one another they have the same correlation.
+Comparisons of the pose with other places of the map (:func:`gpusense.localization.ratio.ratio_of_places`) form a
+second series of ratios. Given right or wrong, they count as independent of the scans' ratios, the offset of their fit.
+Their autocorrelation is the same.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ import numpy as np
 # right again, and of both while the distribution is wide.
 START = 0.1
 PER_SCAN, PER_METRE, FOUND, WIDE = 1e-3, 2e-3, 0.003, 0.05
-# Correlation of the ratios of two scans at one place, and the distance and turn over which it falls to 1 / e [m, rad].
+# Correlation of the ratios of two scans at a place; distance and turn over which it falls to 1 / e [m, rad].
 STAYS, LENGTH, TURN = 0.95, 2.0, 1.0
 # Prior share of wrong places that look like the right one; distance and turn over which it falls to 1 / e [m, rad].
 ALIKE, ALIKE_LENGTH, ALIKE_TURN = 0.12, 8.0, 2.0
-# One in this many searches on a right map finds a wrong place; most wrong places that count.
+# Searches per wrong result on a right map; largest number of wrong results.
 MISSES, MOST_PLACES = 8, 2
-# Longest motion from one scan to the next that counts [m]; a longer one is a jump of the localiser.
+# Longest counted motion between scans [m]; a longer motion is a jump of the localiser.
 _FASTEST = 1.0
 
 
@@ -62,7 +62,7 @@ def motion_between(pose: Sequence[float] | np.ndarray, before: Sequence[float] |
 
 
 def correlation(way: float, turn: float) -> float:
-    """Return the correlation of the log-likelihood ratios of two scans with this motion between them."""
+    """Return the correlation of the log-likelihood ratios of two scans separated by this motion."""
     return STAYS * math.exp(-way / LENGTH - turn / TURN)
 
 
@@ -70,9 +70,9 @@ class Comparison(NamedTuple):
     """Last comparison of the pose with other places; immutable.
 
     Attributes:
-        ratio: Its log-likelihood ratio of "wrong" against "right".
-        pose: Pose that was compared; None before.
-        chosen: True if the next pose is one that scans choose among many.
+        ratio: Log-likelihood ratio of "wrong" against "right".
+        pose: Compared pose; None before.
+        chosen:         chosen: True if scans choose the next pose among many.
     """
 
     ratio: float = 0.0
@@ -86,10 +86,10 @@ class Belief(NamedTuple):
     Attributes:
         log_odds: Logarithm of the odds of "wrong".
         ratio: Log-likelihood ratio of the last judged scan.
-        pose: Pose at which that scan was judged; None before.
-        scans: Scans since that one.
+        pose: Pose of that judgement; None before.
+        scans: Scans since then.
         chosen: True if the next pose is one that scans choose among many.
-        alike: Share of "wrong" that looks like the right place.
+        alike: Share of "wrong" that looks like "right".
         compared: Last comparison of the pose with other places.
     """
 
@@ -108,19 +108,19 @@ class Belief(NamedTuple):
 
     @classmethod
     def anywhere(cls, after: int = 0) -> Belief:
-        """Return the belief at a place that a search on a map has found.
+        """Return the belief at a place from a search on a map.
 
         Args:
-            after: Wrong places of earlier searches. On a right map one in ``MISSES`` searches fails.
+            after: Number of failed searches before. On a right map one in ``MISSES`` fails.
         """
         return cls(math.log(MISSES) * min(after, MOST_PLACES), chosen=True, compared=Comparison(chosen=True))
 
     def counted(self) -> Belief:
-        """Return the belief with one more scan counted."""
+        """Return the belief after counting a scan."""
         return self._replace(scans=self.scans + 1)
 
     def widened(self) -> Belief:
-        """Return the belief after scans without a common pose: the next pose may be anywhere."""
+        """Return the belief after scans without a tracked pose: the next pose may be anywhere."""
         log_odds = self._moved(WIDE, WIDE, min(self.scans, 100))[0]
         return Belief(log_odds, chosen=True, compared=Comparison(chosen=True))
 
@@ -128,7 +128,7 @@ class Belief(NamedTuple):
         """Return the belief after a scan.
 
         Args:
-            pose: Pose at which the scan was judged [m, m, rad].
+            pose: Pose of the judgement [m, m, rad].
             ratio: Log-likelihood ratio of "wrong" against "right"; NaN for a scan without evidence.
         """
         way, turn, rho = 0.0, 0.0, 0.0
@@ -146,7 +146,7 @@ class Belief(NamedTuple):
         return moved._changed(new)
 
     def compared_with(self, pose: tuple[float, float, float], ratio: float) -> Belief:
-        """Return the belief after a comparison of the pose of the scan judged last with other places.
+        """Return the belief after comparing the last judged pose with other places.
 
         Args:
             pose: The pose [m, m, rad].
@@ -161,7 +161,7 @@ class Belief(NamedTuple):
         return self._replace(compared=Comparison(ratio, pose))._changed(new_part(ratio, before, rho))
 
     def _changed(self, new: float) -> Belief:
-        """Return the belief after new evidence [nats], which places that look alike do not show."""
+        """Return the belief after new evidence [nats]; places that look alike yield none."""
         change = self.alike + (1 - self.alike) * math.exp(new)
         return self._replace(log_odds=self.log_odds + math.log(change), alike=self.alike / change)
 
@@ -176,5 +176,5 @@ class Belief(NamedTuple):
 
 
 def new_part(ratio: float, before: float, rho: float) -> float:
-    """Return the increment of the log odds by a ratio after one with which it has the correlation rho."""
+    """Return the increment of the log odds from a ratio that has the correlation rho with the ratio before."""
     return (ratio - rho * before) / (1 + rho)

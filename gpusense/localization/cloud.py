@@ -1,4 +1,4 @@
-"""The particle cloud of a filter on one device: its steps, and the numbers that it copies to the host.
+"""Run the steps of a filter's particle cloud on a device, and copy its results to the host.
 
 A correction runs stages until the temperature is used up. On a GPU motion, scores and weights of a stage are one
 recorded program.
@@ -22,12 +22,12 @@ from gpusense.localization.particles import Particles, Places, Stage
 
 _DOUBLE = np.dtype(np.float64)
 _MOST_RECORDED, _MOST_STAGES = 64, 48
-# Corrections in a row after which the estimate was read, from which on corrections compute it themselves.
+# Consecutive corrections with a read estimate after which corrections compute the estimate.
 _ASKED = 3
 
 
 class Cloud(Particles):
-    """Particles whose steps are recorded.
+    """Particles with recorded steps.
 
     Args:
         backend: The device.
@@ -44,20 +44,20 @@ class Cloud(Particles):
         self._recordings = ProgramCache[RecordedProgram](_MOST_RECORDED)
         self._estimates, self._stages = RepeatedPrograms(backend, 8), RepeatedPrograms(backend, _MOST_STAGES)
         self._uploads: list[np.ndarray] = []
-        # Results on the host while they are those on the device; the buffers and the number of particles of the
-        # estimate on the device, and the final estimate on the host with these.
+        # Results on the host while they are valid; buffers and number of particles behind the estimate on the device,
+        # and behind the final estimate on the host.
         self._results: np.ndarray | None = None
         self._estimated_of: Hashable = None
         self._known: tuple[Hashable, np.ndarray] | None = None
-        # Corrections in a row after which the estimate was read; whether it was after the last one, which number the
-        # last one's last stage had, and whether the present stage computes it.
+        # Consecutive corrections with a read estimate; whether the last one's was read; number of its last stage;
+        # whether the present stage computes the estimate.
         self._asked, self._was_asked, self._last_stage, self._estimates_too = 0, False, 0, False
-        # Function that prepares judges of scans; those that the last correction uses, until they receive the result.
+        # Function that prepares judges of scans; judges of the last correction until they receive the result.
         self._prepared: Callable[[], list[MapJudge]] | None = None
         self._judges: Sequence[MapJudge] = ()
 
     def place(self, poses: np.ndarray) -> None:
-        """Replace all particles by (N, 3) poses of equal weight, and forget the state of corrections."""
+        """Replace all particles by (N, 3) poses of equal weight, and reset the state of corrections."""
         count, places = len(poses), self.places.placed(self.kept)
         self._fill((self.poses[places.shown], poses), (self.weights[places.weight], np.ones(count)),
                    (self.states[places.state], np.zeros(STATE)))  # fmt: skip
@@ -71,7 +71,7 @@ class Cloud(Particles):
             self.backend.upload(np.ascontiguousarray(array, np.float64), buffer)
 
     def set_pool(self, poses: np.ndarray) -> None:
-        """Upload the poses from which recovery injects particles."""
+        """Upload poses for recovery to inject."""
         self._recordings.clear()
         self._stages.clear()
         self.pool, self.pool_size = self.backend.upload(np.ascontiguousarray(poses, np.float64)), len(poses)
@@ -89,7 +89,7 @@ class Cloud(Particles):
         self._uploads.clear()
 
     def _begin_change(self) -> None:
-        """Forget the results that the host knows."""
+        """Invalidate the results on the host."""
         self._results = self._known = self._estimated_of = None
         self._judges, self._prepared = (), None
 
@@ -116,9 +116,9 @@ class Cloud(Particles):
             settings: Settings of the step.
             stages: The stages.
             drawn: Particles of the next step.
-            sensors: Number of sensors that are used, the first ones of ``log_p``.
-            score: Runs the launches of a stage: its motion if it is the first one, log-likelihoods, and weighing.
-            judges: Returns the judges of scans at the estimated pose, prepared for them; called if it is estimated.
+            sensors: Number of sensors, the first ones of ``log_p``.
+            score: Runs a stage: motion if it is the first one, log-likelihoods, and weighing.
+            judges: Prepares and returns the judges of scans at the estimated pose; called if the pose is estimated.
         """
         self.use(sensors)
         self._begin_change()
@@ -126,7 +126,7 @@ class Cloud(Particles):
         self._asked, self._was_asked = self._asked + 1 if self._was_asked else 0, False
         self.upload_settings(settings)
         if settings[SLOW_RATE] > 0:
-            # Averages of the likelihood persist.
+            # Keep the averages of the likelihood.
             self._copy_state(self.places.state, stages[0].state)
         for stage in stages:
             last, deep = stage.most == 1, settings
@@ -147,7 +147,7 @@ class Cloud(Particles):
         self.set_particles(stage.places, drawn)
 
     def _deepen(self, stage: Stage, settings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Weigh a stage again on lower rungs while too few particles have weight; return state and settings."""
+        """Repeat a stage's weighing on lower rungs while too few particles have weight; return state and settings."""
         numbers = self._state_of(stage.state)
         while is_starved(numbers, settings, stage.number, self.count):
             settings = deeper(settings)
@@ -158,18 +158,18 @@ class Cloud(Particles):
         return numbers, settings
 
     def _weighing(self, stage: Stage) -> Program:
-        """Return the launches of a stage after its scores, with the estimate of its particles if it is expected."""
+        """Return the launches of a stage after its scores, including the estimate if it is expected."""
         if not self._estimates_too:
             return self.weighing(stage)
         return self.weighing(stage) + self._estimating(stage.places, self.count, 0)
 
     def _judging(self) -> Program:
-        """Return the launches that judge scans at the estimate."""
+        """Return the launches for judging scans at the estimate."""
         pairs = zip(self._judges, self.judged, strict=False)
         return tuple(one for judge, judged in pairs for one in judge.launches(self.estimated, judged))
 
     def _prepare_judges(self) -> Hashable:
-        """Prepare the judges of a correction that estimates the pose; return all on which their launches depend."""
+        """Prepare the judges of a correction that estimates the pose; return the key of their launches."""
         if not self._estimates_too:
             return ()
         if self._prepared is not None:
@@ -196,7 +196,7 @@ class Cloud(Particles):
         """Run the launches of a stage after its scores."""
         key = (stage.key, self.count, self._sensors, self._estimates_too)
         self._stages.run(key, lambda: self._weighing(stage))
-        # Scans are prepared while the device works.
+        # Prepare scans while the device works.
         versions = self._prepare_judges()
         if versions:
             self._stages.run((versions, "judge"), self._judging)
@@ -210,7 +210,7 @@ class Cloud(Particles):
 
         Args:
             stage: The stage.
-            key: Everything on which the sensors' programs depend.
+            key: Key of the sensors' programs.
             scoring: Returns the program that scores the poses of a buffer, and the owners of its memory.
         """
         whole = (key, stage, self.count, self._estimates_too, self._prepare_judges())
@@ -223,7 +223,7 @@ class Cloud(Particles):
         recorded.start()
 
     def explain(self) -> str:
-        """Describe how the last recorded step is started."""
+        """Describe how the last recorded step starts."""
         recorded = self._recordings.items()
         return recorded[-1][1].recording.explain() if recorded else "launches one by one"
 
@@ -234,14 +234,14 @@ class Cloud(Particles):
         return summary_of(self._state_of(self.places.state))
 
     def shares(self, count: int) -> Any:
-        """Return the weights of the shown particles with sum 1: on a GPU an array of the device's library."""
+        """Return the normalised weights of the shown particles: on a GPU an array of the device's library."""
         if self.backend.info.kind != "gpu":
             weights = self.host_weights(count)
             return weights / weights.sum()
         return self.backend.lend(self.device_shares(count), (count,), _DOUBLE)
 
     def device_shares(self, count: int) -> Buffer:
-        """Return a new buffer with the weights of the shown particles, with sum 1."""
+        """Return a new buffer with the normalised weights of the shown particles."""
         out, weight = self.backend.blank(count, _DOUBLE), self.weights[self.places.weight]
         program = self.sums.estimate(self.poses[self.places.shown], weight, self.estimated, count)
         program += self.sums.launch("normalize_weights", count, weight=weight, estimate=self.estimated, share=out,
@@ -266,7 +266,7 @@ class Cloud(Particles):
         return self._lent(self.poses[self.places.shown], (count, 3))
 
     def estimate(self, count: int) -> np.ndarray:
-        """Return the kernels' estimate of the shown particles: mean, covariance, sum of weights."""
+        """Return mean, covariance and sum of weights of the shown particles from the kernels."""
         self._was_asked, key = True, (self.places, count)
         if self._known is None or self._known[0] != key:
             numbers = self._estimate(count, 0)
@@ -274,12 +274,12 @@ class Cloud(Particles):
         return self._known[1].copy()
 
     def _estimate(self, count: int, second_pass: int) -> np.ndarray:
-        """Return the result of a pass of the estimate, which runs unless the last correction ran it."""
+        """Return the result of a pass of the estimate; run the pass unless the last correction did."""
         places = self.places
         if second_pass or self._estimated_of != (places, count):
             self._results = self._estimated_of = None
             self._judges = ()
-            # Clouds that change their size rarely ask twice for the same size.
+            # Clouds of varying size rarely repeat a size.
             self._estimates.run(
                 (places.shown, places.weight, count, second_pass), lambda: self._estimating(places, count, second_pass)
             )
@@ -296,7 +296,7 @@ class Cloud(Particles):
         return self._read_results()[begin : begin + STATE]
 
     def _read_results(self) -> np.ndarray:
-        """Return states and estimate, which are copied once after each change."""
+        """Return states and estimate, copied once after each change."""
         if self._results is None:
             self._results = self._read(self.results, self.result_begins[-1])
         return self._results
@@ -306,11 +306,11 @@ class Cloud(Particles):
         return self._read(self.poses[index], 3 * count).reshape(count, 3)
 
     def host_weights(self, count: int) -> np.ndarray:
-        """Return a copy of the weights of the shown particles, before they are normalised."""
+        """Return a copy of the unnormalised weights of the shown particles."""
         return self._read(self.weights[self.places.weight], count)
 
     def contents(self, count: int) -> Contents:
-        """Return a copy of all particles, of which ``count`` are shown."""
+        """Return a copy of all particles; ``count`` of them are shown."""
         places, weighed = self.places, self.places.shown != self.places.next
         return Contents(
             self.host_poses(places.shown, count), self.host_weights(count),
@@ -321,7 +321,7 @@ class Cloud(Particles):
         )  # fmt: skip
 
     def restore(self, contents: Contents) -> None:
-        """Replace all particles by those of ``contents``."""
+        """Replace all particles by ``contents``."""
         if contents.pool is not None:
             self.set_pool(contents.pool)
         places, arrays = contents.places_and_arrays(self.kept)

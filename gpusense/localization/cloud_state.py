@@ -1,4 +1,4 @@
-"""Plain data of a filter's particles: the arguments of a step, the state of a correction, copies on the host."""
+"""Plain data of a filter's particles: arguments of a step, state of a correction, copies on the host."""
 
 from __future__ import annotations
 
@@ -30,10 +30,9 @@ from gpusense.reference.tempering import left_of
 
 # Lowest depth of a ladder: distances of a million deviations differ by 2^-39 on its last rung.
 _DEEPEST = LOWEST**5
-# Effective sample size below which a stage is weighed again on a deeper ladder.
+# Effective sample size below which a stage repeats its weighing on a deeper ladder.
 _FEWEST = 10.0
-# Jitter of a stage on a deeper ladder: the peak lies beyond the particles, which must not contract before they reach
-# it.
+# Jitter of a stage on a deeper ladder: the peak is beyond the particles, which must not contract before reaching it.
 _WIDE_JITTER = 0.7
 # Index of a sensor, and its readings.
 SensorReadings = tuple[int, tuple[Any, ...]]
@@ -43,13 +42,13 @@ class Step(NamedTuple):
     """Arguments of a correction.
 
     Attributes:
-        settings: Settings, by the places in ``interface.constants``.
-        kind: Kind of the motion that begins it.
+        settings: Settings, indexed by ``interface.constants``.
+        kind: Kind of the first motion.
         stages: Most stages.
         drawn: Particles of the next step.
         readings: Indices of sensors with their readings.
-        judged: The scans that are to be judged at the pose after it, with the indices of their sensors; a cloud may
-            leave that to the verdict.
+        judged: Scans to judge at the new pose, with the indices of their sensors; a cloud may leave this to the
+            verdict.
     """
 
     settings: np.ndarray
@@ -65,11 +64,11 @@ class Contents(NamedTuple):
 
     Attributes:
         poses: (N, 3) shown poses.
-        weights: (N,) their weights, before they are normalised.
-        next_poses: (M, 3) poses of the next step; None if these are the shown ones, which were not weighed.
-        next_weights: (M,) weights with which the next step begins; None together with ``next_poses``.
-        state: State of the last correction, as the kernels hold it.
-        pool: Poses from which recovery injects particles; None without them.
+        weights: (N,) their unnormalised weights.
+        next_poses: (M, 3) poses of the next step; None if the shown poses were not weighed.
+        next_weights: (M,) weights at the beginning of the next step; None if ``next_poses`` is None.
+        state: State of the last correction in the kernels' layout.
+        pool: Poses for recovery to inject, or None.
     """
 
     poses: np.ndarray
@@ -85,10 +84,10 @@ class Contents(NamedTuple):
         return len(self.poses if self.next_poses is None else self.next_poses)
 
     def places_and_arrays(self, now: Places) -> tuple[Places, list[tuple[str, int, np.ndarray]]]:
-        """Return buffers for these particles that do not overwrite kept ones, and the array for each buffer.
+        """Return buffers for these particles that keep present buffers intact, and the array for each buffer.
 
         Args:
-            now: The buffers at the beginning of the call, which are kept.
+            now: The buffers at the beginning of the call, to keep.
 
         Returns:
             Places, and arrays by the name ("poses" or "weights") and index of their buffer.
@@ -107,12 +106,11 @@ class Summary(NamedTuple):
     """The state of a filter after a correction.
 
     Attributes:
-        effective_sample_size: Effective sample size of the last stage, at most the number of distinct particles after
-            earlier stages.
-        temperature: Share of the temperature that all stages used.
+        effective_sample_size: Effective sample size of the last stage, at most the number of distinct particles.
+        temperature: Share of the temperature used by all stages.
         degenerate: Whether no particle was possible.
         stages: Number of stages that ran.
-        numbers: The state as the kernels hold it.
+        numbers:         numbers: The state in the kernels' layout.
         resampled: Whether particles were drawn at the end.
     """
 
@@ -125,14 +123,14 @@ class Summary(NamedTuple):
 
 
 def summary_of(numbers: np.ndarray) -> Summary:
-    """Return the summary of a state as the kernels hold it."""
+    """Return the summary of a state in the kernels' layout."""
     used, stage, distinct = 0.0, 0, math.inf
     while True:
         own = numbers[stage * STAGE : (stage + 1) * STAGE]
         used += float(own[RUNG])
         if own[LEFT] == 0.0:
             break
-        # Each copy is jittered by the difference of two other parents, so m parents have at most m^3 distinct copies.
+        # The difference of two other parents jitters each copy, so that m parents have at most m^3 distinct copies.
         distinct = min(distinct, float(own[SAMPLE_SIZE]) ** 3)
         stage += 1
     size = min(float(own[SAMPLE_SIZE]), distinct)
@@ -140,7 +138,7 @@ def summary_of(numbers: np.ndarray) -> Summary:
 
 
 def is_starved(numbers: np.ndarray, settings: np.ndarray, stage: int, count: int) -> bool:
-    """Tell whether even the last rung of a stage leaves too few particles with weight, and a deeper rung may not.
+    """Return whether the tempering ladder is too shallow: its last rung leaves too few particles with weight.
 
     Args:
         numbers: The state after the stage.
@@ -156,7 +154,7 @@ def is_starved(numbers: np.ndarray, settings: np.ndarray, stage: int, count: int
 
 
 def deeper(settings: np.ndarray) -> np.ndarray:
-    """Return the settings of a step whose ladder begins below the last rung of the present ladder."""
+    """Return the settings of a step with a ladder below the last rung of the present one."""
     result = settings.copy()
     result[DEPTH] *= LOWEST
     result[JITTER], result[FARTHEST_X], result[FARTHEST_THETA] = _WIDE_JITTER, math.inf, math.pi
@@ -164,10 +162,10 @@ def deeper(settings: np.ndarray) -> np.ndarray:
 
 
 def meaningful(numbers: np.ndarray, averages: bool) -> np.ndarray:
-    """Clear the numbers of a state that nothing reads: of stages that did not run, and of unused averages.
+    """Clear unused numbers of a state: stages that did not run, and unused averages.
 
     Args:
-        numbers: The state as the kernels hold it.
+        numbers:         numbers: The state in the kernels' layout.
         averages: Whether recovery follows the averages of the likelihood.
     """
     end, result = summary_of(numbers).stages * STAGE, np.zeros(STATE)

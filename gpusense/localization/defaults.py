@@ -1,4 +1,4 @@
-"""Defaults of localisation, shared by the filter, the motion model and the commands; the docs have a table of them."""
+"""Define the defaults of localisation for filter, motion model and commands; the docs list them in a table."""
 
 from __future__ import annotations
 
@@ -8,33 +8,33 @@ from typing import Any, NamedTuple
 
 
 class Defaults(NamedTuple):
-    """Options of a particle filter; ``docs/localization.md`` has the measurements behind them.
+    """Options of a particle filter; ``docs/localization.md`` describes the measurements behind them.
 
     Attributes:
         particles: Number of particles.
-        particles_everywhere: Number of particles where the filter starts anywhere on a map.
-        beams: Beams of a scan that commands use; None for all.
+        particles_everywhere: Number of particles for a start anywhere on a map.
+        beams: Beams per scan in commands; None for all.
         threshold: Resample below this share of the particles.
         stages: Most stages of a correction.
-        share: Least effective sample size of a stage, as a share of the particles, if they lie together.
-        enough: Effective sample size that suffices for a stage, for any number of particles that lie together.
-        share_apart: Least share if they lie apart, and among landmarks, so that no peak wins by chance.
-        jitter: Factor of the difference of two particles by which a drawn particle is jittered between stages.
+        share: Least effective sample size of a stage, as a share of concentrated particles.
+        enough: Sufficient effective sample size of a stage, for any number of concentrated particles.
+        share_apart: Least share for spread-out particles, and among landmarks, so that no peak wins by chance.
+        jitter: Jitter of a drawn particle between stages, as a factor of the difference of two particles.
         farthest: Largest such difference [m].
         farthest_turn: Largest such difference of headings [rad].
         wide_scans: Corrections after a start anywhere on the map that use a lower temperature.
-        wide_share: Factor of that temperature, since particles that lie apart must be judged less precisely.
+        wide_share: Factor of that temperature, since spread-out particles must be judged less precisely.
         slow: Rate of the slow average of the likelihood.
         fast: Rate of the fast average.
         most_injected: Largest share of injected particles.
         recovery: Recovery of the filter.
         temperature: Temperature of the filter.
-        calibrations: Corrections at the beginning that all teach the temperature; later two of ten do.
+        calibrations: Number of first corrections that all teach the temperature; later two in ten do.
         field: Parameters of the likelihood field of ``gpusense localize``.
         alpha: Noise of the odometry.
         reverse: Probability that a translation went the other direction.
         least: Least deviations of a step [m, rad].
-        sideways: Variance of slips to the side per squared turn [m^2/rad^2].
+        sideways: Variance of sideways slips per squared turn [m^2/rad^2].
         start: Deviations of a start at a known pose: x, y [m] and heading [rad].
     """
 

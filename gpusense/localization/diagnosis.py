@@ -1,4 +1,4 @@
-"""Evidence for and against a pose in words and numbers, and the likely cause where readings contradict it."""
+"""Report evidence for and against a pose, and the likely cause of a contradiction."""
 
 from __future__ import annotations
 
@@ -19,17 +19,16 @@ from gpusense.localization.verdict import sightings
 Floats = NDArray[np.float64]
 Cause = Literal["none", "people", "start", "mount", "map", "unknown"]
 
-# Poses tried elsewhere on the map, number of the best ones that are refined, refinements of each, and their largest
-# displacement.
+# Number of poses tried elsewhere on the map, of refined best poses, and of refinements of each; largest displacement.
 _TRIED, _REFINED, _AROUND, _REACH = 8192, 12, 64, (0.4, 0.4, 0.2)
-# A pose explains a scan if at least these shares agree: of the beams that meet walls, and of all informative beams.
+# Least agreeing shares of a pose that explains a scan: among beams that meet walls, and among informative beams.
 _FITS, _FITS_OF_ALL = 0.85, 0.6
-# Least angle from which a wrong mount is a cause [rad]; steps in which mounts are tried.
+# Least angle of a wrong mount [rad]; number of tried angles.
 _LEAST_TURN, _TURNS = math.radians(20), 72
-# Radius of one place through which beams pass [m]; least distance of a second place [m]; share of beams that a crowd
-# shortens.
+# Radius of a place where beams pass through [m]; least distance of a second place [m]; share of beams shortened by a
+# crowd.
 _ONE_PLACE, _ELSEWHERE, _CROWD = 1.5, 1.0, 0.3
-# Most points among which the place is searched.
+# Most points in the search for the place.
 _MOST_POINTS = 1000
 _STILL = np.zeros((3, 3))
 
@@ -39,15 +38,15 @@ class Diagnosis:
     """Evidence of the last readings at a pose.
 
     Attributes:
-        agree: Number of beams that end at a mapped wall, as they should.
+        agree: Number of beams that end at a mapped wall.
         through: Number of beams that pass through a mapped wall.
         short: Number of beams that end in mapped free space.
-        place: (x, y) of the wall near which most beams pass through [m]; None without one.
+        place: (x, y) of the wall where most beams pass through [m], or None.
         inside: True if the pose is inside solid cells.
         off: True if the pose is in unknown cells or off the map.
-        elsewhere: (x, y, theta) of a pose that explains the scan better; None without one, or without a search.
-        turned: Angle by which the scanner seems to be turned relative to its mount [rad]; pi with ``mirrored`` for a
-            scanner that is upside down; None if the mount fits or no other mount does.
+        elsewhere: (x, y, theta) of a pose that explains the scan better; None if there is none, or without a search.
+        turned: Apparent turn of the scanner relative to its mount [rad]; pi and ``mirrored`` for a scanner that is
+            upside down; None if the mount fits or no other mount does.
         mirrored: Whether the readings seem to be in the opposite order.
         cause: Likely cause: "none" (nothing contradicts the pose), "people" (some beams are short, none long), "start"
             (the robot is elsewhere on this map), "mount" (the scanner has another mount), "map" (no place of the map
@@ -72,7 +71,7 @@ class Diagnosis:
 
     @property
     def counted(self) -> int:
-        """Number of beams that give evidence."""
+        """Number of beams with evidence."""
         return self.agree + self.through + self.short
 
     @property
@@ -150,14 +149,14 @@ def evidence_of(scans: Sequence[Passages]) -> Diagnosis:
 
 
 def _fits(scans: Sequence[Passages]) -> bool:
-    """Tell whether a pose explains scans: most beams that meet walls agree, and most informative beams."""
+    """Return whether a pose explains scans: most beams that meet walls agree, and most informative beams."""
     agree, through, short = (sum(one.count(kind) for one in scans) for kind in (AGREES, THROUGH, SHORT))
     inside = any(one.inside or one.off for one in scans)
     return not inside and agree > _FITS * (agree + through) and agree > _FITS_OF_ALL * (agree + through + short)
 
 
 def _place(scans: Sequence[Passages]) -> tuple[float, float] | None:
-    """Return the wall near which most beams pass through walls; None without such beams."""
+    """Return the wall where most beams pass through; None without such beams."""
     walls = [one.wall[one.kind == THROUGH] for one in scans]
     points = np.concatenate(walls) if walls else np.zeros((0, 2))
     points = points[np.isfinite(points).all(axis=1)]
@@ -172,7 +171,7 @@ def _place(scans: Sequence[Passages]) -> tuple[float, float] | None:
 def _mount(
     sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]], pose: Floats
 ) -> tuple[float | None, bool]:
-    """Return the angle by which scans must be turned to fit at a pose (None for no angle), and whether mirrored."""
+    """Return the turn that makes scans fit at a pose (or None), and whether they are mirrored."""
     best: tuple[float, float | None, bool] = (0.0, None, False)
     for mirrored in (False, True):
         seen = _mirrored(sensors, readings) if mirrored else readings
@@ -188,7 +187,7 @@ def _mount(
 
 
 def _mirrored(sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]]) -> dict[int, tuple[Any, ...]]:
-    """Return the scans among readings with their ranges in the opposite order."""
+    """Return the scans among readings with ranges in reverse order."""
     return {index: (reading[0][::-1], *reading[1:]) for index, reading in readings.items() if sensors[index].calibrates}
 
 

@@ -22,23 +22,23 @@ class Estimate:
 
     Attributes:
         pose: (3,) x, y, theta [m, m, rad].
-        covariance: (3, 3) covariance of the particles about it.
+        covariance: (3, 3) covariance of the particles about the pose.
         effective_sample_size: ``1 / sum w^2`` of the last correction, 1 to N; until the next motion, copies of a
-            particle count as one.
+            particle count once.
         p_lost: Probability that the pose is off by more than 1 m or 0.5 rad; see ``docs/localization.md``.
-        verdict: "tracking"; "uncertain", if the particles are spread widely or over several places, or p_lost is above
-            0.1; or "lost", where scans or features contradict the pose and p_lost is above 0.5.
-        explained: Among the beams of the last judged scan that the map could explain, the share that agrees with it at
-            the mean of the particles; NaN without one.
+        verdict: "tracking"; "uncertain", for widely spread particles, several places, or p_lost above 0.1; or "lost",
+            if scans or features contradict the pose and p_lost is above 0.5.
+        explained: Agreeing share of the explainable beams of the last judged scan, at the mean of the particles; NaN
+            without such a scan.
         temperature: Temperature of the first sensor.
-        used: Share of the temperature that the stages of the last correction used: below 1 if even the last stage would
+        used: Share of the temperature used by the stages of the last correction: below 1 if even the last stage would
             have left too few particles.
-        degenerate: Whether no particle was possible at the last correction, which then changed nothing.
+        degenerate: True if no particle was possible at the last correction, which then changed nothing.
         particles: Number of particles.
         widening: Factor of the spread in :meth:`protection_level`; 1 without a map, and before the first correction.
-        moments: (3, 3) second moments of the particles about the pose, if they are not the covariance: for the methods
-            "cluster" and "best".
-        distances: Distances of the particles from the pose, where the covariance does not describe them.
+        moments: (3, 3) second moments of the particles about the pose, for the methods "cluster" and "best"; otherwise
+            the covariance.
+        distances: Distances of the particles from the pose, unless the covariance describes them.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -75,20 +75,20 @@ class Estimate:
 
     @property
     def lost(self) -> bool:
-        """Tell whether p_lost is above 0.5: the pose is unusable, because scans contradict it or the spread is wide."""
+        """True if p_lost is above 0.5: the pose is unusable, because scans contradict it or the spread is wide."""
         return self.p_lost > LOST
 
     def protection_level(self, risk: float) -> float:
         """Return the radius that the error of the position exceeds with at most a stated probability [m].
 
-        It is the smallest r with ``p_lost + (1 - p_lost) P(|error| > r | not lost) <= risk``. P comes
-        from the particles, with their spread times ``widening``; see ``docs/localization.md``.
+        It is the smallest r with ``p_lost + (1 - p_lost) P(|error| > r | not lost) <= risk``. P comes from the
+        particles, with the spread times ``widening``; see ``docs/localization.md``.
 
         Args:
-            risk: The probability, from 0.01 to 1; logs support no lower one.
+            risk: The probability, from 0.01 to 1, the range supported by logs.
 
         Returns:
-            The radius; infinite where p_lost exceeds the risk, and for an effective sample size below 10.
+            The radius; infinite if p_lost exceeds the risk or the effective sample size is below 10.
 
         Raises:
             TypeError, ValueError: ``risk`` breaks its rule.
@@ -106,7 +106,7 @@ class Estimate:
 
 
 def covariance_of(numbers: np.ndarray) -> np.ndarray:
-    """Return the covariance from the results of kernel ``finish_estimate``; negative variances by rounding are 0."""
+    """Return the covariance from the results of kernel ``finish_estimate``, without negative variances."""
     xx, xy, xt, yy, yt, tt = numbers[3:9].tolist()
     xx, yy, tt = max(xx, 0.0), max(yy, 0.0), max(tt, 0.0)
     return np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
@@ -117,7 +117,7 @@ def sample_size_of(weights: np.ndarray, poses: np.ndarray | None = None) -> floa
 
     Args:
         weights: (N,) weights >= 0.
-        poses: (N, 3) particles, of which equal ones count as one; None for different ones.
+        poses: (N, 3) particles; equal ones count once. None if all differ.
     """
     if poses is not None:
         order = np.lexsort(poses.T)
@@ -128,7 +128,7 @@ def sample_size_of(weights: np.ndarray, poses: np.ndarray | None = None) -> floa
 
 
 def clustered(poses: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and covariance of the heaviest cluster: bins of particles that touch each other.
+    """Return mean and covariance of the heaviest cluster of touching bins.
 
     Args:
         poses: (N, 3) particles.

@@ -1,10 +1,9 @@
-"""Evidence of being lost among landmarks: how much better particles predict features than poses anywhere do.
+"""Find evidence of being lost among landmarks: the gain of particles over chance in predicting features.
 
 Before each correction, the mean likelihood of the features over the particles is compared with the larger of two
-alternatives: the mean over poses anywhere among the landmarks, and the likelihood that all features are false
-positives. The difference, in nats for each feature, is the logarithm of a Bayes factor (Jeffreys 1961). A filter that
-follows the robot gains several nats. A filter on a wrong map or at a wrong place gains none, and noise fitted to a
-wrong map cannot hide that.
+alternatives: the mean over poses anywhere among the landmarks, and the likelihood of false positives only. The
+difference, in nats per feature, is the logarithm of a Bayes factor (Jeffreys 1961). A filter that follows the robot
+gains several nats. A filter on a wrong map or at a wrong place gains none, even with noise fitted to a wrong map.
 """
 
 from __future__ import annotations
@@ -19,13 +18,13 @@ from gpusense.models.landmark.base import FeatureModel
 
 Floats = NDArray[np.float64]
 
-# Gain at which right and wrong are equally likely [nats per feature]; scans over which the gain is averaged; number of
-# poses anywhere, and their margin around the landmarks [m].
+# Gain at which right and wrong are equally likely [nats per feature]; scans in the average; number of poses anywhere,
+# and their margin around the landmarks [m].
 LEAST_GAIN, MEMORY, _ANYWHERE, _MARGIN = 1.0, 20, 1000, 1.0
 
 
 class Evidence:
-    """Gain of the predictions of features.
+    """Gain in predicting features.
 
     Args:
         model: The model of the landmarks or lines.
@@ -43,7 +42,7 @@ class Evidence:
     def gain(self, poses: Floats, weights: Floats, features: Floats) -> float:
         """Return the gain of particles over chance in predicting a scan [nats], before the scan corrects them.
 
-        Landmarks count as unidentified, since a pose is right even if two landmarks are exchanged in the map.
+        Landmarks count as unidentified, since exchanged landmarks of a map leave a right pose right.
 
         Args:
             poses: (N, 3) predicted particles.
@@ -70,18 +69,18 @@ class Gains(NamedTuple):
     """Gains of recent scans; immutable.
 
     Attributes:
-        recent: Gain [nats] and number of features of each scan, the last ``MEMORY`` ones.
+        recent: Gain [nats] and number of features of the last ``MEMORY`` scans.
     """
 
     recent: tuple[tuple[float, int], ...] = ()
 
     def added(self, gain: float, count: int) -> Gains:
-        """Return the gains with one more scan added."""
+        """Return the gains after adding a scan."""
         return Gains((*self.recent, (gain, count))[-MEMORY:])
 
     @property
     def mean(self) -> float:
-        """Mean gain of a feature [nats]; NaN before there are enough scans."""
+        """Mean gain per feature [nats]; NaN without enough scans."""
         if len(self.recent) < MEMORY:
             return math.nan
         return sum(gain for gain, _ in self.recent) / sum(count for _, count in self.recent)

@@ -1,4 +1,4 @@
-"""Particle filter: Monte Carlo localisation with the package's measurement and motion models."""
+"""Particle filter for Monte Carlo localisation."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ from gpusense.world.grid import OccupancyGrid
 
 
 class ParticleFilter(Whole):
-    """Monte Carlo localisation: particles that move with the odometry and are weighed by sensors.
+    """Monte Carlo localisation: particles move with the odometry, and sensors weigh them.
 
-    All state is on the device of the models. Random numbers depend on seed, step and particle alone: a seed gives the
+    All state is on the device of the models. Random numbers depend only on seed, step and particle: a seed yields the
     same particles on every backend, up to rounding of log-likelihoods. A correction has up to ``stages`` stages. Each
     applies the largest share of the temperature that keeps the effective sample size above a threshold, then resamples
-    and jitters (annealing). So a few hundred particles track a precise scanner.
+    and jitters (annealing). A few hundred particles therefore suffice for a precise scanner.
 
     Args:
         models: A measurement model, or several models on one device: scans, landmarks, beacons, positions, headings,
-            contacts. Each with temperature 1.
+            contacts; each of temperature 1.
         motion: :class:`OdometryMotion`, :class:`OmniMotion` or :class:`VelocityMotion`.
-        particles: Number of particles, or (least, most) with the number chosen by KLD sampling (Fox 2001).
+        particles: Number of particles, or (least, most) for KLD sampling (Fox 2001).
         seed: Seed of the random numbers, 0 to 2^64 - 1.
-        temperature: Factor of the log-likelihoods of scans in (0, 1], or "auto": from the correlation of beams, which
-            the filter measures while it runs (:func:`calibrate_temperature`). Other sensors have temperature 1.
-        resampling: "systematic", "stratified" or "residual"; sums are exact in each.
+        temperature: Factor of the log-likelihoods of scans in (0, 1], or "auto" for the measured correlation of beams
+            (:func:`calibrate_temperature`). Other sensors have temperature 1.
+        resampling: "systematic", "stratified" or "residual", all with exact sums.
         threshold: Resample where the effective sample size is below this share of the particles.
         stages: Most stages of a correction, 1 to 6; 1 is the plain particle filter with tempered weights.
-        recovery: "sensor": where scans contradict the pose, a rival cloud begins where the scan is likely (sensor
-            resetting, Lenser and Veloso 2000) and takes over once later scans prefer it; "augmented": inject uniform
-            particles where the scans' likelihood drops (*Probabilistic Robotics* table 8.3); None: neither.
-        beam_skip: None, or a share of the particles in (0, 1): a beam that a smaller share explains is left out, such
-            as a beam that hits a person. A scan that would lose most of its beams is used completely, as is every scan
-            while the particles are spread out. Each correction then first evaluates 100 particles on the host.
+        recovery: "sensor": if scans contradict the pose, a rival cloud starts where the scan is likely (sensor
+            resetting, Lenser and Veloso 2000), and takes over once later scans prefer it; "augmented": inject uniform
+            particles when the scans' likelihood drops (*Probabilistic Robotics* table 8.3); None: neither.
+        beam_skip: None, or a share of the particles in (0, 1): beams explained by a smaller share, such as beams on
+            people, are skipped. A scan that would lose most of its beams is used completely, as are all scans while the
+            particles are spread out. Each correction then evaluates 100 particles on the host first.
 
     Attributes:
         motion: The motion model.
@@ -134,7 +134,7 @@ class ParticleFilter(Whole):
             TypeError, ValueError: an argument breaks its rule.
 
         Warns:
-            PlausibilityWarning: the mean lies off the map, or its heading is more than a turn.
+            PlausibilityWarning: the mean is off the map, or its heading exceeds a turn.
         """
         self._parts.start_around(mean, covariance, particles)
 
@@ -142,11 +142,10 @@ class ParticleFilter(Whole):
     def initialize_uniform(self, *, bounds: AnyArray | None = None, particles: int | None = None) -> None:
         """Draw particles uniformly over the free cells of the map, with any heading.
 
-        Without bounds and with ``recovery="sensor"``, the pose to which they converge is later compared with other
-        places.
+        Unless bounded, ``recovery="sensor"`` compares the pose after convergence with other places.
 
         Args:
-            bounds: ((x_min, y_min), (x_max, y_max)) [m] to which they are limited; required for models without a grid.
+            bounds: Limits ((x_min, y_min), (x_max, y_max)) [m]; required for models without a grid.
             particles: Their number; the filter's (most) by default.
 
         Raises:
@@ -160,8 +159,8 @@ class ParticleFilter(Whole):
 
         Args:
             likelihood: The result of :func:`pose_likelihood`, or an object with ``log_p`` (M log-likelihoods, an array
-                of any shape) and ``positions`` ((M, 3) poses in the same order). Particles are spread over the cells of
-                its ``resolution`` [m] and the gaps of its ``headings``, if it has these.
+                of any shape) and ``positions`` ((M, 3) poses in the same order). Attributes ``resolution`` [m] and
+                ``headings``, if present, spread particles over cells and gaps.
             particles: Their number; the filter's (most) by default.
 
         Raises:
@@ -194,7 +193,7 @@ class ParticleFilter(Whole):
         self._parts.check_started()
         sampled = self.motion.sampled(*motion)
         if self._parts.tracker.progress.motion is None and self._parts.recovery.active is None:
-            # A single assignment, which no interrupt divides.
+            # A single assignment, indivisible by interrupts.
             self._parts.tracker.follow(sampled)
         else:
             self._follow(sampled)
@@ -205,7 +204,7 @@ class ParticleFilter(Whole):
 
     @settled
     def flush(self) -> None:
-        """Run the motion of the last ``predict`` now; otherwise the next correction or result runs it."""
+        """Run the motion of the last ``predict`` now instead of at the next correction or result."""
         if self._parts.tracker.progress.motion is not None:
             self._move()
 
@@ -223,8 +222,8 @@ class ParticleFilter(Whole):
                 ``(ranges, ids)``, ``(fix, covariance)``. None is a missing reading. Arrays on a device must not change
                 until :meth:`diagnose`, :meth:`reset` and :meth:`state`, which read them again.
 
-        If it raises, even by an interrupt of the user, the filter is unchanged, so the correction can be repeated. This
-        holds for all calls of a filter.
+        An exception, even a user's interrupt, leaves the filter unchanged, so that the correction can be repeated.
+        This holds for all calls of a filter.
 
         Raises:
             RuntimeError: the filter is not initialised.
@@ -236,7 +235,7 @@ class ParticleFilter(Whole):
 
     @whole
     def reset(self) -> None:
-        """Replace half of the particles by poses at which the last readings are likely (sensor resetting).
+        """Replace half of the particles by poses that make the last readings likely (sensor resetting).
 
         A motion predicted after these readings also moves the new particles.
 
@@ -262,7 +261,7 @@ class ParticleFilter(Whole):
 
     @settled
     def estimate(self, method: str = "mean") -> Estimate:
-        """Return the pose of the robot, without a change of the filter: corrections judge the pose themselves.
+        """Return the pose of the robot without changing the filter: corrections judge the pose.
 
         Args:
             method: "mean", the weighted mean with the circular mean of headings; "cluster", the mean of the heaviest
@@ -318,14 +317,14 @@ class ParticleFilter(Whole):
 
     @property
     def scoring_seconds(self) -> float:
-        """Seconds that the models' log-likelihoods have taken since ``time_scoring`` was called.
+        """Time of the models' log-likelihoods since the call of ``time_scoring`` [s].
 
-        Without ``time_scoring`` only the time of starting them counts; it is 0 where a step is one recorded program.
+        Unless ``time_scoring`` was called, only their start counts; for a step of one recorded program it is 0.
         """
         return self._cloud.scoring_seconds
 
     def time_scoring(self) -> None:
-        """Wait for the log-likelihoods of each stage from now on, so that ``scoring_seconds`` measures their time."""
+        """Wait for the log-likelihoods of each stage from now on, for ``scoring_seconds``."""
         self._cloud.time_scoring()
 
     @property
@@ -347,19 +346,19 @@ class ParticleFilter(Whole):
 
     @settled
     def host_weights(self) -> np.ndarray:
-        """Return a copy of the (N,) weights of the particles in host memory; their sum is 1."""
+        """Return a copy of the (N,) normalised weights in host memory."""
         return self._moved().host_weights()
 
     @property
     @settled
     def particles(self) -> Any:
-        """(N, 3) poses after the last step: on a GPU an array of the device, which further libraries use in place."""
+        """(N, 3) poses after the last step: on a GPU an array of the device, for use in place by other libraries."""
         return self._cloud.particles(self._moved().shown)
 
     @property
     @settled
     def weights(self) -> Any:
-        """(N,) weights of the particles, whose sum is 1: on a GPU an array of the device."""
+        """(N,) normalised weights: on a GPU an array of the device."""
         return self._cloud.shares(self._moved().shown)
 
     @property
@@ -369,23 +368,23 @@ class ParticleFilter(Whole):
         return self._cloud.moments(self._moved().shown)
 
     def explain(self) -> str:
-        """Describe in one line how a step is started on the device."""
+        """Describe in one line how a step starts on the device."""
         return self._cloud.explain()
 
     # ---- state
 
     @settled
     def state(self) -> FilterState:
-        """Return a copy of the filter's state, without models and device: see :class:`FilterState`."""
+        """Return a copy of the filter's state without models and device, see :class:`FilterState`."""
         self.flush()
         return FilterState(*self._kind(), *self._parts.state())
 
     @whole
     def restore(self, state: FilterState) -> None:
-        """Take over the state of a filter with the same options and models, and continue with the same bits.
+        """Restore the state of a filter with the same options and models, and continue with the same bits.
 
         Args:
-            state: The result of :meth:`state`, also of a filter on another device.
+            state: The result of :meth:`state`, possibly from another device.
 
         Raises:
             TypeError, ValueError: ``state`` is no state, or belongs to a filter with other options or models.

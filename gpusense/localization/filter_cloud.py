@@ -1,4 +1,4 @@
-"""The particles of a filter on one device, scored by its sensors."""
+"""Score a filter's particles on a device by its sensors."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from gpusense.localization.sensors import Sensor
 class FilterCloud(Cloud):
     """Particles of a filter on the device of its sensors.
 
-    Steps write no buffer that ``kept`` names, and finally name the new buffers in ``places``. So an interrupted call of
-    a filter is undone by restoring the attributes in ``MEMORY``.
+    Steps never write buffers named in ``kept``, and finally name the new buffers in ``places``. Restoring the
+    attributes in ``MEMORY`` therefore undoes an interrupted call of a filter.
 
     Args:
         sensors: The sensors of the filter.
@@ -36,7 +36,7 @@ class FilterCloud(Cloud):
         self.run_stages(step.settings, stages, step.drawn, len(step.readings), score, judges)
 
     def _judges_of(self, judged: Sequence[SensorReadings]) -> list[MapJudge]:
-        """Return the judges of scans, prepared for them."""
+        """Prepare and return the judges of scans."""
         sensors = ((self._scored[index], reading[0]) for index, reading in judged)
         return [judge for sensor, ranges in sensors if (judge := sensor.judge()).expects(sensor.model.scanner, ranges)]
 
@@ -46,5 +46,5 @@ class FilterCloud(Cloud):
         return sum(sensor.seconds for sensor in self._scored)
 
     def time_scoring(self) -> None:
-        """Wait for the log-likelihoods of each stage from now on, so that ``scoring_seconds`` is their time."""
+        """Wait for the log-likelihoods of each stage from now on, for ``scoring_seconds``."""
         self._scoring.timed = True

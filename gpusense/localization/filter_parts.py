@@ -1,4 +1,4 @@
-"""The parts of a particle filter, and the calls that change several of them."""
+"""Combine the parts of a particle filter."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from gpusense.localization.verdict import Verdict
 
 
 class FilterParts:
-    """Particles that follow the robot, the verdict on their pose, and recovery from a wrong pose.
+    """Particles, the verdict on their pose, and recovery from a wrong pose.
 
     Args:
         sensors: The sensors.
@@ -51,7 +51,7 @@ class FilterParts:
         self.last: dict[int, tuple[Any, ...]] = {}
 
     def keep(self) -> None:
-        """Record the buffers that the call now beginning must not overwrite."""
+        """Record the buffers that the present call must not overwrite."""
         self.tracker.keep()
         self.recovery.keep()
 
@@ -121,14 +121,14 @@ class FilterParts:
         if share is not None:
             used = skipping.skipped(self.sensors, used, tracker.moved_particles(), verdict.anywhere, share)
         tracker.weigh(used, judged=verdict.expected(everything, tracker.progress.motion))
-        # The caller may write the next readings to the same arrays.
+        # The caller may reuse the arrays for the next readings.
         self.last = {index: tuple(map(_copied, reading)) for index, reading in everything.items()}
         verdict.corrected()
         tracker.learn(used, self.recovery.is_doubted)
         self.recovery.corrected(used, self.last)
 
     def reset(self) -> None:
-        """Replace half of the particles by poses at which the last readings are likely, moved as since these."""
+        """Replace half of the particles by poses that make the last readings likely, moved by all later motion."""
         tracker = self.tracker
         tracker.move()
         tries = tracker.random_poses(starts.tries_of(tracker.cloud.count))
@@ -150,5 +150,5 @@ class FilterParts:
 
 
 def _copied(reading: Any) -> Any:
-    """Return a copy of a NumPy array, and another object as it is."""
+    """Return a copy of a NumPy array, and any other object unchanged."""
     return reading.copy() if isinstance(reading, np.ndarray) else reading

@@ -1,14 +1,14 @@
-"""State of a filter on the host: it changes as a whole or not at all, and is copied to and from plain data.
+"""Change a filter's state on the host atomically, and copy it to and from plain data.
 
-Python may raise KeyboardInterrupt between any two lines. A call that changes a filter first saves all of the filter's
-attributes in a journal, and at its end drops the journal by one assignment. If the call is interrupted, the journal
-restores the attributes at once or, if a second interrupt prevents that, before the next call. Buffers on a device need
-no copy, since a step writes only buffers that the attributes do not name yet.
+Python may raise KeyboardInterrupt between any two lines. A call that changes a filter first saves all attributes in a
+journal, and at its end drops the journal by one assignment. After an interrupt the journal restores the attributes at
+once or, if a second interrupt prevents that, before the next call. Buffers on a device need no copy, since a step
+writes only buffers that no attribute names yet.
 
-A class lists its state in ``MEMORY``, and in ``PARTS`` the attributes that hold state themselves. In any other class of
-this package all attributes are state. Dictionaries, lists and queues are saved item by item, objects of this package
-attribute by attribute, everything else by identity. Arrays belong to the last group, so arrays of state are replaced
-and never written.
+A class lists its state in ``MEMORY``, and attributes with further state in ``PARTS``. In any other class of this
+package all attributes are state. Dictionaries, lists and queues are saved item by item, objects of this package
+attribute by attribute, everything else by identity. The last group includes arrays: arrays of state are replaced, never
+written.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ import numpy as np
 
 _PACKAGE = "gpusense.localization."
 _PLAIN = (bool, int, float, str, np.generic)
-# Sensors are state of the filter alone, although further parts refer to them.
+# Sensors are state of the filter only, although other parts refer to them.
 _SENSORS = "_sensors"
-# Containers whose items are state.
+# Containers of state.
 _CONTAINERS = (dict, list, deque)
 
 P = ParamSpec("P")
@@ -42,7 +42,7 @@ _OTHER, _OBJECT, _CONTAINER = range(3)
 
 
 class _Kinds(dict[type, int]):
-    """Map classes to the place of their state: attributes, items, or identity alone."""
+    """Map classes to the kind of their state: attributes, items or identity."""
 
     def __missing__(self, kind: type) -> int:
         own = kind.__module__.startswith(_PACKAGE) and not issubclass(kind, (tuple, type))
@@ -57,7 +57,7 @@ _KINDS = _Kinds()
 
 
 def _attributes(owner: Any) -> dict[str, Any]:
-    """Return the state of an object by name; attributes that are not set yet are left out."""
+    """Return the state of an object by name, without unset attributes."""
     values: dict[str, Any] = owner.__dict__
     names: Collection[str] = getattr(owner, "MEMORY", ())
     return {name: values[name] for name in names if name in values} if names else values.copy()
@@ -78,7 +78,7 @@ class Journal:
         self._objects: list[tuple[Any, dict[str, Any]]] = []
         self._containers: list[tuple[Any, Any]] = []
         kinds, open_ = _KINDS, list(owners)
-        # By identity, so that each object or container is saved once.
+        # By identity: save each object or container once.
         seen: set[int] = set()
         for one in open_:
             if id(one) in seen:
@@ -90,7 +90,7 @@ class Journal:
                 self._containers.append((one, items))
                 open_ += [item for item in (items.values() if kind is dict else items) if kinds[type(item)]]
                 continue
-            # Faster than to choose attributes, which is left to ``restore``.
+            # Faster than choosing attributes, which ``restore`` does.
             kept = one.__dict__.copy()
             self._objects.append((one, kept))
             if (parts := getattr(kind, "PARTS", None)) is not None:
@@ -99,7 +99,7 @@ class Journal:
                 open_ += [item for name, item in kept.items() if kinds[type(item)] and name != _SENSORS]
 
     def is_running(self) -> bool:
-        """Return whether the present call runs within the journal's call."""
+        """Return whether the present call is within the journal's call."""
         frame: FrameType | None = sys._getframe(1)
         while frame is not None:
             if frame is self._frame:
@@ -108,7 +108,7 @@ class Journal:
         return False
 
     def close(self) -> None:
-        """Drop the reference to the call's frame, which holds this object."""
+        """Drop the reference to the call's frame, which refers back to this object."""
         self._frame = None
 
     def restore(self) -> None:
@@ -122,22 +122,19 @@ class Journal:
 
 
 class Whole:
-    """Base of objects whose calls change their state completely or not at all.
-
-    Calls of several threads wait for one another.
-    """
+    """Base class of objects with atomic calls, serialised over threads."""
 
     _journal: Journal | None = None
 
     def _begin_journals(self) -> None:
-        """Prepare the object for calls that are :func:`whole`."""
+        """Prepare the object for :func:`whole` calls."""
         self._calls = threading.RLock()
 
     def _keep(self) -> None:
-        """Record the buffers that the call now beginning must not overwrite."""
+        """Record the buffers that the present call must not overwrite."""
 
     def _changing(self) -> tuple[Any, ...]:
-        """Return the objects whose state a call may change: this one and its parts."""
+        """Return all objects that a call may change: this one and its parts."""
         return (self,)
 
     def settle(self) -> None:
@@ -151,14 +148,14 @@ W = TypeVar("W", bound=Whole)
 
 
 def whole(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P], R]:
-    """Make a method change its object's state completely or, if it raises, not at all."""
+    """Make a method atomic: if it raises, the object's state is unchanged."""
 
     @functools.wraps(method)
     def call(self: W, /, *args: P.args, **kwargs: P.kwargs) -> R:
         with self._calls:
             self.settle()
             if self._journal is not None:
-                # A call within a call that is already whole.
+                # A call within an atomic call.
                 return method(self, *args, **kwargs)
             self._keep()
             journal = self._journal = Journal(self._changing(), sys._getframe())
@@ -177,7 +174,7 @@ def whole(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P],
 
 
 def settled(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P], R]:
-    """Settle the state before a method that changes state only through methods that are :func:`whole`."""
+    """Settle the state before a method that changes state only through :func:`whole` methods."""
 
     @functools.wraps(method)
     def call(self: W, /, *args: P.args, **kwargs: P.kwargs) -> R:
@@ -204,15 +201,15 @@ class Held(NamedTuple):
 
 
 class _NotPlainError(Exception):
-    """A value that is no plain data, such as an object of a device or of another package."""
+    """A value is no plain data, such as an object of a device or another package."""
 
 
 def plain_state(owner: Any, *, without: Collection[str] = ()) -> dict[str, Any]:
-    """Return the state of an object as plain data, which pickles and holds no device.
+    """Return the state of an object as plain data that pickles and holds no device.
 
     Args:
         owner: The object.
-        without: Names of attributes that are left out.
+        without: Names of attributes to omit.
     """
     found = {}
     for name, value in _attributes(owner).items():
@@ -250,7 +247,7 @@ def set_state(owner: Any, values: Mapping[str, Any]) -> None:
 
 
 def _merged(now: Any, value: Any) -> Any:
-    """Return a value from plain data; present objects of this package keep everything that is not state."""
+    """Return a value from plain data; present objects of this package keep all other attributes."""
     if isinstance(value, Held):
         kind = type(now)
         target = now
@@ -261,7 +258,7 @@ def _merged(now: Any, value: Any) -> Any:
             made = getattr(importlib.import_module(module), name)
             target = made.__new__(made)
         elif not hasattr(kind, "MEMORY"):
-            # A new object, so that a single assignment replaces it.
+            # A new object, for a single assignment.
             target = copy.copy(now)
         set_state(target, value.values)
         return target

@@ -1,8 +1,7 @@
-"""Beams of a scan judged on a device by the cells of a map: alone, or by a correction at the pose that it estimates.
+"""Judge beams of a scan on a device by the cells of a map, alone or within a correction at its estimated pose.
 
-The kernel ``judge_beams`` takes pose and covariance from the results of ``finish_estimate``. So the launch of a
-correction that estimates the pose may be followed at once by that of the judgement, and one copy reads both. A
-judgement is kept with everything on which it depends, and is returned where the same is asked for.
+The kernel ``judge_beams`` reads pose and covariance from the results of ``finish_estimate``, so that its launch can
+follow a correction's estimate at once, and one copy reads both. A judgement is cached with all its inputs.
 """
 
 from __future__ import annotations
@@ -27,24 +26,22 @@ from gpusense.world.scanner import Scanner, classify_ranges
 
 Floats = NDArray[np.float64]
 
-# Most beams of a scan that are judged; readings beyond are walked up to here only [m]. Twice the middles of that many
-# parts of a scan.
+# Most judged beams of a scan; longest walk [m]. Twice the middles of as many parts of a scan.
 BEAMS, _FARTHEST = 32, 20.0
 _MIDDLES = np.arange(BEAMS) * 2 + 1
-# Companions start beside the beam [m] and diverge by an angle [rad]; both grow with the deviations of the pose, up to
-# these limits.
+# Offset [m] and divergence [rad] of companion rays; both grow with the deviations of the pose, up to these limits.
 BESIDE, _APART, _MOST_BESIDE, _MOST_APART = 0.08, 0.025, 0.3, 0.1
-# Tolerance of a range: a share of it, and its least values [m] and [cells].
+# Tolerance of a range: relative, and least values [m] and [cells].
 _PART, _LEAST, _LEAST_CELLS = 0.02, 0.2, 2.0
 # Numbers of a judgement.
 JUDGED = 2 * BEAMS
 _DOUBLE, _PLAIN = np.dtype(np.float64), frozenset[str]()
-# Numbers of parts of maps on devices, which recorded launches name.
+# Version numbers of map parts on devices, keys of recorded launches.
 _VERSIONS = itertools.count(1)
 
 
 class Beams(NamedTuple):
-    """The beams of a scan that are judged.
+    """Judged beams of a scan.
 
     Attributes:
         bearing: (B,) bearings [rad].
@@ -60,9 +57,9 @@ class _Setting(NamedTuple):
 
     Attributes:
         scanner: The scanner.
-        turn: Direction of bearing 0 in the map, less the robot's heading [rad].
+        turn: Direction of bearing 0 in the map relative to the robot's heading [rad].
         frame: Frame of the map.
-        rules: Rules for readings, with the first row and column of the map's part.
+        rules: Rules for readings, and first row and column of the map's part.
     """
 
     scanner: Scanner
@@ -72,12 +69,12 @@ class _Setting(NamedTuple):
 
 
 class _Expected(NamedTuple):
-    """A scan that a correction judges.
+    """Scan to be judged by a correction.
 
     Attributes:
         scanner: The scanner.
         ranges: The bytes of its (K,) readings.
-        beams: The beams that are judged.
+        beams: Judged beams.
         version: The part of the map.
     """
 
@@ -88,7 +85,7 @@ class _Expected(NamedTuple):
 
 
 def chosen_beams(scanner: Scanner, ranges: Floats) -> Beams:
-    """Return the beams of a scan (K,) that are judged."""
+    """Return the judged beams of a scan (K,)."""
     hit, far = classify_ranges(ranges, scanner.range_min, scanner.range_max)
     chosen = (hit | far).nonzero()[0]
     if len(chosen) > BEAMS:
@@ -97,7 +94,7 @@ def chosen_beams(scanner: Scanner, ranges: Floats) -> Beams:
 
 
 def judged_on_host(grid: OccupancyGrid, scanner: Scanner, pose: Floats, covariance: Floats, beams: Beams) -> Floats:
-    """Return the result of the kernel ``judge_beams``, computed on the host."""
+    """Compute the result of the kernel ``judge_beams`` on the host."""
     setting, count = _setting_of(grid, scanner), len(beams.bearing)
     scan = np.concatenate([beams.bearing + setting.turn, beams.reading])
     estimate, judged = np.array(_numbers_of(pose, covariance)), np.empty(2 * count)
@@ -108,7 +105,7 @@ def judged_on_host(grid: OccupancyGrid, scanner: Scanner, pose: Floats, covarian
 
 
 class MapJudge:
-    """The cells of a map around the last pose on a device, which judges beams there.
+    """Cells of a map around the last pose on a device, for judging beams.
 
     Args:
         backend: The device.
@@ -116,7 +113,7 @@ class MapJudge:
 
     Attributes:
         grid: The map.
-        version: Number of the part of the map on the device, different from those of all others; 0 before.
+        version: Unique number of the part of the map on the device; 0 before.
     """
 
     def __init__(self, backend: Backend, grid: OccupancyGrid) -> None:
@@ -132,7 +129,7 @@ class MapJudge:
         self._given, self._begin = backend.upload(np.zeros(begin + JUDGED)), begin
         self._estimate = backend.part(self._given, 0, MOMENTS, _DOUBLE)
         self._scan = backend.part(self._given, begin, JUDGED, _DOUBLE)
-        # The scan that a correction judges; with its result, the pose and covariance of that.
+        # Scan to be judged by a correction; later its result with pose and covariance.
         self._expected: _Expected | None = None
         self._known: tuple[_Expected, list[float], Floats] | None = None
         self._uploaded: Floats | None = None
@@ -165,7 +162,7 @@ class MapJudge:
         return beams, result
 
     def expects(self, scanner: Scanner, ranges: Floats) -> bool:
-        """Prepare for a scan that a correction judges at the pose that it estimates, after judgements have ended.
+        """Prepare for judging a scan in a correction at its estimated pose, after previous judgements.
 
         Args:
             scanner: The scanner.
@@ -181,7 +178,7 @@ class MapJudge:
         count = len(beams.bearing)
         if not count:
             return False
-        # Readings that are NaN are no beams.
+        # NaN marks unused beams.
         scan = np.full(JUDGED, np.nan)
         np.add(beams.bearing, turn, out=scan[:count])
         scan[BEAMS : BEAMS + count] = beams.reading
@@ -191,7 +188,7 @@ class MapJudge:
         return True
 
     def launches(self, estimate: Buffer, judged: Buffer) -> Program:
-        """Return the launch that judges the expected scan at an estimate, and depends on ``version``."""
+        """Return the launch that judges the expected scan at an estimate; ``version`` is its key."""
         if self._expected is None:
             raise RuntimeError("launches: needs a scan that is expected")
         return self._launches(self._set(self._expected.scanner), estimate, judged, BEAMS)
@@ -210,7 +207,7 @@ class MapJudge:
             self._known = expected, numbers, result
 
     def _is_of(self, expected: _Expected, scanner: Scanner, ranges: Floats) -> bool:
-        """Tell whether a judgement is that of a scan by the present part of the map."""
+        """Return whether a judgement belongs to a scan and the present part of the map."""
         same = expected.scanner is scanner and expected.version == self.version
         return same and expected.ranges == ranges.tobytes()
 
@@ -234,7 +231,7 @@ class MapJudge:
         return self._setting
 
     def _cover(self, setting: _Setting, pose: Floats) -> None:
-        """Copy another part of the map if some cells are missing that a ray from a pose may reach."""
+        """Copy another part of the map if it lacks cells within reach of a pose."""
         frame, rules = setting.frame, setting.rules
         c, s = math.cos(pose[2]), math.sin(pose[2])
         x = float(pose[0]) - frame.origin_x + c * frame.mount_x - s * frame.mount_y
@@ -245,14 +242,14 @@ class MapJudge:
             (begin == 0 or place - reach >= begin) and (end >= size or place + reach < end)
             for (begin, end), place, size in zip(self._part, places, self.grid.shape, strict=True)
         ):
-            # With a margin, so that a robot that moves on seldom needs another part.
+            # Add a margin, so that a moving robot seldom needs another part.
             self._part = (top, bottom), (left, right) = self._around(places, 1.5 * reach)
             part = np.ascontiguousarray(self.grid.cells[top:bottom, left:right])
             self._cells = self._space.upload("cells", part.reshape(-1).view(np.uint8))
             self.version, self._setting = next(_VERSIONS), None
 
     def _around(self, places: tuple[float, float], reach: float) -> tuple[tuple[int, int], tuple[int, int]]:
-        """Return rows and columns within a distance of a place [cells], at least one of each."""
+        """Return rows and columns within a distance of a position [cells], at least a row and a column."""
         spans = []
         for place, size in zip(places, self.grid.shape, strict=True):
             low = int(min(max(place - reach, 0.0), size - 1.0))
@@ -264,19 +261,19 @@ def _numbers_of(pose: Floats, covariance: Floats) -> list[float]:
     """Return a pose and its covariance in the order of the kernels' estimate."""
     x, y, theta = (float(value) for value in pose)
     (xx, xy, xt), (_, yy, yt), (_, _, tt) = covariance.tolist()
-    # Of headings within half a turn nothing is rounded off.
+    # Headings within half a turn are exact.
     return _finished([x, y, math.remainder(theta, math.tau), xx, xy, xt, yy, yt, tt])
 
 
 def _finished(numbers: list[float]) -> list[float]:
-    """Return an estimate whose variances are not negative by rounding."""
+    """Clear an estimate's variances that rounding made negative."""
     for place in (3, 6, 8):
         numbers[place] = max(numbers[place], 0.0)
     return numbers
 
 
 def _setting_of(grid: OccupancyGrid, scanner: Scanner, corner: tuple[int, int] = (0, 0)) -> _Setting:
-    """Return the setting of a scanner in a map, or in its part from a row and a column on."""
+    """Return the setting of a scanner in a map, or in a part that begins at ``corner``."""
     side, (top, left) = grid.resolution, corner
     rules = BeamRules(
         max(BESIDE, side), max(_MOST_BESIDE, side), _APART, _MOST_APART, scanner.cone / 2,

@@ -1,4 +1,4 @@
-"""Judge the poses of any localiser: pose and readings in, probability of being lost out."""
+"""Judge the poses of any localiser by its readings."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gpusense.localization.verdict import Verdict, VerdictState
 from gpusense.localization.words import LOST, Word, word_of
 from gpusense.world.scanner import float64_readings
 
-# Number of poses drawn from a covariance to predict features.
+# Number of poses drawn from a covariance for predicting features.
 _DRAWN = 64
 
 
@@ -30,10 +30,9 @@ class PoseVerdict:
 
     Attributes:
         p_lost: Probability that the pose is off by more than 1 m or 0.5 rad.
-        verdict: "tracking"; "uncertain", if the covariance is wide or p_lost is above 0.1; or "lost", if readings
-            contradict the pose and p_lost is above 0.5.
-        explained: Among the beams that the map could explain, the share that agrees with it at the pose; NaN without
-            one.
+        verdict: "tracking"; "uncertain", for a wide covariance or p_lost above 0.1; or "lost", if readings contradict
+            the pose and p_lost is above 0.5.
+        explained: Agreeing share of the explainable beams at the pose; NaN without any.
         covariance: (3, 3) covariance of the pose; None if the localiser states none.
         widening: Factor of the spread in :meth:`protection_level`.
 
@@ -51,18 +50,18 @@ class PoseVerdict:
 
     @property
     def lost(self) -> bool:
-        """Tell whether p_lost is above 0.5."""
+        """Return whether p_lost is above 0.5."""
         return self.p_lost > LOST
 
     def protection_level(self, risk: float) -> float:
         """Return the radius that the error of the position exceeds with at most a stated probability [m].
 
-        It is the smallest r with ``p_lost + (1 - p_lost) P(|error| > r | not lost) <= risk``. P comes
-        from a normal density with the pose's covariance, and with the factor of this package's filter. If the localiser
-        states no covariance, the radius is 1 m: a pose that is not lost is off by at most that.
+        It is the smallest r with ``p_lost + (1 - p_lost) P(|error| > r | not lost) <= risk``. P comes from a normal
+        density with the pose's covariance and the widening factor of this package's filter. If the localiser states no
+        covariance, the radius is 1 m, the largest error of a pose that is not lost.
 
         Args:
-            risk: The probability, from 0.01 to 1; logs support no lower one.
+            risk: The probability, from 0.01 to 1, the range supported by logs.
 
         Returns:
             The radius; infinite where p_lost exceeds the risk.
@@ -79,15 +78,15 @@ class PoseVerdict:
 
 
 class PoseMonitor:
-    """Judge the poses of a localiser by its scans, one after another.
+    """Judge a localiser's poses by successive scans.
 
-    It needs no particle filter: poses may come from AMCL, a pose graph or motion capture. Each call adds a scan to a
-    belief that persists between calls (``docs/localization.md``), so pass the scans in order. Unlike a filter it
-    does not compare the pose with other places of the map, so on a coarse map it says "lost" more often.
+    Poses may come from AMCL, a pose graph or motion capture. Each call adds a scan to a persistent belief
+    (``docs/localization.md``), so pass the scans in order. Unlike a filter it does not compare the pose with other
+    places of the map; on a coarse map it therefore reports "lost" more often.
 
     Args:
-        models: A model of scans or landmarks with the map, or several of one device.
-        seed: Seed of the random poses with which features are compared.
+        models: A model of scans or landmarks with the map, or several models of a device.
+        seed: Seed of the random poses for comparing features.
 
     Raises:
         TypeError: An object is no such model.
@@ -117,7 +116,7 @@ class PoseMonitor:
         return f"PoseMonitor([{names}], scans={self._verdict.state.corrections}, wrong={self._verdict.wrong:.2g})"
 
     def update(self, pose: AnyArray, ranges: Any, covariance: AnyArray | None = None) -> PoseVerdict:
-        """Judge a pose by the readings taken there.
+        """Judge a pose by its readings.
 
         Args:
             pose: (3,) x, y, theta [m, m, rad].
@@ -149,7 +148,7 @@ class PoseMonitor:
 
     @property
     def state(self) -> VerdictState:
-        """All that the monitor remembers of the scans: an immutable value that may be stored and assigned again."""
+        """The monitor's memory of the scans: an immutable value that can be stored and assigned again."""
         return self._verdict.state
 
     @state.setter
@@ -197,7 +196,7 @@ def _checked(covariance: AnyArray) -> np.ndarray:
 
 
 def _finite(covariance: np.ndarray) -> np.ndarray:
-    """Return a covariance from which poses can be drawn."""
+    """Return a covariance for drawing poses."""
     if np.isfinite(covariance).all():
         values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

@@ -1,8 +1,8 @@
-"""Motion models: densities of a robot's motion, given its odometry or its commands.
+"""Motion models: densities of a robot's motion for given odometry or commands.
 
-The models are those of Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), chapter 5. Each gives the means and
-deviations of a first turn, a translation ahead and to the left, and a second turn, which the kernel
-``move_particles`` samples for each particle.
+The models follow Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), chapter 5. Each returns means and deviations
+of a first turn, a translation ahead and to the left, and a second turn; the kernel ``move_particles`` samples them for
+each particle.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from gpusense.localization.defaults import DEFAULTS
 
 # Least translation that has a direction [m].
 SHORTEST = 0.01
-# Largest turn of a step, and largest deviation of turns [rad], since kernels take headings of up to LARGEST_HEADING.
+# Largest turn of a step and largest deviation of turns [rad]; kernels limit headings to LARGEST_HEADING.
 _MOST_TURNED = 1e5
 
 
 class SampledMotion(NamedTuple):
-    """Numbers that ``move_particles`` samples.
+    """Parameters of the kernel ``move_particles``.
 
     Attributes:
         mean: First turn, translation ahead and to the left, second turn [rad, m, m, rad].
@@ -43,7 +43,7 @@ class SampledMotion(NamedTuple):
         """Return a pose (x, y, theta) [m, m, rad] after the mean motion."""
         (x, y, theta), (first, ahead, left, second) = pose, self.mean
         if self.kind == VELOCITY_MODEL:
-            # The chord of an arc that turns by twice the first turn.
+            # Chord of an arc that turns by twice the first turn.
             ahead, second = ahead * (math.sin(first) / first if first else 1.0), first + second
         cosine, sine = math.cos(theta + first), math.sin(theta + first)
         turned = math.remainder(theta + first + second, math.tau)
@@ -62,7 +62,7 @@ class MotionModel(Protocol):
 
 
 def _difference(before: np.ndarray, after: np.ndarray) -> tuple[float, float, float]:
-    """Return one pose in the frame of a second one, without the cost of arrays."""
+    """Return the pose ``after`` in the frame of ``before``, without the cost of arrays."""
     (x0, y0, theta0), (x1, y1, theta1) = before.tolist(), after.tolist()
     x, y, cosine, sine = x1 - x0, y1 - y0, math.cos(theta0), math.sin(theta0)
     return cosine * x + sine * y, cosine * y - sine * x, math.remainder(theta1 - theta0, math.tau)
@@ -71,7 +71,7 @@ def _difference(before: np.ndarray, after: np.ndarray) -> tuple[float, float, fl
 def odometry_turns(before: object, after: object) -> tuple[float, float, float]:
     """Return an odometer's motion as a first turn, a translation and a second turn [rad, m, rad].
 
-    Below a translation of 1 cm the whole turn is the second turn. A first turn of more than a quarter turn counts as
+    For translations below 1 cm the second turn is the whole turn. A first turn of more than a quarter turn counts as
     driving backwards, with a negative translation.
 
     Args:
@@ -123,15 +123,14 @@ class OdometryMotion:
     Attributes:
         alpha: (4,) noise. The variances are ``alpha[0] turn^2 + alpha[1] trans^2`` of each turn, and
             ``alpha[2] trans^2 + alpha[3] (turn1^2 + turn2^2)`` of the translation [rad^2, m^2].
-        reverse: Probability that the translation had the opposite direction. Some odometers count wheel turns without a
-            sign; a filter loses track on such logs with 0.
-        least: Standard deviations of translation and turns that are always added [m, rad], for slipping wheels or a
+        reverse: Probability of a translation in the opposite direction. Some odometers count wheel turns without sign;
+            with 0, a filter loses track on their logs.
+        least: Additional standard deviations of translation and turns of each step [m, rad], for slipping wheels or a
             pushed robot.
-        systematic: Systematic errors, corrected before noise is added: the shares of translations and of turns that the
-            odometer misses, and a turn per metre [rad/m], as from wheels of unequal radius (Borenstein and Feng 1996).
-        sideways: Variance of a sideways translation per squared turn [m^2/rad^2], for a robot that slips as it turns,
-            or whose odometer reports a point other than its centre of rotation. 0 is the book's model, which has no
-            sideways motion.
+        systematic: Systematic errors, corrected before noise is added: the missed shares of translations and of turns,
+            and a turn per metre [rad/m], as from wheels of unequal radius (Borenstein and Feng 1996).
+        sideways: Variance of a sideways translation per squared turn [m^2/rad^2], for a robot that slips in turns, or
+            an odometer at a point other than the centre of rotation. 0 is the book's model without sideways motion.
 
     Raises:
         TypeError, ValueError: a number is missing, negative or not finite.
@@ -158,9 +157,9 @@ class OdometryMotion:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Make the model from a mapping of its attributes, as ``gpusense fit`` writes it.
+        """Make the model from a mapping of its attributes, such as ``gpusense fit`` writes.
 
-        Missing attributes have their defaults.
+        Missing attributes take their defaults.
 
         Raises:
             TypeError: ``values`` is not a mapping, or a value has the wrong type.
@@ -187,7 +186,7 @@ class OdometryMotion:
         trans *= 1 + stretch
         a1, a2, a3, a4 = self.alpha
         at, ar = self.least
-        # Noise does not depend on the direction: turning by half a turn and back is no turn.
+        # Noise is independent of the direction: turning by half a turn and back is no turn.
         deviations = [math.sqrt(a1 * turn * turn + a2 * trans * trans + ar * ar) for turn in (first, second)]
         squares = first * first + second * second
         length = math.sqrt(a3 * trans * trans + a4 * squares + at * at)
@@ -205,7 +204,7 @@ class OmniMotion:
     Attributes:
         alpha: (5,) noise. The variances are ``alpha[0] turn^2 + alpha[1] trans^2`` of the turn, ``alpha[2] trans^2 +
             alpha[3] turn^2`` of the translation along its direction, and ``alpha[4] trans^2 + alpha[3] turn^2`` across.
-        least: Standard deviations of translation and turn that are always added [m, rad].
+        least: Additional standard deviations of translation and turn of each step [m, rad].
 
     Raises:
         TypeError, ValueError: a number is missing, negative or not finite.
@@ -251,7 +250,7 @@ class VelocityMotion:
     Attributes:
         alpha: (6,) noise. The variances are ``alpha[0] v^2 + alpha[1] w^2`` of v, ``alpha[2] v^2 + alpha[3] w^2`` of w
             and ``alpha[4] v^2 + alpha[5] w^2`` of a last turn per second.
-        least: Standard deviations of translation and last turn that are always added [m, rad].
+        least: Additional standard deviations of translation and last turn of each step [m, rad].
 
     Raises:
         TypeError, ValueError: a number is missing, negative or not finite.
@@ -290,6 +289,6 @@ class VelocityMotion:
 def settings_of(motion: SampledMotion) -> tuple[list[float], float]:
     """Return the eight means and deviations, and the probability of a reverse."""
     first, ahead, left, second = motion.deviation
-    # A heading with a deviation of many turns is uniform, so a limit changes only the size of the numbers.
+    # A heading with a deviation of many turns is uniform; the limit changes only the size of the numbers.
     turns = min(first, _MOST_TURNED), min(second, _MOST_TURNED)
     return [*motion.mean, turns[0], ahead, left, turns[1]], motion.reverse

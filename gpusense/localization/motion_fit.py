@@ -1,22 +1,21 @@
 """Fit the noise of the odometry model to a log with reference poses, by maximum likelihood with weak priors.
 
-The difference between reference and odometry over a step is, to first order, normal: (along, across, heading) =
-(noise of the translation, trans * noise of the first turn + noise to the side, noise of both turns). Where references
-are further apart, the covariances of the steps in between add up (:mod:`gpusense.localization.step_errors`). A Student
-t density with 4 degrees of freedom prevents single slips from inflating the noise of all steps. The probability of a
-reverse comes from the number of steps that fit better with the odometer's translation reversed. A filter draws normal
-noise: the variances are multiplied by the mean square of standardised errors, each at most 9.
+The difference between reference and odometry over a step is, to first order, normal: (along, across, heading) = (noise
+of the translation, trans * noise of the first turn + sideways noise, noise of both turns). Between distant references
+the covariances of all steps add up (:mod:`gpusense.localization.step_errors`). A Student t density with 4 degrees of
+freedom prevents single slips from inflating the noise of all steps. The probability of a reverse comes from the number
+of steps that fit better with a reversed translation. Since a filter draws normal noise, the variances are multiplied by
+the mean square of standardised errors, each at most 9.
 
-Errors of an odometer repeat from step to step (a wheel's radius, a slope), while a filter draws new noise at each step.
-Their constant part is also fitted (on the intel log 3 degrees a metre). For the rest, variances are multiplied by
-1 + 2 sum rho_l, the inflation of the variance of a sum by the autocorrelation rho_l of standardised errors, if it is
-significant.
+An odometer's errors repeat from step to step (a wheel's radius, a slope), while a filter draws new noise at each step.
+Their constant part is also fitted (on the intel log 3 degrees a metre). The variances of the rest are multiplied by 1 +
+2 sum rho_l, if significant: the autocorrelation rho_l of standardised errors inflates the variance of a sum.
 
-A log may not determine each variance: a robot that never turned says nothing about the noise of turns. The logarithm of
-each variance has a normal prior around the default, with a deviation of a factor of ten. A variance without data keeps
-the default; the prior moves a variance determined by 100 steps by 2 % of the distance to the default. With the Fisher
-information I of the t density (Lange, Little and Taylor 1989), the logarithms have the covariance (I + 1 / prior
-variance)^-1. A variance counts as determined if the data at least halve the prior's deviation. An undetermined
+A log may leave variances undetermined: a robot that never turned reveals nothing about the noise of turns. The
+logarithm of each variance has a normal prior around the default, with a deviation of a factor of ten. A variance
+without data keeps the default; a variance determined by 100 steps moves by 2 % of the distance to the default. The
+covariance of the logarithms is (I + 1 / prior variance)^-1, with the Fisher information I of the t density (Lange,
+Little and Taylor 1989). A variance is determined if the data at least halve the prior's deviation. An undetermined
 variance, including its inflation, is at most the default.
 """
 
@@ -39,22 +38,21 @@ from gpusense.localization.step_errors import NOISES, REST, Errors, corrected, e
 
 _FREEDOM = 4.0
 _LEAST_ALPHA, _MOST_ALPHA = 1e-6, 1.0
-# Limits of the least deviations [m, rad], and the largest squared standardised error that counts in the tails.
+# Limits of the least deviations [m, rad], and largest squared standardised error in the tails.
 _LEAST, _MOST, _FAR = 0.002, 0.1, 9.0
-# Distance by which a reversed translation must fit better to count [m].
+# Least improvement of a reversed translation [m].
 _CLEAR = 0.05
-# Longest lag of the autocorrelation, deviations beyond which its sums are significant, and the largest inflation.
+# Longest lag of the autocorrelation, significance of its sums [deviations], and largest inflation.
 _LAGS, _SIGNIFICANT, _MOST_INFLATION = 10, 4.0, 10.0
-# Prior deviation of each of the three parts of the systematic error; rounds of the fit.
+# Prior deviation of each part of the systematic error; rounds of the fit.
 _PRIOR, _ROUNDS = 0.1, 3
-# Defaults of the variances, prior deviation of their logarithms, and number of steps that the default of ``reverse``
-# counts as.
+# Defaults of the variances, prior deviation of their logarithms, and weight of the default of ``reverse`` [steps].
 _DEFAULT = np.array([*DEFAULTS.alpha, DEFAULTS.sideways, *(value**2 for value in DEFAULTS.least)])
 _PRIOR_LOG, _PRIOR_STEPS = math.log(10), 25
 # Logarithms of the defaults, and of the limits of variances.
 _LOG_DEFAULT = np.log(_DEFAULT)
 _LOWEST, _HIGHEST = np.log([_LEAST_ALPHA] * 5 + [_LEAST**2] * 2), np.log([_MOST_ALPHA] * 5 + [_MOST**2] * 2)
-# A variance is determined if the deviation of its logarithm is at most this share of the prior deviation.
+# Largest deviation of the logarithm of a determined variance, as a share of the prior deviation.
 _DETERMINED = 0.5
 
 
@@ -65,16 +63,16 @@ class MotionFit:
     Attributes:
         motion: The model.
         steps: Number of steps of the odometer between the first and the last reference.
-        reversed_steps: Steps in which the odometer's translation had the wrong sign.
-        inflation: Factor of the variances by the autocorrelation and the tails of errors, included in ``motion``.
+        reversed_steps: Steps with a translation of the wrong sign.
+        inflation: Factor of the variances for autocorrelation and tails of errors, included in ``motion``.
         log_likelihood: Log-likelihood of all differences before the inflation, up to a constant.
         references: Number of reference poses.
         travelled: Sum of the translations of the steps [m].
         turned: Sum of the turns of the steps [rad].
         log_errors: (7,) standard errors of the logarithms of alpha1 to alpha4, ``sideways`` and the squares of
-            ``least``, if steps err independently; 2.3, a factor of ten, if the log has no information.
-        undetermined: Names of the parameters that the log does not determine, with an error of the logarithm above
-            1.15. Each has its default, or less if the log excludes the default.
+            ``least``, for independent steps; 2.3, a factor of ten, if the log has no information.
+        undetermined: Names of undetermined parameters, with an error of the logarithm above 1.15. Each has its
+            default, or less if the log excludes the default.
 
     Example:
         >>> import gpusense as gs
@@ -107,14 +105,14 @@ class MotionFit:
 def fit_odometry_motion(odometry: AnyArray, poses: AnyArray, *, systematic: bool = True) -> MotionFit:
     """Fit the noise of :class:`OdometryMotion` to a log with reference poses.
 
-    The fitted noise is that of one step of ``odometry`` and depends on the step's length, so pass every step that a
-    filter will take. Reference poses may be known at some steps only. A variance that the log does not determine is at
-    most the default of :class:`OdometryMotion`, and is in ``undetermined``.
+    The noise depends on the length of a step, so pass ``odometry`` with the steps of the filter. Some reference poses
+    may be unknown. A variance that the log does not determine is at most the default of :class:`OdometryMotion`, and is
+    listed in ``undetermined``.
 
     Args:
         odometry: (M, 3) poses of the odometer, M > 2 [m, m, rad].
         poses: (M, 3) reference poses at the same times; rows of NaN where unknown, at most M - 3.
-        systematic: Fit the errors that repeat at each step; otherwise they are 0.
+        systematic: Fit the errors that repeat at each step instead of assuming 0.
 
     Raises:
         TypeError, ValueError: the arrays are no poses, or fewer than three, or the odometer moved by less than 1 cm and
@@ -178,9 +176,9 @@ def _references(poses: AnyArray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _reverse(turns: np.ndarray, reference: np.ndarray, at: np.ndarray) -> tuple[int, int]:
-    """Reverse translations that then fit better; return the numbers of steps tested and reversed.
+    """Reverse translations that fit better reversed; return the numbers of tested and reversed steps.
 
-    A reverse shows only where a step has a reference before and after it.
+    Only steps with references before and after can be tested.
     """
     single = np.flatnonzero(np.diff(at) == 1)
     truth, steps = pose_difference(reference[single], reference[single + 1]), at[single]
@@ -202,7 +200,7 @@ def _motion(noise: np.ndarray, reverse: float, repeated: np.ndarray) -> Odometry
 
 
 def _fitted(errors: Errors, starts: list[np.ndarray]) -> tuple[np.ndarray, float]:
-    """Return the most probable variances given the prior, and the negative log-likelihood there without it."""
+    """Return the most probable variances given the prior, and their negative log-likelihood without it."""
     from scipy.optimize import minimize
 
     def cost(logs: np.ndarray) -> float:
@@ -225,7 +223,7 @@ def _limited(logs: np.ndarray) -> np.ndarray:
 def _systematic(noise: np.ndarray, errors: Errors, before: np.ndarray) -> np.ndarray:
     """Return the correction (3,) of the systematic error for given variances.
 
-    It comes from least squares, reweighted for the t density, around the error that is already corrected.
+    Least squares, reweighted for the t density, start from the present correction.
     """
     inverse = np.linalg.inv(errors.covariances(noise))
     design, residual = errors.design, errors.residual
@@ -258,7 +256,7 @@ def _log_errors(noise: np.ndarray, errors: Errors) -> np.ndarray:
 
 
 def _inflation(noise: np.ndarray, errors: Errors) -> float:
-    """Return the factor of the variances by the tails of errors and by their autocorrelation."""
+    """Return the factor of the variances for tails and autocorrelation of errors."""
     variances = np.diagonal(errors.covariances(noise), axis1=1, axis2=2)
     standardised = errors.residual / np.sqrt(variances)
     tails = float(np.mean(np.minimum(standardised**2, _FAR)))
@@ -268,8 +266,8 @@ def _inflation(noise: np.ndarray, errors: Errors) -> float:
 def _correlation_factor(errors: np.ndarray) -> float:
     """Return 1 + 2 sum rho_l of errors (G, C), the mean over the components with a significant autocorrelation.
 
-    The rho_l keep their signs, so noise has no mean effect. The sum of the first m of them has the variance m / G for
-    independent errors, or less. A component counts if one of its sums exceeds a multiple of the deviation.
+    The rho_l keep their signs, so that noise has no mean effect. For independent errors the sum of the first m has the
+    variance m / G, or less. A component is significant if any sum exceeds a multiple of the deviation.
     """
     lags = np.arange(1, min(_LAGS, len(errors) - 1) + 1)
     squares = np.maximum(np.sum(errors**2, axis=0), 1e-300)

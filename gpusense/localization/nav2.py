@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 LaserModel = Literal["beam", "likelihood_field", "likelihood_field_prob"]
 
-# Defaults of nav2_amcl 1.5.0's node. The types of the values are those of the parameters.
+# Defaults of nav2_amcl 1.5.0's node, with the parameters' types.
 DEFAULTS: dict[str, Any] = {
     "alpha1": 0.2, "alpha2": 0.2, "alpha3": 0.2, "alpha4": 0.2, "alpha5": 0.2,
     "base_frame_id": "base_footprint", "beam_skip_threshold": 0.3, "do_beamskip": False,
@@ -54,7 +54,7 @@ _ROBOTS = {
 
 @dataclass(frozen=True)
 class Nav2Options:
-    """Options of nav2_amcl's node, as :func:`from_nav2` reads them.
+    """Options of nav2_amcl's node, read by :func:`from_nav2`.
 
     Example:
         >>> import gpusense as gs
@@ -66,14 +66,13 @@ class Nav2Options:
     model: LaserModel
     """The laser model: ``"beam"``, ``"likelihood_field"`` or ``"likelihood_field_prob"``."""
     weights: BeamWeights | FieldWeights
-    """The model's parameters as they are in the file, for ``compat="amcl"``; their weights need not sum to 1."""
+    """The file's parameters of the model, for ``compat="amcl"``; weights need not sum to 1."""
     parameters: BeamParameters | LikelihoodFieldParameters
-    """The model's parameters with weights that sum to 1; those of ``beam_model`` if ``gpusense fit`` wrote the file."""
+    """Parameters of the model with weights that sum to 1, from ``beam_model`` in a file of ``gpusense fit``."""
     alpha: tuple[float, float, float, float, float]
-    """Noise of the odometry, alpha1 to alpha5; the fifth is for omnidirectional robots. Missing ones come from the fit
-    in a file of ``gpusense fit --fit-motion``."""
+    """Noise of the odometry: alpha1 to alpha5 (for omnidirectional robots), completed by ``odometry_motion``."""
     odometry: OdometryMotion | None
-    """The noise that ``gpusense fit --fit-motion`` wrote; None in other files, and for omnidirectional robots."""
+    """Noise from ``gpusense fit --fit-motion``; None in other files and for omnidirectional robots."""
     motion: Literal["differential", "omni"]
     """The kind of robot."""
     particles: tuple[int, int]
@@ -87,27 +86,27 @@ class Nav2Options:
     recovery: tuple[float, float]
     """Decay rates of the slow and the fast average weight; 0 switches recovery off."""
     beam_skip: float | None
-    """beam_skip_threshold where do_beamskip is true: the share of the particles that must explain a beam."""
+    """beam_skip_threshold if do_beamskip is true: the share of the particles that must explain a beam."""
     update_min: tuple[float, float]
     """Least translation along x or y [m] and least turn [rad] before the next correction."""
     max_beams: int
     """Most beams of a scan that nav2_amcl uses."""
     range_limits: tuple[float | None, float | None]
-    """laser_min_range and laser_max_range [m]; None where the scan's own limit holds."""
+    """laser_min_range and laser_max_range [m]; None keeps the scan's limit."""
     frames: tuple[str, str, str]
     """Frames of the map, the odometry and the robot's base."""
     topics: tuple[str, str]
     """Topics of the map and the scans."""
     tf_broadcast: bool
-    """True if the transform from map to odometry is sent."""
+    """Whether to send the transform from map to odometry."""
     transform_tolerance: float
-    """Time by which the transform is dated ahead [s]."""
+    """Time added to the transform's stamp [s]."""
     initial_pose: tuple[float, float, float] | None
-    """The robot's first pose (x, y, yaw) [m, m, rad]; None where the file sets none."""
+    """The robot's first pose (x, y, yaw) [m, m, rad], or None."""
     initial_covariance: Matrix | None
-    """(3, 3) covariance of the first pose, of Beluga's ``initial_pose.covariance_x`` and so on; None without one."""
+    """(3, 3) covariance of the first pose, from Beluga's ``initial_pose.covariance_x`` and so on, or None."""
     ignored: tuple[str, ...]
-    """Names of other parameters in the file, which have no effect here."""
+    """Names of other parameters in the file, without effect here."""
 
     def make_model(
         self, grid: OccupancyGrid, scanner: Scanner, *, compat: bool = False, **options: Any
@@ -117,7 +116,7 @@ class Nav2Options:
         Args:
             grid: The map.
             scanner: The scanner.
-            compat: Weigh as nav2_amcl does, by ``weights``; otherwise log p of the book, by ``parameters``.
+            compat: True for nav2_amcl's weights, by ``weights``; False for the book's log p, by ``parameters``.
             options: Options of :class:`BeamModel` or :class:`LikelihoodFieldModel`, such as ``backend``.
 
         Raises:
@@ -136,9 +135,9 @@ class Nav2Options:
         return OdometryMotion(self.alpha[:4]) if self.odometry is None else self.odometry
 
     def make_filter(self, models: Any, **options: Any) -> ParticleFilter:
-        """Make a particle filter with the motion, the number of particles, the recovery and the skipping of beams.
+        """Make a particle filter with motion, number of particles, recovery and beam skipping.
 
-        Recovery is "augmented", with gpusense's rates, where both of ``recovery`` are positive.
+        Recovery is "augmented", with gpusense's rates, if both numbers of ``recovery`` are positive.
 
         Args:
             models: A measurement model, or several.
@@ -159,16 +158,16 @@ class Nav2Options:
 def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str | None = None) -> Nav2Options:
     """Read the parameters of nav2_amcl's node from a YAML file or a mapping, without ROS.
 
-    A missing parameter has the node's default. A dotted name (``initial_pose.x``) and a mapping (``initial_pose: {x:
-    ...}``) are the same. The file is read as plain data; nothing in it is executed. The book's
-    parameters have the same weights in proportion. A file of ``gpusense fit`` has the fitted parameters, with offset
-    and growth, in ``beam_model``: these are then ``parameters``; and its ``odometry_motion`` is ``odometry``.
+    A missing parameter takes the node's default. A dotted name (``initial_pose.x``) and a mapping (``initial_pose: {x:
+    ...}``) are equivalent. The file is read as plain data and never executed. The book's parameters keep the
+    proportions of the weights. In a file of ``gpusense fit``, ``beam_model`` (with offset and growth) becomes
+    ``parameters``, and ``odometry_motion`` becomes ``odometry``.
 
     Args:
         source: The file of parameters, or its content: a mapping with ``amcl: ros__parameters:`` in any namespace, or
             the mapping of the parameters themselves.
         node: Name of the node, with or without its namespaces, such as ``"/robot1/amcl"``; None for the only amcl.
-            Names in the file match it as in ROS 2: ``*`` is one level, ``**`` any number, and the exact name wins.
+            Names in the file match as in ROS 2: ``*`` is one level, ``**`` any number, and the exact name wins.
 
     Returns:
         The options: model, parameters, motion, particles, gates, frames.
@@ -176,8 +175,8 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
     Raises:
         FileNotFoundError: The file is missing.
         TypeError: A value has the wrong type; the message names the parameter.
-        ValueError: A value breaks its rule, the file has parameters for no such node or for several, or its names are
-            those of amcl in ROS 1.
+        ValueError: A value breaks its rule, the file has parameters for no such node or for several, or uses amcl's
+            names of ROS 1.
 
     Warns:
         UserWarning: A wildcard in the file overrides the exact name in ROS 2, or a name of ROS 1 has no effect there.
@@ -227,7 +226,7 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
 
 
 def has_parameters(content: Mapping[Any, Any]) -> bool:
-    """Return whether a file holds parameters by ROS nodes, or amcl's parameters without a node."""
+    """Return whether a file contains parameters of ROS nodes, or amcl's parameters without a node."""
     flat = (*DEFAULTS, *ROS_1)
     inner = content.get("amcl")
     return any(key in content or (isinstance(inner, Mapping) and key in inner) for key in flat) or any(
@@ -258,7 +257,7 @@ def _value(name: str, key: str, value: object, default: object) -> Any:
 
 
 def _odometry(content: Mapping[str, Any], name: str) -> OdometryMotion | None:
-    """Return the noise that gpusense fit wrote; None without it."""
+    """Return the noise from gpusense fit, or None."""
     if "odometry_motion" not in content:
         return None
     try:
@@ -276,7 +275,7 @@ def _particles(values: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _beam_skip(values: Mapping[str, Any]) -> float | None:
-    """Return the share of the particles that must explain a beam; None where beams are not skipped."""
+    """Return the share of the particles that must explain a beam; None without beam skipping."""
     if not values["do_beamskip"]:
         return None
     return checks.real("beam_skip_threshold", values["beam_skip_threshold"], above=0, below=1)
@@ -289,7 +288,7 @@ def _rate(key: str, values: Mapping[str, Any]) -> float:
 def _weights(model: str, v: Mapping[str, Any]) -> BeamWeights | FieldWeights:
     if model == "beam":
         return BeamWeights(v["z_hit"], v["z_short"], v["z_max"], v["z_rand"], v["sigma_hit"], v["lambda_short"])
-    # The likelihood fields of nav2_amcl do not use z_max.
+    # nav2_amcl's likelihood fields ignore z_max.
     return FieldWeights(
         z_hit=v["z_hit"], z_max=0.0, z_rand=v["z_rand"], sigma_hit=v["sigma_hit"],
         max_distance=v["laser_likelihood_max_dist"],

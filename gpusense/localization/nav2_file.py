@@ -1,4 +1,4 @@
-"""Parameters in a file of ROS 2: those of one node, and the robot's first pose among them."""
+"""Extract a node's parameters, and the robot's first pose, from a parameter file of ROS 2."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _POSE = tuple(f"{_START}.{each}" for each in ("x", "y", "yaw"))
 _COVARIANCES = tuple(f"{_START}.covariance_{each}" for each in ("x", "xy", "xyaw", "y", "yyaw", "yaw"))
 START_NAMES = (*_POSE, *_COVARIANCES)
 _OWN = "ros__parameters"
-# Mappings of a file of gpusense fit that hold no nodes.
+# Mappings in a file of gpusense fit that are no nodes.
 FITTED = ("beam_model", "incidence_model", "odometry_motion")
 ROS_1 = {
     "odom_model_type": "robot_model_type", "kld_err": "pf_err", "kld_z": "pf_z", "laser_max_beams": "max_beams",
@@ -34,7 +34,7 @@ def parameters_of(content: Mapping[str, Any], name: str, node: str | None, known
     """Return the parameters of a node by dotted names.
 
     As in rclcpp, ``*`` in the name of a node matches one level, ``**`` any number of levels, and the last matching
-    wildcard wins. The node's exact name wins over wildcards.
+    wildcard wins. The exact name wins over wildcards.
 
     A mapping within the parameters is equivalent to dotted names: ``initial_pose: {x: 1}`` is ``initial_pose.x: 1``.
 
@@ -89,9 +89,9 @@ def _matches(pattern: str, node: str) -> bool:
 
 
 def _merged(matching: list[tuple[str, dict[str, Any]]], full: str, name: str) -> dict[str, Any]:
-    """Merge the parameters under all names of one node, and move its exact name to the end.
+    """Merge the parameters under all matching names of a node, and move the exact name to the end.
 
-    In rclcpp the last name in the file wins, exact or not. A warning names the parameters with another value there.
+    In rclcpp the last name in the file wins, exact or not. A warning names the parameters that differ there.
     """
     found: dict[str, Any] = {}
     in_order: dict[str, Any] = {}
@@ -111,19 +111,19 @@ def _merged(matching: list[tuple[str, dict[str, Any]]], full: str, name: str) ->
 
 
 def _check_names(values: Mapping[Any, Any], name: str) -> None:
-    """Refuse parameters by their names in ROS 1, since the defaults differ."""
+    """Refuse parameter names of ROS 1, since the defaults differ."""
     if old := _ros_1_names(values):
         raise ValueError(f"{name}: must have amcl's names in ROS 2, got names of ROS 1: {old}")
 
 
 def _warn_of_ros_1(values: Mapping[Any, Any], name: str) -> None:
-    """Warn of parameters by their names in ROS 1, which nav2_amcl ignores."""
+    """Warn of parameter names of ROS 1, which nav2_amcl ignores."""
     if old := _ros_1_names(values):
         warnings.warn(f"{name}: names of ROS 1's amcl have no effect in ROS 2: {old}", stacklevel=2)
 
 
 def _ros_1_names(values: Mapping[Any, Any]) -> str:
-    """Return the names from ROS 1, each with the name in ROS 2, as one text."""
+    """Return a text of names from ROS 1, each with its name in ROS 2."""
     return ", ".join(f"{old} (now {new})" for old, new in ROS_1.items() if old in values)
 
 
@@ -165,7 +165,7 @@ def first_pose(name: str, parameters: Mapping[str, Any]) -> Row:
 
 
 def first_covariance(name: str, parameters: Mapping[str, Any]) -> Matrix | None:
-    """Return the covariance of the first pose; None where the file has no part of it."""
+    """Return the covariance of the first pose, or None."""
     if not any(key in parameters for key in _COVARIANCES):
         return None
     xx, xy, xt, yy, yt, tt = (checks.real(f"{name}: {key}", parameters.get(key, 0.0)) for key in _COVARIANCES)

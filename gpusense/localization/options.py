@@ -1,4 +1,4 @@
-"""Options of a particle filter, and the settings of its steps that follow from them."""
+"""Check the options of a particle filter, and derive the settings of its steps."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _DRAWS = {"systematic": SYSTEMATIC, "stratified": INDEPENDENT, "residual": RESID
 
 
 class Options(NamedTuple):
-    """Options of :class:`gpusense.ParticleFilter`, which describes them.
+    """Options of :class:`gpusense.ParticleFilter`; see there.
 
     Attributes:
         least: Fewest particles.
@@ -117,17 +117,17 @@ def settings_of_step(
     sensors: Sequence[tuple[float, int]],
     one_peak: bool,
 ) -> np.ndarray:
-    """Return the settings of a step, by the places in ``interface.constants``.
+    """Return the settings of a step, indexed by ``interface.constants``.
 
     Args:
         options: Options of the filter.
-        motion: The move that begins the step.
+        motion: First motion of the step.
         step: Number of the step.
         count: Number of particles.
-        pool: Number of poses that recovery injects, and half widths of the box around each in x, y [m] and heading
+        pool: Number of poses for recovery to inject, and half widths of the box around each in x, y [m] and heading
             [rad].
-        sensors: Temperature and beams of each sensor that is used.
-        one_peak: True if the particles lie together, and no sensor has several peaks among them.
+        sensors: Temperature and beams of each sensor in use.
+        one_peak: True if the particles are concentrated, and no sensor has several peaks among them.
     """
     settings = _settings_of_run(options, count, pool, tuple(sensors), one_peak).copy()
     settings[STEP] = step
@@ -143,7 +143,7 @@ def _settings_of_run(
     sensors: tuple[tuple[float, int], ...],
     one_peak: bool,
 ) -> np.ndarray:
-    """Return the settings that steps have in common; arguments as for ``settings_of_step``."""
+    """Return the settings common to all steps; arguments as for ``settings_of_step``."""
     s: list[float] = [0.0] * SETTINGS
     s[SEED], s[SEED + 1] = options.words
     s[JITTER], s[FARTHEST_X], s[FARTHEST_THETA] = DEFAULTS.jitter, DEFAULTS.farthest, DEFAULTS.farthest_turn
@@ -152,7 +152,7 @@ def _settings_of_run(
     s[THRESHOLD] = options.threshold
     s[DEPTH] = 1.0
     s[STRATIFIED] = _DRAWS[options.resampling]
-    # Sums of weights stay below 2^53, since a weight is 1 on average and its square at most 1 / threshold. An effective
+    # Sums of weights stay below 2^53: a weight is 1 on average, and its square at most 1 / threshold. An effective
     # sample size of one particle exceeds any lower threshold.
     threshold = max(options.threshold, 1 / _MOST)
     spare = math.ceil(math.log2(max(count, 2))) + math.ceil(-math.log2(threshold)) + 2

@@ -1,6 +1,6 @@
-"""The particles of a filter on their device, and the launches of its steps.
+"""Hold a filter's particles on a device, and make the launches of its steps.
 
-Four buffers hold poses and four hold weights, in two banks: a step reads from one bank and writes to the other bank. So
+Four buffers hold poses and four hold weights, in two banks: a step reads from one bank and writes to the other, so that
 an interrupted step has changed nothing. A stage of a correction scores and weighs the poses of a buffer, and draws into
 the second buffer of its bank.
 """
@@ -24,13 +24,13 @@ _DOUBLE = np.dtype(np.float64)
 
 
 class Places(NamedTuple):
-    """Buffers of a filter's particles, by their indices.
+    """Buffers of a filter's particles by index.
 
     Attributes:
         shown: Weighted poses.
         next: Poses of the next step; equal to ``shown`` if no step has weighed them.
         weight: Weights of the shown poses.
-        before: Weights with which the next step begins.
+        before: Weights at the beginning of the next step.
         state: State of the last correction.
     """
 
@@ -41,12 +41,12 @@ class Places(NamedTuple):
     state: int = 0
 
     def placed(self, kept: Places) -> Places:
-        """Return the buffers of new particles, which do not overwrite those of ``kept``."""
+        """Return buffers for new particles outside ``kept``."""
         poses, weights = kept.free()
         return Places(poses, poses, weights + 1, weights + 1, 1 - kept.state)
 
     def moved(self, kept: Places) -> Places:
-        """Return the buffers after a move without a correction, which keeps the weights for the next correction."""
+        """Return the buffers after a motion without a correction; weights wait for the next correction."""
         poses = kept.free()[0]
         return self._replace(shown=poses, next=poses, weight=self.before)
 
@@ -55,11 +55,11 @@ class Places(NamedTuple):
         """Return the stages of a correction.
 
         Args:
-            kept: Buffers that the correction does not overwrite.
+            kept: Buffers to keep intact.
             most: Largest number of stages.
             drawn: Particles of the next step.
-            kind: Kind of the motion that begins the first stage.
-            same: True if the present step has as many particles, so that each stage draws this number.
+            kind: Kind of the motion before the first stage.
+            same: True if the present step has equally many particles, so that each stage draws this number.
         """
         (poses, weights), state = kept.free(), 1 - kept.state
         known = drawn if same or most == 1 else 0
@@ -69,7 +69,7 @@ class Places(NamedTuple):
         ]
 
     def free(self) -> tuple[int, int]:
-        """Return the first poses and the first weights of the banks that hold none of these buffers."""
+        """Return the first poses and the first weights of banks without any of these buffers."""
         return 2 - self.shown // 2 * 2, 2 - self.weight // 2 * 2
 
 
@@ -77,13 +77,13 @@ class Stage(NamedTuple):
     """A stage of a correction.
 
     Attributes:
-        source: Index of the buffer with its poses; it draws into the second buffer of the bank.
+        source: Index of the buffer of poses; drawn particles go to the second buffer of the bank.
         number: Number of the stage, from 0.
         most: Most stages of the correction.
-        drawn: Number of particles that it draws; 0 if that follows from its weights.
+        drawn: Number of particles to draw; 0 if the weights determine it.
         before: Index of the weights before the stage.
-        weight: Index of the weights that it sets; the weights of drawn particles are in the next buffer.
-        state: Index of the state that it writes.
+        weight: Index of the weights to set; weights of drawn particles are in the next buffer.
+        state: Index of the state to write.
         origin: Index of the poses before the motion.
         kind: Kind of the motion before the stage; None without motion.
     """
@@ -100,12 +100,12 @@ class Stage(NamedTuple):
 
     @property
     def key(self) -> tuple[int, ...]:
-        """Everything on which its launches after the scores depend."""
+        """Key of the launches after the scores."""
         return self[:7]
 
     @property
     def target(self) -> int:
-        """Index of the buffer into which it draws."""
+        """Index of the buffer for drawn particles."""
         return self.source ^ 1
 
     @property
@@ -120,7 +120,7 @@ class Stage(NamedTuple):
 
 
 class Particles:
-    """Particles and weights on a device, and the launches that work on them.
+    """Particles and weights on a device, and their launches.
 
     Args:
         backend: The device.
@@ -132,10 +132,9 @@ class Particles:
     Attributes:
         count: Particles of the next step.
         places: Buffers of the particles.
-        kept: Buffers that steps do not overwrite: those at the beginning of a call of the filter.
-        pool_size: Number of poses from which recovery injects particles.
-        results: Two states of corrections, the estimate, and the judged beams of each sensor; they begin at
-            ``result_begins``.
+        kept: Buffers at the beginning of a call of the filter, which steps never overwrite.
+        pool_size: Number of poses for recovery to inject.
+        results: Two states of corrections, the estimate, and the judged beams of each sensor, at ``result_begins``.
         states: The two states.
         estimated: The estimate.
         judged: The judged beams of each sensor.
@@ -150,14 +149,14 @@ class Particles:
         self.backend, self.capacity, self.precision, self._sensors = backend, capacity, precision, sensors
         self.count, self.places, self.kept = capacity, Places(), Places()
         self.block = weight_block(backend, capacity)
-        # Memory that a processor shares with the host is not lent to other libraries.
+        # Other libraries get no memory that a processor shares with the host.
         make = backend.blank if backend.info.kind == "gpu" else backend.empty
         self.poses = [make(3 * capacity, _DOUBLE) for _ in range(4)]
         self.weights = [make(capacity, _DOUBLE) for _ in range(4)]
         self.log_p = [make(capacity, precision) for _ in range(sensors)]
         self.score, self.ends = backend.empty(capacity, _DOUBLE), backend.empty(capacity, _DOUBLE)
         self.sums, self.settings = Sums(backend, capacity), backend.empty(SETTINGS, _DOUBLE)
-        # One copy reads them all.
+        # One copy reads all results.
         align = max(backend.alignment // _DOUBLE.itemsize, 1)
         sizes = STATE, STATE, ESTIMATE, *(JUDGED for _ in range(sensors))
         self.result_begins = (0, *itertools.accumulate(-(-size // align) * align for size in sizes))
@@ -187,7 +186,7 @@ class Particles:
     # ---- launches
 
     def motion(self, origin: int, target: int, kind: int) -> Program:
-        """Return the launch that moves particles from a buffer to another."""
+        """Return the launch that moves particles between buffers."""
         return self.sums.launch("move_particles", self.count, source=self.poses[origin], settings=self.settings,
                                 target=self.poses[target], particles=self.count, kind=kind)  # fmt: skip
 
@@ -196,7 +195,7 @@ class Particles:
         return dict(particles=self.count, block=self.block)
 
     def numbers(self, stage: Stage) -> dict[str, Any]:
-        """Return the arguments of launches that make weights, by name."""
+        """Return the arguments of launches for weights, by name."""
         return dict(score=self.score, before=self.weights[stage.before], settings=self.settings,
                     state=self.states[stage.state], blocks=self.blocks, **self.sizes())  # fmt: skip
 
@@ -210,7 +209,7 @@ class Particles:
         )  # fmt: skip
 
     def weighing(self, stage: Stage) -> Program:
-        """Return the launches of a stage after its scores: weights, and the draw if its size is known."""
+        """Return the launches of a stage after its scores: weights, and the draw if the number is known."""
         find, *scored = self.sums.highest(self.blocks)
         found = scored[0], scored[1]
         numbers, out = self.numbers(stage), (self.weights[stage.weight], self.ends)

@@ -1,16 +1,16 @@
-"""Judge the beams of a scan against the map at one pose: some agree, some end too early, some pass through walls.
+"""Judge the beams of a scan against the map at a pose: agreeing, too short, or through walls.
 
-Each judged beam is traced through the map with two companion rays that start beside it and diverge, so that a slightly
-wrong pose, the edge of a door or a grazed wall is no evidence. A beam
+Each judged beam is traced through the map with two diverging companion rays, so that a slightly wrong pose, the edge
+of a door or a grazed wall is no evidence. A beam
 
-- **agrees** where its reading lies between the walls that the three rays meet, within a tolerance;
-- **passes through** where all three meet a wall well before the reading: no person or box makes a beam longer;
-- is **short** where its end lies in mapped free space and no ray has met a wall: people, furniture, or a wrong pose;
-- gives **no** evidence where unknown cells or the map's edge come first, where the three rays contradict each other, or
-    where the reading is missing.
+- **agrees** if its reading is between the walls of the three rays, within a tolerance;
+- **passes through** if all three meet a wall well before the reading: no person or box lengthens a beam;
+- is **short** if it ends in mapped free space and no ray has met a wall: people, furniture, or a wrong pose;
+- is **no** evidence if unknown cells or the map's edge come first, if the rays contradict each other, or without a
+  reading.
 
-Only grid and pose are needed, so the walk costs the same for every model: a few thousand look-ups per scan, on the
-device that holds the map's cells, or on the host. A diagonal pair of walls stops a ray, as in the casters.
+The walk needs only grid and pose, and costs the same for every model: a few thousand look-ups per scan, on the map's
+device or on the host. A diagonal pair of walls stops a ray, as in the casters.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from gpusense.world.scanner import Scanner
 
 Floats = NDArray[np.float64]
 
-# Agreeing readings within this of a wall are close [m].
+# Largest distance of close agreement [m].
 _CLOSE = 0.1
 _STILL = np.zeros((3, 3))
 
@@ -39,12 +39,12 @@ class Passages(NamedTuple):
 
     Attributes:
         kind: (B,) class of each beam.
-        distance: (B,) range to the first mapped wall that the beam meets before its end, inf without one [m].
+        distance: (B,) range to the first mapped wall before the beam's end, inf without one [m].
         bearing: (B,) bearing from the scanner [rad].
         reading: (B,) its reading [m].
         origin: Origin of the beams [m].
         heading: Direction of bearing 0 in the world [rad].
-        near: Distance from a wall within which agreeing readings are close to it [m].
+        near: Largest distance of close agreement [m].
         inside: True if the pose is inside solid cells.
         off: True if the pose is in unknown cells or off the map.
     """
@@ -61,15 +61,15 @@ class Passages(NamedTuple):
 
     @property
     def wall(self) -> Floats:
-        """(B, 2) where the beam meets the first mapped wall, NaN where it meets none before its end [m]."""
+        """(B, 2) first mapped wall on each beam, NaN without one before its end [m]."""
         distance = np.where(self.distance < np.inf, self.distance, np.nan)[:, None]
         direction = self.heading + self.bearing
         return np.asarray(self.origin + distance * np.column_stack([np.cos(direction), np.sin(direction)]))
 
     @property
     def close(self) -> int:
-        """Number of agreeing beams that end close to that wall."""
-        # Python's numbers, since operations on short arrays take longer.
+        """Number of beams in close agreement."""
+        # Python's numbers are faster than short arrays.
         beams = zip(self.kind.tolist(), self.reading.tolist(), self.distance.tolist(), strict=True)
         return sum([abs(reading - distance) < self.near for kind, reading, distance in beams if kind == AGREES])
 
@@ -83,10 +83,10 @@ class Counts(NamedTuple):
 
     Attributes:
         agree: Agreeing beams.
-        close: Agreeing beams that end close to a wall.
+        close: Beams in close agreement.
         through: Beams that pass through walls.
         short: Short beams.
-        nothing: Beams that give no evidence.
+        nothing: Beams without evidence.
     """
 
     agree: int
@@ -146,7 +146,7 @@ def _origin_of(pose: Floats, mount: tuple[float, float, float]) -> tuple[tuple[f
 
 
 def _place_of(grid: OccupancyGrid, pose: Floats) -> tuple[bool, bool]:
-    """Tell whether all cells around a pose are solid, and whether all are unknown or off the map."""
+    """Return whether all cells around a pose are solid, and whether all are unknown or off the map."""
     (x, y, _), (x0, y0, yaw) = pose.tolist(), grid.origin
     c, s = math.cos(yaw), math.sin(yaw)
     dx, dy = x - x0, y - y0

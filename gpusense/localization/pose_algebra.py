@@ -34,7 +34,7 @@ def wrap_angle(angle: AnyArray) -> np.ndarray:
 
 
 def compose_poses(first: AnyArray, second: AnyArray) -> np.ndarray:
-    """Return the poses in the world of ``second``, which is in the frame of ``first``.
+    """Return the poses in the world of ``second`` in the frames of ``first``.
 
     Args:
         first: (..., 3) poses [m, m, rad].

@@ -1,13 +1,12 @@
 """Protection level of a position: a radius that the error exceeds with at most a stated probability, the risk.
 
-With p_lost the probability that the pose is lost, the protection level is the smallest r with
+Let p_lost be the probability that the pose is lost. The protection level is the smallest r with
 
     p_lost + (1 - p_lost) P(|error| > r | not lost) <= risk
 
 (Joerger and others, "Integrity monitoring of localization systems", *Sensors* 18(8), 2018, 2740, use the same terms).
-P comes from a normal density with the covariance of the position; where particles lie apart, their distances count as
-well. The errors of filters have longer tails than the particles, so the spread is multiplied by a factor that is
-measured on logs.
+P comes from a normal density with the covariance of the position, and from the distances of spread-out particles.
+Errors of filters have longer tails than the particles, so the spread is multiplied by a factor measured on logs.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ from gpusense.localization.spread import FAR, deviations
 
 Floats = NDArray[np.float64]
 
-# Factor by which the spread is widened, and the least risk that its calibration supports.
+# Factor of the spread, and least risk that its calibration supports.
 WIDENING, LEAST_RISK = 2.0, 0.01
-# Least effective sample size whose covariance counts.
+# Least effective sample size of a meaningful covariance.
 LEAST_SAMPLE = 10.0
-# Angles at which the density of a normal position is integrated: the middles of parts of a quarter turn.
+# Angles of the integral over a normal position: middles of parts of a quarter turn.
 _PARTS = 96
 _COSINES = np.cos((np.arange(_PARTS) + 0.5) * (math.pi / 2 / _PARTS)) ** 2
-# Steps of the bisection, which halve the width of an interval of doubles each.
+# Steps of the bisection; each halves the interval.
 _STEPS = 60
 
 
@@ -51,7 +50,7 @@ class Distances(NamedTuple):
 
         Args:
             poses: (N, 3) particles.
-            weights: (N,) weights >= 0, of any positive sum.
+            weights: (N,) weights >= 0, not necessarily normalised.
             pose: (3,) pose.
         """
         distance = np.hypot(poses[:, 0] - pose[0], poses[:, 1] - pose[1])
@@ -60,8 +59,8 @@ class Distances(NamedTuple):
         return cls(distance[order], 1 - sums / sums[-1])
 
     def radius(self, beyond: float) -> float:
-        """Return the least distance that at most a share of the particles exceeds."""
-        # Sums of many weights end within rounding of 1.
+        """Return the least distance exceeded by at most a share of the particles."""
+        # Sums of many weights are 1 up to rounding.
         k = int(np.searchsorted(-self.beyond, -beyond - 1e-12))
         return float(self.distance[min(k, len(self.distance) - 1)])
 
@@ -74,8 +73,8 @@ def protection_level(
     Args:
         risk: Largest probability that the position is farther off, from ``LEAST_RISK`` to 1.
         p_lost: Probability that the pose is lost.
-        covariance: (3, 3) covariance of x, y [m] and heading; None if it is unknown: a pose that is not lost is off by
-            at most 1 m.
+        covariance: (3, 3) covariance of x, y [m] and heading; None if unknown: a pose that is not lost is off by at
+            most 1 m.
         widening: Factor of the spread.
         distances: Distances of the particles from the pose; None if the covariance describes them.
 
@@ -103,15 +102,15 @@ def normal_radius(covariance: Floats, beyond: float) -> float:
     """Return the distance that a normal position exceeds with a probability.
 
     The position is (a u cos t, b u sin t) with the deviations a and b along its axes, u of a Rayleigh density and t
-    uniform, so it is beyond r with the probability that is the mean over t of exp(-r^2 / (2 (a^2 cos^2 t + b^2 sin^2
-    t))). The mean over equal angles converges faster than any power of their number, also for b = 0.
+    uniform. It is beyond r with probability exp(-r^2 / (2 (a^2 cos^2 t + b^2 sin^2 t))), averaged over t. The mean over
+    equal angles converges faster than any power of their number, even for b = 0.
 
     Args:
         covariance: (3, 3) covariance of x, y [m] and heading; entries may be infinite or NaN.
         beyond: The probability, from 0 to 1.
 
     Returns:
-        The distance [m]; infinite for an infinite covariance, and for a probability of 0.
+        The distance [m]; infinite for an infinite covariance or a probability of 0.
     """
     large, _ = deviations(covariance)
     if not math.isfinite(large):

@@ -1,47 +1,46 @@
 """Log-likelihood ratio of "the pose is wrong" against "the pose is right" for one scan.
 
-A short beam is hardly evidence: people and furniture shorten beams at right poses as often as walls do at wrong poses.
-Of the beams that meet a mapped wall, T pass through it and A agree with it, C of them to within a few centimetres.
-Where a filter has fitted a wrong pose to a scan, beams also agree, but less closely. On a wrong map many beams, N, end
-in unknown cells or off the map and give no evidence. With n = A + S + T informative beams, S of them short, and f(a, b)
-= log((a + 1/2) / (b + 1/2)),
+A short beam is hardly evidence: people and furniture shorten beams at right poses as often as walls at wrong poses.
+Among the beams that meet a mapped wall, T pass through and A agree, C of them within a few centimetres. At a wrong pose
+that a filter fitted to a scan beams also agree, but less closely. On a wrong map many beams, N, end in unknown cells or
+off the map and are no evidence. Let n = A + S + T be the informative beams, S of them short, and f(a, b) = log((a +
+1/2) / (b + 1/2)). The ratio is
 
     r = n / (n + FEW) (BIAS + SLOPE f(T, A) + BLUNT f(A - C, C) + NOTHING f(N, n)),
 
-within LIMITS, since no agreement excludes that another place looks alike. A pose inside solid cells adds SOLID, a pose
-in unknown cells UNKNOWN. The coefficients come from a logistic regression on about 450 simulated runs: people, moved
-and new furniture, glass, wrong maps, 16 to 360 beams and kidnapping, half of the weight for right poses and half for
-wrong ones. 200 other runs (``bench/studies/verdict_fit.py``) give 2.83, 1.40, 0.62 and 0.40. BIAS is lower by CAUTION,
-since false alarms cost more; CAUTION alone was chosen on the tuning half of the recorded logs.
+within LIMITS, since another place may always look alike. A pose inside solid cells adds SOLID, a pose in unknown cells
+UNKNOWN. The coefficients come from a logistic regression on about 450 simulated runs with people, moved and new
+furniture, glass, wrong maps, 16 to 360 beams and kidnapping; right and wrong poses have equal weight. 200 other runs
+(``bench/studies/verdict_fit.py``) yield 2.83, 1.40, 0.62 and 0.40. BIAS is lower by CAUTION, since false alarms cost
+more; only CAUTION was chosen on the tuning half of the recorded logs.
 
-**Other places.** On a coarse or old map many beams contradict the right pose as well, and the ratio of the scan alone
-cannot tell a wrong pose from a wrong map. A search of the whole map can. At a wrong pose the scan fits another place
-far better: the robot's own, or on the map of another building the best of many. At a right pose it seldom does. Of the
-places beyond 1 m or 0.5 rad of the pose, the one that explains the scan best maximises T log p(z | place) - rho, with
-the temperature T and the ratio rho of the beams that meet walls there. With its lead
+**Other places.** On a coarse or old map many beams contradict even the right pose, and a single scan cannot
+distinguish a wrong pose from a wrong map. A search of the whole map can. At a wrong pose the scan fits another place
+far better: the true place, or on another building's map the best of many. At a right pose it seldom does. The best
+place beyond 1 m or 0.5 rad of the pose maximises T log p(z | place) - rho, with the temperature T and the ratio rho of
+the place's beams that meet walls. Its lead is
 
     L = T log p(z | place) - T log p(z | pose),
 
-m = T K independent beams of a scan of K, and I = 1 where the pose is itself among the places that the search has found,
-else 0, the ratio of a comparison would be
+A scan of K beams has m = T K independent beams. I is 1 if the search found the pose, else 0. If the place were
+certainly possible, the ratio of the comparison would be
 
     q = OF_LEAD min(max(L, NEAREST), FARTHEST) - m / (m + HALF) (BY_CHANCE + IS_FOUND I)
 
-if the place were possible. The likelihood of end points prefers places with many walls, also those that beams pass
-through: where walls have moved, one of many rooms fits the scan better than the right pose, and is contradicted by its
-beams as well. Then the map is wrong, and the lead says nothing. By rho the place is possible with probability
-pi = 1 / (1 + e^rho), so for q > 0 the likelihood ratio is the mean of both cases,
+The likelihood of end points prefers places with many walls, even walls that beams pass through: after walls have
+moved, one of many rooms fits the scan better than the right pose, although its beams contradict it. Then the map is
+wrong, and the lead is meaningless. By rho the place is possible with probability pi = 1 / (1 + e^rho), so for q > 0 the
+likelihood ratio is the mean of both cases,
 
     log(pi e^q + 1 - pi).
 
-For q < 0 it is q: also on a wrong map a wrong pose is seldom among the best. BY_CHANCE is what the best of many places
-gains by chance, which is nothing for a scan without information. OF_LEAD comes from a logistic regression with the
-ratio of the scan as an offset, on 71 simulated runs other than those above and on one log, robotdata4 of Wean Hall,
-which has a fifth of the weight of right poses. BY_CHANCE and IS_FOUND were chosen on 246 more simulated runs, half of
-them with 30 % of the walls moved, and on the tuning half of the recorded logs. The 200 runs alone, few of whose right
-poses are doubtful, give 0.29, 1.6 and 0.0 for the three.
+For q < 0 it is q: even on a wrong map a wrong pose is seldom among the best. BY_CHANCE is the chance gain of the best
+of many places, 0 for a scan without information. OF_LEAD comes from a logistic regression with the scan's ratio as an
+offset, on 71 further simulated runs and on the log robotdata4 of Wean Hall, with a fifth of the weight of right poses.
+BY_CHANCE and IS_FOUND were chosen on 246 more simulated runs, half of them with 30 % of the walls moved, and on the
+tuning half of the recorded logs. The 200 runs, with few doubtful right poses, yield 0.29, 1.6 and 0.0 for the three.
 
-Among landmarks the ratio is that of the prediction of features (:mod:`gpusense.localization.evidence`).
+Among landmarks the ratio comes from the prediction of features (:mod:`gpusense.localization.evidence`).
 """
 
 from __future__ import annotations
@@ -53,24 +52,24 @@ from gpusense.localization.passages import Counts, Passages, counts_of
 
 BIAS, SLOPE, BLUNT, NOTHING, FEW = 3.34, 1.74, 0.48, 0.58, 4.0
 CAUTION, SOLID, UNKNOWN, LIMITS = 0.9, 2.0, 1.0, (-4.0, 5.0)
-# Comparisons with other places: weight and limits of the lead of the best one [nats]; what it gains by chance; evidence
-# for a pose that a search finds; number of independent beams at which the last two are half of this.
+# Comparisons with other places: weight and limits of the best place's lead [nats]; its gain by chance; evidence for a
+# pose that a search finds; number of independent beams that halves the last two.
 OF_LEAD, NEAREST, FARTHEST, BY_CHANCE, IS_FOUND, HALF = 0.44, -4.0, 8.0, 0.9, 1.9, 1.0
-# Share of a feature's gain that counts, since features of successive scans are dependent; its limit.
+# Weight of a feature's gain, since features of successive scans are dependent; limit of the gain.
 _OF_GAIN, _LIMIT_OF_GAIN = 0.25, 3.0
 
 
 def ratio_of_scan(scans: Sequence[Passages]) -> float:
-    """Return the ratio of simultaneous scans; NaN if they give no evidence.
+    """Return the ratio of simultaneous scans; NaN without evidence.
 
     Args:
-        scans: Judged beams of each scanner, at one pose.
+        scans: Judged beams of each scanner at a pose.
     """
     return evidence_of_scan(scans)[0]
 
 
 def evidence_of_scan(scans: Sequence[Passages]) -> tuple[float, float]:
-    """Return the ratio of simultaneous scans, and the share of agreeing beams; see the functions of each."""
+    """Return the results of :func:`ratio_of_scan` and :func:`explained_of_scan`."""
     if not scans:
         return math.nan, math.nan
     counts = counts_of(scans)
@@ -95,22 +94,22 @@ def _odds(one: int, other: int) -> float:
 
 
 def explained_of_scan(scans: Sequence[Passages]) -> float:
-    """Return the share of agreeing beams among those that the map could explain; NaN without any."""
+    """Return the agreeing share of the explainable beams; NaN without any."""
     return evidence_of_scan(scans)[1]
 
 
 def ratio_of_places(lead: float, beams: float, walls: float, *, is_found: bool) -> float:
-    """Return the ratio of a comparison of a pose with other places of the map.
+    """Return the ratio from comparing a pose with other places of the map.
 
     Args:
-        lead: Log-likelihood, times the temperature, of the best other place less that at the pose [nats]; -inf
-            where a search found none; NaN where neither is possible.
+        lead: Tempered log-likelihood of the best other place less the pose's [nats]; -inf if a search found none; NaN
+            if neither is possible.
         beams: Number of independent beams, the temperature times the number of beams.
         walls: Ratio of the scan at the other place, by the beams that meet walls.
         is_found: Whether the search also found the pose.
 
     Returns:
-        The ratio; NaN where neither place nor pose is possible, or without beams.
+        The ratio; NaN if neither place nor pose is possible, or without beams.
     """
     if math.isnan(lead) or not beams > 0:
         return math.nan
@@ -120,10 +119,10 @@ def ratio_of_places(lead: float, beams: float, walls: float, *, is_found: bool) 
 
 
 def ratio_of_features(gain: float, count: int, least: float) -> float:
-    """Return the ratio of the prediction of features.
+    """Return the ratio from the prediction of features.
 
     Args:
-        gain: Gain of the particles over chance in predicting the features [nats].
+        gain: Gain over chance in predicting the features [nats].
         count: Number of features.
         least: Gain per feature at which right and wrong are equally likely [nats].
     """

@@ -1,4 +1,4 @@
-"""Recovery of a filter from a wrong pose by rivals of its particles, which are searched when scans contradict them."""
+"""Recover a filter from a wrong pose by rivals of its particles, searched when scans contradict the pose."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from gpusense.localization.verdict import Verdict
 
 # Mask that turns the filter's seed into the rival's seed.
 _RIVAL = 0x9E3779B97F4A7C15
-# Probability that another place is right above which a rival is searched; above the prior before the first scan.
+# Probability of another place that starts the search for a rival; above the prior before the first scan.
 _DOUBT = 0.2
 
 
 class Recovery:
-    """The rivals of a filter's particles.
+    """Rivals of a filter's particles.
 
     Args:
         tracker: The particles.
@@ -29,7 +29,7 @@ class Recovery:
 
     Attributes:
         rival: The rival of the particles, if there was one.
-        everywhere: Number of places anywhere that are still to be compared with the place found.
+        everywhere: Number of places still to be compared with the pose.
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("rival", "everywhere")
@@ -43,7 +43,7 @@ class Recovery:
 
     @property
     def active(self) -> Rival | None:
-        """The rival that competes with the particles now."""
+        """The competing rival, or None."""
         return self.rival if self.rival is not None and self.rival.active else None
 
     def changing(self) -> tuple[Any, ...]:
@@ -51,18 +51,18 @@ class Recovery:
         return (self,) if self.rival is None else (self, *self.rival.changing())
 
     def keep(self) -> None:
-        """Record the buffers that the call now beginning must not overwrite."""
+        """Record the buffers that the present call must not overwrite."""
         if self.rival is not None:
             self.rival.keep()
 
     def restart(self) -> None:
-        """Forget the rival, since the particles begin anew."""
+        """Forget the rival for new particles."""
         self.everywhere = 0
         if self.rival is not None:
             self.rival.stop()
 
     def expect_anywhere(self) -> None:
-        """Compare the pose to which the particles converge with other places."""
+        """Compare the pose with other places after convergence."""
         self.everywhere = COMPARISONS
 
     def follow(self, motion: SampledMotion) -> None:
@@ -71,7 +71,7 @@ class Recovery:
             self.rival.predict(motion)
 
     def is_doubted(self) -> bool:
-        """Tell whether the last judged scans contradict the pose, or a rival competes with it."""
+        """Return whether the last judged scans contradict the pose, or a rival competes with it."""
         verdict = self._verdict
         apart = self.active is not None or not self._tracker.together
         return apart or verdict.wrong > _DOUBT or verdict.explains_little
@@ -79,10 +79,10 @@ class Recovery:
     def corrected(self, readings: list[SensorReadings], last: Mapping[int, tuple[Any, ...]]) -> None:
         """Compare the particles with their rival, judge their pose, and search for a rival if scans contradict it.
 
-        A search needs two judgements in a row that contradict the pose, or one at every fifth to tenth correction.
+        A search needs two consecutive judgements that contradict the pose, or one at every fifth to tenth correction.
 
         Args:
-            readings: Indices of sensors, with the readings that corrected the particles.
+            readings: Indices of sensors with the readings of the correction.
             last: Copies of the same readings with all beams.
         """
         tracker, verdict, rival = self._tracker, self._verdict, self.active
@@ -101,27 +101,27 @@ class Recovery:
             verdict.compared(pose, covariance, ratio)
 
     def _is_wanted(self) -> bool:
-        """Tell whether something contradicts the pose, or it is to be compared, and the particles are not too wide."""
+        """Return whether the pose is contradicted or due for comparison, and the particles are not too wide."""
         tracker = self._tracker
         if tracker.wide or (self.everywhere and not tracker.together):
             return False
         return bool(self.everywhere) or self.is_doubted()
 
     def _compare(self, rival: Rival, readings: list[SensorReadings]) -> None:
-        """Correct the rival, and let it replace the particles if it has won."""
+        """Correct the rival, and replace the particles if it has won."""
         tracker = self._tracker
         pose, covariance = tracker.mean_and_covariance()
         rival.correct(readings, evidence_of(tracker.cloud.summary()), pose)
         won = rival.judge(pose, covariance, readings)
         if won is not None:
             poses, weights = won
-            # The next scans have to confirm them.
+            # The next scans must confirm the new particles.
             tracker.place(poses[starts.rows_by_weight(weights, tracker.cloud.count)])
             self._verdict.doubt()
             self.expect_anywhere()
 
     def _made(self) -> Rival:
-        """Return the rival, which is made at its first use with the sensors of the filter."""
+        """Return the rival, made on first use with the sensors of the filter."""
         if self.rival is None:
             tracker = self._tracker
             options = tracker.options._replace(

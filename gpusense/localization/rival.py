@@ -1,20 +1,20 @@
-"""A rival of a filter's particles: a second cloud that is searched when scans contradict the pose.
+"""Rival of a filter's particles: a second cloud, searched when scans contradict the pose.
 
 Sensor resetting (Lenser and Veloso, "Sensor resetting localization for poorly modelled mobile robots" (2000)) and
 augmented MCL (*Probabilistic Robotics* table 8.3) mix new poses into the particles at once. A person in front of the
-scanner can then destroy a sound track, since a pose chosen for a scan explains that scan. Here the new poses form a
-separate cloud, which moves with the same odometry and is corrected by the same readings. With p(z_t | z_1 .. z_t-1) of
-each cloud, the mean likelihood of its predicted particles, the logarithm of the Bayes factor
+scanner can then destroy a sound track, since poses chosen for a scan explain that scan. Here the new poses form a
+separate cloud with the same odometry and readings. Let p(z_t | z_1 .. z_t-1) be the mean likelihood of a cloud's
+predicted particles. The logarithm of the Bayes factor
 
     B = sum over later scans t of log p_rival(z_t | ...) - log p_filter(z_t | ...)
 
-is evidence for the rival (Kass and Raftery, "Bayes factors" (1995)); the scan by which the rival was chosen is not.
-Terms of scans that lie close together repeat one another, since the same furniture is wrong in all of them, so against
-a tracked pose each counts as far as it is new (:mod:`gpusense.localization.belief`). The rival replaces the particles
-once B exceeds ``WIN``, after ``SCANS`` scans if it lies together, and after ``APART`` scans if several places are
-equally likely, provided that the beams that meet walls support it. Until then the particles give the estimate, and the
-probability that the rival is right adds to the probability of being lost. A rival is given up if it ends at the pose of
-the particles, falls behind, or has not won after ``LONGEST`` scans.
+is evidence for the rival (Kass and Raftery, "Bayes factors" (1995)); the scan that chose the rival is none. Terms of
+nearby scans repeat one another, since the same furniture is wrong in all of them; against a tracked pose only the new
+part of each counts (:mod:`gpusense.localization.belief`). The rival replaces the particles once B exceeds ``WIN``,
+after ``SCANS`` scans if it is concentrated, and after ``APART`` scans if several places are equally likely, provided
+that the beams that meet walls support it. Until then the particles yield the estimate, and the rival's probability adds
+to the probability of being lost. A rival ends if it reaches the pose of the particles, falls behind, or has not won
+after ``LONGEST`` scans.
 """
 
 from __future__ import annotations
@@ -37,39 +37,38 @@ from gpusense.localization.spread import FAR, FAR_TURN, deviations
 from gpusense.localization.tracker import Progress, Tracker
 from gpusense.localization.verdict import sightings
 
-# Log Bayes factors at which a rival wins, and at which a losing rival ends; scans to win for a converged rival, and for
-# a rival with several places; scans after which an undecided rival is given up.
+# Log Bayes factors of a winning and a losing rival; scans to win for a converged rival, and for a rival with several
+# places; largest number of scans.
 WIN, LOSE, SCANS, APART, LONGEST = 7.0, -7.0, 3, 8, 15
-# Scans after which a rival with several places is given up if the beams that meet walls contradict the best place.
+# Scans after which a rival with several places ends if the beams that meet walls contradict the best place.
 SETTLES = 5
-# Number of rivals with which a pose from a search on the whole map is compared.
+# Number of rivals to compare with a pose from a search on the whole map.
 COMPARISONS = 3
-# Prior odds of a rival of a tracked pose, whose place was unknown before.
+# Prior log odds of a rival of a tracked pose at an unknown place.
 PRIOR = -7.0
 # Particles of a rival; half widths around each of its initial poses [m, m, rad].
 PARTICLES, _SPREAD = 1000, (0.1, 0.1, 0.05)
-# Largest deviation of a cloud that lies together [m]. Largest distance and turn between two clouds at one place [m,
-# rad].
+# Largest deviation of a concentrated cloud [m]; largest distance and turn between two clouds at a place [m, rad].
 _TOGETHER, _SAME, _SAME_TURN = 0.5, 0.5, 0.3
-# Mean ratio of wrong against right up to which the beams support a pose; share of the old mean kept by a new scan.
+# Largest mean ratio of wrong against right of a supported pose; share of the old mean after a new scan.
 _RIGHT, _AGAINST, _KEPT = -1.0, 0.0, 0.6
 # Largest contribution of a scan [nats].
 _MOST = 50.0
 
 
 def evidence_of(summary: Summary) -> float:
-    """Return log p(z | earlier readings) of the last correction; -inf where no particle was possible."""
+    """Return log p(z | earlier readings) of the last correction; -inf if no particle was possible."""
     return -math.inf if summary.degenerate else float(summary.numbers[EVIDENCE])
 
 
 class Rival:
-    """The rival of a filter.
+    """Rival of a filter.
 
     Args:
         tracker: A second set of particles with the filter's sensors.
 
     Attributes:
-        active: True if there is a rival now.
+        active: True if a rival competes.
         log_odds: Log odds of the rival against the particles.
     """
 
@@ -77,7 +76,7 @@ class Rival:
         self._tracker = tracker
         self.active, self.log_odds = False, PRIOR
         self._scans, self._place = 0, np.zeros(3)
-        # Of each set of sensors: log ratio of its last scan, and the pose of the particles then.
+        # Log ratio of the last scan of each set of sensors, and the particles' pose then.
         self._last: dict[tuple[int, ...], tuple[float, np.ndarray]] = {}
         self._prior, self._settled = PRIOR, False
         # Weighted sums of the log-likelihood ratios of the rival and of the particles, and the sum of the weights.
@@ -85,7 +84,7 @@ class Rival:
         self._search = RivalSearch(tracker.sensors)
 
     def keep(self) -> None:
-        """Record the buffers that the call now beginning must not overwrite."""
+        """Record the buffers that the present call must not overwrite."""
         self._tracker.keep()
 
     def changing(self) -> tuple[Any, ...]:
@@ -102,7 +101,7 @@ class Rival:
         self._tracker.restore(*state[1:])
 
     def stop(self) -> None:
-        """Give the rival up."""
+        """End the rival."""
         self.active = False
 
     def start(
@@ -121,7 +120,7 @@ class Rival:
             covariance: (3, 3) their covariance.
             readings: Indices of sensors with the last readings.
             step: Number of the last step of the filter; equal steps give equal rivals.
-            prior: Prior log odds; with 0, places near the estimate are no rivals.
+            prior: Prior log odds; 0 excludes places near the estimate.
 
         Returns:
             Log-likelihood ratio of other places against the estimate; NaN without a search of the whole map.
@@ -138,7 +137,7 @@ class Rival:
             return ratio
         self._tracker.place(starts.spread(tries[chosen], _SPREAD, options.most, key, each=True))
         self.active, self.log_odds, self._prior, self._scans, self._settled = True, prior, prior, 0, False
-        # No trace of an earlier rival may remain in the state.
+        # Clear all state of an earlier rival.
         self._ratios, self._place, self._last = np.zeros(3), np.zeros(3), {}
         return ratio
 
@@ -161,7 +160,7 @@ class Rival:
             ratio = min(max(mine - evidence, -_MOST), _MOST)
             sensors = tuple(index for index, _ in readings)
             before, at = self._last.get(sensors, (0.0, pose))
-            # A place that was searched on the whole map is no likelier than its rivals, so they are compared at once.
+            # A place from a search on the whole map is no likelier than its rivals: compare them at once.
             rho = correlation(*motion_between(pose, at)) if sensors in self._last and self._prior < 0.0 else 0.0
             self.log_odds += new_part(ratio, before, rho)
             self._last[sensors] = ratio, np.array(pose)
@@ -170,7 +169,7 @@ class Rival:
     def judge(
         self, pose: np.ndarray, covariance: np.ndarray, readings: list[SensorReadings]
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the rival's particles and weights if it has won; give it up if it cannot win.
+        """Return the rival's particles and weights if it has won; end it if it cannot win.
 
         Args:
             pose: (3,) estimated pose of the particles.
@@ -181,13 +180,13 @@ class Rival:
         gain = self.log_odds - self._prior
         together = deviations(own)[0] < _TOGETHER
         if not together:
-            # The mean of several places is none of them.
+            # The mean of several places is no place.
             poses, weights = self._tracker.host_particles(), self._tracker.host_weights()
             self._place, own = poses[int(np.argmax(weights))], np.zeros((3, 3))
         self._compare(own, pose, covariance, dict(readings))
         if together and not self._settled:
             self._settled = True
-            # The particles were also spread out once, so two clouds that lie together start with even odds.
+            # The particles were once spread out as well: two concentrated clouds start with even odds.
             self.log_odds, gain = (0.0, 0.0) if self._prior == 0.0 else (self.log_odds, gain)
         if together and self.is_at(pose, _SAME, _SAME_TURN):
             self.stop()
@@ -208,32 +207,32 @@ class Rival:
             self._ratios = _KEPT * self._ratios + np.array([*pair, 1.0])
 
     def _is_plausible(self, *, better: bool = False) -> bool:
-        """Tell whether the beams that meet walls support the rival, in itself or more than the particles."""
+        """Return whether the beams that meet walls support the rival, absolutely or relative to the particles."""
         mine, other, weight = self._ratios
         return bool(not weight or (mine / weight < _RIGHT and (mine < other or not better)))
 
     def _is_contradicted(self) -> bool:
-        """Tell whether the beams that meet walls contradict the rival."""
+        """Return whether the beams that meet walls contradict the rival."""
         mine, _, weight = self._ratios
         return bool(weight and mine / weight > _AGAINST)
 
     def _is_late(self, gain: float) -> bool:
-        """Tell whether a rival has fallen behind or had enough scans; equal clouds that lie together may both stay."""
+        """Return whether a rival has fallen behind or had enough scans; equal concentrated clouds may both stay."""
         if self._scans >= (SCANS if self._settled else SETTLES) and self._is_contradicted():
             return True
         over = self._scans >= LONGEST
         if self._prior == 0.0 and self._settled:
             return gain < LOSE or (over and not self._is_plausible())
-        # A cloud that is still spread out predicts scans badly.
+        # A spread-out cloud predicts scans badly.
         return over or (gain < LOSE and self._prior < 0.0 and (self._settled or self._scans >= SCANS))
 
     def is_at(self, pose: np.ndarray, far: float = FAR, turn: float = FAR_TURN) -> bool:
-        """Tell whether the rival is at a pose, within a distance [m] and an angle [rad]."""
+        """Return whether the rival is within a distance [m] and an angle [rad] of a pose."""
         d = self._place - pose
         return math.hypot(d[0], d[1]) <= far and abs(math.remainder(float(d[2]), math.tau)) <= turn
 
     def probability(self, pose: np.ndarray) -> float:
-        """Return the probability that the rival is right and a pose is not."""
+        """Return the probability that the rival is right and a pose is wrong."""
         if not self.active or not self._scans or self.is_at(pose) or not self._is_plausible():
             return 0.0
         return 1 / (1 + math.exp(-min(max(self.log_odds, -_MOST), _MOST)))

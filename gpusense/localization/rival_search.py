@@ -1,11 +1,10 @@
-"""Find poses at which a rival of a filter's particles begins: candidates for the last readings on the whole map.
+"""Find initial poses of a rival of a filter's particles: candidates for the last readings on the whole map.
 
-Scans are searched by branch and bound on the whole map (:func:`gpusense.matching.likely.likely_poses`), which misses no
-place: once with all beams, and once with the longer half, since people shorten beams. Among people the likelihood
-prefers places with many walls, so candidates are also weighed by the beams that meet walls
-(:mod:`gpusense.localization.ratio`). The same search shows whether the scan fits another place better than the
-estimate, which is evidence for the verdict. For landmarks, and where the search finds nothing, poses are drawn at
-random.
+Branch and bound searches the whole map for scans (:func:`gpusense.matching.likely.likely_poses`) without missing any
+place: once with all beams, and once with the longer half, since people shorten beams. People make the likelihood prefer
+places with many walls, so candidates are also weighed by the beams that meet walls
+(:mod:`gpusense.localization.ratio`). A better fit of the scan at another place than at the estimate is evidence for
+the verdict. For landmarks, and if the search finds nothing, poses are drawn at random.
 """
 
 from __future__ import annotations
@@ -30,29 +29,29 @@ from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.world.parameters import LikelihoodFieldParameters
 from gpusense.world.scanner import classify_ranges, float64_readings
 
-# Candidates of each search on a map; effective number of candidates that begin a rival; beams of a scan in a search.
+# Candidates of each search on a map; effective number of initial candidates of a rival; beams of a scan in a search.
 _CANDIDATES, _EFFECTIVE, _BEAMS = 40, 5, 60
-# Covariance of a candidate, whose standard deviations are half the distances between poses of the search.
+# Covariance of a candidate: half the distances between poses of the search, squared.
 _SPREAD_OF_POSE = np.diag([0.05**2, 0.05**2, 0.025**2])
-# Field parameters of a search, wider than the filter's, since its poses are farther apart.
+# Field parameters of a search, wider than the filter's, since the poses are farther apart.
 _FIELD = LikelihoodFieldParameters(z_hit=0.7, z_max=0.0, z_rand=0.3, sigma_hit=0.15)
-# Number of random poses, and their effective number that begins a rival.
+# Number of random poses, and effective number of initial poses of a rival.
 _TRIES, _CHOSEN = 20_000, 100
 # Least deviation of random poses around the estimate [m], and margin around landmarks [m].
 _NEARBY, _MARGIN = 2.0, 1.0
 
 
 class Candidates(NamedTuple):
-    """Poses at which a rival may begin, and how the estimate compares with them.
+    """Initial poses of a rival, and the comparison with the estimate.
 
     Attributes:
         poses: (M, 3) poses.
-        score: (M,) log-likelihood of each, less the ratio of its beams that meet walls.
-        effective: Effective number of them that begins a rival.
-        lead: Log-likelihood, times the temperature, of the candidate with the largest score beyond 1 m or 0.5 rad of
-            the estimate, less that at the estimate [nats]; NaN without a search of the whole map.
+        score: (M,) log-likelihood of each pose, less the ratio of its beams that meet walls.
+        effective: Effective number of initial poses.
+        lead: Tempered log-likelihood of the best candidate beyond 1 m or 0.5 rad of the estimate, less the estimate's
+            [nats]; NaN without a search of the whole map.
         beams: Number of independent beams, the temperature times the number of beams.
-        walls: Ratio of the beams that meet walls at that candidate.
+        walls: Ratio of the beams that meet walls at this candidate.
         is_found: True if a candidate is at the estimate.
     """
 
@@ -71,7 +70,7 @@ class Candidates(NamedTuple):
 
 
 class RivalSearch:
-    """Searches for rivals.
+    """Search for rivals.
 
     Args:
         sensors: The sensors of the rival.
@@ -140,7 +139,7 @@ class RivalSearch:
         return np.empty((0, 3))
 
     def _field_of(self, sensor: Sensor) -> LikelihoodFieldModel:
-        """Return the field of a sensor's map for searches, which is made once."""
+        """Return the cached field of a sensor's map for searches."""
         grid, scanner = sensor.model.grid, sensor.model.scanner
         if self._field is None or self._field.grid is not grid or self._field.scanner is not scanner:
             beams = min(_BEAMS, scanner.count)
@@ -150,7 +149,7 @@ class RivalSearch:
         return self._field
 
     def _at_random(self, pose: np.ndarray, covariance: np.ndarray, key: starts.Key) -> np.ndarray:
-        """Return poses anywhere, and poses around the estimate with any heading."""
+        """Return random poses anywhere, and around the estimate with any heading."""
         if self._pool is None:
             self._pool = _anywhere(self._sensors)
         anywhere = starts.spread(*self._pool, _TRIES // 2, key)
@@ -160,13 +159,13 @@ class RivalSearch:
 
 
 def are_apart(poses: np.ndarray, pose: np.ndarray, turn: float = FAR_TURN) -> np.ndarray:
-    """Return which of poses (N, 3) are beyond 1 m or a turn [rad] of a pose."""
+    """Return the mask of poses (N, 3) beyond 1 m or a turn [rad] of a pose."""
     way, turned = np.hypot(*(poses[:, :2] - pose[:2]).T), np.abs(wrap_angle(poses[:, 2] - pose[2]))
     return np.asarray((way > FAR) | (turned > turn))
 
 
 def drawn(score: np.ndarray, count: int, effective: int) -> np.ndarray | None:
-    """Draw indices by likelihoods, tempered to an effective number of them; None if no pose is possible."""
+    """Draw indices by likelihoods, tempered to an effective number; None if no pose is possible."""
     possible = np.isfinite(score)
     if not possible.any():
         return None
@@ -187,12 +186,12 @@ def drawn(score: np.ndarray, count: int, effective: int) -> np.ndarray | None:
 
 
 def can_search(sensors: Sequence[Sensor]) -> bool:
-    """Tell whether a sensor has a map in which a rival can be searched."""
+    """Return whether a sensor has a map for the search."""
     return any(hasattr(one.model, "grid") or isinstance(one.model, FeatureModel) for one in sensors)
 
 
 def _anywhere(sensors: Sequence[Sensor]) -> tuple[np.ndarray, starts.Spread]:
-    """Return centres and half widths of all places where a robot may be: free cells, or the landmarks' bounding box."""
+    """Return centres and half widths of all possible places: free cells, or the landmarks' bounding box."""
     models = [sensor.model for sensor in sensors]
     if any(hasattr(model, "grid") for model in models):
         return starts.free_pool(models, None)

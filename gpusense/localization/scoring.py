@@ -1,4 +1,4 @@
-"""Score a filter's particles by readings of its sensors, call by call or within one recorded program."""
+"""Score a filter's particles by its sensors' readings, call by call or within a recorded program."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from gpusense.localization.cloud_state import SensorReadings
 from gpusense.localization.particles import Stage
 from gpusense.localization.sensors import Sensor
 
-# Most recorded programs that are kept.
+# Most cached programs.
 _MOST_PROGRAMS = 8
 _MOST_VIEWS = 32
 _DOUBLE = np.dtype(np.float64)
 
 
 def readings_of(readings: Any, sensors: Sequence[Sensor]) -> list[SensorReadings]:
-    """Return the readings that are not missing, in the order of the sensors.
+    """Return the valid readings in the order of the sensors.
 
     Args:
         readings: The reading of the only sensor, or a mapping from models to readings. A tuple that begins with an
-            array holds several arguments; any other tuple is an array itself.
+            array holds several arguments; any other tuple is an array.
         sensors: The sensors.
     """
     if isinstance(readings, Mapping):
@@ -42,7 +42,7 @@ def readings_of(readings: Any, sensors: Sequence[Sensor]) -> list[SensorReadings
     else:
         pairs = [] if readings is None else [(0, readings)]
     several = [(i, value if _is_several(value) else (value,)) for i, value in pairs]
-    # Lists become arrays, so that ragged ones are refused by name.
+    # Convert lists to arrays, to refuse ragged ones by name.
     return [
         (i, tuple(checks.as_array("readings", part, masked=True) if isinstance(part, list) else part for part in value))
         for i, value in several
@@ -50,18 +50,18 @@ def readings_of(readings: Any, sensors: Sequence[Sensor]) -> list[SensorReadings
 
 
 def _is_several(value: Any) -> bool:
-    """Tell whether a reading is a tuple of arguments: its first item is an array, not a number."""
+    """Return whether a reading is a tuple of arguments: its first item is an array, not a number."""
     return isinstance(value, tuple) and len(value) > 0 and (isinstance(value[0], list) or np.ndim(value[0]) > 0)
 
 
 class FilterScoring:
-    """Scores the particles of a cloud, which owns it.
+    """Score the particles of the owning cloud.
 
     Args:
         sensors: The sensors of the filter.
 
     Attributes:
-        timed: Whether to wait for the log-likelihoods of each stage, to measure their time.
+        timed: Whether to wait for and time the log-likelihoods of each stage.
     """
 
     timed = False
@@ -69,16 +69,16 @@ class FilterScoring:
     def __init__(self, sensors: Sequence[Sensor]) -> None:
         self._sensors, self._backend = sensors, sensors[0].backend
         self._programs = ProgramCache[tuple[Program, object]](_MOST_PROGRAMS)
-        # Views of buffers by the number of particles, as models take them.
+        # Views of buffers for models, by the number of particles.
         self._views: dict[tuple[str, int, int], Any] = {}
 
     def records(self, readings: Sequence[SensorReadings]) -> bool:
-        """Tell whether a stage with such readings is one recorded program: on a GPU that can score them all."""
+        """Return whether a stage with such readings is a recorded program: on a GPU that can score all of them."""
         gpu = self._backend.info.kind == "gpu"
         return gpu and all(self._sensors[index].records(reading) for index, reading in readings)
 
     def of(self, cloud: Cloud, readings: Sequence[SensorReadings]) -> Callable[[Stage], None]:
-        """Return the function that runs a stage with readings, by the indices of their sensors."""
+        """Return the function that runs a stage with readings."""
         if not self.records(readings):
             return functools.partial(self._called, cloud, readings)
         for index, reading in readings:
@@ -128,7 +128,7 @@ class FilterScoring:
         return self._views.get(key) or self._view(key, cloud.log_p[place], (count,), cloud.precision)
 
     def _view(self, key: tuple[str, int, int], buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> Any:
-        """Return a view of a buffer, which is kept, since clouds of one size have few views."""
+        """Return a cached view of a buffer; clouds of one size have few views."""
         if len(self._views) >= _MOST_VIEWS:
             self._views.clear()
         self._views[key] = self._backend.view(buffer, shape, dtype)

@@ -1,4 +1,4 @@
-"""A measurement model as a filter's sensor: its device, its readings on the device, and its temperature."""
+"""Wrap a measurement model as a filter's sensor: device, readings on the device, and temperature."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import float64_readings
 
 _DOUBLE = np.dtype(np.float64)
-# Calls that may be started before the host waits.
+# Most queued calls before the host waits.
 _MOST_STARTED = 64
 _MOST_SENSORS = DEPTH - TEMPERATURE
 
 
 class Sensor:
-    """A measurement model of a filter.
+    """Measurement model of a filter.
 
     Args:
         model: A scan, landmark or point model.
@@ -40,11 +40,11 @@ class Sensor:
         model: The model.
         backend: Device of the model.
         precision: Precision of its log-likelihoods.
-        beams: Beams that a scan uses; 0 for other models.
+        beams: Used beams of a scan; 0 for other models.
         seconds: Time of all calls of ``score``.
-        calibrates: Whether temperature="auto" learns from it.
-        ambiguous: True if its likelihood may have several peaks among particles that lie together, as for landmarks
-            that may be exchanged.
+        calibrates: Whether temperature="auto" learns from this sensor.
+        ambiguous: True if its likelihood may have several peaks among concentrated particles, for example exchangeable
+            landmarks.
 
     Raises:
         TypeError: another object.
@@ -64,7 +64,7 @@ class Sensor:
         self.precision = np.dtype(model.precision)
         self.beams = model.used_beams if isinstance(model, ScanModel) else 0
         self._correlation = BeamCorrelation()
-        # A temperature, and the correlation that it is of; learning replaces the correlation.
+        # A temperature and its correlation; learning replaces the correlation.
         self._known: tuple[BeamCorrelation, float] | None = None
         self._seen, self._learned = 0, -1
         self._ranges: Any = None
@@ -72,7 +72,7 @@ class Sensor:
         self.seconds, self._started = 0.0, 0
 
     def temperature(self, chosen: float | str) -> float:
-        """Return the present temperature of the log-likelihood, from the chosen one of scans or "auto"."""
+        """Return the present temperature of the log-likelihood, for the option ``chosen``."""
         if not self.calibrates:
             return 1.0
         if not isinstance(chosen, str):
@@ -82,12 +82,12 @@ class Sensor:
         return self._known[1]
 
     def restart(self) -> None:
-        """Reset the count of scans: the next scan is treated as the first."""
+        """Reset the count of scans."""
         self._seen, self._learned = 0, -1
 
     @property
     def due(self) -> bool:
-        """Tell whether to learn the correlation of beams from the last scan: each of the first, then two of ten."""
+        """Return whether to learn the correlation of beams from the last scan: each of the first, then two in ten."""
         return self._seen <= DEFAULTS.calibrations or self._seen % 10 <= 1
 
     def count(self) -> None:
@@ -98,13 +98,13 @@ class Sensor:
         """Learn the correlation of beams from the last counted scan, at the estimated pose."""
         axes, scanner = axes_of(covariance), self.model.scanner
         parts = self.parts(poses_around(pose, axes), reading)
-        # A new object, since it is part of the state.
+        # A new object, since the correlation is part of the state.
         correlation = copy.copy(self._correlation)
         correlation.add(parts, axes, scanner.bearings + pose[2], follows=self._learned == self._seen - 1)
         self._correlation, self._learned = correlation, self._seen
 
     def judge(self) -> MapJudge:
-        """Return the present map on the device, where beams are judged; it is copied there on first use."""
+        """Return the present map on the device for judging beams, copied on first use."""
         if self._judge is None or self._judge.grid is not self.model.grid:
             self._judge = MapJudge(self.backend, self.model.grid)
         return self._judge
@@ -126,14 +126,14 @@ class Sensor:
         before: Callable[[], None] | None = None,
         timed: bool = False,
     ) -> None:
-        """Write the log-likelihoods of poses on the device; those of scans are complete once the device has finished.
+        """Write the log-likelihoods of poses on the device; scans are complete once the device has finished.
 
         Args:
             poses: (N, 3) poses on the device.
             reading: The reading.
             out: (N,) array on the device.
-            before: Called before poses are read, to start the launches that write them.
-            timed: Whether to wait for the log-likelihoods, and add their time to ``seconds``.
+            before: Called before poses are read; starts the launches that write them.
+            timed: Whether to wait for the log-likelihoods and add their time to ``seconds``.
         """
         begin = time.perf_counter()
         if self.calibrates:
@@ -143,7 +143,7 @@ class Sensor:
                 )
             self.model.start_scoring(poses, *reading, out=out, before=before)
             self._started += 1
-            # Arrays that the device reads must stay alive until then.
+            # Keep arrays alive until the device has read them.
             if timed or self._started >= _MOST_STARTED:
                 self.model.finish_scoring()
                 self._started = 0
@@ -156,16 +156,16 @@ class Sensor:
     # ---- recorded steps
 
     def records(self, reading: tuple[Any, ...]) -> bool:
-        """Tell whether the device can score such a reading by itself: a scan on the host or on the device."""
+        """Return whether a recorded program can score the reading: a scan on the host or on the device."""
         return self.calibrates and len(reading) == 1 and not self.model.compat
 
     @property
     def version(self) -> int:
-        """Number of the map's table, on which a recorded program depends."""
+        """Version of the map's table, a key of recorded programs."""
         return self.model.table_version if self.calibrates else 0
 
     def upload(self, reading: tuple[Any, ...]) -> None:
-        """Copy the ranges of a scan to the array that recorded programs read."""
+        """Copy the ranges of a scan to the array for recorded programs."""
         ranges = reading[0]
         count = self.model.scanner.count
         if self._ranges is None:
@@ -180,7 +180,7 @@ class Sensor:
         self.backend.upload(np.ascontiguousarray(float64_readings(values, self.model.scanner)), self._ranges)
 
     def program(self, poses: Any, out: Any) -> tuple[Program, object]:
-        """Return the launches that score poses on the device, and the owner of their memory."""
+        """Return the launches for scoring poses on the device, and the owner of their memory."""
         ranges = self.backend.view(self._ranges, (self.model.scanner.count,), _DOUBLE)
         call = self.model.bind(poses, ranges, out=out)
         if not isinstance(call, DeviceCall):
@@ -189,7 +189,7 @@ class Sensor:
 
 
 def sensors_of(models: Any) -> list[Sensor]:
-    """Return the sensors of models, all of one device and one precision.
+    """Return the sensors of models with a common device and precision.
 
     Args:
         models: A measurement model, or several.

@@ -1,10 +1,10 @@
-"""Skip beams that most particles cannot explain, as on people and moved furniture.
+"""Skip beams that most particles cannot explain, such as beams on people and moved furniture.
 
-The idea is nav2_amcl's ``do_beamskip``. There a particle explains a beam whose end is within 0.5 m of a wall. Here it
-explains a beam that it makes likelier than poses anywhere do, so any model of scans can skip. Two faults of nav2_amcl
-are absent: nonexistent beams do not count as skipped, and if too many would be skipped, the scan is used completely
-with the log-likelihoods of all its beams. Scans are also used completely while the particles are spread out, since then
-only the few right particles explain most beams.
+In nav2_amcl's ``do_beamskip`` a particle explains a beam that ends within 0.5 m of a wall. Here it explains a beam that
+it makes likelier than poses anywhere do, so that any model of scans can skip. Two faults of nav2_amcl are absent:
+nonexistent beams do not count as skipped, and a scan with too many skipped beams is used completely, with the
+log-likelihoods of all its beams. Scans are also used completely while the particles are spread out, since then only
+the few right particles explain most beams.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from gpusense.localization.cloud_state import SensorReadings
 from gpusense.localization.pose_algebra import mean_pose
 from gpusense.localization.sensors import Sensor
 
-# Number of evaluated particles; largest deviation of particles that lie together [m]; largest share of skipped beams.
+# Number of evaluated particles; largest deviation of concentrated particles [m]; largest share of skipped beams.
 _ASKED, TOGETHER, _MOST_SKIPPED = 100, 0.5, 0.7
 
 
 def together(poses: np.ndarray, weights: np.ndarray) -> bool:
-    """Tell whether the deviation of particles is at most half a metre along x and along y."""
+    """Return whether the deviation of particles is at most half a metre along x and along y."""
     d = poses[:, :2] - mean_pose(poses, weights)[:2]
     return bool(np.all(weights @ d**2 <= TOGETHER**2 * weights.sum()))
 
@@ -36,7 +36,7 @@ def skipped(
     anywhere: Callable[[], np.ndarray],
     share: float,
 ) -> list[SensorReadings]:
-    """Return readings in which the scans lack the beams that too few particles explain.
+    """Return readings without the beams that too few particles explain.
 
     Args:
         sensors: The filter's sensors.
@@ -64,7 +64,7 @@ def without_skipped(
     elsewhere: np.ndarray,
     share: float,
 ) -> tuple[Any, ...]:
-    """Return a scan in which the beams that too few particles explain are missing readings.
+    """Return a scan with missing readings for the beams that too few particles explain.
 
     Args:
         sensor: A sensor of scans.
@@ -89,13 +89,13 @@ def without_skipped(
 
 
 def boundary(elsewhere: np.ndarray) -> float | None:
-    """Return the log-likelihood above which a beam is explained, between a poor and a good one.
+    """Return the least log-likelihood of an explained beam, between a poor and a good beam.
 
     Args:
         elsewhere: (M, K) log-likelihoods of used beams at poses anywhere in the free space.
 
     Returns:
-        The boundary; None if all beams are equally likely everywhere, or none is possible.
+        The boundary; None if all beams are equally likely everywhere or impossible.
     """
     values = elsewhere[np.isfinite(elsewhere)]
     if not values.size:

@@ -1,4 +1,4 @@
-"""Probability that a pose is far off, by the spread of the particles or by a covariance alone."""
+"""Compute the probability that a pose is far off, from particles or from a covariance."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from gpusense.localization.pose_algebra import wrap_angle
 
 Floats = NDArray[np.float64]
 
-# Errors beyond which a pose is far off, by the definition of p_lost [m, rad].
+# Least errors of a pose far off, in the definition of p_lost [m, rad].
 FAR, FAR_TURN = 1.0, 0.5
-# Largest deviations of particles that lie together [m, rad].
+# Largest deviations of concentrated particles [m, rad].
 WIDE, WIDE_TURN = 0.5, 0.25
-# Deviations below which no error is far off [m, rad], and up to which a normal density replaces the particles.
+# Largest deviations for a normal density instead of particles [m, rad].
 _NARROW, _NARROW_TURN = 0.2, 0.1
 # Nodes and weights of a Gauss-Legendre quadrature on [-1, 1].
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
@@ -24,7 +24,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
 
 def deviations(covariance: Floats) -> tuple[float, float]:
     """Return the largest standard deviation of the position over directions [m], and the heading's deviation [rad]."""
-    # Python's floats, since arrays of nine items take several times as long.
+    # Python's floats are several times faster than arrays of nine items.
     (xx, xy, xt), (yx, yy, yt), (tx, ty, tt) = covariance.tolist()
     if not all(map(math.isfinite, (xx, xy, xt, yx, yy, yt, tx, ty, tt))):
         return math.inf, math.inf
@@ -33,13 +33,14 @@ def deviations(covariance: Floats) -> tuple[float, float]:
 
 
 class Spread(NamedTuple):
-    """Classes of a covariance by the largest standard deviations of position and heading.
+    """Classes of a covariance, by the largest standard deviations of position and heading.
 
     Attributes:
-        wide: Whether the position's exceeds 0.5 m, or the heading's 0.25 rad.
-        apart: Whether the position's exceeds 1 m, or the heading's 0.5 rad: the distribution may cover several places.
+        wide: True if the position's exceeds 0.5 m, or the heading's 0.25 rad.
+        apart: True if the position's exceeds 1 m, or the heading's 0.5 rad: the distribution may cover several
+            places.
         narrow: True if the position's is below 0.2 m and the heading's below 0.1 rad: a normal density then describes
-            the particles well enough.
+            the particles.
     """
 
     wide: bool
@@ -48,7 +49,7 @@ class Spread(NamedTuple):
 
 
 def spread_of(covariance: Floats) -> Spread:
-    """Class a (3, 3) covariance of x, y [m] and heading [rad]."""
+    """Classify a (3, 3) covariance of x, y [m] and heading [rad]."""
     position, heading = deviations(covariance)
     return Spread(
         position > WIDE or heading > WIDE_TURN, position > FAR or heading > FAR_TURN,
@@ -57,17 +58,17 @@ def spread_of(covariance: Floats) -> Spread:
 
 
 def is_wide(covariance: Floats) -> bool:
-    """Return whether the deviation of the position exceeds half a metre, or that of the heading 0.25 rad."""
+    """Return whether the position's deviation exceeds 0.5 m, or the heading's 0.25 rad."""
     return spread_of(covariance).wide
 
 
 def share_off(covariance: Floats) -> float:
     """Return the probability that a normal error is beyond 1 m or 0.5 rad.
 
-    Position and heading are treated as independent: the probability of either is then right to second order in each.
+    Position and heading are treated as independent, correct to second order in each.
 
     Args:
-        covariance: (3, 3) covariance of x, y [m] and heading [rad]; infinite entries are certainly off.
+        covariance: (3, 3) covariance of x, y [m] and heading [rad]; infinite entries are far off.
     """
     large, heading = deviations(covariance)
     if math.isinf(large):
@@ -83,7 +84,7 @@ def share_off_of(poses: Floats, weights: Floats, pose: Floats) -> float:
 
     Args:
         poses: (N, 3) particles.
-        weights: (N,) weights >= 0, of any positive sum.
+        weights: (N,) weights >= 0, not necessarily normalised.
         pose: (3,) pose.
     """
     total = float(weights.sum())
@@ -95,12 +96,12 @@ def share_off_of(poses: Floats, weights: Floats, pose: Floats) -> float:
 
 
 def _within(limit: float, deviation: float) -> float:
-    """Return the probability of a normal number within limits on both sides."""
+    """Return the probability that a normal number is within +-``limit``."""
     return 1.0 if deviation == 0 else math.erf(limit / deviation / math.sqrt(2))
 
 
 def _within_disc(large: float, small: float) -> float:
-    """Return the probability that a normal error with deviations along two axes is within the disc of radius FAR."""
+    """Return the probability that a normal error with two principal deviations is within the disc of radius FAR."""
     if large < _NARROW:
         return 1.0
     reach = min(FAR, 8 * large)

@@ -1,6 +1,6 @@
 """Draw particles of starts and resets on the host, by the reference of the kernels' generator.
 
-So they are equal on all backends. Sensor resetting: Lenser and Veloso, *Sensor resetting localization for poorly
+All backends draw equal particles. Sensor resetting: Lenser and Veloso, *Sensor resetting localization for poorly
 modelled mobile robots* (2000).
 """
 
@@ -25,7 +25,7 @@ Spread = tuple[float, float, float]
 _MOST_POOL = 1 << 18
 # Stream of random numbers that no kernel uses.
 _STREAM = 64
-# Poses that a reset tries per new particle, and at least; new particles per chosen pose.
+# Tried poses per new particle, and at least, in a reset; new particles per chosen pose.
 _TRIES, _LEAST_TRIES, _SHARE = 10, 20_000, 10
 # Half widths of the box around a chosen pose [m, m, rad].
 _SPREAD = (0.1, 0.1, 0.05)
@@ -58,14 +58,14 @@ def normal(mean: Any, covariance: Any, count: int, key: Key) -> np.ndarray:
 
 
 def spread(pool: np.ndarray, half: Spread, count: int, key: Key, *, each: bool = False) -> np.ndarray:
-    """Draw poses from a pool, each uniform in a box around a pose.
+    """Draw poses uniformly in boxes around the poses of a pool.
 
     Args:
         pool: (M, 3) centres.
         half: Half widths of the box [m, m, rad].
         count: Poses to draw.
         key: Seed and step.
-        each: Whether to take the centres cyclically in their order instead of drawing them.
+        each: Whether to cycle through the centres instead of drawing them.
     """
     first, more = _words(count, key, 1), _words(count, key, 2)
     row = np.arange(count) % len(pool)
@@ -100,7 +100,7 @@ def free_pool(models: Sequence[Any], bounds: Any) -> tuple[np.ndarray, Spread]:
 
 
 def rows_by_weight(weights: np.ndarray, count: int, start: float = 0.5) -> np.ndarray:
-    """Draw indices systematically by weights of any positive sum; ``start`` is the place of the first mark."""
+    """Draw indices systematically by weights, not necessarily normalised; the first mark is at ``start``."""
     ends = np.cumsum(weights)
     rows = np.searchsorted(ends, (np.arange(count) + start) / count * ends[-1], side="right")
     return np.minimum(rows, len(weights) - 1)
@@ -133,7 +133,7 @@ def look_at(pose: np.ndarray, grid: OccupancyGrid | None) -> None:
 
     Args:
         pose: (3,) pose.
-        grid: The map; None without one.
+        grid: The map, or None.
     """
     if grid is None:
         look_at_heading("start", float(pose[2]))
@@ -143,12 +143,12 @@ def look_at(pose: np.ndarray, grid: OccupancyGrid | None) -> None:
 
 
 def _replaced(particles: int) -> int:
-    """Return the number of particles that get new poses."""
+    """Return the number of particles with new poses."""
     return max(particles // 2, 1)
 
 
 def tries_of(particles: int) -> int:
-    """Return the number of poses that a reset of particles tries."""
+    """Return the number of tried poses in a reset."""
     return max(_LEAST_TRIES, _TRIES * _replaced(particles))
 
 
@@ -159,7 +159,7 @@ def likeliest(
     readings: Mapping[int, tuple[Any, ...]],
     temperature: float | str,
 ) -> np.ndarray:
-    """Return the likeliest of ``tries``, around which a reset of particles draws.
+    """Return the likeliest of ``tries``, the centres of a reset's draws.
 
     Args:
         tries: (M, 3) poses anywhere.

@@ -1,4 +1,4 @@
-"""State of a particle filter as plain data, to copy, store, or continue on another device."""
+"""Plain data of a particle filter's state, to copy, store, or continue on another device."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from gpusense.localization.verdict import Verdict
 class FilterState:
     """State of a :class:`ParticleFilter`: particles, weights, step, options, and everything learned.
 
-    It holds no device and no models, and can be pickled. A filter with the same models and options takes it over by
-    ``restore`` and continues with the same bits as the original.
+    It holds no device and no models, and pickles. A filter with the same models and options continues from it, after
+    ``restore``, with the same bits as the original.
 
     Attributes:
         options: Keyword arguments of the filter's constructor.
         models: Names of the classes of its models.
         contents: Particles on the host.
-        memory: Everything else: learned temperature, recent verdicts, the number of the step.
+        memory: Everything else: learned temperature, recent verdicts, number of the step.
 
     Example:
         >>> import gpusense as gs, pickle
@@ -59,12 +59,12 @@ class FilterState:
 
     @property
     def weights(self) -> np.ndarray:
-        """(N,) weights of the particles; their sum is 1."""
+        """(N,) normalised weights."""
         return np.asarray(self.contents.weights / self.contents.weights.sum())
 
     @property
     def step(self) -> int:
-        """Number of the last step, on which random numbers depend."""
+        """Number of the last step, a key of random numbers."""
         return int(self.memory["tracker"]["progress"].step)
 
 
@@ -83,7 +83,7 @@ def model_names(sensors: Sequence[Sensor]) -> tuple[str, ...]:
 def memory_of(
     tracker: Tracker, verdict: Verdict, recovery: Recovery, readings: Mapping[int, tuple[Any, ...]]
 ) -> dict[str, Any]:
-    """Return the filter's state without particles, as plain data with arrays in host memory."""
+    """Return the filter's state without particles as plain data, with arrays in host memory."""
     return {
         "tracker": plain_state(tracker), "verdict": plain_state(verdict), "recovery": recovery.state(),
         "sensors": [plain_state(sensor) for sensor in tracker.sensors],
@@ -94,7 +94,7 @@ def memory_of(
 def remember(
     memory: Mapping[str, Any], tracker: Tracker, verdict: Verdict, recovery: Recovery
 ) -> dict[int, tuple[Any, ...]]:
-    """Take over the result of ``memory_of``, and return the last readings."""
+    """Restore the result of ``memory_of``, and return the last readings."""
     set_state(tracker, memory["tracker"])
     set_state(verdict, memory["verdict"])
     for sensor, values in zip(tracker.sensors, memory["sensors"], strict=True):
@@ -117,7 +117,7 @@ def readings_on_host(readings: Mapping[int, tuple[Any, ...]], backend: Backend) 
 
 
 def check_state(state: object, options: dict[str, Any], models: tuple[str, ...]) -> FilterState:
-    """Check that a state is of a filter with these options and models; the motion model may differ."""
+    """Check that a state belongs to a filter with these options and models; the motion model may differ."""
     checked = checks.instance("state", state, FilterState)
     if checked.models != models:
         raise ValueError(f"state: must be of a filter of {', '.join(models)}, got one of {', '.join(checked.models)}")

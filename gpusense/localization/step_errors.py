@@ -1,8 +1,9 @@
-"""Errors of an odometer between reference poses, and the covariance that the odometry model predicts for them.
+"""Compute errors of an odometer between reference poses, and their covariance by the odometry model.
 
-Between two references lie one or more steps. The difference of reference and odometry is, to first order, the sum of
-the errors of the steps in between, each carried to the end of the gap: a turn displaces the end by the angle times its
-distance. So the covariance is linear in the model's variances: a sum of variances times matrices of the path.
+Between two references there are one or more steps. The difference between reference and odometry is, to first order,
+the sum of the errors of these steps, each carried to the end of the gap: a turn displaces the end by the angle times
+its distance. The covariance is therefore linear in the model's variances: a sum of variances times matrices of the
+path.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from gpusense.localization.pose_algebra import pose_difference, wrap_angle
 
 # Variances of the model: alpha1 to alpha4, sideways, and the squares of the least deviations.
 NOISES = ("alpha1", "alpha2", "alpha3", "alpha4", "sideways", "least translation", "least turn")
-# A step that ends this near its start [m, rad] is at rest: its motion may be jitter, so it informs only the least
-# deviations. By the defaults, the noise of a motion of this length has a tenth of their variances.
+# A shorter step [m, rad] is at rest: its motion may be jitter, so it informs only the least deviations. By the
+# defaults, the noise of a motion of this length has a tenth of their variances.
 REST = (0.02, 0.01)
 
 
@@ -26,8 +27,8 @@ class Errors(NamedTuple):
 
     Attributes:
         residual: (G, 3) errors.
-        basis: (7, G, 3, 3) covariance for a unit of each variance of ``NOISES``.
-        design: (G, 3, 3) errors for a unit of each part of the systematic error.
+        basis: (7, G, 3, 3) covariances per unit of each variance of ``NOISES``.
+        design: (G, 3, 3) errors per unit of each part of the systematic error.
     """
 
     residual: np.ndarray
@@ -41,7 +42,7 @@ class Errors(NamedTuple):
 
 
 def corrected(turns: np.ndarray, repeated: np.ndarray) -> np.ndarray:
-    """Return motions (M, 3) without the systematic error, as :class:`OdometryMotion` corrects them."""
+    """Return motions (M, 3) without the systematic error, corrected like :class:`OdometryMotion`."""
     stretch, gain, drift = repeated
     first, trans, second = turns.T
     half = drift * trans / 2
@@ -62,7 +63,7 @@ def errors_of(turns: np.ndarray, references: np.ndarray, at: np.ndarray) -> Erro
     x, y = (np.r_[0.0, np.cumsum(trans * part)] for part in (np.cos(way), np.sin(way)))
     path = np.stack([x, y, heading], axis=1)
     moved, truth = pose_difference(path[at[:-1]], path[at[1:]]), pose_difference(references[:-1], references[1:])
-    # Along the motion from one reference to the next, ahead or backwards; along the heading where there is none.
+    # Along the motion between references, ahead or backwards; along the heading if there is none.
     turn = np.where(np.hypot(moved[:, 0], moved[:, 1]) < SHORTEST, 0.0, np.arctan2(moved[:, 1], moved[:, 0]))
     turn = np.where(np.abs(turn) > np.pi / 2, turn - np.copysign(np.pi, turn), turn)
     difference = truth - moved
@@ -70,7 +71,7 @@ def errors_of(turns: np.ndarray, references: np.ndarray, at: np.ndarray) -> Erro
     steps = slice(at[0], at[-1])
     gap = np.repeat(np.arange(len(moved)), np.diff(at))
     axis = (path[at[:-1], 2] + turn)[gap]
-    # Line from the end of a step to the end of its gap: a turn displaces the gap's end perpendicular to it.
+    # Line from the end of a step to the end of its gap: a turn displaces the gap's end at right angles.
     lever = _turned((path[at[1:]][gap] - path[1:][steps])[:, :2], -axis)
     carry = np.zeros((len(gap), 3, 3))
     carry[:, :2, 0] = _turned(np.tile((1.0, 0.0), (len(gap), 1)), way[steps] - axis)
@@ -93,12 +94,12 @@ def _turned(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def _of_steps(turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return basis (7, M, 3, 3) and design (M, 3, 3) of single steps, along and across their translation."""
+    """Return basis (7, M, 3, 3) and design (M, 3, 3) of steps, along and across their translation."""
     moving = ~at_rest(turns)
     first, trans, second = np.where(moving[:, None], turns, 0.0).T
     squares = first**2 + second**2
     basis = np.zeros((len(NOISES), len(turns), 3, 3))
-    # A first turn moves the end to the side; the second turn changes only the heading.
+    # A first turn moves the end sideways; the second turn changes only the heading.
     for noise, (one, two) in {0: (first**2, second**2), 1: (trans**2, trans**2), 6: (1.0, 1.0)}.items():
         length = turns[:, 1] if noise == 6 else trans
         basis[noise, :, 1, 1] = one * length**2
@@ -115,5 +116,5 @@ def _of_steps(turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def at_rest(turns: np.ndarray) -> np.ndarray:
-    """Return whether steps (M, 3) are shorter than ``REST``, and turn by less in all."""
+    """Return the mask of steps (M, 3) that translate and turn by less than ``REST``."""
     return (np.abs(turns[:, 1]) < REST[0]) & (np.abs(wrap_angle(turns[:, 0] + turns[:, 2])) < REST[1])

@@ -1,8 +1,8 @@
-"""Sums over a filter's particles: first over blocks, then over groups of blocks, then over all.
+"""Sum over a filter's particles: first over blocks, then over groups of blocks, then over all.
 
 A work-item adds up a block. Particles per block, blocks per group and groups are all about the cube root of the number
-of particles. Small clouds have one group. GPUs use more and smaller blocks of weights, since sums of weights are exact.
-Sums of poses have the same blocks on every device; on GPUs a work-item adds one lane of a block.
+of particles; small clouds have one group. GPUs use more and smaller blocks of weights, since sums of weights are exact.
+Sums of poses have the same blocks on every device; on GPUs a work-item adds up one lane of a block.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from gpusense.interface.launches import Program, launch
 
 _DOUBLE = np.dtype(np.float64)
 _PLAIN = frozenset[str]()
-# Particles in a float64 vector; fewest particles of a block; most blocks of a cloud with one group.
+# Particles per float64 vector; fewest particles per block; most blocks of a cloud with one group.
 _VECTOR, _LEAST, MOST_BLOCKS = 8, 8, 128
 
 
 def block_of(count: int) -> int:
-    """Return the particles of a block, in whole vectors."""
+    """Return the number of particles of a block, in whole vectors."""
     return max(math.ceil(round(count ** (1 / 3), 6) / _VECTOR) * _VECTOR, 2 * _LEAST)
 
 
@@ -35,7 +35,7 @@ def weight_block(backend: Backend, count: int) -> int:
 
 
 def reduction_fans(blocks: int) -> tuple[int, ...]:
-    """Return the numbers of rows that are added up in turn: blocks of a group, then groups; or all of a small cloud."""
+    """Return the rows per level of the reduction: blocks of a group, then groups; or all of a small cloud."""
     if blocks <= MOST_BLOCKS:
         return (blocks,)
     fan = math.isqrt(blocks - 1) + 1
@@ -43,7 +43,7 @@ def reduction_fans(blocks: int) -> tuple[int, ...]:
 
 
 class Sums:
-    """Buffers of sums, and the launches that fill them.
+    """Buffers of sums, and their launches.
 
     Args:
         backend: The device.
@@ -67,11 +67,11 @@ class Sums:
         self.totals = backend.empty(WEIGHT_SUMS, _DOUBLE)
 
     def launch(self, kernel: str, size: int, **arguments: Any) -> Program:
-        """Return a launch of a kernel, in lanes where the device asks for them."""
+        """Return a launch of a kernel, in lanes if the device uses them."""
         return (launch(kernel, with_lanes_flag(self._backend.info.lanes, kernel, _PLAIN), (size,), **arguments),)
 
     def highest(self, blocks: int) -> tuple[Program, Buffer, int]:
-        """Return the launches that find the largest score of each group, the buffer of results, and its length."""
+        """Return the launches for the largest score of each group, the buffer of results, and its length."""
         fan, *groups_of = reduction_fans(blocks)
         if not groups_of:
             return (), self.largest, blocks
@@ -108,7 +108,7 @@ class Sums:
                            ends=ends, **numbers)  # fmt: skip
 
     def copies(self, numbers: dict[str, Any], copies: Buffer, drawn: int, stage: int) -> Program:
-        """Return the launches that add up certain copies of residual resampling, and overwrite the sums of weights.
+        """Return the launches that add up certain copies of residual resampling; they overwrite the sums of weights.
 
         Args:
             numbers: Arguments by name: ends, state, particles, block, blocks.
@@ -127,13 +127,13 @@ class Sums:
     def estimate(self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, second_pass: int = 0) -> Program:
         """Return the launches that write the estimate of a cloud, or of its second pass."""
         info, block = self._backend.info, block_of(count)
-        # A work-item of a kernel with lanes processes all lanes.
+        # In a kernel with lanes, a work-item processes all lanes.
         lanes = ESTIMATE_LANES if info.kind == "cpu" or info.lanes > 1 else 1
         blocks, each = -(-count // block), ESTIMATE_LANES // lanes
         program = self.launch("sum_poses", blocks * each, poses=poses, weight=weight, estimate=estimate,
                               sums=self.rows, particles=count, block=block, lanes=lanes,
                               second_pass=second_pass)  # fmt: skip
-        # finish_estimate adds up the groups; on GPUs one more join is faster.
+        # finish_estimate adds up the groups; on GPUs a further join is faster.
         fans = (each, *reduction_fans(blocks)) if each > 1 else reduction_fans(blocks)[:-1]
         source, target, groups = self.rows, self._joined, blocks * each
         for fan in fans:
@@ -154,7 +154,7 @@ class Sums:
         return program + self._join(source, self.totals, shape, last)[0]
 
     def _join(self, sums: Buffer, joined: Buffer, shape: tuple[int, int], fan: int) -> tuple[Program, int]:
-        """Return the launch that adds up each ``fan`` of (rows, columns) sums, and the number of groups."""
+        """Return the launch that adds up (rows, columns) sums in groups of ``fan``, and the number of groups."""
         rows, columns = shape
         groups = -(-rows // fan)
         launches = self.launch("join_rows", groups * columns, sums=sums, joined=joined, rows=rows, columns=columns,

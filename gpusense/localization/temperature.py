@@ -1,30 +1,30 @@
-"""Temperature of a scan's log-likelihood: the weight at which its curvature equals the variance of its score.
+"""Compute the temperature of a scan's log-likelihood: the weight that equates curvature and variance of the score.
 
-The product over a scan's beams treats them as independent. They are not: one error of the map, or one person, changes
-many neighbours. Let s_k be the score of beam k, the gradient of its log-likelihood with respect to the pose, H the sum
-of the negative second derivatives, and J the variance of the sum of the s_k. A likelihood has J = H (Bartlett's second
-identity). One with a temperature T has T^2 J = T H on average, so T = tr(P H) / tr(P J) (Pauli, Racugno and Ventura,
-"Bayesian composite marginal likelihoods" (2011); Ribatet, Cooley and Davison, "Bayesian inference from composite
-likelihoods" (2012)). P is the covariance of the pose, so uncertain directions count more.
+The product over a scan's beams treats them as independent, but an error of the map, or a person, changes many
+neighbours. Let s_k be the score of beam k, the gradient of its log-likelihood with respect to the pose, H the sum of
+the negative second derivatives, and J the variance of the sum of the s_k. A likelihood has J = H (Bartlett's second
+identity). At the temperature T, T^2 J = T H on average, so T = tr(P H) / tr(P J) (Pauli, Racugno and Ventura, "Bayesian
+composite marginal likelihoods" (2011); Ribatet, Cooley and Davison, "Bayesian inference from composite likelihoods"
+(2012)). P is the covariance of the pose, which gives uncertain directions more weight.
 
 J is measured. B, the sum of s_k s_k', is the variance for independent beams. Blocks of neighbours with scores g_b and
-sums B_b have the variance B_b under independence. A fit to the scan takes B_b B^-1 of the sum of all scores away from
-each, and leaves B_b - B_b B^-1 B_b. The ratio of the measured variance to this one, F_n for n blocks, is 1 for
-independent beams at any n, and the inflation of the variance for beams whose correlation is shorter than a block. Four
-blocks are the longest blocks that leave a degree of freedom.
+sums B_b have the variance B_b under independence. A fit to the scan removes B_b B^-1 of the sum of all scores from
+each, and leaves B_b - B_b B^-1 B_b. The ratio F_n of the measured variance to this value, for n blocks, is 1 for
+independent beams at any n; for a correlation shorter than a block it is the inflation of the variance. Four blocks are
+the longest blocks that leave a degree of freedom.
 
-Errors of maps are correlated over any length, so the variance still grows from blocks to the whole scan. Let it grow by
-a factor x each time that blocks become four times as long (method of aggregated variance: Beran, *Statistics for
-Long-Memory Processes* (1994), section 4.4). The fit removes the part that all blocks share. So the inflations V, x V
-and x^2 V of sixteenths, quarters and the whole are observed as F_16 = (V - x^2 V / 16) / (1 - 1 / 16) and F_4 = (x V -
-x^2 V / 4) / (1 - 1 / 4).
+Errors of maps are correlated over any length, so that the variance grows further from blocks to the whole scan. Let it
+grow by a factor x whenever blocks become four times as long (method of aggregated variance: Beran, *Statistics for
+Long-Memory Processes* (1994), section 4.4). The fit removes the part common to all blocks. The inflations V, x V and
+x^2 V of sixteenths, quarters and the whole are therefore observed as F_16 = (V - x^2 V / 16) / (1 - 1 / 16) and F_4 =
+(x V - x^2 V / 4) / (1 - 1 / 4).
 
-With R = F_4 / F_16, x is 4 R / (5 - R), and the inflation of the whole x^2 V = F_4 3 R / (5 - 2 R): F_4 for R = 1. R is
-limited to 5/3, where sums over n beams have the variance n^1.5; beyond that, the fit hides most of the errors.
+Let R = F_4 / F_16. Then x is 4 R / (5 - R), and the inflation of the whole x^2 V = F_4 3 R / (5 - 2 R): F_4 for R = 1.
+R is limited to 5/3, where sums over n beams have the variance n^1.5; beyond, the fit hides most of the errors.
 
-Errors that repeat from scan to scan add up in a filter. With a correlation r of the blocks' scores at the same
-direction in consecutive scans, and a filter that keeps the share f of its information, errors have the variance (1 + r
-f) / (1 - r f) of independent ones. Its inverse is the second factor of the temperature.
+Errors that repeat from scan to scan add up in a filter. Let r be the correlation of blocks' scores at the same
+direction in consecutive scans, and f the share of information that the filter keeps. Errors have (1 + r f) / (1 - r f)
+times the variance of independent errors; the inverse is the second factor of the temperature.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ from gpusense.models.scan.model import ScanModel
 INDEPENDENT_AT_FIRST = 10.0
 # Fewest independent beams of a scan, largest correlation of consecutive scans, and largest growth R.
 INDEPENDENT_AT_LEAST, _LARGEST_REPEAT, _LARGEST_GROWTH = 1.0, 0.9, 5 / 3
-# Number of scans over which weights fall to 1 / e; least scans for an estimate; least beams of a scan.
+# Number of scans for weights to fall to 1 / e; least scans for an estimate; least beams of a scan.
 _MEMORY, _LEAST_SCANS, _FEWEST = 40, 5, 8
-# Deviations beyond which the variance of blocks exceeds that of independent beams.
+# Significance of an excess variance of blocks [deviations].
 _SIGNIFICANT = 2.0
-# Blocks of a scan: long ones, short ones, and those compared from scan to scan.
+# Numbers of long blocks, of short blocks, and of sectors for comparing scans.
 _LONG, _SHORT, _SECTORS = 4, 16, 8
-# Least and largest steps [m], and radians that correspond to a metre.
+# Least and largest steps [m], and radians per metre.
 _STEPS, _TURN = (1e-4, 0.1), 0.25
 # Deviations from the pose to the points of a cubature of degree 3 in 3 dimensions (Arasaratnam and Haykin, "Cubature
 # Kalman filters" (2009)): differences are means of derivatives over the normal density of the pose.
@@ -60,7 +60,7 @@ _FIRST_STEPS = (0.05, 0.05, 0.0125)
 
 
 def axes_of(covariance: np.ndarray) -> np.ndarray:
-    """Return steps in the columns of a (3, 3) array: deviations along the axes of a covariance, 0.1 mm to 10 cm.
+    """Return steps as columns of a (3, 3) array: deviations along the axes of a covariance, 0.1 mm to 10 cm.
 
     Args:
         covariance: (3, 3) covariance of a pose [m, m, rad].
@@ -73,7 +73,7 @@ def axes_of(covariance: np.ndarray) -> np.ndarray:
 
 
 def poses_around(pose: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Return the (7, 3) poses at which scores are measured: the pose, and a step forward and back along each axis."""
+    """Return the (7, 3) poses for measuring scores: the pose, and steps forward and back along each axis."""
     return np.vstack([pose, pose + _FAR * axes.T, pose - _FAR * axes.T])
 
 
@@ -93,7 +93,7 @@ class _Scores(NamedTuple):
     outer: np.ndarray
 
     def of_blocks(self, places: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return (count, 3) scores of blocks after the fit, and (count, 3, 3) outer products, by ``_places_of``."""
+        """Return (count, 3) scores of blocks after the fit, and (count, 3, 3) outer products."""
         sums = np.bincount(places, self.numbers, 12 * count).reshape(count, 12)
         outer = sums[:, 3:].reshape(count, 3, 3)
         return sums[:, :3] - outer @ self.fit, outer
@@ -112,18 +112,18 @@ def _scores_of(parts: np.ndarray) -> _Scores:
 
 
 def _places_of(block: np.ndarray) -> np.ndarray:
-    """Return the places (12 K,) of the numbers of beams among the sums of their blocks (K,)."""
+    """Return the indices (12 K,) of beams' numbers in the sums of their blocks (K,)."""
     return (block[:, None] * 12 + _TWELVE).reshape(-1)
 
 
 @functools.lru_cache(maxsize=64)
 def _places_of_neighbors(beams: int, count: int) -> np.ndarray:
-    """Return the places of the numbers of beams in ``count`` blocks of neighbours."""
+    """Return the indices of beams' numbers in the sums of ``count`` blocks of neighbours."""
     return _places_of(np.arange(beams) * count // beams)
 
 
 class BeamCorrelation:
-    """Running variance of the scores of scans, which yields the effective number of independent beams.
+    """Running variance of scans' scores, for the effective number of independent beams.
 
     Attributes:
         scans: Scans added.
@@ -132,7 +132,7 @@ class BeamCorrelation:
 
     def __init__(self) -> None:
         self.scans, self.beams = 0, 0.0
-        # Curvature; variance for independent beams; variance of long blocks, measured and for independent beams; the
+        # Curvature; variance for independent beams; variances of long blocks, measured and for independent beams; the
         # same for short blocks.
         self._sums = np.zeros(6)
         # Products and squares of consecutive scans; share of a pose's information that a scan contributes.
@@ -144,10 +144,10 @@ class BeamCorrelation:
 
         Args:
             parts: (7, K) log-likelihoods of beams at :func:`poses_around` the estimated pose, in the order of their
-                bearings; beams with 0 or a non-finite value are left out.
-            axes: (3, 3) steps between the poses; their squares are the covariance of the pose.
-            directions: (K,) directions of beams in the world [rad]: needed to compare consecutive scans.
-            follows: Whether the scan directly follows the last one added.
+                bearings; beams with 0 or a non-finite value are ignored.
+            axes: (3, 3) steps between the poses; their products are the covariance of the pose.
+            directions: (K,) directions of beams in the world [rad], for comparing consecutive scans.
+            follows: Whether the scan directly follows the previous one.
 
         Raises:
             TypeError, ValueError: arrays of other shapes.
@@ -176,14 +176,14 @@ class BeamCorrelation:
         self, scores: _Scores, axes: np.ndarray, directions: np.ndarray, used: np.ndarray, follows: bool
     ) -> None:
         """Correlate a scan's blocks with the last scan's blocks in the same directions."""
-        # Sectors of the world, an eighth of a scan wide, in a whole number per turn.
+        # Sectors of the world, an eighth of a scan wide, a whole number per turn.
         ahead = np.mod(directions, 2 * np.pi)
         ordered = np.sort(ahead)
         gap = max(float(np.max(ordered[1:] - ordered[:-1])), float(ordered[0] + 2 * np.pi - ordered[-1]))
         around = max(round(_SECTORS * 2 * np.pi / max(2 * np.pi - gap, 0.1)), 1)
         block = (ahead[used] * (around / (2 * np.pi))).astype(np.int64) % around
         blocks, _ = scores.of_blocks(_places_of(block), around)
-        # Gradients in the world, times the covariance's root of this scan.
+        # Gradients in the world, times this scan's root of the covariance.
         world = np.linalg.solve(axes.T, blocks.T).T
         seen = np.bincount(block, minlength=around) > 0
         if follows and self._previous is not None and len(self._previous[1]) == around:
@@ -204,7 +204,7 @@ class BeamCorrelation:
 
     @property
     def kept(self) -> float:
-        """Share f of the information on a pose that precedes the scan, 0 to 1."""
+        """Share f of a pose's information that precedes the scan, 0 to 1."""
         return 1 - self._gain if self.scans else 0.0
 
     @property
@@ -214,7 +214,7 @@ class BeamCorrelation:
         if not (long_wanted > 0 and short_wanted > 0 and short > 0):
             return 1.0
         quarters, sixteenths = float(long / long_wanted), float(short / short_wanted)
-        # Deviations of the ratios for independent beams, whose blocks have at least one degree of freedom each.
+        # Deviations of the ratios for independent beams, with at least one degree of freedom per block.
         scans = min(self.scans, 2 * _MEMORY - 1)
         unsure, less = (_SIGNIFICANT * math.sqrt(2 / ((blocks - 1) * scans)) for blocks in (_LONG, _SHORT))
         if quarters <= 1 + unsure and sixteenths <= 1 + less:
@@ -224,10 +224,10 @@ class BeamCorrelation:
         return max(quarters * 3 * growth / (5 - 2 * growth), 1.0)
 
     def temperature(self, beams: int) -> float:
-        """Return the temperature of a sensor with ``beams`` beams: from its scans, or an initial one before the first.
+        """Return the temperature of a sensor with ``beams`` beams from its scans, or an initial one.
 
         Args:
-            beams: Beams that a scan uses.
+            beams: Used beams of a scan.
 
         Raises:
             TypeError, ValueError: not a number of beams.
@@ -241,17 +241,17 @@ class BeamCorrelation:
 
 
 def _variances(scores: _Scores, count: int) -> tuple[float, float]:
-    """Return the variance of the scores of ``count`` blocks of beams after a fit, and that of independent beams."""
+    """Return the variance of blocks' scores after a fit, measured and for independent beams."""
     blocks, outer = scores.of_blocks(_places_of_neighbors(len(scores.numbers) // 12, count), count)
     taken = np.einsum("bij,bij->", outer, np.linalg.solve(scores.outer, outer).transpose(0, 2, 1))
     return float(np.sum(blocks**2)), float(np.trace(scores.outer) - taken)
 
 
 def learn_from_scan(correlation: BeamCorrelation, model: Any, ranges: AnyArray, pose: AnyArray) -> None:
-    """Add a scan at a pose of unknown covariance, which is taken from this scan and the present temperature.
+    """Add a scan at a pose; this scan and the present temperature determine the covariance.
 
     Args:
-        correlation: The running variance of the scores of scans.
+        correlation: The running variance of scans' scores.
         model: A model of scans.
         ranges: (K,) ranges [m].
         pose: (3,) pose of the robot [m, m, rad].
@@ -273,10 +273,9 @@ def _parts(model: Any, poses: np.ndarray, ranges: AnyArray) -> np.ndarray:
 
 
 def calibrate_temperature(model: Any, scans: AnyArray, poses: AnyArray) -> float:
-    """Return the temperature that a log's scans have, each judged by itself.
+    """Return the temperature of a log's scans, each judged separately.
 
-    A filter with ``temperature="auto"`` measures it from its scans, and lowers it further if errors repeat from scan to
-    scan.
+    A filter with ``temperature="auto"`` measures it, and lowers it further if errors repeat from scan to scan.
 
     Args:
         model: A :class:`BeamModel` or :class:`LikelihoodFieldModel`.

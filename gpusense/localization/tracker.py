@@ -1,4 +1,4 @@
-"""Particles that follow the robot: their motion, their weighing, and the settings of each step.
+"""Track the robot by particles: motion, weighing, and settings of each step.
 
 A filter has one tracker for its particles and another for the rival.
 """
@@ -24,18 +24,18 @@ from gpusense.localization.options import Options, settings_of_step
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.skipping import TOGETHER
 
-# Interval [corrections] at which a converged filter re-checks that it is converged.
+# Interval between checks that a converged filter is still converged [corrections].
 _LOOK = 5
 
 
 class Progress(NamedTuple):
-    """Progress of the particles in time; immutable, so one assignment changes it.
+    """Progress of the particles in time; immutable, replaced by one assignment.
 
     Attributes:
-        step: Number of the last step, which a start, a motion or a correction without one begins.
-        motion: The last motion while it has not run, so that one program does it and the correction.
+        step: Number of the last step; starts, motions, and corrections without a motion begin steps.
+        motion: The postponed motion, to share a program with the correction.
         moved: Mean motion since the last correction, as a pose; None without a motion.
-        copies: Whether the last correction weighed particles that had been drawn since the motion before it.
+        copies: Whether the last correction weighed particles drawn since the last motion.
     """
 
     step: int = 0
@@ -53,12 +53,12 @@ class Tracker:
         cloud: The particles.
 
     Attributes:
-        started: True if there are particles.
+        started: True after a start.
         progress: Steps so far, and the motion since the last correction.
-        shown: Number of shown particles, which are those of the last step.
+        shown: Number of shown particles, from the last step.
         wide: Number of remaining corrections at a low temperature.
-        together: True if the particles lie together, as far as is known.
-        pool: Number of poses that recovery injects, and half widths of the box around each.
+        together: True if the particles are known to be concentrated.
+        pool: Number of poses for recovery to inject, and half widths of the box around each.
         corrections: Corrections so far.
     """
 
@@ -75,7 +75,7 @@ class Tracker:
         self.pool: tuple[int, starts.Spread] = 0, (0.0, 0.0, 0.0)
 
     def keep(self) -> None:
-        """Record the buffers that the call now beginning must not overwrite."""
+        """Record the buffers that the present call must not overwrite."""
         self.cloud.kept = self.cloud.places
 
     # ---- particles
@@ -105,7 +105,7 @@ class Tracker:
             self.pool = len(pool), spread
 
     def random_poses(self, count: int) -> np.ndarray:
-        """Return poses in free space, or around the particles without a grid; the same in every call."""
+        """Return poses in free space, or around the particles without a grid; deterministic."""
         try:
             pool, spread = starts.free_pool(self._models, None)
         except ValueError:
@@ -126,7 +126,7 @@ class Tracker:
         return self.cloud.host_poses(self.cloud.places.next, self.cloud.count)
 
     def host_weights(self) -> np.ndarray:
-        """Return a copy of the weights of the shown particles; their sum is 1."""
+        """Return a copy of the normalised weights of the shown particles."""
         weights = self.cloud.host_weights(self.shown)
         return weights / weights.sum()
 
@@ -149,7 +149,7 @@ class Tracker:
     # ---- steps
 
     def follow(self, motion: SampledMotion) -> None:
-        """Postpone a motion to the next correction, so that one program does both."""
+        """Postpone a motion to share the next correction's program."""
         self.move()
         now = self.progress
         moved = motion.after(now.moved or (0.0, 0.0, 0.0))
@@ -166,7 +166,7 @@ class Tracker:
 
         Args:
             readings: Indices of sensors with their readings.
-            judged: Scans that will be judged at the pose after the correction.
+            judged: Scans to judge at the pose after the correction.
         """
         chosen, drawn = self.options, self.cloud.count
         if chosen.least != chosen.most:
@@ -188,16 +188,16 @@ class Tracker:
         if now.copies and now.moved is None:
             size = sample_size_of(self.cloud.host_weights(self.shown), self.host_particles())
         elif not size > 0:
-            # The kernels have no sum of squares before a correction, or where no weighted particle was possible.
+            # The kernels lack a sum of squares before a correction, or if no weighted particle was possible.
             size = sample_size_of(self.cloud.host_weights(self.shown))
         return min(max(size, 1.0), float(self.shown))
 
     def learn(self, readings: list[SensorReadings], is_doubted: Callable[[], bool]) -> None:
-        """Determine whether the particles lie together, and learn from scans at a pose that nothing contradicts.
+        """Determine whether the particles are concentrated, and learn from scans at an uncontradicted pose.
 
         Args:
             readings: Indices of sensors with the readings of the last correction.
-            is_doubted: Tells whether something contradicts the pose.
+            is_doubted: Returns whether the pose is contradicted.
         """
         self.corrections += 1
         due = _due_of(self.sensors, readings) if self.options.temperature == "auto" else []
@@ -210,7 +210,7 @@ class Tracker:
                 sensor.correlate(pose, covariance, reading)
 
     def settings(self, motion: SampledMotion, indices: list[int]) -> np.ndarray:
-        """Return the settings of the present step with readings of sensors, by their indices."""
+        """Return the settings of the present step with readings of the sensors ``indices``."""
         temperature, sensors = self.options.temperature, []
         wide = DEFAULTS.wide_share if self.wide and temperature == "auto" else 1.0
         for sensor in (self.sensors[index] for index in indices):
@@ -232,7 +232,7 @@ def _due_of(sensors: Sequence[Sensor], readings: Sequence[SensorReadings]) -> li
 
 
 def is_together(covariance: np.ndarray) -> bool:
-    """Tell whether particles lie together: their deviation along x and along y is at most half a metre.
+    """Return whether particles are concentrated: their deviations along x and y are at most half a metre.
 
     Args:
         covariance: (3, 3) covariance of their poses [m, m, rad].

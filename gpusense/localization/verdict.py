@@ -1,12 +1,13 @@
-"""Verdict on a filter or any localiser: the probability that it is lost, and a word for it.
+"""Judge a filter or any localiser: the probability of being lost, and a word for it.
 
-``p_lost`` is the probability that the pose is off by more than 1 m or 0.5 rad. With W the belief that another place is
-right (:mod:`gpusense.localization.belief`), and s the share of the particles, or of a covariance, beyond these limits,
+``p_lost`` is the probability that the pose is off by more than 1 m or 0.5 rad. Let W be the belief that another place
+is right (:mod:`gpusense.localization.belief`), and s the share of the particles, or of a covariance, beyond these
+limits:
 
     p_lost = W + (1 - W) s.
 
 W comes from the scans (:mod:`gpusense.localization.ratio`), s from the spread. Models of positions or headings have no
-map and give no evidence: W would follow only its prior and rates, so it is left out.
+map and no evidence; W would only follow its prior and rates, and is omitted.
 """
 
 from __future__ import annotations
@@ -32,27 +33,27 @@ from gpusense.world.scanner import float64_readings
 
 # Random poses.
 _RANDOM = 64
-# A pose with at most this belief of being wrong is judged again after this distance [m], turn [rad], number of
-# corrections, or drop of the readings' log-likelihood [nats].
+# Largest belief of a sure pose; distance [m], turn [rad], number of corrections, and drop of the readings'
+# log-likelihood [nats] before its next judgement.
 _SURE, _WAY, _TURNED, _SELDOM, _DROP = 0.05, 0.25, 0.25, 10, 3.0
-# Corrections after which one judgement of an unsure pose may begin a search.
+# Corrections before a single judgement of an unsure pose may begin a search.
 _INTERVAL = 5
-# Share of explained beams below which a search elsewhere is worthwhile.
+# Least share of explained beams that makes a search elsewhere unnecessary.
 _FEW = 0.4
 
 
 class VerdictState(NamedTuple):
-    """Everything that a verdict remembers; immutable, so it is saved and restored by assignment.
+    """Memory of a verdict; immutable, saved and restored by assignment.
 
     Attributes:
         belief: Belief that the pose is wrong.
         corrections: Corrections since the filter began.
         judged: Corrections at the last judgement; -1 before.
-        explained: Share of explained beams at that judgement; NaN without beams.
-        gains: Gains of recent features by the index of their sensor.
+        explained: Share of explained beams then; NaN without beams.
+        gains: Gains of recent features by index of the sensor.
         ratios: Ratios of features since the last judgement.
-        places: Number of places searched since the last one that scans have confirmed.
-        evidence: Evidence, by the particles, of the readings that were judged last.
+        places: Number of places searched since the last confirmed place.
+        evidence: Evidence of the last judged readings, by the particles.
     """
 
     belief: Belief = Belief()
@@ -74,8 +75,8 @@ class Verdict:
         seed: Seed of the poses among landmarks.
 
     Attributes:
-        state: Everything that the verdict remembers.
-        informed: True if a sensor has a map, so that readings can contradict a pose.
+        state: Memory of the verdict.
+        informed: True if a sensor has a map that can contradict a pose.
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("state",)
@@ -88,7 +89,7 @@ class Verdict:
             for index, sensor in enumerate(sensors)
             if isinstance(sensor.model, FeatureModel)
         }
-        # Pose of the last call of ``judge``; it is no state, since only the speed depends on it.
+        # Pose of the last call of ``judge``; no state, since it affects only the speed.
         self._pose: np.ndarray | None = None
         self.informed = bool(self._evidence) or any(sensor.calibrates for sensor in sensors)
         self.state = VerdictState()
@@ -97,20 +98,20 @@ class Verdict:
         """Forget all scans.
 
         Args:
-            anywhere: True if the pose is searched on the whole map.
+            anywhere: True for a search on the whole map.
         """
         self.state = VerdictState(Belief.anywhere() if anywhere else Belief())
 
     def is_informed_by(self, readings: Mapping[int, tuple[Any, ...]]) -> bool:
-        """Tell whether a sensor with a map took any of the readings, so that the pose is judged after them."""
+        """Return whether any of the readings comes from a sensor with a map, so that the pose is judged."""
         return any(self._sensors[index].calibrates or index in self._evidence for index in readings)
 
     def watches(self, readings: Mapping[int, tuple[Any, ...]]) -> bool:
-        """Tell whether readings include features, whose prediction is judged before the correction."""
+        """Return whether readings include features; their prediction is judged before the correction."""
         return any(index in self._evidence and _count(reading) for index, reading in readings.items())
 
     def predicted(self, poses: np.ndarray, weights: np.ndarray, readings: Mapping[int, tuple[Any, ...]]) -> None:
-        """Add the features of a scan, before the filter is corrected by them."""
+        """Add the features of a scan before they correct the filter."""
         gains, ratios = dict(self.state.gains), list(self.state.ratios)
         for index, evidence in self._evidence.items():
             if index not in readings or not _count(readings[index]):
@@ -129,7 +130,7 @@ class Verdict:
         return min((mean for mean in means if not math.isnan(mean)), default=math.nan)
 
     def anywhere(self) -> np.ndarray:
-        """Return poses anywhere in the free space, with which a pose is compared."""
+        """Return poses anywhere in the free space, for comparison."""
         if self._poses is None:
             self._poses = self._random_poses(_RANDOM)
         return self._poses
@@ -141,17 +142,17 @@ class Verdict:
 
     @property
     def due(self) -> bool:
-        """Tell whether the judgement of this correction alone may begin a search, without one before it."""
+        """Return whether a single judgement of this correction may begin a search."""
         return self.state.corrections % (_SELDOM if self.state.belief.wrong <= _SURE else _INTERVAL) == 0
 
     def doubt(self) -> None:
-        """Restart with a pose that a search has just found, for which the scans of the search are no evidence."""
+        """Restart at a pose from a search; the scans of the search are no evidence for it."""
         places = self.state.places + 1
         self.state = self.state._replace(belief=Belief.anywhere(after=places - 1), judged=-1, places=places)
 
     @property
     def explains_little(self) -> bool:
-        """Tell whether few beams of the last judged scans agree with the pose; people can be the cause as well."""
+        """Return whether few beams of the last judged scans agree with the pose, perhaps because of people."""
         return self.state.explained < _FEW
 
     @property
@@ -166,7 +167,7 @@ class Verdict:
         readings: Mapping[int, tuple[Any, ...]],
         evidence: float = -math.inf,
     ) -> float:
-        """Judge a pose by the last readings, unless it is sure and they add almost nothing.
+        """Judge a pose by the last readings, unless they add almost nothing to a sure pose.
 
         Args:
             pose: (3,) estimated pose.
@@ -175,7 +176,7 @@ class Verdict:
             evidence: log p(last readings | earlier readings) of the particles; -inf always judges.
 
         Returns:
-            Share of the beams that the pose explains; NaN without beams.
+            Share of explained beams; NaN without beams.
         """
         state, spread = self.state, spread_of(covariance)
         self._pose = pose
@@ -207,25 +208,25 @@ class Verdict:
     def expected(
         self, readings: Mapping[int, tuple[Any, ...]], motion: SampledMotion | None
     ) -> list[tuple[int, tuple[Any, ...]]]:
-        """Return the scans that are likely to be judged after the next correction, so that this may judge them already.
+        """Return the scans that will probably be judged after the next correction, for judging them within it.
 
         Args:
             readings: Readings of the next correction by the index of their sensor.
-            motion: The motion before it; None without one.
+            motion: The motion before it, or None.
         """
         if self._pose is None or self._stays(self._pose, STILL if motion is None else motion):
             return []
         scans = []
         for index, (ranges, *_) in readings.items():
             sensor = self._sensors[index]
-            # The model checks others, and refuses or converts them.
+            # The model checks, and refuses or converts, other types.
             plain = type(ranges) is np.ndarray and ranges.dtype.kind == "f"
             if sensor.calibrates and plain and ranges.shape == (sensor.model.scanner.count,):
                 scans.append((index, (ranges.astype(np.float64, copy=False),)))
         return scans
 
     def _stays(self, pose: np.ndarray, motion: SampledMotion) -> bool:
-        """Tell whether a pose is sure, and will probably be near the last judged one after a motion."""
+        """Return whether a pose is sure and will probably stay near the last judged pose."""
         state = self.state
         before = state.belief.pose
         if before is None or state.judged < 0 or state.belief.wrong > _SURE or state.ratios:
@@ -234,12 +235,12 @@ class Verdict:
         return way < _WAY and turn < _TURNED and state.corrections + 1 - state.judged < _SELDOM
 
     def compared(self, pose: np.ndarray, covariance: np.ndarray, ratio: float) -> None:
-        """Add a comparison of the pose judged last with other places of the map, unless the pose is wide.
+        """Add a comparison of the last judged pose with other places of the map, unless its covariance is wide.
 
         Args:
             pose: (3,) the pose.
             covariance: (3, 3) its covariance.
-            ratio: Log-likelihood ratio of other places against it; NaN for none.
+            ratio: Log-likelihood ratio of other places against the pose, or NaN.
         """
         if is_wide(covariance):
             return
@@ -247,7 +248,7 @@ class Verdict:
         self.state = self.state._replace(belief=self.state.belief.compared_with((x, y, theta), ratio))
 
     def _adds_nothing(self, pose: np.ndarray, spread: Spread, evidence: float) -> bool:
-        """Tell whether a pose is sure and so near the last judged one that its scan adds almost no evidence."""
+        """Return whether a pose is sure and near the last judged pose, so that its scan adds almost no evidence."""
         state = self.state
         before = state.belief.pose
         if before is None or state.judged < 0 or state.belief.wrong > _SURE or state.ratios or spread.wide:
@@ -274,6 +275,6 @@ def sightings(
 
 
 def _count(reading: tuple[Any, ...]) -> int:
-    """Return the number of features of a reading; 0 for a reading that the model will refuse."""
+    """Return the number of features of a reading; 0 if the model will refuse it."""
     shape = np.shape(reading[0])
     return int(shape[0]) if shape else 0

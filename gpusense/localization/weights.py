@@ -1,7 +1,7 @@
 """Convert log-likelihoods to particle weights, and resample particles by their weights.
 
-Weights are computed in float64 after the largest log-likelihood is subtracted, so that a scan of 100 000 beams neither
-underflows to 0 nor overflows. Cumulative sums for resampling are integers and therefore exact.
+Weights are computed in float64 relative to the largest log-likelihood, so that a scan of 100 000 beams neither
+underflows nor overflows. Cumulative sums for resampling are integers and therefore exact.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 
-# Most indices of a call, which take 2 GiB.
+# Most indices of a call, in 2 GiB.
 _MOST = 1 << 28
 # Sum of the integer weights; the error of a weight is below one step per particle.
 _STEPS = 1 << 52
@@ -26,8 +26,8 @@ class Weights:
 
     Attributes:
         weights: (N,) float64, >= 0, sum 1.
-        log_evidence: Logarithm of the mean likelihood, ``log(sum p / N)``: a measure of how well the cloud explains the
-            scan; -inf if no particle is possible.
+        log_evidence: Logarithm of the mean likelihood, ``log(sum p / N)``: the cloud's fit to the scan; -inf if no
+            particle is possible.
         effective_sample_size: ``1 / sum w^2``, from 1 to N.
         degenerate: True if every log-likelihood was -inf: no particle is possible, and the weights are uniform.
 
@@ -86,12 +86,12 @@ def resample(weights: AnyArray, count: int, rng: Any = None, *, method: str = "s
     Args:
         weights: (N,) weights >= 0 with a positive sum, N > 0; they need not sum to 1.
         count: Number of new particles, >= 0.
-        rng: Random generator: a Generator or RandomState of NumPy, or any seed that ``numpy.random.default_rng`` takes.
-            None draws fresh numbers from the system.
+        rng: Random generator: NumPy's Generator or RandomState, or any seed of ``numpy.random.default_rng``. None
+            draws a fresh seed from the system.
         method: "systematic": one random number (book table 4.4, the low-variance sampler); particle i appears ``floor``
             or ``ceil`` of ``count * w_i`` times. "stratified": one number in each of ``count`` strata (Kitagawa 1996).
-            "residual": ``floor(count * w_i)`` copies, and the remaining particles by independent draws from the
-            remaining weights (Liu and Chen 1998).
+            "residual": ``floor(count * w_i)`` copies, and independent draws from the remaining weights (Liu and Chen
+            1998).
 
     Returns:
         (count,) int64 indices in ascending order; the expected copies of particle i are ``count * w_i``.
@@ -124,7 +124,7 @@ def resample(weights: AnyArray, count: int, rng: Any = None, *, method: str = "s
         return np.empty(0, np.int64)
     if method == "residual":
         return _residual(steps, total, size, generator)
-    # The marks (k + u) / size of the unit interval as exact integers: (k total + start) // size without overflow.
+    # Marks (k + u) / size of the unit interval as exact integers: (k total + start) // size without overflow.
     whole, rest = divmod(total, size)
     k = np.arange(size, dtype=np.int64)
     start = _below(total, generator, size) if method == "stratified" else _below(total, generator)
@@ -152,7 +152,7 @@ def _residual(
 
 
 def _generator(rng: Any) -> np.random.Generator | np.random.RandomState:
-    """Return a generator as it is, or a new one from a seed."""
+    """Return a generator unchanged, or make a new generator from a seed."""
     if isinstance(rng, (np.random.Generator, np.random.RandomState)):
         return rng
     try:
@@ -163,7 +163,7 @@ def _generator(rng: Any) -> np.random.Generator | np.random.RandomState:
 
 
 def _below(end: int, rng: np.random.Generator | np.random.RandomState, count: int | None = None) -> Any:
-    """Draw an integer from 0 to before ``end``, or an array of ``count``."""
+    """Draw an integer, or an array of ``count`` integers, in [0, ``end``)."""
     if isinstance(rng, np.random.Generator):
         return rng.integers(0, end, count)
     return rng.randint(0, end, count, dtype=np.int64)

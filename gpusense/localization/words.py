@@ -1,4 +1,4 @@
-"""Words for the probability of being lost."""
+"""Choose the word for the probability of being lost."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Literal
 
 Word = Literal["tracking", "uncertain", "lost"]
 WORDS: tuple[Word, ...] = ("tracking", "uncertain", "lost")
-# Probabilities above which a pose is lost, and up to which it is tracking.
+# Bounds on the probability of "lost" (above) and "tracking" (up to).
 LOST, TRACKING = 0.5, 0.1
 
 
@@ -16,8 +16,8 @@ def word_of(p_lost: float, wrong: float, *, wide: bool, apart: bool) -> Word:
     Args:
         p_lost: The probability.
         wrong: Probability that another place is right, by the scans.
-        wide: True if the distribution is too wide for a pose that is tracked.
-        apart: Whether the distribution covers several places, so that scans cannot contradict a single one.
+        wide: True if the distribution is too wide for a tracked pose.
+        apart: True if the distribution covers several places, so that scans cannot contradict a single one.
     """
     if wrong > LOST and not apart:
         return "lost"

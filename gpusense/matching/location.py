@@ -91,5 +91,5 @@ class Location:
 
     @property
     def found(self) -> bool:
-        """Tell whether a single pose explains the scan."""
+        """Return whether a single pose explains the scan."""
         return self.status == "found"

@@ -83,7 +83,7 @@ class MapMatch:
 
     @property
     def found(self) -> bool:
-        """Tell whether a single pose explains the local map."""
+        """Return whether a single pose explains the local map."""
         return self.status == "found"
 
 

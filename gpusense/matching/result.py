@@ -93,12 +93,12 @@ class ScanMatch:
 
     @property
     def converged(self) -> NDArray[np.bool]:
-        """Tell whether the status is ``"converged"``: one pose, observed in every direction. For S matches (S,)."""
+        """Return whether the status is ``"converged"``: one pose, observed in every direction. For S matches (S,)."""
         return np.asarray(self.status) == "converged"
 
     @property
     def usable(self) -> NDArray[np.bool]:
-        """Tell whether the pose may be used along its observed directions, with ``information``. For S matches (S,)."""
+        """Whether the pose may be used along its observed directions, with ``information``. For S matches (S,)."""
         return is_usable(self.status)
 
     def __len__(self) -> int:

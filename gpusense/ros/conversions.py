@@ -55,7 +55,7 @@ def map_to_odometry(in_map: Pose, in_odometry: Pose) -> Pose:
 
 
 def moved_enough(before: Pose, after: Pose, least: tuple[float, float]) -> bool:
-    """Tell whether the robot moved by ``least`` (m along x or y, rad), as nav2_amcl decides to update its filter."""
+    """Return whether the robot moved by ``least`` (m along x or y, rad), as nav2_amcl decides to update its filter."""
     turn = abs(math.remainder(after[2] - before[2], 2 * math.pi))
     return abs(after[0] - before[0]) > least[0] or abs(after[1] - before[1]) > least[0] or turn > least[1]
 

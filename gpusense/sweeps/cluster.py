@@ -160,7 +160,7 @@ class DaskExecutor(Executor):
 
     @property
     def alive(self) -> bool:
-        """Tell whether the scheduler is running."""
+        """Return whether the scheduler is running."""
         return bool(self._client.status == "running" and not self._client.scheduler_comm.comm.closed())
 
     def _watch(self) -> None:

@@ -50,7 +50,7 @@ def answer(executor: str, payload: bytes, seconds: float | None) -> bytes:
     task = dask_worker.get_current_task()
 
     def wanted() -> bool:
-        """Tell whether the task is still wanted; Dask forgets the tasks of a killed client."""
+        """Return whether the task is still wanted; Dask forgets the tasks of a killed client."""
         state = dask_worker.state.tasks.get(task)
         return state is not None and state.state == "executing"
 

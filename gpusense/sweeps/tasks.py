@@ -194,5 +194,5 @@ _TIMINGS = ("seconds", "cpu_seconds", "worker", "device", "attempts", "particle_
 
 
 def is_timing(column: str) -> bool:
-    """Tell whether a column depends on time or place, so that it differs between two runs of a job."""
+    """Return whether a column depends on time or place, so that it differs between two runs of a job."""
     return column.startswith("ms_") or column in _TIMINGS

@@ -40,7 +40,7 @@ class BeamDensity:
 
     @property
     def max_depends(self) -> bool:
-        """Tell whether the probability of a max reading depends on the pose."""
+        """Return whether the probability of a max reading depends on the pose."""
         return self.table is not None or len({p.z_max for p in self.mixtures}) > 1
 
     @property
@@ -50,7 +50,7 @@ class BeamDensity:
 
     @property
     def possible(self) -> bool:
-        """Tell whether ranges can be possible.
+        """Return whether ranges can be possible.
 
         If ``max_depends``, the kernel detects impossible ranges.
         """

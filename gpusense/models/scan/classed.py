@@ -91,7 +91,7 @@ class ClassedScans:
 
     @property
     def shared(self) -> bool:
-        """Tell whether several readings share a ray."""
+        """Return whether several readings share a ray."""
         return len(self.rays) < len(self.readings)
 
     def part(self, begin: int, end: int) -> ClassedScans:

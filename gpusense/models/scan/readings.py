@@ -126,7 +126,7 @@ class Sensing:
 
     @property
     def constants_there(self) -> bool:
-        """Tell whether readings without a place may add a constant term."""
+        """Return whether readings without a place may add a constant term."""
         return self.max_readings == MAX_FIXED or not self.possible
 
 

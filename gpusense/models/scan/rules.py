@@ -118,7 +118,7 @@ class Rules:
 
     @functools.cached_property
     def separate(self) -> bool:
-        """Tell whether each reading has a separate ray, because all bearings differ or nothing is left out."""
+        """Return whether each reading has a separate ray, because all bearings differ or nothing is left out."""
         return not self.specialize or len(set(map(tuple, self.vectors.tolist()))) == len(self.vectors)
 
     @functools.cached_property
@@ -138,7 +138,7 @@ class Rules:
 
     @functools.cached_property
     def max_is_constant(self) -> bool:
-        """Tell whether max readings are added as a constant term instead of being evaluated."""
+        """Return whether max readings are added as a constant term instead of being evaluated."""
         return self.specialize and not self.max_depends
 
     @functools.cached_property

@@ -230,7 +230,7 @@ def test_a_jump_of_time_is_said(needs) -> None:
 
 @pytest.mark.parametrize("step", [0.8, 1.3])
 def test_wrong_motions_are_doubtful(step: float, needs) -> None:
-    # Without odometry, with large steps and turns of a quarter between scans, some matches are wrong.
+    # Large steps and quarter turns between scans make some matches wrong unless odometry is known.
     truth = around(step)
     short = gs.Scanner(FRONT.bearings, range_max=6.0)
     chain = gs.chain_scans(scans_of(BLOCK, truth, short), short, close_loops=False, backend=needs("opencl"))
@@ -258,7 +258,7 @@ def test_large_motions_without_odometry_are_found_or_said(step: float, range_max
 
 
 def test_a_failed_match_is_bridged_over(needs) -> None:
-    # People stand in front of the scanner at one scan.
+    # People block the scanner at one scan.
     truth = np.array([(0.25 * k - 1.2, 0.1 * k - 0.6, 0.12 * k) for k in range(10)])
     scans = scans_of(ROOM, truth, RING)
     rng = np.random.default_rng(3)

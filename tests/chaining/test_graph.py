@@ -236,5 +236,5 @@ def test_closures_of_eliminated_poses_count_between_kept_ones() -> None:
     wide = np.linalg.det(exact.relative(*pairs))
     ratio = np.linalg.det(reduced.relative(*pairs)) / wide
     assert 0.9 < ratio.min() < ratio.max() < 1.5
-    # Without closures the second passage has drifted.
+    # The second passage drifts unless loops are closed.
     assert (np.linalg.det(Drift(plain, most=30).relative(*pairs)) / wide)[far].min() > 20

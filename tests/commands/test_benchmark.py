@@ -67,7 +67,7 @@ def test_same_seed_same_errors(capsys):
 
 
 def test_the_answer_comes_first_on_the_terminal(tmp_path, capsys):
-    """The method to take, then the Pareto front in 80 columns; other rows stand in the report file alone."""
+    """The method to take, then the Pareto front in 80 columns; other rows are only in the report file."""
     folder = tmp_path / "results"
     assert cli.main([*FIELD, *SMALL, "--backend", "numpy", "--output", str(folder)]) == 0
     lines = capsys.readouterr().out.splitlines()

@@ -194,7 +194,7 @@ def test_standard_errors_are_those_of_blocks():
 
 
 def test_impossible_readings_are_counted(capsys, tmp_path):
-    """Without a reading of no return in the fitted half, z_max is 0, and such readings of the other half impossible."""
+    """The fitted half has no reading of no return: z_max is 0, and such readings of the other half are impossible."""
     rows = [f"{1 + 0.01 * (i % 7)},1" if i < 100 or i % 10 else "inf,1" for i in range(200)]
     (tmp_path / "some.csv").write_text("\n".join(rows))
     _, text, _ = run(capsys, "--pairs", tmp_path / "some.csv", "--range-max", 4, "--holdout", "--json")

@@ -23,7 +23,7 @@ READERS = ("localize", "score", "fit", "map", "match", "likelihood-map", "featur
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """Write a map, a bag of two lasers, one without transforms, and true poses; return the folder."""
+    """Write a map, a bag of two lasers, another bag that lacks transforms, and true poses; return the folder."""
     folder = tmp_path_factory.mktemp("lasers")
     grid = write_room_map(folder)
     caster, rng = gs.RayCaster(grid, range_max=20.0, backend="numpy"), np.random.default_rng(0)

@@ -268,7 +268,7 @@ def test_a_run_is_recorded_for_the_viewer(place, capsys, monkeypatch, tmp_path):
     kept = dict(streams[0].logged)
     walls, grid = kept["map"][0][0], gs.read_map(place / "map.yaml")
     assert walls.shape == (grid.occupied.sum(), 3) and kept["path/reference"][0][0][0].shape == (3, 3)
-    # The ends of beams at the estimate lie at walls.
+    # Beams from the estimate end at walls.
     ends = kept["scan"][0][0][:, :2]
     assert np.median(np.hypot(*(ends[:, None] - walls[None, :, :2]).T).min(axis=0)) < 0.1
     monkeypatch.setitem(sys.modules, "rerun", None)

@@ -89,7 +89,7 @@ def test_a_log_is_chained_on_request(log, truth, odometry, tmp_path, capsys, nee
     assert main([*command, "--chain", "--no-odometry", "--no-loops", "--out", str(out["map.yaml"])]) == 0
     text = capsys.readouterr().out
     assert "24 scans, 24 matched" in text and "chained in" in text
-    # Without --chain the logged poses are used.
+    # The default uses the logged poses.
     assert main([*command, "--out", str(out["map.yaml"]), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["chain"] is None
 

@@ -159,7 +159,7 @@ def test_replay_agrees_with_numpy(scene, make, parameters, precision, temperatur
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_an_end_point_on_an_edge_may_go_to_either_cell_but_no_other_one(precision):
-    """Poses lie on corners, and the resolution is not exact: rounding decides on which side of the edge beams end."""
+    """Poses are on corners, and the resolution is not exact: rounding decides which side of the edge beams end on."""
     cells = np.zeros((40, 40), np.int8)
     cells[::7, ::5] = 100
     grid = gs.OccupancyGrid(cells, 0.1)

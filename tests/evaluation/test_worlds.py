@@ -208,7 +208,7 @@ def room(origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> gs.OccupancyGr
 def test_scan_without_noise_is_the_distance_to_the_walls(backend):
     sharp = BeamParameters(z_hit=1, z_short=0, z_max=0, z_rand=0, sigma_hit=1e-7)
     scanner = gs.Scanner([0.0, math.pi / 2, math.pi, -math.pi / 2], RANGE_MAX, mount=(0.3, 0.2, math.pi / 2))
-    # The robot looks along the room's y axis, so the scanner stands at (2 - 0.2, 3 + 0.3) and looks along -x.
+    # The robot looks along the room's y axis, so the scanner is at (2 - 0.2, 3 + 0.3) and looks along -x.
     yaw = 0.9
     c, s = math.cos(yaw), math.sin(yaw)
     pose = (100 + c * 2 - s * 3, 50 + s * 2 + c * 3, yaw + math.pi / 2)

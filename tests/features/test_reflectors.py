@@ -60,7 +60,7 @@ def test_reflectors_need_light():
     ranges, light = scan()
     for intensities in (None, np.ones(1440), np.zeros(1440), np.full(1440, np.nan), light.clip(max=2.5)):
         assert len(gs.extract_features(ranges, SCANNER, "reflector", backend="numpy", intensities=intensities)) == 0
-    # Without a return nothing is bright; a wall that is bright along its whole length is no reflector.
+    # Beams without a return are not bright; a wall that is bright along its whole length is no reflector.
     assert len(gs.extract_features(np.full(1440, np.inf), SCANNER, "reflector", intensities=light)) == 0
     wide = np.where(np.abs(SCANNER.bearings) < 0.2, 8.0, 1.0)
     assert len(gs.extract_features(np.full(1440, 5.0), SCANNER, "reflector", intensities=wide)) == 0

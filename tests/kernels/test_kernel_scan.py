@@ -102,7 +102,8 @@ def test_readings_are_placed_as_the_host_prepares_them(
 
 
 def test_readings_that_keep_their_places(device: Backend) -> None:
-    """With ALL_READINGS nothing moves up; ranges of a table stay below its last, and cones have several vectors."""
+    """ALL_READINGS keeps readings in place; a table's ranges stay below its last bin, and cones have several
+    vectors."""
     (_, ranges, *_), count = scans(np.float32, 53), 53
     scanner = gs.Scanner(np.linspace(-3, 3, count), RANGE, NEAREST, cone=0.2, cone_rays=3)
     vectors = ray_vectors(scanner.ray_bearings, scanner.mount)

@@ -90,7 +90,7 @@ def test_landmarks(name, side, in_lanes, compiled_lanes):
 
 @pytest.mark.long
 def test_unseen_landmarks_have_the_bits_of_one(in_lanes):
-    """Without features that could be landmarks, log p is only the count of unseen ones."""
+    """If no feature can be a landmark, log p depends only on the number of unseen landmarks."""
     p, poses = gs.LandmarkParameters(range_max=12.0, field_of_view=3.0), cloud(30.0)
     found = []
     for lanes in (1, LANES):

@@ -230,7 +230,7 @@ def test_positions_and_headings_against_60_digits(name):
 
 
 def test_frames_without_yaw_and_mount_change_no_bit(backend):
-    """Without yaw and mount no term is added: a heading keeps its cosine and sine, a whole cell has no fraction."""
+    """Zero yaw and mount add no term: a heading keeps its cosine and sine, and a whole cell has no fraction."""
     poses = np.array([[3.0, 4.0, 0.1], [0.5, 0.25, -2.0], [600.0, 300.0, 1e5], [-0.0, -0.0, -0.0]])
     grid = gs.OccupancyGrid(np.zeros((ROWS, COLS), np.int8), 1.0)
     found = launch(get_backend(backend), poses, grid, (0.0, 0.0, 2.0), "float64")

@@ -74,7 +74,7 @@ def test_every_backend_has_the_bits_of_numpy_for_any_number_of_sectors(family, b
 def unexplained(
     scene: Scene, found: np.ndarray, suspects: np.ndarray, move: float, turn: float, tolerance: float
 ) -> list[int]:
-    """Return the rays that differ from all nearby rays, too."""
+    """Return the rays that also differ from all nearby rays."""
     cells = scene.occupied.tolist()
     return [
         i

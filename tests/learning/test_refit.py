@@ -1,6 +1,6 @@
 """Parameters fitted to readings that a model with known parameters drew lie within three standard errors of these.
 
-Seeds are fixed. With another seed each number is beyond three standard errors with probability 0.0027.
+Seeds are fixed. For another seed each number exceeds three standard errors with probability 0.0027.
 """
 
 from __future__ import annotations

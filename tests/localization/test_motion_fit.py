@@ -69,7 +69,7 @@ def test_motion_noise_is_learned_from_references_at_some_steps():
     some[3::17] = truth[3::17]
     fit = gs.fit_odometry_motion(odometry, some)
     assert fit.references == len(odometry[3::17]) and fit.steps == 17 * (fit.references - 1)
-    # Of the variances that these gaps determine, before the inflation; a step has 1/17 of a gap's.
+    # Gaps determine these variances before the inflation; a step has 1/17 of a gap's variance.
     ratio = np.array(fit.motion.alpha[:3]) / fit.inflation / motion.alpha[:3]
     assert (np.abs(np.log(ratio)) < 3 * np.array(fit.log_errors[:3])).all() and max(fit.log_errors[:3]) < 0.7
     assert "sideways" in fit.undetermined and fit.motion.sideways <= gs.OdometryMotion().sideways

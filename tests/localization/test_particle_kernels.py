@@ -60,7 +60,7 @@ def test_deviates_are_uniform_and_standard_normal():
     one, two = normal_pair(found[0], found[1])
     assert stats.kstest(one, "norm").pvalue > 1e-3 and stats.kstest(two, "norm").pvalue > 1e-3
     assert abs(np.corrcoef(one, two)[0, 1]) < 0.01
-    # Steps and streams are independent, too.
+    # Steps and streams are also independent.
     other = normal_pair(*random_words((n, zero + 1, zero, zero), 7, 9)[:2])[0]
     assert abs(np.corrcoef(one, other)[0, 1]) < 0.01
 
@@ -136,7 +136,7 @@ def test_draws_keep_the_expected_copies(stratified):
 def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC, lone=False, depth=1.0):
     """Return all buffers after two motions, a correction of two stages and an estimate.
 
-    With ``lone``, only particles without a weight are possible.
+    ``lone`` makes only particles of weight 0 possible.
     """
     device, rng = get_backend(selection), np.random.default_rng(0)
     sums, block = Sums(device, count), 8
@@ -321,8 +321,7 @@ def test_an_estimate_after_a_jump_has_the_moments_of_wrapped_headings(backend):
     pf.predict((0.0, 0.0, 0.0), (100.0, 0.0, 0.0))
     found, poses = pf.estimate(), pf.host_particles()
     assert np.abs(poses[:, 2]).max() <= np.pi
-    # Uniform on the circle, nearly: one deviation of any heading about any mean.
-    # Beyond the limit as well.
+    # Uniform on the circle, nearly: one deviation of any heading about any mean. Also beyond the limit.
     far = gs.OdometryMotion().sampled((0.0, 0.0, 0.0), (1e9, 0.0, 0.0))
     assert far.deviation[0] > 1e8 and settings_of(far)[0][4] == 1e5
     assert 1.6 < np.sqrt(found.covariance[2, 2]) < 2.0 and abs(found.pose[2]) <= np.pi

@@ -80,7 +80,7 @@ def test_what_has_no_spread_promises_nothing() -> None:
     assert estimate(np.eye(3) * 0.01, size=1.0).protection_level(0.05) == math.inf
     for value in (math.inf, math.nan):
         assert estimate(np.diag([value, 0.1, 0.1])).protection_level(0.05) == math.inf
-    # Without a covariance a pose that is not lost is off by at most 1 m.
+    # If the covariance is unknown, a pose that is not lost is off by at most 1 m.
     assert gs.PoseVerdict(0.01, "tracking", 0.9).protection_level(0.05) == 1.0
     assert gs.PoseVerdict(0.06, "tracking", 0.9).protection_level(0.05) == math.inf
 
@@ -103,7 +103,7 @@ def at_poses(poses, backend="numpy"):
 
 
 def test_a_cloud_of_a_filter_has_its_quantile(backend: str) -> None:
-    """Without a map nothing is widened: the cloud is the density of the start."""
+    """Nothing is widened unless a map is known: the cloud is the density of the start."""
     pf = gs.ParticleFilter(gs.PositionModel(gs.PositionParameters(), backend=backend), particles=4000)
     pf.initialize(mean=(5.0, 5.0, 0.0), covariance=np.diag([0.01, 0.01, 0.0001]))
     assert pf.estimate().protection_level(0.05) == pytest.approx(0.1 * math.sqrt(-2 * math.log(0.05)), rel=0.03)

@@ -154,7 +154,7 @@ def test_the_belief_is_the_exact_filter_of_two_states():
         start = belief.log_odds
         for k, ratio in enumerate(ratios):
             belief = belief.judged((gap * k, 0.0, 0.0), float(ratio))
-        # Without counted scans there are no transitions.
+        # Only counted scans cause transitions.
         assert belief.log_odds - start == pytest.approx(exact, abs=1e-9)
 
 
@@ -219,7 +219,7 @@ def test_a_short_log_leaves_places_that_look_alike():
         far = far.counted().judged((0.6 * k, 0.2 * k, 0.1 * k), -4.0)
     least = ALIKE / (1 + ALIKE)
     assert least < near.wrong < 0.35 and far.wrong < 0.4 * least
-    # Without scans in between the share is that of Bayes' rule.
+    # If no scans come between, the share follows Bayes' rule.
     one = Belief(0.0, 0.0, (0.0, 0.0, 0.0)).judged((9.0, 0.0, 0.0), -3.0)
     alike = ALIKE * math.exp(-9.0 / ALIKE_LENGTH)
     assert one.wrong / (1 - one.wrong) == pytest.approx(alike + (1 - alike) * math.exp(one_step(9.0, -3.0)))

@@ -76,7 +76,7 @@ def test_motion_during_scans_counts():
     assert len(match) >= 10
     assert held.sum() >= 0.7 * len(match)
     assert np.abs(match.pose[held] - moved).max() < 0.05
-    # Without the motion the scans' shapes are wrong, and so are the poses.
+    # Ignoring the motion distorts the scans' shapes and the poses.
     _, other, _ = lost_and_held(one, two, FRONT, moved)
     assert np.abs(other.pose - moved).max() > 0.05
 

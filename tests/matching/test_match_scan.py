@@ -77,7 +77,7 @@ def test_covariance_is_that_of_the_errors():
 
 
 def successive(rng: np.random.Generator, shape: tuple[int, int], rho: float) -> np.ndarray:
-    """Return numbers of unit variance, each with the correlation rho to the previous one in its row."""
+    """Return rows of numbers of unit variance; neighbours have the correlation rho."""
     noise = rng.normal(size=shape)
     for k in range(1, shape[1]):
         noise[:, k] = rho * noise[:, k - 1] + math.sqrt(1 - rho * rho) * noise[:, k]
@@ -96,7 +96,8 @@ def test_covariance_is_that_of_correlated_errors(rho):
     error = match.pose - truth
     squared = np.einsum("si,sij,sj->s", error, np.linalg.inv(match.covariance), error) / 3
     # The mean of 150 has a deviation of 0.07. The heading is a sum of errors of both signs along a wall, so correlation
-    # adds less to its variance than to the positions'. With covariances of independent errors it is 1.5, 6.6 and 23.
+    # adds less to its variance than to the positions'. Covariances of independent errors would make it 1.5, 6.6 and
+    # 23.
     assert 0.6 < squared.mean() < 1.5
     scatter = np.cov(error.T)[:2, :2]
     np.testing.assert_allclose(np.trace(match.covariance.mean(axis=0)[:2, :2]) / np.trace(scatter), 1.0, atol=0.4)

@@ -46,7 +46,7 @@ def test_walls_in_a_map_leave_the_position_along_them_open(method, place, segmen
     scan = segments_scan(segments, tuple(pose), scanner) + np.random.default_rng(0).normal(0, 0.01, scanner.count)
     grid, guess = drawn(segments, origin), in_world(origin, pose + np.array([-0.2, 0.05, -0.05]))
     match = gs.match_scan(grid, scan, scanner, guess, method, backend="opencl")
-    # Where the expected scan moves along the wall with every pose, the chain does not come to rest.
+    # The chain never comes to rest if the expected scan moves along the wall with every pose.
     assert match.status in {"unobservable", "no convergence"}
     assert np.isinf(match.covariance[0, 0])
     if match.usable:

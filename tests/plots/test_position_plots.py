@@ -97,7 +97,7 @@ def test_ellipse_and_density_agree():
     edge = position_plots.position_log_density(points, XY, ranges=RANGES, sigma_range=1e-3)
     top = position_plots.position_log_density(fix.best, XY, ranges=RANGES, sigma_range=1e-3)
     np.testing.assert_allclose(top - edge, stats.chi2.ppf(0.95, 2) / 2, rtol=2e-2)
-    position_plots.draw_fix(axes(), gs.trilaterate(XY[:2], [1.0, 1.0]))  # Without a covariance there is no ellipse.
+    position_plots.draw_fix(axes(), gs.trilaterate(XY[:2], [1.0, 1.0]))  # An unknown covariance draws no ellipse.
 
 
 def test_density_is_drawn_below_its_maximum():

@@ -103,8 +103,8 @@ def test_turn_shift_scale_and_order(case):
         both = np.concatenate([order, order + case.beacons])[: values.size]
         fix = case.solve(moved, (values * stretch)[both], POSE[2] + angle, sigma=(sigma * stretch)[both])
         assert (fix.status, fix.degenerate, len(fix)) == (base.status, base.degenerate, len(base))
-        # With noise the cost is flat to its rounding within the root of that, 1.5e-8 sigma or so; coordinates of
-        # 5e6 m are rounded to 1e-9 m.
+        # Rounding flattens the cost of noisy measurements within its root, about 1.5e-8 sigma; coordinates of 5e6 m
+        # are rounded to 1e-9 m.
         precision = 1e-7 * scale + 1e-7 * (np.abs(shift).max() > 1e3)
         frame = np.eye(fix.solutions.shape[1])
         frame[:2, :2] = scale * turned(angle)

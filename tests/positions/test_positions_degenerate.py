@@ -51,7 +51,7 @@ def near(fix, *points, atol=1e-6):
 )
 @placed
 def test_two_circles_that_do_not_cross(place, ranges, sigma, status, point):
-    """The nearest point lies on the line of centres, and divides the gap in proportion to the variances."""
+    """The nearest point on the line of centres divides the gap in proportion to the variances."""
     xy = place(SQUARE[:2])
     factor = np.hypot(*(xy[1] - xy[0])) / 4
     fix = gs.trilaterate(xy, np.array(ranges) * factor, sigma=sigma)
@@ -91,7 +91,7 @@ def test_beacons_at_one_place(place):
         assert (fix.status, fix.degenerate, len(fix)) == ("coincident", True, 0)
         with pytest.raises(ValueError, match="solutions: must hold one, got none: coincident: too few"):
             _ = fix.best
-    # With beacons elsewhere, the fix is not degenerate.
+    # Other beacons make the fix regular.
     xy = place(SQUARE[[0, 1, 1, 2]])
     point = place(np.array([(1.0, 2.5)]))[0]
     fix = gs.trilaterate(xy, ranges_to(xy, point))
@@ -107,7 +107,7 @@ def test_beacons_in_line_leave_the_mirror_image(place, beacons):
     assert fix.status == ("two" if len(beacons) == 2 else "mirror") and not fix.degenerate
     first = np.argmin(ranges_to(fix.solutions, point))
     assert near(fix, *[(point, image), (image, point)][first])
-    # The covariances of the images are mirrored, too.
+    # The covariances of the images are also mirrored.
     np.testing.assert_allclose(np.linalg.eigvalsh(fix.covariance[0]), np.linalg.eigvalsh(fix.covariance[1]), rtol=1e-6)
 
 
@@ -205,7 +205,7 @@ def test_three_bearings_in_bad_places(place):
     robot = place(np.array([(1.0, 3.0)]))[0]
     fix = gs.triangulate_triangle(line, bearings_to(line, (*robot, 0.4)))
     assert fix.status == "unique" and near(fix, (*robot, 0.4), atol=1e-5)
-    # With equal bearings of two beacons, the robot is in line with them, and the third determines its place.
+    # Equal bearings put the robot in line with two beacons, and the third beacon determines its position.
     xy = place(SQUARE[:3])
     robot = place(np.array([(-3.0, 0.0)]))[0]
     fix = gs.triangulate_triangle(xy, bearings_to(xy, (*robot, -1.0)))
@@ -249,10 +249,9 @@ def test_poses_that_see_beacons_behind_their_bearings():
 
 @placed
 def test_scenes_on_a_small_lattice(place):
-    """On few lattice points, beacons and robots often coincide, or lie in line or on circles.
-
-    In every scene without noise, the truth is among the solutions, or the fix is reported as degenerate, or the robot
-    stands at a beacon, whose bearing is made up.
+    """On few lattice points, beacons and robots often coincide, are in line, or share circles. In every noiseless
+    scene, the truth is among the solutions, or the fix is degenerate, or the robot is at a beacon with a made-up
+    bearing.
     """
     rng = np.random.default_rng(3)
     seen = set()

@@ -22,7 +22,7 @@ BENCH = ROOT / "bench"
 def test_limits_measures_small_calls_on_a_gpu(
     needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """PoCL's processor stands in for a GPU; poses and results are arrays of pyopencl."""
+    """PoCL's processor replaces a GPU; poses and results are arrays of pyopencl."""
     monkeypatch.syspath_prepend(str(BENCH))
     limits = importlib.import_module("speed.limits")
     device = get_backend(needs("opencl"))

@@ -18,7 +18,7 @@ _LEFT_OUT = ("bench/results/", ".git/", ".venv/", "venv/", "build/", "dist/", "s
 _SOURCES = (".py", ".pyi", ".cl", ".md", ".toml", ".cpp")
 # Scripts whose former names a page explains.
 _FORMER = {"bench/RESULTS.md": {"speed.py", "several_scans.py", "work_items.py"}}
-# Folders in which a path may begin, beside that of the file that names it.
+# Folders where a path may begin, apart from the folder of the file that names it.
 _BASES = ("", "gpusense", "kernels", "kernels/opencl", "kernels/warp", "bench", "tests", "docs")
 _ENDINGS = "py|pyi|cl|md|toml|cpp|svg|png|json|yaml|yml|xml|cfg"
 _PATH = re.compile(rf"(?<![\w/.:<>{{}}*$~-])((?:[\w.-]+/)*[\w.-]*\w\.(?:{_ENDINGS})|(?:[\w.-]+/)+)(?![\w/*<{{-])")
@@ -69,9 +69,9 @@ def prose(name: str, text: str) -> Iterator[tuple[int, str]]:
 def missing_paths(name: str, text: str) -> list[str]:
     """Return the paths that a file names and that the project lacks, with their places.
 
-    A path with folders is one of the project if its first folder is there, in the root, in one of the usual bases, or
-    beside the file. A bare name is one if it ends as a source does. Few files have such a path at all, so most are not
-    split into code and prose.
+    A path with folders belongs to the project if its first folder exists in the root, in a usual base, or next to the
+    file. A bare name is one if it ends as a source does. Few files have such a path at all, so most are not split into
+    code and prose.
     """
     if not gone_in(name, enumerate(text.splitlines(), 1)):
         return []

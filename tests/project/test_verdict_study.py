@@ -40,5 +40,5 @@ def test_the_study_of_protection_levels_counts_excesses_and_alerts(monkeypatch: 
     found = report.figures([run], report.RISKS[0], 2.0, np.random.default_rng(0))
     assert found["excesses"] == 13 and found["scans"] == 60 and found["available"] == 1 and found["late"] == [3]
     assert report.figures([run], report.RISKS[0], 2.2, np.random.default_rng(0))["excesses"] == 3
-    # Without an excess the limit is about 3 / n.
+    # The limit is about 3 / n if no error exceeds.
     assert report.upper_limit(np.zeros(300), np.random.default_rng(0)) == pytest.approx(3 / 300, rel=0.01)

@@ -100,7 +100,7 @@ def test_prose_has_no_banned_words():
 
 
 def test_no_sentence_of_a_page_ends_with_too():
-    """Notes and the changelog are pages, too."""
+    """Notes and the changelog are also pages."""
     found = [
         f"{file.relative_to(ROOT).as_posix()}:{text.count(chr(10), 0, match.start()) + 1}"
         for file in scanned_files()

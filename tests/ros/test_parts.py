@@ -147,7 +147,7 @@ def test_a_scanner_of_as_many_beams_as_places_may_vary(monkeypatch: pytest.Monke
         assert own.update(message, (1.0 * k, 0.0, 0.0), np.eye(4))
     first, second = FakeFilter.made
     assert np.isfinite(first.calls[-1][1]).all()
-    # The readings of 2 rad lie at bearings of 2 rad.
+    # Readings of 2 are at bearings of 2 rad.
     read = second.model.scanner.bearings[np.isfinite(second.calls[-1][1])]
     assert read.min() == pytest.approx(-0.9, abs=0.005) and read.max() == pytest.approx(1.1, abs=0.005)
 

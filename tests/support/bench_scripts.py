@@ -29,7 +29,7 @@ def run_script(name: str, *arguments: str, output: Path) -> dict:
 
 
 def run_here(name: str, *arguments: str, output: Path) -> dict:
-    """Run a script like :func:`run_script` in this process, which has started devices and compiled kernels already."""
+    """Run a script like :func:`run_script`, but in this process with its started devices and compiled kernels."""
     command = [str(BENCH / name), *arguments, "--output", str(output)]
     with (
         mock.patch.object(sys, "argv", command),

@@ -29,7 +29,7 @@ class Floor:
     Attributes:
         walls: (W, 4) ends x, y, x, y of walls [m].
         circles: (C, 3) centres x, y and radii [m]; every circle is a pole.
-        doors: (D, 4) jambs x, y, x, y of passages, one for each face of the wall [m].
+        doors: (D, 4) jambs x, y, x, y of passages, one per face of the wall [m].
         hallways: (H, 5) start x, y and end x, y of axes, and widths [m].
         free: (R, 4) rectangles x, y, x, y in which a robot may stand [m].
     """
@@ -137,7 +137,7 @@ def floor_plan(seed: int, *, rooms: int = 3, clutter: bool = True) -> Floor:
     Args:
         seed: Seed of all sizes and places.
         rooms: Rooms on each side of the corridor.
-        clutter: Whether rooms have square pillars, poles and boxes.
+        clutter: True for rooms with square pillars, poles and boxes.
     """
     rng = np.random.default_rng([seed, 0])
     width, plan = rng.uniform(1.6, 2.6), _Plan()

@@ -189,7 +189,7 @@ def _doors(walls: list[_Run], local: _Local, bearings: Floats, ranges: Floats, s
 
 
 def _is_face(wall: Floats, door: Floats) -> bool:
-    """Return whether a wall lies in the plane of a door."""
+    """Return whether a wall continues the plane of a door."""
     n = np.array([math.cos(door[2]), math.sin(door[2])])
     return bool(np.abs(wall.reshape(2, 2) @ n - door[:2] @ n).max() < 1e-6)
 

@@ -17,7 +17,7 @@ Line = tuple[CodeType, int]
 
 
 def _interruptible(frame: FrameType | None) -> bool:
-    """Return whether a call is not part of ``__del__``, whose errors Python itself catches."""
+    """Return whether a call is not part of ``__del__``, where Python catches all errors."""
     while frame is not None:
         if frame.f_code.co_name == "__del__":
             return False

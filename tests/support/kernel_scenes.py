@@ -23,7 +23,7 @@ UNREACHABLE = (1 << 31) - 1
 PLANES = (Planes(1), Planes(2), Planes(4))
 GROUPED = Planes(2, ROWS)
 SCALE = RangeScale(LIMIT, RESOLUTION, LIMIT * RESOLUTION)
-# Particles of each scan and particles before a launch, which are not read for a single scan.
+# Particles of each scan and particles before a launch, not read for a single scan.
 ONE_SCAN = ScanBatch(1, 0)
 
 

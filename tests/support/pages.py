@@ -1,4 +1,4 @@
-"""Run the blocks of a documentation page, in their order, in a folder of their own.
+"""Run the blocks of a documentation page in order, in a temporary folder.
 
 Python blocks share a namespace. Shell blocks with a command of gpusense run in this process; blocks that install
 or start other programs do not. A YAML block whose first line is ``# name.yaml`` is written as that file. Comments of

@@ -43,7 +43,7 @@ def fraction_walk(occupied: np.ndarray, ray: Ray, outside_occupied: bool = False
     """Return the distance to the first occupied cell by Amanatides and Woo's walk in fractions, or None.
 
     Cells are half-open. At a tie, where the ray passes a corner, the step in x comes first. The limit is checked before
-    the cell. The distance is in units of the direction's length, which is 1 up to rounding.
+    the cell. The distance is in units of the direction's length, 1 up to rounding.
     """
     rows, cols = occupied.shape
     x, y = ray.cell
@@ -85,7 +85,7 @@ def walk(occupied: Sequence[Sequence[bool]], ray: Ray, outside_occupied: bool = 
     """Return the end of an equally exact walk in integers, ten times as fast; a test compares both with
     ``fraction_walk``.
 
-    With fractions a / one and directions d / unit, the boundary k lies at (k * one + a) * unit / (one * d).
+    For fractions a / one and directions d / unit, boundary k is at (k * one + a) * unit / (one * d).
     """
     rows, cols = len(occupied), len(occupied[0])
     x, y = ray.cell
@@ -133,7 +133,7 @@ def backward_error_is_small(
     tolerance: float,
     outside_occupied: bool = False,
 ) -> bool:
-    """Return whether a range is that of a ray with its origin moved by at most ``move`` and turned by ``turn``.
+    """Return whether a ray with its origin moved by at most ``move`` and turned by ``turn`` has a given range.
 
     Walk the rays on both sides of the ray. On one face the range varies continuously with the ray, so any value
     between two rays that end on the same face belongs to a ray between them.

@@ -57,7 +57,7 @@ def cast(scene: Scene, backend: str, precision: str, form: Planes = ONE_SECTOR, 
         backend: The device.
         precision: ``"float32"`` or ``"float64"``.
         form: Form of the planes of rectangles.
-        wide: Whether to use the kernel for the device's lanes, where there is one.
+        wide: True to use the kernel for the device's lanes, if any.
     """
     device, real = get_backend(backend), np.dtype(precision)
     rows, cols = scene.occupied.shape

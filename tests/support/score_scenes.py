@@ -142,7 +142,7 @@ FIELD_SCENES = [
 OCCUPIED = GRIDS["rooms"]
 RANGE = LIMIT * RESOLUTION
 WINDOW = window_of(OCCUPIED)
-# Starts of the scans, which are not read for a single scan.
+# Starts of the scans, not read for a single scan.
 NOWHERE = np.zeros(1, np.int32)
 
 

@@ -27,7 +27,7 @@ def failing(job, store):
 
 
 def deadly(job, store):
-    """Kill the worker at seed 3 once, recorded by a file; at seed 4 always, if the option says so."""
+    """Kill the worker at seed 3 once, recorded by a file, and at seed 4 always if the option is set."""
     done = Path(job.option("folder")) / "killed"
     if (job.seed == 3 and not done.exists()) or (job.seed == 4 and job.option("always")):
         done.touch()

@@ -129,7 +129,7 @@ def test_failures_are_rows_and_resuming_repeats_none_of_the_finished(tmp_path):
 def test_what_a_worker_keeps_is_made_once(tmp_path):
     jobs = [Job(task="support.sweep_tasks:plain", map=name, seed=seed) for name in "ab" for seed in range(3)]
     assert swept(jobs, tmp_path / "t.csv")[1]["made"] == [True, False, False] * 2
-    # The least recently used one is evicted, and nothing is kept for another sweep, whose files may have changed.
+    # The least recently used entry is evicted, and another sweep reads all files again, since they may have changed.
     more = [Job(task="support.sweep_tasks:plain", map=name, seed=9) for name in "bcdea"]
     more += [Job(task="support.sweep_tasks:plain", map=name, seed=8) for name in "eb"]
     assert swept(more, tmp_path / "more.csv")[1]["made"] == [True] * 5 + [False, True]

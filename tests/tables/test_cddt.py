@@ -116,7 +116,7 @@ def test_directional_ranges_end_near_an_obstacle_and_pass_none(bins):
 
 
 def test_pruned_ranges_differ_beside_an_obstacle_only(backend):
-    """Only obstacles that begin beside another one of their line are left out, so ranges differ only there."""
+    """Only obstacles that begin inside another obstacle of their line are omitted, so ranges differ only there."""
     grid, poses, clearance = floor()
     for bins in (36, 216):
         every, pruned = (gs.RayCaster(grid, 6.0, method=Cddt(bins, p), backend=backend) for p in (False, True))

@@ -51,7 +51,7 @@ def test_normals_of_straight_walls(thick, record_property):
 @pytest.mark.parametrize("radius", [5, 12, 40])
 @pytest.mark.parametrize("filled", [True, False])
 def test_normals_of_circles(radius, filled):
-    """Normals of a disc point outwards; those of a thin ring lie along the radius, in either direction."""
+    """Normals of a disc point outwards; normals of a thin ring are radial, in either direction."""
     side = 2 * radius + 11
     x, y = np.meshgrid(*2 * [np.arange(side) + 0.5 - side / 2])
     far = np.hypot(x, y)
@@ -90,7 +90,7 @@ def test_normals_turn_with_the_map_and_know_its_surroundings():
     assert np.isnan(gs.surface_normals(grid)).all()
     thin = gs.surface_normals(grid, unknown="occupied")[10:20, 0]
     np.testing.assert_allclose(np.abs(thin), [(1, 0)] * 10, atol=1e-12)
-    # With a wall around the map there is one free side, and it is that of the column up to the room's corners.
+    # A wall around the map has one free side, the column's up to the room's corners.
     found = gs.surface_normals(grid, unknown="occupied", outside="occupied")[:, 0]
     np.testing.assert_allclose(found, [(1, 0)] * 30, atol=0.03)
     for bad in (dict(unknown="maybe"), dict(outside="x")):

@@ -36,7 +36,7 @@ def test_a_look_up_table_holds_the_exact_ranges_of_centres(backend, tmp_path, mo
     part = exact.astype(np.float64).reshape(table.shape) / limit * 65535
     assert (table[part == 65535] == 65535).all()
     assert np.abs(table - np.minimum(part, 65534))[part < 65535].max() <= 0.5 + 0.02
-    # Three rows at a time, and one in the end.
+    # Three rows at a time, and a last row.
     monkeypatch.setattr(casters, "_TILE", {"cpu": 2100, "gpu": 2100})
     np.testing.assert_array_equal(saved(tmp_path / "tiles", backend), table)
 

@@ -118,7 +118,7 @@ CRITICAL, RANGE, SIZE = 0.4, 10.0, (5.0, 4.0)
 
 
 def analytic(scanner: gs.Scanner, poses: np.ndarray) -> np.ndarray:
-    """Return the expected ranges of cones in a room of SIZE around the origin, whose walls are mirrors."""
+    """Return the expected ranges of cones in a room of SIZE around the origin with mirror walls."""
     angle = poses[:, 2, None] + np.asarray(scanner.ray_bearings).reshape(-1)
     dx, dy = np.cos(angle), np.sin(angle)
     tx = (np.sign(dx) * SIZE[0] / 2 - poses[:, :1]) / dx

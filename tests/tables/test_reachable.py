@@ -17,7 +17,7 @@ from gpusense.world import windows
 @pytest.mark.parametrize("kind", [*KINDS, "caster"])
 @pytest.mark.parametrize("outside", ["free", "occupied"])
 def test_a_cropped_map_gives_the_same_bits(kind, outside, backend, monkeypatch):
-    """Clouds stay, leave the window, lie at the border, jump, and return."""
+    """Clouds stay, leave the window, touch the border, jump, and return."""
     grid = room((400, 500))
     z = scan()
     rng = np.random.default_rng(5)

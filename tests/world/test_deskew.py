@@ -37,7 +37,7 @@ def measured(pose, motion, scanner):
 
 
 def arc(turn):
-    """Return the matrix by which a body's velocity becomes a displacement: the integral of its rotations."""
+    """Return the matrix that maps a body's velocity to a displacement: the integral of its rotations."""
     share = (np.arange(4000) + 0.5) / 4000 * turn
     c, s = np.cos(share).mean(), np.sin(share).mean()
     return np.array([[c, -s], [s, c]])

@@ -81,7 +81,7 @@ def test_16_bits_are_a_fraction_of_their_own_maximum(place):
 
 
 def grey_png_16():
-    # Grey 90, which is not occupied, begins at 90 * 257 = 23130.
+    # Grey 90 is not occupied and begins at 90 * 257 = 23130.
     rows = np.array([[23129, 23130]], ">u2")
     return png(2, 1, b"\0" + rows.tobytes(), depth=16)
 

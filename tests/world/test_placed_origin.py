@@ -1,4 +1,4 @@
-"""The placed origin of a sensor against 50 digits: its bound has a term of distances, and one of the fraction."""
+"""Compare the placed origin of a sensor with 50 digits; the bound has terms of distances and of the fraction."""
 
 from __future__ import annotations
 

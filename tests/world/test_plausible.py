@@ -1,4 +1,4 @@
-"""Legal but implausible values are used as they are, and give one warning that names the likely cause."""
+"""Legal but implausible values are used unchanged, with one warning that names the likely cause."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ def test_a_line_is_a_column(tmp_path):
 def test_the_recorded_map_is_the_one_converted_by_others(data_dir):
     grid, picture = (gs.read_map(data_dir / "wean_hall" / name) for name in ("wean.dat.gz", "wean_10cm.yaml"))
     assert grid.shape == picture.shape == (800, 800) and grid.resolution == picture.resolution
-    # The picture has 256 greys and two thresholds, 0.65 and 0.196: cells beside them may differ.
+    # The picture has 256 greys and two thresholds, 0.65 and 0.196: cells near them may differ.
     clear = ~np.isin(grid.cells, (19, 20, 65))
     assert np.array_equal((grid.cells > 65)[clear], (picture.cells == 100)[clear])
     assert np.array_equal(((grid.cells >= 0) & (grid.cells < 19))[clear], (picture.cells == 0)[clear])

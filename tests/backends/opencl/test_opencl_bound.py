@@ -18,7 +18,7 @@ from gpusense.models.scan import binding
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("case", CASES)
 def test_bound_calls(case, as_gpu, queue, there):
-    """Each has the bits of an ordinary call with the current contents of arrays and map, NumPy's arrays included."""
+    """Bound calls return the bits of an ordinary call with the present arrays, NumPy's included, and map."""
     model = CASES[case](backend=queue)
     beams = model.scanner.count
     for real in (np.float32, np.float64):

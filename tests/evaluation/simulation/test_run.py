@@ -62,7 +62,7 @@ def test_people_change_readings_and_nothing_else():
 def test_people_hide_the_share_of_beams_that_is_asked_for(share):
     run = gs.worlds.simulate_run(OFFICE, SCANNER, scans=200, hidden=share, seed=3)
     assert abs(run.hidden.mean() - share) < 0.06
-    # People hide whole sectors: most neighbours of a hidden beam are hidden, too.
+    # People hide whole sectors: most neighbours of a hidden beam are also hidden.
     pairs = run.hidden[:, 1:] & run.hidden[:, :-1]
     assert pairs.sum() > 0.5 * run.hidden.sum()
     # Beams that discs hide end on them.

@@ -190,7 +190,7 @@ def test_a_reading_is_impossible_only_where_it_is():
     """Logarithms do not underflow: without random triggers, a reading 300 deviations away is still possible."""
     far = gs.DiscreteBeamModel(gs.DiscreteCauses(0.0, 0.0, 0.9, 0.01), RANGE, 100).log_probabilities
     assert np.isfinite(far[:-1]).all() and far.min() < -1e4
-    # Without an obstacle or another cause, there is no return.
+    # A beam that no cause triggers has no return.
     assert (far[-1] == [*[-math.inf] * 100, 0]).all()
 
 

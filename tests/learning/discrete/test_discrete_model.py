@@ -102,7 +102,7 @@ def test_cones_are_looked_up_too(selection, needs):
 
 
 def test_impossible_readings_are_minus_infinity(backend):
-    """Without noise and random triggers, no reading lies behind the wall, and no return is impossible."""
+    """Zero noise and no random triggers exclude readings behind the wall and "no return"."""
     _, scanner, poses = scene()
     one = model(TABLES["certain"], backend)
     log_p, parts = one.log_likelihood(poses, [INF] + [NAN] * (scanner.count - 1), per_beam=True)

@@ -54,7 +54,7 @@ def test_a_flat_direction_leaves_the_other_standard_errors() -> None:
     errors = fit.standard_errors
     assert math.isnan(errors["lambda_short"]) and math.isnan(errors["lambda_rand"])
     assert "the readings do not determine lambda_short, lambda_rand" in fit.status
-    # Without one of the rates the information has no flat direction.
+    # Fixing either rate removes the flat direction.
     counts = count_pairs(z, expected, 5.0, 50)
     causes = gs.DiscreteBeamModel.learn(z, expected, 5.0, 50).causes
     at = np.array([causes.lambda_short + causes.lambda_rand, causes.p_detect, causes.sigma_hit])

@@ -92,8 +92,8 @@ def test_a_literal_of_each_peer():
 @pytest.mark.parametrize("peer", ["amcl", "beluga"])
 def test_field_weights_by_hand(peer, precision, backend):
     model = gs.LikelihoodFieldModel(GRID, SCANNER, compat=peer, backend=backend, precision=precision)
-    # In the wall; a cell south-west of the unknown one, which is no obstacle; outside the map; max, which only Beluga
-    # takes for a range, far outside.
+    # In the wall; a cell south-west of the unknown cell, no obstacle; outside the map; max, a range only for Beluga,
+    # far outside.
     readings = (6.0, 1.5, 4.0, TOP)
     p = PEERS[peer].field
     hit = p.z_hit if peer == "amcl" else p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))

@@ -1,8 +1,7 @@
 """Laws that range models satisfy: there is no oracle, only two scenes whose results must agree.
 
-Most laws are exact to the bit, because the second scene equals the first one in the grid's frame: poses lie at odd
-multiples of 1/256 cell, resolutions are powers of two, and free cells around the walls extend beyond the largest
-distance that counts.
+Most laws are exact to the bit, because both scenes are equal in the grid's frame: poses are at odd multiples of 1/256
+cell, resolutions are powers of two, and free cells around the walls extend beyond the largest distance that counts.
 """
 
 from __future__ import annotations

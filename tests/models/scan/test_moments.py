@@ -111,7 +111,7 @@ def test_models_have_the_densities_on_every_backend(shape, real, backend):
 @pytest.mark.long
 @pytest.mark.parametrize("growth", [0.0, 0.1])
 def test_small_offsets_of_narrow_densities_keep_all_digits(growth, backend):
-    """The offset has digits beyond the last one of z - z*, which is as large as it."""
+    """The offset has digits beyond the last digit of z - z*, of equal size."""
     grid, scanner, poses, expected = scene("float32")
     rng = np.random.default_rng(8)
     for sigma, bias in ((1e-4, -1.5e-3), (1e-4, 2.3e-4), (2e-3, 0.7), (3e-3, -0.0123), (0.02, 3.1)):
@@ -128,7 +128,7 @@ def test_small_offsets_of_narrow_densities_keep_all_digits(growth, backend):
 @pytest.mark.long
 @pytest.mark.parametrize("shape", ["normal", "student"])
 def test_means_near_the_longest_range_keep_all_digits(shape, backend):
-    """The distance from there to range_max has digits beyond the last one of the mean."""
+    """The distance from there to range_max has digits beyond the mean's last digit."""
     grid, scanner, poses, expected = scene("float32")
     sigma = 2e-3
     for sigmas in (-1.5, 0.3, 1.0, 4.0):
@@ -144,7 +144,7 @@ def test_means_near_the_longest_range_keep_all_digits(shape, backend):
 
 @pytest.mark.parametrize("shape", ["normal", "student"])
 def test_a_mean_that_rounds_to_the_longest_range_has_half_of_its_mass(shape, backend):
-    """The sum of z* and the bias lies above range_max by less than half of its last bit, which is many sigma."""
+    """The sum of z* and the bias exceeds range_max by less than half of its last bit, many sigma."""
     grid, scanner, poses, expected = scene("float32")
     start = float(expected[5, 0])
     bias = RANGE - start + 2e-7

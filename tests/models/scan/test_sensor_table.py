@@ -115,7 +115,7 @@ def test_missing_and_max_readings_are_treated_as_the_formula_treats_them(special
 
 @pytest.mark.sampled(1, without="warp:cpu")
 def test_impossible_scans_are_minus_infinity_and_no_others(backend):
-    """With unexpected obstacles alone, a reading in a bin beyond the expected range's is impossible."""
+    """If all causes are unexpected obstacles, a reading beyond the expected range's bin is impossible."""
     grid, scanner, poses = scene()
     p = gs.BeamParameters(0.0, 0.9, 0.1, 0.0, lambda_short=0.2)
     for precision in PRECISIONS:
@@ -153,7 +153,7 @@ def test_any_caster_may_feed_the_table(backend):
     lines, alone = model(0.01, backend=backend, caster="bresenham"), model(0.01, backend=backend)
     _, parts = lines.log_likelihood(poses, readings(), per_beam=True)
     _, exact = alone.log_likelihood(poses, readings(), per_beam=True)
-    # Where the line's range is in the exact one's bin, densities are equal.
+    # Densities are equal if the line's range and the exact range share a bin.
     bins = [(one.expected_ranges(poses) * np.float32(100)).astype(int) for one in (lines, alone)]
     same = bins[0] == bins[1]
     assert 0.5 < same.mean() < 1

@@ -79,7 +79,7 @@ def test_shared_memory_that_cannot_be_allocated(two_ways):
         SharedBuffer(two_ways[0]._context, 1 << 60, two_ways[0].synchronize)
 
 
-# ---- CUDA: launches and copies in batches, and graphs; Warp's processor stands in for a GPU
+# ---- CUDA: launches and copies in batches, and graphs; Warp's processor replaces a GPU
 
 
 def plainly(device, monkeypatch, call):

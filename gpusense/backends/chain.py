@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from gpusense.backends import listing, proof
 from gpusense.backends.listing import Device
-from gpusense.backends.proof import Verdict
+from gpusense.backends.proof import DeviceCheck
 from gpusense.backends.registry import BY_NAME, ENTRIES, SPEED_CLASSES, Entry
 
 # Least speed ratio at which a device replaces an earlier device of its class.
@@ -39,7 +39,7 @@ class Failure:
 
 
 @dataclass
-class Chain:
+class FallbackOrder:
     """The usable devices, the fastest first.
 
     Attributes:
@@ -125,7 +125,7 @@ def _name_of(device: Device) -> str:
     return f"{device.selection} ({device.name}, {device.driver})"
 
 
-def _verdict_of(device: Device) -> Verdict:
+def _verdict_of(device: Device) -> DeviceCheck:
     """Return the verdict on a device that is present; a failure to obtain one is also a verdict."""
     library, info, handle = listing.lookup(device.selection)
     try:

@@ -9,7 +9,7 @@ from gpusense.backends import proof, registry
 from gpusense.backends.base import Backend
 from gpusense.backends.info import BackendInfo
 from gpusense.backends.library import Library
-from gpusense.backends.proof import Verdict
+from gpusense.backends.proof import DeviceCheck
 from gpusense.backends.registry import BY_NAME, ENTRIES, Entry
 
 
@@ -94,7 +94,7 @@ def lookup(selection: str) -> tuple[Library, BackendInfo, Any]:
     raise ValueError(f"backend: must be a device that is present, got {selection!r}")
 
 
-def verdict_on(info: BackendInfo, handle: Any, library: Library, *, anew: bool = False) -> Verdict:
+def verdict_on(info: BackendInfo, handle: Any, library: Library, *, anew: bool = False) -> DeviceCheck:
     """Return the verdict on a device; simulators are slow and selected only by name, so they are trusted."""
     if not BY_NAME[info.backend].compiles or library.is_simulator(info):
         return proof.trust(info)
@@ -163,7 +163,7 @@ def _absent(entry: Entry, name: str, kind: str, reason: str) -> Device:
     return Device(entry.name, name, kind, False, reason, "")
 
 
-def _device(info: BackendInfo, library: Library, verdict: Verdict | None = None) -> Device:
+def _device(info: BackendInfo, library: Library, verdict: DeviceCheck | None = None) -> Device:
     """Return a device as users see it; without a verdict it is taken to be available."""
     verdict = proof.trust(info) if verdict is None else verdict
     reason = proof.with_remedy(verdict.reason, verdict.remedy)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gpusense._version import __version__
-from gpusense.backends import child, notices
+from gpusense.backends import notices, probe_process
 from gpusense.backends.cache import discard_entry, load_entry, store_entry
 from gpusense.backends.info import BackendInfo
 from gpusense.backends.processor import fingerprint
@@ -47,7 +47,7 @@ _OTHERWISE = "update the driver, or choose another device with GPUSENSE_BACKEND 
 
 
 @dataclass(frozen=True)
-class Verdict:
+class DeviceCheck:
     """The families of kernels that a device runs correctly.
 
     Attributes:
@@ -70,20 +70,20 @@ class Verdict:
 
 
 _lock = threading.RLock()
-_known: dict[str, Verdict] = {}
+_known: dict[str, DeviceCheck] = {}
 
 
-def trust(info: BackendInfo) -> Verdict:
+def trust(info: BackendInfo) -> DeviceCheck:
     """Return a verdict without proof: the driver has the abilities that it claims."""
-    return Verdict(True, info.lanes, info.float64)
+    return DeviceCheck(True, info.lanes, info.float64)
 
 
-def unusable(reason: str, *, passing: bool = False) -> Verdict:
+def unusable(reason: str, *, passing: bool = False) -> DeviceCheck:
     """Return the verdict on a device that no model can run on."""
-    return Verdict(False, 1, False, reason, remedy_for(reason), passing=passing)
+    return DeviceCheck(False, 1, False, reason, remedy_for(reason), passing=passing)
 
 
-def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> Verdict:
+def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> DeviceCheck:
     """Return the verdict on a device: the cached verdict; without one, or with ``anew``, a child's.
 
     Args:
@@ -91,9 +91,9 @@ def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> V
         setup: The preparation of the child; see ``library.Library.child_setup``.
         anew: True if the cached verdict is dropped.
     """
-    if child.is_off():
+    if probe_process.is_off():
         return trust(info)
-    key, obstacle = _key(info), child.obstacle()
+    key, obstacle = _key(info), probe_process.obstacle()
     with _lock:
         if anew and not obstacle:
             _known.pop(key, None)
@@ -113,7 +113,7 @@ def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> V
         return verdict
 
 
-def _hangs_first(key: str, verdict: Verdict) -> bool:
+def _hangs_first(key: str, verdict: DeviceCheck) -> bool:
     """Return whether a device hangs for the first time, and note it.
 
     A busy machine may be the reason, so the next process proves the device once more.
@@ -129,7 +129,7 @@ def name_of(info: BackendInfo) -> str:
     return f"{info.selection} ({info.name}, {info.driver})"
 
 
-def summary(info: BackendInfo, verdict: Verdict) -> str:
+def summary(info: BackendInfo, verdict: DeviceCheck) -> str:
     """Return the failures of a device and their consequence, in one line."""
     if not verdict.usable:
         return f"{name_of(info)} is unusable: {with_remedy(verdict.reason, verdict.remedy)}"
@@ -141,7 +141,7 @@ def with_remedy(reason: str, remedy: str) -> str:
     return f"{reason}; {remedy}" if remedy else reason
 
 
-def apply(info: BackendInfo, verdict: Verdict) -> BackendInfo:
+def apply(info: BackendInfo, verdict: DeviceCheck) -> BackendInfo:
     """Return a device as the verdict leaves it."""
     return dataclasses.replace(info, lanes=verdict.lanes, float64=verdict.float64)
 
@@ -157,18 +157,18 @@ def _key(info: BackendInfo) -> str:
     )
 
 
-def _load(key: str) -> Verdict | None:
+def _load(key: str) -> DeviceCheck | None:
     """Return the cached verdict; None if it is absent or damaged."""
     payload = load_entry(key)
     if payload is None:
         return None
     try:
-        return Verdict(**json.loads(payload))
+        return DeviceCheck(**json.loads(payload))
     except (TypeError, ValueError):
         return None
 
 
-def _prove(info: BackendInfo, setup: Any) -> tuple[Verdict, bool]:
+def _prove(info: BackendInfo, setup: Any) -> tuple[DeviceCheck, bool]:
     """Prove families of kernels in children until each is proved or dropped.
 
     Returns:
@@ -177,14 +177,14 @@ def _prove(info: BackendInfo, setup: Any) -> tuple[Verdict, bool]:
     failures: list[str] = []
     conclusive = True
     while True:
-        outcome = child.run({"do": _PROVE, "info": dataclasses.asdict(info), "setup": setup})
+        outcome = probe_process.run({"do": _PROVE, "info": dataclasses.asdict(info), "setup": setup})
         if not outcome.started:
             notices.warn(f"{name_of(info)} is trusted without a proof: {outcome.failure}")
             return _verdict(info, failures, outcome), False
         failed, failure = _failure(outcome)
         if not failed:
             return _verdict(info, failures, outcome), conclusive
-        conclusive &= outcome.conclusive and not child.PASSING.search(failure)
+        conclusive &= outcome.conclusive and not probe_process.PASSING.search(failure)
         lanes = f" of {info.lanes}" if failed == VECTORS else ""
         failures.append(f"{failed}{lanes} {failure}")
         if failed == FLOAT64:
@@ -195,14 +195,14 @@ def _prove(info: BackendInfo, setup: Any) -> tuple[Verdict, bool]:
             return unusable("; ".join(failures)), conclusive
 
 
-def _verdict(info: BackendInfo, failures: list[str], outcome: child.Outcome) -> Verdict:
+def _verdict(info: BackendInfo, failures: list[str], outcome: probe_process.Outcome) -> DeviceCheck:
     """Return the verdict on a device as it was proved."""
     reason = "; ".join(failures)
     rate = next((float(report["rate"]) for report in outcome.said if "rate" in report), 0.0)
-    return Verdict(True, info.lanes, info.float64, reason, remedy_for(reason) if reason else "", rate)
+    return DeviceCheck(True, info.lanes, info.float64, reason, remedy_for(reason) if reason else "", rate)
 
 
-def _failure(outcome: child.Outcome) -> tuple[str, str]:
+def _failure(outcome: probe_process.Outcome) -> tuple[str, str]:
     """Return the family that failed and its failure in words; empty texts if none failed."""
     begun = ""
     for report in outcome.said:

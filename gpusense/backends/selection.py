@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from gpusense._util.checks import show
 from gpusense.backends import listing, notices, proof, registry
 from gpusense.backends.base import Backend
-from gpusense.backends.chain import Chain, best_of
+from gpusense.backends.chain import FallbackOrder, best_of
 from gpusense.backends.info import ProcessBound
 from gpusense.backends.library import Library
 from gpusense.backends.listing import Device, short_driver
@@ -141,7 +141,7 @@ def _opened(selection: str) -> Backend:
 
 def _open_fastest() -> Backend:
     """Open the fastest device that opens, and report those that were passed over."""
-    chain = Chain()
+    chain = FallbackOrder()
     with notices.held() as lines:
         for device in chain:
             try:

@@ -27,7 +27,7 @@ from gpusense.chaining.links import CLOSURE, Links
 from gpusense.chaining.matcher import Matcher, TeamMatcher
 from gpusense.chaining.motion import relative
 from gpusense.chaining.options import ChainOptions, check_durations, check_steps, check_times
-from gpusense.chaining.places import place_points_of
+from gpusense.chaining.place_recognition import place_points_of
 from gpusense.chaining.result import ScanChain, doubts_of
 from gpusense.chaining.selected import pose_covariances
 from gpusense.chaining.sweep import signed_duration

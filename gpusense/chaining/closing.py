@@ -23,7 +23,7 @@ from gpusense.chaining.graph import KERNEL, Solution, solve
 from gpusense.chaining.links import CLOSURE, Links
 from gpusense.chaining.matcher import BATCH, TeamMatcher
 from gpusense.chaining.motion import relative
-from gpusense.chaining.places import overlaps
+from gpusense.chaining.place_recognition import overlaps
 from gpusense.localization.pose_algebra import wrap_angle
 
 Floats = NDArray[np.float64]

@@ -13,8 +13,8 @@ import numpy as np
 from gpusense._util.angles import wrapped
 from gpusense._util.typing import Precision
 from gpusense.backends.base import Backend
-from gpusense.matching.chain import to_sensor
 from gpusense.matching.icp import IcpPairs, space_of
+from gpusense.matching.icp_with_search import to_sensor
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import scan_points
 from gpusense.matching.result import ScanMatch

@@ -14,12 +14,12 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray, CasterName, Precision
 from gpusense.backends import Selection, arrays, get_backend
 from gpusense.backends.base import Backend
-from gpusense.matching.chain import match_pairs
+from gpusense.matching.icp_with_search import match_pairs
 from gpusense.matching.noise import ASSUMED_NOISE, map_noise, match_noise, scan_noise
 from gpusense.matching.options import MatchOptions, check_guess, check_options
 from gpusense.matching.points import scan_points
 from gpusense.matching.result import ScanMatch
-from gpusense.matching.scan_pair import match_pair, takes
+from gpusense.matching.scan_pair import match_pair, supports_single_pair
 from gpusense.matching.to_map import MapMatcher, match_to_map
 from gpusense.matching.verdicts import judged
 from gpusense.models.arguments import real_dtype
@@ -142,7 +142,13 @@ def _matches(
         return _by_noise(noise, options, to_map), second.ndim == 1
     first = readings("reference", reference, scanner, device)
     single = first.ndim == 1 and second.ndim == 1
-    if single and method in ("auto", "icp") and motions[0] is None and motions[1] is None and takes(device, scanner):
+    if (
+        single
+        and method in ("auto", "icp")
+        and motions[0] is None
+        and motions[1] is None
+        and supports_single_pair(device, scanner)
+    ):
         poses, real = check_guess(guess, None), np.dtype(precision)
         match = match_pair(device, real, first, second, scanner, poses, method, options, given=given)
         return judged(match, poses, options), True

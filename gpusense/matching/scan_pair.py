@@ -16,8 +16,8 @@ from gpusense.interface.constants import MATCH_RESULT
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
-from gpusense.matching.chain import POOR, POOR_TURN, finished, judged_pairs, to_sensor
 from gpusense.matching.icp import WIDTH, PlacedPairs, line_rules, slack_of, space_of
+from gpusense.matching.icp_with_search import POOR, POOR_TURN, finished, judged_pairs, to_sensor
 from gpusense.matching.noise import NoiseLevels, beams_in_order, neighbors, noise_levels
 from gpusense.matching.options import COARSE_POINTS, MatchOptions
 from gpusense.matching.points import beams_by_angle
@@ -55,7 +55,7 @@ class _Scene(NamedTuple):
         return noise_levels() if self.noise is None else NoiseLevels([self.noise], [math.inf], 0)
 
 
-def takes(backend: Backend, scanner: Scanner) -> bool:
+def supports_single_pair(backend: Backend, scanner: Scanner) -> bool:
     """Return whether a device matches the scans of a scanner as a single pair."""
     return (
         backend.info.kind == "cpu"

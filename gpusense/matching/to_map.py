@@ -16,9 +16,9 @@ from gpusense._util.angles import wrapped
 from gpusense._util.typing import CasterName
 from gpusense.backends import Backend
 from gpusense.matching.basin import is_held
-from gpusense.matching.chain import DOUBTFUL, match_pairs
 from gpusense.matching.columns import column_of
 from gpusense.matching.evidence import pair_evidence
+from gpusense.matching.icp_with_search import DOUBTFUL, match_pairs
 from gpusense.matching.observability import axes_of, balance_of, observed_information, orthonormal
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints, dense_scanner, scan_points

@@ -10,7 +10,7 @@ import pytest
 import gpusense as gs
 from gpusense import backends
 from gpusense.backends import chain, get_backend, listing, registry, selection
-from gpusense.backends.proof import Verdict
+from gpusense.backends.proof import DeviceCheck
 
 
 def fake_devices(*rows: tuple[str, str, str]) -> list[backends.Device]:
@@ -18,17 +18,17 @@ def fake_devices(*rows: tuple[str, str, str]) -> list[backends.Device]:
             enumerate(rows)]  # fmt: skip
 
 
-def use_devices(monkeypatch, listed: list[backends.Device], verdicts: dict[str, Verdict] | None = None) -> None:
+def use_devices(monkeypatch, listed: list[backends.Device], verdicts: dict[str, DeviceCheck] | None = None) -> None:
     """Pretend that devices other than NumPy are present, and proved unless a verdict says otherwise."""
     rows = [*listed, backends.Device("numpy", "NumPy reference", "cpu", True, "", "numpy")]
     monkeypatch.setattr(listing, "present", lambda entry: ([d for d in rows if d.backend == entry.name], []))
-    proved = Verdict(True, 1, True, rate=100.0)
+    proved = DeviceCheck(True, 1, True, rate=100.0)
     monkeypatch.setattr(chain, "_verdict_of", lambda device: (verdicts or {}).get(device.selection, proved))
 
 
 def fastest() -> str:
     """Return the device that ``"auto"`` would open first."""
-    return next(iter(chain.Chain())).selection
+    return next(iter(chain.FallbackOrder())).selection
 
 
 def test_devices_name_what_is_present_and_what_is_absent():
@@ -124,14 +124,14 @@ def test_of_one_class_the_faster_device_is_taken_if_it_is_noticeably_so(monkeypa
         ((100, 111, 900), "opencl:1:0"),
         ((100, 50, 9), "opencl:0:0"),
     ):
-        verdicts = {d.selection: Verdict(True, 1, True, rate=rate) for d, rate in zip(rows, rates, strict=True)}
+        verdicts = {d.selection: DeviceCheck(True, 1, True, rate=rate) for d, rate in zip(rows, rates, strict=True)}
         use_devices(monkeypatch, rows, verdicts)
         assert fastest() == selection._find("opencl") == chosen
 
 
 def test_an_unusable_device_is_passed_over_unless_it_is_named(monkeypatch):
     rows = fake_devices(("opencl", "GPU", "gpu"), ("opencl", "CPU", "cpu"), ("warp", "CPU", "cpu"))
-    bad = Verdict(False, 1, False, "scalar kernels hang", "update the driver")
+    bad = DeviceCheck(False, 1, False, "scalar kernels hang", "update the driver")
     use_devices(monkeypatch, rows, {"opencl:0:0": bad})
     assert fastest() == selection._find("opencl") == "opencl:1:0"
     assert selection._find("opencl:0:0") == selection._find("opencl:GPU") == "opencl:0:0"
@@ -145,7 +145,7 @@ def test_an_unusable_device_is_passed_over_unless_it_is_named(monkeypatch):
 def test_opening_an_unusable_device_says_why(monkeypatch, needs):
     needs("opencl")
     name = next(d.selection for d in gs.devices() if d.backend == "opencl" and d.kind != "simulator")
-    bad = Verdict(False, 1, False, "scalar kernels hang: no answer in 60 s", "update the driver")
+    bad = DeviceCheck(False, 1, False, "scalar kernels hang: no answer in 60 s", "update the driver")
     monkeypatch.setattr(listing, "verdict_on", lambda *a, **k: bad)
     selection.forget()
     try:
@@ -163,7 +163,7 @@ def test_a_gpu_of_opencl_is_taken_without_loading_warp(monkeypatch):
     asked = []
     rows = {"opencl": fake_devices(("opencl", "GPU", "gpu")), "warp": fake_devices(("warp", "GPU", "gpu"))}
     monkeypatch.setattr(listing, "present", lambda entry: (asked.append(entry.name) or rows[entry.name], []))
-    monkeypatch.setattr(chain, "_verdict_of", lambda device: Verdict(True, 1, True))
+    monkeypatch.setattr(chain, "_verdict_of", lambda device: DeviceCheck(True, 1, True))
     assert fastest() == "opencl:0:0"
     assert asked == ["opencl"]
 

@@ -12,7 +12,7 @@ from support import fake_driver
 
 from gpusense.backends import Device, chain, default_failures, get_backend, listing, notices, selection
 from gpusense.backends.numpy.backend import NumpyBackend
-from gpusense.backends.proof import Verdict
+from gpusense.backends.proof import DeviceCheck
 
 GPU = Device("opencl", "A GPU", "gpu", True, "", "opencl:0:0", "Driver 1")
 CPU = Device("opencl", "A CPU", "cpu", True, "", "opencl:1:0", "Driver 2")
@@ -38,7 +38,7 @@ def machine(monkeypatch):
 
         def verdict_of(device):
             failure = failures.get(device.selection)
-            return failure if isinstance(failure, Verdict) else Verdict(True, 1, True, rate=1.0)
+            return failure if isinstance(failure, DeviceCheck) else DeviceCheck(True, 1, True, rate=1.0)
 
         parts = [Device(name, f"{name} (no device)", "cpu", False, reason, "") for name, reason in absent]
         monkeypatch.setattr(
@@ -56,7 +56,7 @@ def machine(monkeypatch):
 
 
 BROKEN = RuntimeError("clCreateContext failed:\nOUT_OF_RESOURCES")
-KEPT = Verdict(False, 1, False, "scalar kernels hang", "update the driver")
+KEPT = DeviceCheck(False, 1, False, "scalar kernels hang", "update the driver")
 PASSING = dataclasses.replace(KEPT, reason="no folder", passing=True)
 
 
@@ -109,7 +109,7 @@ def test_a_verdict_is_reported_by_the_process_that_makes_it(machine, caplog):
     machine([GPU, WARP], {"opencl:0:0": KEPT})
     assert get_backend("auto").info.selection == "warp:cpu" and caplog.messages == []
     text = "opencl:0:0 (A GPU, Driver 1) is unusable: scalar kernels hang; update the driver"
-    made = chain.Chain([chain.Failure("opencl:0:0", "", text, True)])
+    made = chain.FallbackOrder([chain.Failure("opencl:0:0", "", text, True)])
     held = ["another warning", text]
     made.report(WARP, held)
     assert held == ["another warning", f"'auto' is warp:cpu (CPU): {text}"]

@@ -13,9 +13,9 @@ from support import fake_driver
 
 import gpusense as gs
 from gpusense._util import files
-from gpusense.backends import BackendInfo, child, get_backend, proof, selection
-from gpusense.backends.child import Outcome
-from gpusense.backends.proof import FLOAT64, SCALAR, VECTORS, Verdict, verdict_on
+from gpusense.backends import BackendInfo, get_backend, probe_process, proof, selection
+from gpusense.backends.probe_process import Outcome
+from gpusense.backends.proof import FLOAT64, SCALAR, VECTORS, DeviceCheck, verdict_on
 
 INFO = BackendInfo("opencl:0:0", "opencl", "Some device", "cpu", "Driver 1", 1 << 30, 1 << 28, True, 16)
 
@@ -51,7 +51,7 @@ def driver(monkeypatch):
                     return Outcome(said, how, conclusive)
             return Outcome([*said, {"rate": 100.0}, {"end": True}])
 
-        monkeypatch.setattr(child, "run", run)
+        monkeypatch.setattr(probe_process, "run", run)
         return tried
 
     return make
@@ -59,9 +59,9 @@ def driver(monkeypatch):
 
 def test_a_good_driver_is_proved_once(driver):
     tried = driver({})
-    assert verdict_on(INFO) == Verdict(True, 16, True, rate=100.0)
+    assert verdict_on(INFO) == DeviceCheck(True, 16, True, rate=100.0)
     proof._known.clear()
-    assert verdict_on(INFO) == Verdict(True, 16, True, rate=100.0)
+    assert verdict_on(INFO) == DeviceCheck(True, 16, True, rate=100.0)
     assert tried == [(16, True)]
 
 
@@ -151,8 +151,8 @@ def test_a_state_of_the_machine_is_no_lasting_verdict(driver, state):
 
 def test_a_crash_after_the_end_of_a_proof_condemns_no_device(monkeypatch):
     said = [{"begin": SCALAR}, {"rate": 5.0}, {"end": True}]
-    monkeypatch.setattr(child, "run", lambda job: Outcome(said, "ends the process with SIGSEGV"))
-    assert verdict_on(INFO) == Verdict(True, 16, True, rate=5.0)
+    monkeypatch.setattr(probe_process, "run", lambda job: Outcome(said, "ends the process with SIGSEGV"))
+    assert verdict_on(INFO) == DeviceCheck(True, 16, True, rate=5.0)
 
 
 def test_a_damaged_verdict_is_made_anew(driver, folder):
@@ -169,7 +169,7 @@ def test_a_damaged_verdict_is_made_anew(driver, folder):
 def test_proofs_can_be_switched_off(driver, monkeypatch):
     tried = driver({(SCALAR, 0): ABORT})
     monkeypatch.setenv("GPUSENSE_PROOF", "off")
-    assert verdict_on(INFO) == proof.trust(INFO) == Verdict(True, 16, True)
+    assert verdict_on(INFO) == proof.trust(INFO) == DeviceCheck(True, 16, True)
     assert tried == []
 
 
@@ -196,7 +196,7 @@ def test_no_room_for_the_output_of_a_child_is_no_failure_of_a_driver(monkeypatch
 
 def test_settings_that_failed_before_the_last_child_stay_off(monkeypatch, caplog):
     outcomes = iter([Outcome([{"begin": VECTORS}], ABORT), Outcome([], "no child", conclusive=False, started=False)])
-    monkeypatch.setattr(child, "run", lambda job: next(outcomes))
+    monkeypatch.setattr(probe_process, "run", lambda job: next(outcomes))
     verdict = verdict_on(INFO)
     assert (verdict.usable, verdict.lanes) == (True, 8) and "kernels in vectors of 16 end the process" in verdict.reason
 

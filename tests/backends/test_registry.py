@@ -12,7 +12,7 @@ import gpusense as gs
 from gpusense.backends import BackendInfo, chain, get_backend, listing, registry, selection
 from gpusense.backends.library import Absent, Library
 from gpusense.backends.numpy.backend import NumpyBackend
-from gpusense.backends.proof import Verdict
+from gpusense.backends.proof import DeviceCheck
 from gpusense.backends.registry import BY_NAME, ENTRIES, SPEED_CLASSES, Entry
 
 INFO = BackendInfo("metal:0", "metal", "Some GPU", "gpu", "Metal 3", 1 << 30, 1 << 28, False)
@@ -63,7 +63,7 @@ def metal(monkeypatch):
     monkeypatch.setattr(chain, "SPEED_CLASSES", (("metal", "gpu"), *SPEED_CLASSES))
     monkeypatch.setitem(sys.modules, "metal_library", library)
     monkeypatch.setitem(sys.modules, "metalpy", package)
-    monkeypatch.setattr(listing.proof, "verdict_on", lambda info, **options: Verdict(True, 4, info.float64))
+    monkeypatch.setattr(listing.proof, "verdict_on", lambda info, **options: DeviceCheck(True, 4, info.float64))
     selection.forget()
     yield library.LIBRARY
     selection.forget()
@@ -106,7 +106,7 @@ def test_devices_anew_renews_all_verdicts(metal, monkeypatch):
     seen = []
     monkeypatch.setattr(metal, "renew", lambda: seen.append("library"))
     monkeypatch.setattr(metal, "list_devices", lambda: seen.append("list") or [(INFO, "handle")])
-    verdict_on = lambda info, *, anew=False, **options: seen.append(anew) or Verdict(True, 4, True)  # noqa: E731
+    verdict_on = lambda info, *, anew=False, **options: seen.append(anew) or DeviceCheck(True, 4, True)  # noqa: E731
     monkeypatch.setattr(listing.proof, "verdict_on", verdict_on)
     for entry in ENTRIES[1:]:
         library, _ = registry.load(entry)

@@ -19,7 +19,7 @@ ALLOWED = {
     "tables/lookup_files.py": {"json.loads": "of a first line of at most 4096 bytes"},
     "backends/packing.py": {"zipfile.ZipFile": "sizes are bounded before anything is unpacked"},
     "backends/proof.py": {"json.loads": "what this package wrote to its cache"},
-    "backends/child.py": {"json.loads": "what this package's own process said"},
+    "backends/probe_process.py": {"json.loads": "what this package's own process said"},
     "backends/opencl/drivers.py": {"json.loads": "what this package's own process said"},
     "logs/carmen_writer.py": {"gzip.GzipFile": "only to write"},
     "sweeps/process.py": {"pickle.loads": "jobs and results of this package's own processes, by pipes"},

@@ -19,7 +19,7 @@ from pathlib import Path
 import pyopencl as cl
 
 from gpusense._version import __version__
-from gpusense.backends import child, notices
+from gpusense.backends import notices, probe_process
 from gpusense.backends.cache import discard_entry, load_entry, store_entry
 from gpusense.backends.opencl import driver_files, pocl_kernels
 from gpusense.backends.opencl.driver_files import Driver
@@ -123,7 +123,7 @@ def _chosen(*, anew: bool = False) -> Choice:
     """Return the choice by the cached verdict; without one, or with ``anew``, by a child's verdict."""
     drivers, by_itself = driver_files.installed()
     wanted = None if by_itself else drivers
-    if not child.can_start() or not _loader():
+    if not probe_process.can_start() or not _loader():
         return Choice(wanted)
     key = _key(drivers)
     if anew:
@@ -183,13 +183,15 @@ def _tried(drivers: tuple[Driver, ...], wanted: tuple[Driver, ...] | None) -> tu
     return Choice(others, left_out), conclusive
 
 
-def _try(drivers: tuple[Driver, ...] | None) -> child.Outcome:
+def _try(drivers: tuple[Driver, ...] | None) -> probe_process.Outcome:
     """Load drivers in a child; a child that cannot start, or has no folder, yields no verdict."""
     try:
         variables = _variables(drivers, kernels=False)
     except OSError:
-        return child.Outcome([], "no folder takes files", conclusive=False)
-    return child.run_text(["-I", "-S", "-c", _LOAD], {"loader": _loader(), "mark": child.MARK}, variables)
+        return probe_process.Outcome([], "no folder takes files", conclusive=False)
+    return probe_process.run_text(
+        ["-I", "-S", "-c", _LOAD], {"loader": _loader(), "mark": probe_process.MARK}, variables
+    )
 
 
 def _loader() -> str:

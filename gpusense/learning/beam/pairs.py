@@ -87,10 +87,12 @@ def make_pairs(ranges: ArrayLike, expected: ArrayLike, range_max: float, range_m
         )
     places = np.flatnonzero(kinds == Reading.HIT)
     reading = z[places]
-    return Pairs(reading, np.minimum(z_expected[places], range_max), places, kinds, range_max, quantum_of(reading))
+    return Pairs(
+        reading, np.minimum(z_expected[places], range_max), places, kinds, range_max, range_resolution(reading)
+    )
 
 
-def quantum_of(reading: NDArray[np.floating]) -> float:
+def range_resolution(reading: NDArray[np.floating]) -> float:
     """Estimate the rounding step of readings; 0 without one.
 
     A step exists if readings repeat and all gaps between different readings are integer multiples of the smallest gap.

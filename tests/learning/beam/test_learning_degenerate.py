@@ -7,7 +7,7 @@ import pytest
 from support.learning_data import RANGE_MAX, TYPICAL, draw
 
 import gpusense as gs
-from gpusense.learning.beam.pairs import quantum_of
+from gpusense.learning.beam.pairs import range_resolution
 from gpusense.learning.beam.problem import NOTHING
 
 RNG = np.random.default_rng(0)
@@ -77,14 +77,14 @@ def test_the_book_breaks_and_says_so(name: str) -> None:
 
 def test_sigma_stays_above_what_rounding_hides() -> None:
     rounded = np.round((FIVE + 0.1 * NOISE) / 0.05) * 0.05
-    assert quantum_of(rounded) == pytest.approx(0.05)
+    assert range_resolution(rounded) == pytest.approx(0.05)
     exact = np.round(AHEAD / 0.05) * 0.05
     fit = gs.fit_beam_parameters(exact, exact, RANGE_MAX, backend="numpy")
     assert fit.parameters.sigma_hit == pytest.approx(0.05 / np.sqrt(12))
-    assert quantum_of(AHEAD) == 0 and quantum_of(FIVE) == 0 and quantum_of(AHEAD[:0]) == 0
-    assert quantum_of(rounded.astype(np.float32)) == pytest.approx(0.05, rel=1e-4)
+    assert range_resolution(AHEAD) == 0 and range_resolution(FIVE) == 0 and range_resolution(AHEAD[:0]) == 0
+    assert range_resolution(rounded.astype(np.float32)) == pytest.approx(0.05, rel=1e-4)
     # Repeated values that share no step.
-    assert quantum_of(np.repeat(AHEAD[:50], 2)) == 0
+    assert range_resolution(np.repeat(AHEAD[:50], 2)) == 0
 
 
 def test_bounds_and_starts_are_kept() -> None:

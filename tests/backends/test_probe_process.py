@@ -10,31 +10,31 @@ from pathlib import Path
 
 import pytest
 
-from gpusense.backends import child
+from gpusense.backends import probe_process
 
 
 @pytest.mark.parametrize("executable", ["", "/usr/bin/blender"])
 def test_a_program_that_is_no_interpreter_is_not_started(monkeypatch, executable):
     monkeypatch.setattr(sys, "executable", executable)
-    assert not child.can_start()
+    assert not probe_process.can_start()
 
 
 def test_a_frozen_program_is_not_started(monkeypatch):
-    assert child.can_start()
+    assert probe_process.can_start()
     monkeypatch.setattr(sys, "frozen", True, raising=False)
-    assert not child.can_start()
+    assert not probe_process.can_start()
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "soon"])
 def test_the_time_limit_is_a_number_of_seconds(monkeypatch, text):
     monkeypatch.setenv("GPUSENSE_PROOF_SECONDS", text)
     with pytest.raises(ValueError, match=rf"GPUSENSE_PROOF_SECONDS: must be a number of seconds > 0, got '{text}'"):
-        child.time_limit()
+        probe_process.time_limit()
 
 
 def run_text(text: str, **job):
     read = "import json, sys; job = json.loads(sys.stdin.readline())\n"
-    return child.run_text(["-c", read + textwrap.dedent(text)], job)
+    return probe_process.run_text(["-c", read + textwrap.dedent(text)], job)
 
 
 @pytest.mark.parametrize(
@@ -94,8 +94,8 @@ def test_a_hanging_child_and_its_children_are_ended(monkeypatch, tmp_path):
 )
 def test_a_child_without_a_processor_gets_more_time(monkeypatch, waits, limits, failure, conclusive):
     monkeypatch.setenv("GPUSENSE_PROOF_SECONDS", "0.1")
-    monkeypatch.setattr(child, "_MOST_LIMITS", limits)
-    monkeypatch.setattr(child, "_starved", lambda _: waits)
+    monkeypatch.setattr(probe_process, "_MOST_LIMITS", limits)
+    monkeypatch.setattr(probe_process, "_starved", lambda _: waits)
     text = "import time; time.sleep(0.3); print('gpusense-child {\"done\": \"%s\"}' % job['token'])"
     outcome = run_text(text)
     assert (outcome.failure, outcome.conclusive) == (failure, conclusive)
@@ -103,7 +103,7 @@ def test_a_child_without_a_processor_gets_more_time(monkeypatch, waits, limits, 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/schedstat"), reason="this system does not say how long threads wait")
 def test_waits_of_threads_are_seconds():
-    assert 0 < child._starved(os.getpid()) < 1e5 and child._starved(0) == 0
+    assert 0 < probe_process._starved(os.getpid()) < 1e5 and probe_process._starved(0) == 0
 
 
 @pytest.mark.parametrize("name", ["SIGKILL", "SIGTERM", "SIGINT"])
@@ -114,5 +114,5 @@ def test_signals_from_outside_say_nothing_of_the_driver(name):
 
 def test_an_interpreter_that_cannot_be_started_says_nothing_of_the_driver(monkeypatch):
     monkeypatch.setattr(sys, "executable", "/nowhere/python3")
-    outcome = child.run({"do": "gpusense.evaluation.proof:prove"})
+    outcome = probe_process.run({"do": "gpusense.evaluation.proof:prove"})
     assert outcome.failure.startswith("no child process can be started") and not outcome.conclusive

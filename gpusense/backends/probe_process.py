@@ -30,7 +30,7 @@ MARK = "gpusense-child "
 _MOST_OUTPUT = 16 << 20
 _START = (
     "import sys, json; job = json.loads(sys.stdin.readline()); sys.path[:] = job['path']; "
-    "from gpusense.backends.child import main; main(job)"
+    "from gpusense.backends.probe_process import main; main(job)"
 )
 # External signals, no failure of the driver.
 _FOREIGN = tuple(getattr(signal, name) for name in ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP") if hasattr(signal, name))

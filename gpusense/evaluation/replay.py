@@ -97,7 +97,7 @@ class Recorder(Proxy):
                 continue
             count = argument.elements(values)
             array = self._backend.download(value, np.empty(count * argument.width, argument.dtype(real)))
-            values[argument.name] = array.reshape(-1, argument.width) if argument.width > 1 else array
+            values[argument.name] = argument.shaped(array)
         cast = self._cast(flags, passed, values, real) if kernel == "score_beams" else (None, None)
         return Launch(kernel, flags, values, *cast)
 
@@ -180,7 +180,7 @@ def _replay_beams(launch: Launch, values: dict[str, Any], shift: float = 0.0) ->
     else:
         parts = log_density(launch.flags, z, expected, terms)
     if "ALL_READINGS" in launch.flags:
-        atom = parts if "SENSOR_TABLE" in launch.flags else np.where(np.isinf(z), terms[7], parts)
+        atom = parts if "SENSOR_TABLE" in launch.flags else np.where(np.isinf(z), terms.z_max, parts)
         parts = np.where(np.isnan(z), 0.0, atom)
     return parts
 

@@ -135,8 +135,9 @@ def density_grid(backend: Selection, precision: str) -> Densities:
         # Rays that are shared do not end behind a reading.
         device.compile("score_beams", flags | (mixture.flags - {"STOPS"}))(
             (count,), rectangles, none, cells, pose, ray, first, device.upload(z),
-            device.upload(mixture.terms), none, none, first, none, device.empty(count, real), parts, *world,
-            len(z), *laser, *casting, structs.Score(0.0, 1.0), structs.ScanBatch(1, 0),
+            device.upload(np.stack(mixture.terms, axis=1)), device.upload(mixture.masses), none, none, first, none,
+            device.empty(count, real), parts, *world, len(z), *laser, *casting, structs.Score(0.0, 1.0),
+            structs.ScanBatch(1, 0),
         )  # fmt: skip
         log_p = device.download(parts, np.empty(count * len(z), real))
         values = np.repeat(np.array([list(p.to_dict().values())], real).T, log_p.size, axis=1)

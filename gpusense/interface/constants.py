@@ -19,8 +19,6 @@ MAX_LEFT_OUT, MAX_FIXED, MAX_PLACED = range(3)
 FIELD_RING = 2
 # Kernel file relative: coordinates are clamped to this [m]; its square is finite in float32.
 FARTHEST = float(1 << 60)
-# Kernel file mixture: numbers of the mixture for a bin of angles of incidence.
-MIXTURE_TERMS = 20
 # Kernel files hit_shape and sampling: cells of a table, cells in a unit of its logarithmic coordinate, and numbers of a
 # cell, by the bytes of a number.
 TABLE_CELLS = {4: 256, 8: 1024}
@@ -32,9 +30,9 @@ NEARBY, SERIES, VON_MISES = 0, 1, 2
 WRAPS, WAVES = 3, 6
 NEGLIGIBLE = 40.0
 # Kernel file beacons: distributions of a range; numbers of a beacon: its place (x, its low part, y, its low part), the
-# reading minus the bias with its low part, and the bias; numbers of the mixture.
+# reading minus the bias with its low part, and the bias.
 NORMAL, STUDENT_T, TWO_NORMALS = 0, 1, 2
-BEACON, BEACON_TERMS = 7, 12
+BEACON = 7
 # Kernel file ray_counts: fraction bits of a coordinate in cells.
 RAY_BITS = 12
 # Kernel file icp: numbers of the result of a match, and of the rules of a level.

@@ -1,17 +1,20 @@
 """Structs: numbers that travel together from the host to kernels, declared once for all languages.
 
 A field is an ``int``, a ``real`` of the model's precision or a ``double``. OpenCL's declarations are written from the
-annotations, Warp's structs are made from them, and the NumPy reference takes the tuples themselves.
+annotations, Warp's structs are made from them, and the NumPy reference takes the tuples themselves. A buffer may hold
+an array of structs whose fields are all ``real``; the NumPy reference sees one tuple of arrays.
 """
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-real: TypeAlias = float
+# A number, or in the NumPy reference an array of numbers.
+real: TypeAlias = Any
 double: TypeAlias = float
 
 _INT, _DOUBLE = np.dtype(np.int32), np.dtype(np.float64)
@@ -67,6 +70,145 @@ class MixtureTables(NamedTuple):
     incidence_bins: int
     cells: int
     per_metre: real
+
+
+class MixtureTerms(NamedTuple):
+    """The beam model's mixture for one bin of angles of incidence; see the kernel file ``mixture``.
+
+    ``hit_peak`` is the peak of z_hit p_hit, z_hit / (sigma_hit sqrt(2 pi)) for a normal, and ``rand_density`` is
+    z_rand / range_max. The log domain has their logarithms and log z_short. ``z_max`` is log z_max, but z_max itself
+    with CUBES. A number named ``*_low`` is the rounding error of the number before the suffix.
+
+    ``square_scale`` is 1 / (2 sigma_hit^2), ``erf_scale`` is 1 / (sigma_hit sqrt 2), and ``relative_growth`` is
+    sigma_growth / sigma_hit. The density is constant from the expected range ``max(last_offset + last_slope z,
+    last_least)`` on. ``inverse_sigma`` is 1 / sigma_hit, and ``unit_peak`` is sigma_hit times the peak of an
+    untruncated hit; only the kernel file ``learning`` reads them. ``mass_table`` is the place of the shape's table in
+    ``masses``.
+    """
+
+    hit_peak: real
+    square_scale: real
+    erf_scale: real
+    z_short: real
+    lambda_short: real
+    rand_density: real
+    range_max: real
+    z_max: real
+    hit_peak_low: real
+    square_scale_low: real
+    range_bias: real
+    range_bias_low: real
+    relative_growth: real
+    relative_growth_low: real
+    last_offset: real
+    last_slope: real
+    last_least: real
+    inverse_sigma: real
+    unit_peak: real
+    shape_power: real
+    shape_rate: real
+    mass_table: real
+
+
+class FieldTerms(NamedTuple):
+    """The mixture of a likelihood field, with the names of ``MixtureTerms``; see the kernel file ``field_term``."""
+
+    hit_peak: real
+    square_scale: real
+    rand_density: real
+    z_max: real
+    hit_peak_low: real
+    square_scale_low: real
+    shape_power: real
+    shape_rate: real
+
+
+class FeatureTerms(NamedTuple):
+    """A landmark sensor; see the kernel file ``landmarks``.
+
+    ``zero_range_density`` is the density of a bearing at zero range, relative to its peak and scale.
+    """
+
+    range_max: real
+    range_max_low: real
+    field_of_view: real
+    zero_range_density: real
+
+
+class PositionTerms(NamedTuple):
+    """Density of a measured position: log of the uniform part, factors of the offset's axes, log of the peak."""
+
+    random: real
+    x_scale: real
+    x_scale_low: real
+    shear: real
+    shear_low: real
+    y_scale: real
+    y_scale_low: real
+    peak: real
+    peak_low: real
+
+
+class HeadingTerms(NamedTuple):
+    """Density of a measured heading; see the kernel file ``absolute``.
+
+    ``scale`` is 1 / (sigma sqrt 2) or sqrt(2 kappa), ``peak`` the log of z_hit times the peak, ``random`` the log of
+    the uniform part, and ``decay`` is 2 pi / sigma^2.
+    """
+
+    random: real
+    decay: real
+    scale: real
+    scale_low: real
+    peak: real
+    peak_low: real
+
+
+class BeaconTerms(NamedTuple):
+    """Density of a range to a beacon; see the kernel file ``beacons``.
+
+    ``scale`` is 1 / (sigma sqrt 2), ``peak`` the log of z_hit times the peak, and ``random`` the log of the uniform
+    part. The wide normal has ``wide_scale`` and ``wide_peak``. For a Student t with peak P, ``scale`` is 1 / (sigma
+    sqrt(nu k)) with k = P^(2 / (nu + 1)), ``peak`` is log z_hit, ``offset`` is 1 / k, ``power`` is (nu + 1) / 2,
+    ``t_scale`` is 1 / (sigma sqrt nu), ``arc`` is the factor of the arc, and ``odd`` is 1 for an odd nu.
+    """
+
+    random: real
+    range_max: real
+    scale: real
+    scale_low: real
+    peak: real
+    peak_low: real
+    wide_scale: real = 0.0
+    wide_scale_low: real = 0.0
+    wide_peak: real = 0.0
+    wide_peak_low: real = 0.0
+    offset: real = 0.0
+    offset_low: real = 0.0
+    power: real = 0.0
+    t_scale: real = 0.0
+    arc: real = 0.0
+    odd: real = 0.0
+
+
+class ContactTerms(NamedTuple):
+    """Density of a bumper's contacts; see the kernel file ``contact``.
+
+    ``scale`` is 1 / (sigma sqrt 2), ``reach`` the gap of touching centres and ``side`` a cell's side [m].
+    ``log_contact`` and ``log_false`` are log p_contact and log p_false, ``log_missed`` and ``log_quiet`` those of 1 -
+    p_contact and 1 - p_false.
+    """
+
+    scale: real
+    scale_low: real
+    reach: real
+    reach_low: real
+    side: real
+    side_low: real
+    log_contact: real
+    log_false: real
+    log_missed: real
+    log_quiet: real
 
 
 class Score(NamedTuple):
@@ -172,8 +314,9 @@ class BeamRules(NamedTuple):
 STRUCTS: dict[str, type[tuple[Any, ...]]] = {
     struct.__name__: struct
     for struct in (
-        Window, Frame, Caster, RangeScale, Cone, MixtureTables, Score, ScanBatch, ReadingRules, Buckets, SensorView,
-        ScoreTable, MatchRules, BeamRules,
+        Window, Frame, Caster, RangeScale, Cone, MixtureTables, MixtureTerms, FieldTerms, FeatureTerms, PositionTerms,
+        HeadingTerms, BeaconTerms, ContactTerms, Score, ScanBatch, ReadingRules, Buckets, SensorView, ScoreTable,
+        MatchRules, BeamRules,
     )
 }  # fmt: skip
 
@@ -197,6 +340,18 @@ def rounded(value: tuple[Any, ...], struct: str, precision: np.dtype) -> tuple[A
     made: type[Any] = STRUCTS[struct]
     pairs = zip(value, dtypes(struct, precision), strict=True)
     return made(*(int(number) if kind == _INT else kind.type(number) for number, kind in pairs))
+
+
+def packed(rows: Sequence[tuple[Any, ...]], precision: np.dtype) -> np.ndarray:
+    """Return structs of real numbers as one array, for a buffer that a kernel reads as an array of structs."""
+    return np.array(rows, precision).ravel()
+
+
+def columns(struct: str, numbers: np.ndarray) -> Any:
+    """Return an array of structs of real numbers as one struct whose fields are arrays with a number of each."""
+    made: type[Any] = STRUCTS[struct]
+    count = len(made._fields)
+    return made(*numbers[: numbers.size // count * count].reshape(-1, count).T)
 
 
 def declaration(struct: str) -> str:

@@ -18,16 +18,26 @@ def sums_linearly(rand: float, peak: float, real: np.dtype) -> bool:
     return rand >= _SMALLEST_DENSITY[real] * max(peak, 1.0)
 
 
-def rounded_terms(terms: list[float], real: np.dtype) -> np.ndarray:
-    """Return the numbers of a mixture in a model's precision, then the rounding errors of the first two."""
+def rounded_terms(real: np.dtype, **terms: float) -> dict[str, np.floating]:
+    """Return the numbers of a mixture in a model's precision, with the rounding errors of the peak and scale of a hit.
+
+    Raises:
+        ValueError: Sigma_hit or lambda_short is too small or too large for the precision.
+    """
     with np.errstate(over="ignore"):
-        rounded = np.array(terms).astype(real)
+        rounded = dict(zip(terms, np.array(list(terms.values())).astype(real), strict=True))
     # Logarithms of zero weights are -inf; no other number may be infinite.
-    if np.isposinf(rounded).any() or rounded[1] < np.finfo(real).tiny:
+    if np.isposinf(list(rounded.values())).any() or rounded["square_scale"] < np.finfo(real).tiny:
         raise ValueError(f"parameters: sigma_hit and lambda_short must fit {real.name}, got terms {terms}")
-    with np.errstate(invalid="ignore"):
-        low = np.nan_to_num(np.array(terms[:2]) - rounded[:2])
-    return np.append(rounded, low.astype(real))
+    for name in ("hit_peak", "square_scale"):
+        rounded[f"{name}_low"] = rounding_error(terms[name], rounded[name])
+    return rounded
+
+
+def rounding_error(exact: float, rounded: np.floating) -> np.floating:
+    """Return the part of a number that rounding has removed, in the same precision; 0 for an infinite number."""
+    low: np.floating = rounded.dtype.type(exact - float(rounded) if math.isfinite(exact) else 0.0)
+    return low
 
 
 def log_weight(weight: float) -> float:

@@ -11,13 +11,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.interface.constants import NEARBY, SERIES, VON_MISES, WAVES, WRAPS
 from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_sum
 from gpusense.reference.log_terms import bounded_square, either, log_one_plus
 
-# Terms of a heading: 1 / (sigma sqrt 2) or sqrt(2 kappa), log of z_hit and the peak, log of the uniform part, 2 pi /
-# sigma^2, and from WAVE on 2 q^(n n).
-SCALE, SCALE_LOW, PEAK, PEAK_LOW, RANDOM, DECAY, WAVE = range(7)
 HALF_TURN = 3.141592653589793
 # sin x = x + x z (SINE[0] + SINE[1] z + ...) with z = x^2, its power series.
 SINE = (
@@ -50,50 +48,58 @@ def log_other_turns(residual: Pair, decay: float) -> np.ndarray:
     return log_one_plus(others)
 
 
-def log_waves(residual: Pair, terms: np.ndarray) -> np.ndarray:
+def log_waves(residual: Pair, waves: np.ndarray) -> np.ndarray:
     """Return the log of the ratio of the Fourier series to its first term, by Clenshaw's recurrence."""
     real = residual[0].dtype.type
     s = half_sine(residual)[0]
     cosine = 1 - 2 * s * s
     newer, older = np.zeros_like(s), np.zeros_like(s)
     for n in range(WAVES, 0, -1):
-        newer, older = terms[WAVE + n - 1] + real(2) * cosine * newer - older, newer
+        newer, older = waves[n - 1] + real(2) * cosine * newer - older, newer
     return log_one_plus(cosine * newer - older)
 
 
 def score_position(
-    flags: frozenset[str], place: np.ndarray, terms: np.ndarray, log_p: np.ndarray, particles: int, temperature: float
+    flags: frozenset[str],
+    place: np.ndarray,
+    terms: structs.PositionTerms,
+    log_p: np.ndarray,
+    particles: int,
+    temperature: float,
 ) -> None:
-    """Score positions; ``terms`` are a, b, c and peak, each with its low part, and the log of the uniform part.
+    """Score positions.
 
-    The exponent is ``(a x)^2 + (b x + c y)^2``, where (x, y) is the offset from the reading to the sensor.
+    The exponent is ``(x_scale x)^2 + (shear x + y_scale y)^2``, where (x, y) is the offset from the reading to the
+    sensor.
     """
     x, y = (place[:particles, 0], place[:particles, 1]), (place[:particles, 2], place[:particles, 3])
-    a, b, c = ((np.asarray(terms[i]), np.asarray(terms[i + 1])) for i in (0, 2, 4))
-    first = bounded_square(pair_product(x, a))
-    second = bounded_square(pair_sum(pair_product(x, b), pair_product(y, c)))
+    x_scale = np.asarray(terms.x_scale), np.asarray(terms.x_scale_low)
+    y_scale = np.asarray(terms.y_scale), np.asarray(terms.y_scale_low)
+    shear = np.asarray(terms.shear), np.asarray(terms.shear_low)
+    first = bounded_square(pair_product(x, x_scale))
+    second = bounded_square(pair_sum(pair_product(x, shear), pair_product(y, y_scale)))
     exponent = pair_sum(first, second)
-    log_density = (terms[6] - exponent[0]) + (terms[7] - exponent[1])
+    log_density = (terms.peak - exponent[0]) + (terms.peak_low - exponent[1])
     if "RAND" in flags:
-        log_density = either(log_density, terms[8])
+        log_density = either(log_density, terms.random)
     log_p[:particles] = temperature * log_density
 
 
 def score_heading(
-    flags: frozenset[str], residual: np.ndarray, terms: np.ndarray, log_p: np.ndarray, particles: int, kind: int,
-    temperature: float,
+    flags: frozenset[str], residual: np.ndarray, terms: structs.HeadingTerms, waves: np.ndarray, log_p: np.ndarray,
+    particles: int, kind: int, temperature: float,
 ) -> None:  # fmt: skip
     """Score headings; residuals are headings minus the reading, in [-pi, pi]."""
     r = residual[:particles, 0], residual[:particles, 1]
-    scale = np.asarray(terms[SCALE]), np.asarray(terms[SCALE_LOW])
+    scale = np.asarray(terms.scale), np.asarray(terms.scale_low)
     if kind == SERIES:
-        log_density = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms))
+        log_density = terms.peak + (terms.peak_low + log_waves(r, waves))
     else:
         root = half_sine(r) if kind == VON_MISES else r
         exponent = bounded_square(pair_product(root, scale))
-        log_density = (terms[PEAK] - exponent[0]) + (terms[PEAK_LOW] - exponent[1])
+        log_density = (terms.peak - exponent[0]) + (terms.peak_low - exponent[1])
         if kind == NEARBY:
-            log_density = log_density + log_other_turns(r, terms[DECAY])
+            log_density = log_density + log_other_turns(r, terms.decay)
     if "RAND" in flags:
-        log_density = either(log_density, terms[RANDOM])
+        log_density = either(log_density, terms.random)
     log_p[:particles] = temperature * log_density

@@ -17,7 +17,9 @@ from gpusense.reference.scans import particles_of_scans
 from gpusense.reference.sensor_table import tabulated_density
 
 
-def ray_limit(flags: frozenset[str], z: np.ndarray, terms: np.ndarray, scale: structs.RangeScale) -> np.ndarray:
+def ray_limit(
+    flags: frozenset[str], z: np.ndarray, terms: structs.MixtureTerms, scale: structs.RangeScale
+) -> np.ndarray:
     """Return the distances in cells to which the rays of readings are cast."""
     if "STOPS" not in flags:
         return np.full_like(z, scale.limit)
@@ -41,7 +43,7 @@ def cast_beam(
 
 
 def reading_term(
-    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray, sensor: np.ndarray,
+    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms, sensor: np.ndarray,
     tables: structs.MixtureTables, range_max: float,
 ) -> np.ndarray:  # fmt: skip
     """Return the terms of the scan's sum: log densities of readings, or cubes of densities."""
@@ -52,7 +54,7 @@ def reading_term(
     else:
         term = log_density(flags, z, expected, terms)
     if "ALL_READINGS" in flags:
-        atom = term if "SENSOR_TABLE" in flags else np.where(np.isinf(z), terms[7], term)
+        atom = term if "SENSOR_TABLE" in flags else np.where(np.isinf(z), terms.z_max, term)
         term = np.where(np.isnan(z), 0, atom).astype(expected.dtype)
     return term
 
@@ -75,10 +77,11 @@ def readings_of_scan(
 
 def score_beams(
     flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
-    ray: np.ndarray, first: np.ndarray, reading: np.ndarray, terms: np.ndarray, edges: np.ndarray, sensor: np.ndarray,
-    start: np.ndarray, constant_terms: np.ndarray, log_p: np.ndarray, parts: np.ndarray, window: structs.Window,
-    particles: int, rays: int, readings: int, tables: structs.MixtureTables, cone: structs.Cone, caster: structs.Caster,
-    scale: structs.RangeScale, score: structs.Score, batch: structs.ScanBatch,
+    ray: np.ndarray, first: np.ndarray, reading: np.ndarray, terms: structs.MixtureTerms, masses: np.ndarray,
+    edges: np.ndarray, sensor: np.ndarray, start: np.ndarray, constant_terms: np.ndarray, log_p: np.ndarray,
+    parts: np.ndarray, window: structs.Window, particles: int, rays: int, readings: int, tables: structs.MixtureTables,
+    cone: structs.Cone, caster: structs.Caster, scale: structs.RangeScale, score: structs.Score,
+    batch: structs.ScanBatch,
 ) -> None:  # fmt: skip
     """Score scans; ray r has the readings first[r] to first[r + 1] - 1, and ``score`` has the constant term.
 
@@ -89,8 +92,8 @@ def score_beams(
             begin, scan_rays, scan_first, scan_reading = readings_of_scan(flags, scan, start, first, reading)
             score_beams(
                 flags - {"SCANS"}, map_table, normals, pose_cell[part], pose[part], ray[begin * cone.rays :],
-                scan_first, scan_reading, terms, edges, sensor, start, constant_terms, log_p[part], parts, window,
-                part.stop - part.start, scan_rays, int(scan_first[scan_rays]), tables, cone, caster, scale,
+                scan_first, scan_reading, terms, masses, edges, sensor, start, constant_terms, log_p[part], parts,
+                window, part.stop - part.start, scan_rays, int(scan_first[scan_rays]), tables, cone, caster, scale,
                 structs.Score(constant_terms[scan], score.temperature), batch,
             )  # fmt: skip
         return
@@ -117,7 +120,8 @@ def score_beams(
 
 def beam_tiles(
     flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
-    order: np.ndarray, ray: np.ndarray, first: np.ndarray, reading: np.ndarray, terms: np.ndarray, edges: np.ndarray,
+    order: np.ndarray, ray: np.ndarray, first: np.ndarray, reading: np.ndarray, terms: structs.MixtureTerms,
+    masses: np.ndarray, edges: np.ndarray,
     sensor: np.ndarray, start: np.ndarray, parts: np.ndarray, window: structs.Window, particles: int, rays: int,
     readings: int, tables: structs.MixtureTables, cone: structs.Cone, caster: structs.Caster, scale: structs.RangeScale,
     spread: int, batch: structs.ScanBatch,
@@ -137,18 +141,18 @@ def beam_tiles(
             scan_parts = np.empty((part.stop - part.start) * each, pose.dtype)
             beam_tiles(
                 flags - {"SCANS", "ORDERED"}, map_table, normals, pose_cell[part], pose[part], order,
-                ray[begin * cone.rays :], scan_first, scan_reading, terms, edges, sensor, start, scan_parts, window,
-                part.stop - part.start, scan_rays, int(scan_first[scan_rays]), tables, cone, caster, scale, spread,
-                batch,
+                ray[begin * cone.rays :], scan_first, scan_reading, terms, masses, edges, sensor, start, scan_parts,
+                window, part.stop - part.start, scan_rays, int(scan_first[scan_rays]), tables, cone, caster, scale,
+                spread, batch,
             )  # fmt: skip
             at = places[part] + np.arange(each)[:, None] * particles
             parts[at] = scan_parts.reshape(at.shape)
         return
     real, single = pose.dtype.type, np.empty(particles * readings, pose.dtype)
     score_beams(
-        flags | {"PER_BEAM"}, map_table, normals, pose_cell, pose, ray, first, reading, terms, edges, sensor, start,
-        sensor, np.empty(particles, pose.dtype), single, window, particles, rays, readings, tables, cone, caster, scale,
-        structs.Score(real(0), real(1)), batch,
+        flags | {"PER_BEAM"}, map_table, normals, pose_cell, pose, ray, first, reading, terms, masses, edges, sensor,
+        start, sensor, np.empty(particles, pose.dtype), single, window, particles, rays, readings, tables, cone, caster,
+        scale, structs.Score(real(0), real(1)), batch,
     )  # fmt: skip
     term = single.reshape(particles, readings)
     term = strand_sums(term) if "STRANDED" in flags else term

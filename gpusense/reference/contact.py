@@ -18,27 +18,24 @@ from gpusense.reference.error_free import Pair, pair_product, two_product, two_s
 from gpusense.reference.log_terms import bounded_square, either
 
 NO_OBSTACLE = (1 << 31) - 1
-# 1 / (sigma sqrt 2), the gap of touching centres, the cell's side; logs of p_contact and p_false; logs of 1 - p_contact
-# and 1 - p_false.
-SCALE, SCALE_LOW, REACH, REACH_LOW, SIDE, SIDE_LOW, HIT_TERM, FALSE_TERM, MISS_TERM, NO_HIT_TERM = range(10)
 # Gap in cells where there is no obstacle.
 FAR_CELLS = 1e9
 LOG_TWO_ROOT_PI = 1.2655121234846454
 SERIES = 12
 
 
-def gap(squared: np.ndarray, terms: np.ndarray) -> Pair:
+def gap(squared: np.ndarray, terms: structs.ContactTerms) -> Pair:
     """Return gaps between outlines and obstacles, negative where they overlap; squared distances are in cells."""
-    real = terms.dtype.type
+    real = np.asarray(terms.side).dtype.type
     whole = two_sum((squared >> 12).astype(real) * real(4096), (squared & 4095).astype(real))
     d = np.sqrt(whole[0])
     dd = two_product(d, d)
     low = np.where(d > 0, ((whole[0] - dd[0]) + (whole[1] - dd[1])) / np.where(d > 0, 2 * d, 1), 0).astype(real)
     nowhere = squared == NO_OBSTACLE
     cells = np.where(nowhere, real(FAR_CELLS), d), np.where(nowhere, real(0), low)
-    away = pair_product(cells, (np.asarray(terms[SIDE]), np.asarray(terms[SIDE_LOW])))
-    left = two_sum(away[0], -terms[REACH])
-    return two_sum(left[0], left[1] + (away[1] - terms[REACH_LOW]))
+    away = pair_product(cells, (np.asarray(terms.side), np.asarray(terms.side_low)))
+    left = two_sum(away[0], -terms.reach)
+    return two_sum(left[0], left[1] + (away[1] - terms.reach_low))
 
 
 def log_above(x: Pair) -> np.ndarray:
@@ -55,21 +52,21 @@ def log_above(x: Pair) -> np.ndarray:
     return np.where(large, tail, np.log(real(0.5) * erfc(inside)))
 
 
-def log_bump(squared: np.ndarray, pressed: int, terms: np.ndarray) -> np.ndarray:
+def log_bump(squared: np.ndarray, pressed: int, terms: structs.ContactTerms) -> np.ndarray:
     """Return the log probability that a segment is pressed, or that it is not."""
-    x = pair_product(gap(squared, terms), (np.asarray(terms[SCALE]), np.asarray(terms[SCALE_LOW])))
+    x = pair_product(gap(squared, terms), (np.asarray(terms.scale), np.asarray(terms.scale_low)))
     touching, clear = log_above(x), log_above((-x[0], -x[1]))
-    hit, no_hit = (HIT_TERM, FALSE_TERM) if pressed else (MISS_TERM, NO_HIT_TERM)
-    return either(terms[hit] + touching, terms[no_hit] + clear)
+    hit, no_hit = (terms.log_contact, terms.log_false) if pressed else (terms.log_missed, terms.log_quiet)
+    return either(hit + touching, no_hit + clear)
 
 
 def score_contact(
     flags: frozenset[str], table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
-    point: np.ndarray, point_low: np.ndarray, start: np.ndarray, pressed: np.ndarray, terms: np.ndarray,
+    point: np.ndarray, point_low: np.ndarray, start: np.ndarray, pressed: np.ndarray, terms: structs.ContactTerms,
     log_p: np.ndarray, window: structs.Window, particles: int, segments: int, guard: float, temperature: float,
 ) -> None:  # fmt: skip
     """Sum log p over segments; segment s has the points start[s] to start[s + 1] - 1."""
-    total = np.zeros(particles, terms.dtype)
+    total = np.zeros(particles, point.dtype)
     sensor_pose, low = pose[:particles, None], pose_low[: particles if "TWO_PART_POINTS" in flags else 1, None]
     for s in range(segments):
         nearest = np.full(particles, NO_OBSTACLE, np.int32)

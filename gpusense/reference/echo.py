@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.interface import structs
-from gpusense.interface.constants import MIXTURE_TERMS
 from gpusense.reference.ranges import BLOCK, caster_of
 from gpusense.reference.ray import Ray, crossed, expected_range, make_ray, off_grid
 
@@ -50,10 +49,12 @@ def hit_normal(
     return np.where(((t == 0) & is_wall(start_normal))[:, None], start_normal, later)
 
 
-def incidence_terms(terms: np.ndarray, edges: np.ndarray, incidence_bins: int, cosine: np.ndarray) -> np.ndarray:
-    """Return (14, ...) terms of the mixture for angles of incidence; edges are cosines of the bins' upper ends."""
+def incidence_terms(
+    terms: structs.MixtureTerms, edges: np.ndarray, incidence_bins: int, cosine: np.ndarray
+) -> structs.MixtureTerms:
+    """Return the terms of the mixture for angles of incidence; edges are cosines of the bins' upper ends."""
     bins = (cosine[..., None] <= edges[: incidence_bins - 1]).sum(axis=-1)
-    return np.moveaxis(terms[: MIXTURE_TERMS * incidence_bins].reshape(incidence_bins, MIXTURE_TERMS)[bins], -1, 0)
+    return structs.MixtureTerms(*(np.asarray(column)[bins] for column in terms))
 
 
 def nearest_echo(

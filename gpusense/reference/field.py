@@ -19,7 +19,7 @@ BLOCK = 1 << 18
 
 def score_field(
     flags: frozenset[str], table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
-    point: np.ndarray, point_low: np.ndarray, terms: np.ndarray, start: np.ndarray, constant_terms: np.ndarray,
+    point: np.ndarray, point_low: np.ndarray, terms: structs.FieldTerms, start: np.ndarray, constant_terms: np.ndarray,
     log_p: np.ndarray, parts: np.ndarray, window: structs.Window, particles: int, readings: int, guard: float,
     score: structs.Score, batch: structs.ScanBatch,
 ) -> None:  # fmt: skip
@@ -49,7 +49,7 @@ def score_field(
 
 def field_blocks(
     flags: frozenset[str], table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
-    point: np.ndarray, point_low: np.ndarray, terms: np.ndarray, guard: np.ndarray, start: np.ndarray,
+    point: np.ndarray, point_low: np.ndarray, terms: structs.FieldTerms, guard: np.ndarray, start: np.ndarray,
     parts: np.ndarray, window: structs.Window, particles: int, readings: int, spread: int, batch: structs.ScanBatch,
 ) -> None:  # fmt: skip
     """Write the sums of blocks of readings to parts[n + block * particles]; on GPUs a work-item takes single blocks."""

@@ -16,21 +16,21 @@ from gpusense.reference.end_point import EndPoint, end_point, field_cell
 from gpusense.reference.error_free import Pair, block_sums
 from gpusense.reference.field import BLOCK
 from gpusense.reference.field_term import bilinear, field_exponent, field_square, log_field
-from gpusense.reference.hit_shape import shape_weight
+from gpusense.reference.hit_shape import shape_of, shape_weight
 from gpusense.reference.scans import particles_of_scans
 
 
-def hit_share(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> np.ndarray:
+def hit_share(flags: frozenset[str], distance: Pair, terms: structs.FieldTerms) -> np.ndarray:
     """Return the share of the hit density in the density at distances."""
     exponent, low = field_exponent(flags, distance, terms)
     if "LINEAR" not in flags:
-        hit = (terms[0] - exponent) + (terms[4] - low)
+        hit = (terms.hit_peak - exponent) + (terms.hit_peak_low - low)
         with np.errstate(over="ignore"):
-            return 1 / (1 + np.exp(terms[2] - hit))
+            return 1 / (1 + np.exp(terms.rand_density - hit))
     if "HIT" not in flags:
         return np.zeros_like(exponent)
-    hit = terms[0] * np.exp(-exponent) * (1 - low)
-    return hit / (hit + terms[2])
+    hit = terms.hit_peak * np.exp(-exponent) * (1 - low)
+    return hit / (hit + terms.rand_density)
 
 
 def distance_slope(
@@ -46,7 +46,7 @@ def distance_slope(
 
 def field_gradient(
     flags: frozenset[str], table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
-    point: np.ndarray, point_low: np.ndarray, terms: np.ndarray, start: np.ndarray, constant_terms: np.ndarray,
+    point: np.ndarray, point_low: np.ndarray, terms: structs.FieldTerms, start: np.ndarray, constant_terms: np.ndarray,
     gradient: np.ndarray, window: structs.Window, particles: int, readings: int, guard: float, mount_x: float,
     mount_y: float, resolution: float, score: structs.Score, batch: structs.ScanBatch,
 ) -> None:  # fmt: skip
@@ -74,12 +74,12 @@ def field_gradient(
         end = end_point(flags, at, low, to, to_low)
         col, row = end.col + pose_cell[part, None, 0], end.row + pose_cell[part, None, 1]
         pair, slope_x, slope_y = distance_slope(flags, table, col, row, end, window)
-        bend = shape_weight(flags, field_square(flags, pair, terms)[0], terms[6:8])
-        log_p, weight = log_field(flags, pair, terms), 2 * terms[1] * hit_share(flags, pair, terms) * bend
+        bend = shape_weight(flags, field_square(flags, pair, terms)[0], shape_of(terms))
+        log_p, weight = log_field(flags, pair, terms), 2 * terms.square_scale * hit_share(flags, pair, terms) * bend
         distance, x, y = pair[0], to[..., 0], to[..., 1]
         if "ALL_READINGS" in flags:
             length = to[..., 0]
-            log_p = np.where(np.isnan(length), 0, np.where(np.isinf(length), terms[3], log_p)).astype(terms.dtype)
+            log_p = np.where(np.isnan(length), 0, np.where(np.isinf(length), terms.z_max, log_p)).astype(table.dtype)
             weight, distance, slope_x, slope_y, x, y = (
                 np.where(np.isfinite(length), number, 0) for number in (weight, distance, slope_x, slope_y, x, y)
             )

@@ -11,7 +11,7 @@ import numpy as np
 from gpusense.interface import structs
 from gpusense.reference.end_point import EndPoint, end_point, field_cell
 from gpusense.reference.error_free import Pair, pair_product, pair_sum
-from gpusense.reference.hit_shape import shape_exponent
+from gpusense.reference.hit_shape import shape_exponent, shape_of
 
 
 def between(flags: frozenset[str], weight_a: Pair, a: Pair, weight_b: Pair, b: Pair) -> Pair:
@@ -35,38 +35,36 @@ def bilinear(
     return between(flags, end.to_next_y, low, end.rest_y, high)
 
 
-def field_square(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> Pair:
+def field_square(flags: frozenset[str], distance: Pair, terms: structs.FieldTerms) -> Pair:
     """Return the exponent of a normal in two parts, since for a high peak exponent and log peak nearly cancel.
 
-    ``terms`` = (hit, 1 / (2 sigma^2), rand, log z_max, the low parts of terms 0 and 1, two numbers of the shape of a
-    hit). hit is the peak of its density, z_hit / (sigma sqrt(2 pi)) for a normal, and rand is z_rand / range_max, or
-    their logarithms in the log domain.
+    ``hit_peak`` and ``rand_density`` are logarithms in the log domain.
     """
     if "EXACT_EXPONENT" in flags:
-        return pair_product(pair_product(distance, distance), (terms[1], terms[5]))
-    return distance[0] * (distance[0] * terms[1]), np.zeros_like(distance[0])
+        return pair_product(pair_product(distance, distance), (terms.square_scale, terms.square_scale_low))
+    return distance[0] * (distance[0] * terms.square_scale), np.zeros_like(distance[0])
 
 
-def field_exponent(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> Pair:
+def field_exponent(flags: frozenset[str], distance: Pair, terms: structs.FieldTerms) -> Pair:
     """Return the exponent of the density of a hit in two parts."""
-    return shape_exponent(flags, field_square(flags, distance, terms), terms[6:8])
+    return shape_exponent(flags, field_square(flags, distance, terms), shape_of(terms))
 
 
-def log_field(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> np.ndarray:
+def log_field(flags: frozenset[str], distance: Pair, terms: structs.FieldTerms) -> np.ndarray:
     """Return log p of distances from end points to the nearest obstacle."""
     exponent, low = field_exponent(flags, distance, terms)
     if "LINEAR" not in flags:
-        hit = (terms[0] - exponent) + (terms[4] - low)
-        return np.logaddexp(hit, terms[2]) if "RAND" in flags else hit
-    p = np.full(exponent.shape, terms[2])
+        hit = (terms.hit_peak - exponent) + (terms.hit_peak_low - low)
+        return np.logaddexp(hit, terms.rand_density) if "RAND" in flags else hit
+    p = np.full(exponent.shape, terms.rand_density)
     if "HIT" in flags:
-        p += terms[0] * np.exp(-exponent) * (1 - low)
+        p += terms.hit_peak * np.exp(-exponent) * (1 - low)
     return np.log(p)
 
 
 def reading_value(
     flags: frozenset[str], table: np.ndarray, origin: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
-    point: np.ndarray, point_low: np.ndarray, terms: np.ndarray, window: structs.Window,
+    point: np.ndarray, point_low: np.ndarray, terms: structs.FieldTerms, window: structs.Window,
 ) -> np.ndarray:  # fmt: skip
     """Return the terms of readings: (M, 1, ...) poses and their cells with (1, K, 2) points give (M, K) terms."""
     end = end_point(flags, pose, pose_low, point, point_low)
@@ -78,5 +76,5 @@ def reading_value(
         term = term if "LOG_TABLE" in flags else log_field(flags, (term, np.zeros_like(term)), terms)
     if "ALL_READINGS" in flags:
         x = point[..., 0]
-        term = np.where(np.isnan(x), 0, np.where(np.isinf(x), terms[3], term)).astype(terms.dtype)
+        term = np.where(np.isnan(x), 0, np.where(np.isinf(x), terms.z_max, term)).astype(table.dtype)
     return term

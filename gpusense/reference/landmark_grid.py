@@ -61,7 +61,7 @@ def may_match(
 
 def log_match(
     flags: frozenset[str], off: Quad, turned: Quad, feature: np.ndarray, normal: np.ndarray, signature: np.ndarray,
-    j: np.ndarray, terms: np.ndarray, arcs: np.ndarray,
+    j: np.ndarray, terms: structs.FeatureTerms, arcs: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """Return ``log(z_detect p(f | j))`` of one feature at the offsets of landmarks j."""
     if "LINE" in flags:
@@ -71,13 +71,14 @@ def log_match(
 
 def search(
     flags: frozenset[str], landmark: np.ndarray, normal: np.ndarray, signature: np.ndarray, start: np.ndarray,
-    place: Quad, turned: Quad, feature: np.ndarray, terms: np.ndarray, arcs: np.ndarray, buckets: structs.Buckets,
+    place: Quad, turned: Quad, feature: np.ndarray, terms: structs.FeatureTerms, arcs: np.ndarray,
+    buckets: structs.Buckets,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Return per particle the log density, the log density of the likeliest landmark, and its index.
 
     The log density belongs to the likeliest landmark or, if MARGINAL, to all landmarks.
     """
-    real, particles = terms.dtype, len(place[0])
+    real, particles = place[0].dtype, len(place[0])
     best, chosen = np.full(particles, -np.inf, real), np.full(particles, -1, np.int32)
     if feature[RADIUS] < 0:
         return best, best, chosen

@@ -71,9 +71,9 @@ def best_set(sums: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def joint_features(
     flags: frozenset[str], landmark: np.ndarray, normal: np.ndarray, signature: np.ndarray, pose_cell: np.ndarray,
-    pose: np.ndarray, pose_low: np.ndarray, feature: np.ndarray, terms: np.ndarray, arcs: np.ndarray, best: np.ndarray,
-    choice: np.ndarray, value: np.ndarray, log_p: np.ndarray, parts: np.ndarray, which: np.ndarray, landmarks: int,
-    particles: int, features: int, sets: int, buckets: structs.Buckets, score: structs.Score,
+    pose: np.ndarray, pose_low: np.ndarray, feature: np.ndarray, terms: structs.FeatureTerms, arcs: np.ndarray,
+    best: np.ndarray, choice: np.ndarray, value: np.ndarray, log_p: np.ndarray, parts: np.ndarray, which: np.ndarray,
+    landmarks: int, particles: int, features: int, sets: int, buckets: structs.Buckets, score: structs.Score,
 ) -> None:  # fmt: skip
     """Find the best joint association of each particle.
 

@@ -20,7 +20,7 @@ BLOCK = 1 << 14
 def score_features(
     flags: frozenset[str], landmark: np.ndarray, normal: np.ndarray, signature: np.ndarray, start: np.ndarray,
     pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray, feature: np.ndarray, partner: np.ndarray,
-    terms: np.ndarray, arcs: np.ndarray, log_p: np.ndarray, parts: np.ndarray, which: np.ndarray,
+    terms: structs.FeatureTerms, arcs: np.ndarray, log_p: np.ndarray, parts: np.ndarray, which: np.ndarray,
     buckets: structs.Buckets, landmarks: int, particles: int, features: int, share: float, score: structs.Score,
 ) -> None:  # fmt: skip
     """Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one.

@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import erf
 
+from gpusense.interface import structs
 from gpusense.interface.feature_layout import (
     ARC_STEPS,
     BEARING_SCALE,
@@ -123,13 +124,13 @@ def angle_pair(side: Pair, ahead: Pair, arcs: np.ndarray) -> Pair:
     return negative_where(np.signbit(side[0]), arc)
 
 
-def range_mass(d: Pair, scale: float, terms: np.ndarray) -> np.ndarray:
+def range_mass(d: Pair, scale: float, terms: structs.FeatureTerms) -> np.ndarray:
     """Return the mass of the normal around d on [0, range_max]; d is clamped to range_max."""
-    above = np.maximum((terms[0] - d[0]) + (terms[1] - d[1]), 0)
-    return d[0].dtype.type(0.5) * (erf(np.minimum(d[0], terms[0]) * scale) + erf(above * scale))
+    above = np.maximum((terms.range_max - d[0]) + (terms.range_max_low - d[1]), 0)
+    return d[0].dtype.type(0.5) * (erf(np.minimum(d[0], terms.range_max) * scale) + erf(above * scale))
 
 
-def field_mass(angle: Pair, upper: float, upper_low: np.floating, scale: np.floating, terms: np.ndarray,
+def field_mass(angle: Pair, upper: float, upper_low: np.floating, scale: np.floating, terms: structs.FeatureTerms,
                arcs: np.ndarray) -> np.ndarray:  # fmt: skip
     """Return the mass of the normal around a landmark's bearing on the field of view.
 
@@ -138,10 +139,10 @@ def field_mass(angle: Pair, upper: float, upper_low: np.floating, scale: np.floa
     """
     half, whole = arcs[ARC_STEPS + 2, 0], 2 * arcs[ARC_STEPS + 2, 0]
     left = (upper - angle[0]) + (upper_low - angle[1])
-    middle = terms[2] / 2
+    middle = terms.field_of_view / 2
     left = np.where(middle - left > half, left + whole, np.where(middle - left < -half, left - whole, left))
-    left = np.clip(left, 0, terms[2])
-    right = terms[2] - left
+    left = np.clip(left, 0, terms.field_of_view)
+    right = terms.field_of_view - left
     mass = erf(np.minimum(left, half) * scale) + erf(np.minimum(right, half) * scale)
     for side in (left, right):
         mass = mass + np.where(side > half, erf(half * scale) - erf((whole - side) * scale), 0)
@@ -157,11 +158,11 @@ def add_square(total: Pair, residual: Pair, scale: float, scale_low: np.floating
 
 
 def log_detection(
-    flags: frozenset[str], off: Quad, turned: Quad, feature: np.ndarray, signature: np.ndarray, terms: np.ndarray,
-    arcs: np.ndarray,
+    flags: frozenset[str], off: Quad, turned: Quad, feature: np.ndarray, signature: np.ndarray,
+    terms: structs.FeatureTerms, arcs: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """Return ``log(z_detect p(f | j))`` of one feature at each offset; signature is (s_j, low part, -log m_s, 0)."""
-    real = terms.dtype
+    real = off[0].dtype
     zero = np.zeros(len(off[0]), real)
     exponent, mass, norm = (zero, zero), np.ones(len(zero), real), zero
     d = distance_pair(off)
@@ -173,13 +174,13 @@ def log_detection(
     if "BEARING" in flags and feature[BEARING_SCALE] > 0:
         angle = angle_pair(across(off, turned), along(off, turned), arcs)
         squared = add_square(exponent, angle, feature[BEARING_SCALE], feature[BEARING_SCALE_LOW])
-        # At zero range the density is 1 / field: the peak times terms[3] and the scale.
+        # At zero range the density is 1 / field: the peak times zero_range_density and the scale.
         has_bearing = d[0] > real.type(ZERO_RANGE)
         exponent = where_pair(has_bearing, squared, exponent)
         mass_in_field = real.type(1)
         if "FIELD" in flags:
             mass_in_field = field_mass(angle, feature[UPPER], feature[UPPER_LOW], feature[BEARING_SCALE], terms, arcs)
-        mass = mass * np.where(has_bearing, mass_in_field, terms[3] * feature[BEARING_SCALE])
+        mass = mass * np.where(has_bearing, mass_in_field, terms.zero_range_density * feature[BEARING_SCALE])
     if "SIGNATURE" in flags and feature[SIGNATURE_SCALE] > 0:
         s = two_sum(feature[SIGNATURE_AT], -signature[:, 0])
         s = two_sum(s[0], s[1] + (feature[SIGNATURE_LOW] - signature[:, 1]))

@@ -1,11 +1,10 @@
 """Sums over pairs of reading and expected range from which the beam model's parameters are learned (book table 6.2).
 
-``terms`` are the mixture's in the log domain; 1 / sigma, and sigma times the peak of an untruncated hit, replace the
-first two numbers for last_range. A pair whose reading is NaN is padding. The mean of p_hit is z* + range_bias, clamped
-to [0, range_max]; obstacles of p_short lie before z*. r are the responsibilities e_hit, e_short and e_rand of the book.
-With u = (z - mean) / sigma, the distances x_0 = mean / sigma and x_1 = (range_max - mean) / sigma to the ends, phi the
-untruncated density, W = E' the weight of the shape of a hit (1 for a normal), B = -E'' / W^2 (0 for a normal), M the
-mass between the ends and
+``terms`` are in the log domain, with inverse_sigma and unit_peak. A pair whose reading is NaN is padding. The mean of
+p_hit is z* + range_bias, clamped to [0, range_max]; obstacles of p_short lie before z*. r are the responsibilities
+e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances x_0 = mean / sigma and x_1 =
+(range_max - mean) / sigma to the ends, phi the untruncated density, W = E' the weight of the shape of a hit (1 for a
+normal), B = -E'' / W^2 (0 for a normal), M the mass between the ends and
 
     T = (x_0 phi_0 + x_1 phi_1) / M,    P = (phi_1 - phi_0) / M,    V = (W_0 x_0 phi_0 + W_1 x_1 phi_1) / M,
     Q = (W_1 x_1^2 phi_1 - W_0 x_0^2 phi_0) / M + P T,    U = (W_0 x_0^3 phi_0 + W_1 x_1^3 phi_1) / M,
@@ -24,9 +23,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.reference.error_free import add_term
-from gpusense.reference.hit_shape import shape_bend, shape_exponent, shape_weight
+from gpusense.reference.hit_shape import shape_bend, shape_exponent, shape_of, shape_weight
 from gpusense.reference.mixture import (
     above_mean,
     hit_offset,
@@ -39,35 +39,36 @@ from gpusense.reference.mixture import (
 
 
 def responsibilities(
-    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray
+    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return log p(z | z*) and the responsibilities of hit, short and rand, 0 where the density is 0."""
     hit, shorter = log_hit(flags, z, expected, terms), log_short(z, expected, terms)
-    largest = np.maximum(np.maximum(hit, shorter), terms[5])
+    largest = np.maximum(np.maximum(hit, shorter), terms.rand_density)
     shift = np.where(np.isinf(largest), 0, largest)
-    p_hit, p_short, p_rand = np.exp(hit - shift), np.exp(shorter - shift), np.exp(terms[5] - shift)
+    p_hit, p_short, p_rand = np.exp(hit - shift), np.exp(shorter - shift), np.exp(terms.rand_density - shift)
     p = np.where(np.isinf(largest), 1, p_hit + p_short + p_rand)
     return largest + np.log(p), p_hit / p, p_short / p, p_rand / p
 
 
-def hit_phi(flags: frozenset[str], x: np.ndarray, terms: np.ndarray) -> np.ndarray:
+def hit_phi(flags: frozenset[str], x: np.ndarray, terms: structs.MixtureTerms) -> np.ndarray:
     """Return the untruncated density of a hit at a distance of x scales, times sigma."""
-    t = terms.dtype.type(0.5) * x * x
-    density: np.ndarray = terms[15] * np.exp(-shape_exponent(flags, (t, np.zeros_like(t)), terms[17:19])[0])
+    t = x.dtype.type(0.5) * x * x
+    exponent = shape_exponent(flags, (t, np.zeros_like(t)), shape_of(terms))[0]
+    density: np.ndarray = terms.unit_peak * np.exp(-exponent)
     return density
 
 
 def hit_slopes(
-    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray
+    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return W u^2, and the derivatives h_s, h_m, h_ss, h_sm and h_mm of log p_hit of pairs."""
     mean, above = mean_range(flags, expected, terms), above_mean(flags, expected, terms)
-    numbers, half = terms[17:19], terms.dtype.type(0.5)
-    u, x_0, x_1 = hit_offset(flags, z, expected, terms)[0] * terms[14], mean * terms[14], above * terms[14]
+    numbers, half, scale = shape_of(terms), z.dtype.type(0.5), terms.inverse_sigma
+    u, x_0, x_1 = hit_offset(flags, z, expected, terms)[0] * scale, mean * scale, above * scale
     weight = shape_weight(flags, half * u * u, numbers)
     pull = weight * u
     square = pull * u
-    mass = mass_within(flags, mean, above, terms[2], terms)
+    mass = mass_within(flags, mean, above, terms.erf_scale, terms)
     near = mass < 1
     phi_0, phi_1 = (np.where(near, hit_phi(flags, x, terms) / mass, 0) for x in (x_0, x_1))
     pull_0, pull_1 = (shape_weight(flags, half * x * x, numbers) * x * phi for x, phi in ((x_0, phi_0), (x_1, phi_1)))
@@ -76,22 +77,24 @@ def hit_slopes(
     w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1
     bend = shape_bend(flags, square, numbers)
     # A clamped mean does not move with the bias.
-    moves = mean == expected + terms[10]
+    moves = mean == expected + terms.range_bias
     h_m = np.where(moves, pull + p, 0)
     h_sm = np.where(moves, pull * (bend - 2) - p + q, 0)
     h_mm = np.where(moves, weight * (bend - 1) + pull_0 + pull_1 + p * p, 0)
     return square, square - 1 + t, h_m, square * (bend - 2) - t + w + t * t, h_sm, h_mm
 
 
-def short_slopes(z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def short_slopes(z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives s_l and s_ll of log p_short of pairs."""
-    x = terms[4] * expected
+    x = terms.lambda_short * expected
     f = short_factor(x)
     v = f - x
-    return 1 - v - terms[4] * z, v * (f - 1) - terms[4] * z
+    return 1 - v - terms.lambda_short * z, v * (f - 1) - terms.lambda_short * z
 
 
-def add_pair(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray, sums: np.ndarray) -> None:
+def add_pair(
+    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms, sums: np.ndarray
+) -> None:
     """Return the terms of pairs in the sums, (S, pairs).
 
     log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm, r_hit h_mm, r_short s_ll; r_hit W u^2, r_short
@@ -106,7 +109,7 @@ def add_pair(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: 
     added += [r_hit * h_s, r_hit * h_m, r_short * s_l, r_hit * h_ss, r_hit * h_sm, r_hit * h_mm, r_short * s_ll]
     added += [r_hit * square, r_short * z]
     if "INFORMATION" in flags:
-        added.append(((r_rand > r_hit) & (r_rand > r_short)).astype(terms.dtype))
+        added.append(((r_rand > r_hit) & (r_rand > r_short)).astype(z.dtype))
         y = (r_hit, r_short, r_rand, r_hit * h_s, r_hit * h_m, r_short * s_l)
         added += [y[i] * y[j] for i in range(6) for j in range(i, 6)]
         added += [r_hit * h_s * h_s, r_hit * h_s * h_m, r_hit * h_m * h_m, r_short * s_l * s_l]
@@ -115,15 +118,16 @@ def add_pair(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: 
 
 
 def e_step(
-    flags: frozenset[str], reading: np.ndarray, expected: np.ndarray, terms: np.ndarray, sums: np.ndarray, blocks: int,
+    flags: frozenset[str], reading: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms,
+    masses: np.ndarray, sums: np.ndarray, blocks: int,
     readings: int, across: int, along: int, width: int,
 ) -> None:  # fmt: skip
     """Sum over blocks of pairs; pair k of a block is pair block * across + k * along."""
     count = 39 if "INFORMATION" in flags else 13
-    total = (np.zeros((count, blocks), terms.dtype), np.zeros((count, blocks), terms.dtype))
+    total = (np.zeros((count, blocks), reading.dtype), np.zeros((count, blocks), reading.dtype))
     starts = np.arange(blocks) * across
     for first in range(0, readings, BLOCK_TERMS):
-        part = np.zeros((count, blocks), terms.dtype)
+        part = np.zeros((count, blocks), reading.dtype)
         for k in range(first, min(first + BLOCK_TERMS, readings)):
             pairs = starts + k * along
             add_pair(flags, reading[pairs], expected[pairs], terms, part)
@@ -132,7 +136,8 @@ def e_step(
 
 
 def pair_causes(
-    flags: frozenset[str], reading: np.ndarray, expected: np.ndarray, terms: np.ndarray, causes: np.ndarray,
+    flags: frozenset[str], reading: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms,
+    masses: np.ndarray, causes: np.ndarray,
     blocks: int, readings: int, across: int, along: int,
 ) -> None:  # fmt: skip
     """Write log p and the responsibilities of each pair, NaN for padding."""

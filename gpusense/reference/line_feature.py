@@ -17,6 +17,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import erf
 
+from gpusense.interface import structs
 from gpusense.interface.feature_layout import (
     AXIS,
     BEARING_SCALE,
@@ -56,25 +57,25 @@ def overlaps(off: Quad, turned: Quad, feature: np.ndarray, normal: Quad, signatu
     return (cosine >= feature[AXIS]) & beside
 
 
-def distance_mass(d: Pair, scale: float, signature: np.ndarray, terms: np.ndarray) -> np.ndarray:
+def distance_mass(d: Pair, scale: float, signature: np.ndarray, terms: structs.FeatureTerms) -> np.ndarray:
     """Return the mass of the normal around lines' distances d on [0, range_max]; d is clamped to it.
 
     A line that is seen from both sides has two forms, (alpha_j, d) and (alpha_j + pi, -d): together they have the mass
     of d on [-range_max, range_max].
     """
-    lower = np.where(signature[:, 1] > 0, -terms[0], 0).astype(terms.dtype)
-    width = terms[0] - lower
+    lower = np.where(signature[:, 1] > 0, -terms.range_max, 0).astype(d[0].dtype)
+    width = terms.range_max - lower
     below = np.clip((d[0] - lower) + d[1], 0, width)
-    above = np.clip((terms[0] - d[0]) + (terms[1] - d[1]), 0, width)
-    return terms.dtype.type(0.5) * (erf(below * scale) + erf(above * scale))
+    above = np.clip((terms.range_max - d[0]) + (terms.range_max_low - d[1]), 0, width)
+    return d[0].dtype.type(0.5) * (erf(below * scale) + erf(above * scale))
 
 
 def log_line(
-    off: Quad, turned: Quad, feature: np.ndarray, normal: Quad, signature: np.ndarray, terms: np.ndarray,
+    off: Quad, turned: Quad, feature: np.ndarray, normal: Quad, signature: np.ndarray, terms: structs.FeatureTerms,
     arcs: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """Return ``log(z_detect p(f | j))`` of one feature at the offsets of lines' middles."""
-    real = terms.dtype
+    real = off[0].dtype
     zero = np.zeros(len(off[0]), real)
     da = angle_pair(across(turned, normal), along(turned, normal), arcs)
     d = along(off, normal)

@@ -1,11 +1,9 @@
 """Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
 
-``terms`` = (hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of
-terms 0 and 1, range_bias and its low part, sigma_growth / sigma_hit and its low part, three numbers for last_range,
-two numbers of the shape of a hit, the place of the table of its masses, which only kernels read). In the linear domain
-hit is z_hit / (sigma sqrt(2 pi)) for a normal, short is z_short and rand is z_rand / range_max; in the log domain they
-are the logarithms of these. The mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma is sigma_hit +
-sigma_growth z* (GROWTH).
+Causes are numbered as in the book: 1 correct range (hit), 2 unexpected object (short), 3 no return (max), 4 random
+reading (rand). The density has 1, 2 and 4; the caller adds 3. In the linear domain hit_peak, z_short and rand_density
+are densities, in the log domain their logarithms. The mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and
+its sigma is sigma_hit + sigma_growth z* (GROWTH). Masses of hits are computed; only kernels look them up.
 """
 
 from __future__ import annotations
@@ -13,19 +11,20 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import erf
 
+from gpusense.interface import structs
 from gpusense.reference.error_free import Pair, pair_sum, rest_of, two_product, two_sum
-from gpusense.reference.hit_shape import half_mass, shape_exponent
+from gpusense.reference.hit_shape import half_mass, shape_exponent, shape_of
 
 TINY = 1e-30
 SMALLEST_RANGE = 1e-37
 
 
-def last_range(z: np.ndarray, terms: np.ndarray) -> np.ndarray:
+def last_range(z: np.ndarray, terms: structs.MixtureTerms) -> np.ndarray:
     """Return the expected ranges of readings beyond which log p is constant to the last bit.
 
     There log p is that of p_rand, or of p_short far from its end, whatever the distance of the obstacle.
     """
-    return np.maximum(terms[14] + terms[15] * z, terms[16])
+    return np.maximum(terms.last_offset + terms.last_slope * z, terms.last_least)
 
 
 def hit_mass(before: np.ndarray, after: np.ndarray, erf_scale: float | np.ndarray) -> np.ndarray:
@@ -35,56 +34,56 @@ def hit_mass(before: np.ndarray, after: np.ndarray, erf_scale: float | np.ndarra
 
 
 def mass_within(
-    flags: frozenset[str], mean: np.ndarray, above: np.ndarray, scale: np.ndarray, terms: np.ndarray
+    flags: frozenset[str], mean: np.ndarray, above: np.ndarray, scale: np.ndarray, terms: structs.MixtureTerms
 ) -> np.ndarray:
     """Return the mass of a hit of any shape on [0, range_max], given its mean and the distance to range_max."""
     if "MASS_TABLE" not in flags:
         return hit_mass(mean, above, scale)
-    numbers = terms[17:19]
+    numbers = shape_of(terms)
     return half_mass(flags, mean * scale, numbers) + half_mass(flags, above * scale, numbers)
 
 
-def mean_range(flags: frozenset[str], expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
+def mean_range(flags: frozenset[str], expected: np.ndarray, terms: structs.MixtureTerms) -> np.ndarray:
     """Return the mean of p_hit."""
-    return np.clip(expected + terms[10], 0, terms[6]) if "BIAS" in flags else expected
+    return np.clip(expected + terms.range_bias, 0, terms.range_max) if "BIAS" in flags else expected
 
 
-def above_mean(flags: frozenset[str], expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
+def above_mean(flags: frozenset[str], expected: np.ndarray, terms: structs.MixtureTerms) -> np.ndarray:
     """Return the distance from the mean of p_hit to range_max, which keeps its digits where it is short."""
     if "BIAS" not in flags:
-        return terms[6] - expected
-    last, rest = two_sum(terms[6], -terms[10])
-    return np.clip((last - expected) + (rest - terms[11]), 0, terms[6])
+        return terms.range_max - expected
+    last, rest = two_sum(terms.range_max, -terms.range_bias)
+    return np.clip((last - expected) + (rest - terms.range_bias_low), 0, terms.range_max)
 
 
-def hit_offset(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> Pair:
+def hit_offset(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms) -> Pair:
     """Return z minus the mean of p_hit as a sum of two numbers; z, z* and the bias nearly cancel."""
     off = z - expected
     none = np.zeros_like(off)
     if "BIAS" not in flags:
         return off, none
     mean = mean_range(flags, expected, terms)
-    high, low = pair_sum(two_sum(z, -expected), (none - terms[10], none - terms[11]))
-    moved = mean == expected + terms[10]
+    high, low = pair_sum(two_sum(z, -expected), (none - terms.range_bias, none - terms.range_bias_low))
+    moved = mean == expected + terms.range_bias
     return np.where(moved, high, z - mean), np.where(moved, low, none)
 
 
-def hit_scale(flags: frozenset[str], expected: np.ndarray, terms: np.ndarray) -> Pair:
+def hit_scale(flags: frozenset[str], expected: np.ndarray, terms: structs.MixtureTerms) -> Pair:
     """Return sigma_hit / sigma at ranges: the first number times (1 + the second)."""
     one, none = np.ones_like(expected), np.zeros_like(expected)
     if "GROWTH" not in flags:
         return one, none
     if "EXACT_EXPONENT" not in flags:
-        return one / (one + terms[12] * expected), none
-    total = one + terms[12] * expected
+        return one / (one + terms.relative_growth * expected), none
+    total = one + terms.relative_growth * expected
     share = one / total
     # Rounding error of the sum; below 2^24 the sum less 1 is exact.
-    excess = rest_of(terms[12] + none, expected, total - one) - terms[13] * expected
+    excess = rest_of(terms.relative_growth + none, expected, total - one) - terms.relative_growth_low * expected
     return share, rest_of(total, share, one) + excess * share
 
 
 def normal_exponent(
-    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray
+    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ``(z - mean)^2 / (2 sigma^2)`` as a sum of two numbers.
 
@@ -95,30 +94,30 @@ def normal_exponent(
     scale = hit_scale(flags, expected, terms)
     scaled = off * scale[0]
     if "EXACT_EXPONENT" not in flags:
-        return scaled * (scaled * terms[1]), np.zeros_like(off)
+        return scaled * (scaled * terms.square_scale), np.zeros_like(off)
     if "GROWTH" in flags:
         off_low = (off_low * scale[0] + scaled * scale[1]) - rest_of(off, scale[0], scaled)
         off = scaled
     square, square_low = two_product(off, off)
     square_low = square_low + 2 * off * off_low
-    product = two_product(square, terms[1])
-    return product[0], product[1] + (square_low * terms[1] + square * terms[9])
+    product = two_product(square, terms.square_scale)
+    return product[0], product[1] + (square_low * terms.square_scale + square * terms.square_scale_low)
 
 
 def hit_exponent(
-    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray
+    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the exponent of a hit's density as a sum of two numbers."""
-    return shape_exponent(flags, normal_exponent(flags, z, expected, terms), terms[17:19])
+    return shape_exponent(flags, normal_exponent(flags, z, expected, terms), shape_of(terms))
 
 
-def log_hit(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
+def log_hit(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms) -> np.ndarray:
     """Return ``log(z_hit p_hit(z | z*))``; terms are in the log domain."""
     exponent = hit_exponent(flags, z, expected, terms)
     scale = hit_scale(flags, expected, terms)[0]
-    log_p = (terms[0] - exponent[0]) + (terms[8] - exponent[1]) + np.log(scale)
+    log_p = (terms.hit_peak - exponent[0]) + (terms.hit_peak_low - exponent[1]) + np.log(scale)
     mean, above = mean_range(flags, expected, terms), above_mean(flags, expected, terms)
-    return log_p - np.log(mass_within(flags, mean, above, terms[2] * scale, terms))
+    return log_p - np.log(mass_within(flags, mean, above, terms.erf_scale * scale, terms))
 
 
 def short_factor(x: np.ndarray) -> np.ndarray:
@@ -135,35 +134,35 @@ def short_peak(decay: float, expected: np.ndarray) -> np.ndarray:
     return np.where(h > TINY, decay * (1 + t), 1) / np.where(h > TINY, 2 * t, np.maximum(expected, SMALLEST_RANGE))
 
 
-def log_short(z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
+def log_short(z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms) -> np.ndarray:
     """Return ``log(z_short p_short(z | z*))``; terms are in the log domain."""
     inside = (z <= expected) & (expected > 0)
-    log_p = (terms[3] + np.log(short_peak(terms[4], expected))) - terms[4] * z
+    log_p = (terms.z_short + np.log(short_peak(terms.lambda_short, expected))) - terms.lambda_short * z
     return np.where(inside, log_p, -np.inf)
 
 
-def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
+def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms) -> np.ndarray:
     """Return log p(z | z*) of readings in [0, range_max) given expected ranges of the same shape."""
     if "LINEAR" in flags:
         # p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm suffices.
-        p = np.zeros(z.shape, terms.dtype)
+        p = np.zeros(z.shape, z.dtype)
         if "HIT" in flags:
             exponent = hit_exponent(flags, z, expected, terms)
             scale = hit_scale(flags, expected, terms)[0]
             mean, above = mean_range(flags, expected, terms), above_mean(flags, expected, terms)
-            mass = mass_within(flags, mean, above, terms[2] * scale, terms)
-            p += terms[0] * scale * np.exp(-exponent[0]) * (1 - exponent[1]) / mass
+            mass = mass_within(flags, mean, above, terms.erf_scale * scale, terms)
+            p += terms.hit_peak * scale * np.exp(-exponent[0]) * (1 - exponent[1]) / mass
         if "SHORT" in flags:
-            density = terms[3] * np.exp(-terms[4] * z) * short_peak(terms[4], expected)
+            density = terms.z_short * np.exp(-terms.lambda_short * z) * short_peak(terms.lambda_short, expected)
             p += np.where((z <= expected) & (expected > 0), density, 0)
-        return np.log(p + terms[5])
+        return np.log(p + terms.rand_density)
     parts = []
     if "HIT" in flags:
         parts.append(log_hit(flags, z, expected, terms))
     if "SHORT" in flags:
         parts.append(log_short(z, expected, terms))
     if "RAND" in flags:
-        parts.append(np.broadcast_to(terms[5], z.shape))
+        parts.append(np.broadcast_to(terms.rand_density, z.shape))
     if len(parts) == 1:
-        return parts[0].astype(terms.dtype)
-    return np.logaddexp.reduce(parts, axis=0).astype(terms.dtype)
+        return parts[0].astype(z.dtype)
+    return np.logaddexp.reduce(parts, axis=0).astype(z.dtype)

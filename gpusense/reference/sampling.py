@@ -103,11 +103,11 @@ def half_mass(x: np.ndarray) -> np.ndarray:
     return np.where(x < SERIES_END, series, np.where(x < HALF_FROM, 0.5 - tail, 0.5))
 
 
-def polynomial(terms: tuple[float, ...], x: np.ndarray) -> np.ndarray:
+def polynomial(factors: tuple[float, ...], x: np.ndarray) -> np.ndarray:
     """Return a polynomial by Horner's rule, the highest power first."""
-    value = np.full_like(x, terms[0])
-    for term in terms[1:]:
-        value = value * x + term
+    value = np.full_like(x, factors[0])
+    for factor in factors[1:]:
+        value = value * x + factor
     return value
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense.interface.structs import FieldTerms
 from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
 from gpusense.world.hit_shapes import HitShape, shape_of
 from gpusense.world.parameters import LikelihoodFieldParameters
@@ -84,11 +85,16 @@ class FieldDensity:
         """Return whether kernels sum densities rather than logarithms."""
         return sums_linearly(self.rand, self.peak, real)
 
-    def terms(self, real: np.dtype) -> np.ndarray:
-        """Return the numbers of the kernel file ``field_term``, for a sum of densities or of logarithms."""
+    def terms(self, real: np.dtype) -> FieldTerms:
+        """Return the numbers of the kernel file ``field_term``, for a sum of densities or of logarithms.
+
+        Raises:
+            ValueError: Sigma_hit is too small or too large for the precision.
+        """
         hit, rand = (self.peak, self.rand) if self.is_linear(real) else (self.log_peak, self.log_rand)
-        terms = rounded_terms([hit, self.rate, rand, NoReturn(self.parameters.z_max).number], real)
-        return np.append(terms, np.array(self.shape.numbers, real))
+        top, (power, rate) = NoReturn(self.parameters.z_max).number, self.shape.numbers
+        terms = rounded_terms(real, hit_peak=hit, square_scale=self.rate, rand_density=rand, z_max=top)
+        return FieldTerms(**terms, shape_power=power, shape_rate=rate)
 
     def capped(self, distance: Floats) -> Floats:
         """Return distances, clamped to ``max_distance``."""

@@ -43,21 +43,15 @@ class TabulatedHit:
         return getattr(self._shape, name)
 
 
-def mass_tables(shapes: Sequence[HitShape], terms: list[np.ndarray], real: np.dtype) -> list[np.ndarray]:
-    """Return the mass tables that follow the terms of all bins, and write their offsets into the terms.
+def mass_tables(shapes: Sequence[HitShape], real: np.dtype) -> tuple[list[int], np.ndarray]:
+    """Return the place of each shape's table of masses, and all tables one after the other.
 
-    An offset counts from the first term of its bin. Equal shapes share a table.
+    Equal shapes share a table. Shapes without one have place 0, and there is at least one number.
     """
-    tables: dict[HitShape, tuple[int, np.ndarray]] = {}
-    begin = sum(map(len, terms))
-    for number, shape in enumerate(shapes):
-        if not shape.tabulated:
-            continue
-        if shape not in tables:
-            table = mass_table(shape, real)
-            tables[shape] = begin + len(tables) * len(table), table
-        terms[number][-1] = tables[shape][0] - number * len(terms[0])
-    return [table for _, table in tables.values()]
+    different = list(dict.fromkeys(shape for shape in shapes if shape.tabulated))
+    tables = [mass_table(shape, real) for shape in different]
+    begins = {shape: number * len(tables[0]) for number, shape in enumerate(different)}
+    return [begins.get(shape, 0) for shape in shapes], np.concatenate(tables or [np.zeros(1, real)])
 
 
 @functools.lru_cache(maxsize=32)

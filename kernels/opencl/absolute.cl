@@ -11,15 +11,6 @@
 #define VON_MISES 2
 #define WRAPS 3
 #define WAVES 6
-// Terms of a heading: 1 / (sigma sqrt 2) or sqrt(2 kappa), log of z_hit and the peak, log of the uniform part, 2 pi /
-// sigma^2, and from WAVE on 2 q^(n n).
-#define SCALE 0
-#define SCALE_LOW 1
-#define PEAK 2
-#define PEAK_LOW 3
-#define RANDOM 4
-#define DECAY 5
-#define WAVE 6
 // exp(-NEGLIGIBLE) is below half an eps.
 #define NEGLIGIBLE 40
 #define HALF_TURN ((real)3.141592653589793)
@@ -54,32 +45,32 @@ real log_other_turns(const real2 residual, const real decay) {
     return log_one_plus(others);
 }
 
-// Return the log of the ratio of the Fourier series to its first term, by Clenshaw's recurrence.
-real log_waves(const real2 residual, global const real *terms) {
+// Return the log of the ratio of the Fourier series to its first term, by Clenshaw's recurrence; waves are 2 q^(n n).
+real log_waves(const real2 residual, global const real *waves) {
     const real s = half_sine(residual).x, cosine = 1 - 2 * s * s;
     real newer = 0, older = 0;
     for (int n = WAVES; n > 0; --n) {
-        const real next = terms[WAVE + n - 1] + 2 * cosine * newer - older;
+        const real next = waves[n - 1] + 2 * cosine * newer - older;
         older = newer;
         newer = next;
     }
     return log_one_plus(cosine * newer - older);
 }
 
-// Score positions: one work-item takes a particle. terms = {a, b, c, peak}, each followed by its low part, and the log
-// of the uniform part. The exponent is (a x)^2 + (b x + c y)^2, where (x, y) is the offset from the reading to the
-// sensor.
+// Score positions: one work-item takes a particle. The exponent is (x_scale x)^2 + (shear x + y_scale y)^2, where (x, y)
+// is the offset from the reading to the sensor.
 kernel void score_position(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const real2 x = place[n].xy, y = place[n].zw;
-    const real2 a = (real2)(terms[0], terms[1]), b = (real2)(terms[2], terms[3]), c = (real2)(terms[4], terms[5]);
-    const real2 first = bounded_square(pair_product(x, a));
-    const real2 second = bounded_square(pair_sum(pair_product(x, b), pair_product(y, c)));
+    const real2 x_scale = (real2)(terms->x_scale, terms->x_scale_low), y_scale = (real2)(terms->y_scale, terms->y_scale_low);
+    const real2 shear = (real2)(terms->shear, terms->shear_low);
+    const real2 first = bounded_square(pair_product(x, x_scale));
+    const real2 second = bounded_square(pair_sum(pair_product(x, shear), pair_product(y, y_scale)));
     const real2 exponent = pair_sum(first, second);
-    real log_density = (terms[6] - exponent.x) + (terms[7] - exponent.y);
+    real log_density = (terms->peak - exponent.x) + (terms->peak_low - exponent.y);
 #if RAND
-    log_density = either(log_density, terms[8]);
+    log_density = either(log_density, terms->random);
 #endif
     log_p[n] = temperature * log_density;
 }
@@ -91,15 +82,15 @@ kernel void score_heading(ARGUMENTS) {
     const real2 r = residual[n];
     real log_density;
     if (kind == SERIES) {
-        log_density = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms));
+        log_density = terms->peak + (terms->peak_low + log_waves(r, waves));
     } else {
         const real2 root = kind == VON_MISES ? half_sine(r) : r;
-        const real2 exponent = bounded_square(pair_product(root, (real2)(terms[SCALE], terms[SCALE_LOW])));
-        log_density = (terms[PEAK] - exponent.x) + (terms[PEAK_LOW] - exponent.y);
-        if (kind == NEARBY) log_density += log_other_turns(r, terms[DECAY]);
+        const real2 exponent = bounded_square(pair_product(root, (real2)(terms->scale, terms->scale_low)));
+        log_density = (terms->peak - exponent.x) + (terms->peak_low - exponent.y);
+        if (kind == NEARBY) log_density += log_other_turns(r, terms->decay);
     }
 #if RAND
-    log_density = either(log_density, terms[RANDOM]);
+    log_density = either(log_density, terms->random);
 #endif
     log_p[n] = temperature * log_density;
 }

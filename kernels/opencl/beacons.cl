@@ -10,73 +10,55 @@
 #define TWO_NORMALS 2
 // A beacon has its place (x, its low part, y, its low part), the reading minus the bias with its low part, and the bias.
 #define BEACON 7
-// 1 / (sigma sqrt 2), log of z_hit and the peak, log of the uniform part, range_max; for two normals, scale and peak of
-// the wide one. For a t with peak P: 1 / (sigma sqrt(nu k)) with k = P^(2 / (nu + 1)), log z_hit, and in place
-// of the wide normal: 1 / k, (nu + 1) / 2, 1 / (sigma sqrt nu), the factor of the arc, and 1 for an odd nu.
-#define SCALE 0
-#define SCALE_LOW 1
-#define PEAK 2
-#define PEAK_LOW 3
-#define RANDOM 4
-#define RANGE_MAX 5
-#define WIDE_SCALE 6
-#define WIDE_SCALE_LOW 7
-#define WIDE_PEAK 8
-#define WIDE_PEAK_LOW 9
-#define OFFSET 6
-#define OFFSET_LOW 7
-#define POWER 8
-#define T_SCALE 9
-#define ARC 10
-#define ODD 11
 // From this tangent on an arc is a quarter turn to the last bit; the tangent's square is still finite.
 #define STEEPEST ((real)1e18)
 // From here on the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
 
 // Return the log of a truncated normal; near and far are the distances from its mean to the ends.
-real log_normal(const real2 residual, const real near, const real far, global const real *terms, const int first,
-                const int peak) {
-    const real scale = terms[first], below = near * scale, above = far * scale;
-    const real2 exponent = bounded_square(pair_product(residual, (real2)(scale, terms[first + 1])));
-    const real untruncated = (terms[peak] - exponent.x) + (terms[peak + 1] - exponent.y);
+real log_normal(const real2 residual, const real near, const real far, const real2 scale, const real2 peak) {
+    const real below = near * scale.x, above = far * scale.x;
+    const real2 exponent = bounded_square(pair_product(residual, scale));
+    const real untruncated = (peak.x - exponent.x) + (peak.y - exponent.y);
     if (below > ERF_ONE && above > ERF_ONE) return untruncated;
     return untruncated - log((real)0.5 * (erf(below) + erf(above)));
 }
 
 // Return the mass of a Student t between -t and t; t >= 0 is in units of its scale and sqrt(nu).
-real t_mass(const real any_t, global const real *terms, global const real *series, const int count) {
+real t_mass(const real any_t, global const BeaconTerms *terms, global const real *series, const int count) {
     const real t = any_t < STEEPEST ? any_t : STEEPEST, cosine = 1 / sqrt(1 + t * t), square = cosine * cosine;
     real sum = 0;
     for (int i = count - 1; i >= 0; --i) sum = sum * square + series[i];
-    if (!(terms[ODD] > 0)) return t * cosine * sum;
-    return terms[ARC] * atan(t) + t * cosine * cosine * sum;
+    if (!(terms->odd > 0)) return t * cosine * sum;
+    return terms->arc * atan(t) + t * cosine * cosine * sum;
 }
 
 // Return the log of a truncated Student t. Its argument, (1 + u^2 / nu) / k, includes the peak and is a sum of two
 // numbers; -(nu + 1) / 2 is the factor of its log.
-real log_student_t(const real2 residual, const real near, const real far, global const real *terms,
+real log_student_t(const real2 residual, const real near, const real far, global const BeaconTerms *terms,
                    global const real *series, const int count) {
-    const real2 squared = bounded_square(pair_product(residual, (real2)(terms[SCALE], terms[SCALE_LOW])));
-    const real2 x = pair_sum((real2)(terms[OFFSET], terms[OFFSET_LOW]), squared);
-    const real below = t_mass(near * terms[T_SCALE], terms, series, count);
-    const real above = t_mass(far * terms[T_SCALE], terms, series, count);
-    return (terms[PEAK] - terms[POWER] * (log(x.x) + x.y / x.x)) - log((real)0.5 * (below + above));
+    const real2 squared = bounded_square(pair_product(residual, (real2)(terms->scale, terms->scale_low)));
+    const real2 x = pair_sum((real2)(terms->offset, terms->offset_low), squared);
+    const real below = t_mass(near * terms->t_scale, terms, series, count);
+    const real above = t_mass(far * terms->t_scale, terms, series, count);
+    return (terms->peak - terms->power * (log(x.x) + x.y / x.x)) - log((real)0.5 * (below + above));
 }
 
 // Return log p of one range at a distance.
-real log_range(const real2 d, global const real *beacon, global const real *terms, global const real *series,
+real log_range(const real2 d, global const real *beacon, global const BeaconTerms *terms, global const real *series,
                const int count, const int kind) {
     const real2 first = two_sum(d.x, -beacon[4]), r = two_sum(first.x, first.y + (d.y - beacon[5]));
-    const real near = clamp(d.x + beacon[6], (real)0, terms[RANGE_MAX]), far = terms[RANGE_MAX] - near;
+    const real near = clamp(d.x + beacon[6], (real)0, terms->range_max), far = terms->range_max - near;
     real log_p;
     if (kind == STUDENT_T)
         log_p = log_student_t(r, near, far, terms, series, count);
     else
-        log_p = log_normal(r, near, far, terms, SCALE, PEAK);
-    if (kind == TWO_NORMALS) log_p = either(log_p, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK));
+        log_p = log_normal(r, near, far, (real2)(terms->scale, terms->scale_low), (real2)(terms->peak, terms->peak_low));
+    if (kind == TWO_NORMALS)
+        log_p = either(log_p, log_normal(r, near, far, (real2)(terms->wide_scale, terms->wide_scale_low),
+                                         (real2)(terms->wide_peak, terms->wide_peak_low)));
 #if RAND
-    return either(log_p, terms[RANDOM]);
+    return either(log_p, terms->random);
 #else
     return log_p;
 #endif

@@ -3,7 +3,7 @@
 // requires: error_free caster echo tiles mixture sensor_table compat
 
 // Return the distance in cells to which the ray of a reading is cast.
-real ray_limit(const real z, global const real *terms, const RangeScale scale) {
+real ray_limit(const real z, global const MixtureTerms *terms, const RangeScale scale) {
 #if STOPS
     const real last = last_range(z, terms) / scale.resolution;
     return last < scale.limit ? last : scale.limit;
@@ -25,12 +25,12 @@ real2 cast_beam(global const entry *map_table, global const real2 *normals, cons
 }
 
 // Return the term of one reading in the sum.
-real reading_term(const real z, const real expected, global const real *terms, global const real *sensor,
-                  const MixtureTables tables, const real range_max) {
+real reading_term(const real z, const real expected, global const MixtureTerms *terms, global const real *masses,
+                  global const real *sensor, const MixtureTables tables, const real range_max) {
 #if ALL_READINGS
     if (isnan(z)) return 0;
 #if !SENSOR_TABLE
-    if (isinf(z)) return terms[7];
+    if (isinf(z)) return terms->z_max;
 #endif
 #endif
 #if CUBES
@@ -40,7 +40,7 @@ real reading_term(const real z, const real expected, global const real *terms, g
 #if SENSOR_TABLE
     return tabulated_density(z, expected, sensor, tables, range_max);
 #else
-    return log_density(z, expected, terms);
+    return log_density(z, expected, terms, masses);
 #endif
 #endif
 }
@@ -83,9 +83,9 @@ kernel void score_beams(ARGUMENTS) {
         const real2 expected = cast_beam(map_table, normals, window, pose_cell[n], pose[n], ray, r, cone,
                                          ray_limit(reading[r], terms, scale), caster, scale);
 #if INCIDENCE
-        global const real *bin_terms = incidence_terms(terms, edges, tables.incidence_bins, expected.y);
+        global const MixtureTerms *bin_terms = incidence_terms(terms, edges, tables.incidence_bins, expected.y);
 #else
-        global const real *bin_terms = terms;
+        global const MixtureTerms *bin_terms = terms;
 #endif
 #if SHARED_RAYS
         for (int k = first[r] - begin; k < first[r + 1] - begin; ++k) {
@@ -93,7 +93,8 @@ kernel void score_beams(ARGUMENTS) {
         const int k = r;
         {
 #endif
-            const real term = reading_term(reading[k], expected.x, bin_terms, sensor, tables, scale.range_max);
+            const real term = reading_term(reading[k], expected.x, bin_terms, masses, sensor, tables,
+                                           scale.range_max);
 #if PER_BEAM
             parts[(long)n * readings + k] = term;
 #endif
@@ -154,9 +155,9 @@ kernel void beam_tiles(ARGUMENTS) {
         const real2 expected = cast_beam(map_table, normals, window, cell, sensor_pose, ray, r, cone,
                                          ray_limit(reading[r], terms, scale), caster, scale);
 #if INCIDENCE
-        global const real *bin_terms = incidence_terms(terms, edges, tables.incidence_bins, expected.y);
+        global const MixtureTerms *bin_terms = incidence_terms(terms, edges, tables.incidence_bins, expected.y);
 #else
-        global const real *bin_terms = terms;
+        global const MixtureTerms *bin_terms = terms;
 #endif
 #if SHARED_RAYS
         for (int k = first[r] - begin; k < first[r + 1] - begin; ++k) {
@@ -164,7 +165,8 @@ kernel void beam_tiles(ARGUMENTS) {
         const int k = r;
         {
 #endif
-            const real term = reading_term(reading[k], expected.x, bin_terms, sensor, tables, scale.range_max);
+            const real term = reading_term(reading[k], expected.x, bin_terms, masses, sensor, tables,
+                                           scale.range_max);
 #if STRANDED
             sum += term;
             r += STRANDS;

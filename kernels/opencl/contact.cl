@@ -5,18 +5,6 @@
 // requires: error_free end_point log_terms
 
 #define NO_OBSTACLE 0x7fffffff
-// 1 / (sigma sqrt 2), the gap of touching centres, the cell's side; logs of p_contact and p_false; logs of 1 -
-// p_contact and 1 - p_false.
-#define SCALE 0
-#define SCALE_LOW 1
-#define REACH 2
-#define REACH_LOW 3
-#define SIDE 4
-#define SIDE_LOW 5
-#define HIT_TERM 6
-#define FALSE_TERM 7
-#define MISS_TERM 8
-#define NO_HIT_TERM 9
 // Gap in cells where there is no obstacle.
 #define FAR_CELLS ((real)1e9)
 #define LOG_TWO_ROOT_PI ((real)1.2655121234846454)
@@ -24,15 +12,15 @@
 #define SERIES 12
 
 // Return the gap between outline and obstacle, negative where they overlap; the squared distance is in cells.
-real2 gap(const int squared, global const real *terms) {
+real2 gap(const int squared, global const ContactTerms *terms) {
     const real2 whole = two_sum((real)(squared >> 12) * 4096, (real)(squared & 4095));
     const real d = sqrt(whole.x);
     const real2 dd = two_product(d, d);
     const real low = d > 0 ? ((whole.x - dd.x) + (whole.y - dd.y)) / (2 * d) : (real)0;
     const real2 cells = squared == NO_OBSTACLE ? (real2)(FAR_CELLS, 0) : (real2)(d, low);
-    const real2 away = pair_product(cells, (real2)(terms[SIDE], terms[SIDE_LOW]));
-    const real2 left = two_sum(away.x, -terms[REACH]);
-    return two_sum(left.x, left.y + (away.y - terms[REACH_LOW]));
+    const real2 away = pair_product(cells, (real2)(terms->side, terms->side_low));
+    const real2 left = two_sum(away.x, -terms->reach);
+    return two_sum(left.x, left.y + (away.y - terms->reach_low));
 }
 
 // Return log(erfc(x) / 2), by an asymptotic series where erfc nearly underflows.
@@ -46,11 +34,11 @@ real log_above(const real2 x) {
 }
 
 // Return the log probability that a segment is pressed, or that it is not.
-real log_bump(const int squared, const int pressed, global const real *terms) {
-    const real2 x = pair_product(gap(squared, terms), (real2)(terms[SCALE], terms[SCALE_LOW]));
+real log_bump(const int squared, const int pressed, global const ContactTerms *terms) {
+    const real2 x = pair_product(gap(squared, terms), (real2)(terms->scale, terms->scale_low));
     const real touching = log_above(x), clear = log_above(-x);
-    const real hit = pressed ? terms[HIT_TERM] : terms[MISS_TERM];
-    const real no_hit = pressed ? terms[FALSE_TERM] : terms[NO_HIT_TERM];
+    const real hit = pressed ? terms->log_contact : terms->log_missed;
+    const real no_hit = pressed ? terms->log_false : terms->log_quiet;
     return either(hit + touching, no_hit + clear);
 }
 

@@ -43,11 +43,11 @@ real2 hit_normal(global const real2 *normals, const Window window, const int2 ce
 }
 
 // Return the terms of the mixture for the bin of an angle of incidence; edges are cosines of the bins' upper ends.
-global const real *incidence_terms(global const real *terms, global const real *edges, const int incidence_bins,
-                                   const real cosine) {
+global const MixtureTerms *incidence_terms(global const MixtureTerms *terms, global const real *edges,
+                                           const int incidence_bins, const real cosine) {
     int bin = 0;
     while (bin + 1 < incidence_bins && cosine <= edges[bin]) ++bin;
-    return terms + MIXTURE_TERMS * bin;
+    return terms + bin;
 }
 #endif
 

@@ -114,7 +114,7 @@ kernel void field_blocks(ARGUMENTS) {
     for (int block = (item / GROUP) & ((1 << spread) - 1); block * BLOCK_TERMS < size; block += 1 << spread) {
         const int begin = block * BLOCK_TERMS, end = min(begin + BLOCK_TERMS, size);
 #if ROUNDED_CELLS
-        const real sum = rounded_block(table, origin, sensor_pose, low, point, point_low, begin, end, terms[3], window,
+        const real sum = rounded_block(table, origin, sensor_pose, low, point, point_low, begin, end, terms->z_max, window,
                                        guard[block]);
 #else
         real sum = 0;

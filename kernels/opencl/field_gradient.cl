@@ -7,18 +7,18 @@
 #define GRADIENT_NUMBERS 13
 
 // Return the share of the hit density in the density at a distance.
-real hit_share(const real2 distance, global const real *terms) {
+real hit_share(const real2 distance, global const FieldTerms *terms) {
     const real2 exponent = field_exponent(distance, terms);
 #if LINEAR
 #if HIT
-    const real hit = terms[0] * exp(-exponent.x) * (1 - exponent.y);
-    return hit / (hit + terms[2]);
+    const real hit = terms->hit_peak * exp(-exponent.x) * (1 - exponent.y);
+    return hit / (hit + terms->rand_density);
 #else
     return 0;
 #endif
 #else
-    const real hit = (terms[0] - exponent.x) + (terms[4] - exponent.y);
-    return 1 / (1 + exp(terms[2] - hit));
+    const real hit = (terms->hit_peak - exponent.x) + (terms->hit_peak_low - exponent.y);
+    return 1 / (1 + exp(terms->rand_density - hit));
 #endif
 }
 
@@ -76,7 +76,7 @@ kernel void field_gradient(ARGUMENTS) {
         const real2 to = point[k];
 #if ALL_READINGS
         if (!isfinite(to.x)) {
-            if (isinf(to.x)) total = add_term(total, terms[3]);
+            if (isinf(to.x)) total = add_term(total, terms->z_max);
             continue;
         }
 #endif
@@ -84,8 +84,8 @@ kernel void field_gradient(ARGUMENTS) {
         const real4 slope = distance_slope(table, origin + end.cell, end, window);
         const real2 distance = (real2)(slope.x, slope.y);
         total = add_term(total, log_field(distance, terms));
-        const real bend = shape_weight(field_square(distance, terms).x, terms[6], terms[7]);
-        const real weight = 2 * terms[1] * hit_share(distance, terms) * bend;
+        const real bend = shape_weight(field_square(distance, terms).x, terms->shape_power, terms->shape_rate);
+        const real weight = 2 * terms->square_scale * hit_share(distance, terms) * bend;
         add_slope(sums, slope, weight, at, to + (real2)(mount_x, mount_y), resolution);
     }
     global real *out = gradient + (long)GRADIENT_NUMBERS * n;

@@ -24,38 +24,36 @@ real2 bilinear(global const real *table, const int2 cell, const EndPoint end, co
 #endif
 
 #if !LOG_TABLE
-// Return the exponent of a normal in two parts, since for a high peak exponent and log peak nearly cancel. terms[8]
-// = {hit, 1 / (2 sigma^2), rand, log z_max, the low parts of terms 0 and 1, two numbers of the shape of a hit}. hit is
-// the peak of its density, z_hit / (sigma sqrt(2 pi)) for a normal, and rand is z_rand / range_max, or their logarithms
-// in the log domain.
-real2 field_square(const real2 distance, global const real *terms) {
+// Return the exponent of a normal in two parts, since for a high peak exponent and log peak nearly cancel. The
+// numbers are FieldTerms of the signature table; hit_peak and rand_density are logarithms in the log domain.
+real2 field_square(const real2 distance, global const FieldTerms *terms) {
 #if EXACT_EXPONENT
-    return pair_product(pair_product(distance, distance), (real2)(terms[1], terms[5]));
+    return pair_product(pair_product(distance, distance), (real2)(terms->square_scale, terms->square_scale_low));
 #else
-    return (real2)(distance.x * (distance.x * terms[1]), 0);
+    return (real2)(distance.x * (distance.x * terms->square_scale), 0);
 #endif
 }
 
 // Return the exponent of the density of a hit in two parts.
-real2 field_exponent(const real2 distance, global const real *terms) {
-    return shape_exponent(field_square(distance, terms), terms[6], terms[7]);
+real2 field_exponent(const real2 distance, global const FieldTerms *terms) {
+    return shape_exponent(field_square(distance, terms), terms->shape_power, terms->shape_rate);
 }
 
 // Return log p of the distance from an end point to the nearest obstacle. If z_rand is 0, the logarithm belongs to a
 // hit alone.
-real log_field(const real2 distance, global const real *terms) {
+real log_field(const real2 distance, global const FieldTerms *terms) {
     const real2 exponent = field_exponent(distance, terms);
 #if LINEAR
-    real p = terms[2];
+    real p = terms->rand_density;
 #if HIT
-    p += terms[0] * exp(-exponent.x) * (1 - exponent.y);
+    p += terms->hit_peak * exp(-exponent.x) * (1 - exponent.y);
 #endif
     return log(p);
 #else
-    const real hit = (terms[0] - exponent.x) + (terms[4] - exponent.y);
+    const real hit = (terms->hit_peak - exponent.x) + (terms->hit_peak_low - exponent.y);
 #if RAND
-    const real largest = fmax(hit, terms[2]);
-    return largest + log(exp(hit - largest) + exp(terms[2] - largest));
+    const real largest = fmax(hit, terms->rand_density);
+    return largest + log(exp(hit - largest) + exp(terms->rand_density - largest));
 #else
     return hit;
 #endif
@@ -66,10 +64,10 @@ real log_field(const real2 distance, global const real *terms) {
 // Return the term of one reading. The table holds log densities, or cubes of densities (CUBES), or, where it is
 // interpolated, capped distances in metres.
 real reading_value(global const real *table, const int2 origin, const real4 pose, const real4 low, const real2 point,
-                   const real2 point_low, global const real *terms, const Window window, const real guard) {
+                   const real2 point_low, global const FieldTerms *terms, const Window window, const real guard) {
 #if ALL_READINGS
     if (isnan(point.x)) return 0;
-    if (isinf(point.x)) return terms[3];
+    if (isinf(point.x)) return terms->z_max;
 #endif
 #if BILINEAR
     const EndPoint end = end_point(pose, low, point, point_low, (real)0.5, guard);

@@ -53,7 +53,7 @@ int may_match(const real4 off, const real4 turned, global const real *feature, g
 
 // Return log(z_detect p(f | j)) of one feature at the offset of landmark j.
 real log_match(const real4 off, const real4 turned, global const real *feature, global const real4 *normal,
-               global const real4 *signature, const int j, global const real *terms, global const real2 *arcs) {
+               global const real4 *signature, const int j, global const FeatureTerms *terms, global const real2 *arcs) {
 #if LINE
     return log_line(off, turned, feature, facing(normal[j], signature[j], turned), signature[j], terms, arcs);
 #else
@@ -84,7 +84,7 @@ Match with_landmark(Match match, real2 *sum, const real log_p, const int j) {
 // Return the match of a feature among the landmarks within its disc.
 Match search(global const real4 *landmark, global const real4 *normal, global const real4 *signature,
              global const int *start, const real4 place, const real4 turned, global const real *feature,
-             global const real *terms, global const real2 *arcs, const Buckets buckets) {
+             global const FeatureTerms *terms, global const real2 *arcs, const Buckets buckets) {
     Match match = {-INFINITY, -INFINITY, -1};
     real2 sum = 0;
     const real reach = feature[REACH], radius = feature[RADIUS];

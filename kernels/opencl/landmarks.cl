@@ -5,8 +5,7 @@
 // Components that were not measured are left out. Positions, directions and quantities derived from them are sums of
 // two numbers, since a relative error of eps in a distance of 20 m is too large for a deviation of 1 cm. A feature is
 // FEATURE numbers, named below, in the same order in all three languages. A place is (x, its low part, y, its low
-// part), and so are an offset and a direction. terms[4] = {range_max, its low part, field of view, density of a bearing
-// at zero range relative to its peak and scale}.
+// part), and so are an offset and a direction. The sensor's numbers are FeatureTerms of the signature table.
 // requires: error_free log_terms offsets
 
 // Range; cosine and sine of the bearing on the robot; signature.
@@ -123,9 +122,9 @@ real2 angle_pair(const real2 side, const real2 ahead, global const real2 *arcs) 
 
 #if RANGE
 // Return the mass of the normal around d on [0, range_max]; d is clamped to range_max.
-real range_mass(const real2 d, const real scale, global const real *terms) {
-    const real below = fmin(d.x, terms[0]) * scale;
-    const real above = fmax((terms[0] - d.x) + (terms[1] - d.y), (real)0) * scale;
+real range_mass(const real2 d, const real scale, global const FeatureTerms *terms) {
+    const real below = fmin(d.x, terms->range_max) * scale;
+    const real above = fmax((terms->range_max - d.x) + (terms->range_max_low - d.y), (real)0) * scale;
     if (below > ERF_ONE && above > ERF_ONE) return 1;
     return (real)0.5 * (erf(below) + erf(above));
 }
@@ -134,9 +133,9 @@ real range_mass(const real2 d, const real scale, global const real *terms) {
 #if FIELD
 // Return the mass of the normal around a landmark's bearing on the field of view; the bearing is clamped to its ends.
 // Parts of the field more than half a turn away from the landmark are nearer in the other direction.
-real field_mass(const real2 angle, const real upper, const real upper_low, const real scale, global const real *terms,
-                global const real2 *arcs) {
-    const real half_turn = arcs[ARC_STEPS + 2].x, whole = 2 * half_turn, field = terms[2];
+real field_mass(const real2 angle, const real upper, const real upper_low, const real scale,
+                global const FeatureTerms *terms, global const real2 *arcs) {
+    const real half_turn = arcs[ARC_STEPS + 2].x, whole = 2 * half_turn, field = terms->field_of_view;
     real left = (upper - angle.x) + (upper_low - angle.y);
     if (field / 2 - left > half_turn)
         left += whole;
@@ -161,7 +160,7 @@ real2 add_square(const real2 total, const real2 residual, const real scale, cons
 
 // Return log(z_detect p(f | j)) of one feature at an offset; signature is (s_j, low part, -log m_s, 0).
 real log_detection(const real4 off, const real4 turned, global const real *feature, const real4 signature,
-                   global const real *terms, global const real2 *arcs) {
+                   global const FeatureTerms *terms, global const real2 *arcs) {
     real2 exponent = 0;
     real mass = 1, norm = 0;
     const real2 d = distance_pair(off);
@@ -182,8 +181,8 @@ real log_detection(const real4 off, const real4 turned, global const real *featu
             mass *= field_mass(angle, feature[UPPER], feature[UPPER_LOW], feature[BEARING_SCALE], terms, arcs);
 #endif
         } else {
-            // The density is 1 / field: the peak times terms[3] and the scale.
-            mass *= terms[3] * feature[BEARING_SCALE];
+            // The density is 1 / field: the peak times zero_range_density and the scale.
+            mass *= terms->zero_range_density * feature[BEARING_SCALE];
         }
     }
 #endif

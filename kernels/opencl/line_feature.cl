@@ -36,17 +36,17 @@ int overlaps(const real4 off, const real4 turned, global const real *feature, co
 // Return the mass of the normal around a line's distance d on [0, range_max]; d is clamped to it. A line that is seen
 // from both sides has two forms, (alpha_j, d) and (alpha_j + pi, -d): together they have the mass of d on [-range_max,
 // range_max].
-real distance_mass(const real2 d, const real scale, const real4 signature, global const real *terms) {
-    const real lower = signature.y > 0 ? -terms[0] : (real)0, width = terms[0] - lower;
+real distance_mass(const real2 d, const real scale, const real4 signature, global const FeatureTerms *terms) {
+    const real lower = signature.y > 0 ? -terms->range_max : (real)0, width = terms->range_max - lower;
     const real below = clamp((d.x - lower) + d.y, (real)0, width) * scale;
-    const real above = clamp((terms[0] - d.x) + (terms[1] - d.y), (real)0, width) * scale;
+    const real above = clamp((terms->range_max - d.x) + (terms->range_max_low - d.y), (real)0, width) * scale;
     if (below > ERF_ONE && above > ERF_ONE) return 1;
     return (real)0.5 * (erf(below) + erf(above));
 }
 
 // Return log(z_detect p(f | j)) of one feature at the offset of a line's middle.
 real log_line(const real4 off, const real4 turned, global const real *feature, const real4 normal,
-              const real4 signature, global const real *terms, global const real2 *arcs) {
+              const real4 signature, global const FeatureTerms *terms, global const real2 *arcs) {
     const real2 da = angle_pair(across(turned, normal), along(turned, normal), arcs);
     const real2 d = along(off, normal);
     const real2 first = two_sum(feature[RANGE_AT], -d.x);

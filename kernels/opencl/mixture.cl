@@ -1,13 +1,11 @@
 // Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
-// terms[20] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of
-// terms 0 and 1, range_bias and its low part, sigma_growth / sigma_hit and its low part, three numbers for last_range,
-// two numbers of the shape of a hit, the place of the table of its masses after the first term}. In the linear domain
-// hit is z_hit / (sigma sqrt(2 pi)) for a normal, short is z_short and rand is z_rand / range_max; in the log domain
-// they are the logarithms of these. The mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma is
-// sigma_hit + sigma_growth z* (GROWTH).
+// Causes are numbered as in the book: 1 correct range (hit), 2 unexpected object (short), 3 no return (max), 4 random
+// reading (rand). The density has 1, 2 and 4; the caller adds 3. The numbers are MixtureTerms of the signature table. In
+// the linear domain hit_peak, z_short and rand_density are densities, in the log domain their logarithms. The mean of
+// p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma is sigma_hit + sigma_growth z* (GROWTH). masses are
+// tables of the masses of hits.
 // requires: error_free hit_shape
 
-#define MIXTURE_TERMS 20
 // From here on the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
 // Keep 2 / x and 1 / z* finite.
@@ -17,9 +15,9 @@
 #if STOPS
 // Return the expected range of a reading beyond which log p is constant to the last bit: there it is that of p_rand, or
 // of p_short far from its end, whatever the distance of the obstacle.
-real last_range(const real z, global const real *terms) {
-    const real last = terms[14] + terms[15] * z;
-    return last > terms[16] ? last : terms[16];
+real last_range(const real z, global const MixtureTerms *terms) {
+    const real last = terms->last_offset + terms->last_slope * z;
+    return last > terms->last_least ? last : terms->last_least;
 }
 #endif
 
@@ -35,9 +33,10 @@ real hit_mass(const real before, const real after, const real erf_scale) {
 }
 
 // Return the mass of a hit of any shape on [0, range_max], given its mean and the distance from there to range_max.
-real mass_within(const real mean, const real above, const real scale, global const real *terms) {
+real mass_within(const real mean, const real above, const real scale, global const MixtureTerms *terms,
+                 global const real *masses) {
 #if MASS_TABLE
-    global const real *table = terms + (int)terms[19];
+    global const real *table = masses + (int)terms->mass_table;
     return half_mass(mean * scale, table) + half_mass(above * scale, table);
 #else
     return hit_mass(mean, above, scale);
@@ -45,10 +44,10 @@ real mass_within(const real mean, const real above, const real scale, global con
 }
 
 // Return the mean of p_hit.
-real mean_range(const real expected, global const real *terms) {
+real mean_range(const real expected, global const MixtureTerms *terms) {
 #if BIAS
-    const real mean = expected + terms[10];
-    return mean < 0 ? 0 : mean > terms[6] ? terms[6] : mean;
+    const real mean = expected + terms->range_bias;
+    return mean < 0 ? 0 : mean > terms->range_max ? terms->range_max : mean;
 #else
     return expected;
 #endif
@@ -56,34 +55,34 @@ real mean_range(const real expected, global const real *terms) {
 
 // Return the distance from the mean of p_hit to range_max, which keeps its digits where it is short: there z* is nearly
 // range_max less the bias, and their difference is exact.
-real above_mean(const real expected, global const real *terms) {
+real above_mean(const real expected, global const MixtureTerms *terms) {
 #if BIAS
-    const real2 last = two_sum(terms[6], -terms[10]);
-    const real above = (last.x - expected) + (last.y - terms[11]);
-    return above < 0 ? 0 : above > terms[6] ? terms[6] : above;
+    const real2 last = two_sum(terms->range_max, -terms->range_bias);
+    const real above = (last.x - expected) + (last.y - terms->range_bias_low);
+    return above < 0 ? 0 : above > terms->range_max ? terms->range_max : above;
 #else
-    return terms[6] - expected;
+    return terms->range_max - expected;
 #endif
 }
 
 // Return z minus the mean of p_hit as a sum of two numbers; z, z* and the bias nearly cancel.
-real2 hit_offset(const real z, const real expected, global const real *terms) {
+real2 hit_offset(const real z, const real expected, global const MixtureTerms *terms) {
 #if BIAS
     const real mean = mean_range(expected, terms);
-    if (mean != expected + terms[10]) return (real2)(z - mean, 0);
-    return pair_sum(two_sum(z, -expected), (real2)(-terms[10], -terms[11]));
+    if (mean != expected + terms->range_bias) return (real2)(z - mean, 0);
+    return pair_sum(two_sum(z, -expected), (real2)(-terms->range_bias, -terms->range_bias_low));
 #else
     return (real2)(z - expected, 0);
 #endif
 }
 
 // Return sigma_hit / sigma at a range: the first number times (1 + the second).
-real2 hit_scale(const real expected, global const real *terms) {
+real2 hit_scale(const real expected, global const MixtureTerms *terms) {
 #if GROWTH
-    const real sum = 1 + terms[12] * expected, scale = 1 / sum;
+    const real sum = 1 + terms->relative_growth * expected, scale = 1 / sum;
 #if EXACT_EXPONENT
     // Rounding error of the sum; below 2^24 the sum less 1 is exact.
-    const real excess = rest_of(terms[12], expected, sum - 1) - terms[13] * expected;
+    const real excess = rest_of(terms->relative_growth, expected, sum - 1) - terms->relative_growth_low * expected;
     return (real2)(scale, rest_of(sum, scale, 1) + excess * scale);
 #else
     return (real2)(scale, 0);
@@ -95,7 +94,7 @@ real2 hit_scale(const real expected, global const real *terms) {
 
 // Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers. Exponent and log peak are large and nearly cancel where
 // the density's peak is high; the second part keeps the digits that remain.
-real2 normal_exponent(const real z, const real expected, global const real *terms) {
+real2 normal_exponent(const real z, const real expected, global const MixtureTerms *terms) {
     real2 off = hit_offset(z, expected, terms);
 #if EXACT_EXPONENT
 #if GROWTH
@@ -110,32 +109,33 @@ real2 normal_exponent(const real z, const real expected, global const real *term
 #elif GROWTH
     square.y += 2 * off.x * off.y;
 #endif
-    const real2 product = two_product(square.x, terms[1]);
-    return (real2)(product.x, product.y + (square.y * terms[1] + square.x * terms[9]));
+    const real2 product = two_product(square.x, terms->square_scale);
+    return (real2)(product.x, product.y + (square.y * terms->square_scale + square.x * terms->square_scale_low));
 #else
 #if GROWTH
     const real scaled = off.x * hit_scale(expected, terms).x;
-    return (real2)(scaled * (scaled * terms[1]), 0);
+    return (real2)(scaled * (scaled * terms->square_scale), 0);
 #else
-    return (real2)(off.x * (off.x * terms[1]), 0);
+    return (real2)(off.x * (off.x * terms->square_scale), 0);
 #endif
 #endif
 }
 
 // Return the exponent of a hit's density as a sum of two numbers.
-real2 hit_exponent(const real z, const real expected, global const real *terms) {
-    return shape_exponent(normal_exponent(z, expected, terms), terms[17], terms[18]);
+real2 hit_exponent(const real z, const real expected, global const MixtureTerms *terms) {
+    return shape_exponent(normal_exponent(z, expected, terms), terms->shape_power, terms->shape_rate);
 }
 
 // Return log(z_hit p_hit(z | z*)); terms are in the log domain.
-real log_hit(const real z, const real expected, global const real *terms) {
+real log_hit(const real z, const real expected, global const MixtureTerms *terms, global const real *masses) {
     const real2 exponent = hit_exponent(z, expected, terms);
     const real scale = hit_scale(expected, terms).x;
-    real log_p = (terms[0] - exponent.x) + (terms[8] - exponent.y);
+    real log_p = (terms->hit_peak - exponent.x) + (terms->hit_peak_low - exponent.y);
 #if GROWTH
     log_p += log(scale);
 #endif
-    const real mass = mass_within(mean_range(expected, terms), above_mean(expected, terms), terms[2] * scale, terms);
+    const real mass = mass_within(mean_range(expected, terms), above_mean(expected, terms), terms->erf_scale * scale, terms,
+                                  masses);
     return mass == 1 ? log_p : log_p - log(mass);
 }
 #endif
@@ -155,35 +155,37 @@ real short_peak(const real lambda, const real expected) {
 }
 
 // Return log(z_short p_short(z | z*)); terms are in the log domain.
-real log_short(const real z, const real expected, global const real *terms) {
+real log_short(const real z, const real expected, global const MixtureTerms *terms) {
     if (!(z <= expected && expected > 0)) return -INFINITY;
-    return (terms[3] + log(short_peak(terms[4], expected))) - terms[4] * z;
+    return (terms->z_short + log(short_peak(terms->lambda_short, expected))) - terms->lambda_short * z;
 }
 #endif
 
 #if LINEAR
 // Return log p(z | z*). p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm suffices.
-real log_density(const real z, const real expected, global const real *terms) {
+real log_density(const real z, const real expected, global const MixtureTerms *terms, global const real *masses) {
     real p = 0;
 #if HIT
     const real2 exponent = hit_exponent(z, expected, terms);
     const real scale = hit_scale(expected, terms).x;
-    const real hit = terms[0] * scale * exp(-exponent.x) * (1 - exponent.y);
-    const real mass = mass_within(mean_range(expected, terms), above_mean(expected, terms), terms[2] * scale, terms);
+    const real hit = terms->hit_peak * scale * exp(-exponent.x) * (1 - exponent.y);
+    const real mass = mass_within(mean_range(expected, terms), above_mean(expected, terms), terms->erf_scale * scale, terms,
+                                  masses);
     p += mass == 1 ? hit : hit / mass;
 #endif
 #if SHORT
-    if (z <= expected && expected > 0) p += terms[3] * exp(-terms[4] * z) * short_peak(terms[4], expected);
+    if (z <= expected && expected > 0)
+        p += terms->z_short * exp(-terms->lambda_short * z) * short_peak(terms->lambda_short, expected);
 #endif
-    return log(p + terms[5]);
+    return log(p + terms->rand_density);
 }
 #else
 // Return log p(z | z*). Without a sufficient p_rand every component stays a logarithm; -inf only where the mixture is
 // 0.
-real log_density(const real z, const real expected, global const real *terms) {
+real log_density(const real z, const real expected, global const MixtureTerms *terms, global const real *masses) {
     real largest = -INFINITY;
 #if HIT
-    const real hit = log_hit(z, expected, terms);
+    const real hit = log_hit(z, expected, terms, masses);
     largest = hit;
 #endif
 #if SHORT
@@ -191,7 +193,7 @@ real log_density(const real z, const real expected, global const real *terms) {
     largest = fmax(largest, shorter);
 #endif
 #if RAND
-    largest = fmax(largest, terms[5]);
+    largest = fmax(largest, terms->rand_density);
 #endif
 #if SINGLE
     return largest;
@@ -205,7 +207,7 @@ real log_density(const real z, const real expected, global const real *terms) {
     p += exp(shorter - largest);
 #endif
 #if RAND
-    p += exp(terms[5] - largest);
+    p += exp(terms->rand_density - largest);
 #endif
     return largest + log(p);
 #endif

@@ -94,9 +94,9 @@ double half_mass(const double x) {
 }
 
 // Return a polynomial by Horner's rule, the highest power first.
-double polynomial(constant double *terms, const double x) {
-    double value = terms[0];
-    for (int i = 1; i < 8; ++i) value = value * x + terms[i];
+double polynomial(constant double *factor, const double x) {
+    double value = factor[0];
+    for (int i = 1; i < 8; ++i) value = value * x + factor[i];
     return value;
 }
 

@@ -17,10 +17,6 @@ from .prelude import kernel, precision
 # Distributions of a heading: sum of normals, its Fourier series, von Mises.
 NEARBY, SERIES, VON_MISES = wp.constant(0), wp.constant(1), wp.constant(2)
 WRAPS, WAVES = wp.constant(3), wp.constant(6)
-# Terms of a heading: 1 / (sigma sqrt 2) or sqrt(2 kappa), log of z_hit and the peak, log of the uniform part, 2 pi /
-# sigma^2, and from WAVE on 2 q^(n n).
-SCALE, SCALE_LOW, PEAK, PEAK_LOW = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
-RANDOM, DECAY, WAVE = wp.constant(4), wp.constant(5), wp.constant(6)
 # sin x = x + x z (SINE[0] + SINE[1] z + ...) with z = x^2, its power series.
 SINE = (
     -0.16666666666666666, 0.008333333333333333, -0.0001984126984126984, 2.7557319223985893e-06,
@@ -75,24 +71,24 @@ def make(name, flags):
             k += 1
         return log_one_plus(others)
 
-    # Return the log of the ratio of the Fourier series to its first term, by Clenshaw's recurrence.
+    # Return the log of the ratio of the Fourier series to its first term, by Clenshaw's recurrence. waves are
+    # 2 q^(n n).
     @wp.func
-    def log_waves(residual: vec2, terms: wp.array(dtype=real)):
+    def log_waves(residual: vec2, waves: wp.array(dtype=real)):
         sine = half_sine(residual)
         cosine = ONE - TWO * sine.x * sine.x
         newer = real(0.0)
         older = real(0.0)
         n = WAVES
         while n > 0:
-            following = terms[WAVE + n - 1] + TWO * cosine * newer - older
+            following = waves[n - 1] + TWO * cosine * newer - older
             older = newer
             newer = following
             n -= 1
         return log_one_plus(cosine * newer - older)
 
-    # Score positions: one work-item takes a particle. terms = {a, b, c, peak}, each followed by its low part, and the
-    # log of the uniform part. The exponent is (a x)^2 + (b x + c y)^2, where (x, y) is the offset from the reading to
-    # the sensor.
+    # Score positions: one work-item takes a particle. The exponent is (x_scale x)^2 + (shear x +
+    # y_scale y)^2, where (x, y) is the offset from the reading to the sensor.
     @kernel(flags)
     def score_position(place, terms, log_p, particles, temperature):
         n = wp.tid()
@@ -101,34 +97,35 @@ def make(name, flags):
         sensor = place[n]
         x = vec2(sensor.x, sensor.y)
         y = vec2(sensor.z, sensor.w)
-        first = bounded_square(pair_product(x, vec2(terms[0], terms[1])))
-        mixed = pair_sum(pair_product(x, vec2(terms[2], terms[3])), pair_product(y, vec2(terms[4], terms[5])))
+        first = bounded_square(pair_product(x, vec2(terms[0].x_scale, terms[0].x_scale_low)))
+        y_scaled = pair_product(y, vec2(terms[0].y_scale, terms[0].y_scale_low))
+        mixed = pair_sum(pair_product(x, vec2(terms[0].shear, terms[0].shear_low)), y_scaled)
         exponent = pair_sum(first, bounded_square(mixed))
-        log_density = (terms[6] - exponent.x) + (terms[7] - exponent.y)
+        log_density = (terms[0].peak - exponent.x) + (terms[0].peak_low - exponent.y)
         if RAND:
-            log_density = either(log_density, terms[8])
+            log_density = either(log_density, terms[0].random)
         log_p[n] = temperature * log_density
 
     # Score headings: one work-item takes a particle. Residuals are headings minus the reading, in [-pi, pi].
     @kernel(flags)
-    def score_heading(residual, terms, log_p, particles, kind, temperature):
+    def score_heading(residual, terms, waves, log_p, particles, kind, temperature):
         n = wp.tid()
         if n >= particles:
             return
         r = residual[n]
         log_density = real(0.0)
         if kind == SERIES:
-            log_density = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms))
+            log_density = terms[0].peak + (terms[0].peak_low + log_waves(r, waves))
         else:
             root = r
             if kind == VON_MISES:
                 root = half_sine(r)
-            exponent = bounded_square(pair_product(root, vec2(terms[SCALE], terms[SCALE_LOW])))
-            log_density = (terms[PEAK] - exponent.x) + (terms[PEAK_LOW] - exponent.y)
+            exponent = bounded_square(pair_product(root, vec2(terms[0].scale, terms[0].scale_low)))
+            log_density = (terms[0].peak - exponent.x) + (terms[0].peak_low - exponent.y)
             if kind == NEARBY:
-                log_density += log_other_turns(r, terms[DECAY])
+                log_density += log_other_turns(r, terms[0].decay)
         if RAND:
-            log_density = either(log_density, terms[RANDOM])
+            log_density = either(log_density, terms[0].random)
         log_p[n] = temperature * log_density
 
     return locals()[name]

@@ -17,14 +17,6 @@ from .prelude import kernel, precision
 STUDENT_T, TWO_NORMALS = wp.constant(1), wp.constant(2)
 # A beacon has its place (x, its low part, y, its low part), the reading minus the bias with its low part, and the bias.
 BEACON = wp.constant(7)
-# 1 / (sigma sqrt 2), log of z_hit and the peak, log of the uniform part, range_max; for two normals, scale and peak of
-# the wide one. For a t with peak P: 1 / (sigma sqrt(nu k)) with k = P^(2 / (nu + 1)), log z_hit, and in place
-# of the wide normal: 1 / k, (nu + 1) / 2, 1 / (sigma sqrt nu), the factor of the arc, and 1 for an odd nu.
-SCALE, SCALE_LOW, PEAK, RANDOM = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(4)
-RANGE_MAX = wp.constant(5)
-WIDE_SCALE, WIDE_PEAK = wp.constant(6), wp.constant(8)
-OFFSET, OFFSET_LOW, POWER, T_SCALE = wp.constant(6), wp.constant(7), wp.constant(8), wp.constant(9)
-ARC, ODD = wp.constant(10), wp.constant(11)
 
 
 @functools.cache
@@ -47,19 +39,18 @@ def make(name, flags):
 
     # Return the log of a truncated normal; near and far are the distances from its mean to the ends.
     @wp.func
-    def log_normal(residual: vec2, near: real, far: real, terms: wp.array(dtype=real), first: wp.int32, peak: wp.int32):
-        scale = terms[first]
+    def log_normal(residual: vec2, near: real, far: real, scale: vec2, peak: vec2):
         below = near * scale
         above = far * scale
-        exponent = bounded_square(pair_product(residual, vec2(scale, terms[first + 1])))
-        untruncated = (terms[peak] - exponent.x) + (terms[peak + 1] - exponent.y)
+        exponent = bounded_square(pair_product(residual, scale))
+        untruncated = (peak.x - exponent.x) + (peak.y - exponent.y)
         if wp.min(below, above) <= ERF_ONE:
             untruncated = untruncated - wp.log(HALF * (wp.erf(below) + wp.erf(above)))
         return untruncated
 
     # Return the mass of a Student t between -t and t; t >= 0 is in units of its scale and sqrt(nu).
     @wp.func
-    def t_mass(any_t: real, terms: wp.array(dtype=real), series: wp.array(dtype=real), count: wp.int32):
+    def t_mass(any_t: real, terms: wp.array(dtype=types.BeaconTerms), series: wp.array(dtype=real), count: wp.int32):
         t = wp.min(any_t, STEEPEST)
         cosine = ONE / wp.sqrt(ONE + t * t)
         square = cosine * cosine
@@ -69,41 +60,45 @@ def make(name, flags):
             total = total * square + series[i]
             i -= 1
         factor = t * cosine
-        if terms[ODD] > ZERO:
+        if terms[0].odd > ZERO:
             factor = factor * cosine
-        return terms[ARC] * wp.atan(t) + factor * total
+        return terms[0].arc * wp.atan(t) + factor * total
 
     # Return the log of a truncated Student t: -(nu + 1) / 2 log((1 + u^2 / nu) / k), where k includes the peak.
     @wp.func
     def log_student_t(
-        residual: vec2, near: real, far: real, terms: wp.array(dtype=real), series: wp.array(dtype=real),
+        residual: vec2, near: real, far: real, terms: wp.array(dtype=types.BeaconTerms), series: wp.array(dtype=real),
         count: wp.int32,
     ):  # fmt: skip
-        squared = bounded_square(pair_product(residual, vec2(terms[SCALE], terms[SCALE_LOW])))
-        x = pair_sum(vec2(terms[OFFSET], terms[OFFSET_LOW]), squared)
-        below = t_mass(near * terms[T_SCALE], terms, series, count)
-        above = t_mass(far * terms[T_SCALE], terms, series, count)
-        return (terms[PEAK] - terms[POWER] * (wp.log(x.x) + x.y / x.x)) - wp.log(HALF * (below + above))
+        squared = bounded_square(pair_product(residual, vec2(terms[0].scale, terms[0].scale_low)))
+        x = pair_sum(vec2(terms[0].offset, terms[0].offset_low), squared)
+        below = t_mass(near * terms[0].t_scale, terms, series, count)
+        above = t_mass(far * terms[0].t_scale, terms, series, count)
+        return (terms[0].peak - terms[0].power * (wp.log(x.x) + x.y / x.x)) - wp.log(HALF * (below + above))
 
     # Return log p of one range at a distance.
     @wp.func
     def log_range(
-        d: vec2, beacon: wp.array(dtype=real), base: wp.int32, terms: wp.array(dtype=real),
+        d: vec2, beacon: wp.array(dtype=real), base: wp.int32, terms: wp.array(dtype=types.BeaconTerms),
         series: wp.array(dtype=real), count: wp.int32, kind: wp.int32,
     ):  # fmt: skip
         first = two_sum(d.x, -beacon[base + 4])
         r = two_sum(first.x, first.y + (d.y - beacon[base + 5]))
-        near = wp.clamp(d.x + beacon[base + 6], ZERO, terms[RANGE_MAX])
-        far = terms[RANGE_MAX] - near
+        near = wp.clamp(d.x + beacon[base + 6], ZERO, terms[0].range_max)
+        far = terms[0].range_max - near
         log_p = real(0.0)
         if kind == STUDENT_T:
             log_p = log_student_t(r, near, far, terms, series, count)
         else:
-            log_p = log_normal(r, near, far, terms, SCALE, PEAK)
+            log_p = log_normal(
+                r, near, far, vec2(terms[0].scale, terms[0].scale_low), vec2(terms[0].peak, terms[0].peak_low)
+            )
         if kind == TWO_NORMALS:
-            log_p = either(log_p, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK))
+            wide_scale = vec2(terms[0].wide_scale, terms[0].wide_scale_low)
+            wide_peak = vec2(terms[0].wide_peak, terms[0].wide_peak_low)
+            log_p = either(log_p, log_normal(r, near, far, wide_scale, wide_peak))
         if RAND:
-            log_p = either(log_p, terms[RANDOM])
+            log_p = either(log_p, terms[0].random)
         return log_p
 
     # Sum log p of the ranges over beacons: one work-item takes a particle. The first count numbers of the series belong

@@ -56,7 +56,7 @@ def make(name, flags):
 
     # Return the distance in cells to which the ray of a reading is cast.
     @wp.func
-    def ray_limit(z: real, terms: wp.array(dtype=real), scale: types.RangeScale):
+    def ray_limit(z: real, terms: wp.array(dtype=types.MixtureTerms), scale: types.RangeScale):
         if STOPS:
             return wp.min(last_range(z, terms) / scale.resolution, scale.limit)
         else:
@@ -79,22 +79,22 @@ def make(name, flags):
     # Return the term of one reading in the sum.
     @wp.func
     def reading_term(
-        z: real, expected: real, terms: wp.array(dtype=real), sensor: wp.array(dtype=real), tables: types.MixtureTables,
-        range_max: real,
+        z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real),
+        sensor: wp.array(dtype=real), tables: types.MixtureTables, range_max: real,
     ):  # fmt: skip
         if ALL_READINGS:
             if wp.isnan(z):
                 return ZERO
             if not SENSOR_TABLE:
                 if wp.isinf(z):
-                    return terms[7]
+                    return terms[0].z_max
         if CUBES:
             p = compat_density(z, expected, terms)
             return p * p * p
         elif SENSOR_TABLE:
             return tabulated_density(z, expected, sensor, tables, range_max)
         else:
-            return log_density(z, expected, terms)
+            return log_density(z, expected, terms, masses)
 
     # Return the sums of a block's strands.
     @wp.func
@@ -127,8 +127,8 @@ def make(name, flags):
     # fewer than 2^31 parts.
     @kernel(flags, entry=ENTRY)
     def score_beams(
-        map_table, normals, pose_cell, pose, ray, first, reading, terms, edges, sensor, start, constant_terms, log_p,
-        parts, window, particles, rays, readings, tables, cone, caster, scale, score, batch,
+        map_table, normals, pose_cell, pose, ray, first, reading, terms, masses, edges, sensor, start, constant_terms,
+        log_p, parts, window, particles, rays, readings, tables, cone, caster, scale, score, batch,
     ):  # fmt: skip
         n = wp.tid()
         if n >= particles:
@@ -179,16 +179,16 @@ def make(name, flags):
                 i += 1
             if IN_LANES:
                 if INCIDENCE:
-                    values = block_of_bins(z, expected, cosine, terms, edges, tables.incidence_bins)
+                    values = block_of_bins(z, expected, cosine, terms, masses, edges, tables.incidence_bins)
                 else:
-                    values = block_terms(z, expected, terms)
+                    values = block_terms(z, expected, terms, masses)
             else:
                 i = int(0)
                 while i < width:
                     bin_terms = terms
                     if INCIDENCE:
                         bin_terms = incidence_terms(terms, edges, tables.incidence_bins, cosine[i])
-                    values[i] = reading_term(z[i], expected[i], bin_terms, sensor, tables, scale.range_max)
+                    values[i] = reading_term(z[i], expected[i], bin_terms, masses, sensor, tables, scale.range_max)
                     i += 1
             i = int(0)
             if PER_BEAM:
@@ -217,8 +217,8 @@ def make(name, flags):
     # the number at place k is the sum of strand k, and a work-item takes whole strands.
     @kernel(flags, entry=ENTRY)
     def beam_tiles(
-        map_table, normals, pose_cell, pose, order, ray, first, reading, terms, edges, sensor, start, parts, window,
-        particles, rays, readings, tables, cone, caster, scale, spread, batch,
+        map_table, normals, pose_cell, pose, order, ray, first, reading, terms, masses, edges, sensor, start, parts,
+        window, particles, rays, readings, tables, cone, caster, scale, spread, batch,
     ):  # fmt: skip
         item = work_item(wp.tid())
         place = tile_place(item, spread)
@@ -256,7 +256,7 @@ def make(name, flags):
                 end = first[before + r + 1] - readings_before
             while k < end:
                 z = number_at(reading, readings_before + k)
-                term = reading_term(z, expected.x, bin_terms, sensor, tables, scale.range_max)
+                term = reading_term(z, expected.x, bin_terms, masses, sensor, tables, scale.range_max)
                 if STRANDED:
                     strand_sum += term
                 else:

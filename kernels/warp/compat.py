@@ -1,7 +1,7 @@
 """Cubes of densities, which nav2_amcl and Beluga sum over the beams of a scan; for users who migrate.
 
-terms[10] holds the mixture's terms in the linear domain, with two exceptions: terms[0] is z_hit alone for amcl, and
-terms[7] is z_max, not its logarithm.
+Terms are in the linear domain, with two exceptions: hit_peak is z_hit alone for amcl, and z_max is not a logarithm.
+Causes are numbered as in the book.
 """
 
 import functools
@@ -16,7 +16,8 @@ from .prelude import precision
 @functools.cache
 def functions(flags):
     """Make the functions of the file for a set of flags."""
-    real = precision(flags).real
+    types = precision(flags)
+    real = types.real
     parts = mixture.functions(flags)
     hit_mass, short_factor = parts.hit_mass, parts.short_factor
     AMCL = "AMCL" in flags
@@ -24,22 +25,27 @@ def functions(flags):
     # Return the density to be cubed: amcl's without normalisers, Beluga's with both (book table 6.1). A reading of
     # range_max is a max reading; amcl's longer readings are neither random nor max readings.
     @wp.func
-    def compat_density(z: real, expected: real, terms: wp.array(dtype=real)):
+    def compat_density(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
         off = z - expected
-        p = terms[0] * wp.exp(-(off * (off * terms[1])))
+        p = terms[0].hit_peak * wp.exp(-(off * (off * terms[0].square_scale)))
         if AMCL:
             if z < expected:
-                p += terms[3] * terms[4] * wp.exp(-terms[4] * z)
-            if z > terms[6]:
+                p += terms[0].z_short * terms[0].lambda_short * wp.exp(-terms[0].lambda_short * z)
+            if z > terms[0].range_max:
                 return p
         else:
-            p /= hit_mass(expected, terms[6] - expected, terms[2])
+            p /= hit_mass(expected, terms[0].range_max - expected, terms[0].erf_scale)
             if z < expected:
-                p += terms[3] * short_factor(terms[4] * expected) * wp.exp(-terms[4] * z) / expected
-        if z >= terms[6]:
-            p += terms[7]
+                p += (
+                    terms[0].z_short
+                    * short_factor(terms[0].lambda_short * expected)
+                    * wp.exp(-terms[0].lambda_short * z)
+                    / expected
+                )
+        if z >= terms[0].range_max:
+            p += terms[0].z_max
         else:
-            p += terms[5]
+            p += terms[0].rand_density
         return p
 
     return SimpleNamespace(**locals())

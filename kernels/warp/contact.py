@@ -15,11 +15,6 @@ from . import end_point, error_free, log_terms
 from .prelude import kernel, precision
 
 NO_OBSTACLE = wp.constant(0x7FFFFFFF)
-# 1 / (sigma sqrt 2), the gap of touching centres, the cell's side; logs of p_contact and p_false; logs of 1 - p_contact
-# and 1 - p_false.
-SCALE, SCALE_LOW, REACH, REACH_LOW = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
-SIDE, SIDE_LOW, HIT_TERM, FALSE_TERM = wp.constant(4), wp.constant(5), wp.constant(6), wp.constant(7)
-MISS_TERM, NO_HIT_TERM = wp.constant(8), wp.constant(9)
 SERIES = wp.constant(12)
 field_cell = end_point.field_cell
 
@@ -43,7 +38,7 @@ def make(name, flags):
 
     # Return the gap between outline and obstacle, negative where they overlap; the squared distance is in cells.
     @wp.func
-    def gap(squared: wp.int32, terms: wp.array(dtype=real)):
+    def gap(squared: wp.int32, terms: wp.array(dtype=types.ContactTerms)):
         whole = two_sum(real(squared >> 12) * HIGH_PART, real(squared & 4095))
         d = wp.sqrt(whole.x)
         dd = two_product(d, d)
@@ -52,9 +47,9 @@ def make(name, flags):
             cells = vec2(d, ((whole.x - dd.x) + (whole.y - dd.y)) / (TWO * d))
         if squared == NO_OBSTACLE:
             cells = vec2(FAR_CELLS, ZERO)
-        away = pair_product(cells, vec2(terms[SIDE], terms[SIDE_LOW]))
-        left = two_sum(away.x, -terms[REACH])
-        return two_sum(left.x, left.y + (away.y - terms[REACH_LOW]))
+        away = pair_product(cells, vec2(terms[0].side, terms[0].side_low))
+        left = two_sum(away.x, -terms[0].reach)
+        return two_sum(left.x, left.y + (away.y - terms[0].reach_low))
 
     # Return log(erfc(x) / 2), by an asymptotic series where erfc nearly underflows.
     @wp.func
@@ -75,13 +70,13 @@ def make(name, flags):
 
     # Return the log probability that a segment is pressed, or that it is not.
     @wp.func
-    def log_bump(squared: wp.int32, pressed: wp.int32, terms: wp.array(dtype=real)):
-        x = pair_product(gap(squared, terms), vec2(terms[SCALE], terms[SCALE_LOW]))
-        hit = terms[MISS_TERM]
-        no_hit = terms[NO_HIT_TERM]
+    def log_bump(squared: wp.int32, pressed: wp.int32, terms: wp.array(dtype=types.ContactTerms)):
+        x = pair_product(gap(squared, terms), vec2(terms[0].scale, terms[0].scale_low))
+        hit = terms[0].log_missed
+        no_hit = terms[0].log_quiet
         if pressed != 0:
-            hit = terms[HIT_TERM]
-            no_hit = terms[FALSE_TERM]
+            hit = terms[0].log_contact
+            no_hit = terms[0].log_false
         return either(hit + log_above(x), no_hit + log_above(-x))
 
     # Sum log p over segments: one work-item takes a particle. Points start[s] to start[s + 1] - 1 belong to segment s;

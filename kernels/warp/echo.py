@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import ray as ray_file
-from .mixture import MIXTURE_TERMS
 from .prelude import kernel, precision
 from .ranges import caster_of
 from .ray import off_grid
@@ -79,12 +78,12 @@ def functions(flags):
     # Return the terms of the mixture for the bin of an angle of incidence; edges are cosines of the bins' upper ends.
     @wp.func
     def incidence_terms(
-        terms: wp.array(dtype=real), edges: wp.array(dtype=real), incidence_bins: wp.int32, cosine: real
+        terms: wp.array(dtype=types.MixtureTerms), edges: wp.array(dtype=real), incidence_bins: wp.int32, cosine: real
     ):
         bin = int(0)
         while bin + 1 < incidence_bins and cosine <= edges[bin]:
             bin += 1
-        return terms[MIXTURE_TERMS * bin :]
+        return terms[bin:]
 
     # Return the nearest return of a cone's rays, which begin at index first. A ray whose angle of incidence has a
     # cosine below critical has none: the surface reflects it like a mirror.

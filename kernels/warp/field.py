@@ -13,7 +13,7 @@ from . import error_free, field_term
 from .end_point import field_cell
 from .error_free import BLOCK_TERMS
 from .lanes import field_term as lane_field_term
-from .prelude import kernel, precision, reader, work_item
+from .prelude import field_readers, kernel, precision, reader, work_item
 
 # Particles per work-group of field_blocks.
 GROUP = wp.constant(64)
@@ -39,7 +39,7 @@ def make(name, flags):
     # Constants of loops that Warp shall unroll.
     WHOLE_BLOCK, HALF_BLOCK = 16, 8
     number_at, cell_at, point_at, pose_at = reader(real), reader(wp.vec2i), reader(vec2), reader(vec4)
-    two_at = reader(vec2, 2)
+    two_at, term_of = reader(vec2, 2), field_readers(types.FieldTerms)
     IN_LANES = "IN_LANES" in flags
     staged = lane_field_term.functions(flags)
     block_exponents, block_logs = staged.block_exponents, staged.block_logs
@@ -107,7 +107,8 @@ def make(name, flags):
     @wp.func
     def staged_sum(
         table: wp.array(dtype=real), origin: wp.vec2i, sensor_pose: vec4, sensor_low: vec4, point: wp.array(dtype=vec2),
-        point_low: wp.array(dtype=vec2), terms: wp.array(dtype=real), parts: wp.array(dtype=real), window: types.Window,
+        point_low: wp.array(dtype=vec2), terms: wp.array(dtype=types.FieldTerms),
+        parts: wp.array(dtype=real), window: types.Window,
         begin: wp.int32, size: wp.int32, first_part: wp.int32, before: vec2,
     ):  # fmt: skip
         total = before
@@ -247,7 +248,7 @@ def make(name, flags):
             block_guard = number_at(guard, guards + block)
             if ROUNDED_CELLS:
                 total = rounded_block(
-                    table, origin, sensor_pose, sensor_low, point, point_low, begin, end, number_at(terms, 3), window,
+                    table, origin, sensor_pose, sensor_low, point, point_low, begin, end, term_of.z_max(terms), window,
                     block_guard,
                 )  # fmt: skip
             else:

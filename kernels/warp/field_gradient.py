@@ -34,20 +34,20 @@ def functions(flags):
     if "LINEAR" in flags:
 
         @wp.func
-        def hit_share(distance: vec2, terms: wp.array(dtype=real)):
+        def hit_share(distance: vec2, terms: wp.array(dtype=types.FieldTerms)):
             hit = ZERO
             if HIT:
                 exponent = field_exponent(distance, terms)
-                hit = terms[0] * wp.exp(-exponent.x) * (ONE - exponent.y)
-            return hit / (hit + terms[2])
+                hit = terms[0].hit_peak * wp.exp(-exponent.x) * (ONE - exponent.y)
+            return hit / (hit + terms[0].rand_density)
 
     else:
 
         @wp.func
-        def hit_share(distance: vec2, terms: wp.array(dtype=real)):
+        def hit_share(distance: vec2, terms: wp.array(dtype=types.FieldTerms)):
             exponent = field_exponent(distance, terms)
-            hit = (terms[0] - exponent.x) + (terms[4] - exponent.y)
-            return ONE / (ONE + wp.exp(terms[2] - hit))
+            hit = (terms[0].hit_peak - exponent.x) + (terms[0].hit_peak_low - exponent.y)
+            return ONE / (ONE + wp.exp(terms[0].rand_density - hit))
 
     # Return the distance at an end point, and its derivatives in x and y, in metres per cell.
     @wp.func
@@ -134,7 +134,7 @@ def make(name, flags):
             if ALL_READINGS:
                 used = wp.isfinite(to.x)
                 if wp.isinf(to.x):
-                    total = add_term(total, terms[3])
+                    total = add_term(total, terms[0].z_max)
             if used:
                 to_low = vec2()
                 if TWO_PART_POINTS:
@@ -143,8 +143,8 @@ def make(name, flags):
                 slope = distance_slope(table, origin + end.cell, end, window)
                 distance = vec2(slope.x, slope.y)
                 total = add_term(total, log_field(distance, terms))
-                bend = shape_weight(field_square(distance, terms).x, terms[6], terms[7])
-                weight = TWO * terms[1] * hit_share(distance, terms) * bend
+                bend = shape_weight(field_square(distance, terms).x, terms[0].shape_power, terms[0].shape_rate)
+                weight = TWO * terms[0].square_scale * hit_share(distance, terms) * bend
                 sums = add_slope(sums, slope, weight, at, vec2(to.x + mount_x, to.y + mount_y), resolution)
             k += 1
         out = n * GRADIENT_NUMBERS

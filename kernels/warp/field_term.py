@@ -64,41 +64,41 @@ def functions(flags):
         return interpolated(four, end)
 
     # Return the exponent of a normal in two parts, since for a high peak exponent and log peak nearly cancel.
-    # terms[8] = {hit, 1 / (2 sigma^2), rand, log z_max, the low parts of terms 0 and 1, two numbers of the shape of a
-    # hit}. hit is the peak of its density, z_hit / (sigma sqrt(2 pi)) for a normal, and rand is z_rand / range_max, or
-    # their logarithms in the log domain.
+    # The numbers are FieldTerms of the signature table; hit_peak and rand_density are logarithms in the log domain.
     @wp.func
-    def field_square(distance: vec2, terms: wp.array(dtype=real)):
+    def field_square(distance: vec2, terms: wp.array(dtype=types.FieldTerms)):
         if EXACT_EXPONENT:
-            return pair_product(pair_product(distance, distance), vec2(terms[1], terms[5]))
+            return pair_product(
+                pair_product(distance, distance), vec2(terms[0].square_scale, terms[0].square_scale_low)
+            )
         else:
-            return vec2(distance.x * (distance.x * terms[1]), ZERO)
+            return vec2(distance.x * (distance.x * terms[0].square_scale), ZERO)
 
     # Return the exponent of the density of a hit in two parts.
     @wp.func
-    def field_exponent(distance: vec2, terms: wp.array(dtype=real)):
-        return shape_exponent(field_square(distance, terms), terms[6], terms[7])
+    def field_exponent(distance: vec2, terms: wp.array(dtype=types.FieldTerms)):
+        return shape_exponent(field_square(distance, terms), terms[0].shape_power, terms[0].shape_rate)
 
     # Return log p of the distance from an end point to the nearest obstacle.
     if LINEAR:
 
         @wp.func
-        def log_field(distance: vec2, terms: wp.array(dtype=real)):
+        def log_field(distance: vec2, terms: wp.array(dtype=types.FieldTerms)):
             exponent = field_exponent(distance, terms)
-            p = terms[2]
+            p = terms[0].rand_density
             if HIT:
-                p += terms[0] * wp.exp(-exponent.x) * (ONE - exponent.y)
+                p += terms[0].hit_peak * wp.exp(-exponent.x) * (ONE - exponent.y)
             return wp.log(p)
 
     else:
 
         @wp.func
-        def log_field(distance: vec2, terms: wp.array(dtype=real)):
+        def log_field(distance: vec2, terms: wp.array(dtype=types.FieldTerms)):
             exponent = field_exponent(distance, terms)
-            hit = (terms[0] - exponent.x) + (terms[4] - exponent.y)
+            hit = (terms[0].hit_peak - exponent.x) + (terms[0].hit_peak_low - exponent.y)
             if RAND:
                 # The larger of two exponentials is 1.
-                return wp.max(hit, terms[2]) + wp.log(ONE + wp.exp(-wp.abs(hit - terms[2])))
+                return wp.max(hit, terms[0].rand_density) + wp.log(ONE + wp.exp(-wp.abs(hit - terms[0].rand_density)))
             else:
                 return hit
 
@@ -107,13 +107,13 @@ def functions(flags):
     @wp.func
     def reading_value(
         table: wp.array(dtype=real), origin: wp.vec2i, pose: vec4, low: vec4, point: vec2, point_low: vec2,
-        terms: wp.array(dtype=real), window: types.Window, guard: real,
+        terms: wp.array(dtype=types.FieldTerms), window: types.Window, guard: real,
     ):  # fmt: skip
         if ALL_READINGS:
             if wp.isnan(point.x):
                 return ZERO
             if wp.isinf(point.x):
-                return terms[3]
+                return terms[0].z_max
         end = end_point(pose, low, point, point_low, SHIFT, guard)
         cell = origin + end.cell
         if BILINEAR:

@@ -66,22 +66,22 @@ def functions(flags):
     def mass_place(b: real):
         return log_one_plus(b) * TABLE_PER_LOG
 
-    # Return the mass between the mean and a place of the table, which begins at index begin of the terms.
+    # Return the mass between the mean and a place of the table, which begins at an index of masses.
     @wp.func
-    def mass_at(at: real, terms: wp.array(dtype=real), begin: wp.int32):
+    def mass_at(at: real, masses: wp.array(dtype=real), begin: wp.int32):
         if not at < real(TABLE_CELLS):
             return HALF
         cell = wp.int32(at)
         share = at - real(cell)
         first = begin + cell * TABLE_POWERS
-        mass = number_at(terms, first + TABLE_POWERS - 1)
+        mass = number_at(masses, first + TABLE_POWERS - 1)
         for i in range(TABLE_POWERS - 1):
-            mass = mass * share + number_at(terms, first + TABLE_POWERS - 2 - i)
+            mass = mass * share + number_at(masses, first + TABLE_POWERS - 2 - i)
         return mass
 
-    # Return the mass between the mean and a distance; the table begins at a place of the terms.
+    # Return the mass between the mean and a distance; the table begins at an index of masses.
     @wp.func
-    def half_mass(b: real, terms: wp.array(dtype=real), place: wp.int32):
-        return mass_at(mass_place(b), terms, place)
+    def half_mass(b: real, masses: wp.array(dtype=real), place: wp.int32):
+        return mass_at(mass_place(b), masses, place)
 
     return SimpleNamespace(**locals())

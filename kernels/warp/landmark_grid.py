@@ -108,7 +108,8 @@ def functions(flags):
     @wp.func
     def log_match(
         off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, normal: wp.array(dtype=vec4),
-        signature: wp.array(dtype=vec4), j: wp.int32, terms: wp.array(dtype=real), arcs: wp.array(dtype=vec2),
+        signature: wp.array(dtype=vec4), j: wp.int32, terms: wp.array(dtype=types.FeatureTerms),
+        arcs: wp.array(dtype=vec2),
     ):  # fmt: skip
         log_p = real(0.0)
         if LINE:
@@ -140,7 +141,7 @@ def functions(flags):
     def search(
         landmark: wp.array(dtype=vec4), normal: wp.array(dtype=vec4), signature: wp.array(dtype=vec4),
         start: wp.array(dtype=wp.int32), place: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32,
-        terms: wp.array(dtype=real), arcs: wp.array(dtype=vec2), buckets: types.Buckets,
+        terms: wp.array(dtype=types.FeatureTerms), arcs: wp.array(dtype=vec2), buckets: types.Buckets,
     ):  # fmt: skip
         match = Match()
         match.log_p = NEVER

@@ -8,8 +8,7 @@ Components that were not measured are left out. Positions, directions and quanti
 numbers, since a relative error of eps in a distance of 20 m is too large for a deviation of 1 cm.
 
 A feature is FEATURE numbers, named below, in the same order in all three languages. A place is (x, its low part, y, its
-low part), and so are an offset and a direction. terms[4] = {range_max, its low part, field of view, density of a
-bearing at zero range relative to its peak and scale}.
+low part), and so are an offset and a direction. The sensor's numbers are FeatureTerms of the signature table.
 """
 
 import functools
@@ -158,9 +157,9 @@ def functions(flags):
 
     # Return the mass of the normal around d on [0, range_max]; d is clamped to range_max.
     @wp.func
-    def range_mass(d: vec2, scale: real, terms: wp.array(dtype=real)):
-        below = wp.min(d[0], terms[0]) * scale
-        above = wp.max((terms[0] - d[0]) + (terms[1] - d[1]), ZERO) * scale
+    def range_mass(d: vec2, scale: real, terms: wp.array(dtype=types.FeatureTerms)):
+        below = wp.min(d[0], terms[0].range_max) * scale
+        above = wp.max((terms[0].range_max - d[0]) + (terms[0].range_max_low - d[1]), ZERO) * scale
         if wp.min(below, above) > ERF_ONE:
             return ONE
         return HALF * (wp.erf(below) + wp.erf(above))
@@ -169,12 +168,17 @@ def functions(flags):
     # ends. Parts of the field more than half a turn away from the landmark are nearer in the other direction.
     @wp.func
     def field_mass(
-        angle: vec2, upper: real, upper_low: real, scale: real, terms: wp.array(dtype=real), arcs: wp.array(dtype=vec2)
+        angle: vec2,
+        upper: real,
+        upper_low: real,
+        scale: real,
+        terms: wp.array(dtype=types.FeatureTerms),
+        arcs: wp.array(dtype=vec2),
     ):
         half = arcs[HALF_TURN]
         half_turn = half[0]
         whole = TWO * half_turn
-        field = terms[2]
+        field = terms[0].field_of_view
         left = (upper - angle[0]) + (upper_low - angle[1])
         if HALF * field - left > half_turn:
             left = left + whole
@@ -201,7 +205,7 @@ def functions(flags):
     @wp.func
     def log_detection(
         off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, signature: vec4,
-        terms: wp.array(dtype=real), arcs: wp.array(dtype=vec2),
+        terms: wp.array(dtype=types.FeatureTerms), arcs: wp.array(dtype=vec2),
     ):  # fmt: skip
         exponent = vec2(ZERO, ZERO)
         mass = real(1.0)
@@ -230,8 +234,8 @@ def functions(flags):
                             arcs,
                         )
                 else:
-                    # The density is 1 / field: the peak times terms[3] and the scale.
-                    mass = mass * (terms[3] * feature[base + BEARING_SCALE])
+                    # The density is 1 / field: the peak times zero_range_density and the scale.
+                    mass = mass * (terms[0].zero_range_density * feature[base + BEARING_SCALE])
         if SIGNATURE:
             if feature[base + SIGNATURE_SCALE] > ZERO:
                 away = two_sum(feature[base + SIGNATURE_AT], -signature[0])

@@ -1,11 +1,10 @@
 """Sums over pairs of reading and expected range from which the beam model's parameters are learned (book table 6.2).
 
-``terms`` are the mixture's in the log domain; 1 / sigma, and sigma times the peak of an untruncated hit, replace the
-first two numbers for last_range. A pair whose reading is NaN is padding. The mean of p_hit is z* + range_bias, clamped
-to [0, range_max]; obstacles of p_short lie before z*. r are the responsibilities e_hit, e_short and e_rand of the book.
-With u = (z - mean) / sigma, the distances x_0 = mean / sigma and x_1 = (range_max - mean) / sigma to the ends, phi the
-untruncated density, W = E' the weight of the shape of a hit (1 for a normal), B = -E'' / W^2 (0 for a normal), M the
-mass between the ends and
+``terms`` are in the log domain, with inverse_sigma and unit_peak. A pair whose reading is NaN is padding. The mean of
+p_hit is z* + range_bias, clamped to [0, range_max]; obstacles of p_short lie before z*. r are the responsibilities
+e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances x_0 = mean / sigma and x_1 =
+(range_max - mean) / sigma to the ends, phi the untruncated density, W = E' the weight of the shape of a hit (1 for a
+normal), B = -E'' / W^2 (0 for a normal), M the mass between the ends and
 
     T = (x_0 phi_0 + x_1 phi_1) / M,    P = (phi_1 - phi_0) / M,    V = (W_0 x_0 phi_0 + W_1 x_1 phi_1) / M,
     Q = (W_1 x_1^2 phi_1 - W_0 x_0^2 phi_0) / M + P T,    U = (W_0 x_0^3 phi_0 + W_1 x_1^3 phi_1) / M,
@@ -52,33 +51,35 @@ def make(name, flags):
 
     # Return log p(z | z*) and the responsibilities of hit, short and rand, 0 where the density is 0.
     @wp.func
-    def responsibilities(z: real, expected: real, terms: wp.array(dtype=real)):
-        hit = log_hit(z, expected, terms)
+    def responsibilities(
+        z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real)
+    ):
+        hit = log_hit(z, expected, terms, masses)
         shorter = log_short(z, expected, terms)
-        largest = wp.max(wp.max(hit, shorter), terms[5])
+        largest = wp.max(wp.max(hit, shorter), terms[0].rand_density)
         if wp.isinf(largest):
             return vec4(largest, ZERO, ZERO, ZERO)
         p_hit = wp.exp(hit - largest)
         p_short = wp.exp(shorter - largest)
-        p_rand = wp.exp(terms[5] - largest)
+        p_rand = wp.exp(terms[0].rand_density - largest)
         p = p_hit + p_short + p_rand
         return vec4(largest + wp.log(p), p_hit / p, p_short / p, p_rand / p)
 
     # Return the untruncated density of a hit at a distance of x scales, times sigma.
     @wp.func
-    def hit_phi(x: real, terms: wp.array(dtype=real)):
+    def hit_phi(x: real, terms: wp.array(dtype=types.MixtureTerms)):
         t = vec2(HALF * x * x, ZERO)
-        return terms[15] * wp.exp(-shape_exponent(t, terms[17], terms[18]).x)
+        return terms[0].unit_peak * wp.exp(-shape_exponent(t, terms[0].shape_power, terms[0].shape_rate).x)
 
     # Return W u^2, and the derivatives h_s, h_m, h_ss, h_sm and h_mm of log p_hit of a pair.
     @wp.func
-    def hit_slopes(z: real, expected: real, terms: wp.array(dtype=real)):
+    def hit_slopes(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real)):
         mean = mean_range(expected, terms)
         above = above_mean(expected, terms)
-        u = hit_offset(z, expected, terms).x * terms[14]
-        x_0 = mean * terms[14]
-        x_1 = above * terms[14]
-        weight = shape_weight(HALF * u * u, terms[17], terms[18])
+        u = hit_offset(z, expected, terms).x * terms[0].inverse_sigma
+        x_0 = mean * terms[0].inverse_sigma
+        x_1 = above * terms[0].inverse_sigma
+        weight = shape_weight(HALF * u * u, terms[0].shape_power, terms[0].shape_rate)
         pull = weight * u
         square = pull * u
         t = real(0.0)
@@ -86,23 +87,23 @@ def make(name, flags):
         v = real(0.0)
         q = real(0.0)
         w = real(0.0)
-        mass = mass_within(mean, above, terms[2], terms)
+        mass = mass_within(mean, above, terms[0].erf_scale, terms, masses)
         if mass < ONE:
             phi_0 = hit_phi(x_0, terms) / mass
             phi_1 = hit_phi(x_1, terms) / mass
-            pull_0 = shape_weight(HALF * x_0 * x_0, terms[17], terms[18]) * x_0 * phi_0
-            pull_1 = shape_weight(HALF * x_1 * x_1, terms[17], terms[18]) * x_1 * phi_1
+            pull_0 = shape_weight(HALF * x_0 * x_0, terms[0].shape_power, terms[0].shape_rate) * x_0 * phi_0
+            pull_1 = shape_weight(HALF * x_1 * x_1, terms[0].shape_power, terms[0].shape_rate) * x_1 * phi_1
             t = x_0 * phi_0 + x_1 * phi_1
             p = phi_1 - phi_0
             v = pull_0 + pull_1
             q = x_1 * pull_1 - x_0 * pull_0 + p * t
             w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1
-        bend = shape_bend(square, terms[17])
+        bend = shape_bend(square, terms[0].shape_power)
         h_m = pull + p
         h_sm = pull * (bend - TWO) - p + q
         h_mm = weight * (bend - ONE) + v + p * p
         # A clamped mean does not move with the bias.
-        if mean != expected + terms[10]:
+        if mean != expected + terms[0].range_bias:
             h_m = ZERO
             h_sm = ZERO
             h_mm = ZERO
@@ -110,24 +111,27 @@ def make(name, flags):
 
     # Return the derivatives s_l and s_ll of log p_short of a pair.
     @wp.func
-    def short_slopes(z: real, expected: real, terms: wp.array(dtype=real)):
-        x = terms[4] * expected
+    def short_slopes(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        x = terms[0].lambda_short * expected
         f = short_factor(x)
         v = f - x
-        return vec2(ONE - v - terms[4] * z, v * (f - ONE) - terms[4] * z)
+        return vec2(ONE - v - terms[0].lambda_short * z, v * (f - ONE) - terms[0].lambda_short * z)
 
     # Add the terms of a pair to the sums. They are log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm,
     # r_hit h_mm, r_short s_ll; r_hit W u^2, r_short z. INFORMATION: 1 where rand is the likeliest cause; the upper
     # triangle of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m,
     # r_hit h_m^2, r_short s_l^2.
     @wp.func
-    def add_pair(z: real, expected: real, terms: wp.array(dtype=real), before: sums_type):
+    def add_pair(
+        z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real),
+        before: sums_type,
+    ):  # fmt: skip
         sums = before
-        r = responsibilities(z, expected, terms)
+        r = responsibilities(z, expected, terms, masses)
         hit = vec6()
         shorter = vec2()
         if r[1] > ZERO:
-            hit = hit_slopes(z, expected, terms)
+            hit = hit_slopes(z, expected, terms, masses)
         if r[2] > ZERO:
             shorter = short_slopes(z, expected, terms)
         h_s = hit[1]
@@ -167,7 +171,7 @@ def make(name, flags):
 
     # Sum over blocks of pairs: one work-item takes a block. Pair k of a block is pair block * across + k * along.
     @kernel(flags)
-    def e_step(reading, expected, terms, sums, blocks, readings, across, along, width):
+    def e_step(reading, expected, terms, masses, sums, blocks, readings, across, along, width):
         block = wp.tid()
         if block >= blocks:
             return
@@ -181,7 +185,7 @@ def make(name, flags):
             while k < last:
                 n = block * across + k * along
                 if not wp.isnan(reading[n]):
-                    part = add_pair(reading[n], expected[n], terms, part)
+                    part = add_pair(reading[n], expected[n], terms, masses, part)
                 k += 1
             # add_term, for all sums at once.
             head = total + part
@@ -196,7 +200,7 @@ def make(name, flags):
 
     # Write log p and the responsibilities of each pair, NaN for padding. One work-item takes a block of pairs.
     @kernel(flags)
-    def pair_causes(reading, expected, terms, causes, blocks, readings, across, along):
+    def pair_causes(reading, expected, terms, masses, causes, blocks, readings, across, along):
         block = wp.tid()
         if block >= blocks:
             return
@@ -206,7 +210,7 @@ def make(name, flags):
             if wp.isnan(reading[n]):
                 causes[n] = vec4(NOTHING, NOTHING, NOTHING, NOTHING)
             else:
-                causes[n] = responsibilities(reading[n], expected[n], terms)
+                causes[n] = responsibilities(reading[n], expected[n], terms, masses)
             k += 1
 
     return locals()[name]

@@ -74,13 +74,13 @@ def functions(flags):
     # seen from both sides has two forms, (alpha_j, d) and (alpha_j + pi, -d): together they have the mass of d on
     # [-range_max, range_max].
     @wp.func
-    def distance_mass(d: vec2, scale: real, signature: vec4, terms: wp.array(dtype=real)):
+    def distance_mass(d: vec2, scale: real, signature: vec4, terms: wp.array(dtype=types.FeatureTerms)):
         lower = real(0.0)
         if signature[1] > ZERO:
-            lower = -terms[0]
-        width = terms[0] - lower
+            lower = -terms[0].range_max
+        width = terms[0].range_max - lower
         below = wp.clamp((d[0] - lower) + d[1], ZERO, width) * scale
-        above = wp.clamp((terms[0] - d[0]) + (terms[1] - d[1]), ZERO, width) * scale
+        above = wp.clamp((terms[0].range_max - d[0]) + (terms[0].range_max_low - d[1]), ZERO, width) * scale
         if wp.min(below, above) > ERF_ONE:
             return ONE
         return HALF * (wp.erf(below) + wp.erf(above))
@@ -89,7 +89,7 @@ def functions(flags):
     @wp.func
     def log_line(
         off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, normal: vec4, signature: vec4,
-        terms: wp.array(dtype=real), arcs: wp.array(dtype=vec2),
+        terms: wp.array(dtype=types.FeatureTerms), arcs: wp.array(dtype=vec2),
     ):  # fmt: skip
         da = angle_pair(across(turned, normal), along(turned, normal), arcs)
         d = along(off, normal)

@@ -1,11 +1,10 @@
 """Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
 
-terms[20] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of
-terms 0 and 1, range_bias and its low part, sigma_growth / sigma_hit and its low part, three numbers for last_range, two
-numbers of the shape of a hit, the place of the table of its masses after the first term}. In the linear domain hit is
-z_hit / (sigma sqrt(2 pi)) for a normal, short is z_short and rand is z_rand / range_max; in the log
-domain they are the logarithms of these. The mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma
-is sigma_hit + sigma_growth z* (GROWTH).
+Causes are numbered as in the book: 1 correct range (hit), 2 unexpected object (short), 3 no return (max), 4 random
+reading (rand). The density has 1, 2 and 4; the caller adds 3. The numbers are MixtureTerms of the signature table. In
+the linear domain hit_peak, z_short and rand_density are densities, in the log domain their logarithms. The mean of
+p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma is sigma_hit + sigma_growth z* (GROWTH). masses are
+tables of the masses of hits.
 """
 
 import functools
@@ -15,9 +14,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import error_free, hit_shape
-from .prelude import precision, reader
-
-MIXTURE_TERMS = 20
+from .prelude import field_readers, precision
 
 
 @functools.cache
@@ -34,7 +31,7 @@ def functions(flags):
     EXACT_EXPONENT = "EXACT_EXPONENT" in flags
     BIAS = "BIAS" in flags
     GROWTH = "GROWTH" in flags
-    at = reader(real)
+    term_of = field_readers(types.MixtureTerms)
     HIT = "HIT" in flags
     LINEAR = "LINEAR" in flags
     SHORT = "SHORT" in flags
@@ -51,8 +48,8 @@ def functions(flags):
     # Return the expected range of a reading beyond which log p is constant to the last bit: there it is that of p_rand,
     # or of p_short far from its end, whatever the distance of the obstacle.
     @wp.func
-    def last_range(z: real, terms: wp.array(dtype=real)):
-        return wp.max(at(terms, 14) + at(terms, 15) * z, at(terms, 16))
+    def last_range(z: real, terms: wp.array(dtype=types.MixtureTerms)):
+        return wp.max(term_of.last_offset(terms) + term_of.last_slope(terms) * z, term_of.last_least(terms))
 
     # Return the mass of the untruncated normal from a distance before its mean to one after it, a sum of positive
     # terms. Most ranges are far from both ends, and nearly all from at least one; rays without an obstacle are at one
@@ -74,62 +71,69 @@ def functions(flags):
 
     # Return the mass of a hit of any shape on [0, range_max].
     @wp.func
-    def mass_within(mean: real, above: real, scale: real, terms: wp.array(dtype=real)):
+    def mass_within(
+        mean: real, above: real, scale: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real)
+    ):
         if MASS_TABLE:
-            place = wp.int32(at(terms, 19))
-            below = half_mass(mean * scale, terms, place)
-            return below + half_mass(above * scale, terms, place)
+            place = wp.int32(term_of.mass_table(terms))
+            below = half_mass(mean * scale, masses, place)
+            return below + half_mass(above * scale, masses, place)
         else:
             return hit_mass(mean, above, scale)
 
     # Return the mean of p_hit.
     @wp.func
-    def mean_range(expected: real, terms: wp.array(dtype=real)):
+    def mean_range(expected: real, terms: wp.array(dtype=types.MixtureTerms)):
         mean = expected
         if BIAS:
-            mean = wp.clamp(expected + at(terms, 10), ZERO, at(terms, 6))
+            mean = wp.clamp(expected + term_of.range_bias(terms), ZERO, term_of.range_max(terms))
         return mean
 
     # Return the distance from the mean of p_hit to range_max, which keeps its digits where it is short: there z* is
     # nearly range_max less the bias, and their difference is exact.
     @wp.func
-    def above_mean(expected: real, terms: wp.array(dtype=real)):
-        above = at(terms, 6) - expected
+    def above_mean(expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        above = term_of.range_max(terms) - expected
         if BIAS:
-            last = two_sum(at(terms, 6), -at(terms, 10))
-            above = wp.clamp((last.x - expected) + (last.y - at(terms, 11)), ZERO, at(terms, 6))
+            last = two_sum(term_of.range_max(terms), -term_of.range_bias(terms))
+            above = wp.clamp(
+                (last.x - expected) + (last.y - term_of.range_bias_low(terms)), ZERO, term_of.range_max(terms)
+            )
         return above
 
     # Return z minus the mean of p_hit as a sum of two numbers; z, z* and the bias nearly cancel.
     @wp.func
-    def hit_offset(z: real, expected: real, terms: wp.array(dtype=real)):
+    def hit_offset(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
         if BIAS:
             mean = mean_range(expected, terms)
             off = vec2(z - mean, ZERO)
-            if mean == expected + at(terms, 10):
-                off = pair_sum(two_sum(z, -expected), vec2(-at(terms, 10), -at(terms, 11)))
+            if mean == expected + term_of.range_bias(terms):
+                off = pair_sum(two_sum(z, -expected), vec2(-term_of.range_bias(terms), -term_of.range_bias_low(terms)))
             return off
         else:
             return vec2(z - expected, ZERO)
 
     # Return sigma_hit / sigma at a range: the first number times (1 + the second).
     @wp.func
-    def hit_scale(expected: real, terms: wp.array(dtype=real)):
+    def hit_scale(expected: real, terms: wp.array(dtype=types.MixtureTerms)):
         scale = vec2(ONE, ZERO)
         if GROWTH:
-            total = ONE + at(terms, 12) * expected
+            total = ONE + term_of.relative_growth(terms) * expected
             share = ONE / total
             scale = vec2(share, ZERO)
             if EXACT_EXPONENT:
                 # Rounding error of the sum; below 2^24 the sum less 1 is exact.
-                excess = rest_of(at(terms, 12), expected, total - ONE) - at(terms, 13) * expected
+                excess = (
+                    rest_of(term_of.relative_growth(terms), expected, total - ONE)
+                    - term_of.relative_growth_low(terms) * expected
+                )
                 scale = vec2(share, rest_of(total, share, ONE) + excess * share)
         return scale
 
     # Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers. Exponent and log peak are large and nearly cancel where
     # the density's peak is high; the second part keeps the digits that remain.
     @wp.func
-    def normal_exponent(z: real, expected: real, terms: wp.array(dtype=real)):
+    def normal_exponent(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
         off = hit_offset(z, expected, terms)
         if EXACT_EXPONENT:
             if GROWTH:
@@ -140,28 +144,35 @@ def functions(flags):
             square = two_product(off.x, off.x)
             if BIAS or GROWTH:
                 square = vec2(square.x, square.y + TWO * off.x * off.y)
-            product = two_product(square.x, at(terms, 1))
-            return vec2(product.x, product.y + (square.y * at(terms, 1) + square.x * at(terms, 9)))
+            product = two_product(square.x, term_of.square_scale(terms))
+            return vec2(
+                product.x,
+                product.y + (square.y * term_of.square_scale(terms) + square.x * term_of.square_scale_low(terms)),
+            )
         else:
             scaled = off.x
             if GROWTH:
                 scaled = off.x * hit_scale(expected, terms).x
-            return vec2(scaled * (scaled * at(terms, 1)), ZERO)
+            return vec2(scaled * (scaled * term_of.square_scale(terms)), ZERO)
 
     # Return the exponent of a hit's density as a sum of two numbers.
     @wp.func
-    def hit_exponent(z: real, expected: real, terms: wp.array(dtype=real)):
-        return shape_exponent(normal_exponent(z, expected, terms), at(terms, 17), at(terms, 18))
+    def hit_exponent(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        return shape_exponent(
+            normal_exponent(z, expected, terms), term_of.shape_power(terms), term_of.shape_rate(terms)
+        )
 
     # Return log(z_hit p_hit(z | z*)); terms are in the log domain.
     @wp.func
-    def log_hit(z: real, expected: real, terms: wp.array(dtype=real)):
+    def log_hit(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real)):
         exponent = hit_exponent(z, expected, terms)
         scale = hit_scale(expected, terms).x
-        log_p = (at(terms, 0) - exponent.x) + (at(terms, 8) - exponent.y)
+        log_p = (term_of.hit_peak(terms) - exponent.x) + (term_of.hit_peak_low(terms) - exponent.y)
         if GROWTH:
             log_p += wp.log(scale)
-        mass = mass_within(mean_range(expected, terms), above_mean(expected, terms), at(terms, 2) * scale, terms)
+        mass = mass_within(
+            mean_range(expected, terms), above_mean(expected, terms), term_of.erf_scale(terms) * scale, terms, masses
+        )
         if mass == ONE:
             return log_p
         return log_p - wp.log(mass)
@@ -188,23 +199,31 @@ def functions(flags):
 
     # Return log(z_short p_short(z | z*)); terms are in the log domain.
     @wp.func
-    def log_short(z: real, expected: real, terms: wp.array(dtype=real)):
+    def log_short(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
         if z <= expected and expected > ZERO:
-            return (at(terms, 3) + wp.log(short_peak(at(terms, 4), expected))) - at(terms, 4) * z
+            return (
+                term_of.z_short(terms) + wp.log(short_peak(term_of.lambda_short(terms), expected))
+            ) - term_of.lambda_short(terms) * z
         return NEVER
 
     if LINEAR:
         # Return log p(z | z*). p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm
         # suffices.
         @wp.func
-        def log_density(z: real, expected: real, terms: wp.array(dtype=real)):
+        def log_density(
+            z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real)
+        ):
             p = real(0.0)
             if HIT:
                 exponent = hit_exponent(z, expected, terms)
                 scale = hit_scale(expected, terms).x
-                hit = at(terms, 0) * scale * wp.exp(-exponent.x) * (ONE - exponent.y)
+                hit = term_of.hit_peak(terms) * scale * wp.exp(-exponent.x) * (ONE - exponent.y)
                 mass = mass_within(
-                    mean_range(expected, terms), above_mean(expected, terms), at(terms, 2) * scale, terms
+                    mean_range(expected, terms),
+                    above_mean(expected, terms),
+                    term_of.erf_scale(terms) * scale,
+                    terms,
+                    masses,
                 )
                 if mass == ONE:
                     p += hit
@@ -212,25 +231,31 @@ def functions(flags):
                     p += hit / mass
             if SHORT:
                 if z <= expected and expected > ZERO:
-                    p += at(terms, 3) * wp.exp(-at(terms, 4) * z) * short_peak(at(terms, 4), expected)
-            return wp.log(p + at(terms, 5))
+                    p += (
+                        term_of.z_short(terms)
+                        * wp.exp(-term_of.lambda_short(terms) * z)
+                        * short_peak(term_of.lambda_short(terms), expected)
+                    )
+            return wp.log(p + term_of.rand_density(terms))
 
     else:
         # Return log p(z | z*). Without a sufficient p_rand every component stays a logarithm; -inf only where the
         # mixture is 0.
         @wp.func
-        def log_density(z: real, expected: real, terms: wp.array(dtype=real)):
+        def log_density(
+            z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real)
+        ):
             hit = NEVER
             shorter = NEVER
             largest = NEVER
             if HIT:
-                hit = log_hit(z, expected, terms)
+                hit = log_hit(z, expected, terms, masses)
                 largest = hit
             if SHORT:
                 shorter = log_short(z, expected, terms)
                 largest = wp.max(largest, shorter)
             if RAND:
-                largest = wp.max(largest, at(terms, 5))
+                largest = wp.max(largest, term_of.rand_density(terms))
             if SINGLE:
                 return largest
             else:
@@ -242,7 +267,7 @@ def functions(flags):
                 if SHORT:
                     p += wp.exp(shorter - largest)
                 if RAND:
-                    p += wp.exp(at(terms, 5) - largest)
+                    p += wp.exp(term_of.rand_density(terms) - largest)
                 return largest + wp.log(p)
 
     return SimpleNamespace(**locals())

@@ -148,6 +148,21 @@ def reader(dtype, count=1):
 
 
 @functools.cache
+def field_readers(struct):
+    """Make functions of (array,) by field name that read a field of the first struct of an array, like ``reader``."""
+
+    def make(field):
+        kind, place = struct.vars[field].type, f"values.data->{field}"
+
+        @wp.func_native(f"#if defined(__CUDA_ARCH__)\nreturn __ldg(&{place});\n#else\nreturn {place};\n#endif\n")
+        def read(values: wp.array(dtype=struct)) -> kind: ...
+
+        return read
+
+    return SimpleNamespace(**{field: make(field) for field in struct.vars})
+
+
+@functools.cache
 def loader(dtype):
     """Make a function of (array, i) that reads a number, like ``reader``, of an array that the kernel writes."""
 

@@ -61,29 +61,29 @@ CENTRAL, CENTRAL_END, CENTRAL_OFFSET = (
     wp.constant(wp.float64(0.180625)),
 )
 OUTER_OFFSET, OUTERMOST_OFFSET = wp.constant(wp.float64(1.6)), wp.constant(wp.float64(5.0))
-terms_8 = wp.types.vector(length=8, dtype=wp.float64)
+factors_8 = wp.types.vector(length=8, dtype=wp.float64)
 # fmt: off
-CENTRAL_OVER = wp.constant(terms_8(
+CENTRAL_OVER = wp.constant(factors_8(
     2509.0809287301227, 33430.57558358813, 67265.7709270087, 45921.95393154987, 13731.69376550946, 1971.5909503065513,
     133.14166789178438, 3.3871328727963665,
 ))
-CENTRAL_UNDER = wp.constant(terms_8(
+CENTRAL_UNDER = wp.constant(factors_8(
     5226.495278852854, 28729.085735721943, 39307.89580009271, 21213.794301586597, 5394.196021424751, 687.1870074920579,
     42.31333070160091, 1.0,
 ))
-OUTER_OVER = wp.constant(terms_8(
+OUTER_OVER = wp.constant(factors_8(
     0.0007745450142783414, 0.022723844989269184, 0.2417807251774506, 1.2704582524523684, 3.6478483247632045,
     5.769497221460691, 4.630337846156546, 1.4234371107496835,
 ))
-OUTER_UNDER = wp.constant(terms_8(
+OUTER_UNDER = wp.constant(factors_8(
     1.0507500716444169e-09, 0.0005475938084995345, 0.015198666563616457, 0.14810397642748008, 0.6897673349851,
     1.6763848301838038, 2.053191626637759, 1.0,
 ))
-OUTERMOST_OVER = wp.constant(terms_8(
+OUTERMOST_OVER = wp.constant(factors_8(
     2.0103343992922881e-07, 2.7115555687434876e-05, 0.0012426609473880784, 0.026532189526576124, 0.29656057182850487,
     1.7848265399172913, 5.463784911164114, 6.657904643501103,
 ))
-OUTERMOST_UNDER = wp.constant(terms_8(
+OUTERMOST_UNDER = wp.constant(factors_8(
     2.0442631033899397e-15, 1.421511758316446e-07, 1.8463183175100548e-05, 0.0007868691311456133, 0.014875361290850615,
     0.1369298809227358, 0.599832206555888, 1.0,
 ))
@@ -123,10 +123,10 @@ def functions(flags):
 
     # Return a polynomial by Horner's rule, the highest power first.
     @wp.func
-    def polynomial(terms: terms_8, x: wp.float64):
-        value = terms[0]
+    def polynomial(factor: factors_8, x: wp.float64):
+        value = factor[0]
         for i in range(1, 8):
-            value = value * x + terms[i]
+            value = value * x + factor[i]
         return value
 
     # Return the x >= 0 with a mass of the standard normal between 0 and x, from 0 to MOST_HALF.

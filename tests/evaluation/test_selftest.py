@@ -234,18 +234,18 @@ def add_to_scan(*arguments):
 def add_to_beam(*arguments):
     score_beams(*arguments)
     if "PER_BEAM" in arguments[0]:
-        arguments[14][7] += np.float32(1e-4)
+        arguments[15][7] += np.float32(1e-4)
 
 
 def densities_of_another_mixture(flags, z, expected, terms):
     found = log_density(flags, z, expected, terms)
-    return np.where(z < 1, found + 1e-3, found).astype(terms.dtype) if terms.dtype == np.float32 else found
+    return np.where(z < 1, found + 1e-3, found).astype(found.dtype) if found.dtype == np.float32 else found
 
 
 def add_without_parts(flags, *arguments):
     score_beams(flags, *arguments)
     if "PER_BEAM" not in flags:
-        arguments[12][:] = np.nextafter(arguments[12], np.inf)
+        arguments[13][:] = np.nextafter(arguments[13], np.inf)
 
 
 def parameters_of_another_angle(terms, edges, kinds, cosine):

@@ -121,7 +121,7 @@ def beams(names: tuple[str, ...]) -> tuple[frozenset[str], list[Any], np.ndarray
     first = np.append(0, np.cumsum(repeats)).astype(np.int32)
     reading = scan(np.linspace(0, RANGE, first[-1]), REAL, all_readings=False)
     counts, most = readings_of(first, "SHARED_RAYS" in names)
-    arrays = [rays_of(int(START[-1]), REAL), first, reading, terms, nothing(REAL), nothing(REAL), START]
+    arrays = [rays_of(int(START[-1]), REAL), first, reading, terms, *[nothing(REAL)] * 3, START]
     return scene_flags(REAL, "ORIGINS_OUTSIDE", "SCANS", *flags, *names), arrays, counts, most
 
 

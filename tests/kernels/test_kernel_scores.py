@@ -27,7 +27,7 @@ from support.score_scenes import FIELD_SCENES, FIELDS, MIXTURES, field_scene, mi
 
 from gpusense.backends import Backend, get_backend
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan
-from gpusense.interface.structs import Score, Window
+from gpusense.interface.structs import Score, Window, columns
 from gpusense.reference.mixture import log_density
 
 # Each set of flags is compiled. Components, precision and the rest of the kernel have separate lines of code, so each
@@ -57,7 +57,7 @@ def test_beams_agree_with_the_reference(name: str, names: tuple[str, ...], real:
     parts = np.full((count, readings), np.nan, real)
     found = run(
         device, "score_beams", flags, (count,), planes_of(occupied), nothing(real, 2), cell, pose, ray, first, reading,
-        terms, nothing(real), nothing(real), first, nothing(real), np.empty(count, real), parts,
+        terms, nothing(real), nothing(real), nothing(real), first, nothing(real), np.empty(count, real), parts,
         window_of(occupied), count, len(ray), readings, *LASER, EXACT, SCALE, Score(fixed, temperature), ONE_SCAN,
     )  # fmt: skip
 
@@ -65,8 +65,8 @@ def test_beams_agree_with_the_reference(name: str, names: tuple[str, ...], real:
     z = np.broadcast_to(reading.astype(np.float64), expected.shape)
     wide = flags | {"FLOAT64"}
     with np.errstate(all="ignore"):
-        truth = log_density(wide, z, expected.astype(np.float64), terms.astype(np.float64))
-    truth = np.where(np.isnan(z), 0.0, np.where(np.isinf(z), float(terms[7]), truth))
+        truth = log_density(wide, z, expected.astype(np.float64), columns("MixtureTerms", terms.astype(np.float64)))
+    truth = np.where(np.isnan(z), 0.0, np.where(np.isinf(z), float(columns("MixtureTerms", terms).z_max[0]), truth))
     assert_near(found["parts"], truth, per_beam(truth, real))
     total = temperature * (truth.sum(axis=1) + fixed)
     assert_near(found["log_p"], total, per_scan(truth, real, fixed=fixed, temperature=temperature))
@@ -79,7 +79,7 @@ def test_no_readings_give_exactly_what_is_fixed(device: Backend) -> None:
     count, none = len(pose), np.zeros(0, real)
     found = run(
         device, "score_beams", frozenset(flags), (count,), planes_of(occupied), nothing(real, 2), cell, pose,
-        np.zeros((0, 2), real), np.zeros(1, np.int32), none, terms, none, none, np.zeros(1, np.int32), none,
+        np.zeros((0, 2), real), np.zeros(1, np.int32), none, terms, none, none, none, np.zeros(1, np.int32), none,
         np.empty(count, real), none, window_of(occupied), count, 0, 0, *LASER, EXACT, SCALE,
         Score(-1.5, 1.0), ONE_SCAN,
     )  # fmt: skip

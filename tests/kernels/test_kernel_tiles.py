@@ -129,7 +129,7 @@ def beam_tiles(
     each = strands_in(readings) if "STRANDED" in names else readings
     expected, found = on_both(
         device, "beam_tiles", flags, items(count, spread), planes_of(OCCUPIED), nothing(real, 2), cell, pose, order,
-        ray, first, reading, terms, nothing(real), nothing(real), first, room_for(count, each, real),
+        ray, first, reading, terms, *[nothing(real)] * 3, first, room_for(count, each, real),
         WINDOW, count, rays, readings, *LASER, EXACT, SCALE, spread, ONE_SCAN,
     )  # fmt: skip
     untouched = np.count_nonzero(expected["parts"] == -77)

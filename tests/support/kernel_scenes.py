@@ -166,14 +166,6 @@ def ranges_on_both(
     return reference["ranges"], found["ranges"]
 
 
-def with_low_parts(terms, real):
-    """Return rounded terms, then the rounding errors (low parts) of the first two."""
-    rounded = np.array(terms).astype(real)
-    with np.errstate(invalid="ignore"):
-        low = np.nan_to_num(np.array(terms[:2]) - rounded[:2])
-    return np.append(rounded, low.astype(real))
-
-
 def squared_distances(occupied: np.ndarray) -> np.ndarray:
     """Return SciPy's squared distances; UNREACHABLE without obstacles."""
     if not occupied.any():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from support.kernel_scenes import (
     GRIDS,
@@ -11,10 +13,11 @@ from support.kernel_scenes import (
     directions,
     squared_distances,
     window_of,
-    with_low_parts,
 )
 
 from gpusense.interface.constants import BLOCK_TERMS, TILE, TILE_PARTICLES
+from gpusense.interface.structs import FieldTerms, MixtureTerms, packed
+from gpusense.interface.terms import rounding_error
 from gpusense.models.scan.field_pipeline import _GUARD
 from gpusense.world.frames import split
 
@@ -50,8 +53,18 @@ def mixture(name: str, real: type, *, z_max: float) -> tuple[set[str], np.ndarra
     else:
         with np.errstate(divide="ignore"):
             head = np.log(head)
-    terms = [head[0], 0.5 / sigma**2, np.sqrt(0.5) / sigma, head[1], decay, head[2], range_max, np.log(z_max)]
-    return flags, with_low_parts(terms, real)
+    terms = MixtureTerms(**dict.fromkeys(MixtureTerms._fields, 0.0))._replace(
+        hit_peak=head[0], square_scale=0.5 / sigma**2, erf_scale=np.sqrt(0.5) / sigma, z_short=head[1],
+        lambda_short=decay, rand_density=head[2], range_max=range_max, z_max=np.log(z_max),
+    )  # fmt: skip
+    return flags, packed_with_low_parts(terms, real)
+
+
+def packed_with_low_parts(terms: Any, real: type) -> np.ndarray:
+    """Return a mixture as kernels read it, with the rounding errors of the peak and scale of a hit."""
+    exact = {name: getattr(terms, name) for name in ("hit_peak", "square_scale")}
+    low = {f"{name}_low": rounding_error(number, real(number)) for name, number in exact.items()}
+    return packed([terms._replace(**low)], np.dtype(real))
 
 
 def scan(expected: np.ndarray, real: type, *, all_readings: bool) -> np.ndarray:
@@ -117,7 +130,7 @@ def field_scene(name: str, real: type, *, all_readings: bool) -> dict[str, np.nd
         "pose_low": pose_low,
         "point": point,
         "point_low": point_low,
-        "terms": with_low_parts(terms, real),
+        "terms": packed_with_low_parts(FieldTerms(*terms, 0.0, 0.0, 0.0, 0.0), real),
         "start": np.zeros(1, np.int32),
         "constant_terms": np.zeros(1, real),
         "log_p": np.empty(count, real),

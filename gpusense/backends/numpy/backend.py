@@ -61,8 +61,7 @@ class NumpyBackend(Backend):
                     dtype = declared.dtype(real)
                     bound.append(int(value) if dtype.kind == "i" else dtype.type(value))
                 else:
-                    whole = value.size // declared.width * declared.width
-                    bound.append(value[:whole].reshape(-1, declared.width) if declared.width > 1 else value)
+                    bound.append(declared.shaped(value))
             with np.errstate(all="ignore"):
                 body(flags, *bound)
 

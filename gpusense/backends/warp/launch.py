@@ -119,7 +119,7 @@ def _binding(argument: Argument, declared: Any) -> Callable[[Any], Any]:
         return functools.partial(_instance, declared)
     if argument.shape is None:
         return float if argument.type in ("real", "double") else int
-    return functools.partial(_view, width=argument.width)
+    return functools.partial(_view, width=argument.width, struct=declared.dtype if argument.holds_structs else None)
 
 
 def _instance(declared: Any, value: Any) -> Any:
@@ -130,14 +130,15 @@ def _instance(declared: Any, value: Any) -> Any:
     return made
 
 
-def _view(buffer: wp.array, width: int) -> wp.array:
-    """Return a view of the buffer's memory as numbers or vectors; the buffer keeps the view alive."""
+def _view(buffer: wp.array, width: int, struct: Any = None) -> wp.array:
+    """Return a view of the buffer's memory as numbers, vectors or structs; the buffer keeps the view alive."""
     views = buffer.__dict__.setdefault("_gpusense_views", {})
-    if width not in views:
-        dtype = buffer.dtype if width == 1 else _VECTORS[buffer.dtype, width]
+    key = struct or width
+    if key not in views:
+        dtype = struct or (buffer.dtype if width == 1 else _VECTORS[buffer.dtype, width])
         shape = (buffer.size // width,)
-        views[width] = wp.array(ptr=buffer.ptr, dtype=dtype, shape=shape, device=buffer.device)
-    return views[width]
+        views[key] = wp.array(ptr=buffer.ptr, dtype=dtype, shape=shape, device=buffer.device)
+    return views[key]
 
 
 def host_view(array: np.ndarray) -> wp.array:

@@ -305,7 +305,7 @@ def score_ranges(
     log_p = np.full(
         len(ranges), np.count_nonzero(kinds == Reading.MAX) * NoReturn(p.z_max).number if p.z_max > 0 else 0.0
     )
-    flags, terms = mixture_of((p,), limit, np.dtype(np.float64), specialize=True, max_depends=False)
+    flags, terms, _ = mixture_of((p,), limit, np.dtype(np.float64), specialize=True, max_depends=False)
     for begin in range(0, len(ranges), _PIECE):
         expected = np.clip(np.asarray(ranges[begin : begin + _PIECE, hit], np.float64), 0, limit)
         z = np.broadcast_to(readings[hit], expected.shape)

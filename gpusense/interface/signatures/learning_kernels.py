@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from gpusense.interface.constants import MIXTURE_TERMS
 from gpusense.interface.signatures.rows import Kernel, kernel
 
 # Readings and expected ranges to learn from, in blocks of equal length, and the mixture.
-_PAIRS = ("real reading [blocks * readings]", "real expected [blocks * readings]", f"real terms [{MIXTURE_TERMS}]")
+_PAIRS = (
+    "real reading [blocks * readings]",
+    "real expected [blocks * readings]",
+    "MixtureTerms terms [1]",
+    "real masses [1]",
+)
 
 KERNELS: dict[str, Kernel] = {
     "e_step": kernel(

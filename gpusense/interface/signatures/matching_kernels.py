@@ -12,7 +12,7 @@ _CELLS = "uchar table [scores.tables * (scores.rows + 2 * scores.margin) * (scor
 KERNELS: dict[str, Kernel] = {
     "field_gradient": kernel(
         "field_gradient", "particle", "real table [(window.rows + 4) * (window.cols + 4)]", *PLACED,
-        "real2 point [readings]", "real2 point_low [readings]", "real terms [8]", "int start [scans + 1]",
+        "real2 point [readings]", "real2 point_low [readings]", "FieldTerms terms [1]", "int start [scans + 1]",
         "real constant_terms [scans]", f"out real gradient [{GRADIENT_NUMBERS} * particles]", WINDOW,
         "int particles", "int readings", "real guard", "real mount_x", "real mount_y", "real resolution",
         "Score score", "ScanBatch batch", in_lanes=True,

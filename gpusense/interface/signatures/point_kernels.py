@@ -7,7 +7,7 @@ from gpusense.interface.signatures.rows import PLACED, WINDOW, Kernel, kernel
 _LANDMARKS = ("real4 landmark [landmarks]", "real4 normal [landmarks]", "real4 signature [landmarks]")
 _BUCKETS = "int start [buckets.rows * buckets.cols + 1]"
 _FEATURES = ("real feature [29 * features]",)
-_MIXTURE = ("real terms [4]", "real2 arcs [11]")
+_MIXTURE = ("FeatureTerms terms [1]", "real2 arcs [11]")
 _FEATURE_RESULT = (
     "out real log_p [particles]", "out real parts [particles * features]", "out int which [particles * features]",
 )  # fmt: skip
@@ -39,22 +39,22 @@ KERNELS: dict[str, Kernel] = {
         "out int pose_status [2]", "double target", "double target_low", "int particles",
     ),
     "score_position": kernel(
-        "absolute", "particle", "real4 place [particles]", "real terms [9]", "out real log_p [particles]",
+        "absolute", "particle", "real4 place [particles]", "PositionTerms terms [1]", "out real log_p [particles]",
         "int particles", "real temperature", in_lanes=True,
     ),
     "score_heading": kernel(
-        "absolute", "particle", "real2 residual [particles]", "real terms [12]", "out real log_p [particles]",
-        "int particles", "int kind", "real temperature", in_lanes=True,
+        "absolute", "particle", "real2 residual [particles]", "HeadingTerms terms [1]", "real waves [6]",
+        "out real log_p [particles]", "int particles", "int kind", "real temperature", in_lanes=True,
     ),
     "score_beacons": kernel(
-        "beacons", "particle", "real4 place [particles]", "real beacon [7 * beacons]", "real terms [12]",
+        "beacons", "particle", "real4 place [particles]", "real beacon [7 * beacons]", "BeaconTerms terms [1]",
         "real series [count]", "out real log_p [particles]", "int particles", "int beacons", "int count", "int kind",
         "real temperature", in_lanes=True,
     ),
     "score_contact": kernel(
         "contact", "particle", "int table [(window.rows + 4) * (window.cols + 4)]", *PLACED,
         "real2 point [points]", "real2 point_low [points]", "int start [segments + 1]", "int pressed [segments]",
-        "real terms [10]", "out real log_p [particles]", WINDOW, "int particles", "int segments",
+        "ContactTerms terms [1]", "out real log_p [particles]", WINDOW, "int particles", "int segments",
         "real guard", "real temperature", in_lanes=True,
     ),
 }  # fmt: skip

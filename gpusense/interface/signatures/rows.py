@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gpusense.interface.structs import STRUCTS
+from gpusense.interface.structs import STRUCTS, columns, fields
 
 _SCALARS: dict[str, np.dtype] = {
     "int": np.dtype(np.int32),
@@ -46,12 +46,19 @@ class Argument:
 
     @property
     def is_struct(self) -> bool:
-        """Return whether the argument is a struct."""
-        return self.type in STRUCTS
+        """Return whether the argument is a struct by value."""
+        return self.shape is None and self.type in STRUCTS
+
+    @property
+    def holds_structs(self) -> bool:
+        """Return whether the argument is an array of structs."""
+        return self.shape is not None and self.type in STRUCTS
 
     @property
     def width(self) -> int:
-        """Return the numbers per element: 4 for real4."""
+        """Return the numbers per element: 4 for real4, and the fields of a struct."""
+        if self.holds_structs:
+            return len(fields(self.type))
         return _WIDTHS[self.type.lstrip("abcdefghijklmnopqrstuvwxyz")]
 
     def elements(self, values: Mapping[str, Any]) -> int:
@@ -59,10 +66,17 @@ class Argument:
         assert self.shape is not None
         return _evaluate(ast.parse(self.shape, mode="eval").body, values)
 
+    def shaped(self, numbers: np.ndarray) -> Any:
+        """Return an array's numbers as the NumPy reference sees them: rows of vectors, or a struct of arrays."""
+        if self.holds_structs:
+            return columns(self.type, numbers)
+        whole = numbers.size // self.width * self.width
+        return numbers[:whole].reshape(-1, self.width) if self.width > 1 else numbers
+
     def dtype(self, real: np.dtype) -> np.dtype:
         """Return the NumPy dtype of one number of an array or scalar."""
         base = self.type.rstrip("24")
-        return real if base == "real" else _SCALARS[base]
+        return real if base == "real" or base in STRUCTS else _SCALARS[base]
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gpusense.interface.constants import DRAW_TERMS, MIXTURE_TERMS
+from gpusense.interface.constants import DRAW_TERMS
 from gpusense.interface.signatures.rows import PLACED, POSES, WINDOW, Kernel, kernel
 
 # Normals of the cells of the map and of a ring around it; not read without INCIDENCE.
@@ -17,9 +17,9 @@ _GIVEN = (
     "out real4 pose_low [particles]", "out int pose_status [2]",
 )  # fmt: skip
 _FRAME = ("Frame frame", WINDOW, "int particles")
-_POINTS = ("real2 point [readings]", "real2 point_low [readings]", "real terms [8]")
+_POINTS = ("real2 point [readings]", "real2 point_low [readings]", "FieldTerms terms [1]")
 _TERMS = (
-    f"real terms [{MIXTURE_TERMS} * tables.incidence_bins]", "real edges [tables.incidence_bins]",
+    "MixtureTerms terms [tables.incidence_bins]", "real masses [1]", "real edges [tables.incidence_bins]",
     "real sensor [(tables.cells + 1) * (tables.cells + 1)]",
 )  # fmt: skip
 # With SCANS: index of the first ray or end point of each scan, and the scan's constant term.

@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense.backends import Backend
+from gpusense.backends.base import Buffer
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.signatures import LANES
+from gpusense.interface.structs import packed
 from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import Point
 from gpusense.models.scan.mixture import learning_terms
@@ -105,9 +107,10 @@ class DeviceSums:
         """The text that selects the device."""
         return self._backend.info.selection
 
-    def terms(self, point: Point) -> NDArray[np.floating]:
-        """Return the terms of the kernels for a set of parameters."""
-        return learning_terms(point.parameters(), self._range_max, self.real)
+    def _mixture(self, point: Point) -> tuple[Buffer, Buffer]:
+        """Upload the numbers of the mixture and its table of masses for a set of parameters."""
+        terms, masses = learning_terms(point.parameters(), self._range_max, self.real)
+        return self._backend.upload(packed([terms], self.real)), self._backend.upload(masses)
 
     def sums(self, point: Point, *, information: bool = False) -> NDArray[np.float64]:
         """Sum over the hits, in a fixed order of addition.
@@ -123,9 +126,9 @@ class DeviceSums:
             return total
         backend = self._backend
         launch = backend.compile("e_step", with_lanes_flag(backend.info.lanes, "e_step", flags))
-        terms = backend.upload(self.terms(point))
+        mixture = self._mixture(point)
         for chunk in self._chunks:
-            launch((chunk.blocks,), chunk.reading, chunk.expected, terms, self._rows, *chunk.layout, width)
+            launch((chunk.blocks,), chunk.reading, chunk.expected, *mixture, self._rows, *chunk.layout, width)
             rows = backend.download(self._rows, np.empty((chunk.blocks, width), self.real))
             total += np.ascontiguousarray(rows.T, np.float64).sum(axis=1)
         # Compensated sums convert the log p = -inf of an impossible pair to NaN.
@@ -136,10 +139,10 @@ class DeviceSums:
         """Return (M, 4) log p and the responsibilities of hit, short and rand for each hit."""
         backend = self._backend
         rows = [np.empty((0, 4))]
-        terms = backend.upload(self.terms(point)) if self._chunks else None
+        mixture = self._mixture(point) if self._chunks else ()
         for chunk in self._chunks:
             out = backend.empty(4 * chunk.blocks * chunk.readings, self.real)
             launch = backend.compile("pair_causes", self._flags | point.shape.flags)
-            launch((chunk.blocks,), chunk.reading, chunk.expected, terms, out, *chunk.layout)
+            launch((chunk.blocks,), chunk.reading, chunk.expected, *mixture, out, *chunk.layout)
             rows.append(backend.download(out, np.empty((chunk.count, 4), self.real)).astype(np.float64))
         return np.concatenate(rows)

@@ -12,6 +12,7 @@ from gpusense._util.typing import AnyArray, Association, Precision
 from gpusense.backends import Selection
 from gpusense.interface.flags import flags_if
 from gpusense.interface.plan import Omission
+from gpusense.interface.structs import FeatureTerms
 from gpusense.models.landmark.base import JOINT_FEATURES, FeatureModel
 from gpusense.models.landmark.features import PreparedFeatures
 from gpusense.models.landmark.line_features import possible_lines, prepare_lines
@@ -90,7 +91,7 @@ class LineModel(FeatureModel):
         signature = np.zeros((len(lines), 4))
         signature[:, 0], signature[:, 1] = half[order], lines.two_sided[order]
         (limit,), (rest,) = split(np.array([self.parameters.range_max]), self._real)
-        terms = np.array([limit, rest, 0, 0], self._real)
+        terms = FeatureTerms(limit, rest, 0.0, 0.0)
         self._tables = uploaded(self._backend, self._real, self._buckets, normal, signature, terms)
 
     @property

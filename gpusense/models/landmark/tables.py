@@ -10,6 +10,7 @@ import numpy as np
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.interface.feature_layout import ARCS
+from gpusense.interface.structs import FeatureTerms, packed
 from gpusense.models.landmark.sensor import Sensor, full_circle, signature_mass
 from gpusense.world.frames import split
 from gpusense.world.landmarks import Buckets, LandmarkMap
@@ -55,13 +56,13 @@ def upload_tables(
     scale = sensor.scales[1]
     flat = p.field_of_view / math.sqrt(math.pi)
     flat /= math.erf(math.pi * scale) if full_circle(p) and scale else 1.0
-    terms = np.array([high[0], low[0], high[1], flat], real)
+    terms = FeatureTerms(high[0], low[0], high[1], flat)
     norm = float(signature[:, 2].max(initial=0.0))
     return uploaded(backend, real, buckets, np.zeros((1, 4)), signature, terms, norm)
 
 
 def uploaded(
-    backend: Backend, real: np.dtype, buckets: Buckets, normal: np.ndarray, signature: np.ndarray, terms: np.ndarray,
+    backend: Backend, real: np.dtype, buckets: Buckets, normal: np.ndarray, signature: np.ndarray, terms: FeatureTerms,
     norm: float = 0.0,
 ) -> LandmarkTables:  # fmt: skip
     """Upload tables, with the arcs of slopes."""
@@ -75,5 +76,5 @@ def uploaded(
 
     return LandmarkTables(
         upload(buckets.table(real)), upload(normal.astype(real)), upload(signature.astype(real)), upload(buckets.start),
-        upload(terms), upload(arcs), norm,
+        backend.upload(packed([terms], real)), upload(arcs), norm,
     )  # fmt: skip

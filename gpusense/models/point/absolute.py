@@ -18,6 +18,7 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
+from gpusense.interface.structs import HeadingTerms, PositionTerms, packed
 from gpusense.interface.terms import log_weight
 from gpusense.models.point.base import MISSING, PointModel, rand_omission, relative_omissions
 from gpusense.models.point.pairs import DIGITS, PI, exact, log_of, total, two_parts
@@ -103,7 +104,7 @@ class PositionModel(PointModel):
         if not (math.isfinite(x) and math.isfinite(y)):
             return cast(np.ndarray, self._score(poses, out, None, [MISSING]))
         terms = self._terms(hit, x, y)
-        impossible = bool(np.isneginf(terms[-1]))
+        impossible = math.isinf(terms.random)
         flags = self._flags if impossible else self._flags | {"RAND"}
         left_out = [rand_omission("the fix is outside the region")] if impossible and self.parameters.z_rand else []
 
@@ -114,8 +115,9 @@ class PositionModel(PointModel):
             place, placing = self._relative(some, part, "place_relative", fix)
             count, in_lanes = part[1] - part[0], with_lanes_flag(self._backend.info.lanes, "score_position", flags)
             score = launch(
-                "score_position", in_lanes, (count,), place=place, terms=self._workspace.upload("terms", terms),
-                log_p=log_p, particles=count, temperature=self.temperature,
+                "score_position", in_lanes, (count,), place=place,
+                terms=self._workspace.upload("terms", packed([terms], self._real)), log_p=log_p, particles=count,
+                temperature=self.temperature,
             )  # fmt: skip
             return (*placing, score)
 
@@ -171,12 +173,12 @@ class PositionModel(PointModel):
         omissions = [] if p.z_rand else [rand_omission("z_rand = 0")]
         return "position fix", omissions + relative_omissions(p.mount, self.precision)
 
-    def _terms(self, hit: list[np.floating], x: float, y: float) -> np.ndarray:
+    def _terms(self, hit: list[np.floating], x: float, y: float) -> PositionTerms:
         region, random = self.parameters.region, -math.inf
         if region is not None and region[0] <= x <= region[2] and region[1] <= y <= region[3]:
             random = log_weight(self.parameters.z_rand)
             random -= math.log(region[2] - region[0]) + math.log(region[3] - region[1])
-        return np.array([*hit, random], self._real)
+        return PositionTerms(random, *hit)
 
     def _gaussian(self, name: str, covariance: tuple[Decimal, Decimal, Decimal]) -> list[np.floating]:
         """Return the whitening by the Cholesky factor, and the log of weight and peak, each as two numbers."""
@@ -226,9 +228,10 @@ class HeadingModel(PointModel):
     ) -> None:
         self.parameters = checks.or_default("parameters", parameters, HeadingParameters)
         super().__init__(backend, precision, temperature)
-        self._kind, terms = self._mixture()
+        self._kind, terms, waves = self._mixture()
         self._flags |= flags_if(RAND=self.parameters.z_rand > 0)
-        self._terms_buffer = self._backend.upload(terms)
+        self._terms_buffer = self._backend.upload(packed([terms], self._real))
+        self._waves_buffer = self._backend.upload(np.array(waves, self._real))
 
     def log_likelihood(self, poses: AnyArray, heading: float, *, out: Any = None) -> np.ndarray:
         """Return log p(z | x) of a heading for each particle, natural logarithm.
@@ -259,8 +262,8 @@ class HeadingModel(PointModel):
             flags = with_lanes_flag(self._backend.info.lanes, "score_heading", self._flags)
             count = part[1] - part[0]
             score = launch(
-                "score_heading", flags, (count,), residual=residual, terms=self._terms_buffer, log_p=log_p,
-                particles=count, kind=self._kind, temperature=self.temperature,
+                "score_heading", flags, (count,), residual=residual, terms=self._terms_buffer, waves=self._waves_buffer,
+                log_p=log_p, particles=count, kind=self._kind, temperature=self.temperature,
             )  # fmt: skip
             return (*wrapping, score)
 
@@ -309,8 +312,8 @@ class HeadingModel(PointModel):
             omissions.append(Omission("other turns", why, f"{2 * WRAPS} exp and 1 log for each such particle"))
         return f"heading, {p.kind}", omissions
 
-    def _mixture(self) -> tuple[int, np.ndarray]:
-        """Return the kind of density, and the numbers of the kernel file ``absolute``."""
+    def _mixture(self) -> tuple[int, HeadingTerms, list[float]]:
+        """Return the kind of density, its numbers, and the factors of its Fourier series."""
         p, real = self.parameters, self._real
         waves, decay = [0.0] * WAVES, 0.0
         log_hit, random = log_of(p.z_hit), log_weight(p.z_rand) - math.log(2 * math.pi)
@@ -331,4 +334,4 @@ class HeadingModel(PointModel):
             else:
                 kind, scale, peak = SERIES, Decimal(0), total(log_hit, -(2 * PI).ln())
                 waves = [2 * math.exp(-0.5 * min(n * p.sigma, 1e3) ** 2) for n in range(1, WAVES + 1)]
-        return kind, np.array([*two_parts((scale, peak), real), random, decay, *waves], real)
+        return kind, HeadingTerms(random, decay, *two_parts((scale, peak), real)), waves

@@ -13,11 +13,12 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Precision
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
-from gpusense.interface.constants import BEACON, BEACON_TERMS, FARTHEST, NORMAL, STUDENT_T, TWO_NORMALS
+from gpusense.interface.constants import BEACON, FARTHEST, NORMAL, STUDENT_T, TWO_NORMALS
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
+from gpusense.interface.structs import BeaconTerms, packed
 from gpusense.models.point.base import PointModel, rand_omission, relative_omissions
 from gpusense.models.point.pairs import DIGITS, PI, exact, log_of, total, two_parts
 from gpusense.models.point.sampling import BEACONS, draws_at, mounted, normal_within, within
@@ -80,7 +81,10 @@ class BeaconModel(PointModel):
             raise ValueError(f"xy: must be within {FARTHEST:.2g} m of the middle, got {far:.2g} m")
         self._kind, terms, series = self._mixture()
         self._count = len(series)
-        self._terms_buffer, self._series_buffer = self._backend.upload(terms), self._backend.upload(series)
+        self._terms_buffer, self._series_buffer = (
+            self._backend.upload(packed([terms], self._real)),
+            self._backend.upload(series),
+        )
 
     def log_likelihood(
         self, poses: AnyArray, ranges: ArrayLike, ids: ArrayLike | None = None, *, out: Any = None
@@ -220,14 +224,14 @@ class BeaconModel(PointModel):
                 rows.append([*two_parts(numbers, self._real), self._real.type(bias)])
         return np.array(rows, self._real).reshape(-1, BEACON), left_out
 
-    def _mixture(self) -> tuple[int, np.ndarray, np.ndarray]:
+    def _mixture(self) -> tuple[int, BeaconTerms, np.ndarray]:
         """Return the kind of density, and the numbers and the series of the kernel file ``beacons``."""
         p, real = self.parameters, self._real
         self._check_scale("sigma_range", p.sigma_range)
         self._check_scale("range_max", p.range_max)
         self._check_scale("bias", max(float(np.abs(self._bias).max(initial=0.0)), 1.0), "its size ")
         random = RandomDensity(p.range_max).log_peak(p.z_rand)
-        rest: list[Any] = [0.0] * 6
+        rest: dict[str, Any] = {}
         series = np.zeros(1)
         with localcontext(prec=DIGITS):
             if p.kind == "student_t":
@@ -237,18 +241,25 @@ class BeaconModel(PointModel):
                 first = two_parts((1 / (exact(p.sigma_range) * (nu * k).sqrt()), log_of(p.z_hit)), real)
                 arc, series = t_series(p.nu)
                 flat = 1 / (p.sigma_range * math.sqrt(p.nu))
-                rest = [*two_parts((1 / k,), real), (p.nu + 1) / 2, flat, arc, float(p.nu % 2)]
+                offset, offset_low = two_parts((1 / k,), real)
+                rest = dict(
+                    offset=offset,
+                    offset_low=offset_low,
+                    power=(p.nu + 1) / 2,
+                    t_scale=flat,
+                    arc=arc,
+                    odd=float(p.nu % 2),
+                )
             else:
                 kind, share = NORMAL, 1.0
                 if p.kind == "mixture":
                     self._check_scale("sigma_heavy", p.sigma_heavy)
                     kind, share = TWO_NORMALS, 1 - p.heavy_weight
                     heavy = _normal(p.sigma_heavy, total(log_of(p.z_hit), log_of(p.heavy_weight)))
-                    rest = [*two_parts(heavy, real), 0.0, 0.0]
+                    names = ("wide_scale", "wide_scale_low", "wide_peak", "wide_peak_low")
+                    rest = dict(zip(names, two_parts(heavy, real), strict=True))
                 first = two_parts(_normal(p.sigma_range, total(log_of(p.z_hit), log_of(share))), real)
-        terms = np.array([*first, random, p.range_max, *rest], real)
-        assert len(terms) == BEACON_TERMS
-        return kind, terms, series.astype(real)
+        return kind, BeaconTerms(random, p.range_max, *first, **rest), series.astype(real)
 
 
 def _normal(sigma: float, log_share: Decimal | float) -> tuple[Decimal, Decimal | float]:

@@ -18,6 +18,7 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
+from gpusense.interface.structs import ContactTerms, packed
 from gpusense.models.arguments import map_words
 from gpusense.models.point.base import PointModel
 from gpusense.models.point.pairs import DIGITS, exact, two_parts
@@ -110,7 +111,7 @@ class BumperModel(PointModel):
         self._guard = _GUARD * float(np.finfo(self._real).eps) * (2 * extent / side + 2)
         high, low = split(self._points / side, self._real)
         self._all_points = [self._backend.upload(each) for each in (high, low)]
-        self._terms_buffer = self._backend.upload(self._terms(self._radius))
+        self._terms_buffer = self._backend.upload(packed([self._terms(self._radius)], self._real))
 
     def log_likelihood(self, poses: AnyArray, pressed: ArrayLike, *, out: Any = None) -> np.ndarray:
         """Return log p(pressed | x, m) for each particle, natural logarithm.
@@ -245,7 +246,7 @@ class BumperModel(PointModel):
             raise ValueError(f"pressed: shape must be ({self.segments},), got ({len(states)},)")
         return np.array(states)
 
-    def _terms(self, radius: float) -> np.ndarray:
+    def _terms(self, radius: float) -> ContactTerms:
         """Return the numbers of the kernel file ``contact``."""
         p, side = self.parameters, self.grid.resolution
         with localcontext(prec=DIGITS):
@@ -254,7 +255,7 @@ class BumperModel(PointModel):
         weights = (p.p_contact, p.p_false)
         logs = [math.log(w) if w > 0 else -math.inf for w in weights]
         misses = [math.log1p(-w) if w < 1 else -math.inf for w in weights]
-        return np.array([*pairs, *logs, *misses], self._real)
+        return ContactTerms(*pairs, *logs, *misses)
 
 
 def _kept(value: Any) -> Any:

@@ -52,9 +52,9 @@ class BeamPipeline(ScanPipeline):
             FLOAT64=self.real == np.float64, ALL_READINGS=max_evaluated or not self.specialize
         )
         upload, cells = self.backend.upload, mixture.cells
-        self._terms = upload(mixture.terms)
+        self._terms = upload(np.stack(mixture.terms, axis=1))
         self._constants = dict(
-            terms=self._terms, edges=upload(mixture.cosines.astype(self.real)),
+            terms=self._terms, masses=upload(mixture.masses), edges=upload(mixture.cosines.astype(self.real)),
             sensor=upload(np.zeros(1, self.real) if mixture.table is None else mixture.table),
             tables=MixtureTables(mixture.bins, cells, cells / self.scanner.range_max),
             cone=cones.struct,

@@ -13,7 +13,7 @@ from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag, with_loops_flag
 from gpusense.interface.launches import Program, launch
-from gpusense.interface.structs import Score
+from gpusense.interface.structs import FieldTerms, Score, packed
 from gpusense.models.poses import PlacedPoses
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.pipeline import ScanLaunch, ScanPipeline, Tiles
@@ -65,7 +65,7 @@ class FieldPipeline(ScanPipeline):
         self.careful = self.real == np.float32
         self.quick = self.careful and self.log_table and self.specialize
         self.components, terms = self._mixture(parameters, bilinear=bilinear, cubes=setting.cubes)
-        self.terms = self.backend.upload(terms)
+        self.terms = self.backend.upload(packed([terms], self.real))
         self.guard = _GUARD * float(np.finfo(self.real).eps)
         range_max = self.scanner.range_max
         self.table = FieldTable(
@@ -87,7 +87,7 @@ class FieldPipeline(ScanPipeline):
 
     def _mixture(
         self, p: LikelihoodFieldParameters, *, bilinear: bool, cubes: bool
-    ) -> tuple[frozenset[str], np.ndarray]:
+    ) -> tuple[frozenset[str], FieldTerms]:
         """Return flags of the mixture, and the numbers of the kernel file ``field``."""
         density, everything = FieldDensity(p, self.scanner.range_max), not self.specialize
         flags = flags_if(

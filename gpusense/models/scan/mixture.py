@@ -10,7 +10,8 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.interface.flags import flags_if
-from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
+from gpusense.interface.structs import MixtureTerms, columns, packed
+from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, rounding_error, sums_linearly
 from gpusense.models.scan.beam_density import BeamDensity
 from gpusense.world.hit_shapes import shape_of
 from gpusense.world.hit_tables import mass_tables
@@ -27,13 +28,15 @@ class Mixture:
 
     Attributes:
         flags: Flags of its components.
-        terms: Its numbers, for each bin of angles of incidence.
+        terms: Its numbers; each field is an array with a number for each bin of angles of incidence.
+        masses: Tables of the masses of hits; one 0 without a table.
         cosines: Cosines between these bins.
         table: Log densities over readings and expected ranges; None where the mixture is evaluated.
     """
 
     flags: frozenset[str]
-    terms: np.ndarray
+    terms: MixtureTerms
+    masses: np.ndarray
     cosines: np.ndarray = field(default_factory=lambda: np.zeros(1))
     table: np.ndarray | None = None
 
@@ -73,23 +76,23 @@ def mixture_on_device(
     """
     mixtures, cosines = density.mixtures, density.cosines
     if compat is not None:
-        return Mixture(*peer_mixture(mixtures[0], range_max, real, amcl=compat == "amcl"), cosines)
-    flags, terms = mixture_of(mixtures, range_max, real, specialize=specialize, max_depends=density.max_depends)
+        return Mixture(*peer_mixture(mixtures[0], range_max, real, amcl=compat == "amcl"), np.zeros(1, real), cosines)
+    flags, terms, masses = mixture_of(mixtures, range_max, real, specialize=specialize, max_depends=density.max_depends)
     if density.table is not None:
         values = density.table.sensor_table(real)
         # Sums of finite numbers need no check for impossible readings.
         flags = flags_if(SENSOR_TABLE=True, LINEAR=bool(np.isfinite(values).all()))
-        return Mixture(flags, terms, cosines, values)
+        return Mixture(flags, terms, masses, cosines, values)
     if width is None:
-        return Mixture(flags, terms, cosines)
+        return Mixture(flags, terms, masses, cosines)
     values = tabulated(mixtures[0], width, range_max, real)
-    return Mixture((flags & {"LINEAR"}) | {"SENSOR_TABLE"}, terms, cosines, values)
+    return Mixture((flags & {"LINEAR"}) | {"SENSOR_TABLE"}, terms, masses, cosines, values)
 
 
 def mixture_of(
     kinds: Sequence[BeamParameters], range_max: float, real: np.dtype, *, specialize: bool, max_depends: bool
-) -> tuple[frozenset[str], np.ndarray]:
-    """Return flags of the components, and the numbers of the kernel file ``mixture`` for each bin of incidence.
+) -> tuple[frozenset[str], MixtureTerms, np.ndarray]:
+    """Return flags of the components, their numbers for each bin of incidence, and the tables of masses of hits.
 
     Raises:
         ValueError: A number is beyond what the precision can hold.
@@ -111,19 +114,24 @@ def mixture_of(
         LINEAR=linear,
         STOPS=specialize and len(ends) == 1 and ends[0] is not None,
     )  # fmt: skip
-    terms = [_terms(p, range_max, real, linear, end) for p, end in zip(kinds, ends, strict=True)]
-    return flags | shape, np.concatenate([*terms, *mass_tables([shape_of(p) for p in kinds], terms, real)])
+    places, masses = mass_tables([shape_of(p) for p in kinds], real)
+    terms = [_terms(p, range_max, real, linear, end, at) for p, end, at in zip(kinds, ends, places, strict=True)]
+    return flags | shape, _columns(terms, real), masses
 
 
-def learning_terms(p: BeamParameters, range_max: float, real: np.dtype) -> np.ndarray:
-    """Return the numbers of the kernel file ``learning``, with the table of masses behind them.
+def learning_terms(p: BeamParameters, range_max: float, real: np.dtype) -> tuple[MixtureTerms, np.ndarray]:
+    """Return the numbers of the kernel file ``learning``, and the table of masses of hits.
 
     Raises:
         ValueError: A number is beyond what the precision can hold.
     """
-    shape = shape_of(p)
-    terms = _terms(p, range_max, real, False, (1 / p.sigma_hit, 1 / shape.width, 0.0))
-    return np.concatenate([terms, *mass_tables([shape], [terms], real)])
+    return _terms(p, range_max, real, False, None, 0), mass_tables([shape_of(p)], real)[1]
+
+
+def _columns(terms: Sequence[MixtureTerms], real: np.dtype) -> MixtureTerms:
+    """Return the numbers of all bins, with an array for each field."""
+    made: MixtureTerms = columns("MixtureTerms", packed(terms, real))
+    return made
 
 
 def _common_flags(kinds: Sequence[BeamParameters]) -> frozenset[str]:
@@ -136,7 +144,7 @@ def _common_flags(kinds: Sequence[BeamParameters]) -> frozenset[str]:
 
 def peer_mixture(
     p: BeamParameters, range_max: float, real: np.dtype, *, amcl: bool
-) -> tuple[frozenset[str], np.ndarray]:
+) -> tuple[frozenset[str], MixtureTerms]:
     """Return flags and numbers of the kernel file ``compat``.
 
     Raises:
@@ -147,8 +155,11 @@ def peer_mixture(
     flags = frozenset({"HIT", "SHORT", "RAND", "LINEAR", "CUBES"}) | flags_if(AMCL=amcl)
     hit = p.z_hit if amcl else hit_peak(p)
     short = ShortDensity(p.lambda_short)
-    terms = [hit, *_shape(p), p.z_short, short.rate, _rand(p, range_max), range_max, NoReturn(p.z_max).weight]
-    return flags, rounded_terms(terms, real)
+    terms = rounded_terms(
+        real, hit_peak=hit, **_scales(p), z_short=p.z_short, lambda_short=short.rate, rand_density=_rand(p, range_max),
+        range_max=range_max, z_max=NoReturn(p.z_max).weight,
+    )  # fmt: skip
+    return flags, _columns([MixtureTerms(**dict.fromkeys(MixtureTerms._fields, 0.0) | terms)], real)
 
 
 def tabulated(p: BeamParameters, width: float, range_max: float, real: np.dtype) -> np.ndarray:
@@ -181,23 +192,35 @@ def _rand(p: BeamParameters, range_max: float) -> float:
     return RandomDensity(range_max).peak(p.z_rand)
 
 
-def _shape(p: BeamParameters) -> tuple[float, float]:
-    return 0.5 / p.sigma_hit / p.sigma_hit, math.sqrt(0.5) / p.sigma_hit
+def _scales(p: BeamParameters) -> dict[str, float]:
+    """Return the factor of the squared distance in the exponent of a normal, and that of a distance in erf."""
+    return {"square_scale": 0.5 / p.sigma_hit / p.sigma_hit, "erf_scale": math.sqrt(0.5) / p.sigma_hit}
 
 
 def _terms(
-    p: BeamParameters, range_max: float, real: np.dtype, linear: bool, end: tuple[float, float, float] | None
-) -> np.ndarray:
+    p: BeamParameters,
+    range_max: float,
+    real: np.dtype,
+    linear: bool,
+    end: tuple[float, float, float] | None,
+    place: int,
+) -> MixtureTerms:
+    shape = shape_of(p)
     if linear:
-        head = (hit_peak(p), p.z_short, _rand(p, range_max))
+        hit, short, rand = hit_peak(p), p.z_short, _rand(p, range_max)
     else:
-        log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - shape_of(p).log_width
-        head = (log_scale, log_weight(p.z_short), RandomDensity(range_max).log_peak(p.z_rand))
-    rate, top = ShortDensity(p.lambda_short).rate, NoReturn(p.z_max).number
-    terms = [head[0], *_shape(p), head[1], rate, head[2], range_max, top]
-    # The last number is the place of the table of masses.
-    rest = [*(end or (0, 0, 0)), *shape_of(p).numbers, 0]
-    return np.concatenate([rounded_terms(terms, real), _moments(p, real), np.array(rest, real)])
+        hit = log_weight(p.z_hit) - math.log(p.sigma_hit) - shape.log_width
+        short, rand = log_weight(p.z_short), RandomDensity(range_max).log_peak(p.z_rand)
+    rounded = rounded_terms(
+        real, hit_peak=hit, **_scales(p), z_short=short, lambda_short=ShortDensity(p.lambda_short).rate,
+        rand_density=rand, range_max=range_max, z_max=NoReturn(p.z_max).number,
+    )  # fmt: skip
+    offset, slope, least = end or (0.0, 0.0, 0.0)
+    power, rate = shape.numbers
+    return MixtureTerms(
+        **rounded, **_moments(p, real), last_offset=offset, last_slope=slope, last_least=least,
+        inverse_sigma=1 / p.sigma_hit, unit_peak=1 / shape.width, shape_power=power, shape_rate=rate, mass_table=place,
+    )  # fmt: skip
 
 
 def _last_range(p: BeamParameters, range_max: float, real: np.dtype, linear: bool) -> tuple[float, float, float] | None:
@@ -230,11 +253,11 @@ def _last_range(p: BeamParameters, range_max: float, real: np.dtype, linear: boo
     return (offset, slope, least) if max(offset, least) < range_max else None
 
 
-def _moments(p: BeamParameters, real: np.dtype) -> np.ndarray:
+def _moments(p: BeamParameters, real: np.dtype) -> dict[str, np.floating]:
     """Return range_bias and sigma_growth / sigma_hit, each as a rounded number and its rounding error."""
-    exact = np.array([p.range_bias, p.sigma_growth / p.sigma_hit])
+    moments = {"range_bias": p.range_bias, "relative_growth": p.sigma_growth / p.sigma_hit}
     with np.errstate(over="ignore"):
-        rounded = exact.astype(real)
-    if not np.isfinite(rounded).all():
+        rounded = {name: real.type(moment) for name, moment in moments.items()}
+    if not np.isfinite(list(rounded.values())).all():
         raise ValueError(f"parameters: range_bias and sigma_growth / sigma_hit must fit {real.name}, got {p}")
-    return np.stack([rounded, (exact - rounded).astype(real)], axis=1).ravel()
+    return rounded | {f"{name}_low": rounding_error(moments[name], rounded[name]) for name in moments}

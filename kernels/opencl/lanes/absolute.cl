@@ -2,8 +2,7 @@
 // lanes/math.
 // requires: lanes/offsets lanes/log_terms
 
-// in lanes: NEARBY SERIES VON_MISES WRAPS WAVES SCALE SCALE_LOW PEAK PEAK_LOW RANDOM DECAY WAVE NEGLIGIBLE HALF_TURN
-// in lanes: HALF_TURN_LOW
+// in lanes: NEARBY SERIES VON_MISES WRAPS WAVES NEGLIGIBLE HALF_TURN HALF_TURN_LOW
 
 // The power series of the sine, as in absolute.cl; float32 needs no more terms up to pi / 2.
 #define SINES 7
@@ -43,13 +42,13 @@ kernel void score_position(ARGUMENTS) {
     const int first_particle = LANES * get_global_id(0);
     if (first_particle >= particles) return;
     const LanePlace offset = load_places(place, first_particle, particles);
-    const LanePair first = bounded_square_lanes(scaled_pair_lanes(offset.x, terms[0], terms[1]));
-    const LanePair sum = pair_sum_lanes(scaled_pair_lanes(offset.x, terms[2], terms[3]),
-                                        scaled_pair_lanes(offset.y, terms[4], terms[5]));
+    const LanePair first = bounded_square_lanes(scaled_pair_lanes(offset.x, terms->x_scale, terms->x_scale_low));
+    const LanePair sum = pair_sum_lanes(scaled_pair_lanes(offset.x, terms->shear, terms->shear_low),
+                                        scaled_pair_lanes(offset.y, terms->y_scale, terms->y_scale_low));
     const LanePair exponent = pair_sum_lanes(first, bounded_square_lanes(sum));
-    lanes log_density = (terms[6] - exponent.hi) + (terms[7] - exponent.lo);
+    lanes log_density = (terms->peak - exponent.hi) + (terms->peak_low - exponent.lo);
 #if RAND
-    log_density = either_lanes(log_density, (lanes)terms[8]);
+    log_density = either_lanes(log_density, (lanes)terms->random);
 #endif
     store_some(temperature * log_density, log_p + first_particle, particles - first_particle);
 }
@@ -61,15 +60,15 @@ kernel void score_heading(ARGUMENTS) {
     const LanePair r = load_pairs((global const real *)(residual + first_particle), particles - first_particle);
     lanes log_density;
     if (kind == SERIES) {
-        log_density = terms[PEAK] + (terms[PEAK_LOW] + log_waves_lanes(r, terms));
+        log_density = terms->peak + (terms->peak_low + log_waves_lanes(r, waves));
     } else {
         const LanePair root = kind == VON_MISES ? half_sine_lanes(r) : r;
-        const LanePair exponent = bounded_square_lanes(scaled_pair_lanes(root, terms[SCALE], terms[SCALE_LOW]));
-        log_density = (terms[PEAK] - exponent.hi) + (terms[PEAK_LOW] - exponent.lo);
-        if (kind == NEARBY) log_density += log_other_turns_lanes(r, terms[DECAY]);
+        const LanePair exponent = bounded_square_lanes(scaled_pair_lanes(root, terms->scale, terms->scale_low));
+        log_density = (terms->peak - exponent.hi) + (terms->peak_low - exponent.lo);
+        if (kind == NEARBY) log_density += log_other_turns_lanes(r, terms->decay);
     }
 #if RAND
-    log_density = either_lanes(log_density, (lanes)terms[RANDOM]);
+    log_density = either_lanes(log_density, (lanes)terms->random);
 #endif
     store_some(temperature * log_density, log_p + first_particle, particles - first_particle);
 }

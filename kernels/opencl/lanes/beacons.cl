@@ -2,8 +2,7 @@
 // the order of the scalar kernel.
 // requires: lanes/offsets lanes/log_terms
 
-// in lanes: STUDENT_T TWO_NORMALS BEACON SCALE PEAK RANDOM RANGE_MAX WIDE_SCALE WIDE_PEAK OFFSET OFFSET_LOW POWER T_SCALE
-// in lanes: ARC ODD STEEPEST
+// in lanes: STUDENT_T TWO_NORMALS BEACON STEEPEST
 
 // tan(pi/8), pi/4 and pi/2.
 #define EIGHTH_SLOPE 0.414213562f
@@ -21,46 +20,49 @@ lanes atan_lanes(const lanes t) {
 }
 
 // Return the log of a truncated normal.
-lanes log_normal_lanes(const LanePair residual, const lanes near, const lanes far, global const real *terms,
-                       const int first, const int peak) {
-    const float scale = terms[first];
-    const LanePair exponent = bounded_square_lanes(scaled_pair_lanes(residual, scale, terms[first + 1]));
-    const lanes untruncated = (terms[peak] - exponent.hi) + (terms[peak + 1] - exponent.lo);
-    const lanes nearest = (near < far ? near : far) * scale;
+lanes log_normal_lanes(const LanePair residual, const lanes near, const lanes far, const float2 scale,
+                       const float2 peak) {
+    const LanePair exponent = bounded_square_lanes(scaled_pair_lanes(residual, scale.x, scale.y));
+    const lanes untruncated = (peak.x - exponent.hi) + (peak.y - exponent.lo);
+    const lanes nearest = (near < far ? near : far) * scale.x;
     if (!any_lane(nearest < LANE_ERF_ONE)) return untruncated;
-    return untruncated - log_lanes(0.5f * (erf_lanes(near * scale) + erf_lanes(far * scale)));
+    return untruncated - log_lanes(0.5f * (erf_lanes(near * scale.x) + erf_lanes(far * scale.x)));
 }
 
 // in lanes: t_mass
 
 // Return the log of a truncated Student t.
-lanes log_student_t_lanes(const LanePair residual, const lanes near, const lanes far, global const real *terms,
+lanes log_student_t_lanes(const LanePair residual, const lanes near, const lanes far, global const BeaconTerms *terms,
                           global const real *series, const int count) {
-    const LanePair squared = bounded_square_lanes(scaled_pair_lanes(residual, terms[SCALE], terms[SCALE + 1]));
-    const LanePair sum = two_sum_lanes((lanes)terms[OFFSET], squared.hi);
-    const LanePair x = two_sum_lanes(sum.hi, sum.lo + (terms[OFFSET_LOW] + squared.lo));
-    const lanes below = t_mass_lanes(near * terms[T_SCALE], terms, series, count);
-    const lanes above = t_mass_lanes(far * terms[T_SCALE], terms, series, count);
-    return (terms[PEAK] - terms[POWER] * (log_lanes(x.hi) + x.lo / x.hi)) - log_lanes(0.5f * (below + above));
+    const LanePair squared = bounded_square_lanes(scaled_pair_lanes(residual, terms->scale, terms->scale_low));
+    const LanePair sum = two_sum_lanes((lanes)terms->offset, squared.hi);
+    const LanePair x = two_sum_lanes(sum.hi, sum.lo + (terms->offset_low + squared.lo));
+    const lanes below = t_mass_lanes(near * terms->t_scale, terms, series, count);
+    const lanes above = t_mass_lanes(far * terms->t_scale, terms, series, count);
+    return (terms->peak - terms->power * (log_lanes(x.hi) + x.lo / x.hi)) - log_lanes(0.5f * (below + above));
 }
 
 // Return log p of one range at distances.
-lanes log_range_lanes(const LanePair d, global const real *beacon, global const real *terms, global const real *series,
+lanes log_range_lanes(const LanePair d, global const real *beacon, global const BeaconTerms *terms,
+                      global const real *series,
                       const int count, const int kind) {
     const LanePair first = two_sum_lanes(d.hi, (lanes)-beacon[4]);
     const LanePair r = two_sum_lanes(first.hi, first.lo + (d.lo - beacon[5]));
     lanes near = d.hi + beacon[6];
     near = near > 0 ? near : (lanes)0;
-    near = near < terms[RANGE_MAX] ? near : (lanes)terms[RANGE_MAX];
-    const lanes far = terms[RANGE_MAX] - near;
+    near = near < terms->range_max ? near : (lanes)terms->range_max;
+    const lanes far = terms->range_max - near;
     lanes log_p;
     if (kind == STUDENT_T)
         log_p = log_student_t_lanes(r, near, far, terms, series, count);
     else
-        log_p = log_normal_lanes(r, near, far, terms, SCALE, PEAK);
-    if (kind == TWO_NORMALS) log_p = either_lanes(log_p, log_normal_lanes(r, near, far, terms, WIDE_SCALE, WIDE_PEAK));
+        log_p = log_normal_lanes(r, near, far, (float2)(terms->scale, terms->scale_low),
+                                 (float2)(terms->peak, terms->peak_low));
+    if (kind == TWO_NORMALS)
+        log_p = either_lanes(log_p, log_normal_lanes(r, near, far, (float2)(terms->wide_scale, terms->wide_scale_low),
+                                                     (float2)(terms->wide_peak, terms->wide_peak_low)));
 #if RAND
-    return either_lanes(log_p, (lanes)terms[RANDOM]);
+    return either_lanes(log_p, (lanes)terms->random);
 #else
     return log_p;
 #endif

@@ -6,9 +6,10 @@
 #define VECTORS 4
 
 // Return the distances in cells to which the rays of readings are cast.
-lanes ray_limit_lanes(const lanes z, global const real *terms, const RangeScale scale) {
+lanes ray_limit_lanes(const lanes z, global const MixtureTerms *terms, const RangeScale scale) {
 #if STOPS
-    const lanes reach = terms[14] + terms[15] * z, last = (reach > terms[16] ? reach : (lanes)terms[16]) / scale.resolution;
+    const lanes reach = terms->last_offset + terms->last_slope * z;
+    const lanes last = (reach > terms->last_least ? reach : (lanes)terms->last_least) / scale.resolution;
     return last < scale.limit ? last : (lanes)scale.limit;
 #else
     return scale.limit;
@@ -16,9 +17,9 @@ lanes ray_limit_lanes(const lanes z, global const real *terms, const RangeScale 
 }
 
 // Return the components of the terms of readings in the sum; bin_at becomes where the terms of their bins begin.
-INLINE DensityParts reading_parts_lanes(const lanes z, const EchoLanes echo, global const real *terms,
-                                        global const real *edges, global const real *sensor, const MixtureTables tables,
-                                        const RangeScale scale, ilanes *bin_at) {
+INLINE DensityParts reading_parts_lanes(const lanes z, const EchoLanes echo, global const MixtureTerms *terms,
+                                        global const real *masses, global const real *edges, global const real *sensor,
+                                        const MixtureTables tables, const RangeScale scale, ilanes *bin_at) {
     const lanes expected = range_lanes(echo.t, scale);
     *bin_at = 0;
 #if INCIDENCE
@@ -30,12 +31,12 @@ INLINE DensityParts reading_parts_lanes(const lanes z, const EchoLanes echo, glo
 #elif CUBES
     return (DensityParts){compat_density_lanes(z, expected, terms), 0};
 #else
-    return density_parts_lanes(z, expected, terms, *bin_at);
+    return density_parts_lanes(z, expected, terms, masses, *bin_at);
 #endif
 }
 
 // Return the terms of readings in the sum.
-lanes reading_term_lanes(const lanes z, const DensityParts parts, global const real *terms, const ilanes bin_at) {
+lanes reading_term_lanes(const lanes z, const DensityParts parts, global const MixtureTerms *terms, const ilanes bin_at) {
 #if SENSOR_TABLE
     lanes term = parts.hit;
 #elif CUBES
@@ -45,7 +46,7 @@ lanes reading_term_lanes(const lanes z, const DensityParts parts, global const r
 #endif
 #if ALL_READINGS
 #if !SENSOR_TABLE
-    term = z == INFINITY ? TERM(7) : term;
+    term = z == INFINITY ? TERM(z_max) : term;
 #endif
     term = z == z ? term : (lanes)0;
 #endif
@@ -122,8 +123,8 @@ kernel void score_beams(ARGUMENTS) {
         DensityParts parts_of[VECTORS];
         ilanes bin_at[VECTORS];
         for (int k = from, v = 0; k < until; k += LANES, ++v)
-            parts_of[v] = reading_parts_lanes(load_some(reading + k, count - k), echo[v], terms, edges, sensor, tables,
-                                              scale, &bin_at[v]);
+            parts_of[v] = reading_parts_lanes(load_some(reading + k, count - k), echo[v], terms, masses, edges, sensor,
+                                              tables, scale, &bin_at[v]);
         for (int k = from, v = 0; k < until; k += LANES, ++v) {
             const int left = count - k;
             lanes term = reading_term_lanes(load_some(reading + k, left), parts_of[v], terms, bin_at[v]);

@@ -2,8 +2,7 @@
 // points have the bits of the scalar kernel.
 // requires: lanes/end_point lanes/log_terms
 
-// in lanes: NO_OBSTACLE SCALE SCALE_LOW REACH REACH_LOW SIDE SIDE_LOW HIT_TERM FALSE_TERM MISS_TERM NO_HIT_TERM FAR_CELLS
-// in lanes: SERIES LOG_TWO_ROOT_PI
+// in lanes: NO_OBSTACLE FAR_CELLS SERIES LOG_TWO_ROOT_PI
 
 #define LOG_TWO 0.693147181f
 // From here on the series is accurate to float32.
@@ -46,16 +45,16 @@ ilanes look_up_lanes(global const int *table, const Particles *particle, const r
 }
 
 // Return the gaps between outline and obstacle, negative where they overlap; squared distances are in cells.
-LanePair gap_lanes(const ilanes squared, global const real *terms) {
+LanePair gap_lanes(const ilanes squared, global const ContactTerms *terms) {
     const LanePair whole = two_sum_lanes(to_lanes(squared >> 12) * 4096, to_lanes(squared & 4095));
     const lanes d = sqrt(whole.hi);
     const LanePair dd = fused_product_lanes(d, d);
     const lanes low = d > 0 ? ((whole.hi - dd.hi) + (whole.lo - dd.lo)) / (2 * d) : (lanes)0;
     const ilanes none = squared == NO_OBSTACLE;
     const LanePair cells = {none ? (lanes)FAR_CELLS : d, none ? (lanes)0 : low};
-    const LanePair away = scaled_pair_lanes(cells, terms[SIDE], terms[SIDE_LOW]);
-    const LanePair left = two_sum_lanes(away.hi, (lanes)-terms[REACH]);
-    return two_sum_lanes(left.hi, left.lo + (away.lo - terms[REACH_LOW]));
+    const LanePair away = scaled_pair_lanes(cells, terms->side, terms->side_low);
+    const LanePair left = two_sum_lanes(away.hi, (lanes)-terms->reach);
+    return two_sum_lanes(left.hi, left.lo + (away.lo - terms->reach_low));
 }
 
 // Return log(erfc(x) / 2) for x >= 0, by an asymptotic series where erfc is small.
@@ -76,15 +75,15 @@ lanes log_above_lanes(const LanePair x) {
 }
 
 // Return the log probabilities that a segment is pressed, or that it is not.
-lanes log_bump_lanes(const ilanes squared, const int pressed, global const real *terms) {
-    const LanePair x = scaled_pair_lanes(gap_lanes(squared, terms), terms[SCALE], terms[SCALE_LOW]);
+lanes log_bump_lanes(const ilanes squared, const int pressed, global const ContactTerms *terms) {
+    const LanePair x = scaled_pair_lanes(gap_lanes(squared, terms), terms->scale, terms->scale_low);
     const ilanes overlaps = x.hi < 0;
     // The smaller of the two probabilities, then the other one.
     const LanePair size = {overlaps ? -x.hi : x.hi, overlaps ? -x.lo : x.lo};
     const lanes small = log_above_lanes(size), large = log_lanes(1 - exp_lanes(small));
     const lanes touching = overlaps ? large : small, clear = overlaps ? small : large;
-    const real hit = pressed ? terms[HIT_TERM] : terms[MISS_TERM];
-    const real no_hit = pressed ? terms[FALSE_TERM] : terms[NO_HIT_TERM];
+    const real hit = pressed ? terms->log_contact : terms->log_missed;
+    const real no_hit = pressed ? terms->log_false : terms->log_quiet;
     return either_lanes(hit + touching, no_hit + clear);
 }
 

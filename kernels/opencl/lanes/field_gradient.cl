@@ -43,11 +43,12 @@ kernel void field_gradient(ARGUMENTS) {
         ((real *)&cos)[i] = pose[n].z;
         ((real *)&sin)[i] = pose[n].w;
     }
-    const real peak = terms[0], twice = 2 * terms[1];
+    const real peak = terms->hit_peak, twice = 2 * terms->square_scale;
+    const real power = terms->shape_power, rate = terms->shape_rate;
     // The sensor's place on the robot, turned.
     const lanes mounted_x = cos * mount_x - sin * mount_y, mounted_y = sin * mount_x + cos * mount_y;
     lanes product = 1, total = constant_term, total_low = 0;
-    const int mask = peak + terms[2] < LARGEST_DENSITY && terms[2] > LEAST_DENSITY ? TOGETHER - 1 : 0;
+    const int mask = peak + terms->rand_density < LARGEST_DENSITY && terms->rand_density > LEAST_DENSITY ? TOGETHER - 1 : 0;
     lanes sums[9];
     for (int i = 0; i < 9; ++i) sums[i] = 0;
     for (int k = 0; k < size; ++k) {
@@ -68,13 +69,13 @@ kernel void field_gradient(ARGUMENTS) {
         const lanes low = a + rest_x * (b - a), high = d + rest_x * (e - d);
         const lanes slope_x = (b - a) + rest_y * ((e - d) - (b - a)), slope_y = high - low;
         const lanes distance = low + rest_y * slope_y;
-        const lanes square = distance * (distance * terms[1]);
+        const lanes square = distance * (distance * terms->square_scale);
 #if HIT
-        const lanes hit = peak * exp_lanes(-shape_exponent_lanes((LanePair){square, 0}, terms[6], terms[7]).hi);
+        const lanes hit = peak * exp_lanes(-shape_exponent_lanes((LanePair){square, 0}, power, rate).hi);
 #else
         const lanes hit = 0;
 #endif
-        const lanes density = hit + terms[2];
+        const lanes density = hit + terms->rand_density;
         product *= density;
         if ((k & mask) == mask || k == size - 1) {
             const lanes term = log_lanes(product), sum = total + term, shift = sum - total;
@@ -82,7 +83,7 @@ kernel void field_gradient(ARGUMENTS) {
             total = sum;
             product = 1;
         }
-        const lanes weight = twice * (hit / density) * shape_weight_lanes(square, terms[6], terms[7]), pull = weight * distance;
+        const lanes weight = twice * (hit / density) * shape_weight_lanes(square, power, rate), pull = weight * distance;
         const lanes turn = slope_y * (arm_x + mounted_x) - slope_x * (arm_y + mounted_y);
         const lanes by_x = weight * slope_x, by_y = weight * slope_y;
         sums[0] -= pull * slope_x;

@@ -10,12 +10,12 @@
 #if BILINEAR
 // Return log p of end points, from the squares of their distances to the nearest obstacles over 2 sigma^2: log_field of
 // field_term.cl.
-lanes log_square_lanes(const LanePair square, global const real *terms) {
-    const LanePair exponent = shape_exponent_lanes(square, terms[6], terms[7]);
+lanes log_square_lanes(const LanePair square, global const FieldTerms *terms) {
+    const LanePair exponent = shape_exponent_lanes(square, terms->shape_power, terms->shape_rate);
 #if LINEAR
-    lanes p = terms[2];
+    lanes p = terms->rand_density;
 #if HIT
-    const lanes hit = terms[0] * exp_lanes(-exponent.hi);
+    const lanes hit = terms->hit_peak * exp_lanes(-exponent.hi);
 #if EXACT_EXPONENT
     p += hit > 0 ? hit * (1 - exponent.lo) : hit;
 #else
@@ -24,9 +24,9 @@ lanes log_square_lanes(const LanePair square, global const real *terms) {
 #endif
     return log_lanes(p);
 #else
-    const lanes hit = (terms[0] - exponent.hi) + (terms[4] - exponent.lo);
+    const lanes hit = (terms->hit_peak - exponent.hi) + (terms->hit_peak_low - exponent.lo);
 #if RAND
-    const lanes random = terms[2];
+    const lanes random = terms->rand_density;
     const lanes largest = hit > random ? hit : random;
     const lanes sum = largest + log_lanes(exp_lanes(hit - largest) + exp_lanes(random - largest));
     return largest == -INFINITY ? largest : sum;
@@ -86,8 +86,11 @@ LanePair between_lanes(const LanePair weight_a, const LanePair a, const LanePair
 }
 
 // Find the squares of the distances of a block's end points over 2 sigma^2.
-void find_squares(LanePair *square, const EndPoints *ends, global const real *table, global const real *terms,
+void find_squares(LanePair *square, const EndPoints *ends, global const real *table, global const FieldTerms *terms,
                   const int size, const Window window) {
+#if EXACT_EXPONENT
+    const LanePair scale = {terms->square_scale, terms->square_scale_low};
+#endif
     for (int k = 0; k < size; ++k) {
         const lane_int *at = (const lane_int *)&ends->cell[k];
         LanePair a = {0, 0}, b = {0, 0}, c = {0, 0}, d = {0, 0};
@@ -97,9 +100,9 @@ void find_squares(LanePair *square, const EndPoints *ends, global const real *ta
         const LanePair high = between_lanes(ends->to_next_x[k], c, ends->rest_x[k], d);
         const LanePair distance = between_lanes(ends->to_next_y[k], low, ends->rest_y[k], high);
 #if EXACT_EXPONENT
-        square[k] = pair_product_lanes(pair_product_lanes(distance, distance), (LanePair){terms[1], terms[5]});
+        square[k] = pair_product_lanes(pair_product_lanes(distance, distance), scale);
 #else
-        square[k] = (LanePair){distance.hi * (distance.hi * terms[1]), 0};
+        square[k] = (LanePair){distance.hi * (distance.hi * terms->square_scale), 0};
 #endif
     }
 }
@@ -189,7 +192,7 @@ half_lanes scaled_square(const float8 a, const float8 b, const float8 c, const f
 #endif
 
 // Find the squares of the distances of a block's end points over 2 sigma^2.
-void find_squares(LanePair *square, const EndPoints *ends, global const real *table, global const real *terms,
+void find_squares(LanePair *square, const EndPoints *ends, global const real *table, global const FieldTerms *terms,
                   const int size, const Window window) {
     for (int k = 0; k < size; ++k) {
         const int *at = (const int *)&ends->cell[k];
@@ -197,7 +200,7 @@ void find_squares(LanePair *square, const EndPoints *ends, global const real *ta
         gather_pairs(table, at, &a, &b);
         gather_pairs(table + window.cols + 2 * FIELD_RING, at, &c, &d);
 #if EXACT_EXPONENT
-        const double factor = (double)terms[1] + terms[5];
+        const double factor = (double)terms->square_scale + terms->square_scale_low;
         half_lanes both[2];
         both[0] = scaled_square(a.lo, b.lo, c.lo, d.lo, ends->rest_x[k][0], ends->rest_y[k][0], factor);
         both[1] = scaled_square(a.hi, b.hi, c.hi, d.hi, ends->rest_x[k][1], ends->rest_y[k][1], factor);
@@ -208,7 +211,7 @@ void find_squares(LanePair *square, const EndPoints *ends, global const real *ta
         const lanes rest_x = ends->rest_x[k], rest_y = ends->rest_y[k], to_next_x = 1 - rest_x;
         const lanes low = to_next_x * a + rest_x * b, high = to_next_x * c + rest_x * d;
         const lanes distance = (1 - rest_y) * low + rest_y * high;
-        square[k] = (LanePair){distance * (distance * terms[1]), 0};
+        square[k] = (LanePair){distance * (distance * terms->square_scale), 0};
 #endif
     }
 }

@@ -5,7 +5,7 @@
 
 #if MASS_TABLE
 // Return the masses between the mean and distances; the tables begin at places.
-lanes half_mass_lanes(const lanes b, global const real *terms, const ilanes place) {
+lanes half_mass_lanes(const lanes b, global const real *masses, const ilanes place) {
     const lanes at = log1p_lanes(b) * TABLE_PER_LOG;
     const ilanes inside = at < TABLE_CELLS;
     const lanes held = inside ? at : (lanes)0;
@@ -13,15 +13,15 @@ lanes half_mass_lanes(const lanes b, global const real *terms, const ilanes plac
     const lanes share = held - to_lanes(cell);
     const lane_int *from = (const lane_int *)&first;
     lanes mass, lower;
-    gather_pairs(terms + (TABLE_POWERS - 2), from, &lower, &mass);
+    gather_pairs(masses + (TABLE_POWERS - 2), from, &lower, &mass);
     mass = mass * share + lower;
     for (int i = TABLE_POWERS - 4; i >= 0; i -= 2) {
         lanes higher;
-        gather_pairs(terms + i, from, &lower, &higher);
+        gather_pairs(masses + i, from, &lower, &higher);
         mass = (mass * share + higher) * share + lower;
     }
     // An odd number of powers leaves the lowest.
-    if (TABLE_POWERS % 2 == 1) mass = mass * share + GATHER_AT(lanes, terms, from);
+    if (TABLE_POWERS % 2 == 1) mass = mass * share + GATHER_AT(lanes, masses, from);
     return inside ? mass : (lanes)0.5;
 }
 #endif

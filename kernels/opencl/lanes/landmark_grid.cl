@@ -61,7 +61,7 @@ ilanes may_be_likelier(const LanePlace off, const lanes d, const LanePlace turne
 // does not measure, and may be likelier than the best so far.
 void with_landmark_lanes(MatchLanes *match, global const real4 *landmark, global const real4 *signature, const int j,
                          const LanePlace place, const LanePlace turned, const lanes end_x, const lanes end_y,
-                         global const real *feature, global const real *terms) {
+                         global const real *feature, global const FeatureTerms *terms) {
     // The disc has room for these rounding errors.
     const real4 here = landmark[j];
     const lanes apart_x = here.x - end_x, apart_y = here.y - end_y;
@@ -110,7 +110,7 @@ int is_beyond(const real4 here, const real2 x, const real2 y, const float square
 void search_buckets_lanes(MatchLanes *match, global const real4 *landmark, global const real4 *signature,
                           global const int *start, const int4 buckets, const int cols, const real2 x, const real2 y,
                           const LanePlace place, const LanePlace turned, const lanes end_x, const lanes end_y,
-                          global const real *feature, global const real *terms) {
+                          global const real *feature, global const FeatureTerms *terms) {
     const float squared_radius = feature[RADIUS] * feature[RADIUS];
     int nearest = -1;
 #if !MARGINAL
@@ -140,7 +140,7 @@ void search_buckets_lanes(MatchLanes *match, global const real4 *landmark, globa
 // alone, the particles search together, else one after the other. A lane has the same bits in both cases.
 MatchLanes search_lanes(global const real4 *landmark, global const real4 *signature, global const int *start,
                         const LanePlace place, const LanePlace turned, global const real *feature,
-                        global const real *terms, const Buckets buckets) {
+                        global const FeatureTerms *terms, const Buckets buckets) {
     const real radius = feature[RADIUS];
     MatchLanes match = {-INFINITY, -INFINITY, -1, -1, {0, 0}};
     if (radius < 0) return match;

@@ -110,7 +110,7 @@ LanePair add_square_lanes(const LanePair total, const LanePair residual, const f
 
 // Return log(z_detect p(f | j)) of a feature at an offset; signature is the landmark's.
 lanes log_detection_lanes(const LanePlace off, const LanePlace turned, global const real *feature,
-                          const real4 signature, global const real *terms) {
+                          const real4 signature, global const FeatureTerms *terms) {
     LanePair exponent = {0, 0};
     lanes mass = 1;
 #if SIGNATURE
@@ -123,8 +123,8 @@ lanes log_detection_lanes(const LanePlace off, const LanePlace turned, global co
         const LanePair r = two_sum_lanes(d.hi, (lanes)-feature[RANGE_AT]);
         exponent = add_square_lanes(exponent, two_sum_lanes(r.hi, r.lo + (d.lo - feature[RANGE_LOW])), scale,
                                     feature[RANGE_SCALE_LOW]);
-        const lanes inside = d.hi < terms[0] ? d.hi : (lanes)terms[0];
-        const lanes left = (terms[0] - d.hi) + (terms[1] - d.lo);
+        const lanes inside = d.hi < terms->range_max ? d.hi : (lanes)terms->range_max;
+        const lanes left = (terms->range_max - d.hi) + (terms->range_max_low - d.lo);
         const lanes below = inside * scale, above = (left > 0 ? left : (lanes)0) * scale;
         if (any_lane((below < above ? below : above) < (float)ERF_ONE))
             mass = 0.5f * (erf_lanes(below) + erf_lanes(above));
@@ -138,11 +138,11 @@ lanes log_detection_lanes(const LanePlace off, const LanePlace turned, global co
             add_square_lanes(exponent, angle, feature[BEARING_SCALE], feature[BEARING_SCALE_LOW]);
         exponent = (LanePair){has_bearing ? more.hi : exponent.hi, has_bearing ? more.lo : exponent.lo};
 #if FIELD
-        const lanes seen = field_mass_lanes(angle, feature, terms[2]);
+        const lanes seen = field_mass_lanes(angle, feature, terms->field_of_view);
 #else
         const lanes seen = 1;
 #endif
-        mass = mass * (has_bearing ? seen : (lanes)(terms[3] * feature[BEARING_SCALE]));
+        mass = mass * (has_bearing ? seen : (lanes)(terms->zero_range_density * feature[BEARING_SCALE]));
     }
 #endif
 #if SIGNATURE

@@ -11,48 +11,50 @@
 // in lanes: hit_phi
 
 // Add the terms of a pair in each lane to the sums of the lane.
-void add_pair_lanes(const lanes reading, const lanes expected_range, global const real *terms, lanes *sums) {
+void add_pair_lanes(const lanes reading, const lanes expected_range, global const MixtureTerms *terms,
+                    global const real *masses, lanes *sums) {
     // Padding has no weight and is read as a pair of zeros.
     const ilanes known = reading == reading;
     const lanes z = known ? reading : (lanes)0, expected = known ? expected_range : (lanes)0;
 
+    const real power = terms->shape_power, rate = terms->shape_rate;
     int any_clamped, within;
     const lanes mean = mean_range_lanes(expected, terms, 0, &any_clamped);
     const lanes above = above_mean_lanes(expected, any_clamped, terms, 0);
-    const lanes mass = mass_within_lanes(mean, above, terms[2], terms, 0, &within);
+    const lanes mass = mass_within_lanes(mean, above, terms->erf_scale, terms, masses, 0, &within);
     const lanes off = z - mean;
-    const LanePair exponent = shape_exponent_lanes((LanePair){off * (off * terms[1]), 0}, terms[17], terms[18]);
-    lanes hit = terms[0] - exponent.hi + (terms[8] - exponent.lo);
+    const LanePair exponent = shape_exponent_lanes((LanePair){off * (off * terms->square_scale), 0}, power, rate);
+    lanes hit = terms->hit_peak - exponent.hi + (terms->hit_peak_low - exponent.lo);
     if (!within) hit -= log_lanes(mass);
     const lanes length = short_length_lanes(expected, terms, 0);
-    lanes shorter = terms[3] - log_lanes(length) - terms[4] * z;
+    lanes shorter = terms->z_short - log_lanes(length) - terms->lambda_short * z;
     shorter = (z <= expected) & (expected > 0) ? shorter : (lanes)-INFINITY;
-    const lanes largest = larger_lanes(larger_lanes(hit, shorter), (lanes)terms[5]);
+    const lanes largest = larger_lanes(larger_lanes(hit, shorter), (lanes)terms->rand_density);
     const ilanes possible = largest > -INFINITY;
     const lanes shift = possible ? largest : (lanes)0;
-    lanes r_hit = exp_lanes(hit - shift), r_short = exp_lanes(shorter - shift), r_rand = exp_lanes(terms[5] - shift);
+    lanes r_hit = exp_lanes(hit - shift), r_short = exp_lanes(shorter - shift), r_rand = exp_lanes(terms->rand_density - shift);
     const lanes p = possible ? r_hit + r_short + r_rand : (lanes)1;
     const lanes part = known ? 1 / p : (lanes)0;
     r_hit *= part;
     r_short *= part;
     r_rand *= part;
 
-    const lanes u = off * terms[14];
-    const lanes weight = shape_weight_lanes((real)0.5 * u * u, terms[17], terms[18]), pull = weight * u;
+    const lanes u = off * terms->inverse_sigma;
+    const lanes weight = shape_weight_lanes((real)0.5 * u * u, power, rate), pull = weight * u;
     const lanes square = pull * u;
     lanes t = 0, v = 0, q = 0, w = 0, slope = 0;
     if (!within) {
-        const lanes x_0 = mean * terms[14], x_1 = above * terms[14];
+        const lanes x_0 = mean * terms->inverse_sigma, x_1 = above * terms->inverse_sigma;
         const lanes phi_0 = hit_phi_lanes(x_0, terms) / mass, phi_1 = hit_phi_lanes(x_1, terms) / mass;
-        const lanes pull_0 = shape_weight_lanes((real)0.5 * x_0 * x_0, terms[17], terms[18]) * x_0 * phi_0;
-        const lanes pull_1 = shape_weight_lanes((real)0.5 * x_1 * x_1, terms[17], terms[18]) * x_1 * phi_1;
+        const lanes pull_0 = shape_weight_lanes((real)0.5 * x_0 * x_0, power, rate) * x_0 * phi_0;
+        const lanes pull_1 = shape_weight_lanes((real)0.5 * x_1 * x_1, power, rate) * x_1 * phi_1;
         t = x_0 * phi_0 + x_1 * phi_1;
         slope = phi_1 - phi_0;
         v = pull_0 + pull_1;
         q = x_1 * pull_1 - x_0 * pull_0 + slope * t;
         w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1;
     }
-    const lanes bend = shape_bend_lanes(square, terms[17]);
+    const lanes bend = shape_bend_lanes(square, power);
     // Terms of a cause that is impossible may be infinite.
     const ilanes is_hit = r_hit > 0, is_short = r_short > 0;
 #if BIAS
@@ -62,8 +64,8 @@ void add_pair_lanes(const lanes reading, const lanes expected_range, global cons
     const ilanes moved = is_hit;
 #endif
     const lanes h_s = is_hit ? square - 1 + t : (lanes)0, h_m = moved ? pull + slope : (lanes)0;
-    const lanes x = terms[4] * expected, f = expected > SMALLEST_RANGE ? expected / length : (lanes)1, left = f - x;
-    const lanes s_l = is_short ? 1 - left - terms[4] * z : (lanes)0;
+    const lanes x = terms->lambda_short * expected, f = expected > SMALLEST_RANGE ? expected / length : (lanes)1, left = f - x;
+    const lanes s_l = is_short ? 1 - left - terms->lambda_short * z : (lanes)0;
     sums[0] += known ? largest + log_lanes(p) : (lanes)0;
     sums[1] += r_hit;
     sums[2] += r_short;
@@ -74,7 +76,7 @@ void add_pair_lanes(const lanes reading, const lanes expected_range, global cons
     sums[7] += is_hit ? r_hit * (square * (bend - 2) - t + w + t * t) : (lanes)0;
     sums[8] += moved ? r_hit * (pull * (bend - 2) - slope + q) : (lanes)0;
     sums[9] += moved ? r_hit * (weight * (bend - 1) + v + slope * slope) : (lanes)0;
-    sums[10] += is_short ? r_short * (left * (f - 1) - terms[4] * z) : (lanes)0;
+    sums[10] += is_short ? r_short * (left * (f - 1) - terms->lambda_short * z) : (lanes)0;
     sums[11] += is_hit ? r_hit * square : (lanes)0;
     sums[12] += r_short * z;
 #if INFORMATION
@@ -102,7 +104,7 @@ kernel void e_step(ARGUMENTS) {
         const int last = min(first + BLOCK_TERMS * LANES, readings);
         for (int j = 0; j < SUMS; ++j) part[j] = 0;
         for (int k = first; k < last; k += LANES)
-            add_pair_lanes(load_lanes(0, z + k), load_lanes(0, z_star + k), terms, part);
+            add_pair_lanes(load_lanes(0, z + k), load_lanes(0, z_star + k), terms, masses, part);
         for (int j = 0; j < SUMS; ++j) {
             const real2 sum = add_term((real2)(total[j], total_low[j]), sum_lanes(part[j]));
             total[j] = sum.x;

@@ -7,11 +7,12 @@
 #else
 #define SMALL_DECAY 2.98023224e-08f
 #endif
-// Number i of the terms; the terms of a bin of angles of incidence begin at index bin_at.
+// Numbers of a bin of angles of incidence, and a field of the terms; those of a bin begin bin_at numbers later.
+#define MIXTURE_TERMS ((int)(sizeof(MixtureTerms) / sizeof(real)))
 #if INCIDENCE
-#define TERM(i) GATHER(lanes, (terms + (i)), bin_at)
+#define TERM(field) GATHER(lanes, (&terms->field), bin_at)
 #else
-#define TERM(i) terms[i]
+#define TERM(field) terms->field
 #endif
 
 // Return the larger numbers.
@@ -23,14 +24,14 @@ lanes larger_lanes(const lanes a, const lanes b) { return a > b ? a : b; }
 
 #if HIT
 // Return the means of p_hit; any_clamped becomes whether one is at an end of the range.
-INLINE lanes mean_range_lanes(const lanes expected, global const real *terms, const ilanes bin_at, int *any_clamped) {
+INLINE lanes mean_range_lanes(const lanes expected, global const MixtureTerms *terms, const ilanes bin_at, int *any_clamped) {
     *any_clamped = 0;
 #if BIAS
-    const lanes wanted = expected + TERM(10);
-    *any_clamped = any_lane((wanted < 0) | (wanted >= terms[6]));
+    const lanes wanted = expected + TERM(range_bias);
+    *any_clamped = any_lane((wanted < 0) | (wanted >= terms->range_max));
     if (*any_clamped) {
         const lanes raised = wanted < 0 ? (lanes)0 : wanted;
-        return raised > terms[6] ? (lanes)terms[6] : raised;
+        return raised > terms->range_max ? (lanes)terms->range_max : raised;
     }
     return wanted;
 #else
@@ -39,37 +40,37 @@ INLINE lanes mean_range_lanes(const lanes expected, global const real *terms, co
 }
 
 // Return the distances from the means of p_hit to range_max, which keep their digits where they are short.
-INLINE lanes above_mean_lanes(const lanes expected, const int any_clamped, global const real *terms, const ilanes bin_at) {
+INLINE lanes above_mean_lanes(const lanes expected, const int any_clamped, global const MixtureTerms *terms, const ilanes bin_at) {
 #if BIAS
-    const LanePair last = two_sum_lanes((lanes)terms[6], -(lanes)(TERM(10)));
-    const lanes above = (last.hi - expected) + (last.lo - TERM(11));
+    const LanePair last = two_sum_lanes((lanes)terms->range_max, -(lanes)(TERM(range_bias)));
+    const lanes above = (last.hi - expected) + (last.lo - TERM(range_bias_low));
     if (any_clamped) {
         const lanes raised = above < 0 ? (lanes)0 : above;
-        return raised > terms[6] ? (lanes)terms[6] : raised;
+        return raised > terms->range_max ? (lanes)terms->range_max : raised;
     }
     return above;
 #else
-    return terms[6] - expected;
+    return terms->range_max - expected;
 #endif
 }
 
 #if BIAS
 // Return whether means are at an end of the range.
-ilanes is_clamped_lanes(const lanes mean, const lanes expected, global const real *terms, const ilanes bin_at) {
-    return mean != expected + TERM(10);
+ilanes is_clamped_lanes(const lanes mean, const lanes expected, global const MixtureTerms *terms, const ilanes bin_at) {
+    return mean != expected + TERM(range_bias);
 }
 #endif
 
 // Return sigma_hit / sigma at ranges: the first number times (1 + the second).
-LanePair hit_scale_lanes(const lanes expected, global const real *terms, const ilanes bin_at) {
+LanePair hit_scale_lanes(const lanes expected, global const MixtureTerms *terms, const ilanes bin_at) {
 #if GROWTH
 #if EXACT_EXPONENT
-    const lanes growth = TERM(12), sum = multiply_add_lanes(growth, expected, (lanes)1), scale = 1 / sum;
+    const lanes growth = TERM(relative_growth), sum = multiply_add_lanes(growth, expected, (lanes)1), scale = 1 / sum;
     // Rounding error of the sum; below 2^24 the sum less 1 is exact.
-    const lanes excess = multiply_add_lanes(-TERM(13), expected, rest_lanes(growth, expected, sum - 1));
+    const lanes excess = multiply_add_lanes(-TERM(relative_growth_low), expected, rest_lanes(growth, expected, sum - 1));
     return (LanePair){scale, multiply_add_lanes(excess, scale, rest_lanes(sum, scale, (lanes)1))};
 #else
-    return (LanePair){1 / (1 + TERM(12) * expected), 0};
+    return (LanePair){1 / (1 + TERM(relative_growth) * expected), 0};
 #endif
 #else
     return (LanePair){1, 0};
@@ -79,10 +80,10 @@ LanePair hit_scale_lanes(const lanes expected, global const real *terms, const i
 // Return z less the mean as sums of two numbers. z less the offset is near z* where the density is high, so their
 // difference is exact there.
 INLINE LanePair hit_offset_lanes(const lanes z, const lanes expected, const lanes mean, const int any_clamped,
-                                 global const real *terms, const ilanes bin_at) {
+                                 global const MixtureTerms *terms, const ilanes bin_at) {
 #if BIAS
-    const LanePair unbiased = two_sum_lanes(z, -TERM(10));
-    LanePair off = ordered_sum_lanes(unbiased.hi - expected, unbiased.lo - TERM(11));
+    const LanePair unbiased = two_sum_lanes(z, -TERM(range_bias));
+    LanePair off = ordered_sum_lanes(unbiased.hi - expected, unbiased.lo - TERM(range_bias_low));
     if (any_clamped) {
         const ilanes clamped = is_clamped_lanes(mean, expected, terms, bin_at);
         off.hi = clamped ? z - mean : off.hi;
@@ -96,7 +97,7 @@ INLINE LanePair hit_offset_lanes(const lanes z, const lanes expected, const lane
 
 // Return (z - mean)^2 / (2 sigma^2) as sums of two numbers.
 LanePair normal_exponent_lanes(const lanes z, const lanes expected, const lanes mean, const int any_clamped,
-                               const LanePair scale, global const real *terms, const ilanes bin_at) {
+                               const LanePair scale, global const MixtureTerms *terms, const ilanes bin_at) {
     LanePair off = hit_offset_lanes(z, expected, mean, any_clamped, terms, bin_at);
 #if EXACT_EXPONENT
 #if GROWTH
@@ -110,28 +111,28 @@ LanePair normal_exponent_lanes(const lanes z, const lanes expected, const lanes 
 #elif GROWTH
     square.lo = multiply_add_lanes(2 * off.hi, off.lo, square.lo);
 #endif
-    const LanePair product = two_product_lanes(square.hi, TERM(1));
+    const LanePair product = two_product_lanes(square.hi, TERM(square_scale));
 #if GROWTH
-    const lanes rest = multiply_add_lanes(square.hi, TERM(9), product.lo);
-    return (LanePair){product.hi, multiply_add_lanes(square.lo, TERM(1), rest)};
+    const lanes rest = multiply_add_lanes(square.hi, TERM(square_scale_low), product.lo);
+    return (LanePair){product.hi, multiply_add_lanes(square.lo, TERM(square_scale), rest)};
 #else
-    return (LanePair){product.hi, product.lo + (square.lo * TERM(1) + square.hi * TERM(9))};
+    return (LanePair){product.hi, product.lo + (square.lo * TERM(square_scale) + square.hi * TERM(square_scale_low))};
 #endif
 #else
 #if GROWTH
     const lanes scaled = off.hi * scale.hi;
-    return (LanePair){scaled * (scaled * TERM(1)), 0};
+    return (LanePair){scaled * (scaled * TERM(square_scale)), 0};
 #else
-    return (LanePair){off.hi * (off.hi * TERM(1)), 0};
+    return (LanePair){off.hi * (off.hi * TERM(square_scale)), 0};
 #endif
 #endif
 }
 
 // Return the exponents of a hit's density as sums of two numbers.
 LanePair hit_exponent_lanes(const lanes z, const lanes expected, const lanes mean, const int any_clamped,
-                            const LanePair scale, global const real *terms, const ilanes bin_at) {
+                            const LanePair scale, global const MixtureTerms *terms, const ilanes bin_at) {
     const LanePair t = normal_exponent_lanes(z, expected, mean, any_clamped, scale, terms, bin_at);
-    return shape_exponent_lanes(t, TERM(17), TERM(18));
+    return shape_exponent_lanes(t, TERM(shape_power), TERM(shape_rate));
 }
 
 // Return the normal's mass between two distances from the mean, in sigma times the root of 2.
@@ -147,17 +148,17 @@ INLINE lanes hit_mass_lanes(const lanes before, const lanes after, const lanes e
 }
 
 // Return the mass of a hit of any shape on [0, range_max]; within becomes whether it is 1 in every lane.
-INLINE lanes mass_within_lanes(const lanes mean, const lanes above, const lanes scale, global const real *terms,
-                               const ilanes bin_at, int *within) {
+INLINE lanes mass_within_lanes(const lanes mean, const lanes above, const lanes scale, global const MixtureTerms *terms,
+                               global const real *masses, const ilanes bin_at, int *within) {
 #if MASS_TABLE
     *within = 0;
 #if INCIDENCE
-    const lanes after = TERM(19);
-    const ilanes place = bin_at + to_ilanes(after);
+    const lanes begin = TERM(mass_table);
+    const ilanes place = to_ilanes(begin);
 #else
-    const ilanes place = (int)terms[19];
+    const ilanes place = (int)terms->mass_table;
 #endif
-    return half_mass_lanes(mean * scale, terms, place) + half_mass_lanes(above * scale, terms, place);
+    return half_mass_lanes(mean * scale, masses, place) + half_mass_lanes(above * scale, masses, place);
 #else
     return hit_mass_lanes(mean, above, scale, within);
 #endif
@@ -166,9 +167,9 @@ INLINE lanes mass_within_lanes(const lanes mean, const lanes above, const lanes 
 
 #if SHORT
 // Return (1 - exp(-lambda z*)) / lambda, the length that divides p_short: z* to the last bit where lambda z* is small.
-lanes short_length_lanes(const lanes expected, global const real *terms, const ilanes bin_at) {
-    const lanes x = TERM(4) * expected;
-    const lanes length = x > SMALL_DECAY ? one_minus_exp_lanes(-x) * (1 / TERM(4)) : expected;
+lanes short_length_lanes(const lanes expected, global const MixtureTerms *terms, const ilanes bin_at) {
+    const lanes x = TERM(lambda_short) * expected;
+    const lanes length = x > SMALL_DECAY ? one_minus_exp_lanes(-x) * (1 / TERM(lambda_short)) : expected;
     return length > SMALLEST_RANGE ? length : (lanes)SMALLEST_RANGE;
 }
 #endif
@@ -181,21 +182,21 @@ typedef struct {
 
 #if LINEAR
 // Return p(z | z*). p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm suffices.
-INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, global const real *terms,
-                                        const ilanes bin_at) {
-    lanes p = TERM(5);
+INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, global const MixtureTerms *terms,
+                                        global const real *masses, const ilanes bin_at) {
+    lanes p = TERM(rand_density);
 #if HIT
     int any_clamped, within;
     const lanes mean = mean_range_lanes(expected, terms, bin_at, &any_clamped);
     const lanes above = above_mean_lanes(expected, any_clamped, terms, bin_at);
     const LanePair scale = hit_scale_lanes(expected, terms, bin_at);
     const LanePair exponent = hit_exponent_lanes(z, expected, mean, any_clamped, scale, terms, bin_at);
-    lanes hit = TERM(0) * exp_lanes(-exponent.hi);
+    lanes hit = TERM(hit_peak) * exp_lanes(-exponent.hi);
 #if GROWTH
     hit *= scale.hi;
-    const lanes mass = mass_within_lanes(mean, above, TERM(2) * scale.hi, terms, bin_at, &within);
+    const lanes mass = mass_within_lanes(mean, above, TERM(erf_scale) * scale.hi, terms, masses, bin_at, &within);
 #else
-    const lanes mass = mass_within_lanes(mean, above, TERM(2), terms, bin_at, &within);
+    const lanes mass = mass_within_lanes(mean, above, TERM(erf_scale), terms, masses, bin_at, &within);
 #endif
 #if EXACT_EXPONENT
     // The second part is arbitrary where the density underflows.
@@ -204,20 +205,20 @@ INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, glo
     p += within ? hit : hit / mass;
 #endif
 #if SHORT
-    const lanes shorter = TERM(3) * exp_lanes(-TERM(4) * z) / short_length_lanes(expected, terms, bin_at);
+    const lanes shorter = TERM(z_short) * exp_lanes(-TERM(lambda_short) * z) / short_length_lanes(expected, terms, bin_at);
     p += ((z <= expected) & (expected > 0)) ? shorter : (lanes)0;
 #endif
     return (DensityParts){p, 0};
 }
 
 // Return log p(z | z*).
-lanes log_of_parts_lanes(const DensityParts parts, global const real *terms, const ilanes bin_at) {
+lanes log_of_parts_lanes(const DensityParts parts, global const MixtureTerms *terms, const ilanes bin_at) {
     return log_lanes(parts.hit);
 }
 #else
 // Return the logarithms of components of p(z | z*).
-INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, global const real *terms,
-                                        const ilanes bin_at) {
+INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, global const MixtureTerms *terms,
+                                        global const real *masses, const ilanes bin_at) {
     DensityParts parts = {-INFINITY, -INFINITY, 1};
 #if HIT
     int any_clamped, within;
@@ -225,12 +226,12 @@ INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, glo
     const lanes above = above_mean_lanes(expected, any_clamped, terms, bin_at);
     const LanePair scale = hit_scale_lanes(expected, terms, bin_at);
     const LanePair exponent = hit_exponent_lanes(z, expected, mean, any_clamped, scale, terms, bin_at);
-    lanes hit = (TERM(0) - exponent.hi) + (TERM(8) - exponent.lo);
+    lanes hit = (TERM(hit_peak) - exponent.hi) + (TERM(hit_peak_low) - exponent.lo);
 #if GROWTH
     hit += log_lanes(scale.hi);
-    const lanes mass = mass_within_lanes(mean, above, TERM(2) * scale.hi, terms, bin_at, &within);
+    const lanes mass = mass_within_lanes(mean, above, TERM(erf_scale) * scale.hi, terms, masses, bin_at, &within);
 #else
-    const lanes mass = mass_within_lanes(mean, above, TERM(2), terms, bin_at, &within);
+    const lanes mass = mass_within_lanes(mean, above, TERM(erf_scale), terms, masses, bin_at, &within);
 #endif
     if (!within) hit = mass == 1 ? hit : hit - log_lanes(mass);
     parts.hit = hit;
@@ -238,9 +239,9 @@ INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, glo
 #if SHORT
     const lanes length = short_length_lanes(expected, terms, bin_at);
 #if SINGLE
-    const lanes decayed = (TERM(3) - log_lanes(length)) - TERM(4) * z;
+    const lanes decayed = (TERM(z_short) - log_lanes(length)) - TERM(lambda_short) * z;
 #else
-    const lanes decayed = TERM(3) - TERM(4) * z;
+    const lanes decayed = TERM(z_short) - TERM(lambda_short) * z;
     parts.reciprocal = 1 / length;
 #endif
     parts.shorter = ((z <= expected) & (expected > 0)) ? decayed : (lanes)-INFINITY;
@@ -249,11 +250,11 @@ INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, glo
 }
 
 // Return log p(z | z*). Every component stays a logarithm; -inf only where the mixture is 0.
-lanes log_of_parts_lanes(const DensityParts parts, global const real *terms, const ilanes bin_at) {
+lanes log_of_parts_lanes(const DensityParts parts, global const MixtureTerms *terms, const ilanes bin_at) {
     const lanes hit = parts.hit, shorter = parts.shorter;
     lanes largest = larger_lanes(shorter, hit);
 #if RAND
-    const lanes random = TERM(5);
+    const lanes random = TERM(rand_density);
     largest = larger_lanes(random, largest);
 #endif
 #if SINGLE
@@ -280,18 +281,18 @@ lanes log_of_parts_lanes(const DensityParts parts, global const real *terms, con
 
 #if CUBES
 // Return the densities to be cubed: compat_density of compat.cl.
-lanes compat_density_lanes(const lanes z, const lanes expected, global const real *terms) {
+lanes compat_density_lanes(const lanes z, const lanes expected, global const MixtureTerms *terms) {
     const lanes off = z - expected;
-    lanes p = terms[0] * exp_lanes(-(off * (off * terms[1])));
+    lanes p = terms->hit_peak * exp_lanes(-(off * (off * terms->square_scale)));
 #if AMCL
-    p += z < expected ? terms[3] * terms[4] * exp_lanes(-terms[4] * z) : (lanes)0;
-    return z > terms[6] ? p : p + (z >= terms[6] ? (lanes)terms[7] : (lanes)terms[5]);
+    p += z < expected ? terms->z_short * terms->lambda_short * exp_lanes(-terms->lambda_short * z) : (lanes)0;
+    return z > terms->range_max ? p : p + (z >= terms->range_max ? (lanes)terms->z_max : (lanes)terms->rand_density);
 #else
     int within;
-    const lanes mass = hit_mass_lanes(expected, terms[6] - expected, terms[2], &within);
+    const lanes mass = hit_mass_lanes(expected, terms->range_max - expected, terms->erf_scale, &within);
     p = within ? p : p / mass;
-    p += z < expected ? terms[3] * exp_lanes(-terms[4] * z) / short_length_lanes(expected, terms, 0) : (lanes)0;
-    return p + (z >= terms[6] ? (lanes)terms[7] : (lanes)terms[5]);
+    p += z < expected ? terms->z_short * exp_lanes(-terms->lambda_short * z) / short_length_lanes(expected, terms, 0) : (lanes)0;
+    return p + (z >= terms->range_max ? (lanes)terms->z_max : (lanes)terms->rand_density);
 #endif
 }
 #endif

@@ -9,7 +9,7 @@ from .. import end_point as end_points
 from .. import field_term, hit_shape
 from ..end_point import FIELD_RING
 from ..error_free import BLOCK_TERMS
-from ..prelude import exact_fma, fuses, precision, reader
+from ..prelude import exact_fma, field_readers, fuses, precision, reader
 from . import math as lane_math
 
 
@@ -36,7 +36,7 @@ def functions(flags):
     EndPoint, end_point = ends.EndPoint, ends.end_point
     shape_exponent = hit_shape.functions(flags).shape_exponent
     multiply_add = exact_fma(double)
-    number_at, point_at = reader(real), reader(vec2)
+    number_at, point_at, term_of = reader(real), reader(vec2), field_readers(types.FieldTerms)
     ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
     DOUBLE_HALF, DOUBLE_ONE = double(0.5), double(1.0)
     # 1.5 * 2^52: a sum of it and an integer of either sign has the integer in its last 32 bits.
@@ -78,8 +78,8 @@ def functions(flags):
         @wp.func
         def block_exponents(
             table: wp.array(dtype=real), origin: wp.vec2i, pose: vec4, low: vec4, point: wp.array(dtype=vec2),
-            point_low: wp.array(dtype=vec2), terms: wp.array(dtype=real), window: types.Window, begin: wp.int32,
-            count: wp.int32,
+            point_low: wp.array(dtype=vec2), terms: wp.array(dtype=types.FieldTerms), window: types.Window,
+            begin: wp.int32, count: wp.int32,
         ):  # fmt: skip
             cells = block_cells()
             rest_x, rest_y, next_x, next_y = block_numbers(), block_numbers(), block_numbers(), block_numbers()
@@ -109,7 +109,7 @@ def functions(flags):
                 at.to_next_x = vec2(next_x[i], next_x_low[i])
                 at.to_next_y = vec2(next_y[i], next_y_low[i])
                 square = field_square(interpolated(vec4(a[i], b[i], c[i], d[i]), at), terms)
-                parts_of = shape_exponent(square, number_at(terms, 6), number_at(terms, 7))
+                parts_of = shape_exponent(square, term_of.shape_power(terms), term_of.shape_rate(terms))
                 exponent[i] = parts_of.x
                 exponent_low[i] = parts_of.y
                 i += 1
@@ -140,8 +140,8 @@ def functions(flags):
         @wp.func
         def block_exponents(
             table: wp.array(dtype=real), origin: wp.vec2i, pose: vec4, low: vec4, point: wp.array(dtype=vec2),
-            point_low: wp.array(dtype=vec2), terms: wp.array(dtype=real), window: types.Window, begin: wp.int32,
-            count: wp.int32,
+            point_low: wp.array(dtype=vec2), terms: wp.array(dtype=types.FieldTerms), window: types.Window,
+            begin: wp.int32, count: wp.int32,
         ):  # fmt: skip
             cells = block_cells()
             rest_x, rest_y = block_rests(), block_rests()
@@ -167,13 +167,13 @@ def functions(flags):
                 cells[i] = table_place(origin.x + below.x, origin.y + below.y, window)
                 i += 1
             a, b, c, d = block_distances(cells, table, window)
-            factor = rest(number_at(terms, 1))
+            factor = rest(term_of.square_scale(terms))
             if EXACT_EXPONENT:
-                factor += rest(number_at(terms, 5))
+                factor += rest(term_of.square_scale_low(terms))
             i = int(0)
             while i < BLOCK_TERMS:
                 square = square_lanes(vec4(a[i], b[i], c[i], d[i]), rest_x[i], rest_y[i], factor)
-                parts_of = shape_exponent(square, number_at(terms, 6), number_at(terms, 7))
+                parts_of = shape_exponent(square, term_of.shape_power(terms), term_of.shape_rate(terms))
                 exponent[i] = parts_of.x
                 exponent_low[i] = parts_of.y
                 i += 1
@@ -181,28 +181,28 @@ def functions(flags):
 
     # Return log p of the exponent of the density of a hit in two parts.
     @wp.func
-    def log_of_exponent_lanes(exponent: real, exponent_low: real, terms: wp.array(dtype=real)):
+    def log_of_exponent_lanes(exponent: real, exponent_low: real, terms: wp.array(dtype=types.FieldTerms)):
         if LINEAR:
-            p = number_at(terms, 2)
+            p = term_of.rand_density(terms)
             if HIT:
-                hit = number_at(terms, 0) * exp_lanes(-exponent)
+                hit = term_of.hit_peak(terms) * exp_lanes(-exponent)
                 if EXACT_EXPONENT:
                     # The second part is arbitrary where the density underflows.
                     hit = wp.where(hit > ZERO, hit * (ONE - exponent_low), hit)
                 p += hit
             return log_lanes(p)
         else:
-            log_hit = (number_at(terms, 0) - exponent) + (number_at(terms, 4) - exponent_low)
+            log_hit = (term_of.hit_peak(terms) - exponent) + (term_of.hit_peak_low(terms) - exponent_low)
             if RAND:
                 # The larger of two exponentials is 1.
-                random = number_at(terms, 2)
+                random = term_of.rand_density(terms)
                 return wp.max(log_hit, random) + log_lanes(ONE + exp_lanes(-wp.abs(log_hit - random)))
             else:
                 return log_hit
 
     # Return log p of the exponents of a block.
     @wp.func
-    def block_logs(exponent: block_numbers, exponent_low: block_numbers, terms: wp.array(dtype=real)):
+    def block_logs(exponent: block_numbers, exponent_low: block_numbers, terms: wp.array(dtype=types.FieldTerms)):
         values = block_numbers()
         i = int(0)
         while i < BLOCK_TERMS:

@@ -8,8 +8,7 @@ import warp as wp
 
 from .. import error_free, hit_shape, mixture
 from ..error_free import BLOCK_TERMS
-from ..mixture import MIXTURE_TERMS
-from ..prelude import apart, precision, reader
+from ..prelude import apart, field_readers, precision, reader
 from . import math as lane_math
 
 
@@ -29,7 +28,7 @@ def functions(flags):
     one_minus_exp_lanes = elementary.one_minus_exp_lanes
     shape = hit_shape.functions(flags)
     shape_exponent, mass_place, mass_at = shape.shape_exponent, shape.mass_place, shape.mass_at
-    at = reader(real)
+    at, term_of = reader(real), field_readers(types.MixtureTerms)
     ALL_READINGS = "ALL_READINGS" in flags
     AMCL = "AMCL" in flags
     BIAS = "BIAS" in flags
@@ -55,13 +54,13 @@ def functions(flags):
 
     # Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers.
     @wp.func
-    def normal_exponent_lanes(z: real, expected: real, scale: vec2, terms: wp.array(dtype=real)):
+    def normal_exponent_lanes(z: real, expected: real, scale: vec2, terms: wp.array(dtype=types.MixtureTerms)):
         off = z - expected
         off_low = real(0.0)
         if BIAS:
             # z, z* and the bias nearly cancel.
-            bias = at(terms, 10)
-            exact_off = pair_sum(two_sum(z, -expected), vec2(-bias, -at(terms, 11)))
+            bias = term_of.range_bias(terms)
+            exact_off = pair_sum(two_sum(z, -expected), vec2(-bias, -term_of.range_bias_low(terms)))
             mean = mean_range(expected, terms)
             inside = mean == expected + bias
             off = wp.where(inside, exact_off.x, z - mean)
@@ -75,19 +74,19 @@ def functions(flags):
             square_low = square.y
             if SHIFTED:
                 square_low += TWO * off * off_low
-            peak = at(terms, 1)
+            peak = term_of.square_scale(terms)
             product = two_product(square.x, peak)
-            return vec2(product.x, product.y + (square_low * peak + square.x * at(terms, 9)))
+            return vec2(product.x, product.y + (square_low * peak + square.x * term_of.square_scale_low(terms)))
         else:
             if GROWTH:
                 off = off * scale.x
-            return vec2(off * (off * at(terms, 1)), ZERO)
+            return vec2(off * (off * term_of.square_scale(terms)), ZERO)
 
     # Return the exponent of a hit's density as a sum of two numbers.
     @wp.func
-    def hit_exponent_lanes(z: real, expected: real, scale: vec2, terms: wp.array(dtype=real)):
+    def hit_exponent_lanes(z: real, expected: real, scale: vec2, terms: wp.array(dtype=types.MixtureTerms)):
         normal = normal_exponent_lanes(z, expected, scale, terms)
-        return shape_exponent(normal, at(terms, 17), at(terms, 18))
+        return shape_exponent(normal, term_of.shape_power(terms), term_of.shape_rate(terms))
 
     # Return whether the mass of a hit on [0, range_max] may be less than 1.
     @wp.func
@@ -99,44 +98,44 @@ def functions(flags):
 
     # Return the masses of hits of any shape on [0, range_max]. Look-ups in a table keep a loop scalar.
     @wp.func
-    def masses_within(expected: block_numbers, terms: wp.array(dtype=real)):
-        masses, far = block_numbers(), block_numbers()
+    def masses_within(expected: block_numbers, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real)):
+        inside, far = block_numbers(), block_numbers()
         i = int(0)
         while i < BLOCK_TERMS:
             mean = mean_range(expected[i], terms)
-            scale = at(terms, 2) * hit_scale(expected[i], terms).x
+            scale = term_of.erf_scale(terms) * hit_scale(expected[i], terms).x
             below = mean * scale
             above = above_mean(expected[i], terms) * scale
             if MASS_TABLE:
-                masses[i] = mass_place(below)
+                inside[i] = mass_place(below)
                 far[i] = mass_place(above)
             else:
-                masses[i] = HALF * (erf_lanes(below) + erf_lanes(above))
+                inside[i] = HALF * (erf_lanes(below) + erf_lanes(above))
             i += 1
         if MASS_TABLE:
             i = int(0)
             while i < BLOCK_TERMS:
-                place = wp.int32(at(terms, 19))
-                masses[i] = mass_at(masses[i], terms, place) + mass_at(far[i], terms, place)
+                place = wp.int32(term_of.mass_table(terms))
+                inside[i] = mass_at(inside[i], masses, place) + mass_at(far[i], masses, place)
                 i += 1
-        return masses
+        return inside
 
     # Return (1 - exp(-lambda z*)) / lambda, the length that divides p_short; where lambda z* is small, it is z* to the
     # last bit.
     @wp.func
-    def short_length_lanes(expected: real, terms: wp.array(dtype=real)):
-        decay = at(terms, 4)
+    def short_length_lanes(expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        decay = term_of.lambda_short(terms)
         x = decay * expected
         length = wp.where(x > SMALL_DECAY, one_minus_exp_lanes(-x) * (ONE / decay), expected)
         return wp.max(length, SMALLEST_RANGE)
 
     # Return the density of a hit before its division by its mass, or its logarithm.
     @wp.func
-    def hit_density_lanes(z: real, expected: real, terms: wp.array(dtype=real)):
+    def hit_density_lanes(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
         scale = hit_scale(expected, terms)
         exponent = hit_exponent_lanes(z, expected, scale, terms)
         if LINEAR:
-            hit = at(terms, 0) * exp_lanes(-exponent.x)
+            hit = term_of.hit_peak(terms) * exp_lanes(-exponent.x)
             if GROWTH:
                 hit = hit * scale.x
             if EXACT_EXPONENT:
@@ -144,26 +143,26 @@ def functions(flags):
                 hit = wp.where(hit > ZERO, hit * (ONE - exponent.y), hit)
             return hit
         else:
-            log_hit = (at(terms, 0) - exponent.x) + (at(terms, 8) - exponent.y)
+            log_hit = (term_of.hit_peak(terms) - exponent.x) + (term_of.hit_peak_low(terms) - exponent.y)
             if GROWTH:
                 log_hit += log_lanes(scale.x)
             return log_hit
 
     # Return the density of a short reading, or its logarithm.
     @wp.func
-    def short_density_lanes(z: real, expected: real, terms: wp.array(dtype=real)):
+    def short_density_lanes(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
         length = short_length_lanes(expected, terms)
-        decay = at(terms, 4)
+        decay = term_of.lambda_short(terms)
         inside = z <= expected and expected > ZERO
         if LINEAR:
-            return wp.where(inside, at(terms, 3) * exp_lanes(-decay * z) / length, ZERO)
+            return wp.where(inside, term_of.z_short(terms) * exp_lanes(-decay * z) / length, ZERO)
         else:
-            return wp.where(inside, (at(terms, 3) - log_lanes(length)) - decay * z, NEVER)
+            return wp.where(inside, (term_of.z_short(terms) - log_lanes(length)) - decay * z, NEVER)
 
     # Return log p(z | z*) from the densities of components, or from their logarithms; -inf only where the mixture is 0.
     @wp.func
-    def log_of_parts_lanes(hit: real, shorter: real, terms: wp.array(dtype=real)):
-        random = at(terms, 5)
+    def log_of_parts_lanes(hit: real, shorter: real, terms: wp.array(dtype=types.MixtureTerms)):
+        random = term_of.rand_density(terms)
         if LINEAR:
             return log_lanes((random + hit) + shorter)
         else:
@@ -187,20 +186,35 @@ def functions(flags):
 
     # Return the density to be cubed, without a division by its hit's mass: compat_density of compat.py.
     @wp.func
-    def compat_density_lanes(z: real, expected: real, hit: real, terms: wp.array(dtype=real)):
+    def compat_density_lanes(z: real, expected: real, hit: real, terms: wp.array(dtype=types.MixtureTerms)):
         p = hit
         if AMCL:
-            p += wp.where(z < expected, at(terms, 3) * at(terms, 4) * exp_lanes(-at(terms, 4) * z), ZERO)
-            return wp.where(z > at(terms, 6), p, p + wp.where(z >= at(terms, 6), at(terms, 7), at(terms, 5)))
+            p += wp.where(
+                z < expected,
+                term_of.z_short(terms) * term_of.lambda_short(terms) * exp_lanes(-term_of.lambda_short(terms) * z),
+                ZERO,
+            )
+            return wp.where(
+                z > term_of.range_max(terms),
+                p,
+                p + wp.where(z >= term_of.range_max(terms), term_of.z_max(terms), term_of.rand_density(terms)),
+            )
         else:
             length = short_length_lanes(expected, terms)
-            p += wp.where(z < expected, at(terms, 3) * exp_lanes(-at(terms, 4) * z) / length, ZERO)
-            return p + wp.where(z >= at(terms, 6), at(terms, 7), at(terms, 5))
+            p += wp.where(
+                z < expected, term_of.z_short(terms) * exp_lanes(-term_of.lambda_short(terms) * z) / length, ZERO
+            )
+            return p + wp.where(z >= term_of.range_max(terms), term_of.z_max(terms), term_of.rand_density(terms))
 
     # Return the terms of a block of readings in the sum. Each stage is a loop, which becomes vector code; a hit's mass
     # is computed where it may be less than 1 for some reading of the block.
     @apart
-    def block_terms(z: block_numbers, expected: block_numbers, terms: wp.array(dtype=real)):
+    def block_terms(
+        z: block_numbers,
+        expected: block_numbers,
+        terms: wp.array(dtype=types.MixtureTerms),
+        masses: wp.array(dtype=real),
+    ):
         hits, results = block_numbers(), block_numbers()
         doubtful = int(0)
         i = int(0)
@@ -208,22 +222,22 @@ def functions(flags):
             while i < BLOCK_TERMS:
                 if CUBES:
                     off = z[i] - expected[i]
-                    hits[i] = at(terms, 0) * exp_lanes(-(off * (off * at(terms, 1))))
+                    hits[i] = term_of.hit_peak(terms) * exp_lanes(-(off * (off * term_of.square_scale(terms))))
                 else:
                     hits[i] = hit_density_lanes(z[i], expected[i], terms)
                 if not AMCL:
                     mean = mean_range(expected[i], terms)
-                    scale = at(terms, 2) * hit_scale(expected[i], terms).x
+                    scale = term_of.erf_scale(terms) * hit_scale(expected[i], terms).x
                     doubtful += near_an_end(mean, above_mean(expected[i], terms), scale)
                 i += 1
         if doubtful > 0:
-            masses = masses_within(expected, terms)
+            inside = masses_within(expected, terms, masses)
             i = int(0)
             while i < BLOCK_TERMS:
                 if SCALED:
-                    hits[i] = hits[i] / masses[i]
+                    hits[i] = hits[i] / inside[i]
                 else:
-                    hits[i] = hits[i] - log_lanes(masses[i])
+                    hits[i] = hits[i] - log_lanes(inside[i])
                 i += 1
         i = int(0)
         while i < BLOCK_TERMS:
@@ -241,7 +255,7 @@ def functions(flags):
                     shorter = short_density_lanes(z[i], expected[i], terms)
                 term = log_of_parts_lanes(hit, shorter, terms)
             if ALL_READINGS:
-                term = wp.where(wp.isinf(z[i]), at(terms, 7), term)
+                term = wp.where(wp.isinf(z[i]), term_of.z_max(terms), term)
                 term = wp.where(wp.isnan(z[i]), ZERO, term)
             results[i] = term
             i += 1
@@ -250,8 +264,8 @@ def functions(flags):
     # Return the terms of a block of readings whose angles of incidence fall into several bins.
     @apart
     def block_of_bins(
-        z: block_numbers, expected: block_numbers, cosine: block_numbers, terms: wp.array(dtype=real),
-        edges: wp.array(dtype=real), incidence_bins: wp.int32,
+        z: block_numbers, expected: block_numbers, cosine: block_numbers, terms: wp.array(dtype=types.MixtureTerms),
+        masses: wp.array(dtype=real), edges: wp.array(dtype=real), incidence_bins: wp.int32,
     ):  # fmt: skip
         values = block_numbers()
         bins = block_bins()
@@ -271,7 +285,7 @@ def functions(flags):
                 inside += int(bins[i] == bin)
                 i += 1
             if inside > 0:
-                of_bin = block_terms(z, expected, terms[MIXTURE_TERMS * bin :])
+                of_bin = block_terms(z, expected, terms[bin:], masses)
                 i = int(0)
                 while i < BLOCK_TERMS:
                     values[i] = wp.where(bins[i] == bin, of_bin[i], values[i])

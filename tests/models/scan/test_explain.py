@@ -113,8 +113,8 @@ PLAIN = dict(z_hit=0.7, z_short=0.1, z_max=0.1, z_rand=0.1)
 PARTS = {
     "short component": ("short_length_lanes(expected", dict(PLAIN, z_hit=0.8, z_short=0.0), PLAIN),
     "hit component": ("hit_exponent_lanes(z", dict(PLAIN, z_hit=0.0, z_rand=0.8), PLAIN),
-    "range_bias": ("TERM(10)", PLAIN, dict(PLAIN, range_bias=0.1)),
-    "sigma_growth": ("TERM(12)", PLAIN, dict(PLAIN, sigma_growth=0.01)),
+    "range_bias": ("TERM(range_bias)", PLAIN, dict(PLAIN, range_bias=0.1)),
+    "sigma_growth": ("TERM(relative_growth)", PLAIN, dict(PLAIN, sigma_growth=0.01)),
     "exponents in two parts": ("two_product_lanes(off", PLAIN, dict(PLAIN, sigma_hit=0.004)),
 }
 
@@ -128,8 +128,8 @@ def test_the_text_of_the_kernel_lacks_what_is_left_out(part, needs):
     scalar = {
         "short_length_lanes(expected": "short_peak(terms",
         "hit_exponent_lanes(z": "hit_exponent(z, expected, terms)",
-        "TERM(10)": "expected + terms[10]",
-        "TERM(12)": "terms[12] * expected",
+        "TERM(range_bias)": "expected + terms->range_bias",
+        "TERM(relative_growth)": "terms->relative_growth * expected",
         "two_product_lanes(off": "two_product(off",
     }
     words = words if backend.info.lanes > 1 else scalar[words]

@@ -23,8 +23,8 @@ def tape_kernel(wp, flags):
     prelude, end_point, field_term = (warp_module(name) for name in ("prelude", "end_point", "field_term"))
     of_field = field_term.functions(flags)
     place, bilinear, log_field = end_point.functions(flags).end_point, of_field.bilinear, of_field.log_field
-    Window, options = prelude.Window, prelude.OPTIONS | {"enable_backward": True}
-    HALF = wp.float64(0.5)
+    types, options = prelude.precision(flags), prelude.OPTIONS | {"enable_backward": True}
+    Window, HALF = types.Window, wp.float64(0.5)
 
     @wp.kernel(module="unique", enable_backward=True, module_options=options)
     def add_terms(
@@ -33,7 +33,7 @@ def tape_kernel(wp, flags):
         pose_cell: wp.array(dtype=wp.vec2i),
         pose: wp.array(dtype=wp.vec4d),
         point: wp.array(dtype=wp.vec2d),
-        terms: wp.array(dtype=wp.float64),
+        terms: wp.array(dtype=types.FieldTerms),
         log_p: wp.array(dtype=wp.float64),
         window: Window,
         guard: wp.float64,
@@ -98,7 +98,9 @@ def test_warps_tape_gives_the_gradient_of_the_kernel(kind, needs, monkeypatch):
     change = wp.zeros(len(poses), dtype=wp.vec3d, device="cpu", requires_grad=True)
     log_p = wp.zeros(len(poses), dtype=wp.float64, device="cpu", requires_grad=True)
     vectors = {"pose_cell": (wp.vec2i, 2), "pose": (wp.vec4d, 4), "point": (wp.vec2d, 2)}
-    arrays = {name: wp.array(getattr(given, name), dtype=wp.float64, device="cpu") for name in ("table", "terms")}
+    numbers = warp_module("prelude").precision(flags).FieldTerms
+    terms = wp.array(ptr=given.terms.ctypes.data, dtype=numbers, shape=(1,), device="cpu")
+    arrays = {"table": wp.array(given.table, dtype=wp.float64, device="cpu"), "terms": terms}
     for name, (dtype, length) in vectors.items():
         rows = getattr(given, name).reshape(-1, length)
         arrays[name] = wp.array(rows, dtype=dtype, device="cpu")

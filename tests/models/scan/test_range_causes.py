@@ -18,6 +18,7 @@ from gpusense.backends import get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.benchmark.accuracy import score_ranges
 from gpusense.evaluation.range_data import RangeData
+from gpusense.interface.structs import MixtureTerms
 from gpusense.learning.beam import blocks, growth, optimum
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.options import make_bounds
@@ -25,7 +26,7 @@ from gpusense.learning.beam.pairs import make_pairs
 from gpusense.learning.beam.problem import NO_PRIOR, Problem
 from gpusense.learning.point import beacons
 from gpusense.models.scan.densities import log_mixture
-from gpusense.models.scan.mixture import mixture_of, peer_mixture, tabulated
+from gpusense.models.scan.mixture import learning_terms, mixture_of, peer_mixture, tabulated
 from gpusense.models.scan.readings import device_readings
 from gpusense.plots import fits
 from gpusense.world.field_density import FieldDensity
@@ -97,7 +98,7 @@ def learned(at):
     theta = np.array([top, rand / rest, short / (hit + short), math.log(at.sigma), 0.01, math.log(at.rate)])
     log_p, gradient = joint.log_p(theta)
     return {
-        "terms": device.terms(at), "components": parts[..., 0], "density": log_p, "derivatives": gradient[:, 3:],
+        "terms": np.array(learning_terms(at.parameters(), RANGE, device.real)[0]), "components": parts[..., 0], "density": log_p, "derivatives": gradient[:, 3:],
         "rate": optimum._next_rate(shares, z, expected, np.array([at.rate]), bounds),
         "blocks": blocks._terms(pairs.reading, pairs.expected, device.causes(at)[:, 1:], at, RANGE)[5],
         "objective": np.array(Problem(device, pairs, bounds, NO_PRIOR, False).value(at).log_likelihood),
@@ -110,10 +111,10 @@ def numbers(p, real=np.float32):
     # The other densities' peak decides whether a kernel sums densities; a steep one has a last range.
     far = p.replace(z_hit=p.z_hit + p.z_rand - 1e-7, z_rand=1e-7, lambda_short=1e23 * p.lambda_short)
     steep = p.replace(lambda_short=50 * p.lambda_short)
-    flags, terms = mixture_of((far,), RANGE, np.dtype(real), **settings)
+    flags, terms, _ = mixture_of((far,), RANGE, np.dtype(real), **settings)
     return {
-        "sum of densities": np.array("LINEAR" in flags), "terms of logarithms": terms[[4, 5]].astype(np.float64),
-        "last range": mixture_of((steep,), RANGE, np.dtype(np.float64), **settings)[1][16],
+        "sum of densities": np.array("LINEAR" in flags), "terms of logarithms": np.array([*terms.lambda_short, *terms.rand_density], float),
+        "last range": mixture_of((steep,), RANGE, np.dtype(np.float64), **settings)[1].last_least[0],
     }  # fmt: skip
 
 
@@ -182,7 +183,8 @@ def test_a_made_up_random_density_is_followed(monkeypatch):
     monkeypatch.setattr(RandomDensity, "__init__", lambda self, longest: setattr(self, "range_max", 2 * longest))
     compare(users(weights), wanted, plain)
     after = learned(at), drawn(gs.BeamParameters(0.0, 0.0, 0.0, 1.0))["worlds"], peers(), radio(), log_floor()
-    assert after[0]["terms"][5] == pytest.approx(before[0]["terms"][5] - math.log(2))
+    dense, sparse = (MixtureTerms(*found[0]["terms"]).rand_density for found in (before, after))
+    assert sparse == pytest.approx(dense - math.log(2))
     np.testing.assert_allclose(after[0]["components"][2], before[0]["components"][2] - math.log(2))
     np.testing.assert_allclose(after[1], np.minimum(2 * before[1], RANGE))
     np.testing.assert_allclose(after[2], 0.5 * before[2], rtol=1e-6)
@@ -201,7 +203,7 @@ def peers():
     p = gs.LikelihoodFieldParameters(z_hit=0.5, z_rand=0.5, sigma_hit=0.1)
     beluga, far = gs.compat.Beluga(model_unknown_space=True), np.array([1e4])
     fields = [each.field_values(far, p, 0.1, RANGE)[0] for each in (beluga, gs.compat.Amcl())]
-    kernel = peer_mixture(BASE, RANGE, np.dtype(np.float64), amcl=False)[1][5]
+    kernel = peer_mixture(BASE, RANGE, np.dtype(np.float64), amcl=False)[1].rand_density[0]
     return np.array([kernel, *fields, beluga.beyond(p, RANGE), beluga.overlay(p, RANGE)])
 
 
@@ -247,10 +249,14 @@ def test_a_made_up_probability_of_no_return_is_followed(monkeypatch):
         found |= {"field": field[1], "host": score_ranges(np.tile(EXPECTED, (2, 1)), WITH_MAX, SCANNER, BASE)}
         found |= mixture((0.6, 0.2, 0.1, 0.1)) | {"sum": field[0]}
         at = learned(point(0.6, 0.2, 0.1, 0.1, sigma=0.3, rate=0.4))
-        found |= {"joint fit": at["density"], "objective": at["objective"], "kernel's term": at["terms"][7]}
-        found["peer"] = np.log(peer_mixture(BASE, RANGE, np.dtype(np.float64), amcl=False)[1][7])
+        found |= {
+            "joint fit": at["density"],
+            "objective": at["objective"],
+            "kernel's term": MixtureTerms(*at["terms"]).z_max,
+        }
+        found["peer"] = np.log(peer_mixture(BASE, RANGE, np.dtype(np.float64), amcl=False)[1].z_max[0])
         nothing = gs.BeamModel(ROOM, SCANNER, BASE, **HOST).log_likelihood(POSES, np.full(20, RANGE), per_beam=True)
-        found["field's term"] = FieldDensity(FIELD, RANGE).terms(np.dtype(np.float64))[3]
+        found["field's term"] = FieldDensity(FIELD, RANGE).terms(np.dtype(np.float64)).z_max
         found["tabulated"] = tabulated(BASE, 0.5, RANGE, np.dtype(np.float64))[-1]
         found |= {"only max readings": nothing[0], "each of them": nothing[1]}
         impossible, every = gs.BeamParameters(0.0, 0.0, 1.0, 0.0), dict(specialize=False) | HOST

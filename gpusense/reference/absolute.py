@@ -73,9 +73,9 @@ def score_position(
     sensor.
     """
     x, y = (place[:particles, 0], place[:particles, 1]), (place[:particles, 2], place[:particles, 3])
-    x_scale = np.asarray(terms.x_scale), np.asarray(terms.x_scale_low)
-    y_scale = np.asarray(terms.y_scale), np.asarray(terms.y_scale_low)
-    shear = np.asarray(terms.shear), np.asarray(terms.shear_low)
+    x_scale = terms.x_scale, terms.x_scale_low
+    y_scale = terms.y_scale, terms.y_scale_low
+    shear = terms.shear, terms.shear_low
     first = bounded_square(pair_product(x, x_scale))
     second = bounded_square(pair_sum(pair_product(x, shear), pair_product(y, y_scale)))
     exponent = pair_sum(first, second)
@@ -91,7 +91,7 @@ def score_heading(
 ) -> None:  # fmt: skip
     """Score headings; residuals are headings minus the reading, in [-pi, pi]."""
     r = residual[:particles, 0], residual[:particles, 1]
-    scale = np.asarray(terms.scale), np.asarray(terms.scale_low)
+    scale = terms.scale, terms.scale_low
     if kind == SERIES:
         log_density = terms.peak + (terms.peak_low + log_waves(r, waves))
     else:

@@ -23,10 +23,6 @@ from gpusense.reference.offsets import distance_pair, offset
 STEEPEST = 1e18
 
 
-def _pair(number: float, low: float) -> Pair:
-    return np.asarray(number), np.asarray(low)
-
-
 def log_normal(residual: Pair, near: np.ndarray, far: np.ndarray, scale: Pair, peak: Pair) -> np.ndarray:
     """Return the log of a truncated normal; near and far are the distances from its mean to the ends."""
     exponent = bounded_square(pair_product(residual, scale))
@@ -50,8 +46,8 @@ def log_student_t(
     residual: Pair, near: np.ndarray, far: np.ndarray, terms: structs.BeaconTerms, series: np.ndarray
 ) -> np.ndarray:
     """Return the log of a truncated Student t: -(nu + 1) / 2 log((1 + u^2 / nu) / k), where k includes the peak."""
-    squared = bounded_square(pair_product(residual, _pair(terms.scale, terms.scale_low)))
-    x = pair_sum(_pair(terms.offset, terms.offset_low), squared)
+    squared = bounded_square(pair_product(residual, (terms.scale, terms.scale_low)))
+    x = pair_sum((terms.offset, terms.offset_low), squared)
     half = near.dtype.type(0.5)
     mass = half * (t_mass(near * terms.t_scale, terms, series) + t_mass(far * terms.t_scale, terms, series))
     return (terms.peak - terms.power * (np.log(x[0]) + x[1] / x[0])) - np.log(mass)
@@ -68,10 +64,10 @@ def log_range(
     if kind == STUDENT_T:
         log_p = log_student_t(r, near, far, terms, series)
     else:
-        log_p = log_normal(r, near, far, _pair(terms.scale, terms.scale_low), _pair(terms.peak, terms.peak_low))
+        log_p = log_normal(r, near, far, (terms.scale, terms.scale_low), (terms.peak, terms.peak_low))
     if kind == TWO_NORMALS:
-        wide_scale = _pair(terms.wide_scale, terms.wide_scale_low)
-        wide_peak = _pair(terms.wide_peak, terms.wide_peak_low)
+        wide_scale = (terms.wide_scale, terms.wide_scale_low)
+        wide_peak = (terms.wide_peak, terms.wide_peak_low)
         log_p = either(log_p, log_normal(r, near, far, wide_scale, wide_peak))
     return either(log_p, terms.random) if "RAND" in flags else log_p
 

@@ -26,14 +26,14 @@ SERIES = 12
 
 def gap(squared: np.ndarray, terms: structs.ContactTerms) -> Pair:
     """Return gaps between outlines and obstacles, negative where they overlap; squared distances are in cells."""
-    real = np.asarray(terms.side).dtype.type
+    real = terms.side.dtype.type
     whole = two_sum((squared >> 12).astype(real) * real(4096), (squared & 4095).astype(real))
     d = np.sqrt(whole[0])
     dd = two_product(d, d)
     low = np.where(d > 0, ((whole[0] - dd[0]) + (whole[1] - dd[1])) / np.where(d > 0, 2 * d, 1), 0).astype(real)
     nowhere = squared == NO_OBSTACLE
     cells = np.where(nowhere, real(FAR_CELLS), d), np.where(nowhere, real(0), low)
-    away = pair_product(cells, (np.asarray(terms.side), np.asarray(terms.side_low)))
+    away = pair_product(cells, (terms.side, terms.side_low))
     left = two_sum(away[0], -terms.reach)
     return two_sum(left[0], left[1] + (away[1] - terms.reach_low))
 
@@ -54,7 +54,7 @@ def log_above(x: Pair) -> np.ndarray:
 
 def log_bump(squared: np.ndarray, pressed: int, terms: structs.ContactTerms) -> np.ndarray:
     """Return the log probability that a segment is pressed, or that it is not."""
-    x = pair_product(gap(squared, terms), (np.asarray(terms.scale), np.asarray(terms.scale_low)))
+    x = pair_product(gap(squared, terms), (terms.scale, terms.scale_low))
     touching, clear = log_above(x), log_above((-x[0], -x[1]))
     hit, no_hit = (terms.log_contact, terms.log_false) if pressed else (terms.log_missed, terms.log_quiet)
     return either(hit + touching, no_hit + clear)

@@ -16,7 +16,7 @@ from gpusense.reference.end_point import EndPoint, end_point, field_cell
 from gpusense.reference.error_free import Pair, block_sums
 from gpusense.reference.field import BLOCK
 from gpusense.reference.field_term import bilinear, field_exponent, field_square, log_field
-from gpusense.reference.hit_shape import shape_of, shape_weight
+from gpusense.reference.hit_shape import shape_weight
 from gpusense.reference.scans import particles_of_scans
 
 
@@ -74,7 +74,7 @@ def field_gradient(
         end = end_point(flags, at, low, to, to_low)
         col, row = end.col + pose_cell[part, None, 0], end.row + pose_cell[part, None, 1]
         pair, slope_x, slope_y = distance_slope(flags, table, col, row, end, window)
-        bend = shape_weight(flags, field_square(flags, pair, terms)[0], shape_of(terms))
+        bend = shape_weight(flags, field_square(flags, pair, terms)[0], terms.shape_power, terms.shape_rate)
         log_p, weight = log_field(flags, pair, terms), 2 * terms.square_scale * hit_share(flags, pair, terms) * bend
         distance, x, y = pair[0], to[..., 0], to[..., 1]
         if "ALL_READINGS" in flags:

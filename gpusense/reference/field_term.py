@@ -11,7 +11,7 @@ import numpy as np
 from gpusense.interface import structs
 from gpusense.reference.end_point import EndPoint, end_point, field_cell
 from gpusense.reference.error_free import Pair, pair_product, pair_sum
-from gpusense.reference.hit_shape import shape_exponent, shape_of
+from gpusense.reference.hit_shape import shape_exponent
 
 
 def between(flags: frozenset[str], weight_a: Pair, a: Pair, weight_b: Pair, b: Pair) -> Pair:
@@ -47,7 +47,7 @@ def field_square(flags: frozenset[str], distance: Pair, terms: structs.FieldTerm
 
 def field_exponent(flags: frozenset[str], distance: Pair, terms: structs.FieldTerms) -> Pair:
     """Return the exponent of the density of a hit in two parts."""
-    return shape_exponent(flags, field_square(flags, distance, terms), shape_of(terms))
+    return shape_exponent(flags, field_square(flags, distance, terms), terms.shape_power, terms.shape_rate)
 
 
 def log_field(flags: frozenset[str], distance: Pair, terms: structs.FieldTerms) -> np.ndarray:

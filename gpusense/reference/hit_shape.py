@@ -8,27 +8,16 @@ with nu degrees of freedom has E = power log(1 + rate t), power = (nu + 1) / 2, 
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from scipy.special import betainc
 
-from gpusense.interface import structs
 from gpusense.reference.error_free import Pair, two_product
 
-Shape = tuple[Any, Any]
 
-
-def shape_of(terms: structs.MixtureTerms | structs.FieldTerms) -> Shape:
-    """Return the numbers that describe the shape of a hit."""
-    return terms.shape_power, terms.shape_rate
-
-
-def shape_exponent(flags: frozenset[str], t: Pair, numbers: Shape) -> Pair:
-    """Return the exponent E as a sum of two numbers; ``numbers`` describe the shape."""
+def shape_exponent(flags: frozenset[str], t: Pair, power: np.ndarray, rate: np.ndarray) -> Pair:
+    """Return the exponent E as a sum of two numbers."""
     if "STUDENT" not in flags:
         return t
-    power, rate = numbers
     more = rate * t[0]
     if "EXACT_EXPONENT" not in flags:
         return power * np.log1p(more), np.zeros_like(more)
@@ -37,24 +26,22 @@ def shape_exponent(flags: frozenset[str], t: Pair, numbers: Shape) -> Pair:
     return high, low + power * ((exact[1] + rate * t[1]) / (1 + more))
 
 
-def shape_weight(flags: frozenset[str], t: np.ndarray, numbers: Shape) -> np.ndarray:
+def shape_weight(flags: frozenset[str], t: np.ndarray, power: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Return the weight E'(t)."""
     if "STUDENT" not in flags:
         return np.ones_like(t)
-    power, rate = numbers
     return power * rate / (1 + rate * t)
 
 
-def shape_bend(flags: frozenset[str], square: np.ndarray, numbers: Shape) -> np.ndarray:
+def shape_bend(flags: frozenset[str], square: np.ndarray, power: np.ndarray) -> np.ndarray:
     """Return ``-u^2 E''(t) / E'(t)`` from ``square = u^2 E'(t)``."""
-    return square * (1 / numbers[0]) if "STUDENT" in flags else np.zeros_like(square)
+    return square * (1 / power) if "STUDENT" in flags else np.zeros_like(square)
 
 
-def half_mass(flags: frozenset[str], b: np.ndarray, numbers: Shape) -> np.ndarray:
+def half_mass(flags: frozenset[str], b: np.ndarray, power: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Return the mass between the mean and a distance; kernels need no formula for it."""
     if "STUDENT" not in flags:
         raise ValueError(f"flags: must be those of a shape with a mass, got {sorted(flags)}")
-    power, rate = numbers
     half_dof = np.asarray(power, np.float64) - 0.5
     with np.errstate(over="ignore", invalid="ignore"):
         ratio = np.asarray(rate, np.float64) * np.square(np.asarray(b, np.float64))

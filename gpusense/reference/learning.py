@@ -26,7 +26,7 @@ import numpy as np
 from gpusense.interface import structs
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.reference.error_free import add_term
-from gpusense.reference.hit_shape import shape_bend, shape_exponent, shape_of, shape_weight
+from gpusense.reference.hit_shape import shape_bend, shape_exponent, shape_weight
 from gpusense.reference.mixture import (
     above_mean,
     hit_offset,
@@ -53,7 +53,7 @@ def responsibilities(
 def hit_phi(flags: frozenset[str], x: np.ndarray, terms: structs.MixtureTerms) -> np.ndarray:
     """Return the untruncated density of a hit at a distance of x scales, times sigma."""
     t = x.dtype.type(0.5) * x * x
-    exponent = shape_exponent(flags, (t, np.zeros_like(t)), shape_of(terms))[0]
+    exponent = shape_exponent(flags, (t, np.zeros_like(t)), terms.shape_power, terms.shape_rate)[0]
     density: np.ndarray = terms.unit_peak * np.exp(-exponent)
     return density
 
@@ -63,19 +63,21 @@ def hit_slopes(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return W u^2, and the derivatives h_s, h_m, h_ss, h_sm and h_mm of log p_hit of pairs."""
     mean, above = mean_range(flags, expected, terms), above_mean(flags, expected, terms)
-    numbers, half, scale = shape_of(terms), z.dtype.type(0.5), terms.inverse_sigma
+    power, rate, half, scale = terms.shape_power, terms.shape_rate, z.dtype.type(0.5), terms.inverse_sigma
     u, x_0, x_1 = hit_offset(flags, z, expected, terms)[0] * scale, mean * scale, above * scale
-    weight = shape_weight(flags, half * u * u, numbers)
+    weight = shape_weight(flags, half * u * u, power, rate)
     pull = weight * u
     square = pull * u
     mass = mass_within(flags, mean, above, terms.erf_scale, terms)
     near = mass < 1
     phi_0, phi_1 = (np.where(near, hit_phi(flags, x, terms) / mass, 0) for x in (x_0, x_1))
-    pull_0, pull_1 = (shape_weight(flags, half * x * x, numbers) * x * phi for x, phi in ((x_0, phi_0), (x_1, phi_1)))
+    pull_0, pull_1 = (
+        shape_weight(flags, half * x * x, power, rate) * x * phi for x, phi in ((x_0, phi_0), (x_1, phi_1))
+    )
     t, p = x_0 * phi_0 + x_1 * phi_1, phi_1 - phi_0
     q = x_1 * pull_1 - x_0 * pull_0 + p * t
     w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1
-    bend = shape_bend(flags, square, numbers)
+    bend = shape_bend(flags, square, power)
     # A clamped mean does not move with the bias.
     moves = mean == expected + terms.range_bias
     h_m = np.where(moves, pull + p, 0)

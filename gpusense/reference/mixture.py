@@ -13,7 +13,7 @@ from scipy.special import erf
 
 from gpusense.interface import structs
 from gpusense.reference.error_free import Pair, pair_sum, rest_of, two_product, two_sum
-from gpusense.reference.hit_shape import half_mass, shape_exponent, shape_of
+from gpusense.reference.hit_shape import half_mass, shape_exponent
 
 TINY = 1e-30
 SMALLEST_RANGE = 1e-37
@@ -39,8 +39,10 @@ def mass_within(
     """Return the mass of a hit of any shape on [0, range_max], given its mean and the distance to range_max."""
     if "MASS_TABLE" not in flags:
         return hit_mass(mean, above, scale)
-    numbers = shape_of(terms)
-    return half_mass(flags, mean * scale, numbers) + half_mass(flags, above * scale, numbers)
+    below, above_mass = (
+        half_mass(flags, distance * scale, terms.shape_power, terms.shape_rate) for distance in (mean, above)
+    )
+    return below + above_mass
 
 
 def mean_range(flags: frozenset[str], expected: np.ndarray, terms: structs.MixtureTerms) -> np.ndarray:
@@ -108,7 +110,7 @@ def hit_exponent(
     flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the exponent of a hit's density as a sum of two numbers."""
-    return shape_exponent(flags, normal_exponent(flags, z, expected, terms), shape_of(terms))
+    return shape_exponent(flags, normal_exponent(flags, z, expected, terms), terms.shape_power, terms.shape_rate)
 
 
 def log_hit(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms) -> np.ndarray:

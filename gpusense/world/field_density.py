@@ -86,11 +86,7 @@ class FieldDensity:
         return sums_linearly(self.rand, self.peak, real)
 
     def terms(self, real: np.dtype) -> FieldTerms:
-        """Return the numbers of the kernel file ``field_term``, for a sum of densities or of logarithms.
-
-        Raises:
-            ValueError: Sigma_hit is too small or too large for the precision.
-        """
+        """Return the numbers of the kernel file ``field_term``, for a sum of densities or of logarithms."""
         hit, rand = (self.peak, self.rand) if self.is_linear(real) else (self.log_peak, self.log_rand)
         top, (power, rate) = NoReturn(self.parameters.z_max).number, self.shape.numbers
         terms = rounded_terms(real, hit_peak=hit, square_scale=self.rate, rand_density=rand, z_max=top)

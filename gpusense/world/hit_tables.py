@@ -44,9 +44,9 @@ class TabulatedHit:
 
 
 def mass_tables(shapes: Sequence[HitShape], real: np.dtype) -> tuple[list[int], np.ndarray]:
-    """Return the place of each shape's table of masses, and all tables one after the other.
+    """Return the offset of each shape's table of masses, and all tables one after the other.
 
-    Equal shapes share a table. Shapes without one have place 0, and there is at least one number.
+    Equal shapes share a table. Shapes without a table have offset 0, and the tables have at least one number.
     """
     different = list(dict.fromkeys(shape for shape in shapes if shape.tabulated))
     tables = [mass_table(shape, real) for shape in different]

@@ -98,7 +98,8 @@ def learned(at):
     theta = np.array([top, rand / rest, short / (hit + short), math.log(at.sigma), 0.01, math.log(at.rate)])
     log_p, gradient = joint.log_p(theta)
     return {
-        "terms": np.array(learning_terms(at.parameters(), RANGE, device.real)[0]), "components": parts[..., 0], "density": log_p, "derivatives": gradient[:, 3:],
+        "terms": np.array(learning_terms(at.parameters(), RANGE, device.real)[0]), "components": parts[..., 0],
+        "density": log_p, "derivatives": gradient[:, 3:],
         "rate": optimum._next_rate(shares, z, expected, np.array([at.rate]), bounds),
         "blocks": blocks._terms(pairs.reading, pairs.expected, device.causes(at)[:, 1:], at, RANGE)[5],
         "objective": np.array(Problem(device, pairs, bounds, NO_PRIOR, False).value(at).log_likelihood),
@@ -113,7 +114,8 @@ def numbers(p, real=np.float32):
     steep = p.replace(lambda_short=50 * p.lambda_short)
     flags, terms, _ = mixture_of((far,), RANGE, np.dtype(real), **settings)
     return {
-        "sum of densities": np.array("LINEAR" in flags), "terms of logarithms": np.array([*terms.lambda_short, *terms.rand_density], float),
+        "sum of densities": np.array("LINEAR" in flags),
+        "terms of logarithms": np.array([*terms.lambda_short, *terms.rand_density], float),
         "last range": mixture_of((steep,), RANGE, np.dtype(np.float64), **settings)[1].last_least[0],
     }  # fmt: skip
 

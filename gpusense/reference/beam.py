@@ -54,6 +54,7 @@ def reading_term(
     else:
         term = log_density(flags, z, expected, terms)
     if "ALL_READINGS" in flags:
+        # 3: failure, an atom at the longest range.
         atom = term if "SENSOR_TABLE" in flags else np.where(np.isinf(z), terms.z_max, term)
         term = np.where(np.isnan(z), 0, atom).astype(expected.dtype)
     return term

@@ -56,8 +56,9 @@ def log_field(flags: frozenset[str], distance: Pair, terms: structs.FieldTerms) 
     if "LINEAR" not in flags:
         hit = (terms.hit_peak - exponent) + (terms.hit_peak_low - low)
         return np.logaddexp(hit, terms.rand_density) if "RAND" in flags else hit
-    p = np.full(exponent.shape, terms.rand_density)
+    p = np.full(exponent.shape, terms.rand_density)  # 4: random measurement
     if "HIT" in flags:
+        # 1: correct range.
         p += terms.hit_peak * np.exp(-exponent) * (1 - low)
     return np.log(p)
 

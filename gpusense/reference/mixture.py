@@ -1,9 +1,9 @@
 """Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
 
-Causes are numbered as in the book: 1 correct range (hit), 2 unexpected object (short), 3 no return (max), 4 random
-reading (rand). The density has 1, 2 and 4; the caller adds 3. In the linear domain hit_peak, z_short and rand_density
-are densities, in the log domain their logarithms. The mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and
-its sigma is sigma_hit + sigma_growth z* (GROWTH). Masses of hits are computed; only kernels look them up.
+Causes are numbered as in the book: 1 correct range (hit), 2 unexpected object (short), 3 failure (max), 4 random
+measurement (rand). The density has 1, 2 and 4; the caller adds 3. In the linear domain hit_peak, z_short and
+rand_density are densities, in the log domain their logarithms. The mean of p_hit is z* + range_bias on [0, range_max]
+(BIAS), and its sigma is sigma_hit + sigma_growth z* (GROWTH). Masses of hits are computed; only kernels look them up.
 """
 
 from __future__ import annotations
@@ -149,22 +149,25 @@ def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, term
         # p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm suffices.
         p = np.zeros(z.shape, z.dtype)
         if "HIT" in flags:
+            # 1: correct range.
             exponent = hit_exponent(flags, z, expected, terms)
             scale = hit_scale(flags, expected, terms)[0]
             mean, above = mean_range(flags, expected, terms), above_mean(flags, expected, terms)
             mass = mass_within(flags, mean, above, terms.erf_scale * scale, terms)
             p += terms.hit_peak * scale * np.exp(-exponent[0]) * (1 - exponent[1]) / mass
         if "SHORT" in flags:
+            # 2: unexpected object.
             density = terms.z_short * np.exp(-terms.lambda_short * z) * short_peak(terms.lambda_short, expected)
             p += np.where((z <= expected) & (expected > 0), density, 0)
+        # 4: random measurement.
         return np.log(p + terms.rand_density)
     parts = []
     if "HIT" in flags:
-        parts.append(log_hit(flags, z, expected, terms))
+        parts.append(log_hit(flags, z, expected, terms))  # 1: correct range
     if "SHORT" in flags:
-        parts.append(log_short(z, expected, terms))
+        parts.append(log_short(z, expected, terms))  # 2: unexpected object
     if "RAND" in flags:
-        parts.append(np.broadcast_to(terms.rand_density, z.shape))
+        parts.append(np.broadcast_to(terms.rand_density, z.shape))  # 4: random measurement
     if len(parts) == 1:
         return parts[0].astype(z.dtype)
     return np.logaddexp.reduce(parts, axis=0).astype(z.dtype)

@@ -30,6 +30,7 @@ real reading_term(const real z, const real expected, global const MixtureTerms *
 #if ALL_READINGS
     if (isnan(z)) return 0;
 #if !SENSOR_TABLE
+    // 3: failure, an atom at the longest range.
     if (isinf(z)) return terms->z_max;
 #endif
 #endif

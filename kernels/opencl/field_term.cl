@@ -44,8 +44,9 @@ real2 field_exponent(const real2 distance, global const FieldTerms *terms) {
 real log_field(const real2 distance, global const FieldTerms *terms) {
     const real2 exponent = field_exponent(distance, terms);
 #if LINEAR
-    real p = terms->rand_density;
+    real p = terms->rand_density;  // 4: random measurement
 #if HIT
+    // 1: correct range.
     p += terms->hit_peak * exp(-exponent.x) * (1 - exponent.y);
 #endif
     return log(p);
@@ -67,7 +68,7 @@ real reading_value(global const real *table, const int2 origin, const real4 pose
                    const real2 point_low, global const FieldTerms *terms, const Window window, const real guard) {
 #if ALL_READINGS
     if (isnan(point.x)) return 0;
-    if (isinf(point.x)) return terms->z_max;
+    if (isinf(point.x)) return terms->z_max;  // 3: failure
 #endif
 #if BILINEAR
     const EndPoint end = end_point(pose, low, point, point_low, (real)0.5, guard);

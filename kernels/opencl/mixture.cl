@@ -1,6 +1,6 @@
 // Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
-// Causes are numbered as in the book: 1 correct range (hit), 2 unexpected object (short), 3 no return (max), 4 random
-// reading (rand). The density has 1, 2 and 4; the caller adds 3. The numbers are MixtureTerms of the signature table. In
+// Causes are numbered as in the book: 1 correct range (hit), 2 unexpected object (short), 3 failure (max), 4 random
+// measurement (rand). The density has 1, 2 and 4; the caller adds 3. The numbers are MixtureTerms of the signature table. In
 // the linear domain hit_peak, z_short and rand_density are densities, in the log domain their logarithms. The mean of
 // p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma is sigma_hit + sigma_growth z* (GROWTH). masses are
 // tables of the masses of hits.
@@ -166,6 +166,7 @@ real log_short(const real z, const real expected, global const MixtureTerms *ter
 real log_density(const real z, const real expected, global const MixtureTerms *terms, global const real *masses) {
     real p = 0;
 #if HIT
+    // 1: correct range.
     const real2 exponent = hit_exponent(z, expected, terms);
     const real scale = hit_scale(expected, terms).x;
     const real hit = terms->hit_peak * scale * exp(-exponent.x) * (1 - exponent.y);
@@ -174,9 +175,11 @@ real log_density(const real z, const real expected, global const MixtureTerms *t
     p += mass == 1 ? hit : hit / mass;
 #endif
 #if SHORT
+    // 2: unexpected object.
     if (z <= expected && expected > 0)
         p += terms->z_short * exp(-terms->lambda_short * z) * short_peak(terms->lambda_short, expected);
 #endif
+    // 4: random measurement.
     return log(p + terms->rand_density);
 }
 #else
@@ -201,13 +204,13 @@ real log_density(const real z, const real expected, global const MixtureTerms *t
     if (isinf(largest)) return largest;
     real p = 0;
 #if HIT
-    p += exp(hit - largest);
+    p += exp(hit - largest);  // 1: correct range
 #endif
 #if SHORT
-    p += exp(shorter - largest);
+    p += exp(shorter - largest);  // 2: unexpected object
 #endif
 #if RAND
-    p += exp(terms->rand_density - largest);
+    p += exp(terms->rand_density - largest);  // 4: random measurement
 #endif
     return largest + log(p);
 #endif

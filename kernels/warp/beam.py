@@ -86,6 +86,7 @@ def make(name, flags):
             if wp.isnan(z):
                 return ZERO
             if not SENSOR_TABLE:
+                # 3: failure, an atom at the longest range.
                 if wp.isinf(z):
                     return terms[0].z_max
         if CUBES:

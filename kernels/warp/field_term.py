@@ -85,8 +85,9 @@ def functions(flags):
         @wp.func
         def log_field(distance: vec2, terms: wp.array(dtype=types.FieldTerms)):
             exponent = field_exponent(distance, terms)
-            p = terms[0].rand_density
+            p = terms[0].rand_density  # 4: random measurement
             if HIT:
+                # 1: correct range.
                 p += terms[0].hit_peak * wp.exp(-exponent.x) * (ONE - exponent.y)
             return wp.log(p)
 
@@ -113,7 +114,7 @@ def functions(flags):
             if wp.isnan(point.x):
                 return ZERO
             if wp.isinf(point.x):
-                return terms[0].z_max
+                return terms[0].z_max  # 3: failure
         end = end_point(pose, low, point, point_low, SHIFT, guard)
         cell = origin + end.cell
         if BILINEAR:

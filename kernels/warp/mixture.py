@@ -1,8 +1,8 @@
 """Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
 
-Causes are numbered as in the book: 1 correct range (hit), 2 unexpected object (short), 3 no return (max), 4 random
-reading (rand). The density has 1, 2 and 4; the caller adds 3. The numbers are MixtureTerms of the signature table. In
-the linear domain hit_peak, z_short and rand_density are densities, in the log domain their logarithms. The mean of
+Causes are numbered as in the book: 1 correct range (hit), 2 unexpected object (short), 3 failure (max), 4 random
+measurement (rand). The density has 1, 2 and 4; the caller adds 3. The numbers are MixtureTerms of the signature table.
+In the linear domain hit_peak, z_short and rand_density are densities, in the log domain their logarithms. The mean of
 p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma is sigma_hit + sigma_growth z* (GROWTH). masses are
 tables of the masses of hits.
 """
@@ -215,6 +215,7 @@ def functions(flags):
         ):
             p = real(0.0)
             if HIT:
+                # 1: correct range.
                 exponent = hit_exponent(z, expected, terms)
                 scale = hit_scale(expected, terms).x
                 hit = term_of.hit_peak(terms) * scale * wp.exp(-exponent.x) * (ONE - exponent.y)
@@ -230,12 +231,14 @@ def functions(flags):
                 else:
                     p += hit / mass
             if SHORT:
+                # 2: unexpected object.
                 if z <= expected and expected > ZERO:
                     p += (
                         term_of.z_short(terms)
                         * wp.exp(-term_of.lambda_short(terms) * z)
                         * short_peak(term_of.lambda_short(terms), expected)
                     )
+            # 4: random measurement.
             return wp.log(p + term_of.rand_density(terms))
 
     else:
@@ -263,11 +266,11 @@ def functions(flags):
                     return largest
                 p = real(0.0)
                 if HIT:
-                    p += wp.exp(hit - largest)
+                    p += wp.exp(hit - largest)  # 1: correct range
                 if SHORT:
-                    p += wp.exp(shorter - largest)
+                    p += wp.exp(shorter - largest)  # 2: unexpected object
                 if RAND:
-                    p += wp.exp(term_of.rand_density(terms) - largest)
+                    p += wp.exp(term_of.rand_density(terms) - largest)  # 4: random measurement
                 return largest + wp.log(p)
 
     return SimpleNamespace(**locals())

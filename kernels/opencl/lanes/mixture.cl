@@ -184,8 +184,9 @@ typedef struct {
 // Return p(z | z*). p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm suffices.
 INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, global const MixtureTerms *terms,
                                         global const real *masses, const ilanes bin_at) {
-    lanes p = TERM(rand_density);
+    lanes p = TERM(rand_density);  // 4: random measurement
 #if HIT
+    // 1: correct range.
     int any_clamped, within;
     const lanes mean = mean_range_lanes(expected, terms, bin_at, &any_clamped);
     const lanes above = above_mean_lanes(expected, any_clamped, terms, bin_at);
@@ -205,6 +206,7 @@ INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, glo
     p += within ? hit : hit / mass;
 #endif
 #if SHORT
+    // 2: unexpected object.
     const lanes shorter = TERM(z_short) * exp_lanes(-TERM(lambda_short) * z) / short_length_lanes(expected, terms, bin_at);
     p += ((z <= expected) & (expected > 0)) ? shorter : (lanes)0;
 #endif
@@ -221,6 +223,7 @@ INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, glo
                                         global const real *masses, const ilanes bin_at) {
     DensityParts parts = {-INFINITY, -INFINITY, 1};
 #if HIT
+    // 1: correct range.
     int any_clamped, within;
     const lanes mean = mean_range_lanes(expected, terms, bin_at, &any_clamped);
     const lanes above = above_mean_lanes(expected, any_clamped, terms, bin_at);
@@ -237,6 +240,7 @@ INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, glo
     parts.hit = hit;
 #endif
 #if SHORT
+    // 2: unexpected object.
     const lanes length = short_length_lanes(expected, terms, bin_at);
 #if SINGLE
     const lanes decayed = (TERM(z_short) - log_lanes(length)) - TERM(lambda_short) * z;
@@ -254,6 +258,7 @@ lanes log_of_parts_lanes(const DensityParts parts, global const MixtureTerms *te
     const lanes hit = parts.hit, shorter = parts.shorter;
     lanes largest = larger_lanes(shorter, hit);
 #if RAND
+    // 4: random measurement.
     const lanes random = TERM(rand_density);
     largest = larger_lanes(random, largest);
 #endif

@@ -19,7 +19,7 @@ def sums_linearly(rand: float, peak: float, real: np.dtype) -> bool:
 
 
 def rounded_terms(real: np.dtype, **terms: float) -> dict[str, np.floating]:
-    """Return the numbers of a mixture in a model's precision, with the rounding errors of the peak and scale of a hit."""
+    """Return a mixture's numbers in a precision, with the rounding errors of the peak and scale of a hit."""
     with np.errstate(over="ignore"):
         rounded = dict(zip(terms, np.array(list(terms.values())).astype(real), strict=True))
     # Logarithms of zero weights are -inf; no other number may be infinite.

@@ -40,8 +40,8 @@ def make(name, flags):
     # Return the log of a truncated normal; near and far are the distances from its mean to the ends.
     @wp.func
     def log_normal(residual: vec2, near: real, far: real, scale: vec2, peak: vec2):
-        below = near * scale
-        above = far * scale
+        below = near * scale.x
+        above = far * scale.x
         exponent = bounded_square(pair_product(residual, scale))
         untruncated = (peak.x - exponent.x) + (peak.y - exponent.y)
         if wp.min(below, above) <= ERF_ONE:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -31,7 +32,7 @@ class Cones:
         """The cone as kernels take it."""
         return structs.Cone(self.rays, self.critical)
 
-    @property
+    @functools.cached_property
     def flags(self) -> frozenset[str]:
         """The kernels' flags."""
         incidence = self.incidence or self.critical > 0

@@ -26,7 +26,7 @@ from gpusense.models.scan.tiles import all_within, order_of, tiles_of
 from gpusense.tables import casters
 from gpusense.tables.caster_base import Caster, CasterInput
 from gpusense.tables.lookup_files import describe, write_lookup
-from gpusense.tables.reachable import ObstaclesOf, ReachableMap, TableMemoryError, obstacles_of
+from gpusense.tables.reachable import MapState, ObstaclesOf, ReachableMap, TableMemoryError, obstacles_of
 from gpusense.world.frames import Mount
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.windows import Window
@@ -203,12 +203,10 @@ class MapCaster:
     ) -> None:
         """Start drawing the readings of a piece."""
         space, count, info = self._workspace, piece.count, self.backend.info
-        state = poses.ensure_table(self.map, piece.part, self.backend, space)
-        placed = place(poses, piece.part, Frame(state.window, state.grid, self.mount), self.backend, space, self.real)
+        placed, state = self._place(poses, piece)
         cosines = space.empty("cosines", count * rays if "INCIDENCE" in cones.flags else 1, self.real)
         with space.result("ranges", flat, piece.begin * rays, count * rays, self.real) as result:
-            program = self._program(placed, state.table, ray, rays, (result, cosines), cones, frozenset({"COSINES"}))
-            self.backend.run((*placed.launches(), *program))
+            self._run(placed, state, ray, rays, cones, self._flags(placed, cones) | {"COSINES"}, result, cosines)
             if info.float64:
                 self.backend.run((drawing.launch(space, piece.begin, count, rays, result, cosines),))
         if not info.float64:
@@ -219,43 +217,55 @@ class MapCaster:
 
     def _cast(self, poses: Poses, piece: Piece, ray: Buffer, rays: int, flat: Any, cones: Cones) -> None:
         space, count = self._workspace, piece.count
-        state = poses.ensure_table(self.map, piece.part, self.backend, space)
-        placed = place(poses, piece.part, Frame(state.window, state.grid, self.mount), self.backend, space, self.real)
+        placed, state = self._place(poses, piece)
         with space.result("ranges", flat, piece.begin * rays, count * rays, self.real) as result:
             other = space.empty("echoes", count * rays if "INCIDENCE" in cones.flags else 1, self.real)
             both = (other, result) if cones.incidence else (result, other)
-            program = self._program(placed, state.table, ray, rays, both, cones)
-            self.backend.run((*placed.launches(), *program))
+            self._run(placed, state, ray, rays, cones, self._flags(placed, cones), *both)
+
+    def _place(self, poses: Poses, piece: Piece) -> tuple[PlacedPoses, MapState]:
+        """Place the poses of a piece in a window of the map; also return the map with its table."""
+        state = poses.ensure_table(self.map, piece.part, self.backend, self._workspace)
+        frame = Frame(state.window, state.grid, self.mount)
+        return place(poses, piece.part, frame, self.backend, self._workspace, self.real), state
+
+    def _flags(self, placed: PlacedPoses, cones: Cones) -> frozenset[str]:
+        """Return the flags that cast the rays of placed poses; the poses must have been placed."""
+        return self.flags | self._precision_flags | cones.flags | flags_if(ORIGINS_OUTSIDE=not all_within(placed, 0))
+
+    def _run(
+        self, placed: PlacedPoses, state: MapState, ray: Buffer, rays: int, cones: Cones, flags: frozenset[str],
+        ranges: Buffer, incidence: Buffer,
+    ) -> None:  # fmt: skip
+        """Cast the rays of placed poses to ranges and, with INCIDENCE, angles of incidence; repeat kept programs."""
+        normals = self.normals(state.window, cones.flags)
+        changing = dict(poses=placed.source, ranges=ranges, incidence=incidence, normals=normals)
+        self._workspace.run(
+            (flags, placed.key, rays, cones), changing,
+            lambda: (*placed.launches(), *self._program(placed, state.table, ray, rays, cones, flags, changing)),
+            version=state.version,
+        )  # fmt: skip
 
     def _program(
-        self,
-        placed: PlacedPoses,
-        table: Buffer,
-        ray: Buffer,
-        rays: int,
-        results: tuple[Buffer, Buffer],
-        cones: Cones,
-        more: frozenset[str] = frozenset(),
-    ) -> Program:
-        """Return the launches that cast the rays of placed poses to ranges and, with INCIDENCE, angles of incidence."""
-        space, window, count = self._workspace, placed.frame.window, placed.count
-        result, incidence = results
-        flags = self.flags | self._precision_flags | cones.flags | flags_if(ORIGINS_OUTSIDE=not all_within(placed, 0))
+        self, placed: PlacedPoses, table: Buffer, ray: Buffer, rays: int, cones: Cones, flags: frozenset[str],
+        results: dict[str, Buffer],
+    ) -> Program:  # fmt: skip
+        """Return the launches that cast the rays of placed poses."""
+        space, count, ranges = self._workspace, placed.count, results["ranges"]
         common = dict(
-            map_table=table, pose_cell=placed.cell, pose=placed.pose, ray=ray, window=window, particles=count,
-            rays=rays, caster=self.method.struct(), scale=self.scale,
+            map_table=table, pose_cell=placed.cell, pose=placed.pose, ray=ray, window=placed.frame.window,
+            particles=count, rays=rays, caster=self.method.struct(), scale=self.scale, ranges=ranges,
         )  # fmt: skip
         if "CONES" in flags:
-            heard = dict(
-                normals=self.normals(window, cones.flags), ranges=result, incidence=incidence, cone=cones.struct
-            )
-            return (launch("cast_echoes", flags | more, (rays, count), **common, **heard),)
+            heard = dict(normals=results["normals"], incidence=results["incidence"], cone=cones.struct)
+            return (launch("cast_echoes", flags, (rays, count), **common, **heard),)
+        flags -= {"COSINES"}
         if self.backend.info.kind == "gpu":
             order = order_of(space, placed, rays, self.real)
             flags |= flags_if(ORDERED=order is not None)
             items, spread = tiles_of(count, rays)
             places = placed.cell if order is None else order.order
-            tiles = launch("cast_tiles", flags, (items,), **common, ranges=result, order=places, spread=spread)
+            tiles = launch("cast_tiles", flags, (items,), **common, order=places, spread=spread)
             return (tiles,) if order is None else (*order.launches(), tiles)
         flags = with_lanes_flag(self.backend.info.lanes, "cast_ranges", flags)
-        return (launch("cast_ranges", flags, (rays, count), **common, ranges=result),)
+        return (launch("cast_ranges", flags, (rays, count), **common),)

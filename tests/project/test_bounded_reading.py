@@ -21,7 +21,7 @@ ALLOWED = {
     "backends/proof.py": {"json.loads": "what this package wrote to its cache"},
     "backends/probe_process.py": {"json.loads": "what this package's own process said"},
     "backends/opencl/drivers.py": {"json.loads": "what this package's own process said"},
-    "logs/carmen_writer.py": {"gzip.GzipFile": "only to write"},
+    "logs/carmen.py": {"gzip.GzipFile": "only to write"},
     "sweeps/process.py": {"pickle.loads": "jobs and results of this package's own processes, by pipes"},
 }
 

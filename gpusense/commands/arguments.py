@@ -63,7 +63,7 @@ def add_json(parser: argparse.ArgumentParser, *, verbose: bool = False) -> None:
         "--json", action="store_true", help="print one JSON document, and nothing else, on standard output"
     )
     if verbose:
-        group.add_argument("-v", "--verbose", action="store_true", help="print all details as well")
+        group.add_argument("-v", "--verbose", action="store_true", help="also print all details")
 
 
 def add_seed(parser: argparse.ArgumentParser) -> None:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from gpusense.backends import Device
 
 NAME = "devices"
-HELP = "List the devices that gpusense can use, and the remedy for each that is absent or unusable."
+HELP = "List the devices that gpusense can use, with remedies for absent or unusable devices."
 
 EPILOG = """\
 The column 'selection' is the value for --backend of the other commands and for backend= of the library.

@@ -30,15 +30,15 @@ if TYPE_CHECKING:
     from gpusense.world.scanner import Scanner
 
 NAME = "explain"
-HELP = "Report the parts that the kernels leave out, keep or could leave out for a scene, each with the reason."
+HELP = "Report the parts that the kernels omit, keep or could omit for a scene, with reasons."
 
 EPILOG = """\
-The scene is a map, a scan of a log, the model's parameters, and 2000 particles in the free cells of the map. Without
---map it is the building of 'gpusense demo'; without --log a scan that the beam model draws at a free pose of the map.
+The scene is a map, a scan of a log, the model's parameters, and 2000 particles in the free cells of the map. The
+default map is the building of 'gpusense demo'; the default scan is drawn by the beam model at a free pose of the map.
 
-Lines with - are parts that are left out, + parts that the scene needs, ? parts that another choice would leave out.
-With --measure each part that a flag of the kernel brings back is timed with and without it, on this device. A
-difference below a few percent of the call is noise.
+Lines with - are omitted parts, + parts that the scene needs, ? parts that another choice would omit. --measure times
+each part that a kernel's flag restores, with and without it, on this device. Differences below a few percent of the
+call are noise.
 
 Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 

@@ -27,9 +27,9 @@ HELP = "Extract lines, corners, doors, hallways, poles and reflectors from the s
 _CALL = 256
 
 EPILOG = """\
-Each scan is split into lines, and corners, doors, hallways and poles are made of them (docs/landmarks.md). With
---map-out the lines, corners, doors, poles and reflectors of all scans become a map, at the logged poses or those of
---reference; --map-in makes a map of an occupancy grid instead. Reflectors need a log with intensities.
+Each scan is split into lines, which form corners, doors, hallways and poles (docs/landmarks.md). --map-out makes a map
+of the lines, corners, doors, poles and reflectors of all scans, at the poses of the log or of --reference; --map-in
+makes a map from an occupancy grid instead. Reflectors need a log with intensities.
 
 Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 

@@ -33,20 +33,19 @@ weight of 'no return' (z_max) and of random readings (z_rand). It needs readings
 a log with good poses, at which expected ranges are cast, or a file of pairs."""
 
 EPILOG = """\
-A file of pairs has a line for each reading: the reading z, a comma, the expected range z*, and optionally another comma
-and the angle of incidence in radians. A first line without numbers is a header; .gz files are read too. inf means 'no
+A file of pairs has a line per reading: the reading z, a comma, the expected range z*, and optionally another comma
+and the angle of incidence in radians. A first line without numbers is a header; files may be gzipped. inf means 'no
 return', nan a missing reading.
 
---holdout leaves every other block (one scan of a log, 100 pairs of a file; see --block) out of the fit, and scores
-these blocks with the fitted parameters and with the defaults of nav2_amcl and Beluga. The standard error is over
-blocks, because errors within a scan are correlated; so are the standard errors of the parameters. With --incidence,
-the fit by angles of incidence is scored too.
+--holdout excludes every other block (one scan of a log, 100 pairs of a file; see --block) from the fit, and scores
+these blocks with the fitted parameters and with the defaults of nav2_amcl and Beluga. All standard errors are over
+blocks, because errors within a scan are correlated. --incidence also scores the fit by angles of incidence.
 
-A map made from the same scans hides their errors. Fit with other scans than the map's: for a map of the even scans,
-use --every 2 --offset 1.
+A map made from the same scans hides their errors. Fit with other scans: for a map of the even scans, use --every 2
+--offset 1.
 
 --out writes parameters.yaml (for 'gpusense localize --parameters' and for nav2's amcl) and pictures: readings.png,
-density.png, trace.png, surface.png, and incidence.png where angles of incidence are fitted.
+density.png, trace.png, surface.png, and incidence.png for fitted angles of incidence.
 
 Ctrl-C ends the fit and prints the best parameters so far.
 

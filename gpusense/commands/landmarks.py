@@ -43,11 +43,11 @@ Parameters are fitted at the logged poses. A particle filter then starts around 
 and uses only odometry and readings; with --known also the recorded landmark of each reading. The map is used unchanged:
 readings of exchanged landmarks count as false positives.
 
-The filter's motion noise is that of the odometry and a random walk. The walk of the heading is measured at the logged
-poses unless --drift gives it: runs with poor odometry need a large one, and with a small one the robot gets lost.
+The filter's motion noise combines the noise of the odometry and a random walk. The walk of the heading is measured at
+the logged poses unless --drift sets it. Poor odometry needs a large walk; with a small one the robot gets lost.
 
-The verdict at the end does not need logged poses: it is 'lost' if the particles predict the last readings hardly better
-than poses anywhere among the landmarks, as on a wrong map.
+The final verdict needs no logged poses: it is 'lost' if the particles predict the last readings hardly better than
+poses anywhere among the landmarks, as on a wrong map.
 
 Exit codes: 0 success, 1 lost at the end, 2 bad input.
 

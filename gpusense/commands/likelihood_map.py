@@ -26,8 +26,8 @@ HELP = "Draw the likelihood of a scan over all positions and headings of a map."
 _MODES = 5
 
 EPILOG = """\
-The darker a position in the picture, the larger P(z | x, m) at its best heading. The table lists the best poses that
-are no neighbours of a better one. The entropy is that of the pose for a uniform prior.
+The darker a position in the picture, the larger P(z | x, m) at its best heading. The table lists the best poses
+without a better neighbour, and the entropy of the pose for a uniform prior.
 
 Ctrl-C ends the run; the picture then shows the positions so far.
 

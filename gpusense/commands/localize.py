@@ -34,20 +34,20 @@ HELP = "Localise a robot along a recorded log with a particle filter."
 LOST = 1
 
 EPILOG = """\
-The filter begins around the first reference pose or that of --start, with deviations of 0.5 m and 0.26 rad, or with
---global anywhere in the free space of the map. It moves with the log's odometry and weighs each chosen scan. Errors
-are those of the weighted mean against reference poses: those of --reference, or the logged ones. They count from the
-first of five scans in a row that are within 1 m and 20 degrees. With -v, coverage is the share
-of reference poses inside the 50, 80 and 95 % regions of the estimate. A rank is the share of particles behind a
-reference pose, to its right, or clockwise of it: many near 0 and 100 % are overconfidence. NEES is the squared distance
-of a reference pose in deviations.
+The filter starts at --start or at the first reference pose, with deviations of 0.5 m and 0.26 rad, or with --global
+anywhere in the free space of the map. It moves with the log's odometry and weighs each chosen scan. The weighted mean
+is compared with reference poses, from --reference or from the log. Errors count from the first of five consecutive
+scans within 1 m and 20 degrees. -v also prints calibration and times: coverage is the share of reference poses inside
+the 50, 80 and 95 % regions of the estimate; a rank is the share of particles behind a reference pose, to its right, or
+clockwise of it, and many ranks near 0 and 100 % show overconfidence; NEES is the squared distance of a reference pose
+in deviations.
 
-The first line is the verdict, which needs no reference poses. It is 'tracking'; 'uncertain', where the particles lie
-apart or the scans leave doubt; or 'lost', where scans contradict the pose, as beams that pass through walls do on a
-wrong map. p_lost is the probability that the pose is off by more than 1 m or 0.5 rad. -v prints calibration and times.
+The first line is the verdict, which needs no reference poses: 'tracking'; 'uncertain' for spread-out particles or
+doubtful scans; or 'lost' if scans contradict the pose, as beams through walls do on a wrong map. p_lost is the
+probability that the pose is off by more than 1 m or 0.5 rad.
 
-A file of nav2 gives amcl's model, beams, particles, noise of the odometry, recovery and initial pose; options of this
-command come first. Its frames, topics and gates (update_min_d, update_min_a, resample_interval) have no effect.
+A file of nav2 sets amcl's model, beams, particles, noise of the odometry, recovery and initial pose; options of this
+command take precedence. Its frames, topics and gates (update_min_d, update_min_a, resample_interval) have no effect.
 
 Ctrl-C ends the run with the results so far, and writes the files.
 
@@ -89,21 +89,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "[rad^2/rad^2] and by translation [rad^2/m^2], of translations by translation and by turns "
         f"(default: {' '.join(map(str, DEFAULTS.alpha))})")  # fmt: skip
     add("--sideways", type=not_negative_number, metavar="S",
-        help="variance of slips to the side per squared turn [m^2/rad^2] "
+        help="variance of sideways slips per squared turn [m^2/rad^2] "
         f"(default: {DEFAULTS.sideways})")  # fmt: skip
     add("--reverse", type=not_negative_number, metavar="P",
         help=f"probability that a translation was reversed (default: {DEFAULTS.reverse})")  # fmt: skip
     add("--fit-motion", action="store_true", help="learn the motion noise from the reference poses of this log first")
     add("--recovery", choices=("sensor", "augmented", "none"),
-        help="where scans contradict the pose: search for a rival that must win by later scans, or inject particles "
+        help="if scans contradict the pose: search for a rival that later scans must confirm, or inject particles "
         f"anywhere, or neither (default: {DEFAULTS.recovery})")  # fmt: skip
     add("--beam-skip", type=positive_number, metavar="P",
-        help="leave out beams, such as on people, that less than this share of the particles explains")  # fmt: skip
+        help="skip beams, such as on people, that less than this share of the particles explains")  # fmt: skip
     add_choice(parser)
     add_backend(parser)
     add_seed(parser)
     add_json(parser, verbose=True)
-    add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the trajectory, as evo reads it")
+    add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the trajectory for evo")
     add("--tum-from", choices=("tracking", "start"), default="tracking",
         help="where the trajectory begins: at the first scan whose verdict is 'tracking', or at the first one "
         "(default: %(default)s)")  # fmt: skip

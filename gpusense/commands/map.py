@@ -35,19 +35,18 @@ _SCANS = 64
 
 EPILOG = """\
 Each ray makes the cells that it crosses more likely free, and the cell where it ends more likely occupied. Cells
-without a ray stay unknown. The map is written as map_server's YAML file with an image beside it, white where it is
-free, black where occupied, grey where unknown: an image editor removes people and closes gaps.
+without a ray stay unknown. The map is map_server's YAML file and an image with white free, black occupied and grey
+unknown cells; remove people and close gaps in an image editor.
 
-Where the log has no corrected poses, as bags, the scans are chained: each is matched to the one before and to key scans
-around it, places that are seen again are found and matched, and the poses are those of least squares over all matches
-and the odometry. The command says what was closed, and what is doubtful. CARMEN logs have poses, which in raw ones are
-copies of the odometry: --chain finds better ones. With --reference the poses are those of a TUM trajectory.
-Several lasers of a bag, whose transforms have their mounts, make one trajectory and one map.
+Logs without corrected poses, such as bags, are chained: each scan is matched to the previous scan and to key scans
+around it, revisited places are found and matched, and least squares over all matches and the odometry yields the poses.
+The command reports closed loops and doubtful stretches. Poses in raw CARMEN logs are copies of the odometry: --chain
+finds better poses. --reference takes the poses of a TUM trajectory. Several lasers of a bag, with mounts from its
+transforms, make a common trajectory and map.
 A chain begins at 0 0 0 of its map: 'gpusense localize' follows the same log from --start 0 0 0, others with --global.
 
-Ctrl-C ends the chain, and the map of the scans so far is written; or it ends the map, which then holds some of the
-scans. A map of more than four million cells is built in bands of rows: then it is the map of the bands so far, and of
-the last one's scans.
+Ctrl-C ends the chain and writes the map of the scans so far, or ends the map with some of the scans. A map of more than
+four million cells is built in bands of rows; an interrupted one holds the finished bands, and some scans of the next.
 
 Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
@@ -66,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_log(parser, "a log with scans", several="lasers of the map")
     add_reference(parser)
     add_chain(parser)
-    add("--out", required=True, type=output_path(".yaml"), metavar="YAML", help="the map; its image lies beside it")
+    add("--out", required=True, type=output_path(".yaml"), metavar="YAML", help="the map, next to its image")
     add("--mode", choices=MODES, default="trinary",
         help="trinary: white, black and grey; scale: shades, a PNG; raw: per cent as greys, almost black "
         "(default: %(default)s)")  # fmt: skip

@@ -50,13 +50,13 @@ def add_chain(parser: argparse.ArgumentParser) -> None:
     """Add the options of a chain."""
     add = parser.add_argument
     add("--chain", action="store_true",
-        help="find the poses by matching the scans and closing loops, though the log has some (default: where it has "
-        "none)")  # fmt: skip
+        help="find the poses by matching the scans and closing loops, even if the log has "
+        "poses (default: if it has none)")  # fmt: skip
     add("--no-odometry", action="store_true", help="chain the scans without the log's odometry")
-    add("--no-loops", action="store_true", help="do not search for places that are seen again")
-    add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the poses of a chain, as evo reads them")
+    add("--no-loops", action="store_true", help="do not search for revisited places")
+    add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the poses of a chain for evo")
     add("--poses", type=output_path(".csv"), metavar="CSV",
-        help="write the poses of a chain with covariances, and which are doubtful")  # fmt: skip
+        help="write the poses of a chain with covariances and doubts")  # fmt: skip
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
         help="draw the map with trajectory, closures and doubtful stretches of a chain")  # fmt: skip
 

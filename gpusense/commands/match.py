@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from gpusense.world.grid import OccupancyGrid
 
 NAME = "match"
-HELP = "Match the scans of a recorded log to one another, or to a map."
+HELP = "Match the scans of a recorded log to each other, or to a map."
 
 EPILOG = """\
 Each scan is matched to the one before, from the odometry's guess; with --map to the map, from its logged pose. Errors

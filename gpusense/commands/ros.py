@@ -18,9 +18,9 @@ HELP = "Localise inside ROS 2, in the place of nav2_amcl, or watch another local
 _ROS = "--ros-args"
 
 EPILOG = """\
-Topics, frames and parameters are those of nav2_amcl: scan, map, initialpose and /tf come in; amcl_pose, particle_cloud,
-the transform from map to odom and /diagnostics go out. docs/ros2.md describes them. The node is a lifecycle node called
-amcl, and starts active.
+Topics, frames and parameters equal nav2_amcl's: the node reads scan, map, initialpose and /tf, and writes amcl_pose,
+particle_cloud, the transform from map to odom and /diagnostics (docs/ros2.md). It is a lifecycle node called amcl, and
+starts active.
 
 'gpusense ros watch' judges the poses of nav2_amcl, or of any node that publishes amcl_pose, and writes /diagnostics.
 

@@ -47,7 +47,7 @@ def add_log(parser: argparse.ArgumentParser, what: str, *, required: bool = True
         help="pose of a bag's laser on the robot [m, m, rad] (default: by the bag's transforms)")  # fmt: skip
     add("--frame", metavar="NAME", help="frame of the laser, if several share a bag's topic")
     add("--odometry", dest="odometry_from", metavar="NAME",
-        help="topic of a bag's odometry, or frame of the transforms that move the robot (default: beside the scans, "
+        help="topic of a bag's odometry, or frame of the transforms that move the robot (default: near the scans, "
         "/odom, or the first one)")  # fmt: skip
 
 
@@ -85,7 +85,7 @@ def add_reference(parser: argparse.ArgumentParser) -> None:
     """Add ``--reference``, the poses of the scans."""
     parser.add_argument(
         "--reference", type=Path, metavar="FILE",
-        help="a TUM trajectory with the poses of the robot at the times of the scans; scans without one are left out "
+        help="a TUM trajectory with the poses of the robot at the times of the scans; scans without a pose are skipped "
         "(default: the logged poses)",
     )  # fmt: skip
 

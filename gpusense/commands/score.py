@@ -41,12 +41,12 @@ DIFFERENT = 1
 EPILOG = """\
 Each scan is scored for N particles: the logged pose, half of the others around it, half uniform over the free cells.
 The percentile is the share of the other particles that score worse than the logged pose, ties counting half. The
-weighted mean excludes the logged pose. Default parameters are those of BeamParameters and LikelihoodFieldParameters.
+weighted mean excludes the logged pose. BeamParameters and LikelihoodFieldParameters define the default parameters.
 Beams of a scan are not independent, so the temperature multiplies their sum. By default it is calibrated: from the
 correlation of beams at the logged poses of the first 100 chosen scans. --temperature 1 is the plain product.
 
-The verdict tells whether the logged poses explain the beams of their scans. On another map beams pass through walls:
-the message says what share of them and near which place. Between the two it is uncertain.
+The verdict is whether the logged poses explain the beams of their scans. On a wrong map beams pass through walls: the
+message states their share and the place of most of them. Cases in between are uncertain.
 
 A row is printed as soon as its scan is scored. Ctrl-C ends the run with the results so far.
 

@@ -33,11 +33,11 @@ HELP = "Make the log of a robot that drives through a map, with noise, people an
 EPILOG = """\
 The robot drives between random places, or along the poses of --path. Its readings are drawn from the beam model around
 the ranges to walls and people; its odometry has the noise of the odometry motion model. With --moved, --removed,
---added and --glass the world differs from the map; with --true-map it is another one, so that --map is wrong. The same
+--added and --glass the world differs from the map; --true-map replaces the world, so that --map is wrong. The same
 options and seed make the same log on every device.
 
-A CARMEN log holds the true poses, which 'gpusense localize', 'score', 'fit' and 'match' compare with; they are those of
-the laser. Bags hold LaserScan, Odometry and transforms; --tum writes the true poses of the robot for --reference.
+A CARMEN log contains the laser's true poses, for comparison by 'gpusense localize', 'score', 'fit' and 'match'. Bags
+contain LaserScan, Odometry and transforms; --tum writes the robot's true poses for --reference.
 
 Exit codes: 0 success, 2 bad input.
 
@@ -52,12 +52,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
     source = parser.add_mutually_exclusive_group(required=True)
-    source.add_argument("--map", type=Path, metavar="YAML", help="a map_server map: the map that the robot has")
+    source.add_argument("--map", type=Path, metavar="YAML", help="the robot's map, a map_server map")
     source.add_argument("--world", metavar="NAME", help="a generated map instead: office, corridor, hall or twins, "
                         "or one of these with a separate seed, as in office:3")  # fmt: skip
     add("--log-out", required=True, type=Output(), metavar="FILE", help="the log to write")
     add("--format", choices=("carmen", "ros1", "ros2"),
-        help="a CARMEN log, compressed where the name ends in .gz; a bag of ROS 1 (.bag); a new folder with a bag of "
+        help="a CARMEN log, gzipped if the name ends in .gz; a bag of ROS 1 (.bag); a new folder with a bag of "
         "ROS 2 (default: by the name, ros1 for .bag and carmen for others)")  # fmt: skip
     add("--map-out", type=output_path(".yaml"), metavar="YAML", help="write the robot's map")
     add("--world-out", type=output_path(".yaml"), metavar="YAML", help="write the true world, without people")
@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _add_run(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--scans", type=whole_number(low=1, high=1_000_000), metavar="T",
-        help="number of scans (default: 200, or those of --path)")  # fmt: skip
+        help="number of scans (default: 200, or the poses of --path)")  # fmt: skip
     add("--path", type=Path, metavar="FILE", help="a TUM trajectory of true poses of the robot to follow")
     add("--step", type=positive_number, default=0.2, metavar="M", help="distance between scans [m] (default: 0.2)")
     add("--turn", type=positive_number, default=0.35, metavar="RAD",
@@ -95,7 +95,7 @@ def _add_world(parser: argparse.ArgumentParser) -> None:
     add("--moved", **share, help="share of the walls that are moved by 0.5 to 2 m (default: 0)")
     add("--removed", **share, help="share of the walls that are removed (default: 0)")
     add("--added", **share, help="new furniture, as a share of the walls (default: 0)")
-    add("--glass", **share, help="share of the walls through which beams pass (default: 0)")
+    add("--glass", **share, help="share of the walls that beams pass through (default: 0)")
 
 
 def _add_sensors(parser: argparse.ArgumentParser) -> None:
@@ -109,8 +109,8 @@ def _add_sensors(parser: argparse.ArgumentParser) -> None:
         help="pose of the laser on the robot [m, m, rad] (default: 0 0 0)")  # fmt: skip
     add("--noise", type=positive_number, metavar="M", help="standard deviation of ranges [m] (default: 0.02)")
     add("--motion-noise", type=not_negative_number, nargs=4, metavar=("A1", "A2", "A3", "A4"),
-        help="variances of the odometry per squared motion, as in 'gpusense localize' (default: those of a fair "
-        "odometer, 5 %% of turns and distances)")  # fmt: skip
+        help="variances of the odometry per squared motion, as in 'gpusense localize' (default: a fair "
+        "odometer's, 5 %% of turns and distances)")  # fmt: skip
     add("--parameters", "--params", type=Path, metavar="YAML",
         help="a file with beam_model or odometry_motion, such as 'gpusense fit --out' writes, for readings and "
         "odometry")  # fmt: skip

@@ -36,12 +36,12 @@ _TLS = {
 EPILOG = """\
 A plan is a YAML file: each combination of its axes is a job. docs/sweeps.md describes it.
 
-A row is appended to the table as soon as its job ends. A failed job is a row with its error; one that ends its worker
-or hangs beyond --job-timeout fails alone. After a crash or Ctrl-C, --resume runs the jobs that have no row yet.
+A row is appended to the table when its job ends. A failed job is a row with its error; a job that ends its worker or
+exceeds --job-timeout fails alone. After a crash or Ctrl-C, --resume runs the jobs without a row.
 
-Jobs run in a process of their own; with --processes or several --device in several, one for each device; with --dask on
-a Dask cluster. A cluster of 'local' listens on the loopback only. Whoever reaches the ports of a Dask cluster executes
-code there: use one at an address in a network that you trust, or with TLS. Maps and logs are sent to its workers, once.
+Jobs run in a separate process; --processes or several --device start several processes, one per device, and --dask uses
+a Dask cluster. The cluster 'local' listens on the loopback only. Everyone who reaches the ports of a Dask cluster can
+execute code there: use a trusted network or TLS. Maps and logs are sent to the workers once.
 
 Exit codes: 0 success, 1 some jobs failed, 2 bad input, or the cluster ended, 130 interrupted, 143 terminated.
 

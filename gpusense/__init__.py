@@ -99,7 +99,12 @@ def __getattr__(name: str) -> Any:
     if name in _MODULES:
         return importlib.import_module(f"gpusense.{name}")
     if name not in _HOME:
-        raise AttributeError(f"module 'gpusense' has no attribute {name!r}")
+        import difflib
+
+        close = difflib.get_close_matches(name, __dir__(), n=1)
+        raise AttributeError(
+            f"module 'gpusense' has no attribute {name!r}" + (f"; did you mean {close[0]!r}?" if close else "")
+        )
     value = getattr(importlib.import_module(f"gpusense.{_HOME[name]}"), name)
     globals()[name] = value
     return value

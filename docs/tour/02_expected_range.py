@@ -30,7 +30,12 @@ print(f"mass of the columns: {mass.min():.3f} to {mass.max():.3f}, with z_max = 
 
 figure, ax = plt.subplots(figsize=(6.4, 5), layout="constrained")
 image = ax.imshow(
-    density.T, origin="lower", extent=(0, RANGE_MAX, 0, RANGE_MAX), norm="log", cmap="cividis", interpolation="nearest"
+    density.T,
+    origin="lower",
+    extent=(0, RANGE_MAX, 0, RANGE_MAX),
+    norm="log",
+    cmap=gs.plots.colours(),
+    interpolation="nearest",
 )
 ax.set(xlabel="expected range z* [m]", ylabel="reading z [m]", title="p(z | z*)")
 figure.colorbar(image, label="density [1/m]")

@@ -23,19 +23,7 @@ features = gs.extract_features(ranges, scanner)
 print({kind: len(features[kind]) for kind in ("line", "corner", "door", "hallway", "pole") if len(features[kind])})
 
 figure, ax = plt.subplots(figsize=(8, 6), layout="constrained")
-hit = ranges < scanner.range_max
-ends = ranges * [np.cos(scanner.bearings), np.sin(scanner.bearings)]
-ax.plot(*ends[:, hit], ".", ms=3, color="0.6")
-lines = features["line"]
-for (x, y, theta), length in zip(lines.pose, lines.size, strict=True):
-    along = np.array([-0.5, 0.5]) * length
-    ax.plot(x + along * np.cos(theta), y + along * np.sin(theta), color="#0072b2", lw=2)
-for kind, mark, colour in (("corner", "s", "#d55e00"), ("door", "D", "#009e73"), ("pole", "o", "#cc79a7")):
-    places = features[kind].pose
-    if len(places):
-        ax.plot(*places[:, :2].T, mark, ms=9, mfc="none", mew=2, color=colour, label=f"{kind}: {len(places)}")
-ax.plot([], [], color="#0072b2", lw=2, label=f"line: {len(lines)}")
-ax.plot(0, 0, "k>", ms=9, label="scanner")
-ax.set(title=f"{hit.sum()} end points, {len(features)} features", xlabel="x [m]", ylabel="y [m]", aspect="equal")
-ax.legend()
+gs.plots.draw_features(ax, features, ranges, scanner)
+ax.set_title(f"{np.isfinite(ranges).sum()} end points, {len(features)} features")
+gs.plots.add_legend(ax, 6)
 plt.show()

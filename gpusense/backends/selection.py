@@ -1,7 +1,8 @@
 """Selection of a backend: by a string, by a queue, or the fastest device that is proved.
 
 Selection strings: ``"auto"``, ``"numpy"``, ``"opencl"``, ``"opencl:P:D"`` (platform and device number),
-``"opencl:<part of a device's or driver's name>"``, ``"warp"``, ``"warp:cpu"``, ``"warp:cuda:0"``. A queue of pyopencl
+``"opencl:<part of a device's or driver's name>"``, ``"warp"``, ``"warp:cpu"``, ``"warp:cuda:0"``; ``"gpu"`` and
+``"cpu"`` are the fastest device of their kind, and ``"cuda"`` is ``"warp:cuda"``. A queue of pyopencl
 selects its device, and a backend that works on that queue. ``"auto"`` is the value of ``$GPUSENSE_BACKEND``, and else
 the fastest device that is proved and opens (see :mod:`gpusense.backends.proof`, :mod:`gpusense.backends.chain`).
 
@@ -43,6 +44,8 @@ VARIABLES = (
 )  # fmt: skip
 # As keys of the dictionary in ``os.environ``.
 _KEYS = tuple(map(getattr(os.environ, "encodekey", str), VARIABLES))
+# Kinds of devices that select their fastest one.
+_KINDS = ("gpu", "cpu")
 
 _LOCK = threading.Lock()
 # By the key of a queue, which its backend keeps alive.
@@ -211,6 +214,10 @@ def _open_queue(queue: Any, library: Library) -> Backend:
 
 def _find(selection: str) -> str:
     """Return the listed selection string of the one device that a user's selection means."""
+    if selection in _KINDS:
+        return _fastest(selection)
+    if selection.partition(":")[0] == "cuda":
+        selection = f"warp:{selection}"
     head, colon, rest = selection.partition(":")
     entry = BY_NAME.get(head)
     if entry is None or (colon and not (rest and entry.has_parts)):
@@ -220,6 +227,14 @@ def _find(selection: str) -> str:
     if not present:
         raise ValueError(f"backend: {absent[0].reason}, got {show(selection)}")
     return _choose(entry, rest, present, absent, selection)
+
+
+def _fastest(kind: str) -> str:
+    """Return the listed selection string of the fastest usable device of a kind."""
+    best = best_of([device for entry in ENTRIES for device in listing.present(entry)[0] if device.kind == kind])
+    if best is None:
+        raise ValueError(f"backend: there must be a usable {kind.upper()}, see 'gpusense devices', got {show(kind)}")
+    return best.selection
 
 
 def _choose(entry: Entry, rest: str, present: list[Device], absent: list[Device], selection: str) -> str:

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 
 BACKEND_HELP = (
-    "device: auto (the fastest one present), numpy, opencl, opencl:<part of a device's or driver's name>, "
-    "opencl:<platform>:<device>, warp:cpu or warp:cuda:<number>; 'gpusense devices' lists the devices"
+    "device: auto (the fastest one present), gpu, cpu, cuda, numpy, opencl, opencl:<part of a name>, warp:cpu or "
+    "warp:cuda:<number>; 'gpusense devices' lists them"
 )
 
 _LONGEST_RANGE = 10_000.0

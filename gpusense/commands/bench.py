@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 NAME = "bench"
 HELP = "Measure error against run time of every caster and model, and name the fastest method within an error."
+FIRST = ("quick", "html", "map", "max_error", "max_time")
 
 PROBLEMS = ("ranges", "beam", "field")
 PRECISIONS = ("float32", "float64")

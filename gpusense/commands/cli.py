@@ -7,9 +7,11 @@ import contextlib
 import difflib
 import importlib
 import io
+import itertools
 import os
 import re
 import sys
+import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn
@@ -39,6 +41,9 @@ start here:
   gpusense demo               localise a robot in a generated building, and draw the result
   gpusense devices            list the devices, and the remedy for each that is absent
   gpusense COMMAND --help     describe a command and its options, with examples
+
+Completion of commands and options by TAB: pip install 'gpusense[completion]', and in ~/.bashrc or ~/.zshrc
+  eval "$(register-python-argcomplete gpusense)"
 
 Exit codes: 0 success, 1 a negative result such as 'lost' (see the command's help), 2 bad input (described in
 one line on standard error), 130 interrupted (Ctrl-C), 143 terminated. A command that is interrupted or terminated
@@ -105,9 +110,39 @@ class Parser(argparse.ArgumentParser):
                         f"argument {action.option_strings[0]}: must be another file than that of {name}, got both"
                     )
 
+    def group_options(self, first: Sequence[str]) -> None:
+        """Put the options that one needs first into a group of the help, and shorten the usage to required ones.
+
+        Args:
+            first: Destinations of these options.
+        """
+        options, group = self._optionals, self.add_argument_group("most used")
+        actions = {action.dest: action for action in self._actions}
+        for action in [actions[name] for name in first if actions[name] in options._group_actions]:
+            options._group_actions.remove(action)
+            group._group_actions.append(action)
+        options.title = "further options" if first else "options"
+        self._action_groups.remove(group)
+        self._action_groups.insert(1, group)
+        required = [action for action in self._actions if action.required or not action.option_strings]
+        words = [
+            f"{action.option_strings[0]} {action.metavar}" if action.option_strings
+            else f"[{action.metavar}]" if action.nargs == "?" else str(action.metavar)
+            for action in required
+        ]  # fmt: skip
+        self.usage = " ".join(["%(prog)s", *words, "[options]"])
+
 
 class Layout(argparse.RawDescriptionHelpFormatter):
-    """Help with verbatim texts, and a column wide enough for indented command names, miscounted by argparse."""
+    """Help with texts whose indented lines stay, and a column wide enough for indented command names."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        """Wrap the paragraphs of a text, and keep its indented lines."""
+        lines: list[str] = []
+        for verbatim, block in itertools.groupby(text.splitlines(), lambda line: not line[:1].strip()):
+            part = list(block)
+            lines += part if verbatim else textwrap.wrap(" ".join(part), width)
+        return "\n".join(indent + line for line in lines)
 
     def add_argument(self, action: argparse.Action) -> None:
         """Add an argument to the help."""
@@ -208,6 +243,10 @@ def _dispatch(argv: list[str]) -> int:
     argv = [ALIASES.get(argv[0], argv[0]), *argv[1:]] if argv else argv
     names = (argv[0],) if argv and argv[0] in COMMANDS else COMMANDS
     parser = _build(names)
+    if "_ARGCOMPLETE" in os.environ:
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
     try:
         args = parser.parse_args(argv)
     except SystemExit as stop:
@@ -234,6 +273,7 @@ def _build(names: Sequence[str]) -> Parser:
             allow_abbrev=False,
         )  # fmt: skip
         module.add_arguments(command)
+        command.group_options(module.FIRST)
         command.set_defaults(run=module.run)
     return parser
 

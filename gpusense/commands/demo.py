@@ -36,6 +36,7 @@ from gpusense.evaluation.machine import machine
 
 NAME = "demo"
 HELP = "Localise a robot in a generated building with every backend, compare them, and draw the result."
+FIRST = ("particles", "backend", "output")
 
 _DESCRIPTION = """\
 Generate a building and a noisy laser scan in it, and compute for many poses how likely the scan is: log P(z | x, m)
@@ -174,15 +175,14 @@ def _report(scene: Scene, scores: list[Score], failures: list[str], written: Pat
     ]  # fmt: skip
     print()
     output.print_table(columns, rows, right=columns[2:])
-    print(f"""
-rate   particle-beams a second of whole calls, NumPy arrays in and out
-error  largest error of log p [nats], by the NumPy reference in float64 at one pose in {scene.checked.step};
-       NumPy scores these poses alone
-Half of the poses lie all over the building, half around the true one. -v prints the scene, and what the
-kernels leave out.""")
+    print()
+    output.print_fact("rate", "particle-beams a second of whole calls, NumPy arrays in and out")
+    output.print_fact("error", "largest error of log p [nats], by the NumPy reference in float64 at one pose in "
+                      f"{scene.checked.step}; NumPy scores these poses alone")  # fmt: skip
+    output.print_fact("poses", "half all over the building, half around the true one")
     print("".join(f"\nfailed: {failure}\n" for failure in failures), end="")
     if written is not None:
-        print(f"\nPicture: {written}")
+        output.print_files(written)
 
 
 def _describe(scene: Scene, seed: int, backends: list[Backend]) -> None:

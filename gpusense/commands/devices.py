@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 from gpusense.commands.arguments import add_json
-from gpusense.commands.output import driver_text, print_json, print_table
+from gpusense.commands.output import driver_text, print_fact, print_json, print_result, print_table
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
@@ -15,10 +15,12 @@ if TYPE_CHECKING:
 
 NAME = "devices"
 HELP = "List the devices that gpusense can use, with remedies for absent or unusable devices."
+FIRST = ()
 
 EPILOG = """\
 The column 'selection' is the value for --backend of the other commands and for backend= of the library.
-'auto' selects the device marked with *; the environment variable GPUSENSE_BACKEND changes it.
+The environment variable GPUSENSE_BACKEND changes the meaning of 'auto'. 'gpu' and 'cpu' are the fastest device of
+their kind, 'cuda' is warp:cuda.
 Before a device is used for the first time, a child process runs kernels of each family on it and compares them with
 NumPy's results, which takes some seconds. Families that fail are not used, and the reason is printed here. 'lanes' are
 the particles or beams per work-item, followed by the processor that the driver compiles for.
@@ -36,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--prove", action="store_true", help="prove all devices anew, as after a change to the machine or its drivers"
     )
-    add_json(parser)
+    add_json(parser, verbose=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -50,15 +52,20 @@ def run(args: argparse.Namespace) -> int:
         documents = [asdict(device) | {"auto": device.available and device.selection == auto} for device in listed]
         print_json({"auto": auto, "auto_error": auto_error, "devices": documents, "machine": machine()})
         return 0
-    rows, notes = [], []
+    chosen = next((device for device in listed if device.available and device.selection == auto), None)
+    print_result(f"NO DEVICE: 'auto' does not work: {auto_error}" if chosen is None else
+                 f"'auto' is {chosen.selection}: {chosen.name}, a {chosen.kind.upper()}")  # fmt: skip
+    print()
+    rows = [
+        (device.selection or "-", device.kind, device.name, driver_text(device), _status(device)) for device in listed
+    ]
+    print_table(("selection", "kind", "name", "driver", "status"), rows, optional=() if args.verbose else ("driver",))
+    print()
     for device in listed:
-        mark = "*" if device.available and device.selection == auto else ""
-        rows.append((mark, device.selection or "-", device.kind, device.name, driver_text(device), _status(device)))
         if device.reason:
-            notes.append(f"{device.selection or device.name}: {device.reason}")
-    print_table(("", "selection", "kind", "name", "driver", "status"), rows)
-    print("", *notes, sep="\n")
-    print(f"* is the device of 'auto'\n{machine_line()}" if auto else f"'auto' does not work: {auto_error}")
+            print_fact(device.selection or device.backend, device.reason)
+    if args.verbose:
+        print(machine_line())
     return 0
 
 

@@ -16,7 +16,7 @@ from gpusense.commands.arguments import (
     parameters_of,
     whole_number,
 )
-from gpusense.commands.output import print_json
+from gpusense.commands.output import counted, print_fact, print_json, print_result
 from gpusense.commands.scans import OPTIONS, add_log, add_range_max, read_scan
 from gpusense.evaluation.machine import machine
 
@@ -31,14 +31,15 @@ if TYPE_CHECKING:
 
 NAME = "explain"
 HELP = "Report the parts that the kernels omit, keep or could omit for a scene, with reasons."
+FIRST = ("map", "log", "model", "parameters", "measure")
 
 EPILOG = """\
 The scene is a map, a scan of a log, the model's parameters, and 2000 particles in the free cells of the map. The
 default map is the building of 'gpusense demo'; the default scan is drawn by the beam model at a free pose of the map.
 
-Lines with - are omitted parts, + parts that the scene needs, ? parts that another choice would omit. --measure times
-each part that a kernel's flag restores, with and without it, on this device. Differences below a few percent of the
-call are noise.
+The report lists the omitted parts; with -v also, after +, parts that the scene needs, and, after ?, parts that another
+choice would omit. --measure times each part that a kernel's flag restores, with and without it, on this device.
+Differences below a few percent of the call are noise.
 
 Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
@@ -63,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_parameters(parser)
     add_seed(parser)
     add_backend(parser)
-    add_json(parser)
+    add_json(parser, verbose=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -78,10 +79,20 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(_document(plan) | ({"sources": texts} if args.sources else {}) | {"machine": machine()})
         return 0
-    print(plan)
+    _print(plan)
+    if args.verbose:
+        print(f"\n{plan}")
     for kernel, text in texts.items():
         print(f"\n{kernel}:\n{text.rstrip()}")
     return 0
+
+
+def _print(plan: Plan) -> None:
+    """Print the numbers of parts, and the omitted parts with reasons and savings."""
+    print_result(f"{counted(len(plan.omissions), 'part')} left out, {len(plan.kept)} kept, {len(plan.could_go)} that "
+                 f"another choice would leave out: {plan.title}")  # fmt: skip
+    for part in plan.omissions:
+        print_fact(f"- {part.what}:", f"{part.why}; saves {part.saves}{plan.saving(part)}")
 
 
 def _scene(args: argparse.Namespace) -> tuple[OccupancyGrid, Scanner, np.ndarray]:

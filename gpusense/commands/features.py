@@ -11,7 +11,7 @@ import numpy as np
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import add_backend, add_json, output_path, positive_number, whole_number
-from gpusense.commands.output import counted, print_json
+from gpusense.commands.output import counted, print_fact, print_files, print_json, print_result
 from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans
 from gpusense.evaluation.machine import machine, machine_line
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 NAME = "features"
 HELP = "Extract lines, corners, doors, hallways, poles and reflectors from the scans of a log."
+FIRST = ("log", "reference", "kinds", "map_out", "plot")
 
 # Scans per call and step of the progress bar.
 _CALL = 256
@@ -53,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--least", type=whole_number(low=1), default=2, metavar="N",
         help="smallest number of scans that must show a landmark (default: %(default)s)")  # fmt: skip
     add_backend(parser)
-    add_json(parser)
+    add_json(parser, verbose=True)
     add("--out", type=output_path(".csv"), metavar="CSV", help="write all features")
     add("--map-out", type=output_path(".csv"), metavar="CSV", help="write landmarks")
     picture = output_path(".png", ".pdf", ".svg")
@@ -116,7 +117,7 @@ def _of_map(args: argparse.Namespace) -> int:
     if args.json:
         print_json({"options": _options(args), "landmarks": _landmark_rows(landmarks), "machine": machine()})
         return 0
-    print(f"{landmarks!r} of {grid!r}")
+    print_result(f"{counted(len(landmarks.kind), 'landmark')} in the map: {_kinds(landmarks.kind)}")
     _print_files(args)
     return 0
 
@@ -146,26 +147,27 @@ def _report(
             "landmarks": None if landmarks is None else _landmark_rows(landmarks), "machine": machine(),
         })  # fmt: skip
         return
-    print(f"{counted(done, 'scan')}, {1e3 * seconds / done:.3g} ms each with the first call's compilation")
-    for kind, count in counts.items():
-        print(f"  {counted(count, kind)}: {count / done:.2f} a scan")
+    print_result(f"{counted(len(features.kind), 'feature')} in {counted(done, 'scan')}: "
+                 f"{len(features.kind) / done:.2g} a scan")  # fmt: skip
+    if counts:
+        print_fact("a scan", ", ".join(f"{kind} {count / done:.2g}" for kind, count in counts.items()))
     if landmarks is not None:
-        print(f"landmarks: {landmarks!r}")
+        print_fact("landmarks", f"{len(landmarks.kind)}, each in {args.least} scans or more: {_kinds(landmarks.kind)}")
     if done < len(scans):
         print(f"interrupted: results of {done} of {len(scans)} scans")
     _print_files(args)
+    if args.verbose:
+        print(f"\n{1e3 * seconds / done:.3g} ms each with the first call's compilation\n{machine_line()}")
+
+
+def _kinds(kinds: np.ndarray) -> str:
+    """Return the number of each kind in words."""
+    names, counts = np.unique(kinds, return_counts=True)
+    return ", ".join(counted(int(count), str(name)) for name, count in zip(names, counts, strict=True)) or "none"
 
 
 def _print_files(args: argparse.Namespace) -> None:
-    for path, word in (
-        (args.out, "written"),
-        (args.map_out, "written"),
-        (args.plot, "drawn"),
-        (args.map_plot, "drawn"),
-    ):
-        if path is not None:
-            print(f"{word}: {path}")
-    print(f"\n{machine_line()}")
+    print_files(args.out, args.map_out, args.plot, args.map_plot)
 
 
 def _options(args: argparse.Namespace) -> dict[str, Any]:

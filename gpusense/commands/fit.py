@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import sys
 from dataclasses import asdict
@@ -13,18 +12,18 @@ from typing import TYPE_CHECKING, Any
 from gpusense._util.files import check_writable, write_whole
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import add_backend, add_json, add_seed, check_writer, whole_number
-from gpusense.commands.fit_results import FitResult, PartialFit
-from gpusense.commands.output import print_json, print_table
+from gpusense.commands.fit_results import DOUBT, FitResult, PartialFit, is_doubtful, print_fit
+from gpusense.commands.output import print_json
 from gpusense.commands.scans import OPTIONS, add_choice, add_log, add_reference, log_options, options_named, read_scans
-from gpusense.evaluation.machine import machine, machine_line
+from gpusense.evaluation.machine import machine
 
 if TYPE_CHECKING:
     from gpusense.evaluation.range_data import RangeData
     from gpusense.localization.motion_fit import MotionFit
-    from gpusense.world.parameters import BeamParameters
 
 NAME = "fit"
 HELP = "Fit the beam model's parameters to a recorded log in a map, or to pairs of readings and expected ranges."
+FIRST = ("map", "log", "reference", "holdout", "out")
 
 _DESCRIPTION = """\
 How good is a range finder? gpusense fit estimates the six parameters of the beam model from your sensor's data: weight
@@ -59,8 +58,6 @@ UNFINISHED = 1
 # Pictures of --out.
 _PICTURES = ("readings.png", "density.png", "trace.png", "surface.png")
 _PAIRS_BLOCK = 100
-# Least weight and largest deviation [m] of correct ranges in a credible fit.
-_LEAST_HIT, _MOST_DEVIATION = 0.3, 0.5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -97,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"neighbouring scans or pairs per block (default: 1 scan, {_PAIRS_BLOCK} pairs)")  # fmt: skip
     add_backend(parser)
     add_seed(parser)
-    add_json(parser)
+    add_json(parser, verbose=True)
     add("--out", type=_folder, metavar="DIR", help="folder for parameters.yaml and pictures, created if absent")
 
 
@@ -113,9 +110,10 @@ def run(args: argparse.Namespace) -> int:
     files = _write(args.out, result) if args.out is not None else []
     if args.json:
         print_json(_document(args, result, files))
+        if is_doubtful(result.fit):
+            sys.stderr.write(f"gpusense: {DOUBT}\n")
     else:
-        _print(result, files)
-    _doubt(result.fit.parameters, "the poses or the map" if args.pairs is None else "the expected ranges")
+        print_fit(result, files, verbose=args.verbose, paired=args.pairs is not None)
     return 0 if result.fit.converged else UNFINISHED
 
 
@@ -221,48 +219,6 @@ def _document(args: argparse.Namespace, result: FitResult, files: list[Path]) ->
         "files": files,
         "machine": machine(),
     }
-
-
-def _doubt(parameters: BeamParameters, what: str) -> None:
-    """Warn of readings far from their expected ranges on standard error, with likely causes."""
-    z_hit, sigma_hit = parameters.z_hit, parameters.sigma_hit
-    if z_hit < _LEAST_HIT or sigma_hit > _MOST_DEVIATION:
-        found = f"z_hit {z_hit:.2f}, sigma_hit {sigma_hit:.2f} m"
-        sys.stderr.write(f"gpusense: readings are not near their expected ranges ({found}): {what} may be wrong\n")
-
-
-def _print(result: FitResult, files: list[Path]) -> None:
-    print(f"{result.fit}\nrange_max {result.data.range_max} m, of {len(result.data.ranges)} readings")
-    if result.incidence is not None:
-        print(f"\n{result.incidence}")
-    if result.motion is not None:
-        _print_motion(result.motion)
-    if result.held_out:
-        print(f"\nheld out: {result.held_out_readings} readings, mean log-likelihood of one [nats]")
-        columns = ("parameters", "log-likelihood", "std. error", "fitted ones gain", "std. error of it")
-        rows = [
-            (row.name, f"{row.per_beam:.4f}", _error(row.error), f"{row.gain:.4f}", _error(row.gain_error))
-            for row in result.held_out
-        ]
-        print_table(columns, rows, right=columns[1:])
-        for row in result.held_out:
-            if row.impossible:
-                print(f"{row.name}: {row.impossible} held-out readings are impossible")
-                print("softened: half a reading added to each cause; the other rows are compared with it")
-    if files:
-        print("\nwritten: " + ", ".join(map(str, files)))
-    print(f"\n{machine_line()}")
-
-
-def _print_motion(fit: MotionFit) -> None:
-    path = f"{fit.travelled:.1f} m and {fit.turned:.1f} rad"
-    print(f"\nodometry: {fit.motion}, of {fit.steps} steps ({path}) with {fit.references} reference poses")
-    if fit.undetermined:
-        print(f"at most the default, because the log does not determine them: {', '.join(fit.undetermined)}")
-
-
-def _error(value: float) -> str:
-    return f"{value:.4f}" if math.isfinite(value) else "-"
 
 
 def _write(folder: Path, result: FitResult) -> list[Path]:

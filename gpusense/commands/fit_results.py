@@ -4,9 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gpusense.commands.output import print_json
+from gpusense.commands.output import (
+    length,
+    print_fact,
+    print_files,
+    print_json,
+    print_parameters,
+    print_result,
+    print_table,
+    rounded,
+)
+from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
     from gpusense.evaluation.held_out import HeldOut
@@ -15,6 +26,15 @@ if TYPE_CHECKING:
     from gpusense.learning.beam.result import BeamFit
     from gpusense.localization.motion_fit import MotionFit
     from gpusense.world.parameters import BeamParameters
+
+# A fit with less weight of correct ranges, a larger deviation of them [m], or more unexplained readings is doubtful.
+_LEAST_HIT, _MOST_DEVIATION, _MOST_UNEXPLAINED = 0.3, 0.5, 0.25
+# Largest share of unexplained readings of six recorded lasers in maps of their scans, see docs/learning.md.
+_USUAL_UNEXPLAINED = 0.11
+# An offset matters from this number of standard errors on, and from this share of sigma_hit.
+_SURE, _NOTABLE = 3.0, 0.2
+DOUBT = "readings are not near their expected ranges: map, poses or expected ranges may be wrong"
+_UNITS = {"sigma_hit": "m", "lambda_short": "1/m", "range_bias": "m"}
 
 
 @dataclass(frozen=True)
@@ -71,3 +91,80 @@ class PartialFit:
             values = "\n".join(f"  {name:12} {value:.6g}" for name, value in best.to_dict().items())
             print(f"interrupted: best parameters up to iteration {self.iteration}, before convergence\n{values}")
             print(f"log-likelihood {self.log_likelihood:.3f}")
+
+
+def print_fit(result: FitResult, files: list[Path], *, verbose: bool, paired: bool) -> None:
+    """Print the verdict, the parameters with their errors, advice, and the written files.
+
+    Args:
+        result: The results.
+        files: The written files.
+        verbose: Whether to print all details.
+        paired: Whether the readings come from a file of pairs.
+    """
+    fit, p = result.fit, result.fit.parameters
+    readings = fit.hits + fit.max_readings
+    unexplained, doubtful = fit.outliers / readings if readings else 0.0, is_doubtful(fit)
+    verdict = "NOT CONVERGED" if not fit.converged else "DOUBTFUL" if doubtful else "FITTED"
+    print_result(
+        f"{verdict}: {100 * p.z_hit:.0f} % of the readings are correct, with a deviation of "
+        f"{length(p.sigma_hit)}; {100 * unexplained:.2g} % are unexplained"
+    )
+    source = "the expected ranges" if paired else "the poses or the map"
+    if doubtful:
+        print_fact("doubt", DOUBT)
+    elif unexplained > _USUAL_UNEXPLAINED:
+        print_fact("many", f"recorded lasers leave 5 to 11 % unexplained; look for people, or places where {source} "
+                   "are wrong, in readings.png (--out)")  # fmt: skip
+    if not fit.converged or fit.held:
+        print_fact("status", fit.status)
+    _print_bias(fit)
+    errors = fit.standard_errors | ({"range_bias": fit.range_bias_error} if fit.bias_fitted else {})
+    print_parameters(p, errors, _UNITS)
+    if result.incidence is not None:
+        print(f"\n{result.incidence}")
+    if result.motion is not None:
+        _print_motion(result.motion)
+    if result.held_out:
+        _print_held_out(result)
+    if files:
+        print()
+    print_files(*files)
+    if verbose:
+        print(f"\n{fit}\nrange_max {result.data.range_max:.6g} m, {len(result.data.ranges)} readings\n{machine_line()}")
+
+
+def is_doubtful(fit: BeamFit) -> bool:
+    """Return whether readings are far from their expected ranges."""
+    p, unexplained = fit.parameters, fit.outliers > _MOST_UNEXPLAINED * (fit.hits + fit.max_readings)
+    return p.z_hit < _LEAST_HIT or p.sigma_hit > _MOST_DEVIATION or unexplained
+
+
+def _print_bias(fit: BeamFit) -> None:
+    """Print the offset of correct ranges, and the option that takes it into the parameters if it matters."""
+    bias, error, sigma = fit.range_bias, fit.range_bias_error, fit.parameters.sigma_hit
+    if fit.bias_fitted or not math.isfinite(bias) or not math.isfinite(error):
+        return
+    if abs(bias) > _SURE * error and abs(bias) > _NOTABLE * sigma:
+        sides = "long" if bias > 0 else "short"
+        print_fact("bias", f"ranges are {length(abs(bias))} too {sides} (error {length(error)}): --range-bias takes "
+                   "this into the parameters; walls that the map draws too thick look the same")  # fmt: skip
+
+
+def _print_held_out(result: FitResult) -> None:
+    print(f"\nheld out: {result.held_out_readings} readings, mean log-likelihood of a reading [nats]")
+    columns = ("parameters", "log-likelihood", "gain of the fit", "std. error")
+    rows = [(row.name, f"{row.per_beam:.4f}", *rounded(row.gain, row.gain_error)) for row in result.held_out]
+    print_table(columns, rows, right=columns[1:])
+    for row in result.held_out:
+        if row.impossible:
+            print_fact("", f"{row.name}: {row.impossible} held-out readings are impossible; softened: half a reading "
+                       "added to each cause, with which the other rows are compared")  # fmt: skip
+
+
+def _print_motion(fit: MotionFit) -> None:
+    path = f"{fit.travelled:.1f} m and {fit.turned:.1f} rad"
+    print()
+    print_fact("odometry", f"{fit.motion}, from {fit.steps} steps ({path}) with {fit.references} reference poses")
+    if fit.undetermined:
+        print_fact("", f"at most the default, because the log does not determine them: {', '.join(fit.undetermined)}")

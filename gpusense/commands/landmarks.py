@@ -18,7 +18,7 @@ from gpusense.commands.arguments import (
     range_number,
     whole_number,
 )
-from gpusense.commands.output import print_json, print_table
+from gpusense.commands.output import counted, degrees, length, print_fact, print_json, print_parameters, print_result
 from gpusense.evaluation.machine import machine, machine_line
 from gpusense.localization.defaults import DEFAULTS
 
@@ -31,13 +31,17 @@ if TYPE_CHECKING:
 
 NAME = "landmarks"
 HELP = "Fit the noise of landmark readings in a recorded run, check the map, and localise the robot."
+FIRST = ("folder", "robot", "known", "particles", "drift")
 
 LOST = 1
+_UNITS = {"sigma_range": "m", "sigma_bearing": "rad"}
 
 EPILOG = """\
 The folder holds files in the format of the UTIAS MRCLAM data, plain or with .gz after the name:
-  Landmark_Groundtruth.dat  subject x y deviation deviation    Barcodes.dat           subject barcode
-  RobotN_Odometry.dat       time v w                           RobotN_Measurement.dat time barcode range bearing
+  Landmark_Groundtruth.dat  subject x y deviation deviation
+  Barcodes.dat              subject barcode
+  RobotN_Odometry.dat       time v w
+  RobotN_Measurement.dat    time barcode range bearing
   RobotN_Groundtruth.dat    time x y heading
 Parameters are fitted at the logged poses. A particle filter then starts around the first logged pose (0.5 m, 0.3 rad)
 and uses only odometry and readings; with --known also the recorded landmark of each reading. The map is used unchanged:
@@ -84,7 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the sensor's field of view [rad] (default: 5 %% more than the readings' span)")  # fmt: skip
     add_backend(parser)
     add_seed(parser)
-    add_json(parser)
+    add_json(parser, verbose=True)
 
 
 def _probability(text: str) -> float:
@@ -166,55 +170,49 @@ def _print(
     args: argparse.Namespace, recorded_run: LandmarkRun, fit: LandmarkFit, suspicions: Suspicions,
     agreement: dict[str, float], track: Track, motion: DriftingOdometry,
 ) -> None:  # fmt: skip
-    left_out = ", ".join(
-        f"{count} of {reason}" if reason == "other robots" else f"{count} {reason}"
-        for reason, count in recorded_run.left_out.items()
-    )
-    print(
-        f"robot {args.robot}: {len(recorded_run.time)} scans with {len(recorded_run.ids)} readings of "
-        f"{len(recorded_run.landmarks)} landmarks\nleft out of the recording: {left_out}\n\n{fit}\n"
-    )
-    _print_suspicions(recorded_run, suspicions)
+    s: dict[str, Any] = track.summary()
     kind = "known" if args.known else "unknown"
-    s = track.summary()
-    print(
-        f"\nlikeliest landmark at the logged pose: {agreement['right']:.1%} right, {agreement['none']:.1%} taken for "
-        f"false positives, {agreement['wrong']:.1%} wrong\n"
-    )
-    rows = [
-        ("position [m]", f"{s['error_median']:.3f}", f"{s['error_90']:.3f}", f"{s['error_max']:.3f}"),
-        ("heading [rad]", f"{s['heading_median']:.3f}", f"{s['heading_90']:.3f}",
-         f"{float(track.error_heading.max()):.3f}"),
-    ]  # fmt: skip
-    print_table(("error", "median", "90 %", "largest"), rows, right=("median", "90 %", "largest"))
-    alpha = " ".join(f"{value:.3g}" for value in motion.alpha)
-    print(
-        f"\n{args.particles} particles, {kind} landmarks\nmotion noise {alpha}, reverse {motion.reverse:.2g}, "
-        f"random walk {motion.drift:.2g} m and {motion.drift_heading:.2g} rad per sqrt(s)\n\n"
-        f"verdict: {_verdict(track)}\n\n{machine_line()}"
-    )
+    doubts = len(suspicions.exchanged) + len(suspicions.misplaced)
+    print_result(f"{_verdict(track)}; {counted(doubts, 'suspicion')} about landmarks")
+    print_fact("error", f"median {length(s['error_median'])}, 90 % below {length(s['error_90'])}, at most "
+               f"{length(s['error_max'])}; heading {degrees(s['heading_median'])}, "
+               f"{degrees(s['heading_90'])} and {degrees(float(track.error_heading.max()))} degrees")  # fmt: skip
+    _print_suspicions(recorded_run, suspicions)
+    print_fact("likeliest", f"landmark at the logged pose: right {agreement['right']:.1%}, wrong "
+               f"{agreement['wrong']:.1%}, taken for false positives {agreement['none']:.1%}")  # fmt: skip
+    print_fact("readings", f"{len(recorded_run.ids)} of {len(recorded_run.landmarks)} landmarks in "
+               f"{len(recorded_run.time)} scans, {args.particles} particles, {kind} landmarks")  # fmt: skip
+    print_parameters(fit.parameters, fit.standard_errors, _UNITS)
+    if args.verbose:
+        print(f"\n{fit}")
+        left_out = ", ".join(f"{count} {reason}" for reason, count in recorded_run.left_out.items())
+        alpha = " ".join(f"{value:.3g}" for value in motion.alpha)
+        print(
+            f"\nleft out of the recording: {left_out}\nmotion noise {alpha}, reverse {motion.reverse:.2g}, random walk "
+            f"{motion.drift:.2g} m and {motion.drift_heading:.2g} rad per sqrt(s)\n{machine_line()}"
+        )
 
 
 def _verdict(track: Track) -> str:
     s = track.summary()
     if s["gain_last"] is None:
-        return "none: too few scans with readings"
+        return "NO VERDICT: too few scans with readings"
     share = f"the particles predict a reading {s['gain_last']:.1f} nats better than chance; p_lost {s['p_lost']:.2g}"
     if track.lost:
         return f"LOST since {s['lost_since']:.0f} s: {share}; is this the map of the run, and --drift large enough?"
     before = f"; lost in {s['scans_lost']} scans before" if s["scans_lost"] else ""
-    return f"not lost: {share}{before}"
+    return f"TRACKING: {share}{before}"
 
 
 def _print_suspicions(recorded_run: LandmarkRun, suspicions: Suspicions) -> None:
     labels = recorded_run.labels
     for pair in suspicions.exchanged:
         a, b = labels[pair.first], labels[pair.second]
-        print(
-            f"SUSPICIOUS: landmarks {a} and {b} fit better exchanged: {pair.before[0]:.0%} and {pair.before[1]:.0%} of "
-            f"their readings agree with the map, {pair.after[0]:.0%} and {pair.after[1]:.0%} with both exchanged"
-        )
+        print_fact("SUSPICIOUS", f"landmarks {a} and {b} fit better exchanged: {pair.before[0]:.0%} and "
+                   f"{pair.before[1]:.0%} of their readings agree with the map, {pair.after[0]:.0%} and "
+                   f"{pair.after[1]:.0%} with both exchanged")  # fmt: skip
     for each in suspicions.misplaced:
-        print(f"SUSPICIOUS: {each.agree:.0%} of the readings of landmark {labels[each.landmark]} agree with its place")
+        print_fact("SUSPICIOUS", f"landmark {labels[each.landmark]}: {each.agree:.0%} of its readings agree with its "
+                   "place")  # fmt: skip
     if not (suspicions.exchanged or suspicions.misplaced):
-        print("no landmark is suspicious")
+        print_fact("map", "no landmark is suspicious")

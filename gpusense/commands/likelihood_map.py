@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import (
@@ -14,20 +16,27 @@ from gpusense.commands.arguments import (
     positive_number,
     whole_number,
 )
-from gpusense.commands.output import print_json, print_table
+from gpusense.commands.output import grouped, print_fact, print_files, print_json, print_result, print_table
 from gpusense.commands.scans import add_log, add_range_max, read_scan
 from gpusense.commands.signals import code_of, word_of
-from gpusense.evaluation.machine import machine
+from gpusense.evaluation.machine import machine, machine_line
+
+if TYPE_CHECKING:
+    import numpy as np
 
 NAME = "likelihood-map"
 HELP = "Draw the likelihood of a scan over all positions and headings of a map."
+FIRST = ("map", "log", "scan", "out", "model")
 
 # Number of printed modes.
 _MODES = 5
+# Differences of log-likelihoods that count as equal, and above which a grid is too coarse [nats].
+_EQUAL, _COARSE = 3.0, 3.0
 
 EPILOG = """\
-The darker a position in the picture, the larger P(z | x, m) at its best heading. The table lists the best poses
-without a better neighbour, and the entropy of the pose for a uniform prior.
+The darker a position in the picture, the larger P(z | x, m) at its best heading. The table lists the best poses that
+are not near a better one, refined between the positions and headings of the grid. A refined pose that is much likelier
+than the grid's best one shows that the grid is too coarse for the model. The entropy belongs to a uniform prior.
 
 Ctrl-C ends the run; the picture then shows the positions so far.
 
@@ -55,12 +64,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="factor of log-likelihoods in (0, 1] (default: %(default)s, the plain product over beams)")  # fmt: skip
     add_range_max(parser)
     add_backend(parser)
-    add_json(parser)
+    add_json(parser, verbose=True)
 
 
 def run(args: argparse.Namespace) -> int:
     """Compute and draw the likelihoods; after Ctrl-C, the tiles so far."""
-    from gpusense.matching.pose_likelihood import prepare_tiles
+    from gpusense.matching.pose_likelihood import prepare_tiles, refine_modes
     from gpusense.models.scan.beam import BeamModel
     from gpusense.models.scan.field import LikelihoodFieldModel
     from gpusense.world.map_files import read_map
@@ -80,21 +89,46 @@ def run(args: argparse.Namespace) -> int:
         except KeyboardInterrupt as stop:
             stopped = stop
     result.plot(args.out)
-    poses, log_p = result.modes(_MODES)
+    poses, log_p, gain = refine_modes(model, scan.ranges, result, _MODES)
     if args.json:
         print_json({
             "picture": str(args.out), "done": done, "rows": result.log_p.shape[0], "cols": result.log_p.shape[1],
             "headings": result.log_p.shape[2], "resolution": result.resolution, "entropy": result.entropy,
-            "log_evidence": result.log_evidence, "modes": [
+            "log_evidence": result.log_evidence, "gain_of_refinement": gain, "modes": [
                 {"pose": pose, "log_likelihood": value} for pose, value in zip(poses.tolist(), log_p, strict=True)
             ], "machine": machine(),
         })  # fmt: skip
     else:
-        columns = ("x [m]", "y [m]", "theta [rad]", "log p")
-        rows = [[*(f"{v:.3f}" for v in pose), f"{value:.2f}"] for pose, value in zip(poses, log_p, strict=True)]
-        print_table(columns, rows, right=columns)
-        print(f"\n{args.out}: {result.log_p.size} poses, entropy {result.entropy:.2f} nats")
+        _print(args, poses, log_p, gain)
+        if args.verbose:
+            print(f"\n{grouped(result.log_p.size)} poses, entropy {result.entropy:.2f} nats; refinement gains "
+                  f"{gain:.2g} nats\n{machine_line()}")  # fmt: skip
     if stopped is not None:
         sys.stderr.write(f"gpusense: {word_of(stopped)}: {100 * done:.0f}% of the positions are done\n")
         return code_of(stopped)
     return 0
+
+
+def _print(args: argparse.Namespace, poses: np.ndarray, log_p: np.ndarray, gain: float) -> None:
+    """Print the likeliest pose with its lead over others, and the table of poses."""
+    if not len(poses):
+        print_result("NO PLACE: the scan is impossible everywhere")
+    else:
+        best = f"{poses[0, 0]:.2f} m, {poses[0, 1]:.2f} m, {math.degrees(poses[0, 2]):.1f} degrees"
+        near = int((log_p > log_p[0] - _EQUAL).sum())
+        lead = f", {log_p[0] - log_p[1]:.3g} nats above the next" if len(poses) > 1 else ""
+        print_result(f"ONE PLACE: {best}{lead}" if near == 1 else
+                     f"{near} PLACES within {_EQUAL:g} nats of the best: {best}")  # fmt: skip
+        if gain > _COARSE:
+            print_fact("grid", f"too coarse for the model: the refined pose is {gain:.3g} nats likelier than the "
+                       f"grid's best, so peaks may be missed; try --resolution {args.resolution / 2:g} --headings "
+                       f"{2 * args.headings}, or a --temperature below {args.temperature:g}")  # fmt: skip
+        columns = ("x [m]", "y [m]", "heading [degrees]", "below the best [nats]")
+        rows = [
+            (f"{x:.2f}", f"{y:.2f}", f"{math.degrees(theta):.1f}", f"{log_p[0] - value:.1f}")
+            for (x, y, theta), value in zip(poses, log_p, strict=True)
+        ]
+        print()
+        print_table(columns, rows, right=columns)
+        print()
+    print_files(args.out)

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 NAME = "localize"
 HELP = "Localise a robot along a recorded log with a particle filter."
+FIRST = ("map", "log", "everywhere", "start", "plot")
 
 LOST = 1
 

@@ -9,9 +9,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpusense.commands.output import print_json, print_result
+from gpusense.commands.output import degrees, length, print_fact, print_files, print_json, print_result
 from gpusense.commands.scans import scan_times
 from gpusense.evaluation.machine import machine, machine_line
+from gpusense.localization.spread import WIDE, WIDE_TURN
 
 if TYPE_CHECKING:
     from gpusense.evaluation.tracking import Track
@@ -48,9 +49,9 @@ def report(
     result = summary(track)
     found = None if result["verdict"] == "tracking" else pf.diagnose()
     result["evidence"] = None if found is None else asdict(found) | {"text": found.text}
+    first = 0 if args.tum_from == "start" else len(track.poses) if track.converged is None else track.converged
     if args.tum is not None:
         times, indices = scan_times([step.scan.time for step in track.steps])
-        first = 0 if args.tum_from == "start" else _left_out(track)
         write_tum(args.tum, times[first:], track.poses[first:], indices=indices)
     if args.plot is not None:
         _draw(args.plot, pf, track)
@@ -64,20 +65,13 @@ def report(
         print_json(document | {"poses": poses, "times": times, "machine": machine()})
         return result
     _print(pf, result, chosen, track)
-    for path in filter(None, (args.tum, args.plot, *recorders)):
-        print(f"written    {path}{f'; open it with: rerun {path}' if path == args.record else ''}")
+    print_files(args.plot, *recorders, args.tum)
+    if args.tum is not None and first:
+        print_fact("", f"without the first {first} of {len(track.poses)} scans, before the verdict is 'tracking'; "
+                   "--tum-from start writes them")  # fmt: skip
     if args.verbose:
         _print_details(pf, result)
     return result
-
-
-def _left_out(track: Track) -> int:
-    """Return the number of scans before convergence, and print it unless it is 0."""
-    first = len(track.poses) if track.converged is None else track.converged
-    if first:
-        rule = f"the first {first} of {len(track.poses)} scans, before the verdict is 'tracking', are left out"
-        print(f"gpusense: --tum: {rule}; --tum-from start writes them", file=sys.stderr)
-    return first
 
 
 def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track) -> None:
@@ -89,13 +83,13 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track
     print_result(_verdict(result, deviations) + error)
     if result["scans"] < chosen:
         print(f"interrupted: results of {result['scans']} of {chosen} scans")
-    print(f"last pose  {_pose(track.poses[-1])}; deviations {_deviations(deviations)}")
-    print(f"scans      {result['scans']}, {sum(result[f'ms_{part}'] for part in _PARTS):.2g} ms each")
+    print_fact("last pose", f"{_pose(track.poses[-1])}; deviations {_deviations(deviations)}")
+    print_fact("scans", f"{result['scans']}, {sum(result[f'ms_{part}'] for part in _PARTS):.2g} ms each")
     if result["scans"] > 1 and not result["odometry_moves"]:
-        print("odometry   does not move: absent, unreadable, at other times than the scans, or the robot stands")
+        print_fact("odometry", "does not move: absent, unreadable, at other times than the scans, or the robot stands")
     if result["references_repeat_odometry"]:
-        print("reference  none: the logged poses are the odometry's own, "
-              f"{length(result['error_median'])} away in the median")  # fmt: skip
+        away = length(result["error_median"])
+        print_fact("reference", f"none: the logged poses are the odometry's own, {away} away in the median")
     elif known:
         _print_errors(result)
     sys.stdout.flush()
@@ -105,15 +99,15 @@ def _print_errors(result: dict[str, Any]) -> None:
     """Print the errors of poses, separately before and after convergence."""
     some = "" if result["references"] == result["scans"] else f" (reference poses of {result['references']} scans)"
     if result["converged_at"] is None:
-        print(f"error      never within 1 m and 20 degrees for long; median {length(result['error_median'])}{some}")
+        print_fact("error", f"never within 1 m and 20 degrees for long; median {length(result['error_median'])}{some}")
         return
     start = result["converged_at"]
     since = f"from scan {start} on: " if start else ""
-    turns = f"{math.degrees(result['settled_heading_median']):.2g} and {math.degrees(result['settled_heading_95']):.2g}"
-    print(f"error      {since}median {length(result['settled_median'])}, 95 % below {length(result['settled_95'])}; "
-          f"heading {turns} degrees{some}")  # fmt: skip
+    turns = f"{degrees(result['settled_heading_median'])} and {degrees(result['settled_heading_95'])}"
+    print_fact("error", f"{since}median {length(result['settled_median'])}, 95 % below {length(result['settled_95'])}; "
+               f"heading {turns} degrees{some}")  # fmt: skip
     if start:
-        print(f"           before: median {length(result['early_median'])}")
+        print_fact("", f"before: median {length(result['early_median'])}")
 
 
 def _print_details(pf: ParticleFilter, result: dict[str, Any]) -> None:
@@ -135,20 +129,13 @@ def _print_details(pf: ParticleFilter, result: dict[str, Any]) -> None:
     )
 
 
-def length(metres: float) -> str:
-    """Format a length with two digits in a suitable unit."""
-    if metres < 0.01:
-        return f"{metres * 1000:.2g} mm"
-    return f"{metres * 100:.2g} cm" if metres < 0.995 else f"{metres:.1f} m"
-
-
 def _pose(pose: Any) -> str:
     x, y, theta = pose
     return f"{x:.2f} m, {y:.2f} m, {math.degrees(theta):.1f} degrees"
 
 
 def _deviations(values: list[float]) -> str:
-    return f"{length(values[0])}, {length(values[1])}, {math.degrees(values[2]):.2g} degrees"
+    return f"{length(values[0])}, {length(values[1])}, {degrees(values[2])} degrees"
 
 
 def _ranks(histogram: list[float]) -> str:
@@ -164,10 +151,17 @@ def _verdict(result: dict[str, Any], deviations: list[float]) -> str:
     if result["verdict"] == "tracking":
         return f"{verdict}: {100 * result['explained_at_end']:.0f} % of the beams of the last scans agree with the map"
     evidence = result["evidence"]["text"]
-    if result["verdict"] == "lost" or result["p_lost"] <= 0.5:
+    if result["verdict"] == "lost":
         return f"{verdict}: {evidence}"
-    wide = f"the particles lie {max(deviations[:2]):.1f} m and {math.degrees(deviations[2]):.0f} degrees apart"
-    return f"{verdict}: {wide}; {evidence}"
+    return f"{verdict}: {_doubt(deviations)}; {evidence}"
+
+
+def _doubt(deviations: list[float]) -> str:
+    """Return the reason why a pose is uncertain: wide particles, or scans that other places explain as well."""
+    position, heading = max(deviations[:2]), deviations[2]
+    if position > WIDE or heading > WIDE_TURN:
+        return f"the particles lie {position:.1f} m and {math.degrees(heading):.0f} degrees apart"
+    return "the particles lie together, but the scans so far fit other places as well, or too few agree; drive on"
 
 
 def _draw(path: Path, pf: ParticleFilter, track: Track) -> None:

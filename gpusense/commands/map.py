@@ -15,11 +15,19 @@ from gpusense.commands.arguments import (
     output_path,
     positive_number,
 )
-from gpusense.commands.map_chain import add_chain, chain_log, check_chain, document, is_chained, words, write_chain
-from gpusense.commands.output import counted, print_json
+from gpusense.commands.map_chain import (
+    add_chain,
+    chain_log,
+    check_chain,
+    document,
+    is_chained,
+    print_chain,
+    write_chain,
+)
+from gpusense.commands.output import counted, grouped, print_fact, print_files, print_json, print_result
 from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans_of_lasers, scanners_of
 from gpusense.commands.signals import code_of, word_of
-from gpusense.evaluation.machine import machine
+from gpusense.evaluation.machine import machine, machine_line
 from gpusense.world.map_greys import MODES
 
 if TYPE_CHECKING:
@@ -29,6 +37,7 @@ if TYPE_CHECKING:
 
 NAME = "map"
 HELP = "Build an occupancy grid from the scans of a log."
+FIRST = ("log", "out", "plot", "chain", "resolution")
 
 # Scans per step of the progress bar.
 _SCANS = 64
@@ -77,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--p-miss", type=number, default=0.45, metavar="P", help="occupancy after one miss (default: %(default)s)")
     add_choice(parser)
     add_backend(parser)
-    add_json(parser)
+    add_json(parser, verbose=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -143,10 +152,19 @@ def _report(
             "chain": None if chained is None else document(args, chained), "machine": machine(),
         })  # fmt: skip
         return
-    if chained is not None:
-        print(words(args, chained))
-    print(f"{args.out}: {rows} x {cols} cells of {grid.resolution} m, {occupied} occupied, {free} free; "
-          f"{counted(builder.rays, 'ray')} of {counted(scans[0], 'scan')}\nimage: {image}")  # fmt: skip
+    if chained is None:
+        print_result(f"MAPPED: {counted(scans[0], 'scan')} at {'reference' if args.reference else 'logged'} poses")
+    else:
+        print_chain(chained)
+    size = f"{cols * grid.resolution:.0f} x {rows * grid.resolution:.0f} m, cells of {grid.resolution:g} m"
+    print_fact("map", f"{size}: {grouped(occupied)} occupied, {grouped(free)} free")
+    print_files(args.out, image, args.plot, args.tum, args.poses)
+    start = " --start 0 0 0" if chained is not None else ""
+    print(f"next       gpusense localize --map {args.out} --log {args.log}{start}")
+    if args.verbose:
+        chain = "" if chained is None else f"{chained.chain.explain()}\nchained in {chained.seconds:.1f} s\n"
+        print(f"\n{chain}{counted(builder.rays, 'ray')} of {counted(scans[0], 'scan')}, {rows} x {cols} cells\n"
+              f"{machine_line()}")  # fmt: skip
 
 
 def _build(builder: MapBuilder) -> tuple[float, KeyboardInterrupt | None]:

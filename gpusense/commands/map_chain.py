@@ -13,6 +13,7 @@ import numpy as np
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import output_path
+from gpusense.commands.output import counted, print_fact, print_result
 from gpusense.commands.scans import scan_times, scanners_of
 from gpusense.commands.signals import word_of
 
@@ -171,9 +172,25 @@ def document(args: argparse.Namespace, chained: ChainedScans) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def words(args: argparse.Namespace, chained: ChainedScans) -> str:
-    """Describe a chain and the written files in words."""
-    lines = [f"{chained.chain.explain()}\nchained in {chained.seconds:.1f} s"]
-    lines += [f"written: {getattr(args, name)}" for name in ("tum", "poses") if getattr(args, name)]
-    lines += [f"drawn: {args.plot}"] if args.plot else []
-    return "\n".join(lines)
+def print_chain(chained: ChainedScans) -> None:
+    """Print the verdict on a chain, its closures and its doubtful stretches."""
+    from gpusense.chaining.result import REASONS
+
+    chain = chained.chain
+    way = float(np.hypot(*np.diff(chain.poses[:, :2], axis=0).T).sum())
+    share = chain.doubtful.mean() if len(chain.poses) else 0.0
+    verdict = "CONSISTENT" if not chain.doubts else f"DOUBTFUL in {counted(len(chain.doubts), 'stretch', 'stretches')}"
+    doubt = f", {100 * share:.2g} % of them in doubt" if chain.doubts else ""
+    print_result(f"{verdict}: chained {counted(len(chain.poses), 'scan')} over {way:.0f} m{doubt}")
+    if len(chain.corrections):
+        print_fact("loops", f"{len(chain.corrections)} closed, moving scans by {np.median(chain.corrections):.2f} m in "
+                   f"the median, {chain.corrections.max():.2f} m at most")  # fmt: skip
+    else:
+        print_fact("loops", "none closed, since no place was seen again with certainty: the map bends by the drift of "
+                   "the whole way")  # fmt: skip
+    for reason, meaning in REASONS.items():
+        some = [doubt for doubt in chain.doubts if doubt.reason == reason]
+        if some:
+            spans = ", ".join(f"{doubt.first} to {doubt.last}" for doubt in some[:5])
+            more = f" and {len(some) - 5} more" if len(some) > 5 else ""
+            print_fact("doubt", f"scans {spans}{more}: {meaning}")

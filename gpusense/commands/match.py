@@ -19,7 +19,7 @@ from gpusense.commands.arguments import (
     output_path,
     positive_number,
 )
-from gpusense.commands.output import print_json
+from gpusense.commands.output import counted, degrees, length, print_fact, print_files, print_json, print_result
 from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans, scan_times
 from gpusense.evaluation.machine import machine, machine_line
 
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 NAME = "match"
 HELP = "Match the scans of a recorded log to each other, or to a map."
+FIRST = ("log", "map", "reference", "tum", "plot")
 
 EPILOG = """\
 Each scan is matched to the one before, from the odometry's guess; with --map to the map, from its logged pose. Errors
@@ -64,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_choice(parser)
     add_backend(parser)
     add_seed(parser)
-    add_json(parser)
+    add_json(parser, verbose=True)
     add("--out", type=output_path(".csv"), metavar="CSV", help="write poses, deviations and statuses")
     add("--tum", type=output_path(".tum", ".txt"), metavar="FILE",
         help="write the trajectory: matches chained from the first scan on, or poses in the map; a match that failed "
@@ -125,25 +126,33 @@ def _report(
     expected = len(scans) - (grid is None)
     if len(matches.match) < expected:
         print(f"interrupted: results of {len(matches.match)} of {expected} matches")
-    for path, word in ((args.out, "written"), (args.tum, "written"), (args.plot, "drawn")):
-        if path is not None:
-            print(f"{word}: {path}")
-    print(f"\n{machine_line()}")
+    print_files(args.out, args.plot, args.tum)
+    if args.verbose:
+        print(f"\nscore: median {total['score_median']:.3f}\n{total['milliseconds_each']:.3g} ms each with the first "
+              f"call's compilation\n{machine_line()}")  # fmt: skip
 
 
 def _print(total: dict[str, Any]) -> None:
+    """Print the share of matches that converged, their errors or corrections, and the reasons of the others."""
     from gpusense.matching.result import STATUSES
 
-    print(f"{total['matches']} matches, {total['milliseconds_each']:.3g} ms each with the first call's compilation")
-    for status, count in total["statuses"].items():
-        print(f"  {count} {status}: {STATUSES[status]}")
-    print(f"score: median {total['score_median']:.3f}")
-    if total["wrong"] is not None:
-        turn = {name: math.degrees(total[f"heading_{name}"]) for name in ("median", "p95")}
-        print(
-            f"against the logged poses: {total['position_median']:.4f} m and {turn['median']:.3f} deg median, "
-            f"{total['position_p95']:.4f} m and {turn['p95']:.3f} deg at 95 %; {total['wrong']} wrong"
-        )
+    count, statuses = total["matches"], total["statuses"]
+    good = statuses.get("converged", 0) + statuses.get("unobservable", 0)
+    known = total["wrong"] is not None
+    kind, prefix = ("error", "") if known else ("correction", "correction_")
+    median, most = (
+        f"{length(total[f'{prefix}position_{name}'])} and {degrees(total[f'{prefix}heading_{name}'])} degrees"
+        for name in ("median", "p95")
+    )
+    verdict = "MATCHED" if good == count else "PARTLY MATCHED" if good else "NO MATCH"
+    print_result(f"{verdict}: {good} of {counted(count, 'scan')} agree; median {kind} {median}")
+    print_fact(kind, f"95 % below {most}" + (f"; {total['wrong']} wrong, beyond 0.2 m or 5 degrees" if known else ""))
+    if known:
+        print_fact("guesses", f"median error {length(total['guess_position_median'])} and "
+                   f"{degrees(total['guess_heading_median'])} degrees")  # fmt: skip
+    for status, number in statuses.items():
+        if status != "converged":
+            print_fact(str(number), f"{status}: {STATUSES[status]}")
 
 
 def _document(args: argparse.Namespace, matches: LogMatches, total: dict[str, Any], chosen: int) -> dict[str, Any]:

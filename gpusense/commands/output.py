@@ -7,6 +7,7 @@ import math
 import os
 import shutil
 import sys
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,11 @@ from gpusense._util.progress import is_terminal
 
 if TYPE_CHECKING:
     from gpusense.backends import BackendInfo, Device
+
+# Columns of a line of facts, and of their names.
+_WIDTH, _INDENT = 80, 11
+# Programs that open files with a suffix, if no picture viewer or editor does.
+_OPENERS = {".rrd": "rerun", ".tum": "evo_traj tum"}
 
 
 def print_json(document: dict[str, Any]) -> None:
@@ -35,12 +41,33 @@ def _plain(value: Any) -> Any:
 
 
 def print_result(text: str) -> None:
-    """Print the result of a command in one line, in bold on a terminal."""
-    print(f"\033[1m{text}\033[0m" if is_terminal(sys.stdout) and "NO_COLOR" not in os.environ else text, flush=True)
+    """Print the result of a command: in one line, on a terminal wrapped and in bold."""
+    if is_terminal(sys.stdout):
+        text = _wrapped(text, min(terminal_width(), _WIDTH))
+        text = text if "NO_COLOR" in os.environ else f"\033[1m{text}\033[0m"
+    print(text, flush=True)
 
 
-def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[str] = ()) -> None:
-    """Print a table by rich on a terminal, otherwise as plain text.
+def print_fact(name: str, text: str) -> None:
+    """Print a named fact below the result, wrapped to 80 columns."""
+    print(_wrapped(f"{name:<{_INDENT - 1}} {text}", _WIDTH, " " * _INDENT))
+
+
+def print_files(*paths: os.PathLike[str] | None) -> None:
+    """Print the files that a command wrote, with the command that opens each; None is left out."""
+    for path in filter(None, paths):
+        opener = _OPENERS.get(os.path.splitext(path)[1].lower())
+        print(f"{'written':<{_INDENT}}{path}{f'; open it with: {opener} {path}' if opener else ''}")
+
+
+def _wrapped(text: str, width: int, indent: str = "") -> str:
+    return textwrap.fill(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+
+
+def print_table(
+    columns: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[str] = (), optional: Sequence[str] = ()
+) -> None:
+    """Print a table: by rich on a terminal, as plain text elsewhere.
 
     On a narrow terminal, each row becomes a paragraph with one value per line.
 
@@ -48,11 +75,17 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right:
         columns: Names of the columns.
         rows: Cells of each row.
         right: Names of the columns that are right-aligned.
+        optional: Names of the columns that are left out on narrow terminals, in this order.
     """
     lines = table_lines(columns, rows, right=right)
     if not is_terminal(sys.stdout):
         print(*lines, sep="\n")
         return
+    for name in optional:
+        if max(map(len, lines)) > terminal_width():
+            kept = [place for place, column in enumerate(columns) if column != name]
+            columns, rows = [columns[k] for k in kept], [[row[k] for k in kept] for row in rows]
+            lines = table_lines(columns, rows, right=right)
     if max(map(len, lines)) > terminal_width():
         print(*paragraph_lines(columns, rows), sep="\n")
         return
@@ -135,9 +168,42 @@ def table_lines(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right:
     return lines
 
 
-def counted(number: int, noun: str) -> str:
-    """Return a number with a noun: ``"1 scan"``, ``"3 scans"``."""
-    return f"{number} {noun}{'s' * (number != 1)}"
+def counted(number: int, noun: str, plural: str | None = None) -> str:
+    """Return a number of things in words: ``"1 scan"``, ``"3 scans"``."""
+    return f"{number} {noun if number == 1 else plural or noun + 's'}"
+
+
+def length(metres: float) -> str:
+    """Format a length with two digits and the unit that suits it."""
+    if metres < 0.01:
+        return f"{metres * 1000:.2g} mm"
+    return f"{metres * 100:.2g} cm" if metres < 0.995 else f"{metres:.1f} m"
+
+
+def degrees(radians: float) -> str:
+    """Format an angle in degrees with two digits, down to a hundredth of a degree."""
+    return f"{round(math.degrees(radians), 2):.2g}"
+
+
+def rounded(value: float, error: float) -> tuple[str, str]:
+    """Format a value and its standard error, both to the error's two digits; "-" for an unknown number."""
+    if not math.isfinite(value):
+        return "-", "-"
+    if not (math.isfinite(error) and error > 0):
+        return f"{value:.4g}", "inf" if error == math.inf else "-"
+    digits = min(max(1 - math.floor(math.log10(error)), 0), 12)
+    return f"{value:.{digits}f}", f"{error:.{digits}f}"
+
+
+def print_parameters(parameters: Any, errors: Mapping[str, float], units: Mapping[str, str]) -> None:
+    """Print a table of parameters with their standard errors."""
+    rows = [
+        (name, *rounded(value, error), units.get(name, ""))
+        for name, error in errors.items()
+        if (value := getattr(parameters, name)) is not None
+    ]
+    print()
+    print_table(("parameter", "value", "std. error", "unit"), rows, right=("value", "std. error"))
 
 
 def grouped(number: int) -> str:

@@ -14,6 +14,7 @@ from gpusense.localization.nav2_file import FITTED
 
 NAME = "ros"
 HELP = "Localise inside ROS 2, in the place of nav2_amcl, or watch another localiser."
+FIRST = ("map", "params_file", "start", "anywhere", "odom_topic")
 
 _ROS = "--ros-args"
 

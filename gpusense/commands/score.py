@@ -22,7 +22,17 @@ from gpusense.commands.arguments import (
     parameters_of,
     whole_number,
 )
-from gpusense.commands.output import TableStream, counted, print_json
+from gpusense.commands.output import (
+    TableStream,
+    counted,
+    degrees,
+    grouped,
+    length,
+    print_fact,
+    print_files,
+    print_json,
+    print_result,
+)
 from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans
 from gpusense.evaluation.machine import machine, machine_line
 
@@ -35,6 +45,7 @@ if TYPE_CHECKING:
 
 NAME = "score"
 HELP = "Score particles with the scans of a recorded log, and rank the logged poses among them."
+FIRST = ("map", "log", "reference", "parameters", "plot")
 
 DIFFERENT = 1
 
@@ -48,7 +59,7 @@ correlation of beams at the logged poses of the first 100 chosen scans. --temper
 The verdict is whether the logged poses explain the beams of their scans. On a wrong map beams pass through walls: the
 message states their share and the place of most of them. Cases in between are uncertain.
 
-A row is printed as soon as its scan is scored. Ctrl-C ends the run with the results so far.
+With -v a row is printed as soon as its scan is scored. Ctrl-C ends the run with the results so far.
 
 Exit codes: 0 the log fits the map, 1 it does not or the verdict is uncertain, or two backends rank the particles
 differently by more than rounding explains, 2 bad input, 130 interrupted, 143 terminated.
@@ -84,7 +95,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_temperature(parser, "auto: calibrated from the chosen scans")
     add_parameters(parser)
     add_seed(parser)
-    add_json(parser)
+    add_json(parser, verbose=True)
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
         help="draw map, logged and estimated poses, and errors")  # fmt: skip
 
@@ -112,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
     if args.plot is not None:
         _draw(args.plot, grid, scores[0], pose_name(args))
         if not args.json:
-            print(f"drawn: {args.plot}")
+            print_files(args.plot)
     return 0 if fit.fits and all(agreement.same for agreement in agreements) else DIFFERENT
 
 
@@ -125,7 +136,7 @@ def _score(
 ) -> None:
     """Score the scans, and print rows immediately."""
     # Rows on a terminal show the progress.
-    shown = not args.json and is_terminal(sys.stdout)
+    shown = args.verbose and is_terminal(sys.stdout)
     optional = (*(("backend",) if len(models) == 1 else ()), "beams", "effective", "error [rad]")
     table = TableStream(_COLUMNS, left=("backend",), optional=optional)
     with contextlib.nullcontext(lambda text: None) if shown else progress(len(scans)) as step:
@@ -133,7 +144,7 @@ def _score(
             step(f"scan {index}")
             scores = scoring.add(index, scan)
             fitness.add(index, scan)
-            if not args.json:
+            if args.verbose:
                 for model, score in zip(models, scores, strict=True):
                     table.add(_row(model.device.selection, score))
 
@@ -195,16 +206,21 @@ def print_report(
         print_json(_document(args, models, scores, agreements) | more)
         return
     pose = pose_name(args)
-    _print(args, models, scores, pose)
+    if args.verbose:
+        print()
+    print_result(_fitness(fitness, pose))
+    for score in scores:
+        _print(score, pose)
     for agreement in agreements:
-        print(f"\n{_verdict(agreement, pose)}")
-    print(f"\nverdict: {_fitness(fitness, pose)}\n\n{machine_line()}")
+        print_fact("backends", _verdict(agreement, pose))
     if len(scores[0].scans) < chosen:
-        print(f"\ninterrupted: results of {len(scores[0].scans)} of {chosen} scans")
+        print(f"interrupted: results of {len(scores[0].scans)} of {chosen} scans")
+    if args.verbose:
+        _print_details(args, models, scores, agreements)
 
 
 def pose_name(args: argparse.Namespace) -> str:
-    """Return the report's name for the scans' poses, from the log or from ``--reference``."""
+    """Return the report's name of a scan's pose, which comes from the log or from ``--reference``."""
     return "logged pose" if args.reference is None else "reference pose"
 
 
@@ -225,25 +241,49 @@ def _document(
     }
 
 
-def _print(args: argparse.Namespace, models: list[Model], scores: list[BackendScore], pose: str) -> None:
+def _print(score: BackendScore, pose: str) -> None:
+    """Print the rank of the true pose, and the error of the weighted mean, on one backend."""
+    from gpusense.evaluation.scoring import summary
+
+    s = summary(score)
+    print_fact("device", f"{score.device.selection} ({score.device.name}): {counted(len(score.scans), 'scan')}, "
+               f"{grouped(score.particles)} particles each")  # fmt: skip
+    print_fact("rank", f"of the {pose} among them: median {number_text(s['rank_median'])}, better than "
+               f"{number_text(s['percentile_median'])} % in the median, {number_text(s['percentile_min'])} % at "
+               "least")  # fmt: skip
+    if s["error_position_median"] is None:
+        print_fact("error", "none: every particle is impossible in every scan")
+    else:
+        print_fact("error", f"of the weighted mean: median {length(s['error_position_median'])} and "
+                   f"{degrees(s['error_heading_median'])} degrees, 90 % below "
+                   f"{length(s['error_position_90'])} and {degrees(s['error_heading_90'])} "
+                   "degrees")  # fmt: skip
+
+
+def _print_details(
+    args: argparse.Namespace, models: list[Model], scores: list[BackendScore], agreements: list[Agreement]
+) -> None:
+    """Print parameters, temperature, effective sample sizes, rates, and agreement of backends."""
     from gpusense.evaluation.scoring import summary
 
     values = ", ".join(f"{name} {value}" for name, value in models[0].parameters.to_dict().items())
-    print(f"\n{args.model} model, {args.precision}: {values}, range_max {models[0].scanner.range_max} m")
+    print(f"\n{args.model} model, {args.precision}: {values}, range_max {models[0].scanner.range_max:.6g} m")
     how = "calibrated from the scans" if args.temperature == "auto" else "given"
     print(f"temperature {models[0].temperature:.4g}, {how}")
     for score in scores:
         s = {name: number_text(value) for name, value in summary(score).items()}
         print(
-            f"\n{score.device.selection} ({score.device.name}): {counted(len(score.scans), 'scan')}, "
-            f"{score.particles} particles each\n"
-            f"  rank of the {pose}: median {s['rank_median']}\n"
-            f"  percentile of the {pose}: median {s['percentile_median']}, least {s['percentile_min']}\n"
-            f"  error of the weighted mean: median {s['error_position_median']} m and {s['error_heading_median']} rad, "
-            f"90 % below {s['error_position_90']} m and {s['error_heading_90']} rad\n"
-            f"  effective sample size: median {s['effective_median']}; scans with every particle at -inf: "
-            f"{s['degenerate']}\n  {s['particle_beams_per_second']} particle-beams/s of whole calls, NumPy in and out"
+            f"{score.device.selection}: effective sample size: median {s['effective_median']}; scans with all "
+            f"particles at -inf: {s['degenerate']}; {s['particle_beams_per_second']} particle-beams/s of whole calls, "
+            "NumPy in and out"
         )
+    for a in agreements:
+        print(
+            f"{a.left} and {a.right}: no two particles change places in {a.same_order} of {a.scans} scans; least rank "
+            f"correlation {a.spearman:.9f}; largest difference {a.difference:.3g} nats; particles that change places "
+            f"are at most {a.gap:.3g} nats apart; rounding explains {a.allowed:.3g}"
+        )
+    print(machine_line())
 
 
 def _verdict(a: Agreement, pose: str) -> str:
@@ -251,19 +291,13 @@ def _verdict(a: Agreement, pose: str) -> str:
         verdict = "the same ranking" if a.same_order == a.scans else "the same ranking to within rounding"
     else:
         verdict = "ANOTHER RANKING"
-    return (
-        f"{a.left} and {a.right}: {verdict}\n"
-        f"  the {pose} has the same rank in {a.same_rank} of {a.scans} scans, no two particles change places "
-        f"in {a.same_order}; least rank correlation {a.spearman:.9f}\n"
-        f"  largest difference {a.difference:.3g} nats; particles that change places are at most {a.gap:.3g} nats "
-        f"apart; rounding explains {a.allowed:.3g}"
-    )
+    return f"{a.left} and {a.right}: {verdict}; the {pose} has the same rank in {a.same_rank} of {a.scans} scans"
 
 
 def _fitness(fitness: Fitness, pose: str) -> str:
     """Return the verdict of a log's poses with its evidence."""
     if fitness.p_lost is None:
-        return "none, no scan has a reading to judge by"
+        return "NO VERDICT: no scan has a reading to judge by"
     explained, better = (
         "-" if share is None else f"{100 * share:.0f} %" for share in (fitness.explained, fitness.better)
     )
@@ -272,7 +306,7 @@ def _fitness(fitness: Fitness, pose: str) -> str:
         f"p_lost {fitness.p_lost:.2g}"
     )
     if fitness.fits:
-        return f"the log fits the map: {share}"
+        return f"FITS THE MAP: {share}"
     if fitness.verdict == "uncertain":
         return f"UNCERTAIN: {share}; {fitness.evidence.text}"
     return f"WRONG MAP: {share}; {fitness.evidence.text}; is this the map of the log, and are its poses on the map?"

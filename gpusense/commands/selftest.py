@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import BACKEND_HELP, add_json
-from gpusense.commands.output import driver_text, print_json, print_table
+from gpusense.commands.output import driver_text, print_fact, print_json, print_result, print_table
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 NAME = "selftest"
 HELP = "Check that the backends present agree with the float64 truth and with each other."
+FIRST = ("backend", "stiff")
 
 BREACH = 1
 
@@ -54,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stiff", action="store_true", help="run the stiff and extreme cases on each backend and in each precision"
     )
-    add_json(parser)
+    add_json(parser, verbose=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -93,17 +94,19 @@ def _run_stiff(args: argparse.Namespace) -> int:
         document = {"passed": not breaches and stopped is None, "rows": listed, "machine": machine()}
         print_json(document)
     else:
-        _print_head(backends)
+        _print_result(len(rows), "cases", breaches, backends, stopped is not None)
         columns = ("backend", "precision", "case", "quantity", "worst", "bound", "not finite", "verdict")
         table = [
             (backend, precision, row.case, row.quantity, f"{row.worst:.3g}", f"{row.bound:.3g}", str(row.nonfinite),
              "ok" if row.ok else "BREACH")
             for backend, precision, row in rows
+            if args.verbose or not row.ok
         ]  # fmt: skip
-        print_table(columns, table, right=("worst", "bound", "not finite"))
-        print()
-        print(machine_line())
-        print(f"{len(rows)} rows, {f'{breaches} BREACHED' if breaches else 'none breached'}")
+        if table:
+            print()
+            print_table(columns, table, right=("worst", "bound", "not finite"))
+        if args.verbose:
+            print(f"\n{machine_line()}")
     if stopped is not None:
         raise stopped
     return BREACH if breaches else 0
@@ -116,16 +119,22 @@ def _kept(stop: KeyboardInterrupt, results: Sequence[object]) -> KeyboardInterru
     return stop
 
 
-def _print_head(backends: Sequence[Backend]) -> None:
-    """Print the tested backends, with the kernels that their proofs excluded."""
+def _print_result(
+    count: int, noun: str, breaches: int, backends: Sequence[Backend], interrupted: bool, details: str = ""
+) -> None:
+    """Print the verdict, and the backends under test, with the kernels that their proofs excluded."""
     from gpusense.backends import devices
 
+    verdict = f"FAILED: {breaches} of {count}" if breaches else f"INTERRUPTED after {count}" if interrupted else (
+        f"PASSED: all {count}"
+    )  # fmt: skip
+    print_result(
+        f"{verdict} {noun} within tolerance{details}" if not breaches else f"{verdict} {noun} beyond tolerance"
+    )
     reasons = {device.selection: device.reason for device in devices()}
     for info in (backend.info for backend in backends):
-        print(f"{info.selection}: {info.name} ({driver_text(info)})")
-        if reasons.get(info.selection):
-            print(f"    {reasons[info.selection]}")
-    print()
+        reason = reasons.get(info.selection)
+        print_fact(info.selection, f"{info.name} ({driver_text(info)}){f': {reason}' if reason else ''}")
 
 
 def _run_pairs(args: argparse.Namespace) -> int:
@@ -156,15 +165,16 @@ def _run_pairs(args: argparse.Namespace) -> int:
         }
         print_json(document)
     else:
-        _print_head(backends)
+        _print_result(len(checks), "comparisons", breaches, backends, stopped is not None, f", in {seconds:.0f} s")
+        for device in absent if args.verbose else ():
+            print_fact("absent", f"{device.name}: {device.reason}")
         columns = ("backend", "against", "quantity", "largest difference", "tolerance", "unit", "verdict")
-        print_table(columns, [_row(check) for check in checks], right=("largest difference", "tolerance"))
-        print()
-        for device in absent:
-            print(f"absent: {device.name}: {device.reason}")
-        print(machine_line())
-        verdict = f"{breaches} BREACHED" if breaches else "none breached"
-        print(f"{len(checks)} comparisons in {seconds:.1f} s, {verdict}")
+        shown = [_row(check) for check in checks if args.verbose or not check.passed]
+        if shown:
+            print()
+            print_table(columns, shown, right=("largest difference", "tolerance"))
+        if args.verbose:
+            print(f"\n{machine_line()}")
     if stopped is not None:
         raise stopped
     return BREACH if breaches else 0

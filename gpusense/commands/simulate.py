@@ -19,7 +19,7 @@ from gpusense.commands.arguments import (
     range_number,
     whole_number,
 )
-from gpusense.commands.output import counted, print_json
+from gpusense.commands.output import counted, print_fact, print_files, print_json, print_result
 
 if TYPE_CHECKING:
     from gpusense.evaluation.simulation.run import SimulatedRun
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 NAME = "simulate"
 HELP = "Make the log of a robot that drives through a map, with noise, people and changes of the world."
+FIRST = ("world", "map", "log_out", "map_out", "scans")
 
 EPILOG = """\
 The robot drives between random places, or along the poses of --path. Its readings are drawn from the beam model around
@@ -218,7 +219,12 @@ def _report(args: argparse.Namespace, made: SimulatedRun) -> None:
             "last_pose": made.poses[-1], "last_odometry": made.odometry[-1],
         })  # fmt: skip
         return
-    size = f"{counted(len(made.times), 'scan')} of {counted(made.scanner.count, 'beam')} over {length:.1f} m"
-    print(f"{args.log_out}: {size}; {none:.1%} without return, {made.hidden.mean():.1%} hidden by people")
+    print_result(f"SIMULATED: {counted(len(made.times), 'scan')} of {counted(made.scanner.count, 'beam')} over "
+                 f"{length:.0f} m")  # fmt: skip
+    print_fact("readings", f"{none:.1%} without return, {made.hidden.mean():.1%} hidden by people")
     if made.kidnapped.any():
-        print(f"carried elsewhere before scans {', '.join(map(str, np.flatnonzero(made.kidnapped).tolist()))}")
+        scans = ", ".join(map(str, np.flatnonzero(made.kidnapped).tolist()))
+        print_fact("kidnaps", f"carried elsewhere before scans {scans}")
+    print_files(args.map_out, args.world_out, args.log_out, args.tum)
+    if grid := args.map_out or args.map:
+        print(f"next       gpusense localize --map {grid} --log {args.log_out} --global")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from gpusense._util import checks
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import BACKEND_HELP, add_json, output_path, positive_number, whole_number
-from gpusense.commands.output import counted, print_json
+from gpusense.commands.output import counted, print_fact, print_files, print_json, print_result
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 NAME = "sweep"
 HELP = "Run many jobs from a plan, on processes or a Dask cluster, into a table that survives crashes."
+FIRST = ("table", "processes", "device", "resume", "plot")
 
 FAILED = 1
 LOCAL = "local"
@@ -74,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--job-timeout", type=positive_number, metavar="SECONDS",
         help="longest time of a job, which then fails, and its worker is replaced (default: none)")  # fmt: skip
     add("--list", action="store_true", help="print the jobs with their keys, and run none")
-    add_json(parser)
+    add_json(parser, verbose=True)
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
         help="draw error against run time, with a point for each job")  # fmt: skip
 
@@ -195,14 +196,16 @@ def _report(args: argparse.Namespace, ended: Sweep, seconds: float) -> None:
         figures = {name: getattr(ended, name) for name in ("jobs", "done", "failed", "skipped", "repeated")}
         print_json({"table": args.table, "plot": args.plot, **figures, "seconds": seconds, "machine": machine()})
         return
-    done = f"{ended.done} done, {ended.failed} failed, {ended.skipped} were in the table already"
-    print(f"{counted(ended.jobs, 'job')}: {done}")
+    verdict = "DONE" if not ended.failed else f"{ended.failed} FAILED"
+    before = f", {ended.skipped} were in the table before" if ended.skipped else ""
+    print_result(f"{verdict}: {ended.done} of {counted(ended.jobs, 'job')} ran in {seconds:.0f} s{before}")
+    if ended.failed:
+        print_fact("failed", "column 'error' of the table has the reasons; --resume --retry-failed runs them again")
     if ended.repeated:
-        print(f"{ended.repeated} runs ended with their worker and were started again")
-    print(f"{seconds:.1f} s\n\n{machine_line()}")
-    for path in (args.table, args.plot):
-        if path is not None:
-            print(f"written: {path}")
+        print_fact("repeated", f"{ended.repeated} runs ended with their worker and were started again")
+    print_files(args.table, args.plot)
+    if args.verbose:
+        print(f"\n{machine_line()}")
 
 
 def _drawn(table: str, path: Path) -> bool:

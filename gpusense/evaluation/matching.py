@@ -91,7 +91,7 @@ def match_log(
         noise: Standard deviation of ranges [m]; None for the default of ``match_scan``.
     """
     if grid is not None and guess != "logged":
-        raise ValueError(f"guess: must be 'logged' with a map, got {guess!r}")
+        raise ValueError(f"--guess: must be 'logged' with --map, since odometry has another frame, got {guess!r}")
     if grid is None and len(scans) < 2:
         raise ValueError(f"log: must have two scans to match, got {len(scans)}")
     numbers = np.array([index for index, _ in scans])
@@ -111,9 +111,8 @@ def match_log(
         logged = start = poses
         indices, second = np.stack([np.full(len(numbers), -1), numbers], axis=1), ranges
     if np.isnan(start).any():
-        raise ValueError(
-            f"guess: {guess!r} needs a pose of every scan, of its own or by --reference, got a scan without one"
-        )
+        cure = "add --guess identity" if grid is None else "add --reference with a TUM trajectory"
+        raise ValueError(f"--guess: {guess!r} needs a pose of every scan, and the log has none: {cure}")
     options: dict[str, Any] = {} if noise is None else {"noise": noise}
     rng = np.random.default_rng(seed)
     start = start + rng.uniform(-1, 1, start.shape) * (spread[0], spread[0], spread[1])
@@ -160,8 +159,14 @@ def summary(matches: LogMatches) -> dict[str, object]:
         "score_median": float(np.median(matches.match.score)),
     }
     known = np.isfinite(matches.logged).all(axis=1)
-    for name, values in zip(("position", "heading"), matches.errors, strict=True):
-        for label, share in (("median", 50), ("p95", 95)):
-            result[f"{name}_{label}"] = float(np.percentile(values[known], share)) if known.any() else None
+    pairs = {
+        "": (matches.match.pose[known], matches.logged[known]),
+        "guess_": (matches.guess[known], matches.logged[known]),
+        "correction_": (matches.match.pose, matches.guess),
+    }
+    for kind, (poses, others) in pairs.items():
+        for name, values in zip(("position", "heading"), differences(poses, others), strict=True):
+            for label, share in (("median", 50), ("p95", 95)):
+                result[f"{kind}{name}_{label}"] = float(np.percentile(values, share)) if len(values) else None
     result["wrong"] = int(matches.wrong[known].sum()) if known.any() else None
     return result

@@ -73,13 +73,14 @@ class Plan:
             lines.append("nothing is left out")
         names = [part.what for part in self.omissions] + [part.what for part in (*self.kept, *self.could_go)]
         width = max(map(len, names), default=0)
-        lines += [f"- {o.what:<{width}}  {o.why}; saves {o.saves}{self._saving(o)}" for o in self.omissions]
+        lines += [f"- {o.what:<{width}}  {o.why}; saves {o.saves}{self.saving(o)}" for o in self.omissions]
         for heading, mark, parts in (("kept:", "+", self.kept), ("could go:", "?", self.could_go)):
             if parts:
                 lines += [heading, *(f"{mark} {note.what:<{width}}  {note.why}" for note in parts)]
         return "\n".join(lines)
 
-    def _saving(self, omission: Omission) -> str:
+    def saving(self, omission: Omission) -> str:
+        """Return the measured saving of an omission in words; empty without measurements."""
         if self.measured is None:
             return ""
         seconds = self.measured.get(omission.what)

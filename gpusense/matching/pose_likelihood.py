@@ -20,6 +20,10 @@ Floats = NDArray[np.float64]
 
 # Poses of one call of the model, and most poses of a map.
 _TILE, _MOST = 1 << 19, 1 << 30
+# Poses nearer than this to a better one are no modes [m, rad].
+_NEAR, _TURN = 0.5, 0.26
+# Refinement of a pose: levels, and offsets per axis of a level in units of its reach, which halves from level to level.
+_LEVELS, _OFFSETS = 8, (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +94,7 @@ class PoseLikelihood:
         p = p[p > 0]
         return float(-(p * np.log(p)).sum())
 
-    def modes(self, count: int = 10, *, radius: float = 0.5, angle: float = 0.26) -> tuple[Floats, Floats]:
+    def modes(self, count: int = 10, *, radius: float = _NEAR, angle: float = _TURN) -> tuple[Floats, Floats]:
         """Return the local maxima: poses that are not near a better one.
 
         Args:
@@ -213,6 +217,43 @@ def prepare_tiles(
         evaluated = np.ones((rows, cols), bool)
     result = PoseLikelihood(grid, log_p, directions, step, cells)
     return result, _fill(model, z, result, evaluated)
+
+
+def refine_modes(
+    model: ScanModel, ranges: ArrayLike, likelihood: PoseLikelihood, count: int
+) -> tuple[Floats, Floats, float]:
+    """Refine the best poses of a lattice between its positions and headings.
+
+    Args:
+        model: The model of the lattice.
+        ranges: (K,) readings [m].
+        likelihood: The lattice.
+        count: Number of poses to return; four times as many are refined.
+
+    Returns:
+        (M, 3) poses [m, m, rad] and (M,) log-likelihoods, the best first, and the gain of the best one over the lattice
+        [nats], which is large where the lattice is coarser than the peaks of the model.
+    """
+    poses, log_p = likelihood.modes(4 * count)
+    if not len(poses):
+        return poses, log_p, 0.0
+    best = log_p[0]
+    reach = np.array([likelihood.resolution, likelihood.resolution, 2 * math.pi / len(likelihood.headings)])
+    offsets = np.stack(np.meshgrid(*[_OFFSETS] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    for level in range(_LEVELS):
+        tried = (poses[:, None] + offsets * reach / 2**level).reshape(-1, 3)
+        values = np.asarray(model.log_likelihood(tried, ranges), np.float64).reshape(len(poses), -1)
+        chosen = values.argmax(axis=1)
+        poses = tried.reshape(len(poses), -1, 3)[np.arange(len(poses)), chosen]
+        log_p = values.max(axis=1)
+    poses[:, 2] = wrapped(poses[:, 2])
+    kept: list[int] = []
+    for k in np.argsort(-log_p, kind="stable").tolist():
+        off = poses[kept] - poses[k]
+        if not ((np.hypot(off[:, 0], off[:, 1]) <= _NEAR) & (np.abs(wrapped(off[:, 2])) <= _TURN)).any():
+            kept.append(k)
+    kept = kept[:count]
+    return poses[kept], log_p[kept], float(log_p[kept[0]] - best)
 
 
 def _middles(size: int, step: int) -> NDArray[np.int64]:

@@ -3,6 +3,8 @@
 from gpusense.plots.chains import chain_figure
 from gpusense.plots.drawing import (
     add_colour_bar,
+    add_legend,
+    colours,
     draw_map,
     draw_pose,
     draw_scan,
@@ -31,7 +33,9 @@ from gpusense.plots.positions import (
 
 __all__ = [
     "add_colour_bar",
+    "add_legend",
     "chain_figure",
+    "colours",
     "draw_beacons",
     "draw_features",
     "draw_fix",

@@ -8,9 +8,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gpusense._util.files import write_whole
-from gpusense.localization.words import Word
-from gpusense.plots.drawing import BEAM, FRAME, FREE, OCCUPIED, UNKNOWN, draw_map, new_figure
-from gpusense.plots.tracks import CLOUD, ESTIMATED, LOGGED
+from gpusense.plots.drawing import (
+    BEAM,
+    CLOUD,
+    ESTIMATE,
+    FRAME,
+    FREE,
+    OCCUPIED,
+    REFERENCE,
+    UNKNOWN,
+    VERDICTS,
+    draw_map,
+    new_figure,
+)
 from gpusense.plots.viewer import end_points
 from gpusense.world.grid import OccupancyGrid
 
@@ -21,10 +31,9 @@ if TYPE_CHECKING:
 
 # Most frames, and particles per frame; time of a frame [ms]; longer side [inches], dots per inch.
 FRAMES, PARTICLES, DURATION, SIDE, DPI = 100, 2000, 100, 7.0, 80
-_VERDICTS: dict[Word, str] = {"tracking": "#2a7f3f", "uncertain": "#b26b00", "lost": "#b3261e"}
 # Colours of all frames.
 _COLOURS = (
-    FREE, UNKNOWN, OCCUPIED, FRAME, BEAM, CLOUD, ESTIMATED, LOGGED, "#000000", *_VERDICTS.values(),
+    FREE, UNKNOWN, OCCUPIED, FRAME, BEAM, CLOUD, ESTIMATE, REFERENCE, "#000000", *VERDICTS.values(),
 )  # fmt: skip
 
 
@@ -47,8 +56,8 @@ class Animation:
         plot: Any = self._ax.plot
         self._cloud = plot([], [], ".", color=CLOUD, ms=2, zorder=3)[0]
         self._scan = plot([], [], ".", color=BEAM, ms=3, zorder=4)[0]
-        self._truth = plot([], [], "-", color=LOGGED, lw=1.6, zorder=3)[0]
-        self._robot = plot([], [], "o", color=ESTIMATED, ms=8, zorder=5)[0]
+        self._truth = plot([], [], "-", color=REFERENCE, lw=1.6, zorder=3)[0]
+        self._robot = plot([], [], "o", color=ESTIMATE, ms=8, zorder=5)[0]
         self._each, self._scans, self._frames = -(-scans // FRAMES), 0, list[Any]()
 
     def add(self, pf: ParticleFilter, track: Track, step: Step) -> None:
@@ -63,10 +72,13 @@ class Animation:
         self._cloud.set_data(*cloud[:: max(len(cloud) // PARTICLES, 1), :2].T)
         self._scan.set_data(*end_points(step.scan.scanner, step.scan.ranges, pose).T)
         self._robot.set_data(*pose[:2, None])
+        # Before convergence the mean of particles that lie apart is no pose of the robot.
+        self._robot.set_fillstyle("none" if track.converged is None else "full")
+        self._robot.set_alpha(0.4 if track.converged is None else 1.0)
         if track.references is not None:
             self._truth.set_data(*track.references[:, :2].T)
         title = f"scan {step.index}: {verdict.upper()} (p_lost {track.p_lost[-1]:.2g})"
-        self._ax.set_title(title, color=_VERDICTS[verdict], loc="left")
+        self._ax.set_title(title, color=VERDICTS[verdict], loc="left")
         canvas: Any = self._figure.canvas
         canvas.draw()
         self._frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))

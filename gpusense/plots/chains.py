@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gpusense.chaining.result import ScanChain
-from gpusense.plots.drawing import draw_map, new_figure
+from gpusense.plots.drawing import CLOSED, CLOUD, ESTIMATE, add_legend, draw_map, new_figure
 from gpusense.world.grid import OccupancyGrid
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PATH, CLOSED, DOUBTED, KEY = "#4c78a8", "#3c8d4f", "#e4572e", "#1f3552"
-# Number of ellipses.
+PATH, DOUBTED, KEY = CLOUD, ESTIMATE, "#1f3552"
+# Number of ellipses that are drawn.
 _ELLIPSES = 40
 
 
@@ -47,17 +47,20 @@ def chain_figure(grid: OccupancyGrid, chain: ScanChain) -> Figure:
     for number, doubt in enumerate(chain.doubts):
         part = poses[doubt.first : doubt.last + 1]
         ax.plot(part[:, 0], part[:, 1], "-", color=DOUBTED, lw=2.2, label="" if number else "doubtful")
-    for k in chain.keys[:: max(len(chain.keys) // _ELLIPSES, 1)]:
-        _ellipse(ax, poses[k], chain.covariance[k, :2, :2], float(np.ptp(poses[:, :2], axis=0).max()))
+    for number, k in enumerate(chain.keys[:: max(len(chain.keys) // _ELLIPSES, 1)]):
+        label = "" if number else "one deviation, from the first pose"
+        _ellipse(ax, poses[k], chain.covariance[k, :2, :2], float(np.ptp(poses[:, :2], axis=0).max()), label)
     ax.set(xlabel="x [m]", ylabel="y [m]")
-    ax.legend(loc="best", fontsize="small")
+    doubts = f"DOUBTFUL in {len(chain.doubts)} places" if chain.doubts else "CONSISTENT"
+    ax.set_title(f"{doubts}: {len(poses)} scans, {len(chain.corrections)} closures", loc="left")
+    add_legend(ax, 5)
     return figure
 
 
-def _ellipse(ax: object, pose: np.ndarray, covariance: np.ndarray, largest: float) -> None:
+def _ellipse(ax: object, pose: np.ndarray, covariance: np.ndarray, largest: float, label: str) -> None:
     """Draw an ellipse of one deviation, no larger than the trajectory."""
     values, vectors = np.linalg.eigh(covariance)
     axes = np.minimum(np.sqrt(np.maximum(values, 0.0)), max(largest, 1e-3))
     t = np.linspace(0, 2 * np.pi, 37)
     x, y = pose[:2, None] + vectors @ (axes[:, None] * np.stack([np.cos(t), np.sin(t)]))
-    ax.plot(x, y, "-", color=PATH, lw=0.5, alpha=0.7)  # type: ignore[attr-defined]
+    ax.plot(x, y, "-", color=PATH, lw=0.5, alpha=0.7, label=label)  # type: ignore[attr-defined]

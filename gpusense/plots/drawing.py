@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 
 FREE, UNKNOWN, OCCUPIED = "#ffffff", "#dfe3e8", "#4a5568"
 BEAM, ROBOT, FRAME = "#0077b6", "#d7263d", "#9aa5b1"
-# Colours from unlikely to likely with falling lightness, readable on paper, in grey and with colour blindness.
+# Meanings that have one colour in all pictures.
+REFERENCE, ESTIMATE, CLOUD, CLOSED = "#8fa3b8", "#e4572e", "#4c78a8", "#3c8d4f"
+VERDICTS = {"tracking": "#2a7f3f", "uncertain": "#b26b00", "lost": "#b3261e"}
+# Colours from unlikely to likely with falling lightness, readable on paper, in grey and under colour blindness.
 SCALE = ("#eef1f5", "#ffd166", "#f3722c", "#b5179e", "#3a0ca3")
 # Dots per inch of a saved image; clouds of points are also rasterised in vector formats.
 DPI = 150
@@ -149,6 +152,27 @@ def draw_pose(ax: Axes, pose: ArrayLike, *, length: float, colour: str = ROBOT) 
                 markeredgewidth=width, linestyle="none", zorder=7)  # fmt: skip
 
 
+def add_legend(ax: Axes, columns: int = 4) -> None:
+    """Draw the legend below an axes, where it hides nothing.
+
+    Args:
+        ax: The axes.
+        columns: Largest number of columns.
+
+    Example:
+        >>> import gpusense as gs
+        >>> ax = gs.plots.new_figure(6.0, 4.0).subplots()
+        >>> line = ax.plot([0, 1], [0, 1], label="path")
+        >>> gs.plots.add_legend(ax)
+        >>> ax.get_legend().get_texts()[0].get_text()
+        'path'
+    """
+    # The distance leaves room for the label of the axis.
+    ax.legend(
+        loc="upper center", bbox_to_anchor=(0.5, 0.0), borderaxespad=4.5, ncols=columns, fontsize="small", frameon=False
+    )
+
+
 def add_colour_bar(ax: Axes, mappable: Any, label: str) -> None:
     """Add a colour bar to axes, with an arrow at its low end for values below the scale.
 
@@ -182,7 +206,14 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     write_whole(target, lambda stream: figure.savefig(stream, format=kind))
 
 
-def _colours() -> Colormap:
+def colours() -> Colormap:
+    """Return the colour map of all likelihoods, from unlikely to likely.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.plots.colours().name
+        'gpusense'
+    """
     from matplotlib.colors import LinearSegmentedColormap
 
     return LinearSegmentedColormap.from_list("gpusense", SCALE)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense.features.feature_map import FeatureMap
 from gpusense.features.result import Features
-from gpusense.plots.drawing import draw_map, draw_pose, new_figure
+from gpusense.plots.drawing import add_legend, draw_map, draw_pose, new_figure
 from gpusense.plots.matches import points_of
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 POINTS = "#9aa5b1"
 COLOURS = {"line": "#1d3557", "corner": "#d7263d", "door": "#b5179e", "hallway": "#2a9d8f", "pole": "#f3722c",
            "reflector": "#ffbe0b"}  # fmt: skip
+# Symbols of landmarks.
+MARKS = {"corner": "s", "door": "D", "hallway": "^", "pole": "o", "reflector": "*"}
 # Length of arrows of directions [m].
 _ARROW = 0.5
 
@@ -78,7 +80,7 @@ def _draw_one(ax: Axes, kind: str, pose: tuple[float, float, float], size: float
         ax.plot(ends[:, 0], ends[:, 1], color=colour, linewidth=wide, alpha=alpha, zorder=4, label=label)
     else:
         ax.plot([x, x + _ARROW * c], [y, y + _ARROW * s], color=colour, linewidth=1.5, zorder=5)
-        ax.plot([x], [y], "o", color=colour, ms=5, zorder=6, label=label)
+        ax.plot([x], [y], MARKS[kind], color=colour, ms=5, zorder=6, label=label)
 
 
 def draw_landmarks(ax: Axes, landmarks: FeatureMap) -> None:
@@ -107,7 +109,7 @@ def draw_landmarks(ax: Axes, landmarks: FeatureMap) -> None:
                 ax.plot(x, y, color=colour, lw=1.6, zorder=6, label=kind if number == 0 else None)
             continue
         x, y, theta = landmarks.pose[rows].T
-        ax.plot(x, y, "o", color=colour, ms=5, zorder=8, label=kind)
+        ax.plot(x, y, MARKS[kind], color=colour, ms=5, zorder=8, label=kind)
         if kind not in ("pole", "reflector"):
             for a, b, t in zip(x, y, theta, strict=True):
                 ax.plot([a, a + _ARROW * math.cos(t)], [b, b + _ARROW * math.sin(t)], color=colour, lw=1, zorder=7)
@@ -131,7 +133,7 @@ def features_figure(features: Features, ranges: ArrayLike, scanner: Scanner) -> 
     figure = new_figure(8.0, 6.0)
     ax = figure.subplots()
     draw_features(ax, features, ranges, scanner)
-    ax.legend(loc="best", fontsize="small")
+    add_legend(ax, 7)
     return figure
 
 
@@ -156,5 +158,5 @@ def landmarks_figure(landmarks: FeatureMap, grid: OccupancyGrid | None = None) -
     draw_landmarks(ax, landmarks)
     ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     if len(landmarks):
-        ax.legend(loc="best", fontsize="small")
+        add_legend(ax, 7)
     return figure

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense.evaluation.range_data import RangeData
-from gpusense.plots.drawing import BEAM, FRAME, ROBOT, new_figure
+from gpusense.plots.drawing import BEAM, FRAME, ROBOT, colours, new_figure
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.range_causes import NoReturn, RandomDensity
 from gpusense.world.scanner import Reading
@@ -53,7 +53,7 @@ def readings_figure(data: RangeData, distances: list[float]) -> Figure:
     edges = np.linspace(0, top, _CELLS + 1)
     counts, _, _ = np.histogram2d(data.expected[known], data.ranges[known], bins=(edges, edges))
     image = left.imshow(
-        np.ma.masked_equal(counts.T, 0), origin="lower", extent=(0, top, 0, top), aspect="auto", cmap="viridis",
+        np.ma.masked_equal(counts.T, 0), origin="lower", extent=(0, top, 0, top), aspect="auto", cmap=colours(),
         norm=LogNorm(vmin=1, vmax=max(counts.max(), 2)),
     )  # fmt: skip
     figure.colorbar(image, ax=left, label="readings")
@@ -156,8 +156,9 @@ def surface_figure(data: RangeData, parameters: BeamParameters) -> Figure:
     log_p = log_mixture(middle[:, None], middle, range_max=data.range_max, **parameters.to_dict())
     finite = log_p[np.isfinite(log_p)]
     low = float(finite.min()) if len(finite) else -1.0
-    low = max(low, float(finite.max()) - 25) if len(finite) else low
-    image = ax.imshow(np.maximum(log_p, low), origin="lower", extent=(0, top, 0, top), aspect="auto", cmap="magma")
+    # The scale ends at the median of readings away from the ridge, so that causes beside it can be seen.
+    low = max(low, float(np.quantile(finite, 0.02)), float(finite.max()) - 12) if len(finite) else low
+    image = ax.imshow(np.maximum(log_p, low), origin="lower", extent=(0, top, 0, top), aspect="auto", cmap=colours())
     figure.colorbar(image, ax=ax, label="log p(z | z*) [log 1/m]", extend="min")
     none = f"log z_max = {NoReturn(parameters.z_max).number:.2f}" if parameters.z_max > 0 else "z_max = 0"
     ax.set(xlabel="expected range z* [m]", ylabel="reading z [m]", title=f"The fitted density; no return: {none}")

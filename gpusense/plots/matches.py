@@ -8,15 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import masks
-from gpusense.plots.drawing import draw_map, new_figure
+from gpusense.plots.drawing import ESTIMATE, OCCUPIED, add_legend, draw_map, new_figure
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, Scanner, classify
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-REFERENCE, SECOND = "#4a5568", "#e4572e"
 
 
 def match_figure(
@@ -36,7 +34,7 @@ def match_figure(
         >>> scanner = gs.Scanner([-0.5, 0.0, 0.5], range_max=9.0)
         >>> figure = gs.plots.match_figure(np.ones(3), np.ones(3), scanner, (0.2, 0, 0), (0, 0, 0))
         >>> [axes.get_title() for axes in figure.axes]
-        ['before', 'after']
+        ['before: 0.20 m, 0.00 m, 0.0 degrees', 'after: 0.00 m, 0.00 m, 0.0 degrees']
     """
     figure = new_figure(11.0, 5.5)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
@@ -48,14 +46,19 @@ def match_figure(
         if isinstance(reference, OccupancyGrid):
             draw_map(ax, reference)
         else:
-            ax.plot(*points_of(reference, scanner).T, ".", color=REFERENCE, ms=3, label="reference")
-        ax.plot(*moved.T, ".", color=SECOND, ms=2, label="second scan")
-        ax.set(title=title, xlabel="x [m]", ylabel="y [m]", aspect="equal")
+            ax.plot(*points_of(reference, scanner).T, ".", color=OCCUPIED, ms=3, label="reference")
+        ax.plot(*moved.T, ".", color=ESTIMATE, ms=2, label="second scan")
+        ax.set(
+            title=f"{title}: {x:.2f} m, {y:.2f} m, {np.degrees(theta):.1f} degrees",
+            xlabel="x [m]",
+            ylabel="y [m]",
+            aspect="equal",
+        )
     near = np.concatenate([points @ np.array([[c, s], [-s, c]]) + (x, y), [(x, y)]])
     margin = 0.5
     axes[0].set(xlim=(near[:, 0].min() - margin, near[:, 0].max() + margin),
                 ylim=(near[:, 1].min() - margin, near[:, 1].max() + margin))  # fmt: skip
-    axes[1].legend(loc="best", fontsize="small")
+    add_legend(axes[1])
     return figure
 
 

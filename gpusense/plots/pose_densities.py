@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
-from gpusense.plots.drawing import _colours, _over_grid
+from gpusense.plots.drawing import _over_grid, colours
 from gpusense.world.grid import OccupancyGrid
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def draw_particles(
     low, high = _scale(value, depth)
     order = np.argsort(value, kind="stable")
     return ax.scatter(
-        position[order, 0], position[order, 1], s=size, c=np.maximum(value[order], low), cmap=_colours(), vmin=low,
+        position[order, 0], position[order, 1], s=size, c=np.maximum(value[order], low), cmap=colours(), vmin=low,
         vmax=high, linewidths=0, rasterized=True, zorder=3,
     )  # fmt: skip
 
@@ -113,7 +113,7 @@ def draw_pose_density(
     value = checks.array("log_p", log_p, ("R", "C"), finite=False)
     low, high = _scale(value[~np.isnan(value)], depth)
     below = np.maximum(value, low) - high
-    return _over_grid(ax, grid, below, extent, cmap=_colours(), vmin=low - high, vmax=0.0, zorder=1)
+    return _over_grid(ax, grid, below, extent, cmap=colours(), vmin=low - high, vmax=0.0, zorder=1)
 
 
 def _scale(value: NDArray[np.float64], depth: float | None) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense.matching.pose_likelihood import PoseLikelihood
-from gpusense.plots.drawing import _over_grid, add_colour_bar, draw_map, draw_pose, new_figure, save
+from gpusense.plots.drawing import _over_grid, add_colour_bar, colours, draw_map, draw_pose, new_figure, save
 from gpusense.plots.pose_densities import _scale
 from gpusense.tables.distances import distance_transform
 from gpusense.world.field_density import FieldDensity
@@ -34,7 +34,7 @@ def draw_pose_likelihood(ax: Axes, likelihood: PoseLikelihood, *, depth: float |
     Args:
         ax: Axes to draw onto, usually after :func:`draw_map`.
         likelihood: A result of :func:`gpusense.pose_likelihood`.
-        depth: Extent of the grey scale below the best value [nats]; the default covers half of the positions.
+        depth: Extent of the colour scale below the best value [nats]; by default half of the positions lie on it.
 
     Returns:
         The image, for :func:`add_colour_bar`.
@@ -52,7 +52,7 @@ def draw_pose_likelihood(ax: Axes, likelihood: PoseLikelihood, *, depth: float |
     below = np.where(np.isfinite(best), np.maximum(best, low) - high, np.nan)
     rows, cols = best.shape
     size = (cols * likelihood.resolution, rows * likelihood.resolution)
-    image = _over_grid(ax, likelihood.grid, below, size, cmap="Greys", zorder=1, interpolation="nearest")
+    image = _over_grid(ax, likelihood.grid, below, size, cmap=colours(), zorder=1, interpolation="nearest")
     image.set_clim(low - high, 0.0)
     return image
 
@@ -69,20 +69,20 @@ def pose_likelihood_figure(likelihood: PoseLikelihood, path: str | os.PathLike[s
     ax = figure.subplots()
     draw_map(ax, grid)
     image = draw_pose_likelihood(ax, likelihood)
-    outlines = np.where(grid.occupied, 1.0, np.nan)
-    _over_grid(ax, grid, outlines, cmap="autumn", vmin=0, vmax=2, zorder=2, interpolation="nearest")
     poses, log_p = likelihood.modes(5)
     for pose, value in zip(poses, log_p, strict=True):
         if value > log_p[0] - 10:
             draw_pose(ax, pose, length=0.05 * math.hypot(grid.width, grid.height))
     add_colour_bar(ax, image, "log P(z | x, m) below the best [nats]")
+    near = int((log_p > log_p[0] - 3).sum()) if len(log_p) else 0
+    ax.set_title(f"{near or 'no'} place{'s' * (near != 1)} within 3 nats of the best; rings: local maxima", loc="left")
     save(figure, path)
 
 
 def draw_likelihood_field(
     ax: Axes, grid: OccupancyGrid, parameters: LikelihoodFieldParameters | None = None, *, range_max: float = 30.0
 ) -> AxesImage:
-    """Draw the likelihood field of a map: the darker a point, the less likely a range ends there (figure 6.8).
+    """Draw the likelihood field of a map: the darker a point, the likelier a range ends there (figure 6.8 inverted).
 
     Args:
         ax: Axes to draw onto.
@@ -102,7 +102,7 @@ def draw_likelihood_field(
     p = LikelihoodFieldParameters() if parameters is None else parameters
     distance = distance_transform(grid.occupied, resolution=grid.resolution, backend="numpy")
     density = FieldDensity(p, checks.real("range_max", range_max, above=0))
-    image = _over_grid(ax, grid, density.log(density.capped(distance)), cmap="gray", interpolation="nearest")
+    image = _over_grid(ax, grid, density.log(density.capped(distance)), cmap=colours(), interpolation="nearest")
     ax.set_aspect("equal")
     x_min, y_min, x_max, y_max = grid.bounds()
     ax.set(xlim=(x_min, x_max), ylim=(y_min, y_max), xlabel="x [m]", ylabel="y [m]")

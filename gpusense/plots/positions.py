@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
-from gpusense.plots.drawing import BEAM, FRAME, OCCUPIED, ROBOT, _colours, draw_pose
+from gpusense.plots.drawing import BEAM, FRAME, OCCUPIED, ROBOT, colours, draw_pose
 from gpusense.positions.fix import PositionFix
 from gpusense.positions.problem import Problem, make_problem
 
@@ -227,7 +227,7 @@ def draw_position_density(
     """
     value = checks.array("log_p", log_p, ("R", "C"))
     below = np.maximum(value - value.max(initial=-np.inf), -checks.real("depth", depth, above=0))
-    return ax.imshow(below, origin="lower", extent=extent, cmap=_colours(), vmin=-depth, vmax=0.0, zorder=0)
+    return ax.imshow(below, origin="lower", extent=extent, cmap=colours(), vmin=-depth, vmax=0.0, zorder=0)
 
 
 def tile_centers(extent: tuple[float, float, float, float], count: int) -> Floats:

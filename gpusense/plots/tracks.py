@@ -8,12 +8,10 @@ import numpy as np
 
 from gpusense.evaluation.tracking import Track
 from gpusense.localization.filter import ParticleFilter
-from gpusense.plots.drawing import draw_map, new_figure
+from gpusense.plots.drawing import CLOUD, ESTIMATE, REFERENCE, VERDICTS, add_legend, draw_map, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-LOGGED, ESTIMATED, CLOUD = "#8fa3b8", "#e4572e", "#4c78a8"
 
 
 def track_figure(pf: ParticleFilter, track: Track) -> Figure:
@@ -26,24 +24,31 @@ def track_figure(pf: ParticleFilter, track: Track) -> Figure:
     if references is not None:
         # A line cannot show single known poses.
         style = "-" if np.isfinite(references).all() else "."
-        ax.plot(references[:, 0], references[:, 1], style, color=LOGGED, lw=1.6, label="reference pose")
-    ax.plot(poses[:, 0], poses[:, 1], "-", color=ESTIMATED, lw=0.8, label="estimate")
+        ax.plot(references[:, 0], references[:, 1], style, color=REFERENCE, lw=1.6, label="reference pose")
+    # Before convergence the mean of particles that lie apart is no pose of the robot.
+    first = len(poses) if track.converged is None else track.converged
+    if first:
+        ax.plot(*poses[: first + 1, :2].T, ":", color=ESTIMATE, lw=0.8, alpha=0.4, label="mean before convergence")
+    ax.plot(*poses[first:, :2].T, "-", color=ESTIMATE, lw=1.2, label="estimate")
+    ax.plot(*poses[-1, :2], "o", color=ESTIMATE, ms=5, label="last pose")
     cloud = pf.host_particles()
     ax.plot(cloud[:, 0], cloud[:, 1], ".", color=CLOUD, ms=1.5, label="particles after the last scan")
-    ax.legend(loc="best", fontsize="small")
+    add_legend(ax, 3)
+    verdict = track.verdicts[-1]
+    ax.set_title(f"{verdict.upper()} (p_lost {track.p_lost[-1]:.2g})", color=VERDICTS[verdict], loc="left")
     deviation = np.sqrt([max(c[0, 0] + c[1, 1], 0.0) for c in track.covariances])
     index = [step.index for step in track.steps]
     errors = track.errors()
     if errors is not None:
         known = np.isfinite(errors[0])
         upper.semilogy(
-            np.array(index)[known], np.maximum(errors[0][known], 1e-4), color=ESTIMATED, lw=0.8, label="error"
+            np.array(index)[known], np.maximum(errors[0][known], 1e-4), color=ESTIMATE, lw=0.8, label="error"
         )
     upper.semilogy(index, np.maximum(deviation, 1e-4), color=CLOUD, lw=0.8, label="deviation of the particles")
     upper.set(xlabel="scan", ylabel="position [m]")
-    upper.legend(loc="best", fontsize="small")
+    add_legend(upper, 2)
     lower.plot(index, track.explained, color=CLOUD, lw=0.8, label="share of beams explained")
-    lower.plot(index, track.p_lost, color=ESTIMATED, lw=0.8, label="p_lost")
+    lower.plot(index, track.p_lost, color=ESTIMATE, lw=0.8, label="p_lost")
     lower.set(xlabel="scan", ylim=(0, 1.02))
-    lower.legend(loc="best", fontsize="small")
+    add_legend(lower, 2)
     return figure

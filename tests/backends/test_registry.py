@@ -187,3 +187,20 @@ def test_a_wrapper_that_is_no_backend_is_refused():
 
     with pytest.raises(TypeError, match="backend: must be a selection string or a queue of pyopencl, got"):
         get_backend(Wrapper(get_backend("numpy")))
+
+
+def test_kinds_select_their_fastest_device():
+    cpu = gs.backends.get_backend("cpu")
+    assert (cpu.info.kind == "cpu" and cpu.info.backend != "numpy") or len(gs.devices()) == 1
+    gpus = [device for device in gs.devices() if device.kind == "gpu" and device.available]
+    for word in ("gpu", "cuda", "cuda:9"):
+        if gpus and word != "cuda:9":
+            assert gs.backends.get_backend(word).info.kind == "gpu"
+        else:
+            with pytest.raises(ValueError, match=f"backend: .*, got '(warp:)?{word}'"):
+                gs.backends.get_backend(word)
+
+
+def test_a_misspelt_name_suggests_the_right_one():
+    with pytest.raises(AttributeError, match="no attribute 'BeamModle'; did you mean 'BeamModel'"):
+        gs.BeamModle  # noqa: B018

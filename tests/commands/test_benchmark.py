@@ -106,7 +106,7 @@ def test_a_map_alone_is_the_only_scene(tmp_path, capsys):
     [
         (["--scene", "moon"], "scene: must be one of building, clutter, got 'moon'"),
         (["--method", "magic"], f"--method: must be one of {', '.join(ENTRIES)}, field"),
-        (["--backend", "cuda"], "backend: must be 'auto', 'numpy'"),
+        (["--backend", "vulkan"], "backend: must be 'auto', 'numpy'"),
         (["--problem", "sonar"], "argument --problem: invalid choice: 'sonar'"),
         (["--particles", "0"], "argument --particles: must be an integer >= 1, got 0"),
         (["--map", "missing.yaml"], "missing.yaml: must exist"),

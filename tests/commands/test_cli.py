@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
+import re
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -90,9 +93,9 @@ def test_version(capsys):
             "argument --out: must be another file than that of --map-out, got both",
         ),
         (
-            [*SMALL, "--no-plot", "--backend", "cuda"],
+            [*SMALL, "--no-plot", "--backend", "vulkan"],
             "backend: must be 'auto', 'numpy', 'opencl', 'opencl:<name or P:D>', 'warp:cpu' or 'warp:cuda:<n>', "
-            "got 'cuda'",
+            "got 'vulkan'",
         ),
     ],
 )
@@ -190,9 +193,9 @@ def test_devices_as_json(capsys):
 def test_devices_as_a_table(capsys):
     assert cli.main(["devices"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split() == ["selection", "kind", "name", "driver", "status"]
-    assert any(line.split()[:2] == ["numpy", "cpu"] or line.split()[:3] == ["*", "numpy", "cpu"] for line in lines)
-    assert sum(line.startswith("*  ") for line in lines) == 1
+    assert re.fullmatch(r"'auto' is \S+: .+, a [CG]PU", lines[0])
+    assert lines[2].split() == ["selection", "kind", "name", "driver", "status"]
+    assert any(line.split()[:2] == ["numpy", "cpu"] for line in lines)
 
 
 def test_devices_survive_a_broken_auto(monkeypatch, capsys):
@@ -202,3 +205,22 @@ def test_devices_survive_a_broken_auto(monkeypatch, capsys):
     monkeypatch.setattr("gpusense.backends.get_backend", fail)
     assert cli.main(["devices"]) == 0
     assert "'auto' does not work: RuntimeError: driver lost" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", [name for name in cli.COMMANDS if name != "devices"])
+def test_help_begins_with_the_most_used_options(name, capsys):
+    assert cli.main([name, "--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(f"usage: gpusense {name} ") and lines[0].endswith("[options]")
+    first, rest = lines.index("most used:"), lines.index("further options:")
+    assert first < rest and "--" in "".join(lines[first:rest]) and "--help" in "".join(lines[rest:])
+    assert max(len(line) for line in lines if "gpusense " not in line) <= 80
+
+
+def test_options_are_completed(tmp_path):
+    pytest.importorskip("argcomplete")
+    line, out = "gpusense localize --ani", tmp_path / "words"
+    variables = dict(_ARGCOMPLETE="1", COMP_LINE=line, COMP_POINT=str(len(line)), _ARGCOMPLETE_STDOUT_FILENAME=str(out))
+    code = "from gpusense.commands.cli import main; main([])"
+    subprocess.run([sys.executable, "-c", code], env=os.environ | variables, check=True)
+    assert out.read_text().split() == ["--animate"]

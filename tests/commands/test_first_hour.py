@@ -91,7 +91,7 @@ def test_rows_of_a_score_are_printed_as_they_come(capsys, recorded, monkeypatch)
         return add(self, number, scan)
 
     monkeypatch.setattr(scoring.LogScoring, "add", watched)
-    assert main(score(recorded, "--limit", "3")) == 0
+    assert main(score(recorded, "--limit", "3", "-v")) == 0
     assert before[0] == "" and [text.splitlines()[-1].split()[0] for text in before[1:]] == ["0", "1"]
 
 
@@ -159,7 +159,7 @@ def test_a_table_does_not_fold_on_a_narrow_terminal(capsys, monkeypatch):
 @pytest.mark.parametrize("width", [60, 100])
 def test_a_score_fits_the_terminal(capsys, recorded, monkeypatch, width):
     narrow(monkeypatch, width)
-    assert main(score(recorded, "--limit", "2")) == 0
+    assert main(score(recorded, "--limit", "2", "-v")) == 0
     out, err = capsys.readouterr()
     table = out.splitlines()[:4]
     assert err == "" and table[0].split()[0] == "scan" and table[1].startswith("-----") and table[3].split()[0] == "1"

@@ -137,7 +137,8 @@ def test_the_fit_by_incidence_is_scored_on_held_out_pairs(capsys, tmp_path):
     assert own["per_beam"] == pytest.approx(total / 2000, rel=1e-9)
     assert document["fit"]["blocks"] == 20 and document["incidence"]["pooled"]["blocks"] == 20
     _, text, _ = run(capsys, *arguments)
-    assert "fitted by incidence" in text and "if independent" in text
+    assert text.startswith("FITTED: ") and "fitted by incidence" in text and "if independent" not in text
+    assert "if independent" in run(capsys, *arguments, "-v")[1]
 
 
 def test_a_bias_is_fitted_and_taken_off_held_out_readings(capsys, recorded, tmp_path):

@@ -78,7 +78,7 @@ def test_command_localises(capsys, folder, kind):
 @pytest.mark.slow
 def test_exchanged_landmarks_are_reported_and_survived(capsys, swapped):
     text = run(capsys, swapped, "--particles", "300", "--scans", "150")
-    assert "SUSPICIOUS: landmarks 8 and 12 fit better exchanged" in text and "known landmarks" in text
+    assert "SUSPICIOUS landmarks 8 and 12 fit better exchanged" in text and "known landmarks" in text
     document = json.loads(run(capsys, swapped, "--particles", "300", "--scans", "60", "--json"))
     assert [(e["first"], e["second"]) for e in document["exchanged"]] == [(8, 12)]
     assert document["filter"]["error_median"] < 0.2
@@ -99,13 +99,13 @@ def test_poor_odometry_is_survived(capsys, tmp_path):
     assert 0.25 < document["motion"]["drift_heading"] < 0.4 and not figures["lost"] and figures["scans_lost"] == 0
     assert figures["error_90"] < 0.15 and figures["heading_90"] < 0.1
     text = run(capsys, folder, *options, "--drift", "0.01", "0.07", code=1)
-    assert "verdict: LOST since " in text
+    assert text.startswith("LOST since ")
 
 
 def test_a_wrong_map_is_reported(capsys, tmp_path):
     folder = world.write_run(tmp_path / "wrong", seconds=20.0, wrong=True)
     text = run(capsys, folder, "--unknown", "--particles", "300", "--fit-motion", code=1)
-    assert "verdict: LOST since " in text and "is this the map of the run" in text
+    assert text.startswith("LOST since ") and "is this the map of the run" in text
 
 
 M, G = "Robot1_Measurement.dat", "Robot1_Groundtruth.dat"

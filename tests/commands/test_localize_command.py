@@ -99,7 +99,7 @@ def test_figures_come_as_json(place, capsys):
 def test_what_the_command_fit_wrote_is_used(place, capsys, tmp_path):
     fitting = ["fit", *call(place)[1:5], "--range-max", "20", "--backend", "numpy", "--sigma-growth", "--fit-motion"]
     assert cli.main([*fitting, "--out", str(tmp_path)]) == 0
-    assert "odometry: OdometryMotion(" in capsys.readouterr().out
+    assert "odometry   OdometryMotion(" in capsys.readouterr().out
     written = yaml.safe_load((tmp_path / "parameters.yaml").read_text())
     noise = written["odometry_motion"]
     assert written["beam_model"]["sigma_growth"] >= 0
@@ -135,7 +135,7 @@ def test_a_filter_that_has_not_converged_is_uncertain(place, capsys):
     printed = capsys.readouterr()
     assert re.match(r"UNCERTAIN \(p_lost \S+\): .* m and \d+ degrees apart", printed.out)
     # No pose serves as a reference.
-    assert "the first 1 of 1 scans" in printed.err and not (place / "none.tum").read_text()
+    assert "without the first 1 of 1 scans" in printed.out and not (place / "none.tum").read_text()
     assert cli.main([*arguments, "--tum-from", "start"]) == 1
     assert len((place / "none.tum").read_text().splitlines()) == 1
 

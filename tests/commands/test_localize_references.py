@@ -265,7 +265,7 @@ def test_other_commands_take_the_poses_of_a_trajectory(place, capsys, tmp_path):
     for more, name in ((reference, "reference"), ([], "logged")):
         assert cli.main([*score, *log, "--backend", "numpy", *more]) in (0, 1)
         text = capsys.readouterr().out
-        assert f"rank of the {name} pose: median" in text and f"the {name} poses explain" in text
+        assert f"of the {name} pose among them: median" in text and f"the {name} poses explain" in text
     bad, _ = document(*score)
     ranks = [np.mean([row["rank"] for row in one["backends"][0]["scans"]]) for one in (good, bad)]
     assert ranks[1] > 10 * ranks[0]
@@ -295,7 +295,7 @@ def test_scans_without_a_pose_are_neither_used_nor_checked(place, capsys, tmp_pa
     command += ["--out", str(tmp_path / "built.yaml")]
     assert cli.main([*command, "--reference", str(tmp_path / "known.tum")]) == 0
     out, err = capsys.readouterr()
-    assert "of 3 scans" in out and f"has poses of 3 of {COUNT + 1} chosen scans" in err
+    assert "MAPPED: 3 scans at reference poses" in out and f"has poses of 3 of {COUNT + 1} chosen scans" in err
     assert "must come from the same scanner, got another at scan 3 of" in error_of(command, capsys)
 
 

@@ -40,7 +40,7 @@ def call(place, *more, plan="plan.yaml", table="t.csv"):
 def test_a_plan_is_run_resumed_and_drawn(place, capsys):
     plot = place / "t.png"
     assert cli.main(call(place, "--plot", str(plot), plan="good.yaml")) == 0
-    assert "4 jobs: 4 done, 0 failed" in capsys.readouterr().out and plot.stat().st_size > 10_000
+    assert "DONE: 4 of 4 jobs ran in " in capsys.readouterr().out and plot.stat().st_size > 10_000
     assert "exists: resume it" in error_of(call(place), capsys)
     assert cli.main(call(place, "--resume", "--json")) == 1
     out, err = capsys.readouterr()
@@ -49,14 +49,15 @@ def test_a_plan_is_run_resumed_and_drawn(place, capsys):
     table = gs.sweep.read_table(place / "t.csv")
     assert table["status"] == ["done"] * 4 + ["failed"] * 4 and table["axis.log"][4] == "absent"
     assert cli.main(call(place, "--plot", str(place / "no.png"), "--resume", "--retry-failed")) == 1
-    assert "0 done, 4 failed, 4 were in the table already" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert out.startswith("4 FAILED: 0 of 8 jobs ran in ") and "4 were in the table before" in out
 
 
 def test_a_job_beyond_a_limit_is_a_row(place, capsys):
     assert cli.main(call(place, "--job-timeout", "1e-6", plan="good.yaml", table="limited.csv")) == 1
     errors = gs.sweep.read_table(place / "limited.csv")["error"]
     assert errors == ["JobTimeout: the worker was ended after the limit of 1e-06 s"] * 4
-    assert "4 jobs: 0 done, 4 failed" in capsys.readouterr().out
+    assert "4 FAILED: 0 of 4 jobs ran in " in capsys.readouterr().out
 
 
 def test_jobs_are_listed(place, capsys):

@@ -84,6 +84,7 @@ def test_a_second_process_compiles_nothing(needs, tmp_path, expected, family):
 
 
 # By default, the backend that the test of a second process does not use.
+@pytest.mark.long
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("family", ["warp:cpu", "opencl"])
 def test_with_the_cache_off_nothing_is_kept(needs, tmp_path, expected, family):

@@ -219,6 +219,7 @@ def test_a_frozen_program_trusts_devices_and_says_so(driver, monkeypatch, caplog
     assert verdict_on(INFO, anew=True) == proved and len(tried) == 2
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.2)
 @pytest.mark.parametrize(
     ("family", "lanes", "float64"),
@@ -240,6 +241,7 @@ def test_the_scene_passes_on_real_devices_with_every_setting(needs, family, lane
     assert (VECTORS in begun) == (lanes > 1)
 
 
+@pytest.mark.long
 def test_a_driver_that_ends_long_loops_early_is_unusable(needs, monkeypatch):
     """Mesa's llvmpipe ends all loops of a work-group after 65 535 steps; small scenes do not show it."""
     from gpusense.evaluation import proof as scene

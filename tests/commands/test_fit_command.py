@@ -110,6 +110,7 @@ def test_held_out_scans_are_likelier_by_the_fit_than_by_defaults(capsys, recorde
     assert code == 0 and "held out: 1800 readings" in text and "Beluga's defaults" in text and "z_hit" in text
 
 
+@pytest.mark.long
 def test_the_fit_by_incidence_is_scored_on_held_out_pairs(capsys, tmp_path):
     """The deviation rises with the angle: the mixtures of the bins and the mixture for all angles are scored."""
     random = np.random.default_rng(1)
@@ -306,6 +307,7 @@ def test_hits_of_a_student_are_fitted_written_and_read(capsys, recorded, tmp_pat
     capsys.readouterr()
 
 
+@pytest.mark.long
 def test_hits_of_a_student_are_fitted_by_incidence(capsys, recorded):
     code, out, _ = run(capsys, *of_log(recorded), "--every", 3, "--hit", "student", "--incidence", 2)
     assert code == 0 and out.count("hit_dof") >= 2

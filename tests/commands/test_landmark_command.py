@@ -102,6 +102,7 @@ def test_poor_odometry_is_survived(capsys, tmp_path):
     assert text.startswith("LOST since ")
 
 
+@pytest.mark.long
 def test_a_wrong_map_is_reported(capsys, tmp_path):
     folder = world.write_run(tmp_path / "wrong", seconds=20.0, wrong=True)
     text = run(capsys, folder, "--unknown", "--particles", "300", "--fit-motion", code=1)
@@ -167,6 +168,7 @@ def test_broken_gzip_is_named(capsys, swapped, tmp_path):
     assert found.startswith(f"{file}:") and "must be a whole gzip file, got a broken one" in found
 
 
+@pytest.mark.long
 def test_recorded_robot(capsys, data_dir, needs):
     """Robot 3 of the UTIAS data: landmarks 11 and 17 are exchanged, and errors are of the paper's order."""
     code = main(["landmarks", "--folder", str(data_dir / "mrclam_ds1"), "--robot", "3", "--particles", "500",

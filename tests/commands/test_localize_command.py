@@ -96,6 +96,7 @@ def test_figures_come_as_json(place, capsys):
     assert 0 <= found["coverage_50"] <= found["coverage_95"] <= 1 and found["ms_score"] > 0
 
 
+@pytest.mark.long
 def test_what_the_command_fit_wrote_is_used(place, capsys, tmp_path):
     fitting = ["fit", *call(place)[1:5], "--range-max", "20", "--backend", "numpy", "--sigma-growth", "--fit-motion"]
     assert cli.main([*fitting, "--out", str(tmp_path)]) == 0
@@ -276,6 +277,7 @@ def test_a_run_is_recorded_for_the_viewer(place, capsys, monkeypatch, tmp_path):
     assert "needs the library rerun-sdk, which is not installed" in message and "pip install '.[rerun]'" in message
 
 
+@pytest.mark.long
 def test_a_run_is_animated(place, tmp_path, capsys, monkeypatch):
     from PIL import Image
 

@@ -146,6 +146,7 @@ def started(*arguments: str, cwd: Path, **options: Any) -> subprocess.Popen[str]
     )  # fmt: skip
 
 
+@pytest.mark.long
 def test_a_terminated_sweep_keeps_whole_rows_and_ends_its_processes(place, tmp_path):
     (place / "long.yaml").write_text(PLAN.replace("SEEDS", "400"))
     table = tmp_path / "t.csv"

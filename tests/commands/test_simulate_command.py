@@ -25,6 +25,7 @@ def office(tmp_path, monkeypatch, capsys):
     return tmp_path
 
 
+@pytest.mark.long
 def test_the_log_runs_through_the_other_commands(office, capsys):
     log = ["--map", "office.yaml", "--log", "run.log"]
     rest = ["--json", "--backend", "numpy"]

@@ -53,6 +53,7 @@ def test_a_plan_is_run_resumed_and_drawn(place, capsys):
     assert out.startswith("4 FAILED: 0 of 8 jobs ran in ") and "4 were in the table before" in out
 
 
+@pytest.mark.long
 def test_a_job_beyond_a_limit_is_a_row(place, capsys):
     assert cli.main(call(place, "--job-timeout", "1e-6", plan="good.yaml", table="limited.csv")) == 1
     errors = gs.sweep.read_table(place / "limited.csv")["error"]

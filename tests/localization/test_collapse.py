@@ -23,6 +23,7 @@ def follow(backend, prior, sigma, far, corrections, **options):
     return distinct, found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "prior, sigma, far", [(10.0, 0.1, 40.0), (1.0, 1e-3, 4.0), (100.0, 0.1, 300.0), (10.0, 0.1, 0.0)]
 )

@@ -33,6 +33,7 @@ def followed(points, scans=24):
     return pf, pose
 
 
+@pytest.mark.long
 def test_a_filter_among_landmarks_tells_a_wrong_map():
     pf, pose = followed(POINTS)
     found = pf.estimate()

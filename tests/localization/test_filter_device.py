@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -100,6 +101,7 @@ def test_corrections_judge_the_pose_that_each_step_asks_for(backend, monkeypatch
         assert many == 10 and few <= 5
 
 
+@pytest.mark.long
 def test_a_gpu_has_the_particles_of_a_processor(needs, monkeypatch):
     def run():
         model = gs.LikelihoodFieldModel(GRID, SCANNER, backend="opencl")

@@ -134,11 +134,12 @@ def check(seed, backend):
     assert ran(seed, backend, looking(seed)) == ran(seed, backend, lambda pf: None)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_random_looks_leave_the_bits_of_the_belief(seed):
     check(seed, "numpy")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [20, 21])
 def test_random_looks_leave_the_bits_of_the_belief_on_devices(seed, device):
     check(seed, device.info.selection)

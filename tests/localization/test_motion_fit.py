@@ -78,6 +78,7 @@ def test_motion_noise_is_learned_from_references_at_some_steps():
     assert apart[1] < 0.2 * motion.alpha[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("steps", "alpha"), [(59, (0.05, 0.01, 0.04, 0.01)), (150, (0.002, 0.002, 0.005, 0.001))])
 def test_independent_motion_noise_is_not_inflated(steps, alpha):
     """The fitted variances of translations and turns are on average the true ones."""

@@ -62,6 +62,7 @@ EACH = [
 ]  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("limit", "team", "scanner", "thin", "precision"), EACH)
 def test_a_team_of_work_items_agrees_with_the_reference(device, monkeypatch, limit, team, scanner, thin, precision):
     """GPUs match in teams that their groups hold; here processors do."""

@@ -112,6 +112,7 @@ def test_no_scans_give_no_matches(method):
     assert len(match) == 0 and match.covariance.shape == (0, 3, 3)
 
 
+@pytest.mark.long
 def test_matches_in_corridors_of_a_recorded_map_stay_at_good_guesses(data_dir):
     """ICP would slide along the corridor for some of these scans, for one of them by 0.95 m."""
     folder = data_dir / "carmen_logs"

@@ -124,6 +124,7 @@ def test_steps_of_ranges_are_noise():
     assert np.isnan(scan_noise(np.full((1, 360), np.inf), RING)).all()
 
 
+@pytest.mark.long
 def test_noise_of_a_call_does_not_depend_on_its_other_scans():
     rng = np.random.default_rng(1)
     one, two, truth = random_pairs(6, RING, seed=12)

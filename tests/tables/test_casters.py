@@ -179,6 +179,7 @@ def test_table_bytes_are_those_of_the_page(backend):
         ), kind
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["opencl", "warp"])
 def test_a_table_too_large_for_the_device_is_an_error_that_names_sizes(name, needs, monkeypatch):
     grid, poses, bearings = place()

@@ -123,6 +123,7 @@ def test_the_rule_centre_takes_fewer_steps_and_errs_more():
         assert errors[1] > errors[0] and counts[1] < 0.7 * counts[0]
 
 
+@pytest.mark.long
 def test_a_march_of_a_million_cells_ends(backend):
     """There the tolerance is below the spacing of float32 numbers, and a step must still advance."""
     cells = np.zeros((3, 60), int)

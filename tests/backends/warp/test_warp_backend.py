@@ -116,6 +116,7 @@ def run_quietly(folder: Path, **variables: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
+@pytest.mark.long
 def test_warp_starts_without_a_word_and_keeps_its_settings(needs: Callable[[str], str], tmp_path: Path) -> None:
     needs("warp")
     run_quietly(tmp_path, GPUSENSE_CACHE="")
@@ -123,6 +124,7 @@ def test_warp_starts_without_a_word_and_keeps_its_settings(needs: Callable[[str]
     assert list(tmp_path.rglob("*.gpusense")) and not list(tmp_path.rglob("*.o"))
 
 
+@pytest.mark.long
 def test_the_cache_can_be_switched_off(needs: Callable[[str], str], tmp_path: Path) -> None:
     needs("warp")
     run_quietly(tmp_path, GPUSENSE_CACHE="off", GPUSENSE_PROOF="off")

@@ -90,14 +90,14 @@ def test_results_have_the_bits_of_poses_that_the_host_bounds(
 
     monkeypatch.setattr(poses_module, "bounds_on_device", bounds)
     for name, call in calls(device):
-        # Each number of poses once each way, since GPUs have a shorter path for sizes that repeat.
+        # Use each number of poses once per path, since GPUs have a shorter path for repeated sizes.
         single = cloud[2:].astype(np.float32), turned[3:].astype(np.float32)
         for poses in (cloud, turned[1:], cloud[:3], *single):
             used.clear()
             found = call(poses)  # type: ignore[operator]
             assert bool(used) == (len(poses) > 3 and not name.startswith("no ")), name
             assert not any(used) or poses.dtype == np.float32
-            # Poses of several scans, and those of small calls on GPUs, are float64 numbers on the way.
+            # Poses of several scans, and of small calls on GPUs, pass through float64.
             assert all(used) or poses.dtype != np.float32 or name == "scans" or device.info.kind == "gpu", name
             with monkeypatch.context() as early:
                 early.setattr(poses_module, "bounds_poses", lambda backend: False)

@@ -21,7 +21,7 @@ FREE = gs.OccupancyGrid(np.pad(np.zeros((20, 30), int), 1, constant_values=100),
 
 
 def forms(values, mask):
-    """Return the readings with NaN, and masked: whole, in lists, by a masked number, and as integers' kin float32."""
+    """Return the readings with NaN, and masked: whole, in lists, by a masked number, and as float32."""
     masked = np.ma.array(values, mask=mask)
     missing = np.where(mask, np.nan, values)
     if np.ndim(values) == 2:
@@ -119,7 +119,7 @@ def test_masked_readings_are_missing(needs, name):
     call, values, mask = READINGS[name]
     missing, all_forms = forms(values, mask)
     expected, plain = np.asarray(call(missing)), np.asarray(call(values))
-    # An unmasked scan has another result, so that an ignored mask is found.
+    # An unmasked scan has another result, to detect an ignored mask.
     assert not np.array_equal(expected, plain, equal_nan=True)
     # Lists have another meaning for several models, and none for bound calls.
     for form in [all_forms["array"]] if name in ARRAYS_ONLY else all_forms.values():
@@ -140,7 +140,7 @@ def test_masked_integers_and_booleans_are_missing():
 
 
 def errors():
-    """Yield name, call and argument of masks that have no meaning."""
+    """Yield name, call and argument of meaningless masks."""
     model = make("field", GRID, "numpy")
     poses = np.ma.array(POSES, mask=np.arange(36).reshape(12, 3) == 4)
     cells = np.ma.array([[0, 100]], mask=[[False, True]])

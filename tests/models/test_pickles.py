@@ -84,7 +84,7 @@ def test_copies_have_the_bits_and_the_options(name, how, backend):
     assert made is not model and type(made) is type(model) and repr(made) == repr(model)
     assert np.array_equal(call(made), expected)
     assert made.backend is model.backend
-    # No memory of the device was copied.
+    # No device memory was copied.
     assert len(pickle.dumps(model)) < 30_000
 
 

@@ -10,7 +10,7 @@ from support.array_libraries import to_device
 
 import gpusense as gs
 
-# float32 rounds both limits down: taken for float64, these readings would be missing and a hit.
+# float32 rounds both limits down: as float64, these readings would be missing and a hit.
 RANGE_MIN, RANGE_MAX = 0.7, 5.6
 NEAREST, FARTHEST = np.float32(RANGE_MIN), np.float32(RANGE_MAX)
 assert float(NEAREST) < RANGE_MIN and float(FARTHEST) < RANGE_MAX

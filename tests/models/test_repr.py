@@ -1,4 +1,4 @@
-"""``repr`` of models and casters is one line that names kind, map, beams, caster, precision and device."""
+"""``repr`` of models and casters names kind, map, beams, caster, precision and device in one line."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Several models of one device in one call: each result has the bits of the model's own call, and there is one wait."""
+"""Several models of a device in one call: each result has the bits of a single call, after one wait."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ def log_mixture(z_hit: float, hit: Any, z_rand: float, rand: Any) -> float:
 
 
 def antenna(pose: Sequence[float], mount: Sequence[float]) -> tuple[Any, Any]:
-    """Return the place of the antenna in the world."""
+    """Return the position of the antenna in the world."""
     x, y, theta = (number(v) for v in pose)
     c, s = mp.cos(theta), mp.sin(theta)
     mx, my = number(mount[0]), number(mount[1])
@@ -66,7 +66,7 @@ def heading(theta: float, reading: float, p: Any) -> float:
 
 
 def normal_density(r: Any, near: Any, far: Any, sigma: Any) -> Any:
-    """Return the density at r from the mean of a normal that is truncated to an interval."""
+    """Return the density at r from the mean of a normal truncated to an interval."""
     mass = (mp.erf(near / sigma / mp.sqrt(2)) + mp.erf(far / sigma / mp.sqrt(2))) / 2
     return mp.exp(-((r / sigma) ** 2) / 2) / (sigma * mp.sqrt(2 * mp.pi)) / mass
 
@@ -104,7 +104,7 @@ def bump(squared_cells: int, side: float, radius: float, pressed: bool, p: Any) 
     """Return log P of a bumper, from the squared distance between the outline's cell and the nearest obstacle."""
     gap = mp.sqrt(int(squared_cells)) * number(side) - number(side) / 2 - number(radius)
     x = gap / number(p.sigma) / mp.sqrt(2)
-    # Beyond a few thousand nats mpmath's erfc is slow, and negligible against other terms.
+    # Beyond a few thousand nats mpmath's erfc is slow and negligible.
     touching, clear = mp.erfc(x) / 2, mp.erfc(-x) / 2
     contact, false = number(p.p_contact), number(p.p_false)
     if not pressed:
@@ -114,7 +114,7 @@ def bump(squared_cells: int, side: float, radius: float, pressed: bool, p: Any) 
 
 
 def placed_point(pose: Any, point: Any, origin: Sequence[float], side: float) -> tuple[Any, Any, Any, Any]:
-    """Return the place of a point of a robot in a grid, in cells."""
+    """Return the position of a point of a robot in a grid, in cells."""
     x, y = antenna(pose, point)
     dx, dy, yaw = x - number(origin[0]), y - number(origin[1]), number(origin[2])
     c, s, cell = mp.cos(yaw), mp.sin(yaw), number(side)

@@ -1,4 +1,4 @@
-"""Poses, a map and one model of each sensor without a scan, and the precision that their results must have."""
+"""Poses, a map, a model of each sensor without a scan, and the required precision of results."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ MISSING: dict[str, Any] = {"position": (NAN, 3.0), "heading": NAN, "beacons": [N
 
 
 def assert_close(found: np.ndarray, truth: object, precision: str, terms: np.ndarray | None = None) -> None:
-    """Check results to within 16 eps (1 + |log p|) of each reading, and that they are infinite where the truth is."""
+    """Check results to within 16 eps (1 + |log p|) of each reading, and equal infinities."""
     truth = np.array(truth, float)
     size = 1 + np.abs(truth) if terms is None else (1 + np.abs(terms)).sum(axis=-1)
     assert not np.isnan(found).any()

@@ -13,7 +13,7 @@ METHODS = ("log_likelihood", "field", "expected_ranges", "cast")
 def result_call(
     method: str, backend: Any, grid: gs.OccupancyGrid, scanner: gs.Scanner, scan: Any
 ) -> tuple[Callable[..., Any], tuple[int, ...]]:
-    """Return the call of a method that takes poses and ``out=``, and the shape of its result for each pose."""
+    """Return the call of a method with poses and ``out=``, and the shape of its result per pose."""
     if method == "cast":
         caster = gs.RayCaster(grid, scanner.range_max, backend=backend)
         return lambda poses, **options: caster.cast(poses, scanner.bearings, **options), (scanner.count,)

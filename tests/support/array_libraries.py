@@ -1,4 +1,4 @@
-"""A made-up library of arrays, which exports and imports NumPy's or Warp's; arrays of Warp's processor."""
+"""A made-up library of arrays that exports and imports NumPy's or Warp's; arrays of Warp's processor."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Array:
 
 
 class OldArray(Array):
-    """Exports DLPack's first version, which cannot say whether memory may be written."""
+    """Exports DLPack's first version, without a read-only flag."""
 
     def __dlpack__(self, stream: Any = None) -> Any:
         return self.held.__dlpack__()
@@ -67,7 +67,7 @@ class OldArray(Array):
 
 
 class Recorded(Array):
-    """Records gradients like PyTorch's arrays, so it can neither be exported nor converted to NumPy."""
+    """Records gradients like PyTorch's arrays, and can be neither exported nor converted to NumPy."""
 
     requires_grad = True
 

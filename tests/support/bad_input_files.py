@@ -1,7 +1,7 @@
 """Types and files for bad input to the map, the scanner, the parameters and the logs.
 
 Each case is (id, action, exception type, message). The action takes an empty folder and writes its input files to
-``input`` in it, so the library has left everything outside ``input``. ``{tmp}`` in a message is the folder.
+``input`` in it, so everything outside ``input`` comes from the library. ``{tmp}`` in a message is the folder.
 """
 
 from __future__ import annotations

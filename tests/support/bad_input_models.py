@@ -25,7 +25,7 @@ POSE = [[0.5, 0.5, 0.0]]
 SCAN = [1.0, 2.0, 3.0]
 NAN, INF = float("nan"), float("inf")
 
-# One model for all calls, so that a refused call must leave it usable.
+# A single model for all calls: a refused call must leave it usable.
 MODEL = gs.BeamModel(GRID, SCANNER, backend="numpy")
 FIELD = gs.LikelihoodFieldModel(GRID, SCANNER, backend="numpy")
 CASTER = gs.RayCaster(GRID, 5.0, backend="numpy")
@@ -64,7 +64,7 @@ def distances(obstacles: Any) -> Action:
 
 
 def absent(selection: str) -> Callable[[], str]:
-    """Return the message for an absent device: the present ones, or the reason and the remedy where there are none."""
+    """Return the message for an absent device: the present devices, or the reason and the remedy without any."""
 
     def message() -> str:
         own = [device for device in gs.devices() if device.backend == selection.partition(":")[0]]

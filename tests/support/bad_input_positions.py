@@ -1,4 +1,4 @@
-"""Bad input to the functions that find positions, with the exact messages: (id, action, exception type, message)."""
+"""Bad input to the position functions, with the exact messages: (id, action, exception type, message)."""
 
 from __future__ import annotations
 

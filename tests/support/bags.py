@@ -79,7 +79,7 @@ class Writer:
                  **values)  # fmt: skip
 
     def echoes(self, time: float, ranges: Any, first: float, step: float, topic: str = "/echoes") -> None:
-        """Write a scan with several echoes, or none, for each beam."""
+        """Write a scan with several or no echoes per beam."""
         each = [self.make("sensor_msgs/msg/LaserEcho", echoes=np.array(one, np.float32)) for one in ranges]
         values = dict(angle_min=first, angle_increment=step, angle_max=first + step * (len(ranges) - 1), scan_time=0.1,
                       time_increment=0.0, range_min=0.1, range_max=8.0)  # fmt: skip

@@ -1,4 +1,4 @@
-"""Places that cannot hold a cache, and folders of a cache."""
+"""Unusable and usable folders of a cache."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def blocked(tmp_path: Path, how: str) -> Path:
 
 
 def entries_in(place: Path) -> list[Path]:
-    """Return the entries of the cache in a place, sorted."""
+    """Return the sorted entries of the cache in a folder."""
     return sorted((place / folders.OWN).glob("*.gpusense"))
 
 
 def contents(folder: Path) -> dict[str, tuple[int, int]]:
-    """Return everything below a folder with its mode and size."""
+    """Return all paths below a folder with mode and size."""
     found = {}
     for path in folder.rglob("*"):
         status = os.lstat(path)

@@ -1,9 +1,9 @@
 """Simulation-based calibration: readings drawn at poses of a prior, and the posterior ranks of these poses.
 
 Talts et al., *Validating Bayesian inference algorithms with simulation-based calibration* (2018). The prior is uniform
-over a set of poses, so the posterior is known without sampling, and the rank of the true pose by a function of the
-pose, ties broken at random, is exactly uniform on (0, 1) where readings come from the density that scores them. One of
-the functions is the log-likelihood itself (Modrák et al. 2023), which depends on the readings.
+over a set of poses, so that the posterior is known without sampling. If readings come from the density that scores
+them, the rank of the true pose by any function of the pose, ties broken at random, is exactly uniform on (0, 1). One of
+the functions is the log-likelihood (Modrák et al. 2023), which depends on the readings.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ class Scene(NamedTuple):
 
 
 _GRID = building(seed=4, size=(12.0, 10.0), resolution=0.1)
-# Wide densities, so that a reading leaves several poses possible.
+# Wide densities leave several poses possible.
 _WIDE = BeamParameters(
     z_hit=0.6, z_short=0.2, z_max=0.1, z_rand=0.1, sigma_hit=0.3, lambda_short=0.5, range_bias=0.1, sigma_growth=0.05
 )
@@ -98,7 +98,7 @@ def _point(model: Any) -> Scene:
 def _landmarks(narrow: bool, options: dict[str, Any]) -> Scene:
     poses, parameters = _points((-1.0, 0.0, -3.1), (5.0, 5.0, 3.1)), _FEATURES
     if narrow:
-        # Poses that see all landmarks: a reading beyond a limit is left out, and that is information.
+        # Poses that see all landmarks: an omitted reading beyond a limit would be information.
         parameters = parameters.replace(field_of_view=4.0, range_max=6.0)
         poses[:, :2] = _MAP.xy.mean(axis=0) + (-3.0, 0.0) + 0.3 * poses[:, :2]
         poses[:, 2] = -0.3 + 0.05 * poses[:, 2]
@@ -114,7 +114,7 @@ def _landmarks(narrow: bool, options: dict[str, Any]) -> Scene:
 
 
 def _lines(options: dict[str, Any]) -> Scene:
-    # Walls are so long that the middle of the part in view is the foot of the normal: the ends carry no information.
+    # Long walls put the middle of the visible part at the foot of the normal: the ends carry no information.
     lines = LineMap([(99.0, 7.0, -99.0, 7.0), (7.0, -99.0, 7.0, 99.0), (-99.0, -30.0, 99.0, 30.0)], [False, True, True])
     p = LineParameters(sigma_angle=0.3, sigma_distance=0.8, z_detect=0.7, z_false=0.3, range_max=12.0)
     model = LineModel(lines, p, mount=(0.2, 0.1, 0.3), **options)
@@ -163,5 +163,5 @@ MAKERS = dict(_makers())
 
 
 def make_scene(name: str, backend: Selection = "numpy") -> Scene:
-    """Return a scene by a name of MAKERS, with its model in float64."""
+    """Return the scene of a name in MAKERS, with its model in float64."""
     return MAKERS[name](dict(backend=backend, precision="float64"))

@@ -1,4 +1,4 @@
-"""A map with poses and bearings for the tests of all casters, and their ranges on it."""
+"""A map with poses and bearings for tests of all casters, and their ranges."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def same_bits(found: np.ndarray, expected: np.ndarray) -> None:
 
 @functools.cache
 def place() -> tuple[gs.OccupancyGrid, np.ndarray, np.ndarray]:
-    """Return a turned map with unknown cells; poses all over it and around it, many on its lattice; bearings."""
+    """Return a turned map with unknown cells, poses in and around it, many on its lattice, and bearings."""
     rng = np.random.default_rng(0)
     cells = rng.choice([0, 100, -1], (40, 56), p=[0.95, 0.03, 0.02])
     grid = gs.OccupancyGrid(cells, 0.1, (1.0, -2.0, 0.4))
@@ -53,7 +53,7 @@ numpy_cast = functools.cache(functools.partial(cast, backend="numpy"))
 
 
 def lists_of(table: np.ndarray, bins: int) -> dict[tuple[int, int], list[int]]:
-    """Return a table's contents: the places where obstacles begin for each bin and line [2^-10 cells]."""
+    """Return a table's contents: the beginnings of obstacles for each bin and line [2^-10 cells]."""
     lines, first = int(table[0]), 1 + 3 * bins
     found = {}
     for bin in range(bins):

@@ -7,7 +7,7 @@ from support.matching_scenes import box, relative, segments_scan
 
 import gpusense as gs
 
-# A ring of corridors around a block, with niches, so that each place is observed in all directions.
+# A ring of corridors with niches around a block: each place is observed in all directions.
 BLOCK = np.array([
     *box(0, 0, 24, 18), *box(2.5, 2.5, 21.5, 15.5), *box(7, 0, 7.6, 0.5), *box(16, 2.0, 17, 2.5), *box(23.2, 6, 24, 7),
     *box(21.5, 11, 22, 12.5), *box(13, 17.4, 14, 18), *box(5, 15.5, 6.5, 16.1), *box(0, 10, 0.6, 10.8),

@@ -20,10 +20,10 @@ def run(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
         pytest.skip("Oclgrind has no wheel for this platform")
     environment = os.environ | {
         "OCLGRIND_DATA_RACES": "1",
-        # Oclgrind misreads vectors of booleans from LLVM's optimizer; in unoptimized code it also sees every access.
+        # Oclgrind misreads vectors of booleans from LLVM's optimizer; unoptimized code also shows every access.
         "OCLGRIND_BUILD_OPTIONS": "-cl-opt-disable",
         "GPUSENSE_CACHE": "off",
-        # With the cache off, every process would prove its device.
+        # Without the cache, every process would prove its device.
         "GPUSENSE_PROOF": "off",
         "PYOPENCL_NO_CACHE": "1",
     }

@@ -1,4 +1,4 @@
-"""Dask clusters on the loopback in processes that gpusense did not start."""
+"""Dask clusters on the loopback in external processes."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Cluster:
             time.sleep(0.05)
 
     def close(self):
-        """End all processes; a nanny ends its worker, which would otherwise wait for the scheduler."""
+        """End all processes; a nanny ends its worker instead of letting it wait for the scheduler."""
         for process in (self.scheduler, *self.workers):
             nanny = process is not self.scheduler and "--no-nanny" not in process.args
             (process.terminate if nanny else process.kill)()

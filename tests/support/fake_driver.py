@@ -1,4 +1,4 @@
-"""OpenCL drivers that fail: PoCL behind a library, built here with the C compiler, that spoils one function."""
+"""OpenCL drivers that fail: PoCL behind a library that spoils one function, built with the C compiler."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Floors of known geometry for features: rooms along a corridor, doors, square pillars, poles and clutter.
 
-A floor is made of straight walls and circles, so that ranges are exact and every line, corner, door, hallway and pole
-is known. The same seed gives the same floor.
+A floor consists of straight walls and circles, so that ranges are exact and every line, corner, door, hallway and pole
+is known. A seed determines the floor.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 
 # Thickness of walls [m].
 WALL = 0.12
-# Rays whose ranges are computed at once.
+# Rays per pass.
 _CHUNK = 4096
 
 
@@ -182,7 +182,7 @@ def _room(
     for face in (side * half, near):
         plan.doors.append((left, face, left + wide, face))
     if kind == "half open":
-        # The leaf turns into the room about the left jamb.
+        # The leaf turns about the left jamb into the room.
         swing = side * math.radians(rng.uniform(50, 110))
         plan.walls.append((left, near, left + wide * math.cos(swing), near + wide * math.sin(swing)))
     return [left, left + wide]

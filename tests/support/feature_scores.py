@@ -22,12 +22,12 @@ class Score:
     """Counts of one kind.
 
     Attributes:
-        required: True features that are seen well.
-        found: The number of them that were found.
-        features: Features that were returned.
-        right: The number of them that exist.
-        squares: Squared error over covariance, per degree of freedom, of each that exists.
-        errors: Position error of each that exists [m]; across the line for lines and hallways.
+        required: Clearly visible true features.
+        found: Their number found.
+        features: Returned features.
+        right: Number of returned features that exist.
+        squares: Squared error over covariance, per degree of freedom, of each existing feature.
+        errors: Position error of each existing feature [m]; across the line for lines and hallways.
     """
 
     required: int = 0
@@ -39,12 +39,12 @@ class Score:
 
     @property
     def recall(self) -> float:
-        """Share of the true features that were found."""
+        """Share of the true features found."""
         return self.found / self.required if self.required else math.nan
 
     @property
     def precision(self) -> float:
-        """Share of the features that exist."""
+        """Share of the returned features that exist."""
         return self.right / self.features if self.features else math.nan
 
     @property
@@ -83,7 +83,7 @@ def _turned(angle: np.ndarray, kind: str) -> np.ndarray:
 
 
 def _errors(features: Features, i: int, kind: str, rows: np.ndarray) -> np.ndarray | None:
-    """Return the error (3,) of a feature against the nearest that exists, or None."""
+    """Return the error (3,) of a feature against the nearest true one, or None."""
     if not len(rows):
         return None
     pose, size = features.pose[i], features.size[i]
@@ -110,7 +110,7 @@ def _errors(features: Features, i: int, kind: str, rows: np.ndarray) -> np.ndarr
 
 
 def _is_found(features: Features, kind: str, row: np.ndarray) -> bool:
-    """Return whether some feature is a true one."""
+    """Return whether a true feature was found."""
     error = features.pose - row[:3]
     turn = np.zeros(len(error)) if kind == "pole" else _turned(error[:, 2], kind)
     if kind == "line":

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from support.feature_scenes import Floats, Floor, corner_between
 
-# Least number of beams and least length [m] of a run on a wall that counts as clearly visible.
+# Least number of beams and least length [m] of a run on a clearly visible wall.
 WELL_POINTS, WELL_LENGTH = 10, 0.5
 # Least turn of a corner; share of a door's beams that pass through it by at least _DEEP [m].
 _TURN, _SHARE, _DEEP = math.radians(30), 0.5, 0.5
@@ -34,7 +34,7 @@ class Truth:
 
 @dataclass
 class _Run:
-    """Beams that meet one surface, one after another."""
+    """Successive beams that meet a surface."""
 
     first: int
     count: int
@@ -106,7 +106,7 @@ class _Local:
         return np.column_stack([centre, np.arctan2(away[:, 1], away[:, 0]), np.hypot(*along.T)])
 
     def corridors(self) -> Floats:
-        """Return the hallways around the robot, rooms as narrow and long included."""
+        """Return the hallways around the robot, including narrow, long rooms."""
         axes = np.concatenate([self.axes, self._rooms[self._ratio > 1.8]])
         along = axes[:, 2:4] - axes[:, :2]
         length = np.hypot(*along.T)
@@ -153,7 +153,7 @@ def _corners(runs: list[_Run], local: _Local, closed: bool, walls: int) -> Float
 
 
 def _oriented(wall: Floats, run: _Run) -> Floats:
-    """Return a wall from the first beam on."""
+    """Return a wall directed from the first beam on."""
     turned = (wall[2:] - wall[:2]) @ (run.points[-1] - run.points[0]) < 0
     return wall[[2, 3, 0, 1]] if turned else wall
 

@@ -1,4 +1,4 @@
-"""A short run of a particle filter of each kind, and all of its state."""
+"""A short run of a particle filter of each kind, and its complete state."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ class Scene:
 
     Attributes:
         name: Number, span and hardness.
-        parameters: The parameters that readings are drawn with.
+        parameters: Parameters for drawing readings.
         range_max: Longest range [m].
         span: Interval of the expected ranges, as shares of range_max; they are uniform there.
     """

@@ -12,7 +12,7 @@ import gpusense as gs
 
 
 def framework(name: str) -> tuple[Any, ...]:
-    """Return a GPU's backend, and functions that make an array there, copy one back, and give its address."""
+    """Return a GPU's backend, and functions that make an array there, copy it back, and return its address."""
     module = pytest.importorskip(name)
     cuda = next((d.selection for d in gs.devices() if d.available and d.selection.startswith("warp:cuda")), None)
     if cuda is None:

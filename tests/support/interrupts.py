@@ -26,7 +26,7 @@ def _interruptible(frame: FrameType | None) -> bool:
 
 
 def executed_lines(call: Callable[[], Any]) -> list[Line]:
-    """Return the lines of the library that a call executes, each once, in the order of their first time."""
+    """Return the distinct lines of the library that a call executes, in order of first execution."""
     lines: dict[Line, None] = {}
 
     def local(frame: FrameType, event: str, _: object) -> Any:

@@ -19,7 +19,7 @@ from gpusense.tables.rectangles import ROWS, Planes, empty_rectangles
 PRECISIONS = (np.float32, np.float64)
 LIMIT, RESOLUTION = 37.3, 0.05
 UNREACHABLE = (1 << 31) - 1
-# Forms of planes of empty rectangles on every device, and that of large maps on GPUs.
+# Layouts of planes of empty rectangles on every device, and for large maps on GPUs.
 PLANES = (Planes(1), Planes(2), Planes(4))
 GROUPED = Planes(2, ROWS)
 SCALE = RangeScale(LIMIT, RESOLUTION, LIMIT * RESOLUTION)
@@ -82,7 +82,7 @@ def directions(real: type) -> np.ndarray:
 
 
 def adversarial_poses(occupied: np.ndarray, real: type, *, outside: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return cells and poses: fractions on and next to edges and corners, in every kind of direction."""
+    """Return cells and poses: fractions on and near edges and corners, in directions of every kind."""
     rng = np.random.default_rng(13)
     rows, cols = occupied.shape
     tiny, below_one = np.finfo(real).smallest_subnormal, np.nextafter(real(1), real(0))
@@ -108,7 +108,7 @@ LASER = (MixtureTables(1, 0, 0.0), Cone(1, 0.0))
 
 
 def window_of(cells: np.ndarray) -> Window:
-    """Return the window that is a whole map."""
+    """Return the window of a whole map."""
     return Window(0, 0, *cells.shape)
 
 
@@ -126,7 +126,7 @@ def planes_of(occupied: np.ndarray, form: Planes = PLANES[0], kind: str = "cpu")
 
 
 def row_after_row(planes: np.ndarray, form: Planes, rows: int) -> np.ndarray:
-    """Return planes of any form as (4, sectors, rows + 2, cols + 2) rectangles, one row after the other."""
+    """Return planes of any layout as (4, sectors, rows + 2, cols + 2) rectangles, row by row."""
     _, sectors, lines, stride = planes.shape
     groups = planes.reshape(4, sectors, lines // form.group, stride, form.group)
     return groups.swapaxes(3, 4).reshape(planes.shape)[:, :, : rows + 2]
@@ -134,7 +134,7 @@ def row_after_row(planes: np.ndarray, form: Planes, rows: int) -> np.ndarray:
 
 @functools.lru_cache(maxsize=32)
 def _planes(cells: bytes, shape: tuple[int, int], form: Planes, kind: str) -> np.ndarray:
-    # A separate backend, since the backend under test may pretend to be a GPU.
+    # A separate backend, since the tested backend may pass as a GPU.
     backend = NumpyBackend()
     backend.info = dataclasses.replace(backend.info, kind=kind)
     planes = np.empty((4, form.sectors, form.lines(shape[0]), shape[1] + 2), np.uint16)

@@ -1,4 +1,4 @@
-"""A simulated robot among landmarks: poses, its features at each, and a folder of such a run in MRCLAM's format."""
+"""A simulated robot among landmarks: poses, features at each pose, and a folder in MRCLAM's format."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SIGMA_RANGE, SIGMA_BEARING, Z_FALSE, P_DETECT, RANGE_MAX = 0.12, 0.04, 0.08, 0.6
 
 @dataclass(frozen=True)
 class Seen:
-    """Holds the features of all scans, the landmark and the scan of each, and which are false positives."""
+    """Features of all scans, each with landmark and scan, and a mask of false positives."""
 
     xy: np.ndarray
     poses: np.ndarray
@@ -40,7 +40,7 @@ def simulate(seed, *, scans=120, landmarks=12, field_of_view=2 * math.pi, bias=(
             while rng.random() < P_DETECT:
                 r = d[j] + bias[0] + noise * rng.normal(0, SIGMA_RANGE)
                 angle = wrap(b[j] + bias[1] + noise * rng.normal(0, SIGMA_BEARING))
-                # Features beyond the limits are drawn anew, whether detected or not.
+                # Redraw features beyond the limits, detected or not.
                 if 0 <= r <= RANGE_MAX and abs(angle) <= field_of_view / 2:
                     found.append((r, angle, j, s))
                     break
@@ -57,7 +57,7 @@ def write_run(
 ) -> Path:  # fmt: skip
     """Write a run of robot 1 in MRCLAM's files: subjects 6 to 15, barcodes 100 more; subjects of ``swap`` exchanged.
 
-    The odometer's heading has a random walk of ``wander`` rad / sqrt(s); with ``wrong`` the map is of another room.
+    The odometer's heading has a random walk of ``wander`` rad / sqrt(s); ``wrong`` writes the map of another room.
     """
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-4, 4, (10, 2))

@@ -1,6 +1,6 @@
 """The landmark model in mpmath, written from its definition: every landmark, no gate, no buckets, no logarithm sums.
 
-``exact_inputs`` takes the kernels' inputs, so that only their arithmetic is judged, and not the rounding of positions.
+``exact_inputs`` takes the kernels' inputs, to judge only their arithmetic and not the rounding of positions.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Table = tuple[list[Any], list[Any], Any]
 
 @dataclass(frozen=True)
 class Seen:
-    """Holds a sensor: position, cosine and sine of its axis's heading (mount's yaw left out)."""
+    """A sensor: position, cosine and sine of its axis's heading, without the mount's yaw."""
 
     x: Any
     y: Any
@@ -51,7 +51,7 @@ def bearing_mass(expected: Any, half: Any, sigma: Any) -> Any:
     expected = min(max(expected, -half), half)
     low, high, found = -half - expected, half - expected, mp.mpf(0)
     for turn in (-1, 0, 1):
-        # The part of the field whose wrapped difference is off by this many turns.
+        # The part of the field with a wrapped difference off by this many turns.
         a, b = max(low + 2 * mp.pi * turn, -mp.pi), min(high + 2 * mp.pi * turn, mp.pi)
         found += mass(a, b, sigma) if b > a else 0
     return found
@@ -105,7 +105,7 @@ def uniform(p: gs.LandmarkParameters, feature: Any, span: Any) -> Any:
 
 
 def candidate(p: gs.LandmarkParameters, seen: Seen, landmark: Any, feature: Any, yaw: float) -> bool:
-    """Return whether an unknown feature may be a landmark: the parts not measured are within the sensor's limits."""
+    """Return whether an unknown feature may be a landmark: unmeasured parts are within the sensor's limits."""
     dx, dy = landmark[0] - seen.x, landmark[1] - seen.y
     d = mp.sqrt(dx * dx + dy * dy)
     if (p.sigma_range is None or feature[0] is None) and d > p.range_max:
@@ -123,7 +123,7 @@ def log(p: Any) -> float:
 
 @dataclass(frozen=True)
 class World:
-    """Holds sensors, landmarks, features and their turns as exact numbers."""
+    """Sensors, landmarks, features and their turns as exact numbers."""
 
     seen: list[Seen]
     landmarks: list[Any]
@@ -133,7 +133,7 @@ class World:
 
 
 def exact_inputs(model: gs.LandmarkModel, poses: Any, features: Any, *, rounded: bool = True) -> World:
-    """Return the kernels' inputs of a call, or with rounded=False the caller's."""
+    """Return a call's inputs of the kernels, or the caller's with rounded=False."""
     lm, yaw = model.landmarks, model.mount[2]
     given = np.full((len(features), 3), np.nan)
     given[:, : np.shape(features)[1]] = features
@@ -193,7 +193,7 @@ def table(model: gs.LandmarkModel, world: World) -> Table:
 
 
 def likelihoods(model: gs.LandmarkModel, tabled: Table, correspondence: Any = None) -> np.ndarray:
-    """Return (N, F) float64 log p of each feature alone, which excludes a joint association."""
+    """Return (N, F) float64 log p of each feature, without joint association."""
     p, (densities, false, _) = model.parameters, tabled
     detect, miss = mp.mpf(p.z_detect), mp.mpf(p.z_false)
     found = np.empty((len(densities), len(false)))
@@ -215,7 +215,7 @@ def joint(model: gs.LandmarkModel, tabled: Table) -> np.ndarray:
     detect, miss = mp.mpf(p.z_detect), mp.mpf(p.z_false)
     found = np.full(len(densities), -np.inf)
     for n, rows in enumerate(densities):
-        # The terms of each feature: as a false positive, and as each possible landmark.
+        # Terms of each feature: as a false positive, and as each possible landmark.
         options = [
             [(-1, log(miss * none))] + [(j, log(detect * d + miss * none)) for j, (d, may) in enumerate(row) if may]
             for row, none in zip(rows, false, strict=True)

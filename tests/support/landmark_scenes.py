@@ -14,7 +14,7 @@ NAN = np.nan
 
 @dataclass(frozen=True)
 class Scene:
-    """Holds parameters that differ from the defaults, the model's options, and the unmeasured parts of features."""
+    """Parameters other than the defaults, the model's options, and unmeasured parts of features."""
 
     parameters: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
@@ -56,7 +56,7 @@ def make(name: str) -> tuple[gs.LandmarkMap, gs.LandmarkParameters, np.ndarray, 
     rng = np.random.default_rng(len(name))
     parameters = gs.LandmarkParameters(**scene.parameters)
     mx, my, yaw = scene.options.get("mount", (0.0, 0.0, 0.0))
-    # The sensor at the origin, looking along x, so that landmark 4 is seen across +-pi.
+    # The sensor at the origin looks along x and sees landmark 4 across +-pi.
     c, s = np.cos(-yaw), np.sin(-yaw)
     pose = np.array([-(c * mx - s * my), -(s * mx + c * my), -yaw])
     noise = [sigma if sigma is not None and sigma < 1 else 0.1 for sigma in

@@ -1,4 +1,4 @@
-"""Readings to learn from, and problems of them."""
+"""Readings for learning, and problems made from them."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from gpusense.world.frames import place_poses, split
 
 mp.mp.dps = 40
 
-# A room; a wall 10 cm before its upper one; a line through the sensor; a short wall far behind the other ones.
+# A room; a wall 10 cm in front of its upper wall; a line through the sensor; a short wall far behind.
 SEGMENTS = np.array([
     (-3, -2, 5, -2), (5, -2, 5, 4), (5, 4, -3, 4), (-3, 4, -3, -2), (1, 3.9, -1, 3.9), (-1, -1, 1, 1), (8, 0, 8, 1),
 ], float)  # fmt: skip
@@ -27,7 +27,7 @@ KNOWN = (0, 0, -1, 4, 2, 3)
 
 @dataclass(frozen=True)
 class Scene:
-    """Holds parameters that differ from the defaults, the model's options, and the map's place in the world."""
+    """Parameters other than the defaults, the model's options, and the map's pose in the world."""
 
     parameters: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
@@ -91,7 +91,7 @@ def seen_line(wall: int, first: float, second: float) -> list[float]:
 
 @dataclass(frozen=True)
 class World:
-    """Holds sensors (x, y, cosine, sine), walls (middle, normal, half length), normals of features: exact numbers."""
+    """Sensors (x, y, cosine, sine), walls (middle, normal, half length) and normals of features as exact numbers."""
 
     sensors: list[Any]
     walls: list[Any]
@@ -104,7 +104,7 @@ def exact(values: Any, low: Any = 0.0) -> list[Any]:
 
 
 def inputs(model: gs.LineModel, poses: np.ndarray, features: np.ndarray) -> World:
-    """Return the kernels' inputs, so that only their arithmetic is judged, and not the rounding of positions."""
+    """Return the kernels' inputs, to judge only their arithmetic and not the rounding of positions."""
     buckets, real = model._buckets, model._real
     at_poses = place_poses(poses, buckets, model.mount, real)
     sensors = []
@@ -139,7 +139,7 @@ def as_given(model: gs.LineModel, poses: np.ndarray, features: np.ndarray) -> Wo
 
 
 def expected(wall: Any, two_sided: bool, sensor: Any, turned: Any) -> tuple[Any, Any, Any, Any]:
-    """Return the angle of a feature from a wall's, the wall's distance, and the places of its ends along it."""
+    """Return the angle of a feature relative to a wall, the wall's distance, and the positions of its ends."""
     (x, y), (nx, ny), half = wall
     fx, fy = sensor[2] * turned[0] - sensor[3] * turned[1], sensor[3] * turned[0] + sensor[2] * turned[1]
     if two_sided and nx * fx + ny * fy < 0:
@@ -166,7 +166,7 @@ def density(p: gs.LineParameters, wall: Any, two_sided: bool, feature: np.ndarra
 
 
 def overlaps(wall: Any, feature: np.ndarray) -> bool:
-    """Return whether the feature, projected on the wall, has a point in common with it."""
+    """Return whether the feature, projected on the wall, overlaps it."""
     if len(feature) == 2:
         return True
     f = [mp.mpf(float(v)) for v in feature]
@@ -195,7 +195,7 @@ def table(model: gs.LineModel, world: World, features: np.ndarray) -> list[list[
 
 
 def likelihoods(model: gs.LineModel, tabled: Any, correspondence: Any = None) -> np.ndarray:
-    """Return (N, F) log p of each feature alone."""
+    """Return (N, F) log p of each feature."""
     p = model.parameters
     false = mp.mpf(p.z_false) / (2 * mp.pi * mp.mpf(p.range_max))
     found = np.empty((len(tabled), len(tabled[0])))
@@ -210,7 +210,7 @@ def likelihoods(model: gs.LineModel, tabled: Any, correspondence: Any = None) ->
 
 
 def joint(model: gs.LineModel, tabled: Any, apart: Any) -> np.ndarray:
-    """Return (N,) log p of the likeliest joint association by trying all; ``apart`` tells which pairs may share."""
+    """Return (N,) log p of the likeliest joint association by trying all; ``apart`` marks pairs that may share."""
     p = model.parameters
     false = mp.mpf(p.z_false) / (2 * mp.pi * mp.mpf(p.range_max))
     found = np.full(len(tabled), -np.inf)

@@ -1,6 +1,6 @@
 """A shape of hits that is not in the package: Student's t with 3 degrees of freedom, 1.7 times as wide.
 
-``same`` describes the same density by a shape of the package, so every user of densities must give equal results.
+``same`` describes the same density by a shape of the package: every user of densities must return equal results.
 """
 
 from __future__ import annotations

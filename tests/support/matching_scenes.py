@@ -11,7 +11,7 @@ FRONT = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / 180, co
 
 
 def segments_scan(segments: np.ndarray, pose: tuple[float, float, float], scanner: gs.Scanner) -> np.ndarray:
-    """Return exact ranges to (M, 4) wall segments x1 y1 x2 y2, infinite where a beam meets none."""
+    """Return exact ranges to (M, 4) wall segments x1 y1 x2 y2, infinite for beams that miss."""
     angle = scanner.bearings + pose[2]
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)[:, None]
     start, along = segments[None, :, :2] - np.array(pose[:2]), segments[None, :, 2:] - segments[None, :, :2]

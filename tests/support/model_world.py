@@ -44,7 +44,7 @@ def make(kind: str, grid: gs.OccupancyGrid, backend: Any, bearings: np.ndarray =
 
 
 def parts_of_kind(model: object, kind: type) -> list[Any]:
-    """Return all objects of a class that a model or its caster owns."""
+    """Return all objects of a class owned by a model or its caster."""
     owners = [model, *(getattr(model, name) for name in ("_caster", "_pipeline") if hasattr(model, name))]
     owned = {id(value): value for owner in owners for value in vars(owner).values()}
     return [value for value in owned.values() if isinstance(value, kind)]

@@ -1,7 +1,6 @@
-"""Truths that share no code and no formula with the library: frames, densities at 60 digits, end points.
-
-Every oracle implements the definition of a model from scratch, slowly and plainly. mpmath evaluates densities, and
-``ray_oracles`` walks rays; nothing here imports ``gpusense``.
+"""Truths without any code or formula of the library: frames, densities at 60 digits, end points. Every oracle
+implements the definition of a model plainly and slowly. mpmath evaluates densities, and ``ray_oracles`` walks rays;
+nothing here imports ``gpusense``.
 """
 
 from __future__ import annotations
@@ -24,7 +23,8 @@ mp.mp.dps = 60
 def placed(
     pose: Sequence[float], origin: Sequence[float], resolution: float, mount: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> tuple[Any, Any, Any, Any]:
-    """Return the sensor's x, y in cells and its heading's cosine and sine in the grid's frame, without mount's yaw."""
+    """Return the sensor's x, y in cells and its heading's cosine and sine in the grid's frame, without the mount's
+    yaw."""
     x, y, theta = (mp.mpf(float(v)) for v in pose)
     ox, oy, yaw = (mp.mpf(float(v)) for v in origin)
     mx, my = mp.mpf(float(mount[0])), mp.mpf(float(mount[1]))
@@ -56,7 +56,7 @@ class Mixture:
 
     @classmethod
     def of(cls, parameters: Any, range_max: float) -> Mixture:
-        """Return the mixture of any object with attributes of the parameters' names."""
+        """Return the mixture of any object with the parameters as attributes."""
         p = parameters
         return cls(p.z_hit, p.z_short, p.z_max, p.z_rand, p.sigma_hit, p.lambda_short, range_max)
 
@@ -92,7 +92,7 @@ class Mixture:
         return mp.log(p) if p else -mp.inf
 
     def log_densities(self, z: np.ndarray, expected: np.ndarray) -> np.ndarray:
-        """Return log densities in float64 for ordinary parameters: rate > 0, and neither a tiny nor a huge sigma."""
+        """Return log densities in float64 for ordinary parameters: rate > 0, and a moderate sigma."""
         hit = norm.pdf(z, expected, self.sigma) / (
             norm.cdf(self.range_max, expected, self.sigma) - norm.cdf(0, expected, self.sigma)
         )

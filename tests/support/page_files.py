@@ -1,4 +1,4 @@
-"""Files of pages that no command of the package makes: a bag with two lasers."""
+"""Files of pages that no command makes: a bag with two lasers."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Run the blocks of a documentation page in order, in a temporary folder.
 
-Python blocks share a namespace. Shell blocks with a command of gpusense run in this process; blocks that install
-or start other programs do not. A YAML block whose first line is ``# name.yaml`` is written as that file. Comments of
+Python blocks share a namespace. Shell blocks with a command of gpusense run in this process; blocks that install or
+start other programs are skipped. A YAML block whose first line is ``# name.yaml`` is written as that file. Comments of
 Markdown hold hidden blocks, ``<!-- invisible-code-block: python`` or ``sh``, and ``<!-- skip: next "reason" -->``, as
 Sybil has them.
 """
@@ -27,7 +27,7 @@ _FILE = re.compile(r"# (\w[\w.-]*\.ya?ml)\b")
 
 @dataclass
 class PageRun:
-    """Counts the visible blocks of a page that ran and that were skipped."""
+    """Number of visible blocks of a page that ran, and that were skipped."""
 
     ran: int = 0
     skipped: int = 0
@@ -73,7 +73,7 @@ def parsed(page: Path) -> Document:
 
 
 def visible(example: Example) -> bool:
-    """Return whether an example is a visible block that is to run."""
+    """Return whether an example is a visible block to run."""
     text = example.document.text[example.region.start : example.region.end]
     return re.match(r"\s*(`{3,}|~{3,})(python|sh)\b", text) is not None
 

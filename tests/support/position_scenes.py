@@ -1,4 +1,4 @@
-"""Beacons, a robot among them, and its measurements of them without noise."""
+"""Beacons, a robot among them, and noiseless measurements."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ POSE = np.array([2.5, 3.1, 2.9])
 
 @dataclass(frozen=True)
 class Case:
-    """Holds a public function and the number of its beacons; ``heading`` says whether it gets the heading."""
+    """A public function and its number of beacons; ``heading`` is True if it gets the heading."""
 
     name: str
     kind: str
@@ -23,7 +23,7 @@ class Case:
     heading: bool = False
 
     def solve(self, xy, values, theta=0.0, **options) -> gs.PositionFix:
-        """Return the fix; values are ranges, bearings, or both one after the other, with their deviations."""
+        """Return the fix; values are ranges, bearings, or both in sequence, with their deviations."""
         known = theta if self.heading else None
         if self.kind == "ranges":
             return gs.trilaterate(xy, values, **options)

@@ -31,7 +31,7 @@ class Call(NamedTuple):
 
 
 def scene() -> SimpleNamespace:
-    """Return small objects that the arguments are made of."""
+    """Return small objects for arguments."""
     cells = np.zeros((40, 50), np.int8)
     cells[[0, -1], :] = cells[:, [0, -1]] = 100
     cells[12:18, 30:34] = 100
@@ -397,7 +397,7 @@ def _add_matching(s: SimpleNamespace, add: Any, made: Any) -> None:
 
 
 def _add_files(s: SimpleNamespace, add: Any) -> None:
-    """Add calls that read and write files of a folder that goes when the process ends."""
+    """Add calls that read and write files in a temporary folder of the process."""
     folder = Path(_FOLDER.name)
     gs.write_map(s.grid, folder / "map.yaml")
     readings = " ".join(f"{z:.3f}" for z in s.scan)

@@ -17,7 +17,7 @@ Number = int | float | Fraction
 
 @dataclass(frozen=True)
 class Ray:
-    """Holds a ray in cell units: the origin's cell and its fraction, a direction, and its limit."""
+    """A ray in cell units: the origin's cell and its fraction, a direction, and a limit."""
 
     cell: tuple[int, int]
     frac: tuple[Number, Number]
@@ -35,7 +35,7 @@ class Ray:
 
 
 def _gone(index: int, step: int, size: int) -> bool:
-    """Return whether an index outside [0, size) moves farther away."""
+    """Return whether an index outside [0, size) moves away."""
     return (index < 0 and step < 0) or (index >= size and step > 0)
 
 
@@ -75,14 +75,14 @@ def fraction_walk(occupied: np.ndarray, ray: Ray, outside_occupied: bool = False
 
 @dataclass(frozen=True)
 class Hit:
-    """Holds the end of a walk: the distance (correctly rounded), and the face: cell, and the axis that was stepped."""
+    """End of a walk: the correctly rounded distance, and the face: cell and axis of the last step."""
 
     t: float
     face: tuple[int, int, str] | None
 
 
 def walk(occupied: Sequence[Sequence[bool]], ray: Ray, outside_occupied: bool = False) -> Hit:
-    """Return the end of an equally exact walk in integers, ten times as fast; a test compares both with
+    """Return the end of an equally exact walk in integers, ten times as fast; a test compares it with
     ``fraction_walk``.
 
     For fractions a / one and directions d / unit, boundary k is at (k * one + a) * unit / (one * d).
@@ -135,8 +135,8 @@ def backward_error_is_small(
 ) -> bool:
     """Return whether a ray with its origin moved by at most ``move`` and turned by ``turn`` has a given range.
 
-    Walk the rays on both sides of the ray. On one face the range varies continuously with the ray, so any value
-    between two rays that end on the same face belongs to a ray between them.
+    Walk the rays on both sides. On a face the range varies continuously with the ray, so any value between two rays
+    that end on the same face belongs to a ray between them.
     """
     dx, dy = float(ray.direction[0]), float(ray.direction[1])
     faces: dict[Any, list[float]] = {}

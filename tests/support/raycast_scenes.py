@@ -17,14 +17,14 @@ from gpusense.tables.rectangles import Planes, empty_rectangles
 LAST_FLOAT32 = 1 - 2.0**-24
 FRACTIONS = (0.0, 0.25, 0.5, 0.75, LAST_FLOAT32)
 PRECISIONS = ("float64", "float32")
-# Tolerances of float32 in cells, cells and radians; those of float64 are near its rounding.
+# Tolerances of float32 in cells, cells and radians; tolerances of float64 are near its rounding.
 FLOAT32_CELLS, FLOAT32_MOVE, FLOAT32_TURN = 1e-3, 1e-4, 1e-6
 FLOAT64_RELATIVE, FLOAT64_MOVE, FLOAT64_TURN = 1e-12, 1e-13, 1e-15
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Holds rays in cell units. Every number is a float32, so both precisions have the same inputs."""
+    """Rays in cell units; every number is a float32, so that both precisions have the same inputs."""
 
     occupied: np.ndarray
     cell: np.ndarray
@@ -106,7 +106,7 @@ def unit(angle: np.ndarray) -> np.ndarray:
 
 
 def random_scenes(rng: np.random.Generator) -> list[Scene]:
-    """Yield scenes of any kind, origins outside included."""
+    """Yield scenes of any kind, including origins outside."""
     scenes = []
     for number in range(10):
         occupied = some_map(rng)
@@ -119,7 +119,8 @@ def random_scenes(rng: np.random.Generator) -> list[Scene]:
 
 
 def lattice_scenes(rng: np.random.Generator) -> list[Scene]:
-    """Yield origins on edges and corners, directions of small rational slope: many rays run exactly through corners."""
+    """Yield origins on edges and corners, and directions of small rational slope: many rays pass exactly through
+    corners."""
     scenes = []
     for number in range(10):
         occupied = some_map(rng)
@@ -133,7 +134,7 @@ def lattice_scenes(rng: np.random.Generator) -> list[Scene]:
 
 
 def axis_scenes(rng: np.random.Generator) -> list[Scene]:
-    """Yield rays along the axes, on edges and off them, also with a direction component of -0."""
+    """Yield rays along the axes, on and off edges, also with a direction component of -0."""
     scenes = []
     for number in range(6):
         occupied = some_map(rng)
@@ -145,7 +146,7 @@ def axis_scenes(rng: np.random.Generator) -> list[Scene]:
 
 
 def diagonal_scenes(rng: np.random.Generator) -> list[Scene]:
-    """Yield exactly 45 degrees and slopes of a power of two, in maps of walls that touch at corners only."""
+    """Yield exactly 45 degrees and slopes of a power of two, in maps of walls that touch only at corners."""
     scenes = []
     for number in range(8):
         occupied = np.zeros((32, 32), bool)
@@ -207,7 +208,7 @@ def limit_scenes(rng: np.random.Generator) -> list[Scene]:
 
 
 def corner_scenes(rng: np.random.Generator) -> list[Scene]:
-    """Yield rays aimed at corners of cells, within a few units of the last place of float32."""
+    """Yield rays aimed at corners of cells, within a few ulp of float32."""
     scenes = []
     for number in range(6):
         occupied = some_map(rng, 0.08, 30)

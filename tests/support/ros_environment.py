@@ -1,4 +1,4 @@
-"""Where tests inside ROS 2 run: in this environment, or in the one that ``.ci/ros`` makes."""
+"""The environment of tests inside ROS 2: this one, or the one that ``.ci/ros`` makes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import gpusense
 
 # Path of an environment that .ci/ros made.
 VARIABLE = "GPUSENSE_ROS"
-# The wheels of ROS run Python again with these; they must not reach other environments.
+# The wheels of ROS start Python with these variables; they must not reach other environments.
 BOOTSTRAP = ("LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")
 
 
@@ -35,7 +35,7 @@ def need_ros() -> None:
 
 
 def environment() -> dict[str, str]:
-    """Return the variables with which the other environment finds the packages of this one."""
+    """Return the variables for the other environment to find this one's packages."""
     kept = {name: value for name, value in os.environ.items() if name not in BOOTSTRAP}
     folders = [path for path in sys.path if path.endswith(("site-packages", "dist-packages"))]
     return kept | {"PYTHONPATH": os.pathsep.join([str(Path(gpusense.__file__).parents[1]), *folders])}

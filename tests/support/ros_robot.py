@@ -29,7 +29,7 @@ from tf2_msgs.msg import TFMessage
 
 import gpusense as gs
 
-# Longest wait for a condition [s]: far beyond what a busy machine takes.
+# Longest wait for a condition, even on a busy machine [s].
 PATIENCE = 90.0
 COUNT = 90
 TIMES = {"CONFIGURE": Transition.TRANSITION_CONFIGURE, "ACTIVATE": Transition.TRANSITION_ACTIVATE,
@@ -42,7 +42,7 @@ CELLS[[0, -1]] = CELLS[:, [0, -1]] = CELLS[:12, 25] = 100
 
 
 def wait_for(condition: Callable[[], Any], what: str) -> Any:
-    """Return the first true value of a condition; fail where none comes."""
+    """Return the first true value of a condition; fail without one."""
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         found = condition()
@@ -98,7 +98,7 @@ def started(log: Path, *arguments: str, **more: str) -> Iterator[Node]:
 
 
 class Robot:
-    """A node that is spun in a thread; ``got`` holds what came, by topic."""
+    """A node spun in a thread; ``got`` holds received messages by topic."""
 
     def __init__(self, namespace: str = "") -> None:
         self.context = rclpy.Context()
@@ -239,7 +239,7 @@ class Robot:
 def play(robot: Robot, folder: Path, rate: float, skip: tuple[str, ...] = (), most: int = 40) -> int:
     """Play a bag of ROS 2 at a rate, and return the number of its scans.
 
-    It waits while ``most`` scans have no pose yet, as on a busy machine.
+    Playing waits while ``most`` scans have no pose yet, as on a busy machine.
     """
     from rosbags.rosbag2 import Reader
 

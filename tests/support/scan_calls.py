@@ -1,4 +1,4 @@
-"""A small map, clouds and scans, and models whose calls cover every path of a call."""
+"""A small map, clouds and scans, and models that cover every path of a call."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ FIELDS = {
 
 
 def field_scene(name: str, real: type, *, all_readings: bool) -> dict[str, np.ndarray]:
-    """Return table, terms, poses and end points; many end points lie exactly on edges and corners of cells."""
+    """Return table, terms, poses and end points; many end points are exactly on edges and corners of cells."""
     occupied = GRIDS["rooms"]
     rng = np.random.default_rng(23)
     z_hit, z_rand, sigma, range_max = 0.9, (0.1 if "LINEAR" in FIELDS[name] else 1e-40), 0.2, LIMIT * RESOLUTION
@@ -179,7 +179,7 @@ def an_order(count: int) -> np.ndarray:
 
 
 def parts_at(parts: np.ndarray, count: int, each: int) -> np.ndarray:
-    """Return (count, each) parts, which lie together by reading."""
+    """Return (count, each) parts, contiguous by reading."""
     return parts[: count * each].reshape(each, count).T
 
 

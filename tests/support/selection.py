@@ -1,4 +1,4 @@
-"""Selection of the backends that tests run on; an absent one skips the test or fails it."""
+"""Select the backends of tests; an absent backend skips or fails a test."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from gpusense.backends import get_backend
 
-# Where tests run; on a machine with a GPU for instance GPUSENSE_TEST_BACKENDS=numpy,opencl,warp:cuda:0.
+# Backends of tests; with a GPU for example GPUSENSE_TEST_BACKENDS=numpy,opencl,warp:cuda:0.
 BACKENDS = os.environ.get("GPUSENSE_TEST_BACKENDS", "numpy,opencl,warp:cpu").split(",")
 
 # Errors of devices without float64.
@@ -24,19 +24,19 @@ def lacks_float64() -> bool:
 
 
 def required(feature: str) -> bool:
-    """Return whether GPUSENSE_REQUIRE, a comma-separated list, says that a feature must not be skipped."""
+    """Return whether GPUSENSE_REQUIRE, a comma-separated list, requires a feature."""
     return feature in [word.strip() for word in os.environ.get("GPUSENSE_REQUIRE", "").split(",")]
 
 
 def skip_or_fail(feature: str, reason: str) -> None:
-    """Skip the test, or fail it where the feature is required."""
+    """Skip the test, or fail it if the feature is required."""
     if required(feature):
         pytest.fail(reason)
     pytest.skip(reason)
 
 
 def present(selection: str) -> str:
-    """Return the tested selection string of a backend's name or selection; skip the test where it is absent."""
+    """Return the tested selection string of a backend's name or selection; skip the test if it is absent."""
     chosen = next((name for name in BACKENDS if name.split(":")[0] == selection), selection)
     try:
         get_backend(chosen)
@@ -46,7 +46,7 @@ def present(selection: str) -> str:
 
 
 def on_every_backend(*, on_warp: Callable[..., bool], **cases: Iterable[object]) -> pytest.MarkDecorator:
-    """Parametrize a test over backends and cases, on Warp only over some: it compiles each set of flags anew."""
+    """Parametrize a test over backends and cases; Warp, which compiles each set of flags, gets only some."""
     chosen = [
         (selection, *case)
         for selection, case in itertools.product(BACKENDS, itertools.product(*cases.values()))

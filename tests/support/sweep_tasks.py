@@ -36,7 +36,7 @@ def deadly(job, store):
 
 
 def slow(job, store):
-    """Append the seed to a file, and wait a little."""
+    """Append the seed to a file, and wait briefly."""
     with open(Path(job.option("folder")) / "runs", "a") as file:
         file.write(f"{job.seed}\n")
     time.sleep(job.option("seconds"))
@@ -93,7 +93,7 @@ def raised():
 
 
 def ending(job, store):
-    """End as the seed's option says, if there is one."""
+    """End by the seed's option, if set."""
     started(job)
     end = job.option(f"end{job.seed}")
     return {"value": ENDS[end]() if end else job.seed / 3}
@@ -107,7 +107,7 @@ def start_and_end(folder):
 
 
 def sent_text(name):
-    """Return the text of a file that was sent."""
+    """Return the text of a sent file."""
     from gpusense.sweeps.worker import _SENT
 
     return Path(_SENT[name]).read_text()

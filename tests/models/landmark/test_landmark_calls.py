@@ -26,7 +26,7 @@ IMPOSSIBLE = {
 @pytest.mark.parametrize("name", IMPOSSIBLE)
 @pytest.mark.parametrize("how", ["nearest", "joint", "negative"])
 def test_features_that_the_sensor_cannot_measure_are_left_out(name, how):
-    """Such a feature is missing, since live data must not stop a filter, and ``explain`` counts it."""
+    """Live data must not stop a filter: such a feature counts as missing, and ``explain`` counts it."""
     options = {"negative": True} if how == "negative" else {"association": how}
     model, poses, features = scenes.model("everything", "numpy", **options)
     with_it = np.insert(features, 2, IMPOSSIBLE[name], axis=0)
@@ -91,7 +91,7 @@ def test_poses_on_the_device_stay_there(name, warp_as_gpu, warp_copies, monkeypa
             found = call(given)
             assert type(found) is type(given)
             assert differing((found.held if wrap is Array else found).numpy(), truth) == 0
-            # Measurements go to the device, and the two numbers of the pose status come back.
+            # Only measurements go to the device, and only the two numbers of the pose status come back.
             assert [size for way, size in warp_copies if way == "down"] == [8]
             assert all(size <= 400 for _, size in warp_copies)
             assert call(given, out=out) is out

@@ -103,7 +103,7 @@ def test_features_as_the_caller_gave_them(backend, precision):
         model, oracle.table(model, oracle.exact_inputs(model, poses, features, rounded=False))
     )
     found = model.associate(poses, features)[1]
-    # float64 positions of up to 300 m, of which 16 eps are rounding; deviations are 0.2.
+    # float64 positions of up to 300 m, rounded by up to 16 eps; deviations are 0.2.
     allowed = (TOLERANCES["landmark"].value + (3e4 if precision == "float64" else 0)) * np.finfo(precision).eps
     assert (np.abs(found.astype(np.float64) - expected) <= allowed * (1 + np.abs(expected))).all()
 
@@ -115,7 +115,7 @@ def test_the_mixture_integrates_to_1(name, place):
     landmarks, p, _, _, options = scenes.make(name)
     model = gs.LandmarkModel(landmarks, p, backend="numpy", precision="float64", **{**options, "mount": (0, 0, 0)})
     half, (low, high), j = p.field_of_view / 2, model._sensor.span, 0 if place == (3.0, 1.0) else 2
-    # The landmark is a little to the left; at zero range it has no direction.
+    # Put the landmark a little to the left, since zero range has no direction.
     away = scenes.XY[j] - place
     d, b = np.hypot(*away), 0.1
     pose = [[*place, np.arctan2(away[1], away[0]) - b]]

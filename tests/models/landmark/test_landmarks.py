@@ -18,7 +18,7 @@ FLOAT64 = dict(precision="float64")
 
 
 def forest(count: int, side: float, seed: int = 5) -> tuple[gs.LandmarkMap, np.ndarray, np.ndarray]:
-    """Return landmarks evenly spread, poses all over them, and the features seen from the middle."""
+    """Return evenly spread landmarks, poses among them, and the features seen from the middle."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-side / 2, side / 2, (count, 2))
     poses = np.concatenate(
@@ -178,7 +178,7 @@ def test_laws(backend, precision):
         turn = np.array([[c, s], [-s, c]])
         moved = np.concatenate([poses[:, :2] @ turn + shift, poses[:, 2:] + angle], axis=1)
         other = gs.LandmarkModel(gs.LandmarkMap(scenes.XY @ turn + shift), **own)
-        near = np.arange(len(poses)) != 1  # The pose is on a landmark; the turned one may be a little off.
+        near = np.arange(len(poses)) != 1  # The pose is on a landmark; after the turn it may be slightly off.
         apart = np.abs(other.log_likelihood(moved, features) - found)
         assert (apart <= eps + lost * (1 + np.abs(found)))[near].all()
     around = features + np.array([0, 2 * np.pi])
@@ -248,7 +248,7 @@ def test_wrong_signatures_are_other_landmarks(backend):
 
 @on_every_backend(on_warp=lambda false: False, false=(0.05, 0.0))
 def test_a_particle_has_the_same_bits_among_any_others(backend, false):
-    """Particles that are computed together visit the same landmarks only where they are near each other."""
+    """Only nearby particles of a group visit the same landmarks."""
     landmarks, _, features = forest(800, 110.0)
     rng = np.random.default_rng(3)
     near, far = rng.normal(0, (0.3, 0.3, 0.1), (40, 3)), rng.uniform(-50, 50, (60, 3))
@@ -266,7 +266,7 @@ def test_a_particle_has_the_same_bits_among_any_others(backend, false):
 
 @pytest.mark.parametrize("association", ["nearest", "sum"])
 def test_100_000_landmarks_by_brute_force(needs, association):
-    """The omitted landmarks of a large map affect no feature: plain NumPy computes the definition over all of them."""
+    """Omitted landmarks of a large map affect no feature: compare with the definition over all landmarks in NumPy."""
     landmarks, poses, features = forest(100_000, 1265.0)
     poses, features = poses[::4], features[:, :2]
     p = gs.LandmarkParameters()
@@ -281,7 +281,7 @@ def test_100_000_landmarks_by_brute_force(needs, association):
         for z, bearing in features:
             turn = (bearing - b + np.pi) % (2 * np.pi) - np.pi
             density = np.exp(-0.5 * ((z - d) / p.sigma_range) ** 2 - 0.5 * (turn / p.sigma_bearing) ** 2)
-            # Mass of a range on [0, range_max], for farther landmarks of one there; a bearing's is nearly 1.
+            # Mass of a range on [0, range_max], clamped for farther landmarks; a bearing's mass is nearly 1.
             near = np.minimum(d, p.range_max) / p.sigma_range
             mass = ndtr(near) - ndtr(near - p.range_max / p.sigma_range)
             density /= 2 * np.pi * p.sigma_range * p.sigma_bearing * mass

@@ -1,4 +1,4 @@
-"""Association at ground-truth poses of a recorded robot, which knows the landmarks by their barcodes (UTIAS MRCLAM)."""
+"""Association at ground-truth poses of a recorded robot that identifies landmarks by barcodes (UTIAS MRCLAM)."""
 
 from __future__ import annotations
 
@@ -46,6 +46,6 @@ def test_the_likeliest_landmark_is_the_one_of_the_barcode(data_dir, needs, robot
     alone = np.array([
         model.log_likelihood(poses[keep][[n]], features[keep][[n]], known[[n]])[0] for n in range(0, len(known), 40)
     ])  # fmt: skip
-    # Where the barcode's landmark is the likeliest one, the barcode adds no information.
+    # If the barcode's landmark is the likeliest, the barcode adds no information.
     agree = (which == known)[::40]
     np.testing.assert_allclose(alone[agree], parts[::40][agree], rtol=1e-5, atol=1e-5)

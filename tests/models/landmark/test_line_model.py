@@ -65,7 +65,7 @@ def test_lines_as_the_caller_gave_them(name):
 @pytest.mark.sampled(0.5)
 @on_every_backend(on_warp=lambda precision: precision == "float32", precision=PRECISIONS)
 def test_joint_association_tries_all(backend, precision):
-    """Lines 0 and 1 are pieces of one wall, and may share it; a shifted copy of line 0 overlaps it, and may not."""
+    """Lines 0 and 1 are pieces of a wall and may share it; a shifted copy of line 0 overlaps line 0 and may not."""
     model, poses, features = oracle.make("no covariance", backend, precision=precision, association="joint")
     copy = features[0] + (0.001, 0.01, 0, 0)
     features = np.vstack([features[[0, 1, 3, 5]], copy])
@@ -89,7 +89,7 @@ def test_overlapping_lines_by_way_of_others_have_one_group():
 @pytest.mark.parametrize("far", [(0.0, 3.0), (0.05, 3.0), (4.0, 8.0)])
 @pytest.mark.parametrize(("lever", "two_sided"), [(0.0, True), (6.0, True), (6.0, False)])
 def test_the_mixture_integrates_to_1(far, lever, two_sided):
-    """The integral is over all angles and distances to a known wall: near the sensor, far from it, off its foot."""
+    """Integrate over all angles and distances to a known wall: near the sensor, far away, off its foot."""
     distance, range_max = far
     p = gs.LineParameters(sigma_angle=0.15, sigma_distance=0.4, range_max=range_max)
     model = gs.LineModel(gs.LineMap([(9, distance, -9, distance)], two_sided), p, backend="numpy", precision="float64")
@@ -104,7 +104,7 @@ def test_the_mixture_integrates_to_1(far, lever, two_sided):
 
 
 def test_angles_wrap_and_sides_count():
-    """Headings of many turns and angles beyond pi are the same; a wall with one side is not seen from behind."""
+    """Headings of many turns and angles beyond pi are equivalent; a one-sided wall is invisible from behind."""
     model = gs.LineModel(gs.LineMap([(-5, 2, 5, 2), (-5, -2, 5, -2)], [False, True]), backend="numpy")
     # The upper wall is visible only from above, here from (0, 4); the lower one from both sides.
     poses = [(0, 4, 0), (0, 4, 200 * np.pi), (0, 0, 0), (0, -4, 0), (0, 0, np.pi)]
@@ -127,7 +127,7 @@ def test_a_line_through_the_sensor_has_two_forms():
 
 
 def test_parallel_walls_10_cm_apart_are_distinguished_where_both_are_seen():
-    """The nearer of two faces is in front for x > 0 only; past its end the farther one is seen."""
+    """The nearer of two faces is in front only for x > 0; past its end the farther one is visible."""
     model = gs.LineModel(gs.LineMap([(-5, 2.1, 5, 2.1), (0, 2, 5, 2)]), gs.LineParameters(sigma_distance=0.015),
                          backend="numpy")  # fmt: skip
     lines = [(np.pi / 2, 2.1, 0.3, 3.0), (np.pi / 2, 2.0, -3.0, -0.3)]
@@ -173,7 +173,7 @@ def test_drawn_lines_have_the_covariance_of_the_density():
     p = gs.LineParameters(sigma_angle=0.02, sigma_distance=0.05, z_detect=1.0, z_false=0.0, p_detect=1.0, range_max=10)
     model = gs.LineModel(gs.LineMap([(4, 3, 20, 3), (-2, -1, 2, -1), (2, -2, -2, -2)], False), p, backend="numpy")
     z = model.sample(np.tile([(0, 0, 0.5)], (20000, 1)), seed=3)
-    # The first two are free above, the last one below: the robot is above two of them.
+    # The first two are free above, the last one below: the robot is above two walls.
     assert np.isnan(z[:, 0]).all() and np.isnan(z[:, 2]).all() and np.isfinite(z[:, 1]).all()
     turned = gs.LineModel(gs.LineMap([(20, 3, 4, 3)], False), p, backend="numpy")
     z = turned.sample(np.tile([(0, 0, 0.5)], (20000, 1)), seed=3)[:, 0]

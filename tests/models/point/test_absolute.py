@@ -32,7 +32,7 @@ from gpusense.models.point.bumper import sample_outline
 
 
 def brute_force(pose, points, radius, pressed, p, *, unknown="free", outside="free"):
-    """Return log P of one segment; nan if a point is too near an edge to belong to one cell for certain."""
+    """Return log P of one segment; nan if a point is so near an edge that its cell is uncertain."""
     pad = 30
     occupied = (CELLS >= 65) | ((CELLS == -1) if unknown == "occupied" else False)
     squared = squared_distances(np.pad(occupied, pad, constant_values=outside == "occupied"))
@@ -115,7 +115,7 @@ def test_a_robot_that_nears_a_wall(backend: str) -> None:
     pressed = np.exp(gs.BumperModel(grid, 0.3, p, backend=backend).log_likelihood(poses, True))
     assert (np.diff(pressed) >= 0).all()
     np.testing.assert_allclose(pressed[[0, -1]], [0.02, 0.9], rtol=1e-5)
-    # The wall begins at 3.0 m; where the circle touches it, half of the bumpers do.
+    # The wall begins at 3.0 m; half of the bumpers touch it when the circle does.
     at = int(np.argmin(abs(x + 0.3 - 3.0)))
     gap = 3.0 - 0.3 - x[at]
     assert abs(gap) < 0.026 and (pressed[at - 2] < 0.05) and (pressed[at + 2] > 0.85)
@@ -167,7 +167,7 @@ def test_batches_order_and_repetition_change_no_bit(backend: str, precision: str
 
 
 def test_poses_that_the_host_places_have_the_same_bits(backend: str) -> None:
-    """Devices without float64 get places and residuals from the host."""
+    """The host computes places and residuals for devices without float64."""
     poses = poses_around(GRID)
     device = get_backend(backend)
     before = device.info

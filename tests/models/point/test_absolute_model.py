@@ -38,12 +38,12 @@ def test_temperature_multiplies_the_sum(backend):
 
 
 def with_rand(kernel, flags, size, **arguments):
-    """Return a launch whose code has the outliers' component."""
+    """Return a launch with code for outliers."""
     return launch(kernel, frozenset(flags) | {"RAND"}, size, **arguments)
 
 
 def test_without_outliers_the_code_for_them_changes_no_bit(backend, monkeypatch):
-    """RAND with a weight of 0 adds exactly 0: code without it has the same numbers."""
+    """RAND with a weight of 0 adds exactly 0: code without RAND returns the same numbers."""
     given = {
         "position": (gs.PositionModel(gs.PositionParameters(sigma=1.0), backend=backend), ((5e6, -1.0),)),
         "heading": (gs.HeadingModel(backend=backend), (2.0,)),
@@ -61,7 +61,7 @@ def test_without_outliers_the_code_for_them_changes_no_bit(backend, monkeypatch)
 
 @pytest.mark.parametrize("z", [-0.001, 20.001, INF, -INF, NAN])
 def test_ranges_that_no_radio_reports_are_left_out(backend, z):
-    """Live data must not stop a filter, and a factor of 0 at every pose carries no information."""
+    """Live data must not stop a filter, and a factor of 0 at every pose is no information."""
     xy = [(5e6, 0.0), (5e6 + 9, 3.0)]
     model = gs.BeaconModel(xy, gs.BeaconParameters(range_max=20.0), backend=backend)
     alone = model.log_likelihood(POSES, [4.0], [1])
@@ -133,7 +133,8 @@ def test_explain_names_what_is_left_out():
 
 
 def test_the_heading_that_explain_names_is_where_other_turns_begin_to_count():
-    """By mpmath, turns omitted up to there add less than eps; at sigma = 0.6 it is 2.3 rad from half a turn."""
+    """By mpmath, omitted turns up to this heading add less than eps; it is 2.3 rad from half a turn at sigma =
+    0.6."""
     p = gs.HeadingParameters(sigma=0.6)
     model = gs.HeadingModel(p, backend="numpy", precision="float64")
     edge = np.pi - float(left_out(model)["other turns"].split("pi - ")[1].split(" ")[0])

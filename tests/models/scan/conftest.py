@@ -14,7 +14,7 @@ from gpusense.backends.base import Adopted
 
 @pytest.fixture
 def batching(needs, monkeypatch):
-    """Return a backend with batches, and a list that grows with each start of a graph."""
+    """Return a backend with batches, and a list that records each start of a graph."""
     needs("warp")
     import warp as wp
 
@@ -27,7 +27,7 @@ def batching(needs, monkeypatch):
     monkeypatch.setattr(device, "_graphs", GraphCache(device._device))
     started, launch = [], wp.capture_launch
     monkeypatch.setattr(wp, "capture_launch", lambda *given: started.append(launch(*given)))
-    # Libraries of earlier tests in this process may have left threads.
+    # Earlier tests' libraries may have left threads in this process.
     earlier, everything = {*threading.enumerate()} - {threading.current_thread()}, threading.enumerate
     monkeypatch.setattr(threading, "enumerate", lambda: [one for one in everything() if one not in earlier])
     return device, started

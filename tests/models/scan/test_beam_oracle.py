@@ -33,7 +33,7 @@ RANGE_MAX = (1.0, 80.0)
 
 
 def readings_around(expected: float, p: gs.BeamParameters, range_max: float, real: np.dtype) -> np.ndarray:
-    """Return readings that matter for an expected range: the ends, z* and neighbours, deviations and decay lengths."""
+    """Return critical readings for an expected range: the ends, z* and neighbours, deviations and decay lengths."""
     top, last = real.type(range_max), np.nextafter(real.type(range_max), real.type(0))
     z = real.type(expected)
     beside = [0.0, z, np.nextafter(z, real.type(0)), np.nextafter(z, top), last, range_max / 3, expected / 2]
@@ -44,7 +44,7 @@ def readings_around(expected: float, p: gs.BeamParameters, range_max: float, rea
 
 
 def error_in_eps(found: float, mixture: Mixture, z: float, expected: float, eps: float) -> float:
-    """Return the error over eps (1 + |log p|); infinite where only one value is infinite, or on NaN."""
+    """Return the error over eps (1 + |log p|); infinite if only one value is infinite, or for NaN."""
     truth = exact_log_density(mixture, float(z), float(expected))
     if mp.isinf(truth) or not math.isfinite(found):
         return 0.0 if truth == -mp.inf and found == -math.inf else math.inf
@@ -56,7 +56,7 @@ def error_in_eps(found: float, mixture: Mixture, z: float, expected: float, eps:
 @on_every_backend(weights=WEIGHTS, on_warp=lambda weights: weights in ("all", "hit and short", "hardly any rand"))
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_mixture_on_a_stiff_grid(weights, precision, backend):
-    """The model scores poses in a corridor at chosen distances from its end, with all rays along it."""
+    """Score poses in a corridor at chosen distances from its end, with all rays along the corridor."""
     real = np.dtype(precision)
     cells = np.zeros((1, 64), int)
     cells[0, -1] = 100
@@ -89,7 +89,7 @@ def test_mixture_on_a_stiff_grid(weights, precision, backend):
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("weights", WEIGHTS)
 def test_reference_mixture_on_a_dense_grid(weights, precision):
-    """The reference's density is right for every expected range from 0 to range_max."""
+    """The reference's density is correct for every expected range from 0 to range_max."""
     real = np.dtype(precision)
     eps, grid = np.finfo(real).eps, gs.OccupancyGrid([[0]], 1.0)
     for range_max, sigma, rate in itertools.product((10.0,), SIGMAS, RATES):
@@ -110,7 +110,7 @@ def test_reference_mixture_on_a_dense_grid(weights, precision):
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_where_the_logarithm_cancels(precision):
-    """Bound the error of a log density near 0 relative to the large terms of which it is the difference."""
+    """Bound the error of a log density near 0, a difference of large terms, relative to these terms."""
     real, rng = np.dtype(precision), np.random.default_rng(3)
     eps, grid = np.finfo(real).eps, gs.OccupancyGrid([[0]], 1.0)
     for _ in range(100):

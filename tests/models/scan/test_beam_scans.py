@@ -104,7 +104,7 @@ def test_whole_scans(options, specialize, backend):
 
 
 def used_beams(beams: object, parts: np.ndarray, scan: list[float], range_min: float, z_max: float) -> list[int]:
-    """Return the beams that must count. The library chooses for ``beams=n``: n informative ones, evenly."""
+    """Return the beams that must count; ``beams=n`` chooses n informative beams evenly."""
     says = informative(scan, RANGE, range_min, z_max)
     if beams is None:
         return says
@@ -121,7 +121,7 @@ def used_beams(beams: object, parts: np.ndarray, scan: list[float], range_min: f
 
 
 def test_thinning_counts_informative_beams_only(backend):
-    """In a scan with two informative readings, beams=2 must find both, wherever they are."""
+    """If a scan has two informative readings, beams=2 must find both."""
     _, poses = room()
     scan = [NAN] * 10
     scan[3], scan[8] = 1.5, 2.5
@@ -174,7 +174,7 @@ def test_no_scans_beam_by_beam(backend):
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize(("count", "nats"), [(1000, 2e-3), (10_000, 1e-2), (100_000, 1e-1)])
 def test_sums_of_many_beams(count, nats, shared, precision, backend):
-    """Readings and ranges are the same rounded ones. Beyond 10 000 beams float32 has no stated error; it keeps 0.1."""
+    """Both sides use rounded readings and ranges. Beyond 10 000 beams float32 has no stated error; it keeps 0.1."""
     rng = np.random.default_rng(count)
     grid, poses = room()
     bearings = rng.choice(BEARINGS, count) if shared else rng.uniform(-np.pi, np.pi, count)

@@ -1,4 +1,4 @@
-"""Bound calls give the results of ``log_likelihood`` for the arrays' contents at the time of the call."""
+"""Bound calls return the results of ``log_likelihood`` for the arrays' contents at call time."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_bound_calls_that_add_up_strands(batching, monkeypatch):
 
 @pytest.mark.parametrize("kind", MODELS)
 def test_bearings_that_repeat_are_cast_one_by_one(kind, batching):
-    """The ordinary call sorts them by their rays, so sums differ in their order."""
+    """The ordinary call sorts beams by ray, so the sums have another order."""
     model = kind(GRID, gs.Scanner(np.repeat(np.linspace(-3, 3, 8), 3), RANGE, 0.3), backend=batching[0])
     poses, ranges = to_device(cloud(1)), to_device(mixed(4, 24))
     expected = model.log_likelihood(poses, ranges.numpy()).numpy()
@@ -69,7 +69,7 @@ def test_bearings_that_repeat_are_cast_one_by_one(kind, batching):
 
 @pytest.mark.parametrize("kind", MODELS)
 def test_a_map_that_changes(kind, batching):
-    """The table is updated or rebuilt, and the host's poses need only a part of it."""
+    """The table is updated or rebuilt, and host poses need only a part of it."""
     device, _ = batching
     model = kind(GRID, NEAR, backend=device)
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
@@ -130,7 +130,7 @@ def test_a_pose_that_is_not_finite_is_reported_by_check(value, batching):
     poses.assign(bad)
     call()
     poses.assign(cloud(1))
-    # It is reported once, although the last call had no such pose.
+    # The error is reported once, although the last call had no such pose.
     found = call().numpy()
     with pytest.raises(ValueError, match=r"^poses: must be finite, got a pose on the device that is not$"):
         call.check()

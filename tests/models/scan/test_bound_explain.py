@@ -1,4 +1,4 @@
-"""A bound call explains in one line how it is started, and why not as a graph."""
+"""A bound call explains in one line how it starts, and why it is no graph."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ONE_BY_ONE = "3 launches one by one: "
 
 
 def refusing(monkeypatch, error: str = "no graphs here") -> list[int]:
-    """Let the driver refuse every capture; return a list that grows with each try."""
+    """Let the driver refuse every capture; return a list that records each try."""
     import warp as wp
 
     tries: list[int] = []
@@ -106,7 +106,7 @@ def test_failures_in_a_row_end_all_captures_and_the_reason_is_kept(batching, mon
     assert len(tries) == 3 and device._graphs.refusal == reason
     assert [call.explain() for call in calls[2:]] == [ONE_BY_ONE + reason] * 3
     assert len(caplog.messages) == 3 and reason in caplog.messages[2]
-    # A graph that was captured before is still one start.
+    # A captured graph is still one start.
     count = len(started)
     before()
     assert len(started) == count + 1 and before.explain() == "one CUDA graph of 3 launches"
@@ -166,7 +166,7 @@ def test_devices_without_recordings_give_their_reason(batching, monkeypatch):
     assert ordinary(device, cloud(1), mixed(1)) == "the host places the poses, as the device has no float64"
     monkeypatch.setattr(device, "info", dataclasses.replace(info, graphs=False))
     assert ordinary(device, cloud(1), mixed(1)) == "warp:cpu starts launches fast enough without a recording"
-    # Arrays on a device that counts as a processor.
+    # Arrays on a device that passes as a processor.
     monkeypatch.setattr(device, "info", dataclasses.replace(info, kind="cpu"))
     monkeypatch.setattr(type(device), "reads", lambda self, array: True)
     assert ordinary(device, *arrays) == "processors score scans that the host prepares"

@@ -1,4 +1,4 @@
-"""Bound calls with arrays of the host, and of the host and the device, against ordinary ones."""
+"""Bound calls with arrays of the host, or of host and device, against ordinary calls."""
 
 from __future__ import annotations
 
@@ -51,7 +51,8 @@ def test_short_calls_of_the_host_are_one_graph(case, batching, monkeypatch):
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("case", CASES)
 def test_ordinary_calls_that_repeat_a_size(case, batching):
-    """They become one graph with the same bits, errors and reports; maps, tables, sizes and types may change."""
+    """Repeated calls become a graph with the same bits, errors and reports; maps, tables, sizes and types may
+    change."""
     device, started = batching
     model, plain = (CASES[case](backend=device) for _ in range(2))
     plain._short = None
@@ -81,7 +82,7 @@ def test_ordinary_calls_that_repeat_a_size(case, batching):
         model.log_likelihood(cloud(1), ranges, out=np.zeros(3, model.precision))
 
 
-# Limits that float32 rounds, one up and one down, and readings next to them.
+# Limits that float32 rounds up and down, and readings next to the limits.
 ROUNDED = gs.Scanner(np.linspace(-3, 3, BEAMS), 5.6, 0.06)
 BESIDE = np.array(
     [5.6, 0.06, np.nextafter(np.float32(5.6), np.float32(0)), 2.0, np.nextafter(np.float32(0.06), np.float32(0))]
@@ -91,7 +92,7 @@ BESIDE = np.array(
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 @pytest.mark.parametrize("kind", MODELS)
 def test_limits_are_rounded_as_readings_are(kind, real, batching):
-    """A driver's largest float32 reading is a max reading, however it reaches the device."""
+    """A driver's largest float32 reading is a max reading on every path to the device."""
     parameters = {BEAM: gs.BeamParameters(), FIELD: gs.LikelihoodFieldParameters(0.7, 0.2, 0.1)}[kind]
     model = kind(GRID, ROUNDED, parameters, backend=batching[0])
     poses, ranges = cloud(1), np.resize(BESIDE, BEAMS).astype(real)
@@ -140,7 +141,7 @@ def test_arrays_of_the_host_on_every_backend(kind, backend):
 
 @pytest.mark.parametrize("compat", [None, "amcl"])
 def test_calls_that_take_the_ordinary_path_on_a_device(compat, batching):
-    """Calls have poses or readings on the host, or weights for which the host prepares the readings."""
+    """Poses or readings are on the host, or the host prepares the readings for weights."""
     model = FIELD(GRID, NEAR, backend=batching[0], compat=compat)
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
     pairs = [(poses, mixed(1)), (cloud(1), ranges), *([(poses, ranges)] if compat else [])]

@@ -1,4 +1,4 @@
-"""Number of Python calls in a steady call of a device: each costs time, and the number has no noise."""
+"""Python calls in a steady call of a device: each costs time, and their number is exact."""
 
 from __future__ import annotations
 
@@ -20,24 +20,22 @@ SCANNER = gs.Scanner(np.linspace(-np.pi / 2, np.pi / 2, 60), range_max=9.0)
 POSE = np.array([4.0, 3.0, 0.3])
 RANGES = gs.RayCaster(GRID, 9.0, backend="numpy").cast(POSE[None], SCANNER.bearings)[0]
 PACKAGE = Path(gs.__file__).parent
-# Largest number of calls of Python functions, NumPy's included, with Python 3.11.
-# A step judges its pose, whether or not anybody asks for it.
+# Largest number of calls of Python functions, NumPy's included, with Python 3.11. A step always judges its pose.
 MOST_FIELD, MOST_BEAMS, MOST_STEP, MOST_BOUND = 80, 90, 225, 90
-# Most stays of a call in rooms of the package: successive calls in one room are one stay.
+# Most stays of a call in rooms of the package; successive calls in a room are one stay.
 MOST_STAYS = 22
 
 
 @pytest.fixture(autouse=True)
 def unwatched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Do not watch for the ends of launches, since the number of looks depends on the machine."""
+    """Do not poll for the ends of launches, since the number of polls depends on the machine."""
     if find_spec("pyopencl") is not None:
         monkeypatch.setattr("gpusense.backends.opencl.backend.watch", lambda event: None)
 
 
 def called_by(run: Callable[[], object]) -> list[CodeType]:
-    """Return the Python functions that a function calls, in order.
-
-    Finalizers of other tests' objects do not count, since garbage collection is off.
+    """Return the Python functions that a function calls, in order, without garbage collection of other tests'
+    objects.
     """
     called: list[CodeType] = []
     gc.disable()
@@ -89,7 +87,7 @@ def test_a_bound_call(needs):
 
 @pytest.mark.parametrize("recovery", [None, "sensor"])
 def test_a_step_of_a_filter(recovery, needs):
-    """The bound is for the median: some steps check whether particles lie together, learn the temperature, or judge."""
+    """The bound is for the median: some steps check the spread of particles, learn the temperature, or judge."""
     needs("opencl")
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend="opencl:pocl")
     pf = gs.ParticleFilter(model, particles=500, seed=1, recovery=recovery)

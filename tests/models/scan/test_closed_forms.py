@@ -37,14 +37,14 @@ def test_ranges_in_a_rectangle(frame, precision, backend):
         along_y = np.where(np.sin(angle) > 0, top - local[:, 1:2], bottom - local[:, 1:2]) / np.sin(angle)
     expected = np.minimum(along_x, along_y) * resolution
     found = caster.cast(poses, BEARINGS)
-    # In float64, world coordinates of 5e4 m have an absolute error of 1e-11 m, which a grazing ray magnifies.
+    # In float64, world coordinates of 5e4 m have an error of 1e-11 m; a grazing ray magnifies it.
     off = {"float32": 1e-3, "float64": 1e-7 if origin[2] else 1e-11}[precision] * resolution
     np.testing.assert_allclose(found, expected, rtol=1e-6 if precision == "float32" else 1e-12, atol=off)
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_ranges_in_a_disc_of_pixels(precision, backend):
-    """Cells with centres at least radius cells away are occupied, so entries are half a diagonal off at most."""
+    """Cells with centres at least radius cells away are occupied, so entries are off by at most half a diagonal."""
     radius, size = 150.0, 320
     centre = size / 2
     row, col = np.indices((size, size)) + 0.5
@@ -52,7 +52,7 @@ def test_ranges_in_a_disc_of_pixels(precision, backend):
     grid = gs.OccupancyGrid(cells, 0.1)
     caster = gs.RayCaster(grid, 40.0, backend=backend, precision=precision)
     rng = np.random.default_rng(4)
-    # From the middle all ranges are equal; from elsewhere they are secants.
+    # From the middle all ranges are equal; elsewhere they are secants.
     distance, turn = np.append(0.0, rng.uniform(0, 140, 40)), rng.uniform(-4, 4, 41)
     x, y = distance * np.cos(turn), distance * np.sin(turn)
     poses = np.stack([(centre + x) * 0.1, (centre + y) * 0.1, rng.uniform(-4, 4, 41)], axis=1)

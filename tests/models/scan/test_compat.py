@@ -1,4 +1,4 @@
-"""compat="amcl" and "beluga": their weights in scenes computed by hand, with special readings and edges of the map."""
+"""compat="amcl" and "beluga": weights in scenes computed by hand, with special readings and edges of the map."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def close(precision: str) -> dict[str, float]:
     ("peer", "readings", "kept"),
     [
         ("amcl", (5.5, 3.0, 2.9, 1.0), (5.5, 3.0, 2.9, 1.0)),
-        # Too close is a max reading; +inf adds 0, beyond range_max the hit alone; NaN is left out.
+        # A too short reading is a max reading; +inf adds 0, a reading beyond range_max only the hit; NaN is ignored.
         ("amcl", (0.5, INF, 13.0, NAN), (TOP, None, 13.0, None)),
         ("amcl", (12.5, INF, 13.0, 3.2), (12.5, None, 13.0, 3.2)),
         ("amcl", (-INF, TOP, 6.0, 6.0), (TOP, TOP, 6.0, 6.0)),

@@ -20,7 +20,7 @@ BOUND = 16  # eps (1 + |log p|)
 
 
 def exact_hit(z: float, expected: float, sigma: float, range_max: float) -> mp.mpf:
-    """Return the truncated normal, its normaliser the difference of the tails on the far side of z*, at 90 digits."""
+    """Return the truncated normal at 90 digits; the normaliser is the difference of the tails beyond z*."""
     with mp.workdps(90):
         z, expected, sigma, range_max = (mp.mpf(float(v)) for v in (z, expected, sigma, range_max))
         root = sigma * mp.sqrt(2)
@@ -46,7 +46,7 @@ def eps_off(found: float, truth: mp.mpf, precision: str) -> float:
 
 
 def worst_of(cases, ours, naive, exact, precision):
-    """Return our worst error, and the shares of cases in which the textbook's formula is not finite or wrong."""
+    """Return the worst error, and the shares of cases where the textbook's formula is not finite or wrong."""
     real, worst, lost, wrong = np.dtype(precision).type, (0.0, ()), 0, 0
     for case in cases:
         case = tuple(real(v) for v in case)
@@ -163,7 +163,7 @@ def test_mixture_of_one_component_is_that_component_and_nothing_is_nan():
 
 
 def test_mixture_is_the_mixture_of_the_kernels():
-    """The numbers are the reference kernel's where that is defined, for z* in [0, range_max]."""
+    """The numbers equal the reference kernel's on its domain, z* in [0, range_max]."""
     from gpusense.reference.mixture import log_density
 
     p = gs.BeamParameters()

@@ -1,4 +1,4 @@
-"""A call gives the same bits when repeated, in another process, in any batches, in any order and on a full device."""
+"""A call returns the same bits when repeated, in another process, batch or order, and on a full device."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gpusense.world import windows
 
 KINDS = ("ranges", "beam", "field", "bilinear")
 PRECISIONS = ("float32", "float64")
-# 44 beams make two whole blocks of the sum over beams and a part of one; four of them repeat a bearing.
+# 44 beams make two whole blocks and a partial block of the sum over beams; four beams repeat a bearing.
 BEARINGS = np.concatenate([np.linspace(-2.2, 2.2, 40), [0.0, 0.0, 1.0, 1.0]])
 RANGE, COUNT = 3.0, 301
 Call = Callable[[np.ndarray], np.ndarray]
@@ -76,7 +76,7 @@ def make(kind: str, precision: str, backend: str) -> tuple[object, Call]:
     return scored, score
 
 
-# Tests share models, so earlier calls must not matter either.
+# Tests share models: earlier calls must not matter.
 shared = functools.cache(make)
 
 
@@ -109,7 +109,7 @@ def hashes(backend: str) -> str:
 
 @pytest.mark.long
 def test_in_a_fresh_process(needs):
-    """Another process orders sets of flags differently, and has a single thread."""
+    """Another process orders sets of flags differently and has a single thread."""
     from support.selection import BACKENDS
 
     backends = [needs(backend) for backend in BACKENDS]
@@ -177,7 +177,7 @@ def test_several_scans_or_one_by_one(kind, precision, backend):
 
 
 def real_devices() -> list[str]:
-    """Return every processor and GPU: PoCL's and Intel's OpenCL for the same processor are two."""
+    """Return every processor and GPU; PoCL's and Intel's OpenCL for a processor are two devices."""
     return [device.selection for device in gs.devices() if device.available and device.kind != "simulator"]
 
 

@@ -1,4 +1,4 @@
-"""Log-likelihoods that PyTorch and JAX differentiate; the rule itself is tested without these libraries."""
+"""Log-likelihoods for PyTorch and JAX to differentiate; the rule is tested without these libraries."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def field(interpolation="bilinear", precision="float64", backend="numpy"):
 
 
 class Tensor:
-    """A tensor of a made-up PyTorch, which records gradients."""
+    """A tensor of a made-up PyTorch that records gradients."""
 
     __module__ = "torch"
     device, requires_grad = "cpu", True
@@ -39,7 +39,7 @@ class Tensor:
 
 
 def test_the_rule_multiplies_the_gradient_by_what_comes_from_above(monkeypatch):
-    """A stand-in for PyTorch calls ``forward`` and ``backward`` of operations."""
+    """A substitute for PyTorch calls ``forward`` and ``backward`` of operations."""
     made = []
 
     class Function:

@@ -1,4 +1,4 @@
-"""Rays end behind their readings, where an obstacle no longer changes the density; no bit of a result changes."""
+"""Rays end behind their readings, where obstacles no longer change the density; results keep all bits."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PARAMETERS = {
 
 
 def scene(count: int) -> tuple[gs.OccupancyGrid, gs.Scanner, np.ndarray, np.ndarray]:
-    """Return a map with few obstacles, a scanner, poses all over it, and a scan with max and missing readings."""
+    """Return a sparse map, a scanner, poses all over the map, and a scan with max and missing readings."""
     rng = np.random.default_rng(3)
     grid = gs.OccupancyGrid(rng.choice([0, 100], (150, 170), p=[0.995, 0.005]), 0.1)
     scanner = gs.Scanner(np.linspace(-3, 3, 61), RANGE)
@@ -67,7 +67,7 @@ def test_nothing_beyond_the_end_changes_the_density(name, precision):
         if end < RANGE:
             log_p = log_mixture(z, np.linspace(end, RANGE, 400), range_max=RANGE, **p.to_dict())
             assert np.ptp(log_p) <= 0.25 * np.finfo(precision).eps + 4 * np.finfo(float).eps * abs(log_p).max()
-    # The end is not much too far: half an offset nearer, an obstacle matters, unless p_hit is 0.
+    # The end is tight: half an offset nearer, an obstacle matters, unless p_hit is 0.
     if p.z_hit and not p.z_short and slope < 1.01:
         near = log_mixture(2.0, 2.0 + 0.5 * offset - p.range_bias, range_max=RANGE, **p.to_dict())
         far = log_mixture(2.0, RANGE, range_max=RANGE, **p.to_dict())

@@ -1,4 +1,4 @@
-"""``explain()`` lists all parts that a scene does not need, with reason and saving, and none that it needs."""
+"""``explain()`` lists exactly the parts that a scene does not need, with reason and saving."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_explain_of_a_field(kind):
 
 
 def marked(model: Any, mark: str) -> dict[str, str]:
-    """Return the lines of ``explain`` with a mark, by their names."""
+    """Return the lines of ``explain`` with a mark, by name."""
     lines = [line[2:] for line in model.explain().splitlines() if line.startswith(f"{mark} ")]
     return {name.strip(): why.strip() for name, why in (line.split("  ", 1) for line in lines)}
 
@@ -108,7 +108,7 @@ def test_parts_of_a_component_that_is_left_out_go_with_it():
     assert not {"range_bias", "sigma_growth", "exponents in two parts"} & set(left_out(model))
 
 
-# Words of the kernel's text that a part of the density needs; the parameters of a scene without it, and with it.
+# Words of the kernel's text for a part of the density; parameters of a scene without and with the part.
 PLAIN = dict(z_hit=0.7, z_short=0.1, z_max=0.1, z_rand=0.1)
 PARTS = {
     "short component": ("short_length_lanes(expected", dict(PLAIN, z_hit=0.8, z_short=0.0), PLAIN),
@@ -181,7 +181,7 @@ def test_sources_are_those_of_every_backend(backend):
 
 @pytest.fixture
 def pretend(monkeypatch) -> Callable[[str], Backend]:
-    """Let the reference pretend to be a processor or a GPU, since the host makes the list."""
+    """Let the reference pass as a processor or a GPU, since the host makes the list."""
 
     def as_kind(kind: str) -> Backend:
         device = get_backend("numpy")

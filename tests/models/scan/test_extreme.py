@@ -15,7 +15,7 @@ from gpusense.interface.structs import Caster, RangeScale, Window
 from gpusense.tables.rectangles import Planes, empty_rectangles
 
 PRECISIONS = ("float32", "float64")
-# Denormal in float32, denormal in both precisions, and on either side of the limit below which a ray takes 0.
+# Denormal in float32, denormal in both precisions, and on both sides of the limit that a ray rounds to 0.
 TINY = (5e-324, 1e-310, 1e-45, 1e-40, 1.1e-38, 1e-37, 0.99e-30)
 MODELS = {
     "beam": (gs.BeamModel, gs.BeamParameters()),
@@ -86,7 +86,7 @@ def test_a_map_of_20_000_x_20_000_cells(needs):
     grid, scanner = gs.OccupancyGrid(cells, cell), look_around(24, range_max)
     del cells
     poses = np.random.default_rng(5).uniform((1500, 800, -4), (1503, 803, 4), (50, 3))
-    # A map of the part that the poses can see, with an exact origin.
+    # A map of the visible part, with an exact origin.
     row, col = int(800 / cell) - reach, int(1500 / cell) - reach
     part = gs.OccupancyGrid(
         grid.cells[row : row + 2 * reach + 24, col : col + 2 * reach + 24], cell, (col * cell, row * cell, 0)
@@ -106,7 +106,7 @@ def test_a_map_of_20_000_x_20_000_cells(needs):
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_denormal_direction_components_are_zero(backend, precision):
-    """The kernel takes a component of a direction below 1e-30 as 0, for either sign and axis."""
+    """The kernel rounds components of a direction below 1e-30 to 0, for both signs and axes."""
     real, obstacles = np.dtype(precision), np.pad(np.zeros((6, 9), bool), 1, constant_values=True)
     obstacles[4, 5] = True
     turns = [(1.0, t) for t in (0.0, *TINY)] + [(1.0, -t) for t in TINY]
@@ -164,6 +164,6 @@ def test_tiny_headings_bearings_and_places(backend, precision):
     assert differing(field_parts, same_field_parts) == 0
     assert differing(field_p, same_field_p) == 0
     np.testing.assert_allclose(beam_p, same_beam_p, rtol=0, atol=4e-3 if precision == "float32" else 1e-9)
-    # Along the axes, all tiny headings have the ranges of the heading 0.
+    # Along the axes, tiny headings have the ranges of heading 0.
     tiny_rows = ranges.reshape(len(places), len(headings), -1)[:, : 2 * (1 + len(TINY)), : len(tiny)]
     assert (tiny_rows[0] == tiny_rows[0, 0, 0]).all()

@@ -40,7 +40,7 @@ def test_gradients_are_finite_differences(kind, origin):
     model = field(grid, "numpy", kind=kind, temperature=0.5)
     log_p, gradient, information = model.gradient(poses, ranges)
     np.testing.assert_array_equal(log_p, model.log_likelihood(poses, ranges))
-    # Central differences have errors of h^2 within a cell, and end points leave theirs with probability h.
+    # Central differences have errors of h^2 within a cell, and end points leave their cells with probability h.
     h = 1e-7
     numeric = [
         (model.log_likelihood(poses + step, ranges) - model.log_likelihood(poses - step, ranges)) / (2 * h)

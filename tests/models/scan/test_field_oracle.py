@@ -38,7 +38,7 @@ PARAMETERS = {
 
 
 def scene(resolution: float, origin: tuple[float, float, float], density: float = 0.08, seed: int = 0):
-    """Return a grid with unknown cells, and poses in it and around it; lengths are in units of 4 cells."""
+    """Return a grid with unknown cells, and poses in and around it; lengths are in units of 4 cells."""
     rng = np.random.default_rng([seed, int(density * 100)])
     cells = rng.choice([0, 100, -1, 64], (50, 70), p=[0.9 - density, density, 0.05, 0.05])
     grid = gs.OccupancyGrid(cells, resolution, origin)
@@ -58,7 +58,7 @@ def scaled(names: dict[str, float], resolution: float, interpolation: str) -> gs
 
 
 def compare(field: Field, model, poses, ranges, bearings, range_min=0.0) -> None:
-    """Compare parts and sums; a beam that ends on an edge up to rounding may take either nearest cell."""
+    """Compare parts and sums; a beam that ends on an edge up to rounding may take either cell."""
     expected, clear = field.parts(poses, ranges, bearings, range_min)
     log_p, parts = model.log_likelihood(poses, ranges, per_beam=True)
     assert parts.dtype == log_p.dtype == np.dtype(model.precision)
@@ -161,7 +161,7 @@ def parts_of(precision: str, backend: str, grid, poses, ranges, bearings, sigma:
 
 
 def differing_cells(grid, poses, ranges, bearings, left: tuple[str, str], right: tuple[str, str]) -> np.ndarray:
-    """Return beams whose parts differ by more than a few eps: end points that fell into cells of different distance."""
+    """Return beams with parts that differ by more than a few eps: end points in cells of different distance."""
     sigma = 10 * grid.resolution
     a, b = (parts_of(precision, name, grid, poses, ranges, bearings, sigma) for precision, name in (left, right))
     return np.argwhere(np.abs(a - b) > 32 * np.finfo(np.float32).eps * (1 + np.abs(a)))
@@ -179,7 +179,7 @@ def test_float32_look_ups_hit_the_cells_of_float64(origin, longest, backend):
     poses = np.column_stack([xy, rng.uniform(-1e3, 1e3, 200)])
     ranges, bearings = rng.uniform(0, 5, 200), rng.uniform(-4, 4, 200)
     if longest > 5:
-        # Far readings that end in the map: the poses are as far away as the readings are long.
+        # Long readings of equally distant poses end in the map.
         poses[:, 0] -= longest * np.cos(poses[:, 2])
         poses[:, 1] -= longest * np.sin(poses[:, 2])
         ranges, bearings = longest + rng.uniform(-4, 4, 200), rng.uniform(-0.004, 0.004, 200)
@@ -227,7 +227,7 @@ def test_an_end_point_just_below_the_cell_of_the_pose(backend):
 
 
 def test_a_cloud_in_a_map_longer_than_distances_reach(backend):
-    """The cloud reaches 1300 of 60 000 cells in a row: the other ones are left out."""
+    """The cloud reaches 1300 of 60 000 cells in a row; all other cells are omitted."""
     cells = np.zeros((1, 60_001), int)
     cells[0, [0, 50_000]] = 100
     grid = gs.OccupancyGrid(cells, 0.05)
@@ -238,7 +238,7 @@ def test_a_cloud_in_a_map_longer_than_distances_reach(backend):
 
 
 def test_a_window_that_fits_is_not_refused_for_its_room_to_move(backend):
-    """24 000 cells are within reach; a margin of half as much, which saves refreshes, would be too long."""
+    """24 000 cells are within reach; with a margin of half the reach the window would be too long."""
     cells = np.zeros((1, 60_001), int)
     cells[0, 30_000] = 100
     grid = gs.OccupancyGrid(cells, 0.001)

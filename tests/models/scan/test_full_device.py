@@ -16,7 +16,7 @@ from gpusense.tables.reachable import ReachableMap
 
 
 class FullDevice(Proxy):
-    """A proxy that fails the allocations numbered in ``failing``, and those of too many numbers."""
+    """A proxy that fails the allocations numbered in ``failing``, and too large allocations."""
 
     def __init__(self, backend: str) -> None:
         super().__init__(get_backend(backend))
@@ -49,7 +49,7 @@ def test_a_launch_that_does_not_fit_is_halved(kind, backend):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_whichever_allocation_fails_the_model_goes_on(kind, backend):
-    """A call gives the right answer or raises MemoryError; the next call gives the right answer."""
+    """A call returns the correct result or raises MemoryError; the next call returns the correct result."""
     grid, z = room(), scan()
     poses = cloud(grid, 600)
     expected = make(kind, grid, backend).log_likelihood(poses, z)
@@ -66,7 +66,7 @@ def test_whichever_allocation_fails_the_model_goes_on(kind, backend):
 
 @pytest.mark.parametrize("kind", [*KINDS, "caster"])
 def test_a_table_that_does_not_fit_is_reported_at_once(kind, backend, monkeypatch):
-    """Fewer particles need the same table, so it is tried once, and the message is the device's."""
+    """Fewer particles need the same table, so it is tried once; the message is the device's."""
     grid, z = room(), scan()
     poses = cloud(grid, 3000)
     monkeypatch.setattr(run, "SMALLEST_CHUNK", 1)

@@ -1,4 +1,4 @@
-"""Shapes of hits: Student's t against mpmath and SciPy, on every backend; a made-up shape, which all users follow."""
+"""Shapes of hits: Student's t against mpmath and SciPy, on every backend; all users follow a made-up shape."""
 
 from __future__ import annotations
 
@@ -204,7 +204,7 @@ def test_readings_are_drawn_from_the_density_with_equal_bits(backend):
 
 
 def users(parameters, field, backend, real):
-    """Return all numbers that depend on the density of hits, by the name of their user."""
+    """Return all numbers that depend on the density of hits, by user."""
     beams = dict(backend=backend, precision=real)
     plain = gs.BeamModel(GRID, SCANNER, parameters, **beams)
     bilinear = gs.LikelihoodFieldModel(GRID, SCANNER, field.replace(interpolation="bilinear"), **beams)

@@ -1,4 +1,4 @@
-"""Beam models whose parameters depend on the angle of incidence."""
+"""Beam models with parameters that depend on the angle of incidence."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_every_beam_has_the_parameters_of_its_angle(no_surface, backend):
         assert np.isnan(model.incidence(poses)).any() and (", parameters for 3 ranges" in model.explain())
         truth = brute_force(model, poses, z)
         log_p, parts = model.log_likelihood(poses, z, per_beam=True)
-        # The truth's terms are not rounded to the model's precision, nor its readings.
+        # The truth rounds neither terms nor readings to the model's precision.
         assert (np.abs(parts - truth) <= 3 * per_beam(truth, precision)).all()
         assert (np.abs(log_p - 0.5 * truth.sum(axis=1)) <= 3 * per_scan(truth, precision)).all()
         assert differing(model.log_likelihood(poses, z), log_p) == 0
@@ -116,7 +116,7 @@ def test_max_readings_where_their_probability_depends_on_the_pose(backend):
     expected = np.array([-np.inf, math.log(0.2), 0.0])[which]
     np.testing.assert_allclose(parts, expected, rtol=1e-6)
     np.testing.assert_allclose(log_p, expected.sum(axis=1), rtol=1e-5)
-    # A bin whose continuous part is 0 makes a range impossible, and only there.
+    # Only in a bin without a continuous part is a range impossible.
     z = np.full(len(bearings), 3.0)
     parts = model.log_likelihood(poses, z, per_beam=True)[1]
     np.testing.assert_array_equal(np.isneginf(parts), which == 2)

@@ -1,4 +1,4 @@
-"""After an interrupt at any line, a model gives the results of a new one, of the old map or of the changed one."""
+"""After an interrupt at any line, a model returns the results of a new model, of the old or the changed map."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ MODELS = {
     "beluga": lambda grid, backend: gs.LikelihoodFieldModel(grid, SCANNER, backend=backend, compat="beluga"),
 }
 
-# On devices: models whose tables are made by different kernels, and lines of these rooms. Lines of other rooms work on
-# plain data. A call makes tables by the lines of ``prepare``.
+# On devices: models with tables from different kernels, and lines of these rooms. Lines of other rooms work on plain
+# data. A call makes tables by the lines of ``prepare``.
 ON_DEVICES = ("exact", "incidence", "lookup", "nearest", "beluga")
 ROOMS = {
     "update_map": ("models", "tables", "backends"), "prepare": ("models", "tables", "backends"),
@@ -94,7 +94,7 @@ class Interrupted:
         return executed_lines(lambda: self._during(model))
 
     def check(self, line: Line, *, look: bool) -> bool:
-        """Interrupt the call at a line, and repeat it; with ``look`` use the model in between."""
+        """Interrupt the call at a line, and repeat it; if ``look``, use the model in between."""
         model = self._model()
         interrupted = interrupt(lambda: self._during(model), line)
         if look:
@@ -114,7 +114,7 @@ class Interrupted:
 @pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("call", CALLS)
 def test_a_call_that_was_interrupted_can_be_repeated(call, every):
-    """Interrupt every line, or every fourth, of every model; lines outside the room ``tables`` once for all models."""
+    """Interrupt every line, or every fourth, of every model; lines outside the room ``tables`` once for all."""
     interrupt_lines(call, "numpy", everything=True, every=every)
 
 

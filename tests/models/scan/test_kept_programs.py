@@ -15,7 +15,7 @@ GUARD = [argument.name for argument in KERNELS["score_field"].arguments].index("
 
 
 class Guards(Proxy):
-    """A backend that lists the bounds of rounding errors in launches of likelihood fields."""
+    """A backend that records the bounds of rounding errors in launches of likelihood fields."""
 
     def __init__(self, backend: Backend) -> None:
         super().__init__(backend)
@@ -34,7 +34,7 @@ class Guards(Proxy):
 
 @pytest.mark.parametrize("gpu", [False, True])
 def test_the_bound_of_rounding_errors_follows_the_longest_reading(backend, gpu, as_gpu):
-    """End points of longer readings have larger errors: a stored program starts with the bound of the scan."""
+    """End points of longer readings have larger errors: a stored program takes the scan's bound."""
     as_gpu(gpu)
     device = Guards(get_backend(backend))
     model = FIELD(GRID, NEAR, backend=device)
@@ -75,7 +75,7 @@ def test_scans_of_poses_that_stay_in_place_have_the_bits_of_ordinary_calls(case,
         found = device.download(out.buffer, np.empty(COUNT, model.precision))
         assert differing(found, scored.log_likelihood(cloud(seed), scan)) == 0
         assert len(moved) == seed + 1
-    # On processors the first one, the list, and scans whose log-likelihood is the same everywhere; on GPUs all.
+    # On processors the first scan, the list, and scans with a constant log-likelihood; on GPUs all.
     most = len(moved) if device.info.kind == "gpu" else 5
     assert 2 <= len(ordinary) <= most or not model._setting.possible
     once.start_scoring(poses, scan, out=out)

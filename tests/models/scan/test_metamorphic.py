@@ -47,7 +47,7 @@ SUM_ROUNDINGS = BLOCK_TERMS + 3
 FAR_FLOAT64 = 1e-5
 
 SEEDS, NAMES = st.integers(0, 2**32 - 1), st.sampled_from(list(FIELD))
-# Where two scenes round an interpolated distance differently, a tiny sigma shows it (docs/numerics.md).
+# A tiny sigma shows different roundings of an interpolated distance (docs/numerics.md).
 SMOOTH = st.sampled_from(list(FIELD)[:-1])
 LAWS = settings(
     max_examples=10, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -66,7 +66,7 @@ def on(request: pytest.FixtureRequest, backend: str) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Scene:
-    """Holds a map, its place, poses, a scanner and a scan."""
+    """A map, its place, poses, a scanner and a scan."""
 
     cells: np.ndarray
     poses: np.ndarray
@@ -146,7 +146,7 @@ def sum_error(parts: np.ndarray) -> np.ndarray:
 
 
 def plain_sum(log_p: np.ndarray, parts: np.ndarray) -> None:
-    """Check that log p is the sum over the beams but for the roundings of the sum."""
+    """Check that log p is the sum over the beams up to rounding."""
     assert_near(log_p, np.array([math.fsum(row) for row in parts.astype(np.float64)]), sum_error(parts))
 
 
@@ -283,7 +283,7 @@ def test_cells_cut_in_four_change_distances_by_a_diagonal(interpolation, longer,
 @LAWS
 @given(SEEDS, NAMES)
 def test_permuting_beams_and_particles(kind, on, seed, name):
-    """Particles and parts have the same bits, sums differ by rounding alone; four beams repeat a bearing."""
+    """Particles and parts have the same bits, and sums differ only by rounding; four beams repeat a bearing."""
     before, p, rng = scene(kind, seed, mount=MOUNT), PARAMETERS[kind][name], np.random.default_rng(seed)
     before = replace(before, bearings=np.concatenate([before.bearings[:20], before.bearings[:4]]))
     beams, particles = rng.permutation(24), rng.permutation(12)
@@ -301,7 +301,7 @@ def test_permuting_beams_and_particles(kind, on, seed, name):
 @LAWS
 @given(SEEDS, NAMES, st.integers(0, 24))
 def test_splitting_a_scan(kind, on, seed, name, count):
-    """Beams that are left out do not matter, and log p of both halves add up; a half may have no beam."""
+    """Omitted beams do not matter, and log p of both halves add up; a half may have no beam."""
     whole, p = scene(kind, seed, mount=MOUNT), PARAMETERS[kind][name]
     log_p, parts = whole.score(p, **on)
     total = np.zeros(len(log_p))
@@ -343,7 +343,7 @@ def test_no_information_is_exactly_0(kind, on, name):
 
 @pytest.mark.sampled(1, without="warp:cpu")
 def test_laws_can_be_broken(on):
-    """Poses that move by the smallest distance that counts break them, and so does an additional beam in the sum."""
+    """The smallest relevant motion of a pose breaks them, and so does an additional beam in the sum."""
     before, p = scene("beam", 0), PARAMETERS["beam"]["ordinary"]
     least = np.maximum(CELL * np.finfo(on["precision"]).eps / 2, np.spacing(before.poses[:, 0]))
     moved = replace(before, poses=before.poses + np.outer(least, [1, 0, 0]))

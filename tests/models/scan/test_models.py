@@ -71,7 +71,7 @@ def test_buffers_are_used_again(kind, backend):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_clouds_and_scans_that_grow_and_shrink(kind, backend):
-    """A model that is used with many sizes gives the results of new models."""
+    """A model used with many sizes returns the results of new models."""
     grid, rng = room(), np.random.default_rng(12)
     model = make(kind, grid, backend)
     for count in (1, 2, 3, 5, 8, 4, 31, 30, 47, 100, 7):

@@ -154,7 +154,7 @@ def test_a_mean_that_rounds_to_the_longest_range_has_half_of_its_mass(shape, bac
     for sigma in (1e-7, 1e-6, 1e-5):
         p = gs.BeamParameters(0.9, 0.0, 0.0, 0.1, sigma, range_bias=bias, hit=shape)
         log_p = gs.BeamModel(grid, scanner, p, backend=backend).log_likelihood(poses[5:6], z)
-        # The mean moves by half of its last bit, and half of the density lies below it.
+        # The mean moves by half of its last bit, and half of the density is below it.
         offset, moved = RANGE - z[0], RANGE - z[0] + 2.4e-7
         near, far = (
             log_mixture(RANGE - by, RANGE, range_max=RANGE, **p.replace(range_bias=0.0).to_dict())
@@ -182,7 +182,7 @@ def test_the_code_for_them_changes_nothing_where_they_are_0(name, real):
     z = np.roll(expected, 1, axis=1)
     plain = log_density(flags, z, expected, terms)
     found = log_density(flags | {"BIAS", "GROWTH"}, z, expected, terms)
-    # Exponents in two parts are normalised once again.
+    # Exponents in two parts are normalised again.
     eps = np.finfo(real).eps if "EXACT_EXPONENT" in flags else 0
     same = plain == found
     assert (same | (np.abs(np.where(same, 0, plain) - np.where(same, 0, found)) <= 2 * eps * np.abs(plain))).all()

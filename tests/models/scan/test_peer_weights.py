@@ -103,7 +103,7 @@ def test_readings_beyond_range_max():
     weights = [math.exp(model.log_likelihood([(5.5, 1.5, 0.0)], [z])[0]) for z in (math.inf, 12.1, 12.0)]
     hit = 0.5 * math.exp(-0.125)
     assert weights == pytest.approx([1.0, 1 + hit**3, 1 + 0.55**3], rel=1e-12)
-    # In float32 readings, the one that range_max is rounded to is the max reading.
+    # For float32 readings, the rounded range_max is the max reading.
     model = gs.BeamModel(grid, gs.Scanner([0.0], 12.1), compat="amcl", backend="numpy", precision="float64")
     at_max = model.log_likelihood([(5.5, 1.5, 0.0)], np.array([12.1], np.float32))[0]
     assert at_max == model.log_likelihood([(5.5, 1.5, 0.0)], [12.1])[0] == pytest.approx(math.log1p(0.55**3), rel=1e-12)

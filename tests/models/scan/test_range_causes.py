@@ -82,7 +82,7 @@ def models(p):
 
 
 def learned(at):
-    """Return the quantities that fits compute of parameters: numbers of kernels, terms of starts, growth and blocks."""
+    """Return quantities of fits by parameters: numbers of kernels, terms of starts, growth and blocks."""
     pairs = make_pairs(WITH_MAX, EXPECTED, RANGE)
     device = DeviceSums(get_backend("numpy"), np.dtype(np.float64), pairs)
     sample = optimum.Sample.of(pairs)
@@ -133,7 +133,7 @@ def table(p):
 
 
 def mixture(weights, rate=BASE.lambda_short):
-    """Return log densities of the host's mixture; weights need not have the sum 1."""
+    """Return log densities of the host's mixture; weights need not be normalised."""
     hit, short, top, rand = weights
     shape = dict(sigma_hit=0.3, lambda_short=rate, range_max=RANGE)
     return {"mixture": log_mixture(WITH_MAX, EXPECTED, z_hit=hit, z_short=short, z_max=top, z_rand=rand, **shape)}
@@ -175,7 +175,7 @@ def test_a_made_up_random_density_is_followed(monkeypatch):
         found = {name: parts + (math.log(total - 0.2) if "field" in name else 0.0) for name, parts in found.items()}
         return found | table(p) | mixture(chosen)
 
-    # Without random readings, nothing of the sum of logarithms depends on them.
+    # A weight of 0 removes random readings from the sum of logarithms.
     skipped = ("sum of logarithms",)
     plain, wanted, ranges = users(weights), users(halved), far_ranges()
     at = point(*weights, sigma=0.3, rate=0.4)
@@ -232,7 +232,7 @@ def far_ranges():
 
 
 def placed_and_drawn():
-    """Return log z_max as kernels that place readings take it, and as the picture of a fit shows it."""
+    """Return log z_max for kernels that place readings, and in the picture of a fit."""
     device, kind = get_backend("numpy"), np.dtype(np.float64)
     sensing = gs.BeamModel(ROOM, SCANNER, BASE, **HOST)._pipeline.sensing()
     placing, _ = device_readings(sensing, device.upload(WITH_MAX), kind, kind, Workspace(device))

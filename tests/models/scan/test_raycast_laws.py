@@ -91,7 +91,7 @@ def test_shift(backend, seed, dx, dy):
 @LAWS
 @given(MAPS, st.sampled_from(PRECISIONS), st.booleans())
 def test_a_wall_lengthens_no_range(backend, seed, precision, on_lattice):
-    """A ray in a map with one more wall is exactly as long or shorter, wherever it starts."""
+    """An additional wall leaves a ray exactly equal or shortens it."""
     cells, poses, bearings = drawn(seed)
     if on_lattice:
         poses, bearings = np.round(poses * 4) / 4, np.arange(8) * (np.pi / 4)

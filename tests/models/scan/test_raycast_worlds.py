@@ -30,7 +30,7 @@ CELLS_FAR = 30.5
 
 @dataclass(frozen=True)
 class World:
-    """A grid with unknown cells, poses all around it, and the exact casts."""
+    """A grid with unknown cells, poses all around, and the exact casts."""
 
     grid: gs.OccupancyGrid
     poses: np.ndarray
@@ -89,7 +89,7 @@ def forward_error(ray: Ray, exact: Hit) -> float:
 
 @pytest.mark.parametrize("theta", [1e6, -1e6, 123456.789])
 def test_large_headings(backend, theta):
-    """The heading is reduced by its true value modulo 2 pi, not by a rounded one."""
+    """The heading is reduced modulo the true 2 pi, not a rounded one."""
     rng = np.random.default_rng(3)
     occupied = rng.random((30, 30)) < 0.05
     poses = np.column_stack([rng.uniform(0, 30, (100, 2)), theta + rng.uniform(-3, 3, 100)])

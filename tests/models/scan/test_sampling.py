@@ -1,4 +1,4 @@
-"""Readings that beam models draw: their distribution by SciPy, the same bits on every backend, and stiff cases."""
+"""Readings drawn from beam models: distribution by SciPy, equal bits on every backend, and stiff cases."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_readings_have_the_density_of_the_mixture(changes):
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_shares_of_bins_are_those_of_the_log_likelihood(kind):
-    # The density that the model itself integrates to 1 with its max atom: chi-square over bins of readings.
+    # Chi-square over bins of readings, by the model's density and its atom of max readings.
     model = model_of(kind)
     limit, count, beam = model.scanner.range_max, 6000, 1
     z = model.sample([POSE] * count, seed=8)[:, beam]

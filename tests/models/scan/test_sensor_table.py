@@ -1,4 +1,4 @@
-"""The tabulated beam mixture: its values, its errors, and readings treated as the formula treats them."""
+"""The tabulated beam mixture: values, errors, and classes of readings as in the formula."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_a_table_holds_the_mixture_at_the_centres_of_bins(width, precision):
 
 @pytest.mark.parametrize("weights", WEIGHTS)
 def test_narrower_bins_are_more_exact(weights):
-    """The mean error is at least of first order, and so is the largest one where the mixture is continuous."""
+    """The mean error is at least of first order; so is the largest error, where the mixture is continuous."""
     (grid, _, poses), p = scene(), model(None, weights).parameters
     z, parts = readings(count=200), []
     for width in (None, 0.4, 0.2, 0.1, 0.05):
@@ -136,7 +136,7 @@ def test_impossible_scans_are_minus_infinity_and_no_others(backend):
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("weights", WEIGHTS)
 def test_every_backend_has_the_bits_of_numpy_with_and_without_specialisation(weights, precision, backend):
-    """Expected ranges have the same bits on every backend, and all else is look-ups and sums in a fixed order."""
+    """Expected ranges have the same bits on every backend; the rest is look-ups and sums in a fixed order."""
     _, _, poses = scene()
     for seed, options in ((0, {}), (1, {"temperature": 0.3}), (2, {"beams": 3})):
         z = readings(seed)

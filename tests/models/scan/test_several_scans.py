@@ -32,7 +32,7 @@ ATOMS = gs.LikelihoodFieldParameters(1.0, 0.0, 0.0)
 
 
 def scans_of(scanner: gs.Scanner = SCANNER) -> np.ndarray:
-    """Return scans with every number of readings that blocks of 16 distinguish, 0 included; max and missing ones."""
+    """Return scans with all distinct numbers of readings for blocks of 16; some are max or missing."""
     z = np.random.default_rng(8).uniform(0.1, 4.99, (11, scanner.count))
     z[1, 16:] = np.nan
     z[2, 17:] = -1.0
@@ -59,7 +59,7 @@ def field(scanner: gs.Scanner = SCANNER, **options: Any) -> Any:
     return functools.partial(gs.LikelihoodFieldModel, GRID, scanner, **{"temperature": 0.7} | options)
 
 
-# Arguments of models, and whether they run on Warp, which compiles each set of flags for seconds.
+# Arguments of models, and whether they run on Warp, where each set of flags compiles for seconds.
 MODELS: dict[str, tuple[Any, bool]] = {
     "beam": (beam(), True),
     "beam, float64": (beam(precision="float64"), True),
@@ -153,7 +153,7 @@ def test_scans_with_readings_share_one_set_of_launches(kind, gpu, as_gpu, monkey
     device.launches.clear()
     model.log_likelihood(poses[5:], z[5:])
     launches(1)
-    # Launches of at most 150 particles, those of three scans.
+    # Launches of at most 150 particles, three scans each.
     monkeypatch.setattr(run, "CHUNK", 150)
     assert_as_one_by_one(model, poses, z)
     device.launches.clear()
@@ -246,7 +246,7 @@ def test_a_batch_is_its_scans_one_after_the_other(options, near):
 
 
 def test_groups_of_scans():
-    """Rays and readings of each scan: none, as many, or fewer rays."""
+    """Scans with no rays, as many rays as readings, or fewer."""
     rays, counts = np.array([5, 4, 9, 0, 0, 3, 3, 3, 2, 2, 0]), np.array([5, 4, 9, 0, 0, 3, 3, 3, 7, 4, 0])
     whole = np.zeros(counts.sum())
     scans = ClassedScans(whole, whole, whole, whole, whole, rays, counts, whole, LeftOut(*[whole > 0] * 5, False))

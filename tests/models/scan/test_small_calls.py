@@ -1,4 +1,4 @@
-"""Paths of calls of few particles against the plain one: shared memory, batches of launches."""
+"""Paths of calls with few particles against the plain path: shared memory, batches of launches."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gpusense.models.scan.packed_call import ShortCalls
 
 @pytest.fixture(autouse=True)
 def no_short_calls(monkeypatch):
-    """Let calls that repeat a size stay ordinary; test_bound_host.py tests the others."""
+    """Keep repeated calls ordinary; test_bound_host.py tests the other ones."""
     monkeypatch.setattr(ShortCalls, "of", staticmethod(lambda pipeline: None))
 
 
@@ -52,7 +52,7 @@ def test_shared_memory_changes_no_bit(kind, two_ways):
 
 
 def test_launches_see_the_contents_of_their_time(two_ways):
-    """Copies stay in order with launches, and released memory lives until these have ended."""
+    """Copies stay in order with launches, and released memory lives until the launches have ended."""
     device, numpy = two_ways[0], get_backend("numpy")
     size, int32 = (200_000,), np.dtype(np.int32)
     results = []
@@ -205,7 +205,7 @@ def test_several_models_are_batched(count, batching, monkeypatch):
         bad[5, 2] = np.inf
         with pytest.raises(ValueError, match="poses: must be finite, got a pose on the device"):
             gs.log_likelihoods(models, [there[0], there[1], to_device(bad), there[3]], z)
-        # It is reported once, and for no other model.
+        # The error is reported once, and for no other model.
         assert differing(gs.log_likelihoods(models, there, z)[2].numpy(), expected[2]) == 0
 
 
@@ -223,7 +223,7 @@ def test_arrays_that_are_too_large_are_copied_at_once(batching, monkeypatch):
 
 
 def test_a_call_that_fails_leaves_nothing_behind(batching, monkeypatch):
-    """Its table is whole, and its arrays are not written later."""
+    """The table is complete, and arrays are never written later."""
     device, _ = batching
     model = gs.BeamModel(GRID, SCANNER, backend=device)
     other = gs.BeamModel(GRID, SCANNER, backend=device)
@@ -273,7 +273,7 @@ def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(batching, 
     for count in (300, 200, 100, 50):
         for _ in range(3):
             model.log_likelihood(cloud(count, count), scan(1))
-    # Two that are in use are not evicted for others, which would be evicted for them in turn.
+    # Two entries in use are never evicted for others, to avoid evicting in turn.
     assert len(device._graphs._graphs) == 2 and len(device._graphs._seen) <= 2 and len(started) == 4
     monkeypatch.setattr(_warp_graphs, "_STALE", 2)
     for _ in range(4):

@@ -1,4 +1,4 @@
-"""Sonar against single rays: cones, and surfaces that return nothing beyond an angle of incidence."""
+"""Sonar against single rays: cones, and surfaces without return beyond an angle of incidence."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def test_more_surfaces_that_return_never_lengthen_it_either():
 
 
 def test_nothing_is_nearer_than_the_nearest_obstacle():
-    """Each end of a distance lies half a diagonal from its cell's centre at most."""
+    """Each end of a distance is at most half a diagonal from its cell's centre."""
     grid, _, _ = place()
     rng = np.random.default_rng(2)
     row, col = rng.integers(0, 90, 400), rng.integers(0, 120, 400)
@@ -185,7 +185,7 @@ def test_nothing_is_nearer_than_the_nearest_obstacle():
     distance = distance_transform_edt(~grid.obstacles("free"))[row, col] * grid.resolution
     diagonal = grid.resolution * math.sqrt(2)
     assert (found >= distance[:, None] - diagonal).all()
-    # Rays in all directions find it, except where it fits between two rays.
+    # Rays in all directions find it unless it fits between two rays.
     assert np.median(found[:, 0] - distance) < diagonal
 
 

@@ -1,4 +1,4 @@
-"""Code that a scene leaves out changes no number."""
+"""Omitting code that a scene does not need changes no number."""
 
 from __future__ import annotations
 

@@ -103,14 +103,14 @@ class Watch:
 
 
 def scan_uploads(device, size: int, *counts: int) -> list[int]:
-    """Return the bytes of a scan's arrays: a batch copies them at once, each begins at a multiple of 64."""
+    """Return the bytes of a scan's arrays; a batch copies all at once, each at a multiple of 64."""
     if device.info.graphs:
         return [sum(size * -(-count // 64) * 64 for count in counts)]
     return [size * count for count in counts]
 
 
 def call_of(what: str, device, precision: str):
-    """Return the call that scores or casts poses, and the bytes that it copies there and back."""
+    """Return the call that scores or casts poses, and the bytes copied to and from the device."""
     size = np.dtype(precision).itemsize
     if what == "caster":
         caster = gs.RayCaster(GRID, RANGE, backend=device, precision=precision)
@@ -195,7 +195,7 @@ def test_several_scans_share_their_copies(what, gpu, as_gpu, monkeypatch):
     model = (gs.BeamModel if what == "beam" else gs.LikelihoodFieldModel)(GRID, SCANNER, backend=device)
 
     def call(count: int, seed: int) -> np.ndarray:
-        # The scans of each call have the same numbers of readings, in another order.
+        # Scans of each call have the same numbers of readings in another order.
         z = np.stack([scan(seed + s) for s in range(scans)])
         for s in range(scans):
             z[s, BEAMS - (seed + s) % scans :] = np.nan

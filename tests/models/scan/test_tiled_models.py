@@ -1,6 +1,6 @@
 """Models and casters on a GPU, which use tiles and blocks, have the bits of single particles.
 
-No GPU is needed: any device may pretend to be one.
+No GPU is needed: any device can pass as a GPU.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def same_as_one_by_one(
     return code
 
 
-# Parts of a beam model's tiles that the other tests leave to a sample: options, and the flags of the code.
+# Parts of a beam model's tiles that other tests only sample: options, and flags of the code.
 PARTS = [
     (
         dict(parameters=gs.BeamParameters(range_bias=0.02, sigma_growth=0.01), outside="occupied"),
@@ -156,7 +156,7 @@ def test_a_table_of_densities(ordered, as_gpu):
     on_warp=lambda method, kind: (kind, method) in (("all over", "exact"), ("inside", "lookup")),
 )  # fmt: skip
 def test_casters(method, kind, ordered, as_gpu):
-    """Casters have two settings in turn: one kernel makes the tiles of all."""
+    """Alternate casters between two settings: one kernel makes all tiles."""
     grid, scanner, _ = world()
     outside, precision, _ = FEW[list(CASTERS).index(method) % 2]
     found = [
@@ -272,7 +272,7 @@ def test_end_points_on_edges_of_cells(resolution, quarter_turns, as_gpu):
 
 
 def border_poses(grid: gs.OccupancyGrid, reach: float) -> np.ndarray:
-    """Return clouds of 12 poses: far inside, then nearer and nearer to the border, over it, and off the map."""
+    """Return clouds of 12 poses: far inside, successively nearer to the border, over it, and off the map."""
     low_x, low_y, high_x, high_y = grid.bounds()
     rng, found = np.random.default_rng(8), []
     for gap in np.concatenate([np.linspace(reach + 0.6, reach - 0.6, 13), [0.3, 0.0, -0.3, -3.0]]):

@@ -38,7 +38,7 @@ def cells_of(rng, shape, share=0.01):
 
 
 def patches(rng, shape, count):
-    """Return patches of cells and their places, the first in two corners."""
+    """Return patches of cells and their positions, the first in two corners."""
     for k in range(count):
         rows, cols = (int(rng.integers(1, min(12, size) + 1)) for size in shape)
         place = [(0, 0), (shape[0] - rows, shape[1] - cols)][k] if k < 2 else None
@@ -121,7 +121,7 @@ def test_the_field_follows(field, outside, precision, device):
 
 @pytest.mark.parametrize("outside", ["free", "occupied"])
 def test_every_cell_of_an_updated_field_is_that_of_a_new_one(outside, device):
-    """With a cap of 7.2 cells, distances of 7 cells count, just within reach of an edit."""
+    """Capped at 7.2 cells, distances of 7 cells count, just within reach of an edit."""
     rng, shape = np.random.default_rng(14), (90, 80)
     parameters = gs.LikelihoodFieldParameters(max_distance=0.72)
 
@@ -278,7 +278,7 @@ def test_only_cells_that_can_change_are_computed_again(monkeypatch):
     grid = gs.OccupancyGrid(cells_of(np.random.default_rng(12), (2000, 2000)), RESOLUTION)
     device = get_backend("numpy")
     parameters, sizes = gs.LikelihoodFieldParameters(max_distance=0.72), []
-    # Of the class: undone, a method of the device itself would hide the class's from later tests.
+    # Patch the class: an undone patch of the device would hide the class's method from later tests.
     kind, upload = type(device), type(device).upload
 
     def counted(backend, array, out=None):

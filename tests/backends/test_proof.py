@@ -241,7 +241,7 @@ def test_the_scene_passes_on_real_devices_with_every_setting(needs, family, lane
     assert (VECTORS in begun) == (lanes > 1)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_driver_that_ends_long_loops_early_is_unusable(needs, monkeypatch):
     """Mesa's llvmpipe ends all loops of a work-group after 65 535 steps; small scenes do not show it."""
     from gpusense.evaluation import proof as scene

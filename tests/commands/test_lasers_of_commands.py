@@ -202,7 +202,7 @@ def test_noise_reaches_the_match(place, capsys, monkeypatch):
     assert "argument --noise: must be a finite number > 0" in error_of([*argv, "--noise", "0"], capsys)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_sweep_over_lasers(place, tmp_path):
     (tmp_path / "plan.yaml").write_text(
         "options: {everywhere: true, particles: 2000, log: run, map: map.yaml}\naxes: {topic: [/front, /rear]}\n"

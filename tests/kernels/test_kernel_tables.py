@@ -201,7 +201,7 @@ def test_long_rectangles_end_at_255_cells(as_kind: Callable[[str], Backend]) -> 
                 assert width.max() == min(255, shape[1]) or height.max() == min(255, shape[0])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])
 def test_rectangles_of_maps_with_more_rows_or_columns_than_16_bits_count(

@@ -71,7 +71,7 @@ def test_any_heading(theta):
     assert errors(np.array([theta])).max() <= WORST
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.skipif(np.finfo(np.longdouble).nmant < 63, reason="long double is no wider than double here")
 @pytest.mark.parametrize("reach", [math.pi / 4, 4.0, 2.0**20, 2.0**40])
 def test_a_million_headings(reach):

@@ -55,7 +55,7 @@ def test_float32_is_the_rational_walk_of_a_ray_near_by(family):
         assert not len(wrong), [(scene.ray(i), scene.outside_occupied, found[i], scene.exact[i]) for i in wrong[:3]]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.sampled(0.2)
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize("precision", PRECISIONS)

@@ -139,7 +139,7 @@ def test_random_looks_leave_the_bits_of_the_belief(seed):
     check(seed, "numpy")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [20, 21])
 def test_random_looks_leave_the_bits_of_the_belief_on_devices(seed, device):
     check(seed, device.info.selection)

@@ -29,6 +29,7 @@ def test_features_are_measured(data_dir: Path, needs: Callable[[str], str], tmp_
     assert all(row["scans_per_s"] > 0 for row in report["rates"].values())
 
 
+@pytest.mark.slow
 def test_a_scan_with_its_features_is_drawn(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:
     drawn = tmp_path / "features.png"
     arguments = ["--data", str(data_dir), "--backend", needs("opencl"), "--figure", str(drawn)]

@@ -192,6 +192,7 @@ def test_first_call_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     assert cold["open"] > warm["open"] > 0 and warm["field"] > 0 and warm["all"] > warm["open and field"]
 
 
+@pytest.mark.slow
 def test_learning_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     words = (
         "--pairs 4000 --numpy-pairs 1000 --scenes 1 --count 400 --starts 1 --repeats 2 --seconds 1 --precision float64"
@@ -325,6 +326,7 @@ def test_calibration_runs(tmp_path: Path) -> None:
     assert all(0 < row["least_p"] <= 1 for row in report["rows"])
 
 
+@pytest.mark.slow
 def test_rays_per_core_runs(needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Every caster has rows of both clouds; a stand-in replaces range_libc."""
     monkeypatch.syspath_prepend(str(BENCH))

@@ -113,7 +113,7 @@ def test_field_weights_by_hand(peer, precision, backend):
     assert left_out[0] == 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("peer", ["amcl", "beluga"])
 def test_nothing_is_left_out_with_the_same_weights(peer, needs):
     readings = (5.5, NAN, 2.9, INF)

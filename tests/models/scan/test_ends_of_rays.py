@@ -74,7 +74,7 @@ def test_nothing_beyond_the_end_changes_the_density(name, precision):
         assert abs(near - far) > np.finfo(precision).eps or offset < 1e-5 * RANGE
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.sampled(1, without="warp:cpu")
 def test_scenes_in_which_rays_do_not_end(backend):
     """Try default parameters, repeated bearings, tables, bins of incidence, peers' weights, and casters by table."""

@@ -61,7 +61,7 @@ def test_weights_of_long_scans_and_of_many_particles(backend, name, beams, parti
         assert ((product == 0) | np.isinf(product)).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("name", MODELS)
 def test_ten_million_particles(name, needs):

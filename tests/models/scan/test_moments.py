@@ -125,7 +125,7 @@ def test_small_offsets_of_narrow_densities_keep_all_digits(growth, backend):
         assert (np.abs(parts[0] - truth) <= per_beam(truth, np.float32))[within].all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["normal", "student"])
 def test_means_near_the_longest_range_keep_all_digits(shape, backend):
     """The distance from there to range_max has digits beyond the mean's last digit."""

@@ -54,7 +54,12 @@ def test_quick_run_writes_whole_files(needs, tmp_path, capsys):
     }
     assert {p["checked"] for p in written["points"]} == {6} and {p["particles"] for p in written["points"]} == {1, 8}
     text = (folder / "report.md").read_text(encoding="utf-8")
-    assert all(f"## {problem}: clutter, {cloud}" in text for problem in candidates.PROBLEMS for cloud in scenes.CLOUDS)
+    rows = [line for line in text.splitlines() if line.startswith("| ")][2:]
+    assert len(rows) == len(written["points"]) > 0
+    assert all(
+        any(row.startswith(f"| {problem} | clutter | {cloud} |") for row in rows)
+        for problem in candidates.PROBLEMS for cloud in scenes.CLOUDS
+    )  # fmt: skip
 
 
 def test_same_seed_same_errors(capsys):

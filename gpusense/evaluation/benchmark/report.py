@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from gpusense.evaluation.benchmark.choice import label, setting
+from gpusense.evaluation.benchmark.choice import error_of, label, setting
 from gpusense.evaluation.benchmark.runner import Outcome, Plan
 
 SCHEMA = 2
@@ -21,23 +21,18 @@ SCHEMA = 2
 _DIGITS = 6
 
 _READING = """\
-Times are nanoseconds per particle-beam: a ray for *ranges*, an evaluated reading for *beam* and *field*. *call* is a
-call with NumPy arrays in and out: minimum and quartiles of the calls after a warm-up. A star marks a single call, of
-more than a second. *processor* is the processor's time of a call over all threads. *launch* is the minimum of the
-launches alone, with all arrays on the device. *build* is the time to build the map's tables. *compile* is the
-additional time of the first call in this process: kernels may come from a cache on disk, and later rows reuse compiled
-kernels; where the first call takes long, *build* includes it. *table* and *device* are bytes on the device: of the
-map's tables, and of all buffers that are alive after a call.
+A row is a method with a value of its knob on a device, in a scene with a cloud; report.json has all figures. Times are
+nanoseconds per particle-beam: *call* is the shortest call with NumPy arrays in and out (a star marks a single call),
+*processor* its processor time over all threads, *launch* its launches alone. *build* builds the map's tables.
 
-Errors are against the exact caster and the models in float64. For ranges: median, 95th percentile and maximum in cells,
-and the shares wrong by more than one and two cells. For the scan's log-likelihood: root mean square and maximum in
-nats; for *ranges* it follows from the ranges by the float64 mixture. For the posterior, the normalised weights: KL, the
-Kullback-Leibler divergence from the exact weights in nats; TV, the total variation; and the shift of the weighted mean
-pose. *tempered* is the posterior at the temperature where a tenth of the particles share the weight, as in a working
-filter. *comparable* is the posterior at the temperature that gives the method's weights the same effective sample
-size. *fine* compares with the true posterior, untempered, on a fine grid of poses around the true one. *fewer beams*
-counts each of every n-th beam n times, and *compat* computes another model than the book's; they are shown for
-comparison."""
+Errors are against the exact caster and the models in float64: rays wrong by more than a cell, root mean square of log p
+in nats, and for the posterior at a comparable temperature the Kullback-Leibler divergence in nats and the shift of its
+mean. *fewer beams* counts each of every n-th beam n times; *compat* computes another program's model."""
+_COLUMNS = (
+    "problem", "scene", "cloud", "backend", "method", "knob", "precision", "remark", "call ns", "processor ns",
+    "launch ns", "build s", "table MB", "> 1 cell", "log p rms", "KL", "shift m",
+)  # fmt: skip
+_WORDS = _COLUMNS.index("call ns")
 
 
 def document(
@@ -113,7 +108,7 @@ def commit() -> str | None:
 
 
 def markdown(report: Mapping[str, Any]) -> str:
-    """Format a report of :func:`document` as Markdown."""
+    """Format a report of :func:`document` as Markdown, with a row for each point."""
     machine, truth = report["machine"], report["truth"]
     facts = ", ".join(f"{name} {value}" for name, value in machine.items())
     lines = [
@@ -122,15 +117,8 @@ def markdown(report: Mapping[str, Any]) -> str:
         *(f"- absent: {text}" for text in report["absent"]), "",
         f"Truth: {truth['backend']} ({truth['device']}), {truth['precision']}: {truth['note']}.",
         f"Arguments: {', '.join(f'{key} {value}' for key, value in report['arguments'].items())}.", "", _READING, "",
-        "## Scenes", "", *_scene_table(report["scenes"]), "",
+        *table(_COLUMNS, [_row(point) for point in report["points"]], _WORDS),
     ]  # fmt: skip
-    points = report["points"]
-    for status, title in (("failed", "Failed"), ("unstable", "Unstable"), ("left out", "Left out")):
-        lines += _reasons(title, [point for point in points if point["status"] == status])
-    groups = dict.fromkeys((p["problem"], p["scene"], p["cloud"]) for p in points)
-    for problem, scene, cloud in groups:
-        group = [p for p in points if (p["problem"], p["scene"], p["cloud"]) == (problem, scene, cloud)]
-        lines += [f"## {problem}: {scene}, {cloud}", "", *_point_table(group, problem), ""]
     return "\n".join(lines)
 
 
@@ -142,69 +130,21 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: int) -
     return [lines[0], f"|{'|'.join(rule)}|", *lines[1:]]
 
 
-def _scene_table(scenes: Sequence[Mapping[str, Any]]) -> list[str]:
-    columns = ("scene", "map", "cells", "resolution m", "beams, hits", "cloud", "checked", "rays that hit",
-               "mean range m", "effective sample size beam, field", "temperature beam, field")  # fmt: skip
-    rows = [
-        (
-            s["name"], s["map"], f"{s['rows']} x {s['cols']}", f"{s['resolution']:g}", f"{s['beams']}, {s['hits']}",
-            name, str(c["checked"]), f"{c['rays_that_hit']:.3f}", f"{c['mean_range']:.2f}",
-            ", ".join(f"{c['effective_sample_size'][k]:.3g}" for k in ("beam", "field")),
-            ", ".join(f"{c['temperature'][k]:.2g}" for k in ("beam", "field")),
-        )
-        for s in scenes for name, c in s["clouds"].items()
-    ]  # fmt: skip
-    return table(columns, rows, 2)
-
-
-def _reasons(title: str, points: Sequence[Mapping[str, Any]]) -> list[str]:
-    if not points:
-        return []
-    where: dict[tuple[str, ...], list[str]] = {}
-    for p in points:
-        key = (p["backend"], p["problem"], label(p), setting(p), p["precision"], p["reason"])
-        where.setdefault(key, []).append(f"{p['scene']}, {p['cloud']}")
-    columns = ("backend", "problem", "method", "knob", "precision", "why", "where")
-    return [f"## {title}", "", *table(columns, [(*key, "; ".join(places)) for key, places in where.items()], 7), ""]
-
-
-COLUMNS = (
-    "backend", "method", "knob", "precision", "call ns", "quartiles ns", "processor ns", "launch ns", "build s",
-    "compile s", "table MB", "device MB", "log p rms", "max", "KL", "shift m", "tempered KL", "comparable KL", "TV",
-    "shift m", "fine KL", "shift m",
-)  # fmt: skip
-TIMES = 12  # columns before those of the errors
-RANGE_COLUMNS = ("median", "p95", "max", "> 1 cell", "> 2 cells")
-
-
-def _point_table(points: Sequence[Mapping[str, Any]], problem: str) -> list[str]:
-    extra = () if problem == "field" else RANGE_COLUMNS
-    columns = (*COLUMNS[:TIMES], *extra, *COLUMNS[TIMES:])
-    return table(columns, [row(point, extra=bool(extra)) for point in points], 4)
-
-
-def row(point: Mapping[str, Any], *, extra: bool) -> list[str]:
-    """Format a point's cells of ``COLUMNS``; ``extra`` inserts those of ``RANGE_COLUMNS``."""
-    time_s, memory, errors = (point[name] or {} for name in ("time", "memory", "errors"))
+def _row(point: Mapping[str, Any]) -> list[str]:
+    """Format a point's cells of ``_COLUMNS``."""
+    time_s, memory = (point[name] or {} for name in ("time", "memory"))
     backend = f"{point['backend']}: {point['device']}" if point["outside"] else point["backend"]
     name = f"**{label(point)}**" if point["exact"] else label(point)
-    cells = [backend, name, setting(point), point["precision"]]
-    if point["status"] != "ok":
-        cells[1] += f" ({point['status']})"
-    star = "*" if time_s.get("calls") == 1 else ""
-    spread = ", ".join(_per_beam(point, f"call_{which}_s") for which in ("q1", "median", "q3"))
-    cells += [_per_beam(point, "call_min_s") + star, spread, _per_beam(point, "processor_s")]
-    cells += [_per_beam(point, "launch_min_s"), _text(time_s.get("build_s")), _text(time_s.get("compile_s"))]
-    cells += [_text(memory.get(f"{which}_bytes"), 1e-6) for which in ("table", "device")]
-    if extra:
-        of = errors.get("ranges") or {}
-        cells += [_text(of.get(name)) for name in ("median", "p95", "max")]
-        cells += [_share(of.get(name)) for name in ("wrong_1", "wrong_2")]
-    for kind, names in (("log_p", ("rms", "max")), ("posterior", ("kl", "shift_m")), ("tempered", ("kl",)),
-                        ("comparable", ("kl", "tv", "shift_m")), ("fine", ("kl", "shift_m"))):  # fmt: skip
-        of = errors.get(kind) or {}
-        cells += [_text(of.get(name)) for name in names]
-    return cells
+    remark = "" if point["status"] == "ok" else f"{point['status']}: {point['reason']}"
+    wrong = error_of(point, "ranges", "wrong_1")
+    errors = (("log_p", "rms"), ("comparable", "kl"), ("comparable", "shift_m"))
+    return [
+        *(str(point[key]) for key in ("problem", "scene", "cloud")), backend, name, setting(point), point["precision"],
+        remark, _per_beam(point, "call_min_s") + ("*" if time_s.get("calls") == 1 else ""),
+        *(_per_beam(point, f"{kind}_s") for kind in ("processor", "launch_min")), _text(time_s.get("build_s")),
+        _text(memory.get("table_bytes"), 1e-6), "-" if wrong is None else f"{100 * wrong:.2g} %",
+        *(_text(error_of(point, *place)) for place in errors),
+    ]  # fmt: skip
 
 
 def _per_beam(point: Mapping[str, Any], name: str) -> str:
@@ -214,7 +154,3 @@ def _per_beam(point: Mapping[str, Any], name: str) -> str:
 
 def _text(value: float | None, scale: float = 1.0) -> str:
     return "-" if value is None else f"{value * scale:.3g}"
-
-
-def _share(value: float | None) -> str:
-    return "-" if value is None else "0" if value == 0 else f"{100 * value:.2g} %"

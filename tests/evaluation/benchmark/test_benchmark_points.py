@@ -114,7 +114,7 @@ def test_failures_are_shown(made, status, reason):
     assert [p["time"] is None for p in outcome.points] == [status != "unstable"] * 2
     shown = report.document(plan, outcome, {}, {"processor": "p"}, [])
     text = report.markdown(shown)
-    assert f"## {status.capitalize()}" in text and reason in text
+    assert f"| {status}: {reason} |" in text
 
 
 def test_a_point_that_works_is_measured():

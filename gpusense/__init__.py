@@ -19,6 +19,8 @@ _NAMES = {
     "backends": ("Device", "devices"),
     "chaining.chain": ("chain_scans",),
     "chaining.result": ("ScanChain",),
+    "evaluation.integrity": ("Integrity", "integrity"),
+    "evaluation.judging": ("Judgement", "Stretch", "judge_trajectory"),
     "features.extract": ("extract_features",),
     "features.feature_map": ("FeatureMap",),
     "features.landmarks": ("landmarks_of_map", "map_features"),

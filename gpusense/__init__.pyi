@@ -10,6 +10,11 @@ from gpusense.backends import Device as Device
 from gpusense.backends import devices as devices
 from gpusense.chaining.chain import chain_scans as chain_scans
 from gpusense.chaining.result import ScanChain as ScanChain
+from gpusense.evaluation.integrity import Integrity as Integrity
+from gpusense.evaluation.integrity import integrity as integrity
+from gpusense.evaluation.judging import Judgement as Judgement
+from gpusense.evaluation.judging import Stretch as Stretch
+from gpusense.evaluation.judging import judge_trajectory as judge_trajectory
 from gpusense.features.extract import extract_features as extract_features
 from gpusense.features.feature_map import FeatureMap as FeatureMap
 from gpusense.features.landmarks import landmarks_of_map as landmarks_of_map

@@ -22,7 +22,7 @@ from gpusense.commands import signals
 
 # Modules of gpusense.commands, in the order of the help.
 COMMANDS = (
-    "devices", "selftest", "demo", "explain", "simulate", "map", "score", "localize", "fit", "match",
+    "devices", "selftest", "demo", "explain", "simulate", "map", "score", "localize", "judge", "fit", "match",
     "likelihood-map", "features", "landmarks", "ros", "sweep", "bench",
 )  # fmt: skip
 ALIASES = {"localise": "localize"}

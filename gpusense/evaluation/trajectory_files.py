@@ -92,7 +92,9 @@ def read_tum(path: Path) -> tuple[Floats, Floats]:
     return rows[:, 0], np.column_stack([rows[:, 1], rows[:, 2], theta])
 
 
-def poses_at(scans: Sequence[float], times: Floats, poses: Floats) -> list[Pose | None]:
+def poses_at(
+    scans: Sequence[float], times: Floats, poses: Floats, *, near: float = _SAME_TIME, name: str = "--reference"
+) -> list[Pose | None]:
     """Return the poses of a trajectory at the times of scans; None where none is near.
 
     Between two poses of the trajectory that are at most half a second apart, poses are interpolated.
@@ -101,23 +103,38 @@ def poses_at(scans: Sequence[float], times: Floats, poses: Floats) -> list[Pose 
         scans: Times of the scans [s], at least one.
         times: (T,) increasing times of the trajectory [s].
         poses: (T, 3) its poses.
+        near: Largest time from a scan to a single pose near it [s].
+        name: Name of the trajectory in errors.
+
+    Raises:
+        ValueError: no scan has a time of the trajectory.
     """
-    found = [_pose_at(time, times, poses) for time in scans]
+    found = [_pose_at(time, times, poses, near) for time in scans]
     if not any(found):
         span, wanted = f"{times[0]:.3f} to {times[-1]:.3f} s", f"{scans[0]:.3f} to {scans[-1]:.3f} s"
-        raise ValueError(f"--reference: must have poses at times of the scans, {wanted}, got {span}")
+        raise ValueError(f"{name}: must have poses at times of the scans, {wanted}, got {span}")
     return found
 
 
-def _pose_at(time: float, times: Floats, poses: Floats) -> Pose | None:
+def nearest_index(scans: Sequence[float], times: Floats) -> NDArray[np.int64]:
+    """Return the index of the pose of a trajectory nearest to each time of a scan."""
+    wanted = np.asarray(scans, np.float64)
+    after = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(times) - 1)
+    return np.where(wanted - times[before] <= times[after] - wanted, before, after)
+
+
+def _pose_at(time: float, times: Floats, poses: Floats, near: float) -> Pose | None:
     """Return the pose of a trajectory at a time; None if none is near."""
+    nearest = int(nearest_index([time], times)[0])
     after = int(np.searchsorted(times, time))
-    near = [k for k in (after - 1, after) if 0 <= k < len(times)]
-    nearest = min(near, key=lambda k: abs(times[k] - time))
-    if abs(times[nearest] - time) <= _SAME_TIME:
+    apart = abs(times[nearest] - time)
+    between = 0 < after < len(times) and times[after] - times[after - 1] <= _FARTHEST
+    if apart <= _SAME_TIME or (apart <= near and not between):
         x, y, theta = (float(value) for value in poses[nearest])
         return x, y, theta
-    if len(near) < 2 or times[after] - times[after - 1] > _FARTHEST:
+    if not between:
         return None
     share = (time - times[after - 1]) / (times[after] - times[after - 1])
     change = poses[after] - poses[after - 1]

@@ -169,12 +169,7 @@ def check_track(place: str, track: Track, scans_at: Times) -> None:
     """Warn of odometry that is not level, or does not overlap with the scans in time."""
     if not track.poses:
         return
-    tilted = [tilt for tilt in track.tilts if tilt > LEVEL]
-    if tilted:
-        warn_user(
-            f"{place}: {len(tilted)} of {len(track.tilts)} poses of odometry ({track.source}) are not level, by up "
-            f"to {math.degrees(max(tilted)):.3g} deg: their x, y and yaw are used"
-        )
+    warn_of_tilt(place, f"odometry ({track.source})", track)
     for one, other in ((scans_at, track.times), (track.times, scans_at)):
         # A simulation that begins at 0 may have a single message.
         one.from_zero = len(one.stamps) == 1 and other.stamped and min(other.stamps) <= _APART
@@ -183,4 +178,14 @@ def check_track(place: str, track: Track, scans_at: Times) -> None:
         warn_user(
             f"{place}: the times of scans ({min(scans):.9g} to {max(scans):.9g} s) and odometry ({min(poses):.9g} "
             f"to {max(poses):.9g} s) do not overlap: all scans have the same pose in odometry"
+        )
+
+
+def warn_of_tilt(place: str, name: str, track: Track) -> None:
+    """Warn of poses that are not level."""
+    tilted = [tilt for tilt in track.tilts if tilt > LEVEL]
+    if tilted:
+        warn_user(
+            f"{place}: {len(tilted)} of {len(track.tilts)} poses of {name} are not level, by up to "
+            f"{math.degrees(max(tilted)):.3g} deg: their x, y and yaw are used"
         )

@@ -12,6 +12,7 @@ from gpusense.plots.drawing import (
     save,
 )
 from gpusense.plots.features import draw_features, draw_landmarks, features_figure, landmarks_figure
+from gpusense.plots.judgements import draw_stanford, judgement_figure
 from gpusense.plots.localization import localization_figure
 from gpusense.plots.matches import match_figure
 from gpusense.plots.pose_densities import draw_particles, draw_pose_density, pose_lattice
@@ -52,6 +53,8 @@ __all__ = [
     "features_figure",
     "landmarks_figure",
     "draw_solution_set",
+    "draw_stanford",
+    "judgement_figure",
     "localization_figure",
     "match_figure",
     "new_figure",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 
 from gpusense._util.extras import library
 from gpusense._util.files import write_whole
+from gpusense.evaluation.judging import Judgement
 from gpusense.evaluation.steps import Step
 from gpusense.evaluation.tracking import Track
 from gpusense.localization.filter import ParticleFilter
 from gpusense.localization.pose_algebra import compose_poses
+from gpusense.logs import Scan
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, Scanner, classify
 
@@ -32,9 +35,9 @@ class Recording:
         ImportError: rerun-sdk is not installed.
     """
 
-    def __init__(self, grid: OccupancyGrid) -> None:
+    def __init__(self, grid: OccupancyGrid, name: str = "localize") -> None:
         self._rr: Any = library("rerun", "a recording for Rerun")
-        self._stream: Any = self._rr.RecordingStream("gpusense localize")
+        self._stream: Any = self._rr.RecordingStream(f"gpusense {name}")
         self._content = self._stream.binary_stream()
         walls = grid.cell_centers(*np.nonzero(grid.occupied))
         self._points("map", walls, _WALL, grid.resolution / 2, static=True)
@@ -60,6 +63,25 @@ class Recording:
         if track.references is not None:
             known = np.isfinite(track.references[:, 0])
             paths.append(("path/reference", track.references[known], _REFERENCE))
+        self._write(paths, path)
+
+    def write_judgement(self, found: Judgement, scans: Sequence[Scan], path: Path) -> None:
+        """Write a judgement of N poses by N scans atomically as a file .rrd."""
+        rr = self._rr
+        for k, scan in enumerate(scans):
+            self._stream.set_time("scan", sequence=int(found.index[k]))
+            self._points("scan", end_points(scan.scanner, scan.ranges, found.poses[k]), _SCAN, 0.03)
+            self._arrow("pose", found.poses[k], _ESTIMATE)
+            for name, values in (("p_lost", found.p_lost), ("explained", found.explained), ("radius", found.radii)):
+                if math.isfinite(values[k]):
+                    self._stream.log(name, rr.Scalars(float(values[k])))
+        for one in found.stretches:
+            if one.place is not None and math.isfinite(one.off):
+                self._stream.set_time("scan", sequence=int(found.index[one.first]))
+                self._arrow("likeliest_place", one.place.pose, _REFERENCE)
+        self._write([("path/poses", found.poses, _ESTIMATE)], path)
+
+    def _write(self, paths: Sequence[tuple[str, NDArray[np.float64], tuple[int, ...]]], path: Path) -> None:
         for name, poses, colour in paths:
             line = self._rr.LineStrips3D([_flat(poses[:, :2])], colors=[colour])
             self._stream.log(name, line, static=True)

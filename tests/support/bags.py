@@ -105,6 +105,23 @@ class Writer:
         self.put(topic, "nav_msgs/msg/Odometry", time, header=self.header(time if stamp is None else stamp, frame),
                  child_frame_id=base, **both)  # fmt: skip
 
+    def pose(self, time: float, x: float, y: float, yaw: float, topic: str = "/amcl_pose", frame: str = "map",
+             covariance: Any = None, stamp: float | None = None) -> None:  # fmt: skip
+        """Write a PoseWithCovarianceStamped, or a PoseStamped for ``covariance=None``.
+
+        ``covariance`` has the variances of x, y and yaw.
+        """
+        point = self.make("geometry_msgs/msg/Point", x=x, y=y, z=0.0)
+        pose = self.make("geometry_msgs/msg/Pose", position=point, orientation=self.quaternion(yaw))
+        header = self.header(time if stamp is None else stamp, frame)
+        if covariance is None:
+            self.put(topic, "geometry_msgs/msg/PoseStamped", time, header=header, pose=pose)
+            return
+        full = np.zeros((6, 6))
+        full[[0, 1, 5], [0, 1, 5]] = covariance
+        both = self.make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=full.ravel())
+        self.put(topic, "geometry_msgs/msg/PoseWithCovarianceStamped", time, header=header, pose=both)
+
     def turn(self, values: Any) -> Any:
         return self.make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", map(float, values), strict=True)))
 

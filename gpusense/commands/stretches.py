@@ -1,0 +1,73 @@
+"""Text and JSON of the stretches of a trajectory with the same verdict, for ``judge`` and ``localize``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gpusense.evaluation.judging import Stretch
+
+# Most stretches that are printed.
+_MOST = 12
+
+
+def print_stretches(stretches: Sequence[Stretch], begin: float, risk: float) -> None:
+    """Print the stretches in the order of time, the worst ones of many.
+
+    Args:
+        stretches: The stretches.
+        begin: Time of the first scan [s].
+        risk: Probability that an error exceeds the radius.
+    """
+    order = {"lost": 0, "uncertain": 1, "tracking": 2}
+    chosen = sorted(stretches, key=lambda one: (order[one.verdict], -one.duration))[:_MOST]
+    for one in sorted(chosen, key=lambda one: one.first):
+        print("\n".join(_lines(one, begin, risk)))
+    if len(chosen) < len(stretches):
+        print(f"           and {len(stretches) - len(chosen)} shorter ones; --json lists all")
+
+
+def _lines(one: Stretch, begin: float, risk: float) -> list[str]:
+    share = "no beam to judge by" if math.isnan(one.explained) else f"{100 * one.explained:.0f} % of the beams explained"
+    radius = "no radius"
+    if math.isfinite(one.radius):
+        some = "" if one.promised == 1 else f" ({100 * one.promised:.0f} % of the scans)"
+        radius = f"within {one.radius:.2g} m at risk {risk:g}{some}"
+    lines = [
+        f"{one.verdict:<10} {one.start - begin:.1f} s to {one.end - begin:.1f} s: p_lost at most {one.p_lost:.2g}, "
+        f"{share}, {radius}"
+    ]
+    if one.place is not None:
+        lines.append(f"           {_place(one)}")
+    if one.diagnosis is not None:
+        lines.append(f"           {one.diagnosis.text}")
+    return lines
+
+
+def _place(one: Stretch) -> str:
+    assert one.place is not None
+    if one.place.status == "no match":
+        return "no place of the map explains the scans"
+    x, y, theta = one.place.pose.tolist()
+    sure = "more likely at" if one.place.status == "found" else "among several places, likeliest at"
+    return (
+        f"{sure} x = {x:.2f}, y = {y:.2f}, theta = {theta:.2f} (p_right {one.place.p_right:.2g}), "
+        f"{one.off:.1f} m off"
+    )
+
+
+def stretch_rows(stretches: Sequence[Stretch]) -> list[dict[str, Any]]:
+    """Return the stretches as JSON documents."""
+    rows = []
+    for one in stretches:
+        names = ("verdict", "first", "last", "start", "end", "p_lost", "explained", "radius", "promised", "pose", "off")
+        row = {name: getattr(one, name) for name in names}
+        row["place"] = None if one.place is None else {
+            "pose": one.place.pose, "p_right": one.place.p_right, "status": one.place.status,
+        }  # fmt: skip
+        row["evidence"] = None if one.diagnosis is None else asdict(one.diagnosis) | {"text": one.diagnosis.text}
+        rows.append(row)
+    return rows

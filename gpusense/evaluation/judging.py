@@ -1,0 +1,329 @@
+"""Judge the trajectory of any localiser by the scans of a recording: when it was right, when lost, where it was."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense._util import checks
+from gpusense._util.typing import AnyArray
+from gpusense.evaluation.posed_scans import NEAR
+from gpusense.evaluation.trajectory_files import nearest_index, poses_at
+from gpusense.localization.defaults import DEFAULTS
+from gpusense.localization.diagnosis import Diagnosis
+from gpusense.localization.monitor import PoseMonitor
+from gpusense.localization.protection import protection_level
+from gpusense.localization.spread import FAR
+from gpusense.localization.words import Word
+from gpusense.logs import Scan
+from gpusense.matching.locate import locate_scan
+from gpusense.matching.location import Location
+from gpusense.models.scan.field import LikelihoodFieldModel
+from gpusense.models.scan.model import ScanModel
+from gpusense.world.parameters import LikelihoodFieldParameters
+from gpusense.world.scanner import Scanner
+
+Floats = NDArray[np.float64]
+# A stretch ends where no pose is judged for this time [s], and for this multiple of the median time between them.
+_GAP, _GAP_STEPS = 2.0, 5.0
+# Steps of the search for the place of a scan [m, rad].
+_RESOLUTION, _ANGLE = 0.1, math.radians(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Successive poses with the same verdict.
+
+    Attributes:
+        verdict: "tracking", "uncertain" or "lost".
+        first: Row of the first pose.
+        last: Row of the last pose.
+        start: Time of the first pose [s].
+        end: Time at which the next stretch begins, or of the last pose if none follows at once [s].
+        p_lost: Largest p_lost.
+        explained: Median share of the beams that agree with the map; NaN without one.
+        radius: Median radius of protection [m].
+        promised: Share of the poses with a finite radius.
+        pose: (3,) pose at the scan that was searched, else the last pose [m, m, rad].
+        place: The likeliest place of the scan at ``pose``; None without a search.
+        diagnosis: Evidence at ``pose`` and the likely cause; None for "tracking".
+    """
+
+    verdict: Word
+    first: int
+    last: int
+    start: float
+    end: float
+    p_lost: float
+    explained: float
+    radius: float
+    promised: float
+    pose: Floats
+    place: Location | None = field(default=None, repr=False)
+    diagnosis: Diagnosis | None = field(default=None, repr=False)
+
+    @property
+    def duration(self) -> float:
+        """Time from start to end [s]."""
+        return self.end - self.start
+
+    @property
+    def off(self) -> float:
+        """Distance from the pose to the likeliest place of its scan [m]; NaN without such a place."""
+        if self.place is None or self.place.status == "no match":
+            return math.nan
+        return float(np.hypot(*(self.place.pose - self.pose)[:2]))
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """Verdicts on the poses of a localiser: N poses of S scans.
+
+    Attributes:
+        scans: Number of scans; those without a pose are not judged.
+        index: (N,) index of the scan of each pose.
+        times: (N,) times [s].
+        poses: (N, 3) poses [m, m, rad].
+        p_lost: (N,) probabilities that the pose is off by more than 1 m or 0.5 rad.
+        verdicts: N times "tracking", "uncertain" or "lost".
+        explained: (N,) shares of the beams that agree with the map; NaN without one.
+        radii: (N,) radii that the error of the position exceeds with at most the probability ``risk`` [m]; infinite
+            where that cannot be promised.
+        risk: The probability.
+        stretches: Successive poses with the same verdict.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> room = gs.OccupancyGrid(np.pad(np.zeros((50, 80), int), 1, constant_values=100), 0.1)
+        >>> scanner = gs.Scanner.uniform(angle_min=-3.1, angle_increment=0.2, count=32, range_max=10.0)
+        >>> model = gs.LikelihoodFieldModel(room, scanner, backend="numpy")
+        >>> z = gs.RayCaster(room, range_max=10.0, backend="numpy").cast([[2.0, 3.0, 0.5]], scanner.bearings)[0]
+        >>> scans = [gs.Scan(0.1 * k, z, scanner, (0, 0, 0), None) for k in range(20)]
+        >>> gs.judge_trajectory(model, scans, [[2.0, 3.0, 0.5]] * 20)
+        Judgement(20 of 20 scans, tracking 1.9 s, uncertain 0.0 s, lost 0.0 s)
+    """
+
+    scans: int
+    index: NDArray[np.int64]
+    times: Floats
+    poses: Floats
+    p_lost: Floats
+    verdicts: tuple[Word, ...]
+    explained: Floats
+    radii: Floats
+    risk: float
+    stretches: tuple[Stretch, ...]
+
+    def __repr__(self) -> str:
+        parts = ", ".join(f"{word} {self.duration(word):.1f} s" for word in ("tracking", "uncertain", "lost"))
+        return f"Judgement({len(self.times)} of {self.scans} scans, {parts})"
+
+    @property
+    def lost(self) -> bool:
+        """Tell whether a pose was lost."""
+        return "lost" in self.verdicts
+
+    @property
+    def informed(self) -> bool:
+        """Tell whether a scan had a beam to judge by."""
+        return bool(np.isfinite(self.explained).any())
+
+    def duration(self, *verdicts: Word) -> float:
+        """Return the time with some verdicts; with any if none is named [s]."""
+        return float(sum(one.duration for one in self.stretches if not verdicts or one.verdict in verdicts))
+
+    def errors(self, times: Floats, poses: Floats) -> Floats:
+        """Return (N,) distances from the positions of a true trajectory [m]; NaN where it has no pose.
+
+        Args:
+            times: (T,) increasing times of the trajectory [s].
+            poses: (T, 3) its poses.
+
+        Raises:
+            ValueError: No pose has a time of the trajectory.
+        """
+        none = (math.nan,) * 3
+        true = np.array([pose or none for pose in poses_at(self.times.tolist(), times, poses, name="--truth")])
+        return np.asarray(np.hypot(*(self.poses - true)[:, :2].T))
+
+
+class TrajectoryJudge:
+    """Judges a trajectory, scan by scan."""
+
+    def __init__(self, models: ScanModel | Sequence[ScanModel], *, risk: float = 0.05, searches: int = 5) -> None:
+        """Begin; the arguments are those of :func:`judge_trajectory`."""
+        each = [models] if isinstance(models, ScanModel) else list(models)
+        for model in each:
+            checks.instance("models", model, ScanModel)
+        self._models: dict[Scanner, ScanModel] = {model.scanner: model for model in each}
+        self._searches = checks.integer("searches", searches, low=0)
+        # This checks the risk.
+        protection_level(risk, 0.0, None, 1.0)
+        self._risk = float(risk)
+        self._monitor = PoseMonitor(each)
+        self._locators: dict[Scanner, LikelihoodFieldModel] = {}
+        self._judged: list[tuple[int, Scan, Floats, Any]] = []
+
+    @property
+    def count(self) -> int:
+        """Number of judged poses."""
+        return len(self._judged)
+
+    def add(self, index: int, scan: Scan, pose: AnyArray, covariance: AnyArray | None = None) -> Word:
+        """Judge the pose (3,) of a scan; return the verdict."""
+        model = self._models.get(scan.scanner)
+        if model is None:
+            raise ValueError(f"scans: every scanner must have a model, got none for that of scan {index}")
+        verdict = self._monitor.update(pose, {model: scan.ranges}, covariance)
+        radius = verdict.protection_level(self._risk)
+        place = np.array(pose, np.float64)
+        self._judged.append((index, scan, place, (verdict.p_lost, verdict.verdict, verdict.explained, radius)))
+        return verdict.verdict
+
+    def result(self, scans: int) -> Judgement:
+        """Return the judgement of the poses so far, of ``scans`` scans."""
+        index, times = [one[0] for one in self._judged], np.array([one[1].time for one in self._judged])
+        poses = np.array([one[2] for one in self._judged]).reshape(-1, 3)
+        p_lost, verdicts, explained, radii = zip(*(one[3] for one in self._judged), strict=True)
+        columns = [np.array(column, np.float64) for column in (p_lost, explained, radii)]
+        stretches = stretches_of(times, poses, verdicts, *columns)
+        explained_stretches = tuple(one if one.verdict == "tracking" else self._explained(one) for one in stretches)
+        return Judgement(
+            scans, np.array(index, np.int64), times, poses, columns[0], tuple(verdicts), columns[1], columns[2],
+            self._risk, explained_stretches,
+        )  # fmt: skip
+
+    def _explained(self, stretch: Stretch) -> Stretch:
+        """Return a stretch with its likely cause, and where the robot more likely was if it is lost."""
+        count = min(self._searches, stretch.last - stretch.first + 1)
+        if not count:
+            return stretch
+        rows = np.unique(np.linspace(stretch.first, stretch.last, count).round().astype(int))
+        found: list[Stretch] = []
+        for row in rows:
+            _, scan, pose, _ = self._judged[row]
+            place = self._locate(scan) if stretch.verdict == "lost" else None
+            found.append(replace(stretch, pose=pose, place=place, diagnosis=self._diagnose(scan, pose)))
+        causes = [one.diagnosis.cause for one in found if one.diagnosis is not None]
+        usual = max(causes, key=causes.count)
+        # The search that is surest tells the place; the diagnosis there may have another cause than most.
+        best = max(found, key=lambda one: -1.0 if one.place is None else one.place.p_right)
+        if best.place is not None and best.place.found and best.off > FAR:
+            x, y, theta = best.place.pose.tolist()
+            assert best.diagnosis is not None
+            return replace(best, diagnosis=replace(best.diagnosis, elsewhere=(x, y, theta), cause="start"))
+        if best.diagnosis is not None and best.diagnosis.cause != usual:
+            best = replace(best, diagnosis=next(d for d in (one.diagnosis for one in found) if d and d.cause == usual))
+        return best
+
+    def _diagnose(self, scan: Scan, pose: Floats) -> Diagnosis:
+        model = self._models[scan.scanner]
+        monitor = PoseMonitor(model)
+        monitor.update(pose, scan.ranges)
+        return monitor.diagnose()
+
+    def _locate(self, scan: Scan) -> Location:
+        if scan.scanner not in self._locators:
+            model = self._models[scan.scanner]
+            if not (isinstance(model, LikelihoodFieldModel) and model.compat is None):
+                parameters = LikelihoodFieldParameters(**DEFAULTS.field)
+                model = LikelihoodFieldModel(
+                    model.grid, scan.scanner, parameters, beams=model.beams, backend=model.device.selection
+                )
+            self._locators[scan.scanner] = model
+        return locate_scan(self._locators[scan.scanner], scan.ranges, resolution=_RESOLUTION, angle=_ANGLE)
+
+
+def judge_trajectory(
+    models: ScanModel | Sequence[ScanModel],
+    scans: Sequence[Scan],
+    poses: AnyArray,
+    *,
+    times: AnyArray | None = None,
+    covariances: AnyArray | None = None,
+    risk: float = 0.05,
+    searches: int = 5,
+    step: Callable[[int], None] = lambda index: None,
+) -> Judgement:
+    """Judge the poses of any localiser by the scans of a recording.
+
+    :class:`PoseMonitor` judges the pose of each scan in turn. Where the poses are lost, :func:`locate_scan` searches the
+    whole map for the places of some scans.
+
+    Args:
+        models: A model of scans with the map, or several of one device: one for each scanner.
+        scans: S scans in the order of time.
+        poses: (S, 3) poses of the robot at the scans [m, m, rad], NaN where unknown; with ``times`` (T, 3) poses.
+        times: (T,) increasing times of the poses [s], which are then interpolated at the scans: between poses at most
+            0.5 s apart, else the pose within 0.05 s. None if each scan has a pose.
+        covariances: (S, 3, 3) or (T, 3, 3) covariances of the poses, NaN where unknown; None if unknown.
+        risk: Probability that the error of the position exceeds the radius of protection, from 0.01 to 1.
+        searches: Scans of a stretch that are searched and diagnosed.
+        step: Called with the index of each scan before it is judged.
+
+    Raises:
+        TypeError, ValueError: An argument breaks its rule, no scan has a pose, or a scan has a scanner without a model.
+
+    Example:
+        See :class:`gpusense.Judgement`.
+    """
+    if not len(scans):
+        raise ValueError("scans: must have a scan, got none")
+    count = "S" if times is None else "T"
+    places = checks.array("poses", poses, (count, 3), finite=False)
+    spread = None if covariances is None else checks.array("covariances", covariances, (len(places), 3, 3), finite=False)
+    if times is not None:
+        known = checks.array("times", times, (len(places),))
+        if not (np.diff(known) > 0).all():
+            raise ValueError("times: must increase, got times that do not")
+        at = [scan.time for scan in scans]
+        if spread is not None:
+            spread = spread[nearest_index(at, known)]
+        none = (math.nan,) * 3
+        places = np.array([pose or none for pose in poses_at(at, known, places, near=NEAR, name="poses")])
+    if len(places) != len(scans):
+        raise ValueError(f"poses: must be as many as scans, {len(scans)}, or come with times, got {len(places)}")
+    judge = TrajectoryJudge(models, risk=risk, searches=searches)
+    judged = np.flatnonzero(np.isfinite(places).all(axis=1))
+    if not len(judged):
+        raise ValueError("poses: must have a pose of a scan, got none that is finite")
+    for k in judged.tolist():
+        step(k)
+        unknown = spread is None or np.isnan(spread[k]).any()
+        judge.add(k, scans[k], places[k], None if unknown or spread is None else spread[k])
+    return judge.result(len(scans))
+
+
+def stretches_of(
+    times: Floats, poses: Floats, verdicts: Sequence[Word], p_lost: Floats, explained: Floats, radii: Floats
+) -> list[Stretch]:
+    """Return the stretches of successive poses with the same verdict, and without a long gap of time.
+
+    Args:
+        times: (N,) times [s].
+        poses: (N, 3) poses.
+        verdicts: Their verdicts.
+        p_lost: (N,) their p_lost.
+        explained: (N,) shares of beams that agree with the map.
+        radii: (N,) radii [m].
+    """
+    steps = np.diff(times)
+    longest = max(_GAP, _GAP_STEPS * float(np.median(steps))) if len(steps) else _GAP
+    gap = np.append(steps > longest, True)
+    ends = [k for k in range(len(times)) if gap[k] or verdicts[k + 1] != verdicts[k]]
+    stretches = []
+    for first, last in zip([0, *(k + 1 for k in ends)], ends, strict=False):
+        part = slice(first, last + 1)
+        known = explained[part][np.isfinite(explained[part])]
+        end = times[last] if gap[last] else times[last + 1]
+        share = float(np.median(known)) if len(known) else math.nan
+        stretches.append(
+            Stretch(verdicts[first], first, last, float(times[first]), float(end), float(p_lost[part].max()), share,
+                    float(np.median(radii[part])), float(np.isfinite(radii[part]).mean()), poses[last])
+        )  # fmt: skip
+    return stretches

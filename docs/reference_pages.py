@@ -21,6 +21,7 @@ TITLES = {
     "localization": "Localisation",
     "positions": "Positions from beacons",
     "logs": "Logs",
+    "evaluation": "Judged trajectories",
     "backends": "Devices",
 }
 # Public modules, by their titles.

@@ -56,8 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
     add_log(parser, "a log with laser scans", several="lasers that judge the poses")
     add("--poses", type=_source, metavar="SOURCE",
-        help="topic of a bag with the poses, such as /amcl_pose, or /tf; or a TUM trajectory, such as run.tum (default: "
-        "/tf, the only topic of poses, or the poses of a CARMEN log)")  # fmt: skip
+        help="topic of a bag with the poses, such as /amcl_pose, or /tf; or a TUM trajectory, such as run.tum "
+        "(default: /tf, the only topic of poses, or the poses of a CARMEN log)")  # fmt: skip
     add("--map-frame", default="map", metavar="NAME", help="frame of the map among transforms (default: %(default)s)")
     add("--risk", type=positive_number, default=0.05, metavar="P",
         help="probability that the error exceeds the radius, at least 0.01 (default: %(default)s)")  # fmt: skip
@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_backend(parser)
     add_json(parser)
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
-        help="draw the track on the map coloured by p_lost, p_lost and radius over time, and the Stanford diagram")  # fmt: skip
+        help="draw the track on the map coloured by p_lost, p_lost and radius over time, and errors")  # fmt: skip
     add("--csv", type=output_path(".csv"), metavar="FILE", help="write a row for each pose")
     add("--record", type=output_path(".rrd"), metavar="FILE", help="record the run for the viewer Rerun")
 

@@ -33,7 +33,9 @@ def report(
     args: argparse.Namespace, grid: OccupancyGrid, found: Judgement, posed: PosedScans, truth: Trajectory | None
 ) -> None:
     """Write the files, and print the results."""
-    errors = np.full(len(found.times), math.nan) if truth is None else found.errors(*truth)
+    from gpusense.evaluation.judging import errors_of
+
+    errors = np.full(len(found.times), math.nan) if truth is None else errors_of(found, *truth)
     known = np.isfinite(errors)
     rated: Integrity | None = None
     if truth is not None:

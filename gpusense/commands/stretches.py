@@ -31,7 +31,9 @@ def print_stretches(stretches: Sequence[Stretch], begin: float, risk: float) -> 
 
 
 def _lines(one: Stretch, begin: float, risk: float) -> list[str]:
-    share = "no beam to judge by" if math.isnan(one.explained) else f"{100 * one.explained:.0f} % of the beams explained"
+    share = (
+        "no beam to judge by" if math.isnan(one.explained) else f"{100 * one.explained:.0f} % of the beams explained"
+    )
     radius = "no radius"
     if math.isfinite(one.radius):
         some = "" if one.promised == 1 else f" ({100 * one.promised:.0f} % of the scans)"
@@ -54,8 +56,7 @@ def _place(one: Stretch) -> str:
     x, y, theta = one.place.pose.tolist()
     sure = "more likely at" if one.place.status == "found" else "among several places, likeliest at"
     return (
-        f"{sure} x = {x:.2f}, y = {y:.2f}, theta = {theta:.2f} (p_right {one.place.p_right:.2g}), "
-        f"{one.off:.1f} m off"
+        f"{sure} x = {x:.2f}, y = {y:.2f}, theta = {theta:.2f} (p_right {one.place.p_right:.2g}), {one.off:.1f} m off"
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from gpusense.localization.diagnosis import Diagnosis
 from gpusense.localization.monitor import PoseMonitor
 from gpusense.localization.protection import protection_level
 from gpusense.localization.spread import FAR
-from gpusense.localization.words import Word
+from gpusense.localization.words import WORDS, Word
 from gpusense.logs import Scan
 from gpusense.matching.locate import locate_scan
 from gpusense.matching.location import Location
@@ -52,6 +52,11 @@ class Stretch:
         pose: (3,) pose at the scan that was searched, else the last pose [m, m, rad].
         place: The likeliest place of the scan at ``pose``; None without a search.
         diagnosis: Evidence at ``pose`` and the likely cause; None for "tracking".
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> gs.Stretch("tracking", 0, 9, 12.0, 13.5, 0.02, 0.97, 0.1, 1.0, np.zeros(3)).duration
+        1.5
     """
 
     verdict: Word
@@ -99,13 +104,9 @@ class Judgement:
 
     Example:
         >>> import gpusense as gs, numpy as np
-        >>> room = gs.OccupancyGrid(np.pad(np.zeros((50, 80), int), 1, constant_values=100), 0.1)
-        >>> scanner = gs.Scanner.uniform(angle_min=-3.1, angle_increment=0.2, count=32, range_max=10.0)
-        >>> model = gs.LikelihoodFieldModel(room, scanner, backend="numpy")
-        >>> z = gs.RayCaster(room, range_max=10.0, backend="numpy").cast([[2.0, 3.0, 0.5]], scanner.bearings)[0]
-        >>> scans = [gs.Scan(0.1 * k, z, scanner, (0, 0, 0), None) for k in range(20)]
-        >>> gs.judge_trajectory(model, scans, [[2.0, 3.0, 0.5]] * 20)
-        Judgement(20 of 20 scans, tracking 1.9 s, uncertain 0.0 s, lost 0.0 s)
+        >>> n = np.arange(3.0)
+        >>> gs.Judgement(4, n.astype(int), n, np.zeros((3, 3)), n / 9, ("tracking",) * 3, n, n, 0.05, ()).lost
+        False
     """
 
     scans: int
@@ -133,33 +134,22 @@ class Judgement:
         """Tell whether a scan had a beam to judge by."""
         return bool(np.isfinite(self.explained).any())
 
-    def duration(self, *verdicts: Word) -> float:
-        """Return the time with some verdicts; with any if none is named [s]."""
-        return float(sum(one.duration for one in self.stretches if not verdicts or one.verdict in verdicts))
-
-    def errors(self, times: Floats, poses: Floats) -> Floats:
-        """Return (N,) distances from the positions of a true trajectory [m]; NaN where it has no pose.
-
-        Args:
-            times: (T,) increasing times of the trajectory [s].
-            poses: (T, 3) its poses.
-
-        Raises:
-            ValueError: No pose has a time of the trajectory.
-        """
-        none = (math.nan,) * 3
-        true = np.array([pose or none for pose in poses_at(self.times.tolist(), times, poses, name="--truth")])
-        return np.asarray(np.hypot(*(self.poses - true)[:, :2].T))
+    def duration(self, verdict: Word | None = None) -> float:
+        """Return the time with a verdict; with any for None [s]."""
+        if verdict is not None:
+            checks.choice("verdict", verdict, WORDS)
+        return float(sum(one.duration for one in self.stretches if verdict in (None, one.verdict)))
 
 
 class TrajectoryJudge:
     """Judges a trajectory, scan by scan."""
 
-    def __init__(self, models: ScanModel | Sequence[ScanModel], *, risk: float = 0.05, searches: int = 5) -> None:
+    def __init__(self, models: ScanModel | list[ScanModel], *, risk: float = 0.05, searches: int = 5) -> None:
         """Begin; the arguments are those of :func:`judge_trajectory`."""
-        each = [models] if isinstance(models, ScanModel) else list(models)
+        each = list(models) if isinstance(models, (list, tuple)) else [models]
         for model in each:
-            checks.instance("models", model, ScanModel)
+            if not isinstance(model, ScanModel):
+                raise TypeError(f"models: must be a model of scans or a list of them, got {checks.show(model)}")
         self._models: dict[Scanner, ScanModel] = {model.scanner: model for model in each}
         self._searches = checks.integer("searches", searches, low=0)
         # This checks the risk.
@@ -240,7 +230,7 @@ class TrajectoryJudge:
 
 
 def judge_trajectory(
-    models: ScanModel | Sequence[ScanModel],
+    models: ScanModel | list[ScanModel],
     scans: Sequence[Scan],
     poses: AnyArray,
     *,
@@ -248,12 +238,11 @@ def judge_trajectory(
     covariances: AnyArray | None = None,
     risk: float = 0.05,
     searches: int = 5,
-    step: Callable[[int], None] = lambda index: None,
 ) -> Judgement:
     """Judge the poses of any localiser by the scans of a recording.
 
-    :class:`PoseMonitor` judges the pose of each scan in turn. Where the poses are lost, :func:`locate_scan` searches the
-    whole map for the places of some scans.
+    :class:`PoseMonitor` judges the pose of each scan in turn. Where the poses are lost, :func:`locate_scan` searches
+    the whole map for the places of some scans.
 
     Args:
         models: A model of scans with the map, or several of one device: one for each scanner.
@@ -261,22 +250,31 @@ def judge_trajectory(
         poses: (S, 3) poses of the robot at the scans [m, m, rad], NaN where unknown; with ``times`` (T, 3) poses.
         times: (T,) increasing times of the poses [s], which are then interpolated at the scans: between poses at most
             0.5 s apart, else the pose within 0.05 s. None if each scan has a pose.
-        covariances: (S, 3, 3) or (T, 3, 3) covariances of the poses, NaN where unknown; None if unknown.
+        covariances: (S, 3, 3) or (T, 3, 3) covariances of the poses, NaN for a pose without one; None for none.
         risk: Probability that the error of the position exceeds the radius of protection, from 0.01 to 1.
         searches: Scans of a stretch that are searched and diagnosed.
-        step: Called with the index of each scan before it is judged.
 
     Raises:
         TypeError, ValueError: An argument breaks its rule, no scan has a pose, or a scan has a scanner without a model.
 
     Example:
-        See :class:`gpusense.Judgement`.
+        >>> import gpusense as gs, numpy as np
+        >>> room = gs.OccupancyGrid(np.pad(np.zeros((50, 80), int), 1, constant_values=100), 0.1)
+        >>> model = gs.LikelihoodFieldModel(room, gs.Scanner(np.arange(-3, 3, 0.2), range_max=9.0), backend="numpy")
+        >>> z = gs.RayCaster(room, range_max=9.0, backend="numpy").cast([[2.0, 3.0, 0.5]], model.scanner.bearings)[0]
+        >>> scans = [gs.Scan(0.1 * k, z, model.scanner, (0, 0, 0), None) for k in range(20)]
+        >>> gs.judge_trajectory(model, scans, [[2.0, 3.0, 0.5]] * 20)
+        Judgement(20 of 20 scans, tracking 1.9 s, uncertain 0.0 s, lost 0.0 s)
     """
-    if not len(scans):
+    if not isinstance(scans, (list, tuple)) or not all(isinstance(scan, Scan) for scan in scans):
+        raise TypeError(f"scans: must be a list of Scan, got {checks.show(scans)}")
+    if not scans:
         raise ValueError("scans: must have a scan, got none")
     count = "S" if times is None else "T"
     places = checks.array("poses", poses, (count, 3), finite=False)
-    spread = None if covariances is None else checks.array("covariances", covariances, (len(places), 3, 3), finite=False)
+    spread = (
+        None if covariances is None else checks.array("covariances", covariances, (len(places), 3, 3), finite=False)
+    )
     if times is not None:
         known = checks.array("times", times, (len(places),))
         if not (np.diff(known) > 0).all():
@@ -293,10 +291,28 @@ def judge_trajectory(
     if not len(judged):
         raise ValueError("poses: must have a pose of a scan, got none that is finite")
     for k in judged.tolist():
-        step(k)
         unknown = spread is None or np.isnan(spread[k]).any()
-        judge.add(k, scans[k], places[k], None if unknown or spread is None else spread[k])
+        try:
+            judge.add(k, scans[k], places[k], None if unknown or spread is None else spread[k])
+        except ValueError as error:
+            raise ValueError(f"scans, poses or covariances: at scan {k}: {error}") from None
     return judge.result(len(scans))
+
+
+def errors_of(found: Judgement, times: Floats, poses: Floats) -> Floats:
+    """Return (N,) distances of judged poses from a true trajectory [m]; NaN where it has no pose.
+
+    Args:
+        found: The judgement.
+        times: (T,) increasing times of the trajectory [s].
+        poses: (T, 3) its poses.
+
+    Raises:
+        ValueError: No pose has a time of the trajectory.
+    """
+    none = (math.nan,) * 3
+    true = np.array([pose or none for pose in poses_at(found.times.tolist(), times, poses, name="--truth")])
+    return np.asarray(np.hypot(*(found.poses - true)[:, :2].T))
 
 
 def stretches_of(

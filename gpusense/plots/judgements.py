@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -39,9 +39,9 @@ def judgement_figure(
         >>> n = np.arange(3.0)
         >>> judged = gs.Judgement(3, n.astype(int), n, np.zeros((3, 3)), n / 9, ("tracking",) * 3, n, n, 0.05, ())
         >>> len(gs.plots.judgement_figure(gs.worlds.building(), judged).axes)
-        4
+        3
     """
-    rows = [["map", "p_lost"], ["map", "radius"]]
+    rows: Any = [["map", "p_lost"], ["map", "radius"]]
     if rated is not None:
         rows.append(["map", "stanford"])
     figure = new_figure(12.0, 3.0 * len(rows) + 0.5)
@@ -130,7 +130,7 @@ def draw_stanford(ax: Axes, rated: Integrity) -> None:
     ax.fill([0, top, top, 0], [limit, limit, top, top], color=FRAME, alpha=0.25, linewidth=0)
     ax.plot([0, top], [0, top], color=FRAME, lw=0.8)
     ax.plot(error, radius, ".", color=CLOUD, ms=3, alpha=0.6, rasterized=True)
-    style = {"ha": "center", "va": "center", "fontsize": "small"}
+    style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": "small"}
     ax.text(1.5 * limit, 0.5 * limit, f"hazardously\nmisleading\n{100 * rated.hazardous:.3g} %", **style)
     ax.text(0.72 * limit, 0.22 * limit, f"misleading\n{100 * rated.misleading:.3g} %", **style)
     ax.text(0.5 * limit, 1.6 * limit, f"unavailable\n{100 * (1 - rated.available):.3g} %", **style)

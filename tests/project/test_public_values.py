@@ -23,8 +23,9 @@ import gpusense as gs
 # Results, which only the package makes, and names that are no calls.
 RESULTS = {
     "BeamFit", "BoundCall", "Device", "Diagnosis", "DiscreteFit", "Estimate", "FeatureMap", "Features", "FilterState",
-    "IncidenceFit", "LandmarkFit", "Location", "MapMatch", "MotionFit", "Odometry", "PlausibilityWarning", "PointFit",
-    "PoseLikelihood", "PoseMode", "PoseVerdict", "PositionFix", "Reading", "Scan", "ScanChain", "ScanMatch", "Weights",
+    "IncidenceFit", "Integrity", "Judgement",
+    "LandmarkFit", "Location", "MapMatch", "MotionFit", "Odometry", "PlausibilityWarning", "PointFit", "PoseLikelihood",
+    "PoseMode", "PoseVerdict", "PositionFix", "Reading", "Scan", "ScanChain", "ScanMatch", "Stretch", "Weights",
 }  # fmt: skip
 # Methods for the package's own use, of enumerations and exceptions, or that draw a picture.
 METHODS = {
@@ -38,7 +39,7 @@ FUNCTIONS = {"devices"}
 UNKNOWN = re.compile(
     r"fit_\w+|DiscreteBeamModel\.learn|suspicious_landmarks|chain_scans|\w+\.incidence|\w+\.sample|deskew_scan"
     r"|wrap_angle|ParticleFilter\.correct|PoseMonitor\.update|trilaterate|triangulate\w*|locate|locate_scan"
-    r"|pose_likelihood|LandmarkMap|read_log"
+    r"|judge_trajectory|pose_likelihood|LandmarkMap|read_log"
 )
 # Other names of arguments in messages: fields of a mapping, readings of a sensor, the map of a model.
 ALIASES = {

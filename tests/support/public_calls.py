@@ -269,6 +269,15 @@ def _add_filters(s: SimpleNamespace, add: Any, made: Any) -> None:
         covariance=np.eye(3) / 100)  # fmt: skip
     add("PoseVerdict.protection_level", lambda: gs.PoseVerdict(0.0, "tracking", 0.9).protection_level, risk=0.5)
     add("PoseMonitor.diagnose", lambda: _monitor(field, s).diagnose, search=False)
+    add("judge_trajectory", lambda: gs.judge_trajectory, models=field, scans=_scans(s), poses=s.poses,
+        times=np.arange(3.0), covariances=np.tile(np.eye(3) / 100, (3, 1, 1)), risk=0.1, searches=0)  # fmt: skip
+    add(
+        "Judgement.duration",
+        lambda: gs.judge_trajectory(field, _scans(s), s.poses, searches=0).duration,
+        verdict="lost",
+    )
+    add("integrity", lambda: gs.integrity, errors=np.array([0.1, 0.4]), radii=np.array([0.3, 0.3]), alert_limit=0.5,
+        times=np.arange(2.0))  # fmt: skip
     add("normalize_weights", lambda: gs.normalize_weights, log_p=np.array([-1.0, -2.0, -3.0]))
     add("resample", lambda: gs.resample, weights=np.array([0.2, 0.3, 0.5]), count=5, rng=0, method="systematic")
     add("calibrate_temperature", lambda: gs.calibrate_temperature, model=field, scans=np.tile(s.ranges, (2, 1)),
@@ -280,6 +289,10 @@ def _monitor(field: Any, s: SimpleNamespace) -> gs.PoseMonitor:
     monitor = gs.PoseMonitor(field)
     monitor.update(s.poses[0], s.scan)
     return monitor
+
+
+def _scans(s: SimpleNamespace) -> list[gs.Scan]:
+    return [gs.Scan(float(k), s.ranges[k], s.scanner, (0.0, 0.0, 0.0), None) for k in range(3)]
 
 
 def _predict(s: SimpleNamespace) -> Callable[..., Any]:

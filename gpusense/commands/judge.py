@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gpusense.world.grid import OccupancyGrid
 
 NAME = "judge"
-HELP = "Judge the poses of any localiser in a recording: was it right, and if not, when, why, and where was the robot?"
+HELP = "Judge the poses of any localiser in a recording: when they were right, when lost, and why."
 FIRST = ("map", "log", "poses", "plot", "truth")
 
 LOST = 1
@@ -25,16 +25,16 @@ LOST = 1
 _TRAJECTORIES = (".tum", ".txt")
 
 EPILOG = """\
-The poses are those of a topic of a bag (geometry_msgs/PoseWithCovarianceStamped or PoseStamped, nav_msgs/Odometry), of
-the transforms from the map to the robot's base (/tf), of a TUM trajectory, or the poses that a CARMEN log contains. The
+Poses come from a topic of a bag (geometry_msgs/PoseWithCovarianceStamped or PoseStamped, nav_msgs/Odometry), the
+transforms from the map to the robot's base (/tf), a TUM trajectory, or the poses that a CARMEN log contains. The
 default is the transforms, if the bag has them, else the only topic of poses. A pose belongs to a scan if it has the
 scan's time within 0.05 s, or lies between poses that are at most 0.5 s apart.
 
 p_lost is the probability that the pose is off by more than 1 m or 0.5 rad. A pose is 'lost' if scans contradict it,
 and 'uncertain' where they leave doubt. The radius is the distance that the error of the position exceeds with at most
-the probability --risk. Where the robot was lost, the whole map is searched for some of the scans.
+the probability --risk. The whole map is searched for some of the scans of each lost stretch.
 
-With --truth, a pose is available if its radius is at most --alert-limit. An available pose is misleading if its
+--truth adds the integrity: a pose is available if its radius is at most --alert-limit. It is then misleading if its
 error exceeds the radius, and hazardously misleading if the error exceeds the alert limit. The time to alert is
 counted from the first scan with an error above the limit to the first radius above it.
 

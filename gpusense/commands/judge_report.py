@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gpusense._util.files import write_whole
-from gpusense.commands.output import counted, print_json, print_result
+from gpusense.commands.output import counted, length, print_fact, print_files, print_json, print_result
 from gpusense.commands.stretches import print_stretches, stretch_rows
 from gpusense.evaluation.machine import machine
 
@@ -60,12 +60,11 @@ def report(
         print_json(_document(args, found, posed, rated, errors))
         return
     print_result(headline(found))
-    print(f"poses      {len(found.times)} of {counted(found.scans, 'scan')}, by {posed.source}")
+    print_fact("poses", f"{len(found.times)} of {counted(found.scans, 'scan')}, by {posed.source}")
     print_stretches(found.stretches, float(found.times[0]), found.risk)
     if rated is not None:
         _print_integrity(rated, found.risk)
-    for path in filter(None, (args.plot, args.csv, args.record)):
-        print(f"written    {path}{f'; open it with: rerun {path}' if path == args.record else ''}")
+    print_files(args.plot, args.csv, args.record)
 
 
 def headline(found: Judgement) -> str:
@@ -100,16 +99,19 @@ def _seconds(time: float, *, unit: bool = True) -> str:
 
 
 def _print_integrity(rated: Integrity, risk: float) -> None:
-    print(f"integrity  {counted(len(rated.errors), 'pose')} with a truth, risk {risk:g}, alert limit "
-          f"{rated.alert_limit:g} m: hazardously misleading {100 * rated.hazardous:.3g} %, misleading "
-          f"{100 * rated.misleading:.3g} %, available {100 * rated.available:.3g} %")  # fmt: skip
-    print(f"           error above the radius in {100 * rated.exceeded:.3g} % of the poses; median error "
-          f"{np.median(rated.errors):.2g} m")  # fmt: skip
+    print_fact(
+        "integrity",
+        f"hazardously misleading {100 * rated.hazardous:.3g} %, misleading {100 * rated.misleading:.3g} %, available "
+        f"{100 * rated.available:.3g} % of {counted(len(rated.errors), 'pose')} with a truth, at risk {risk:g} and "
+        f"alert limit {rated.alert_limit:g} m",
+    )
+    print_fact("error", f"median {length(float(np.median(rated.errors)))}; above the radius in "
+               f"{100 * rated.exceeded:.3g} % of the poses")  # fmt: skip
     delays = rated.times_to_alert
     if len(delays):
         alerted = delays[np.isfinite(delays)]
         longest = f", after at most {alerted.max():.2g} s" if len(alerted) else ""
-        print(f"           {len(alerted)} of {len(delays)} errors above the alert limit are alerted{longest}")
+        print_fact("alerts", f"{len(alerted)} of {counted(len(delays), 'error')} above the alert limit{longest}")
 
 
 def _increasing(times: np.ndarray) -> np.ndarray | None:

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+from gpusense.commands.output import length, print_fact
+
 if TYPE_CHECKING:
     from gpusense.evaluation.judging import Stretch
 
@@ -25,28 +27,23 @@ def print_stretches(stretches: Sequence[Stretch], begin: float, risk: float) -> 
     order = {"lost": 0, "uncertain": 1, "tracking": 2}
     chosen = sorted(stretches, key=lambda one: (order[one.verdict], -one.duration))[:_MOST]
     for one in sorted(chosen, key=lambda one: one.first):
-        print("\n".join(_lines(one, begin, risk)))
+        print_fact(one.verdict, _summary(one, begin, risk))
+        if one.place is not None:
+            print_fact("", _place(one))
+        if one.diagnosis is not None:
+            print_fact("", one.diagnosis.text)
     if len(chosen) < len(stretches):
-        print(f"           and {len(stretches) - len(chosen)} shorter ones; --json lists all")
+        print_fact("", f"and {len(stretches) - len(chosen)} shorter ones; --json lists all")
 
 
-def _lines(one: Stretch, begin: float, risk: float) -> list[str]:
-    share = (
-        "no beam to judge by" if math.isnan(one.explained) else f"{100 * one.explained:.0f} % of the beams explained"
-    )
-    radius = "no radius"
+def _summary(one: Stretch, begin: float, risk: float) -> str:
+    share, radius = "no beam to judge by", "no radius"
+    if math.isfinite(one.explained):
+        share = f"{100 * one.explained:.0f} % of the beams explained"
     if math.isfinite(one.radius):
         some = "" if one.promised == 1 else f" ({100 * one.promised:.0f} % of the scans)"
-        radius = f"within {one.radius:.2g} m at risk {risk:g}{some}"
-    lines = [
-        f"{one.verdict:<10} {one.start - begin:.1f} s to {one.end - begin:.1f} s: p_lost at most {one.p_lost:.2g}, "
-        f"{share}, {radius}"
-    ]
-    if one.place is not None:
-        lines.append(f"           {_place(one)}")
-    if one.diagnosis is not None:
-        lines.append(f"           {one.diagnosis.text}")
-    return lines
+        radius = f"within {length(one.radius)} at risk {risk:g}{some}"
+    return f"{one.start - begin:.1f} s to {one.end - begin:.1f} s: p_lost at most {one.p_lost:.2g}, {share}, {radius}"
 
 
 def _place(one: Stretch) -> str:

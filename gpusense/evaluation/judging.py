@@ -90,7 +90,7 @@ class Judgement:
     """Verdicts on the poses of a localiser: N poses of S scans.
 
     Attributes:
-        scans: Number of scans; those without a pose are not judged.
+        scans: Number of scans; only scans with a pose are judged.
         index: (N,) index of the scan of each pose.
         times: (N,) times [s].
         poses: (N, 3) poses [m, m, rad].
@@ -241,13 +241,13 @@ def judge_trajectory(
 ) -> Judgement:
     """Judge the poses of any localiser by the scans of a recording.
 
-    :class:`PoseMonitor` judges the pose of each scan in turn. Where the poses are lost, :func:`locate_scan` searches
-    the whole map for the places of some scans.
+    :class:`PoseMonitor` judges the pose of each scan in turn. :func:`locate_scan` searches the whole map
+    for the places of some scans of each lost stretch.
 
     Args:
-        models: A model of scans with the map, or several of one device: one for each scanner.
+        models: A model of scans with the map, or a list of models on one device, one for each scanner.
         scans: S scans in the order of time.
-        poses: (S, 3) poses of the robot at the scans [m, m, rad], NaN where unknown; with ``times`` (T, 3) poses.
+        poses: (S, 3) poses of the robot at the scans [m, m, rad], NaN where unknown; or with ``times`` (T, 3) poses.
         times: (T,) increasing times of the poses [s], which are then interpolated at the scans: between poses at most
             0.5 s apart, else the pose within 0.05 s. None if each scan has a pose.
         covariances: (S, 3, 3) or (T, 3, 3) covariances of the poses, NaN for a pose without one; None for none.

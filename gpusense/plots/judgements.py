@@ -9,8 +9,17 @@ import numpy as np
 
 from gpusense.evaluation.integrity import Integrity
 from gpusense.evaluation.judging import Judgement
-from gpusense.plots.drawing import FRAME, SCALE, add_colour_bar, draw_map, new_figure
-from gpusense.plots.tracks import CLOUD, ESTIMATED
+from gpusense.plots.drawing import (
+    CLOUD,
+    ESTIMATE,
+    FRAME,
+    SCALE,
+    VERDICTS,
+    add_colour_bar,
+    add_legend,
+    draw_map,
+    new_figure,
+)
 from gpusense.world.grid import OccupancyGrid
 
 if TYPE_CHECKING:
@@ -47,12 +56,15 @@ def judgement_figure(
     figure = new_figure(12.0, 3.0 * len(rows) + 0.5)
     axes = figure.subplot_mosaic(rows, width_ratios=(1.6, 1.0))
     _draw_track(axes["map"], grid, found)
+    axes["map"].set_title(
+        "LOST" if found.lost else "RIGHT", color=VERDICTS["lost" if found.lost else "tracking"], loc="left"
+    )
     time = found.times - found.times[0]
     ax = axes["p_lost"]
     ax.plot(time, found.explained, color=CLOUD, lw=0.8, label="share of beams explained")
-    ax.plot(time, found.p_lost, color=ESTIMATED, lw=1.2, label="p_lost")
+    ax.plot(time, found.p_lost, color=ESTIMATE, lw=1.2, label="p_lost")
     ax.set(xlabel="time [s]", ylim=(0, 1.02))
-    ax.legend(loc="best", fontsize="small")
+    add_legend(ax, 2)
     _draw_radius(axes["radius"], time, found, rated, errors)
     if rated is not None:
         draw_stanford(axes["stanford"], rated)
@@ -75,11 +87,11 @@ def _draw_track(ax: Axes, grid: OccupancyGrid, found: Judgement) -> None:
     for one in found.stretches:
         if one.place is not None and math.isfinite(one.off):
             places.append(one.place.pose)
-            ax.plot(*np.array([one.pose[:2], one.place.pose[:2]]).T, ":", color=ESTIMATED, lw=1.0, zorder=5)
-            ax.plot(*one.place.pose[:2], "x", color=ESTIMATED, ms=8, mew=2, zorder=6)
+            ax.plot(*np.array([one.pose[:2], one.place.pose[:2]]).T, ":", color=ESTIMATE, lw=1.0, zorder=5)
+            ax.plot(*one.place.pose[:2], "x", color=ESTIMATE, ms=8, mew=2, zorder=6)
     if places:
-        ax.plot([], [], "x", color=ESTIMATED, ms=8, mew=2, label="likeliest place of a lost stretch")
-        ax.legend(loc="best", fontsize="small")
+        ax.plot([], [], "x", color=ESTIMATE, ms=8, mew=2, label="likeliest place of a lost stretch")
+        add_legend(ax, 2)
     shown = np.vstack([found.poses[:, :2], *(place[None, :2] for place in places)])
     low, high = shown.min(axis=0), shown.max(axis=0)
     space = max(_MARGIN * float((high - low).max()), _LEAST)
@@ -98,14 +110,14 @@ def _draw_radius(
     limit = 1.0 if rated is None else rated.alert_limit
     top = _BEYOND * max(limit, float(found.radii[finite].max(initial=0.0)))
     ax.plot(time, np.where(finite, found.radii, np.nan), color=CLOUD, lw=1.2, label=f"radius, risk {found.risk:g}")
-    ax.fill_between(time, 0, 1, where=~finite, step="post", color=ESTIMATED, alpha=0.25, linewidth=0,
+    ax.fill_between(time, 0, 1, where=~finite, step="post", color=ESTIMATE, alpha=0.25, linewidth=0,
                     transform=ax.get_xaxis_transform(), label="no radius can be promised")  # fmt: skip
     if errors is not None and np.isfinite(errors).any():
-        ax.plot(time, np.minimum(errors, top), ".", color=ESTIMATED, ms=3, label="error")
+        ax.plot(time, np.minimum(errors, top), ".", color=ESTIMATE, ms=3, label="error")
     if rated is not None:
         ax.axhline(limit, color=FRAME, lw=1.0, ls="--", label="alert limit")
     ax.set(xlabel="time [s]", ylabel="[m]", ylim=(0, top))
-    ax.legend(loc="best", fontsize="small")
+    add_legend(ax, 2)
 
 
 def draw_stanford(ax: Axes, rated: Integrity) -> None:
@@ -125,7 +137,7 @@ def draw_stanford(ax: Axes, rated: Integrity) -> None:
     limit = rated.alert_limit
     top = 2 * limit
     error, radius = np.minimum(rated.errors, 0.99 * top), np.minimum(rated.radii, 0.99 * top)
-    ax.fill([limit, top, top, limit], [0, 0, limit, limit], color=ESTIMATED, alpha=0.30, linewidth=0)
+    ax.fill([limit, top, top, limit], [0, 0, limit, limit], color=ESTIMATE, alpha=0.30, linewidth=0)
     ax.fill([0, limit, limit], [0, 0, limit], color=SCALE[1], alpha=0.45, linewidth=0)
     ax.fill([0, top, top, 0], [limit, limit, top, top], color=FRAME, alpha=0.25, linewidth=0)
     ax.plot([0, top], [0, top], color=FRAME, lw=0.8)

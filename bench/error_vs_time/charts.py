@@ -14,6 +14,13 @@ WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 480, 330, 62, 14, 34, 48
 STRIP = 62
 """Width of the strip for methods without an error."""
 SMALLEST = 1e-6
+LABELS = 4
+"""Largest number of labels of a panel; the other names are shown on hover."""
+# Corners of the shapes of groups; none is a circle.
+SHAPES: tuple[tuple[tuple[float, float], ...], ...] = (
+    (), ((-0.8, -0.8), (0.8, -0.8), (0.8, 0.8), (-0.8, 0.8)), ((0, -1), (1, 0.8), (-1, 0.8)),
+    ((0, -1), (1, 0), (0, 1), (-1, 0)), ((0, 1), (1, -0.8), (-1, -0.8)),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -52,17 +59,18 @@ def drawing(charts: Sequence[Chart]) -> str:
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" font-family="sans-serif" '
         f'font-size="11">',
-        "<style>.g{stroke:#e3e7ed}.f{fill:none;stroke:#b8c0cc;stroke-width:4;stroke-opacity:.8}.t{font-weight:bold}"
+        "<style>.n{font-size:10px;paint-order:stroke;stroke:white;stroke-width:3px}.g{stroke:#e3e7ed}.f{fill:none;stroke:#b8c0cc;stroke-width:4;stroke-opacity:.8}.t{font-weight:bold}"
         ".s{fill:#4a5568}</style>",
         f'<rect width="{width}" height="{height}" fill="white"/>',
     ]
+    scales = _scales(charts)
     for i, chart in enumerate(charts):
         parts.append(f'<g transform="translate({WIDTH * (i % 2)} {HEIGHT * (i // 2)})">')
-        parts += _panel(chart, groups)
+        parts += _panel(chart, groups, scales)
         parts.append("</g>")
     for i, group in enumerate(groups):
         x, y = 20 + 160 * (i % (3 * columns)), HEIGHT * rows + 14 + 18 * (i // (3 * columns))
-        parts.append(f'<circle cx="{x}" cy="{y - 4}" r="4" fill="{_colour(groups, group)}"/>')
+        parts.append(_symbol(groups, group, x, y - 4, 4, ""))
         parts.append(f'<text x="{x + 9}" y="{y}">{escape(group)}</text>')
     return "\n".join([*parts, "</svg>", ""])
 
@@ -71,11 +79,25 @@ def _colour(groups: Sequence[str], group: str) -> str:
     return COLOURS[groups.index(group) % len(COLOURS)]
 
 
-def _panel(chart: Chart, groups: Sequence[str]) -> list[str]:
-    errors = [mark.error for mark in chart.marks if mark.error >= SMALLEST]
-    times = [mark.seconds for mark in chart.marks]
-    low, high = _decades(errors or [0.1])
-    fast, slow = _decades(times)
+def _symbol(groups: Sequence[str], group: str, x: float, y: float, radius: float, title: str) -> str:
+    """Draw the symbol of a group: its colour, and its shape."""
+    corners = SHAPES[groups.index(group) % len(SHAPES)]
+    inside = f"<title>{escape(title)}</title>" if title else ""
+    colour = f'fill="{_colour(groups, group)}"'
+    if not corners:
+        return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius}" {colour}>{inside}</circle>'
+    points = " ".join(f"{x + 1.25 * radius * a:.1f},{y + 1.25 * radius * b:.1f}" for a, b in corners)
+    return f'<polygon points="{points}" {colour}>{inside}</polygon>'
+
+
+def _scales(charts: Sequence[Chart]) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the decades of errors and of times that all panels share."""
+    errors = [mark.error for chart in charts for mark in chart.marks if mark.error >= SMALLEST]
+    return _decades(errors or [0.1]), _decades([mark.seconds for chart in charts for mark in chart.marks])
+
+
+def _panel(chart: Chart, groups: Sequence[str], scales: tuple[tuple[int, int], tuple[int, int]]) -> list[str]:
+    (low, high), (fast, slow) = scales
     begin, end, top, bottom = LEFT + STRIP, WIDTH - RIGHT, TOP, HEIGHT - BOTTOM
 
     def x(error: float) -> float:
@@ -107,15 +129,14 @@ def _panel(chart: Chart, groups: Sequence[str]) -> list[str]:
         steps = "".join(f"H{x(mark.error):.1f}V{y(mark.seconds):.1f}" for mark in best[1:])
         parts.append(f'<path class="f" d="M{x(best[0].error):.1f} {y(best[0].seconds):.1f}{steps}H{end}"/>')
     for mark in sorted(chart.marks, key=lambda mark: mark.best):
-        parts.append(
-            f'<circle cx="{x(mark.error):.1f}" cy="{y(mark.seconds):.1f}" r="{4.5 if mark.best else 3}" '
-            f'fill="{_colour(groups, mark.group)}"><title>{escape(mark.name)}</title></circle>'
-        )
+        parts.append(_symbol(groups, mark.group, x(mark.error), y(mark.seconds), 4.5 if mark.best else 3, mark.name))
     return parts + _names(best, x, y, end)
 
 
 def _names(best: Sequence[Mark], x, y, end: float) -> list[str]:
-    """Label the marks of the front, except where a label would cover another one."""
+    """Label at most four marks of the front, except where a label would cover another one."""
+    last = len(best) - 1
+    best = [best[k] for k in sorted({round(last * k / (LABELS - 1)) for k in range(LABELS)})] if best else []
     placed: list[tuple[float, float, float]] = []
     parts = []
     for mark in best:
@@ -125,7 +146,7 @@ def _names(best: Sequence[Mark], x, y, end: float) -> list[str]:
         if any(abs(at - other) < 12 and left < right and begin < left + width for begin, right, other in placed):
             continue
         placed.append((left, left + width, at))
-        parts.append(f'<text x="{left:.1f}" y="{at:.1f}" font-size="10">{escape(mark.name)}</text>')
+        parts.append(f'<text x="{left:.1f}" y="{at:.1f}" class="n">{escape(mark.name)}</text>')
     return parts
 
 

@@ -133,21 +133,18 @@ def answer(rows: Sequence[Row], wish: Wish, device: str, standing: str = "") -> 
     return f"**{row.text}**: {figures}" if kept else f"none; nearest: {row.text}, {figures}"
 
 
-PLACES = (("laptop", "a laptop's processor", False), ("gpu", "a GPU", True))
-
-
 def lead(rows: Sequence[Row], devices: Sequence[str], standing: Standing) -> list[str]:
-    """Return the methods and code for the first wish, on the first processor and the first GPU that have any."""
-    lines, codes = [], []
-    for name, place, gpu in PLACES:
-        for device in devices:
-            row, kept = chosen(rows, FIRST[0], device, standing.get((device, FIRST[0].words), ""))
-            if row is not None and kept and ("NVIDIA" in device) == gpu:
-                figures = _figures(row, SHOWN[row.need][0])
-                lines.append(f"- **{FIRST[0].words} on {place}** ({device}): {row.text}: {figures}")
-                codes.append(f"{name} = {row.code}")
-                break
-    return [*lines, "", "```python", *codes, "```"] if lines else []
+    """Return the answer to the first wish in one line a device, and the code of the first processor and GPU."""
+    lines, codes = [], {}
+    for device in devices:
+        row, kept = chosen(rows, FIRST[0], device, standing.get((device, FIRST[0].words), ""))
+        if row is None:
+            continue
+        lines.append(f"- {device}: {answer(rows, FIRST[0], device, standing.get((device, FIRST[0].words), ''))}")
+        if kept:
+            codes.setdefault("gpu" if "NVIDIA" in device else "processor", row.code)
+    code = [f"{name} = {code}" for name, code in codes.items()]
+    return [f"**{FIRST[0].words}:**", "", *lines, "", "```python", *code, "```"] if lines else []
 
 
 def _figures(row: Row, measure: str) -> str:

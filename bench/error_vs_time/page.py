@@ -20,7 +20,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from error_vs_time.charts import Chart, Mark, drawing
 from error_vs_time.choices import (
-    FIRST,
     KL,
     SHOWN,
     WISHES,
@@ -170,7 +169,7 @@ def picture(name: str) -> Path:
 
 def interactive(folder: Path = RESULTS) -> str:
     """Return the interactive page."""
-    return error_page(rows_of(sources(folder)), SHOWN)
+    return error_page(rows_of(sources(folder)), SHOWN, back="../docs/error-vs-time.html")
 
 
 def last_answers() -> Standing:
@@ -209,10 +208,9 @@ def files(folder: Path = RESULTS, last: Standing | None = None) -> dict[Path, st
     made = {picture(need): chart(rows, need, devices) for need in needs}
     standing = standing_of(rows, devices, last_answers() if last is None else last)
     made[STANDING] = _written(standing)
-    able = [device for device in devices if own(rows, FIRST[0].need, device)]
     blocks = {
-        "lead": lead(rows, devices, standing), "first": answers(rows, able, FIRST, standing),
-        "answers": answers(rows, devices, WISHES, standing), "peers": peers(rows),
+        "lead": lead(rows, devices, standing), "answers": answers(rows, devices, WISHES, standing),
+        "peers": peers(rows),
         "matchers": rivals(rows, "matching", "a match"), "filters": rivals(rows, "localisation", "a scan"),
         "maps": by_map(rows, devices), "reports": listing(found), "limit": [str(LIMIT)],
     }  # fmt: skip

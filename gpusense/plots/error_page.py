@@ -12,7 +12,9 @@ from gpusense.evaluation.benchmark.rows import Row
 _PAGES = Path(__file__).parent / "pages"
 
 
-def error_page(rows: Sequence[Row], shown: Mapping[str, Sequence[str]] | None = None, text: str = "") -> str:
+def error_page(
+    rows: Sequence[Row], shown: Mapping[str, Sequence[str]] | None = None, text: str = "", back: str = ""
+) -> str:
     """Return the page: a figure of time over error, a budget, and performance profiles.
 
     A reader chooses need, device, map and error. The page marks the most exact method within the budget, by
@@ -23,6 +25,7 @@ def error_page(rows: Sequence[Row], shown: Mapping[str, Sequence[str]] | None = 
         rows: Rows of reports.
         shown: Texts of the measures on the page, by need; None for all.
         text: Line about the machine below the title.
+        back: Address of the page that explains the figure; empty for no link.
     """
     origins = list(dict.fromkeys(row.origin for row in rows))
     order = sorted({_preference(row) for row in rows})
@@ -30,13 +33,15 @@ def error_page(rows: Sequence[Row], shown: Mapping[str, Sequence[str]] | None = 
     data = f'{{"origins":{_json(origins)},"text":{_json(text)},"rows":[\n{lines}]}}'
     page = (_PAGES / "error.html").read_text(encoding="utf-8")
     script = (_PAGES / "error.js").read_text(encoding="utf-8")
-    return page.replace("/*{script}*/", script).replace("/*{data}*/", data)
+    link = f'<p class="note"><a href="{back}">Methods, measures and reports</a></p>' if back else ""
+    return page.replace("<!--{back}-->", link).replace("/*{script}*/", script).replace("/*{data}*/", data)
 
 
 def _plain(row: Row, origins: Sequence[str], shown: Mapping[str, Sequence[str]] | None) -> dict[str, Any]:
     measures = [name for name in (row.errors if shown is None else shown[row.need]) if name in row.errors]
     return {
         "need": row.need, "device": row.device, "map": row.scene, "name": row.text, "method": row.method,
+        "setting": row.setting,
         "code": row.code, "outside": row.outside, "maps": row.maps, "time": _short(row.seconds),
         "quartiles": [_short(one) for one in row.quartiles],
         "errors": {name: _short(row.errors[name]) for name in measures},

@@ -1,7 +1,9 @@
 "use strict";
 const $ = id => document.getElementById(id), {rows, origins, text} = JSON.parse($("data").textContent);
-const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f4f24", "#5e3c99", "#7a7a7a", "#66a61e", "#e7298a", "#8b0000", "#1b7f79"];
-const ALL = "all maps", SMALLEST = 1e-6, CLOSE = 1.25, ALIKE = 1.25, W = 900, H = 460, LEFT = 74, STRIP = 72, RIGHT = 20, TOP = 16, BOTTOM = 44;
+const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "currentColor", "#7f4f24", "#5e3c99", "#7a7a7a", "#66a61e", "#e7298a", "#8b0000", "#1b7f79"];
+const ALL = "all maps", SMALLEST = 1e-6, CLOSE = 1.25, ALIKE = 1.25, NARROW = typeof window !== "undefined" && window.innerWidth < 640, W = NARROW ? 460 : 900, H = 460, LEFT = 92, ANY = "any", OPENING = 0.01, STRIP = 72, RIGHT = 20, TOP = 16, BOTTOM = 44;
+// Corners of the symbols of methods; none is a circle.
+const SHAPES = [[], [[-0.8, -0.8], [0.8, -0.8], [0.8, 0.8], [-0.8, 0.8]], [[0, -1], [1, 0.8], [-1, 0.8]], [[0, -1], [1, 0], [0, 1], [-1, 0]], [[0, 1], [1, -0.8], [-1, -0.8]]];
 const unique = list => [...new Set(list)];
 
 function fill(select, options) {
@@ -18,11 +20,31 @@ function errorText(error, unit) {
   return `${error < SMALLEST ? 0 : Number(error.toPrecision(2))} ${unit}`;
 }
 
+/** Particles and beams of a row of a filter, such as "1000 x 60"; empty texts for others. */
+const sizes = row => (/^(\d+) x (\d+)/.exec(row.need === "localisation" ? row.setting : "") ?? ["", "", ""]).slice(1);
+
+/** The path of a method's symbol. */
+function symbol(methods, method, x, y, radius) {
+  const corners = SHAPES[methods.indexOf(method) % SHAPES.length];
+  if (!corners.length) return `M${x - radius} ${y}a${radius} ${radius} 0 1 0 ${2 * radius} 0a${radius} ${radius} 0 1 0 ${-2 * radius} 0z`;
+  return `M${corners.map(([a, b]) => `${x + 1.2 * radius * a} ${y + 1.2 * radius * b}`).join("L")}z`;
+}
+
+function legend(methods) {
+  $("legend").replaceChildren(...methods.map(method => {
+    const item = document.createElement("li"), picture = element("svg", {viewBox: "0 0 14 14"});
+    picture.append(element("path", {d: symbol(methods, method, 7, 7, 5), fill: COLOURS[methods.indexOf(method) % COLOURS.length]}));
+    item.append(picture, method);
+    return item;
+  }));
+}
+
 /** The rows that are chosen, with the error of the chosen measure. */
 function chosen() {
   const measure = $("measure").value;
   return rows
     .filter(row => row.need === $("need").value && row.device === $("device").value && row.map === ($("view").value === "profile" ? ALL : $("map").value) && measure in row.errors)
+    .filter(row => ["particles", "beams"].every((id, i) => !sizes(row)[0] || $(id).value === ANY || $(id).value === sizes(row)[i]))
     .map(row => ({...row, error: row.errors[measure], unit: row.units[Object.keys(row.errors).indexOf(measure)]}));
 }
 
@@ -65,6 +87,15 @@ function profiles(list, measure, limit) {
 function budget(list) {
   const times = list.map(row => row.time), low = Math.log(Math.min(...times) * 0.99), high = Math.log(Math.max(...times) * 1.01);
   return Math.exp(low + (high - low) * Number($("budget").value) / 1000);
+}
+
+/** Set the budget to a time, as far as the slider reaches. */
+function open(seconds) {
+  const times = chosen().filter(row => !row.outside && !row.maps).map(row => row.time);
+  if (!times.length) return;
+  const low = Math.log(Math.min(...times) * 0.99), high = Math.log(Math.max(...times) * 1.01);
+  $("budget").value = Math.round(1000 * Math.min(Math.max((Math.log(seconds) - low) / (high - low), 0), 1));
+  draw();
 }
 
 function element(name, attributes, text) {
@@ -136,15 +167,16 @@ function drawProfile() {
   const most = Math.max(2, ...curves.map(curve => curve.steps.at(-1)[0])), bottom = H - BOTTOM, end = W - RIGHT;
   const powers = Math.ceil(Math.log2(most) - 1e-9), x = ratio => LEFT + Math.log2(ratio) / powers * (end - LEFT), y = share => bottom - share * (bottom - TOP - 8);
   for (let d = 0; d <= powers; d += Math.ceil(powers / 10)) {
-    figure.append(element("path", {d: `M${x(2 ** d)} ${TOP}V${bottom}`, stroke: "#e3e7ed"}));
-    figure.append(element("text", {x: x(2 ** d), y: bottom + 18, "text-anchor": "middle", fill: "#4a5568"}, 2 ** d));
+    figure.append(element("path", {d: `M${x(2 ** d)} ${TOP}V${bottom}`, class: "grid"}));
+    figure.append(element("text", {x: x(2 ** d), y: bottom + 18, "text-anchor": "middle", class: "soft"}, 2 ** d));
   }
   for (const share of [0, 0.25, 0.5, 0.75, 1]) {
-    figure.append(element("path", {d: `M${LEFT} ${y(share)}H${end}`, stroke: "#e3e7ed"}));
-    figure.append(element("text", {x: LEFT - 6, y: y(share) + 4, "text-anchor": "end", fill: "#4a5568"}, `${100 * share} %`));
+    figure.append(element("path", {d: `M${LEFT} ${y(share)}H${end}`, class: "grid"}));
+    figure.append(element("text", {x: LEFT - 6, y: y(share) + 4, "text-anchor": "end", class: "soft"}, `${100 * share} %`));
   }
   figure.append(element("text", {x: (LEFT + end) / 2, y: H - 6, "text-anchor": "middle"}, "factor of the best time (share of scenes solved within it)"));
   const methods = unique(list.map(row => row.method));
+  legend(methods);
   curves.forEach(({row, steps, share}, i) => {
     let before = 0;
     const path = steps.map(([ratio, upTo]) => { const part = `${before ? "H" : "M"}${x(ratio)}${before ? "" : ` ${y(0)}`}V${y(upTo)}`; before = upTo; return part; }).join("");
@@ -187,28 +219,31 @@ function drawFront() {
   const begin = LEFT + STRIP, end = W - RIGHT, bottom = H - BOTTOM;
   const x = error => error < SMALLEST ? LEFT + STRIP / 2 : begin + (Math.log10(error) - low) / (high - low) * (end - begin);
   const y = time => bottom - (Math.log10(time) - fast) / (slow - fast) * (bottom - TOP);
-  figure.append(element("rect", {x: LEFT, y: TOP, width: STRIP, height: bottom - TOP, fill: "#eef1f5"}));
-  figure.append(element("text", {x: LEFT + STRIP / 2 - 10, y: bottom + 18, "text-anchor": "middle", fill: "#4a5568"}, "exact"));
+  figure.append(element("rect", {x: LEFT, y: TOP, width: STRIP, height: bottom - TOP, class: "strip"}));
+  figure.append(element("text", {x: LEFT + STRIP / 2 - 10, y: bottom + 18, "text-anchor": "middle", class: "soft"}, "exact"));
   figure.append(element("text", {x: (begin + end) / 2, y: H - 6, "text-anchor": "middle"}, `${$("measure").value} [${list[0].unit}]`));
   for (let d = low; d <= high; d++) {
     const at = x(10 ** d);
-    figure.append(element("path", {d: `M${at} ${TOP}V${bottom}`, stroke: "#e3e7ed"}));
-    figure.append(element("text", {x: at, y: bottom + 18, "text-anchor": "middle", fill: "#4a5568"}, Number((10 ** d).toPrecision(1))));
+    figure.append(element("path", {d: `M${at} ${TOP}V${bottom}`, class: "grid"}));
+    figure.append(element("text", {x: at, y: bottom + 18, "text-anchor": "middle", class: "soft"}, Number((10 ** d).toPrecision(1))));
   }
   for (let d = fast; d <= slow; d++) {
-    figure.append(element("path", {d: `M${LEFT} ${y(10 ** d)}H${end}`, stroke: "#e3e7ed"}));
-    figure.append(element("text", {x: LEFT - 6, y: y(10 ** d) + 4, "text-anchor": "end", fill: "#4a5568"}, timeText(10 ** d)));
+    figure.append(element("path", {d: `M${LEFT} ${y(10 ** d)}H${end}`, class: "grid"}));
+    figure.append(element("text", {x: LEFT - 6, y: y(10 ** d) + 4, "text-anchor": "end", class: "soft"}, timeText(10 ** d)));
   }
   const line = y(Math.min(Math.max(seconds, 10 ** fast), 10 ** slow));
   figure.append(element("path", {d: `M${LEFT} ${line}H${end}`, stroke: "#0072b2", "stroke-dasharray": "6 4"}));
   const steps = best.slice(1).map(row => `H${x(row.error)}V${y(row.time)}`).join("");
-  figure.append(element("path", {d: `M${x(best[0].error)} ${y(best[0].time)}${steps}H${end}`, fill: "none", stroke: "#b8c0cc", "stroke-width": 5}));
+  figure.append(element("path", {d: `M${x(best[0].error)} ${y(best[0].time)}${steps}H${end}`, class: "front"}));
+  const middle = (TOP + bottom) / 2;
+  figure.append(element("text", {x: 14, y: middle, "text-anchor": "middle", transform: `rotate(-90 14 ${middle})`}, "time of a call"));
   const methods = unique(list.map(row => row.method));
+  legend(methods);
   for (const row of list) {
     const colour = COLOURS[methods.indexOf(row.method) % COLOURS.length], mine = pick && row.name === pick.name && !row.outside;
-    const dot = element("circle", {
-      cx: x(row.error), cy: y(row.time), r: mine ? 9 : 5, tabindex: 0, fill: row.outside ? "none" : colour,
-      stroke: mine ? "#000" : row.outside ? "#7a7a7a" : colour, "stroke-width": mine || row.outside ? 2.5 : 1, "aria-label": row.name,
+    const dot = element("path", {
+      d: symbol(methods, row.method, x(row.error), y(row.time), mine ? 9 : 5), class: "mark", tabindex: 0, fill: row.outside ? "none" : colour,
+      stroke: mine ? "currentColor" : row.outside ? "#7a7a7a" : colour, "stroke-width": mine || row.outside ? 2.5 : 1, "aria-label": row.name,
     });
     listen(dot, row);
     figure.append(dot);
@@ -222,16 +257,24 @@ function choose() {
   const here = need.filter(row => row.device === $("device").value);
   fill($("map"), unique(here.map(row => row.map)).sort((a, b) => (b === ALL) - (a === ALL)));
   fill($("measure"), unique(here.flatMap(row => Object.keys(row.errors))));
+  for (const [i, id] of ["particles", "beams"].entries()) {
+    const known = unique(here.map(row => sizes(row)[i]).filter(text => text)).sort((a, b) => a - b);
+    fill($(id), [ANY, ...known]);
+    $(id).closest("label").hidden = !known.length;
+  }
   draw();
 }
 
 if (typeof module === "undefined") {
   fill($("need"), unique(rows.map(row => row.need)));
   if ([...$("need").options].some(option => option.value === "localisation")) $("need").value = "localisation";
-  for (const id of ["view", "need", "device", "map", "measure"]) $(id).addEventListener("change", choose);
+  $("figure").setAttribute("viewBox", `0 0 ${W} ${H}`);
+  for (const id of ["view", "need", "device", "map", "measure", "particles", "beams"]) $(id).addEventListener("change", choose);
   for (const id of ["budget", "limit"]) $(id).addEventListener("input", draw);
   $("text").textContent = text;
   $("origins").append(...origins.map(origin => { const item = document.createElement("li"), code = document.createElement("code"); code.textContent = origin; item.append(code); return item; }));
+  $("budget").value = 1000;
   choose();
+  open(OPENING);
   $("check").textContent = `${rows.length} rows.`;
 }

@@ -43,7 +43,7 @@ GOLDEN = (5**0.5 - 1) / 2
 # Parts of a test's sample that run by default and in .ci/run.
 BRIEF, CHECKED = 0.2, 0.6
 
-# Objects of collection live as long as the tests: looking for garbage among them takes a quarter of its time.
+# Objects of collection live as long as the tests; searching them for garbage would take a quarter of its time.
 gc.disable()
 
 
@@ -57,7 +57,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_collection_finish() -> None:
-    """Collect garbage again, of objects made from here on."""
+    """Collect garbage of later objects again."""
     gc.collect()
     gc.freeze()
     gc.enable()
@@ -79,7 +79,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             if where[1] == sampled.kwargs.get("without"):
                 item.add_marker("slow")
                 continue
-            # Multiples of the golden ratio spread evenly over every parameter, whatever the order of its values.
+            # Multiples of the golden ratio spread evenly over every parameter, for any order of its values.
             place = number[function] * GOLDEN % 1
             if place < CHECKED * sampled.args[0]:
                 kept.add(where)
@@ -91,7 +91,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 left[where].append(item)
             number[function] += 1
     for where, beyond in left.items():
-        # A sample leaves out no backend that its marker does not name.
+        # A sample omits only backends that its marker names.
         for item in beyond if where in kept else beyond[1:]:
             item.add_marker("slow")
     for where, beyond in beyond_brief.items():
@@ -135,9 +135,8 @@ def device(request: pytest.FixtureRequest, needs: Callable[[str], str]) -> Backe
 
 @pytest.fixture
 def as_gpu(backend: str) -> Iterator[Callable[..., Backend]]:
-    """Return a function that makes each tested backend pretend to be a GPU (True) or a processor (False).
-
-    With ``scalar`` the processor's kernels compute one particle or beam at a time, like a GPU's kernels.
+    """Return a function that makes each tested backend pass as a GPU (True) or a processor (False). ``scalar`` makes
+    the processor's kernels compute one particle or beam at a time, like a GPU's kernels.
     """
     device = get_backend(backend)
     before = device.info
@@ -167,13 +166,14 @@ def data_dir() -> Path:
 
 @pytest.fixture
 def no_data(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hide recorded data, whatever the environment names."""
+    """Hide recorded data from the environment."""
     monkeypatch.delenv("GPUSENSE_DATA", raising=False)
 
 
 @pytest.fixture
 def place(tmp_path):
-    """Return a function that writes an image (bytes, or an object with ``save``) and its YAML; it returns this path."""
+    """Return a function that writes an image (bytes, or an object with ``save``) and its YAML, and returns its
+    path."""
 
     def write(content, image="map.pgm", save=None, **changes):
         if isinstance(content, bytes):
@@ -188,7 +188,7 @@ def place(tmp_path):
 
 @pytest.fixture
 def warp_as_gpu(needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> Backend:
-    """Return Warp's processor as a GPU that holds Warp's arrays and those of ``fakelib`` in its own memory."""
+    """Return Warp's processor as a GPU with arrays of Warp and ``fakelib`` in its memory."""
     needs("warp")
     import warp as wp
 

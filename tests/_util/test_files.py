@@ -1,4 +1,4 @@
-"""Files are written whole or not at all, and an interrupt at any line leaves no unfinished file."""
+"""Files are written atomically, and an interrupt at any line leaves no unfinished file."""
 
 from __future__ import annotations
 
@@ -61,14 +61,14 @@ def test_an_interrupt_at_any_line_leaves_all_or_nothing(tmp_path, call):
     for line in lines:
         fresh()
         reached += interrupt(lambda: run(tmp_path), line)
-        # The files are whole, even if an interrupt at the last lines was raised.
+        # The files are complete, even after an interrupt at the last lines.
         assert contents(tmp_path) in (before, after), line
     assert reached == len(lines)
     assert not files._UNFINISHED
 
 
 class RefusedError(Exception):
-    """An error of a function that writes."""
+    """Error of a writing function."""
 
 
 def refuse(stream: object) -> None:

@@ -12,7 +12,7 @@ from gpusense.backends import cache, folders
 
 @pytest.fixture
 def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Use a folder of temporary files of this test alone, with no failure reported before."""
+    """Use a private folder of temporary files, without earlier reports of failures."""
     (tmp_path / "tmp").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
     monkeypatch.setattr(folders, "_reported", set())
@@ -23,7 +23,7 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def place(tmp_path: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Use a place for the cache of this test alone."""
+    """Use a private cache folder."""
     monkeypatch.setenv("GPUSENSE_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.delenv("GPUSENSE_CACHE", raising=False)
     return tmp_path / "cache"

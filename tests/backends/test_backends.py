@@ -19,7 +19,7 @@ def fake_devices(*rows: tuple[str, str, str]) -> list[backends.Device]:
 
 
 def use_devices(monkeypatch, listed: list[backends.Device], verdicts: dict[str, DeviceCheck] | None = None) -> None:
-    """Pretend that devices other than NumPy are present, and proved unless a verdict says otherwise."""
+    """Pretend that devices other than NumPy are present, and proved except by contrary verdicts."""
     rows = [*listed, backends.Device("numpy", "NumPy reference", "cpu", True, "", "numpy")]
     monkeypatch.setattr(listing, "present", lambda entry: ([d for d in rows if d.backend == entry.name], []))
     proved = DeviceCheck(True, 1, True, rate=100.0)
@@ -59,7 +59,7 @@ def test_an_absent_library_is_listed_with_its_remedy(monkeypatch):
 
 
 def test_a_remedy_installs_what_is_absent(monkeypatch):
-    """A package that is installed and does not load is installed again; PoCL's wheel is for one kind of machine."""
+    """An installed package that does not load is reinstalled; PoCL's wheel is for one kind of machine."""
     entry, installed = registry.BY_NAME["opencl"], {"pyopencl"}
     monkeypatch.setattr(registry, "_is_installed", installed.__contains__)
     monkeypatch.setattr(registry, "_has_wheel", lambda name: True)

@@ -52,7 +52,7 @@ class Plain(Backend):
 
 
 class Watching(Proxy):
-    """A proxy that lists the launched kernels."""
+    """A proxy that records the launched kernels."""
 
     def __init__(self, backend: Backend) -> None:
         super().__init__(backend)
@@ -93,7 +93,7 @@ def test_a_recording_starts_nothing_until_it_is_called():
 
 
 def test_abilities_that_a_backend_lacks():
-    """Such methods do nothing where that is correct; elsewhere an error names the device."""
+    """Such methods do nothing if that is correct; otherwise an error names the device."""
     device, array = Plain(), np.zeros(3)
     device.begin_batch()
     device.submit()

@@ -23,7 +23,7 @@ needs_fifo = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system h
 
 @pytest.fixture
 def alarm():
-    """End a test that waits for a FIFO."""
+    """End a test that blocks on a FIFO."""
     before = signal.signal(signal.SIGALRM, lambda *_: pytest.fail("the test waits"))
     signal.alarm(20)
     yield
@@ -67,7 +67,7 @@ def test_a_damaged_entry_is_none_and_is_written_again(place, damage):
 
 
 def test_two_entries_that_were_exchanged_are_none(place):
-    """Each of both is whole, and was written by gpusense."""
+    """Both are complete, and written by gpusense."""
     store_entry("first", b"one")
     store_entry("second", b"two")
     first, second = (place / folders.OWN / cache._file(key) for key in ("first", "second"))
@@ -105,7 +105,7 @@ def make_device(path: Path, tmp_path: Path) -> None:
 
 
 def make_link(path: Path, tmp_path: Path) -> None:
-    """Make a link to a whole entry of that key."""
+    """Make a link to a complete entry of the key."""
     data = cache._head(cache._digest("key"), b"payload") + b"payload"
     (tmp_path / "target").write_bytes(data)
     path.symlink_to(tmp_path / "target")
@@ -186,7 +186,7 @@ def foreign_files(folder: Path) -> list[Path]:
 
 
 def test_only_entries_are_evicted(place, monkeypatch):
-    """Files that gpusense did not write stay, even in its own folder, whatever their names and age."""
+    """Files of other programs stay, even in gpusense's folder, with any names and age."""
     folders.own_folder(place)
     foreign = foreign_files(place / folders.OWN)
     monkeypatch.setattr(cache, "MAX_ENTRIES", 1)
@@ -277,7 +277,7 @@ def test_packed_files_stay_below_their_folder(name):
 
 
 def test_other_contents_are_no_packed_files(monkeypatch):
-    """A change of any byte of packed files is found, and the sizes in their heads are not trusted."""
+    """A change of any byte of packed files is detected, and the sizes in their heads are not trusted."""
     with pytest.raises(ValueError, match="must hold packed files"):
         unpack(b"something else")
     whole = pack({"a": b"some text" * 9, "b": b""})

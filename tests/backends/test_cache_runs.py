@@ -57,9 +57,8 @@ def entries(folder: Path) -> dict[str, int]:
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("family", ["opencl", "warp:cpu"])
 def test_a_second_process_compiles_nothing(needs, tmp_path, expected, family):
-    """A compiled kernel is stored as an entry; a second process stores none, and neither touches other files.
-
-    The folder is the user's: it holds more than a cache may, under names that older caches of gpusense had.
+    """A compiled kernel is stored as an entry; a second process stores none, and neither touches other files. The
+    folder is the user's: it also contains other files, with names of gpusense's older caches.
     """
     needs(family.split(":")[0])
     folder, environment = tmp_path / "cold", fake_driver.environment(tmp_path)
@@ -83,7 +82,7 @@ def test_a_second_process_compiles_nothing(needs, tmp_path, expected, family):
     assert others == [folders.MARKER]
 
 
-# By default, the backend that the test of a second process does not use.
+# The default is the backend that the test of a second process does not use.
 @pytest.mark.long
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("family", ["warp:cpu", "opencl"])
@@ -108,7 +107,7 @@ DAMAGES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("family", ["opencl", "warp:cpu"])
 def test_damaged_files_of_every_kind_are_made_anew(needs, tmp_path, expected, family):
-    """Damage entries of verdicts, programs, PoCL's and Warp's kernels, and put folders in place of entries."""
+    """Damage entries of verdicts, programs, PoCL's and Warp's kernels, and replace entries by folders."""
     needs(family.split(":")[0])
     environment = fake_driver.environment(tmp_path)
     assert outcome(start(family, environment)) == (0, expected, "")
@@ -147,7 +146,7 @@ def test_a_cache_that_cannot_be_written_is_named_and_stops_nothing(needs, tmp_pa
 
 @pytest.mark.slow
 def test_a_full_file_system_is_named_and_stops_nothing(needs, tmp_path, expected):
-    """The cache is a file system of 256 KiB; the folder of the process is made elsewhere."""
+    """The cache is a file system of 256 KiB; the folder of the process is elsewhere."""
     needs("opencl")
     full = tmp_path / "full"
     full.mkdir()
@@ -168,7 +167,7 @@ def test_a_full_file_system_is_named_and_stops_nothing(needs, tmp_path, expected
 @pytest.mark.slow
 @pytest.mark.parametrize("family", ["opencl", "warp:cpu"])
 def test_killed_processes_leave_nothing_that_a_later_one_trips_over(needs, tmp_path, expected, family):
-    """Kill processes of each family with their children, half of them while they prove the device."""
+    """Kill processes of each family with their children, half of them during the proof of the device."""
     needs(family.split(":")[0])
     moments = random.Random(family)
     ended = 0

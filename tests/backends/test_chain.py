@@ -1,4 +1,4 @@
-"""The default device is the fastest that opens, and its look-up is done once."""
+"""The default device is the fastest that opens, and is looked up once."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_numpy_is_taken_with_one_line_whatever_else_is_said(machine, monkeypatch
 
 
 def test_a_verdict_is_reported_by_the_process_that_makes_it(machine, caplog):
-    """Later processes that have another compiled device are silent."""
+    """Later processes with another compiled device are silent."""
     machine([GPU, WARP], {"opencl:0:0": KEPT})
     assert get_backend("auto").info.selection == "warp:cpu" and caplog.messages == []
     text = "opencl:0:0 (A GPU, Driver 1) is unusable: scalar kernels hang; update the driver"
@@ -205,7 +205,7 @@ def test_a_change_of_a_variable_looks_anew(looks, monkeypatch, variable):
 
 
 def test_variables_are_compared_where_the_environment_has_no_dictionary_of_its_own(looks, monkeypatch):
-    """Other implementations of Python lack it, and so does a mapping in place of ``os.environ``."""
+    """Other implementations of Python, and a mapping that replaces ``os.environ``, lack it."""
     monkeypatch.setattr(os, "environ", dict(os.environ))
     get_backend("auto")
     count = len(looks)
@@ -285,7 +285,7 @@ for name in ("opencl:portable", "warp:cpu"):
     except ValueError as error:
         print(str(error).startswith("backend: "))
 """
-# File systems of containers: both are read-only; the second has a temporary folder that is mounted without execution.
+# File systems of containers: both are read-only; the second has a temporary folder mounted without execution.
 _MOUNTS = """
 set -e
 mount --make-rprivate /
@@ -300,7 +300,7 @@ exec "$@"
 
 
 def in_container(kind: str, *command: str) -> subprocess.CompletedProcess[str]:
-    """Run Python with file systems like a container's; skip the test where this user may not."""
+    """Run Python with file systems like a container's; skip the test without permission."""
     if not sys.platform.startswith("linux") or os.geteuid() != 0:
         pytest.skip("only root of Linux mounts file systems")
     dropped = ("GPUSENSE_CACHE_DIR", "XDG_CACHE_HOME", "TMPDIR", "GPUSENSE_BACKEND", "OCL_ICD_VENDORS")
@@ -326,7 +326,7 @@ def test_a_container_without_a_folder_for_code_has_a_slower_device(needs, kind, 
     said = [line for line in done.stderr.splitlines() if "'auto' is" in line]
     assert len(said) == 1 and said[0].startswith(f"gpusense: 'auto' is {chosen}")
     assert "compiled kernels need a folder that takes 16 MiB and from which code may run" in said[0]
-    # Nothing is compiled, so no other line is needed.
+    # Nothing is compiled: no other line is necessary.
     assert len(done.stderr.splitlines()) <= (1 if chosen == "numpy" else 2), done.stderr
     listed = in_container(kind, "-P", "-m", "gpusense", "devices")
     assert listed.returncode == 0, listed.stderr
@@ -343,7 +343,7 @@ def test_a_variable_that_hides_devices_is_the_remedy(needs, tmp_path, variable):
     fake_driver.pocl_library()
     code = "from gpusense.backends import listing\n"
     code += "print(*[device.reason for device in listing.present(listing.BY_NAME['opencl'])[1]], sep='\\n')"
-    # The library itself is the only driver, so that no simulator is found.
+    # The library is the only driver, so that no simulator is found.
     vendors = {"OCL_ICD_VENDORS": fake_driver.pocl_library()} if variable == "POCL_DEVICES" else {}
     value = "cuda" if variable == "POCL_DEVICES" else str(tmp_path / "nothing.icd")
     (tmp_path / "nothing.icd").write_text("/nowhere/libnothing.so\n")
@@ -368,7 +368,7 @@ except ValueError as error:
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can give folders away")
 def test_pocl_that_a_program_has_loaded_must_keep_its_kernels_where_only_this_user_writes(needs, tmp_path):
-    """PoCL loads libraries from the folder that it chose when it was loaded."""
+    """PoCL loads libraries from the folder that it chose on loading."""
     needs("opencl")
     fake_driver.pocl_library()
     environment = fake_driver.environment(tmp_path, GPUSENSE_PROOF="off")

@@ -1,4 +1,4 @@
-"""Arrays on a device: Warp's processor as a stand-in for a GPU, and real frameworks where there is one."""
+"""Arrays on a device: Warp's processor replaces a GPU; real frameworks on a real GPU."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_poses_on_the_device_stay_there(method, real, warp_as_gpu, warp_copies):
         held = found.held if isinstance(given, Array) else found
         assert type(found) is type(given) and tuple(held.shape) == shape
         assert differing(held.numpy(), expected) == 0
-        # Rays and readings go to the device, and the two numbers of the pose status come back.
+        # Only rays and readings go to the device, and only the two numbers of the pose status come back.
         assert all(size <= 16 * BEAMS for _, size in warp_copies)
         assert [size for way, size in warp_copies if way == "down"] == [8]
 
@@ -64,7 +64,7 @@ def test_out_on_the_device(method, warp_as_gpu, warp_copies):
 
 @pytest.mark.parametrize("selection", ["opencl", "warp"])
 def test_copies_on_the_device(selection, needs):
-    """Copy from any place to any other, after all earlier commands."""
+    """Copy between any two places, after all earlier commands."""
     backend, real = get_backend(needs(selection)), np.dtype(np.float32)
     source, target = backend.blank(8, real), backend.blank(6, real)
     backend.upload(np.arange(8, dtype=real), source)
@@ -102,7 +102,7 @@ def test_scans_that_share_launches_on_the_device(kind, real, warp_as_gpu, warp_c
         found = model.log_likelihood(given, scans)
         assert type(found) is type(given) and model._last.together == 2
         assert differing((found.held if isinstance(found, Array) else found).numpy(), expected) == 0
-        # Poses stay there; the scan without readings is filled in.
+        # Poses stay on the device; the scan without readings is filled in.
         assert all(size <= 5 * 16 * BEAMS for way, size in warp_copies) and ("up", 24 * COUNT) not in warp_copies
         assert [size for way, size in warp_copies if way == "down"] == [8]
         assert model.log_likelihood(given, scans, out=out) is out and differing(out.numpy(), expected) == 0
@@ -132,7 +132,7 @@ def test_in_pieces_on_the_device(method, warp_as_gpu, monkeypatch):
 @pytest.mark.parametrize("count", [COUNT, 0])
 @pytest.mark.parametrize("where", [to_device, np.array], ids=["device", "host"])
 def test_no_array_of_a_call_is_kept(where, count, warp_as_gpu):
-    """A scan's arrays must live until the device has read them, and no longer, since filters run for hours."""
+    """A scan's arrays live exactly until the device has read them, since filters run for hours."""
     model, caster = gs.BeamModel(GRID, SCANNER, backend=warp_as_gpu), gs.RayCaster(GRID, RANGE, backend=warp_as_gpu)
     for scan in (SCAN, np.full(BEAMS, np.nan)):
         model.log_likelihood(where(POSES[:count]), scan)
@@ -159,12 +159,12 @@ def test_a_pose_on_the_device_that_is_not_finite(value, scan, warp_as_gpu):
         expected = call(POSES)
         with pytest.raises(ValueError, match=message):
             call(to_device(bad))
-        # It is reported once.
+        # The error is reported once.
         assert differing(call(to_device(POSES)).numpy(), expected) == 0
 
 
 def test_a_pose_that_is_not_finite_is_reported_after_memory_ran_out(warp_as_gpu, monkeypatch):
-    """The first piece has it; the second is tried again in halves."""
+    """The first piece has the pose; the second is retried in halves."""
     model = gs.BeamModel(GRID, SCANNER, backend=warp_as_gpu)
     poses = np.tile(POSES, (6, 1))
     model.log_likelihood(to_device(poses), SCAN)

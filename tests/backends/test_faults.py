@@ -1,4 +1,4 @@
-"""Faults of real machines, provoked: each gives a clear message and leaves a working model."""
+"""Provoked faults of real machines: each causes a clear message and leaves a working model."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_out_of_memory_halves_the_batch_and_changes_no_bit(backend, model_type):
     model = model_type(grid, scanner, backend=backend)
     whole = model.log_likelihood(poses, ranges)
     device = get_backend(backend)
-    # For 2000 particles; GPUs store 41 numbers for each of 256 particles of a beam model until they are summed.
+    # For 2000 particles; GPUs store 41 numbers for each of 256 particles of a beam model before summing them.
     room_for = 11_000 if device.info.kind == "gpu" and model_type is gs.BeamModel else 2500
 
     model._workspace.release()

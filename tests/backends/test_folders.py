@@ -36,7 +36,7 @@ PARENT_RULES = {
 
 
 def poison(key: str) -> None:
-    """Write an entry, and forget that its folder was checked."""
+    """Write an entry, and forget the check of its folder."""
     store_entry(key, b"code")
     assert load_entry(key) == b"code"
     folders._checked.clear()
@@ -152,7 +152,7 @@ def test_the_group_of_one_user_has_the_users_name_and_no_other_member(monkeypatc
 
 @with_owners
 def test_the_owners_outside_of_a_user_namespace_are_trusted(monkeypatch):
-    """Such an owner is root of the machine; a user of that number within the namespace is not trusted."""
+    """Such an owner is the machine's root; a user of that number within the namespace is not trusted."""
     import builtins
     import io
 
@@ -170,7 +170,7 @@ def test_the_owners_outside_of_a_user_namespace_are_trusted(monkeypatch):
 
 
 def test_systems_without_owners_have_caches_too(place, monkeypatch):
-    """As Windows, where Python has no ``geteuid`` and no ``O_NOFOLLOW``."""
+    """Windows' Python, for example, lacks ``geteuid`` and ``O_NOFOLLOW``."""
     monkeypatch.delattr(os, "geteuid", raising=False)
     monkeypatch.setattr(private, "_HAS_OWNERS", False)
     for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC"):
@@ -231,7 +231,7 @@ assert all(cache.load_entry(f"{sys.argv[1]} {number}") for number in range(40))
 
 
 def test_processes_may_make_the_folder_at_once(place, tmp_path):
-    """No process finds a folder without a marker, and no process reports anything."""
+    """No process sees a folder without a marker, and no process reports anything."""
     started = [
         subprocess.Popen(
             [sys.executable, "-c", _COLD, f"{number}"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,

@@ -1,4 +1,4 @@
-"""Child processes that work with drivers: their reports, their end, and the time they may take."""
+"""Child processes that work with drivers: reports, end, and time limit."""
 
 from __future__ import annotations
 

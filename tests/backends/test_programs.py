@@ -1,4 +1,4 @@
-"""Programs of earlier calls: which are kept, for how long, and which objects free them."""
+"""Programs of earlier calls: selection, lifetime, and the objects that free them."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_owners_of_memory_live_as_long_as_a_recording(backend):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 def test_a_forked_child_starts_no_program(needs):
-    """The parent's device does not survive a fork: the child gets an error, at once."""
+    """The parent's device does not survive a fork: the child gets an error at once."""
     needs("opencl")
     device = get_backend("opencl")
     buffers = device.upload(np.zeros(4)), device.empty(4, REAL)

@@ -1,4 +1,4 @@
-"""Failing drivers end no user's process: verdicts, the order in which settings give way, and compiled fake drivers."""
+"""Failing drivers end no user's process: verdicts, the order of fallback settings, and compiled fake drivers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ INFO = BackendInfo("opencl:0:0", "opencl", "Some device", "cpu", "Driver 1", 1 <
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
-    """Use a cache of this test alone, and forget the verdicts of this process."""
+    """Use a private cache, and forget the verdicts of this process."""
     monkeypatch.setenv("GPUSENSE_CACHE_DIR", str(tmp_path / "cache"))
     for name in ("GPUSENSE_CACHE", "GPUSENSE_PROOF", "GPUSENSE_PROOF_SECONDS", "GPUSENSE_BACKEND"):
         monkeypatch.delenv(name, raising=False)
@@ -33,7 +33,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def driver(monkeypatch):
-    """Return a function that makes a driver whose families fail in given ways, and records the tried settings."""
+    """Return a function that makes a driver with failing families, and records the tried settings."""
     tried: list[tuple[int, bool]] = []
 
     def make(fails: dict[tuple[str, int], str], conclusive: bool = True) -> list[tuple[int, bool]]:
@@ -117,7 +117,7 @@ def test_a_verdict_is_made_anew_when_its_key_changes(driver, monkeypatch, change
 
 
 def test_a_hang_lasts_once_it_has_happened_in_two_processes(driver):
-    """A machine that was busy once does not lose a device for good."""
+    """A temporarily busy machine does not lose a device permanently."""
     tried = driver({(VECTORS, 16): "hangs: no answer in 60 s"})
     for _ in range(3):
         proof._known.clear()
@@ -202,7 +202,7 @@ def test_settings_that_failed_before_the_last_child_stay_off(monkeypatch, caplog
 
 
 def test_a_frozen_program_trusts_devices_and_says_so(driver, monkeypatch, caplog):
-    """It does not if a program with an interpreter has proved them."""
+    """It trusts only without a proof by a program with an interpreter."""
     caplog.set_level("INFO")
     tried = driver({(VECTORS, 16): ABORT})
     monkeypatch.setattr(sys, "frozen", True, raising=False)
@@ -226,7 +226,7 @@ def test_a_frozen_program_trusts_devices_and_says_so(driver, monkeypatch, caplog
     [("opencl", 8, False), ("opencl", 16, True), ("warp", 1, True)],
 )
 def test_the_scene_passes_on_real_devices_with_every_setting(needs, family, lanes, float64):
-    """Within this process, with less time for the rate."""
+    """In this process, with less time for the rate."""
     from gpusense.evaluation import proof as scene
 
     needs(family)
@@ -336,7 +336,7 @@ def test_a_driver_that_fails_altogether_is_named_and_another_backend_is_the_defa
     ],
 )
 def test_a_driver_that_fails_in_part_keeps_the_rest(needs, tmp_path, mode, words, message, left):
-    """One claims float64 without having it; the vectors of the other are wrong."""
+    """One driver claims float64 without support; the other has wrong vectors."""
     needs("opencl")
     icd = fake_driver.build(tmp_path, mode, *words)
     found, errors = default_of(tmp_path, OCL_ICD_VENDORS=str(icd))
@@ -347,7 +347,7 @@ def test_a_driver_that_fails_in_part_keeps_the_rest(needs, tmp_path, mode, words
 
 @pytest.mark.slow
 def test_a_fake_that_fails_nowhere_is_usable(needs, tmp_path):
-    """If this failed, the tests above would prove nothing."""
+    """The tests above rely on this one."""
     needs("opencl")
     found, errors = default_of(tmp_path, OCL_ICD_VENDORS=str(fake_driver.build(tmp_path, "")))
     assert (found["selection"], found["named"], errors) == ("opencl:0:0", "", "")
@@ -394,14 +394,14 @@ pocl.fit_target = misfit
 
 @pytest.mark.slow
 def test_a_target_that_does_not_fit_the_library_ends_in_narrower_kernels(needs, tmp_path):
-    """The fault of a Zen 4: PoCL is given a processor without the AVX-512 of its library."""
+    """The fault of a Zen 4: PoCL gets a processor without the AVX-512 of its library."""
     needs("opencl")
     info = gs.backends.get_backend("opencl").info
     if "Portable" not in info.driver or info.target != "skylake-avx512":
         pytest.skip(f"{info.name} has no AVX-512, or the driver is not PoCL")
     (tmp_path / "sitecustomize.py").write_text(_MISFIT)
     found, errors = default_of(tmp_path, PYTHONPATH=str(tmp_path), GPUSENSE_PROOF_SECONDS="12")
-    # The load of the machine decides which one it is.
+    # The machine's load decides between them.
     assert found["lanes"] < 16
     assert "kernels in vectors of 16 " in errors
 

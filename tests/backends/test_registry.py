@@ -1,4 +1,4 @@
-"""The table of backends: a new backend is one entry, and a module with its library."""
+"""The table of backends: a new backend is an entry and a module with its library."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ def test_a_child_is_set_up_by_its_library(metal, monkeypatch):
 
 
 def test_a_wrapper_that_is_no_backend_is_refused():
-    """Methods of the same names do not make a backend."""
+    """Equal names of methods do not make a backend."""
 
     class Wrapper:
         def __init__(self, backend):

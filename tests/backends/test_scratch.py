@@ -1,4 +1,4 @@
-"""The folder of a process for the kernels of drivers: where it is made, and which folders are removed."""
+"""A process's folder for the kernels of drivers: location, and removal of old folders."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gpusense.backends.scratch import scratch_folder
 
 @pytest.fixture
 def made(place):
-    """Return a function that makes this process's folder anew; remove all of them in the end."""
+    """Return a function that remakes this process's folder; remove all folders at the end."""
     found: list[Path] = []
 
     def make(*, executable: bool = True) -> Path:
@@ -61,7 +61,7 @@ def test_a_folder_without_room_is_passed_over(place, made, temporary, monkeypatc
 
 
 def no_code(monkeypatch, *places: str) -> None:
-    """Refuse to map files below some folders as code, as a file system that is mounted without execution does."""
+    """Refuse to map files below some folders as code, like a file system mounted without execution."""
     real = mmap.mmap
 
     def mapped(handle, *arguments, prot=mmap.PROT_READ, **options):
@@ -123,7 +123,7 @@ def test_the_folder_goes_with_its_process_and_that_of_a_killed_one_later(made):
     killed.kill()
     killed.wait()
     assert second.exists()
-    # The folder may be one that its process has not locked yet.
+    # The folder's process may not have locked it yet.
     made()
     assert second.exists()
     for path in (second, third):

@@ -1,4 +1,4 @@
-"""Large copies in pieces, reuse of memory of results, and bounds that several threads compute."""
+"""Large copies in pieces, reused memory of results, and bounds from several threads."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class _Slot(staging.Slot):
 
 @pytest.fixture
 def slots(monkeypatch):
-    """Use small slots, on a host of several threads."""
+    """Use small slots on a host with several threads."""
     monkeypatch.setattr(staging, "SLOT", 4096)
     monkeypatch.setattr(staging, "LEAST", 100)
     monkeypatch.setattr(staging, "_LEAST_PIECE", 512)
@@ -58,7 +58,7 @@ def test_large_copies(slots, size):
 
 
 def test_plain_copies(slots, monkeypatch):
-    """Small arrays, hosts of few threads and a second thread are left to the driver."""
+    """The driver copies small arrays, on hosts of few threads, and in a second thread."""
     large = staging.Staging(lambda number, size: slots)
     array, there = np.zeros(1000, np.uint8), np.zeros(1000, np.uint8)
     assert not large.upload(array[:99], there)
@@ -70,7 +70,7 @@ def test_plain_copies(slots, monkeypatch):
 
 
 def test_a_failed_copy_leaves_the_slots_to_the_next(slots):
-    """An error of the device comes through, and later copies work."""
+    """An error of the device propagates, and later copies work."""
     large = staging.Staging(lambda number, size: slots)
     array, there = np.arange(40000, dtype=np.uint8), np.zeros(40000, np.uint8)
     slots[3].to_device = lambda *_: (_ for _ in ()).throw(MemoryError("no"))
@@ -83,7 +83,7 @@ def test_a_failed_copy_leaves_the_slots_to_the_next(slots):
 
 
 def test_memory_of_results_is_used_again():
-    """Memory goes to the next result of its size as soon as no array refers to it, and not before."""
+    """Memory goes to the next result of its size exactly when no array refers to it."""
     memory, real = recycled.ResultMemory(), np.dtype(np.float32)
     first = memory.empty((1024, 300), real)
     part, place = first[5:], first.ctypes.data

@@ -1,4 +1,4 @@
-"""Agreement of matches of places: single ones, groups, evidence, and breaks that closures join."""
+"""Agreement of place matches: single matches, groups, evidence, and breaks joined by closures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ COUNT = 12
 
 
 def passages(right: list[float], off: tuple[float, ...] = (2.0, -1.0, 0.2)) -> tuple[np.ndarray, Links]:
-    """Return poses of two passages, the second with drift, and matches of equal places with these p_right."""
+    """Return poses of two passages, the second with drift, and matches of equal places with p_right."""
     one = np.stack([0.8 * np.arange(COUNT), 0.05 * np.arange(COUNT), 0.02 * np.arange(COUNT)], axis=1)
     poses = np.concatenate([one, compose_poses(np.array(off), one)])
     at = np.arange(len(right))
@@ -41,11 +41,11 @@ def test_where_the_drift_tells_nothing_a_group_needs_evidence(right: list[float]
     assert found.group.tolist() == [0] * len(right)
     assert found.evidence == pytest.approx([-np.log10(1 - np.array(right)).sum()])
     assert found.scans.tolist() == [len(right)]
-    # Over weak steps less evidence is needed.
+    # Weak steps need less evidence.
     weak = np.full(len(right), EVIDENCE_OVER_WEAK)
     assert agreeing(links, poses, weak).all()
     assert agreeing(links[:4], poses, weak[:4]).tolist() == [right[0] > 0.9] * 4
-    # Matches that need no evidence do not count for matches that do.
+    # Matches that need no evidence are none for other matches.
     mixed = np.where(np.arange(len(right)) < 2, EVIDENCE, 0.0)
     assert agreeing(links, poses, mixed).tolist() == [False] * 2 + [len(right) > 4] * (len(right) - 2)
 

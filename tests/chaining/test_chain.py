@@ -18,7 +18,7 @@ from gpusense.chaining.place_recognition import overlaps
 
 @pytest.fixture(scope="module")
 def lap() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return poses of a little more than a lap, scans and odometry."""
+    """Return poses of slightly more than a lap, scans and odometry."""
     poses = around(0.5)
     return poses, scans_of(BLOCK, poses, FRONT), drifting(poses)
 
@@ -65,7 +65,7 @@ def test_errors_are_within_their_deviations(lap: tuple[np.ndarray, ...], closed:
 
 
 def test_covariances_are_those_of_the_links(closed: gs.ScanChain) -> None:
-    """They are blocks of the inverse information of all links, given the first pose, without a further factor."""
+    """They are blocks of the inverse information of all links for a fixed first pose, without a further factor."""
     links, used = closed.links, np.unique([closed.links.first, closed.links.second])
     poses, ends = closed.poses[used], np.searchsorted(used, [links.first, links.second])
     information = np.zeros((len(used), 3, len(used), 3))
@@ -104,7 +104,7 @@ def test_key_scans_links_and_bytes_grow_with_the_way(needs) -> None:
 
 @pytest.mark.parametrize("path", [around(1.0, laps=1.0), rounds(1)[::2]], ids=["corridors", "room"])
 def test_passes_through_the_same_places_are_compared_with_a_few(path: np.ndarray) -> None:
-    # The number of earlier passages grows; the number of those that a later one is compared with does not.
+    # The number of earlier passages grows, but not the number of comparisons per passage.
     walls = ROOM if len(path) == len(rounds(1)[::2]) else BLOCK
     points, compared = [end_points(scan) for scan in scans_of(walls, path, FRONT)], []
     for laps in (30, 60):
@@ -244,7 +244,7 @@ def test_wrong_motions_are_doubtful(step: float, needs) -> None:
 
 @pytest.mark.parametrize(("step", "range_max", "most"), [(1.0, 30.0, 0.3), (0.7, 10.0, 2.0), (1.0, 10.0, 5.0)])
 def test_large_motions_without_odometry_are_found_or_said(step: float, range_max: float, most: float, needs) -> None:
-    # In a corridor, scans agree best where the robot has not moved.
+    # In a corridor, scans agree best for a robot at rest.
     truth = around(step)
     short = gs.Scanner(FRONT.bearings, range_max=range_max)
     chain = gs.chain_scans(scans_of(BLOCK, truth, short), short, close_loops=False, backend=needs("opencl"))
@@ -271,7 +271,7 @@ def test_a_failed_match_is_bridged_over(needs) -> None:
     assert chain.doubtful[5:7].all() and not chain.doubtful[:5].any() and not chain.doubtful[7:9].any()
     # Its neighbours are linked.
     assert ((chain.links.first <= 4) & (chain.links.second >= 6)).any()
-    # Both steps may be breaks, as may a step with an unsure match, or with a single match after a jump in time.
+    # Both steps may be breaks; so may a step with an unsure match, or with a single match after a jump in time.
     (front,) = chainer.fronts
     assert np.flatnonzero(front.weak).tolist() == [4, 5]
     front.p_right[7] = 0.6
@@ -328,7 +328,7 @@ def test_motion_during_scans_is_taken_out(needs) -> None:
         ])  # fmt: skip
     moved = gs.chain_scans(scans, RING, times=times, duration=duration, backend=needs("opencl"))
     assert moved.duration == duration
-    # Beams that are listed from the last one to the first.
+    # Beams in reverse order.
     back = gs.Scanner(RING.bearings[::-1], range_max=30.0)
     turned = gs.chain_scans(np.array(scans)[:, ::-1], back, times=times, duration=duration, backend=needs("opencl"))
     assert turned.duration == -duration

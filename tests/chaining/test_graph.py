@@ -180,7 +180,7 @@ def test_covariances_are_blocks_of_the_dense_inverse(count: int) -> None:
     for k in range(count - 1):
         part = slice(3 * k, 3 * k + 3)
         assert np.allclose(blocks[k], whole[part, part], rtol=1e-8, atol=1e-12)
-    # Relative covariances: by the derivatives of the relative pose, from the whole inverse.
+    # Relative covariances from the complete inverse, by the derivatives of the relative pose.
     joint = np.zeros((3 * count, 3 * count))
     joint[3:, 3:] = whole
     one, two = pose_jacobians(found.poses, first, second)
@@ -189,7 +189,7 @@ def test_covariances_are_blocks_of_the_dense_inverse(count: int) -> None:
         wide = np.zeros((3, 3 * count))
         wide[:, 3 * a : 3 * a + 3], wide[:, 3 * b : 3 * b + 3] = one[n], two[n]
         assert np.allclose(relative[n], wide @ joint @ wide.T, rtol=1e-6, atol=1e-10)
-    # The covariances of a few anchors, with all other poses eliminated, are the same.
+    # Eliminating all other poses leaves the covariances of a few anchors unchanged.
     some = Drift(found, most=max(count // 3, 1))
     pairs = np.array([(a, b) for a in some.anchors for b in some.anchors if a < b], np.int64).reshape(-1, 2).T
     assert np.allclose(some.relative(*pairs), Drift(found, most=count).relative(*pairs), rtol=1e-6, atol=1e-10)
@@ -209,7 +209,7 @@ def test_breaks_of_a_long_graph_are_seen_between_its_anchors() -> None:
         assert len(drift.anchors) <= most
         assert deviation[:2] == pytest.approx(1.0, abs=0.01)
         assert deviation[2] < 0.05
-    # Up to 300 poses nothing is left out.
+    # Up to 300 poses nothing is omitted.
     assert len(Drift(solve(found.poses[:300], links[:299])).anchors) == 300
 
 

@@ -1,4 +1,4 @@
-"""Matches of a log by their indices: what a chain takes along directions that few pairs observe."""
+"""Matches of a log by index: information of a chain along directions that few pairs observe."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_directions_that_few_pairs_observe_are_taken_among_furniture_alone(scene
     assert np.count_nonzero(lost.any(axis=1)) >= 8
     assert (np.count_nonzero(rows) >= 5) if scene == "furniture" else not rows.any()
     assert (more == lost)[rows].all() and not (more & ~lost).any()
-    # Each of these directions has a deviation of 4 cm, before the temperature, and others have what they had.
+    # Each of these directions gets a deviation of 4 cm before the temperature; other directions are unchanged.
     axes = found.directions * np.stack([np.ones(12), np.ones(12), 1 / found.lever], axis=1)[:, None]
     gained = np.einsum("lki,lij,lmj->lkm", axes, taken.information - found.information, axes)
     np.testing.assert_allclose(gained, np.eye(3) * more[:, :, None] / 0.04**2, rtol=1e-6, atol=1e-3)

@@ -1,4 +1,4 @@
-"""Chains of a robot with several lasers: one trajectory, loops between lasers, and places that one of them misses."""
+"""Chains of a robot with several lasers: one trajectory, loops between lasers, and places that one laser misses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SIDE = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.02, count=201, range
 
 
 def seen(walls: np.ndarray, poses: np.ndarray, scanners: list[gs.Scanner]) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return scans of lasers in turn along a trajectory, and the laser of each."""
+    """Return scans of alternating lasers along a trajectory, and the laser of each."""
     sensor = np.arange(len(poses)) % len(scanners)
     scans = []
     for k, (pose, one) in enumerate(zip(poses, sensor, strict=True)):
@@ -32,7 +32,7 @@ def seen(walls: np.ndarray, poses: np.ndarray, scanners: list[gs.Scanner]) -> tu
 
 
 def wrong(links: Links, truth: np.ndarray) -> float:
-    """Return the largest error of links along the directions that they observe [m, or rad at 5 m]."""
+    """Return the largest error of links along their observed directions [m, or rad at 5 m]."""
     off = relative(truth[links.first], truth[links.second])
     off = links.pose - off
     off[:, 2] = 5 * gs.wrap_angle(off[:, 2])
@@ -44,7 +44,7 @@ def wrong(links: Links, truth: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def lap() -> tuple[np.ndarray, list[np.ndarray], np.ndarray, np.ndarray]:
-    """Return poses of a little more than a lap, scans of two lasers in turn, the laser of each, and odometry."""
+    """Return poses of slightly more than a lap, scans of two alternating lasers, the laser of each, and odometry."""
     poses = around(0.5)
     scans, sensor = seen(BLOCK, poses, [AHEAD, BACK])
     return poses, scans, sensor, drifting(poses)
@@ -69,7 +69,7 @@ def test_lasers_in_turn_are_one_trajectory(lap: tuple, chains: dict, with_odomet
     assert not chain.doubtful[3:-1].any()
     kinds = set(chain.links.kind.tolist())
     assert {"match", "coupling", "closure"} <= kinds and ("odometry" in kinds) == with_odometry
-    # Matches are between scans of one laser, couplings between those of two.
+    # Matches link scans of a laser, couplings link scans of two lasers.
     lasers = sensor[chain.links.first] == sensor[chain.links.second]
     assert lasers[chain.links.kind == "match"].all() and not lasers[chain.links.kind == "coupling"].any()
     closures = chain.closures
@@ -117,7 +117,7 @@ def test_a_direction_that_one_laser_observes_is_no_doubt(needs) -> None:
 
 
 def test_loops_are_closed_between_lasers_in_front_and_rear(needs) -> None:
-    # There and back again, turned around: the front sees the places that the rear saw.
+    # There and back, turned around: the front sees the rear's places.
     walls = BLOCK
     ahead = np.array([(x, 1.25, 0.0) for x in np.arange(2.0, 15.0, 0.35)])
     turn = np.array([(15.0, 1.25, t) for t in np.arange(0.15, np.pi, 0.15)])
@@ -204,7 +204,7 @@ def test_two_lasers_of_a_recorded_run_are_better_than_the_worse_one(data_dir: Pa
     track = np.load(folder / "jarvis_complex_path_fast.npz")["gt"]
 
     def off(poses: np.ndarray, times: list[float]) -> float:
-        """Return the root mean square error after alignment, with the clock that fits best [m]."""
+        """Return the root mean square error after alignment, for the best clock [m]."""
         found = []
         for shift in np.arange(-0.1, 0.21, 0.03):
             x, y = (np.interp(np.array(times) - shift, track[:, 0], track[:, k]) for k in (1, 2))

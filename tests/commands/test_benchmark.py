@@ -1,4 +1,4 @@
-"""``gpusense bench`` as a command: whole files, the same errors again, options refused."""
+"""``gpusense bench`` as a command: complete files, reproducible errors, refused options."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_the_answer_comes_first_on_the_terminal(tmp_path, capsys):
 
 
 def test_the_recommendation_follows_the_request(capsys):
-    """Limits are a time below that of every method, one above all, and an error that only the model itself keeps."""
+    """Limits are a time below every method's, a time above all, and an error that only the model keeps."""
     own = [*FIELD, *SMALL, "--backend", "numpy"]
     for wish, answer in (
         (["--max-time", "1 us"], "field on numpy, 1 x 7, at most 1 us: no method"),

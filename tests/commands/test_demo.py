@@ -1,4 +1,4 @@
-"""``gpusense demo``, and the example: their numbers and pictures, and the arguments that they refuse."""
+"""``gpusense demo``, and the example: numbers, pictures and refused arguments."""
 
 from __future__ import annotations
 

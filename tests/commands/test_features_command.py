@@ -1,4 +1,4 @@
-"""``gpusense features``: features of a log, landmarks of runs and of maps, files that it writes, and bad input."""
+"""``gpusense features``: features of a log, landmarks of runs and of maps, written files, and bad input."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_features_of_a_log_are_written_and_drawn(capsys, log, tmp_path):
 
 
 def test_landmarks_are_those_of_map_features(capsys, log, tmp_path, monkeypatch):
-    """They are, even if a call takes fewer scans than the log has."""
+    """They are equal even if a call takes fewer scans than the log has."""
     monkeypatch.setattr(command, "_CALL", 5)
     out, plot = tmp_path / "landmarks.csv", tmp_path / "landmarks.svg"
     text = run(capsys, "--log", log, "--map-out", out, "--map-plot", plot, "--kinds", "corner", "door")

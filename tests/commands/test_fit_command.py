@@ -85,7 +85,7 @@ def test_pairs_are_fitted_as_the_log_they_come_from(capsys, recorded):
     for name in ("pairs.csv", "pairs.csv.gz"):
         code, text, _ = run(capsys, "--pairs", recorded / name, "--range-max", RANGE, "--json")
         assert code == 0 and json.loads(text)["fit"]["hits"] + json.loads(text)["fit"]["max_readings"] == SCANS * BEAMS
-    # Every other pair differs from every other scan, with as many readings.
+    # Every other pair differs from every other scan, with equally many readings.
     _, text, _ = run(capsys, "--pairs", recorded / "pairs.csv", "--range-max", RANGE, *chosen)
     pairs = json.loads(text)
     assert pairs["readings"] == SCANS * BEAMS // 2
@@ -183,7 +183,7 @@ def test_peers_are_proper_densities():
 
 
 def test_standard_errors_are_those_of_blocks():
-    """40 blocks of 25 equal values have the information of 40 values; blocks of other sizes give a ratio of sums."""
+    """40 blocks of 25 equal values have the information of 40 values; unequal blocks use a ratio of sums."""
     random = np.random.default_rng(0)
     values = random.normal(size=40)
     mean, error = held_out.block_mean(np.repeat(values, 25), np.repeat(np.arange(40), 25))

@@ -22,7 +22,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def swapped(tmp_path_factory):
-    """Write the same run with the places of subjects 8 and 12 exchanged, compressed."""
+    """Write the run compressed, with the positions of subjects 8 and 12 exchanged."""
     folder = world.write_run(tmp_path_factory.mktemp("swapped"), swap=(8, 12))
     for file in list(folder.glob("Robot*.dat")):
         (folder / f"{file.name}.gz").write_bytes(gzip.compress(file.read_bytes()))
@@ -86,7 +86,7 @@ def test_exchanged_landmarks_are_reported_and_survived(capsys, swapped):
 
 @pytest.mark.slow
 def test_poor_odometry_is_survived(capsys, tmp_path):
-    """The heading errs by 0.6 to 0.8 rad in 5 s: measured noise makes up for it, a fixed small one does not."""
+    """The heading errs by 0.6 to 0.8 rad in 5 s: measured noise covers it, small fixed noise does not."""
     folder = world.write_run(tmp_path / "poor", seed=2, seconds=30.0, wander=0.31)
     found = read_mrclam(folder, 1)
     apart = np.searchsorted(found.time, found.time[found.time < found.time[-1] - 5] + 5)
@@ -170,7 +170,7 @@ def test_broken_gzip_is_named(capsys, swapped, tmp_path):
 
 @pytest.mark.long
 def test_recorded_robot(capsys, data_dir, needs):
-    """Robot 3 of the UTIAS data: landmarks 11 and 17 are exchanged, and errors are of the paper's order."""
+    """Robot 3 of the UTIAS data: landmarks 11 and 17 are exchanged, and errors have the paper's magnitude."""
     code = main(["landmarks", "--folder", str(data_dir / "mrclam_ds1"), "--robot", "3", "--particles", "500",
                  "--scans", "500", "--backend", needs("opencl"), "--json"])  # fmt: skip
     document = json.loads(capsys.readouterr().out)

@@ -1,4 +1,4 @@
-"""Each command that reads logs takes --topic and --mount, and bags as well as other logs."""
+"""Each command that reads logs takes --topic and --mount, and bags like other logs."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def test_two_lasers_make_one_trajectory_and_one_map(place, capsys, tmp_path):
     np.testing.assert_allclose(here, there, atol=0.03)
     lasers = [line.rsplit(",", 1)[1] for line in csv.read_text().splitlines()]
     assert lasers == ["laser", *["0", "1"] * 8]
-    # The rear laser sees what the front one does not.
+    # The rear laser sees places that the front one misses.
     occupied = {}
     for topics in (["/front"], ["/front", "/rear"]):
         argv = command(place, "map", "run", "--topic", *topics)

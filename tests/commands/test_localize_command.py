@@ -1,4 +1,4 @@
-"""``gpusense localize`` on a made log: figures, files, the verdict on a wrong map, bad input."""
+"""``gpusense localize`` on a made-up log: results, files, the verdict on a wrong map, bad input."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_a_log_on_a_wrong_map_is_lost(place, capsys):
     out = capsys.readouterr().out
     assert out.startswith("LOST (p_lost ") and "pass through them, most near x = " in out
     assert "likely cause: wrong map" in out
-    # The map has no place on which the particles could agree.
+    # The map has no place for the particles to agree on.
     assert cli.main(call(place, "--global", "--particles", "500", grid="other.yaml")) == 1
     assert capsys.readouterr().out.startswith(("LOST (p_lost ", "UNCERTAIN (p_lost "))
 
@@ -247,7 +247,7 @@ class FakeStream:
 
 
 def test_a_run_is_recorded_for_the_viewer(place, capsys, monkeypatch, tmp_path):
-    """The run is tried with a module that has the needed names of rerun-sdk 0.41, and without one."""
+    """Try the run with a module that has the necessary names of rerun-sdk 0.41, and without."""
     streams, path = [], tmp_path / "run.rrd"
 
     def open_stream(name):

@@ -1,4 +1,4 @@
-"""Compare the estimates of ``gpusense localize`` with the poses of ``--reference``, or with the logged ones."""
+"""Compare the estimates of ``gpusense localize`` with the poses of ``--reference`` or of the log."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COUNT = 14
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """Return a folder with a map, a log whose poses are its odometry, and the true trajectory of every other scan."""
+    """Return a folder with a map, a log with odometry as poses, and the true trajectory of every other scan."""
     folder, rng = tmp_path_factory.mktemp("references"), np.random.default_rng(1)
     grid = write_room_map(folder)
     caster = gs.RayCaster(grid, range_max=20.0, backend="numpy")
@@ -79,7 +79,7 @@ def test_convergence_is_counted_in_scans_not_in_references(place):
         track.temperatures.append(1.0)
         track.verdicts.append("tracking")
         track.seconds.append((0.0, 0.0, 0.0, 0.0))
-    # Four references are left, and five are needed.
+    # Only four of five necessary references remain.
     assert summary(track)["converged_at"] is None
     track.poses[4] = np.array(steps[4].reference)
     assert summary(track)["converged_at"] == 4
@@ -287,7 +287,7 @@ def test_other_commands_take_the_poses_of_a_trajectory(place, capsys, tmp_path):
 
 def test_scans_without_a_pose_are_neither_used_nor_checked(place, capsys, tmp_path):
     lines = (place / "raw.log").read_text().splitlines()
-    # A scan of another laser, and a reading of the odometry that is none.
+    # A scan of another laser, and an invalid odometry reading.
     lines[3:3] = ["FLASER 3 1 2 3 0 0 0 0 0 0 2.5 robot 2.5", "ODOM nan 0 0 0 0 0 2.6 robot 2.6"]
     (tmp_path / "mixed.log").write_text("\n".join(lines))
     write_tum(tmp_path / "known.tum", [0.0, 1.0, 4.0], [(3.0, 1.5, 3.0)] * 3)

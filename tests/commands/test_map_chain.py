@@ -34,7 +34,7 @@ def odometry(truth: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def log(truth: np.ndarray, odometry: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write a CARMEN log whose poses are copies of the odometry."""
+    """Write a CARMEN log with copies of the odometry as poses."""
     rng, lines = np.random.default_rng(0), []
     for k, (pose, wheels) in enumerate(zip(truth, odometry, strict=True)):
         z = np.minimum(segments_scan(ROOM, tuple(pose), FRONT) + rng.normal(0, 0.01, FRONT.count), 30.0)

@@ -1,4 +1,4 @@
-"""``gpusense match``: pairs of a log and scans in a map, files that it writes, interrupts and bad input."""
+"""``gpusense match``: pairs of a log and scans in a map, written files, interrupts and bad input."""
 
 from __future__ import annotations
 

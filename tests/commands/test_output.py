@@ -1,4 +1,4 @@
-"""Output of commands: whole files or none, JSON, tables and progress."""
+"""Output of commands: atomic files, JSON, tables and progress."""
 
 from __future__ import annotations
 

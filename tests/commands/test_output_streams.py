@@ -1,4 +1,4 @@
-"""Streams and files that cannot be written: one line that names them, and nothing left behind."""
+"""Streams and files that cannot be written: one line names them, and nothing remains."""
 
 from __future__ import annotations
 

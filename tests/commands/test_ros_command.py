@@ -16,7 +16,7 @@ from gpusense.commands import cli
 
 @pytest.fixture
 def called(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Return the arguments passed to nodes, with a stand-in for rclpy."""
+    """Return the arguments passed to nodes, with a substitute for rclpy."""
     found: list[Any] = []
     rclpy = ModuleType("rclpy")
     rclpy.__spec__ = ModuleSpec("rclpy", None)

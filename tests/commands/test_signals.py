@@ -1,4 +1,4 @@
-"""Signals that end a command: SIGTERM and SIGHUP are handled like Ctrl-C, and no unfinished file is left."""
+"""Signals that end a command: SIGTERM and SIGHUP act like Ctrl-C, and no unfinished file remains."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def same_handlers():
 
 LOG = ["--log", "run.log", "--range-max", "20", "--backend", "numpy"]
 MAP = ["--map", "map.yaml"]
-# Arguments of a command, the step of its progress at which the signal comes, and the output expected at its end.
+# Arguments of a command, the progress step of the signal, and the expected output at the end.
 COMMANDS: dict[str, tuple[list[str], int, str]] = {
     "map": ([*LOG, "--out", "OUT/made.yaml"], 2, "the map holds 4 of 6 scans"),
     "likelihood_map": ([*MAP, *LOG, "--out", "OUT/made.png", "--headings", "4"], 2, "of the positions are done"),
@@ -288,7 +288,7 @@ def test_the_wait_of_a_destructor_ends_before_the_interrupt():
 
 
 def test_an_interrupt_while_memory_is_freed_is_not_lost(needs):
-    """Memory that host and device share waits for the device before it is freed."""
+    """Freeing memory that host and device share waits for the device."""
     import numpy as np
 
     from gpusense.backends import get_backend

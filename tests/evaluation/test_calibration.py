@@ -60,7 +60,7 @@ def test_another_density_is_found(name):
 
 
 def test_ranks_of_a_known_posterior():
-    # Two poses and a reading without information: ranks of one pose are uniform below one half, of the other above.
+    # Two poses and a reading without information: the poses' ranks are uniform below and above one half.
     poses = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)])
     ranks = posterior_ranks(poses, lambda at, seed: np.zeros(len(at)), lambda at, z: np.zeros(len(at)), 1000, seed=3)
     assert_uniform(ranks)

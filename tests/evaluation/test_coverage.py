@@ -1,4 +1,4 @@
-"""Coverage, widths, NEES and ranks of estimates whose errors have a known density."""
+"""Coverage, widths, NEES and ranks of estimates with errors of a known density."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_ranks_of_poses_beyond_all_particles_are_in_the_histogram():
         weights /= weights.sum()
         ranks += [tracking.rank_of(side * ahead, weights, np.zeros(3)) for side in (1, -1)]
     ranks = np.array(ranks)
-    # Sums of weights are rounded, and a histogram leaves out what is beyond its ends.
+    # Sums of weights are rounded, and a histogram ignores values beyond its ends.
     assert ranks.min() >= 0 and ranks.max() <= 1
     found = tracking.coverage_report(np.zeros(ranks.shape), np.tile(np.eye(3), (len(ranks), 1, 1)), ranks)
     assert found["rank_histogram"] == [0.5, *[0.0] * 8, 0.5]

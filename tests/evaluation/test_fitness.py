@@ -1,4 +1,4 @@
-"""Tests of the judgement of a log's poses: it is the same on devices that cannot judge beams."""
+"""The judgement of a log's poses is the same on devices that cannot judge beams."""
 
 import copy
 import dataclasses

@@ -86,7 +86,7 @@ def test_distance_transform_is_scipys(data_dir, opencl, name):
 
 
 def scene_of(data_dir, name):
-    """Return a scene in a map, and the backends that are present, without NumPy: it is slow in wide open space."""
+    """Return a scene in a map, and the present backends except NumPy (slow in open space)."""
     scanner = gs.Scanner.uniform(
         angle_min=-2.0, angle_increment=0.05, count=81, range_max=20.0, mount=(0.1, -0.05, 0.02)
     )  # fmt: skip
@@ -97,7 +97,7 @@ def scene_of(data_dir, name):
 
 
 def test_end_points_on_edges_do_not_breach(data_dir):
-    """Without a mount, beams along the axes end on the edges on which the poses lie."""
+    """Beams along the axes from poses on edges end on edges, for a mount of 0."""
     grid = gs.read_map(data_dir / "wean_hall/wean_10cm.yaml")
     scanner = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.025, count=161, range_max=20.0)
     checks = selftest.run([get_backend("numpy")], selftest.scene_in(grid, scanner), sonar=False)
@@ -147,13 +147,13 @@ def test_yaw_of_a_map_turns_its_poses(data_dir):
     ])  # fmt: skip
     ranges = [gs.RayCaster(g, 20.0, backend="numpy", precision="float64").cast(p, bearings)
               for g, p in ((plain, poses), (grid, turned))]  # fmt: skip
-    # Rounding moves rays by some 1e-14, which changes the range of a ray that grazes a corner.
+    # Rounding moves rays by some 1e-14 and changes the range of a ray that grazes a corner.
     assert np.quantile(np.abs(ranges[0] - ranges[1]), 0.999) < 1e-9
 
 
 @pytest.mark.slow
 def test_distance_transform_of_120_million_cells(gigantic, opencl):
-    """Compare distances at the corners and other places, 100 000 as memory allows, with a nearest-neighbour search."""
+    """Compare distances at the corners and up to 100 000 other cells with a nearest-neighbour search."""
     obstacles = gigantic.obstacles()
     found = gs.distance_transform(obstacles, squared=True, backend=opencl)
     rows, cols = obstacles.shape

@@ -70,7 +70,7 @@ def test_gap_is_the_largest_difference_of_particles_that_change_places():
     assert agreement.largest_gap(left, left) == 0
     assert agreement.largest_gap(left, np.array([0.0, -1.5, -1.25, -3.0])) == 0.25
     assert agreement.largest_gap(left, np.array([-3.0, -2.0, -1.0, 0.0])) == 3
-    # Scores on the left are equal, so it allows any order on the right.
+    # Equal scores on the left allow any order on the right.
     assert agreement.largest_gap(np.zeros(4), left) == 0
     assert agreement.largest_gap(np.full(2, -np.inf), np.full(2, -np.inf)) == 0
     assert agreement.largest_gap(left, np.array([-np.inf, 0, -1, -2])) == np.inf

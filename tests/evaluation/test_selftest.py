@@ -304,7 +304,7 @@ def test_a_breach_is_detected(capsys, monkeypatch, module, name, broken, quantit
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("kernel", [None, "sum_parts", "order_fill"])
 def test_a_breach_of_a_gpu_is_detected(kernel, monkeypatch):
-    """Only GPUs use tiles, orders and sums; the reference pretends to be one."""
+    """Only GPUs use tiles, orders and sums; the reference passes as a GPU."""
     backend = NumpyBackend()
     backend.info = dataclasses.replace(backend.info, kind="gpu")
     monkeypatch.setattr(selftest, "_REPEATS", 2)

@@ -1,4 +1,4 @@
-"""Stiff and extreme cases hold on every backend and precision, and the catalogue detects when they do not."""
+"""Stiff and extreme cases hold on every backend and precision, and the catalogue detects violations."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def test_ranges_in_an_empty_room_are_those_of_plain_geometry(name, precision, ba
 
 
 def weigh(selection: str, beams: int, particles: int) -> None:
-    """Check that log-weights are finite and sum to 1 where the product of likelihoods is 0 for every particle."""
+    """Check that log-weights are finite and sum to 1 although the product of likelihoods is 0 for every particle."""
     cells = np.pad(np.zeros((98, 98), np.int8), 1, constant_values=100)
     grid = gs.OccupancyGrid(cells, 0.1)
     scanner = gs.Scanner(np.linspace(-math.pi, math.pi, beams, endpoint=False), 20.0)

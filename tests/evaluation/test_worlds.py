@@ -21,7 +21,7 @@ RANGE_MAX = 10.0
 
 
 def turned(seed: int = 1) -> gs.OccupancyGrid:
-    """Return a building that is turned and far from the origin."""
+    """Return a turned building far from the origin."""
     grid = worlds.building(seed, (16.0, 12.0), 0.1)
     return gs.OccupancyGrid(grid.cells, grid.resolution, (5e5, -3e5, 0.7))
 
@@ -213,7 +213,7 @@ def test_scan_without_noise_is_the_distance_to_the_walls(backend):
     c, s = math.cos(yaw), math.sin(yaw)
     pose = (100 + c * 2 - s * 3, 50 + s * 2 + c * 3, yaw + math.pi / 2)
     ranges = worlds.simulate_scan(room((100, 50, yaw)), scanner, pose, sharp, np.random.default_rng(0), backend)
-    # The walls are square to the beams, so float32 is within 1e-3 cell on any device.
+    # The walls are perpendicular to the beams, so float32 is within 1e-3 cell on any device.
     assert ranges == pytest.approx([1.8 - 0.5, 3.3 - 0.5, 7.5 - 1.8, 5.5 - 3.3], abs=1e-4)
 
 

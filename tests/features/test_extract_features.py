@@ -173,7 +173,7 @@ def test_float32_finds_nearly_the_same(device, monkeypatch):
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_ties_are_the_same_in_float32(noise, monkeypatch, needs):
-    """Readings decide between splits by less than float32's rounding; on these floors some splits once differed."""
+    """Some splits on these floors are closer than float32's rounding, and once differed."""
     device, scanner = get_backend(needs("opencl")), ring(720)
     ranges, _ = floor_scans(1, scanner, 0.0, 20)
     ranges = ranges + noise * np.random.default_rng(1).standard_normal(ranges.shape)
@@ -214,7 +214,7 @@ def test_beams_of_one_bearing_raise_nothing(backend):
 @pytest.mark.parametrize("beams", [180, 720, 1081])
 @pytest.mark.parametrize("turn", [0.0, 0.3, math.pi / 4])
 def test_a_square_room_has_four_walls_and_corners(backend, beams, turn):
-    """The wall at which a scan begins is one line, whatever the first bearing."""
+    """The first wall of a scan is one line for any first bearing."""
     bearings = turn + np.arange(beams) * 2 * math.pi / beams
     scanner = gs.Scanner(np.mod(bearings + math.pi, 2 * math.pi) - math.pi, range_max=9.0)
     found = gs.extract_features(square_room(scanner, x=0.4, y=-0.3), scanner, backend=backend)
@@ -224,7 +224,7 @@ def test_a_square_room_has_four_walls_and_corners(backend, beams, turn):
     assert {(round(x, 3) + 0.0, round(y, 3) + 0.0) for x, y in corners.pose[:, :2]} == {
         (round(x, 3), round(y, 3)) for x, y in expected
     }
-    # In float32 a beam next to a corner may be assigned to the second wall, by less than the least noise of 3 mm.
+    # In float32 a beam next to a corner may go to the second wall, by less than the least noise of 3 mm.
     np.testing.assert_allclose(corners.size, math.pi / 2, atol=3e-4)
     # Bisectors point into the room.
     inward = corners.pose[:, :2] + 0.5 * np.column_stack([np.cos(corners.pose[:, 2]), np.sin(corners.pose[:, 2])])
@@ -233,7 +233,7 @@ def test_a_square_room_has_four_walls_and_corners(backend, beams, turn):
 
 @pytest.mark.parametrize(("swing", "least"), [(-70, 0.97), (-45, 0.97), (60, 0.6), (90, 0.6)])
 def test_doors_have_leaves(swing, least):
-    """A leaf opens out of the room (-) or into it (+), where it hides a jamb or the adjacent wall from many places."""
+    """A leaf opens out of the room (-) or into it (+), where it hides a jamb or the adjacent wall."""
     near, far, angle = 1.5, 2.4, math.radians(swing)
     leaf = (0, near, 0.9 * math.sin(angle), near + 0.9 * math.cos(angle))
     room = [(0, 0, 6, 0), (6, 0, 6, 4), (6, 4, 0, 4), (0, 4, 0, far), (0, near, 0, 0), leaf]
@@ -326,7 +326,7 @@ def test_scans_in_several_parts_give_the_same(monkeypatch):
 @pytest.mark.parametrize("beams", [360, 1081])
 @pytest.mark.parametrize("noise", ["auto", 0.02])
 def test_independent_ranges_have_no_poles(beams, noise):
-    """Of 40 scans at most one has a pole by chance."""
+    """At most one of 40 scans has a pole by chance."""
     rng, scanner = np.random.default_rng(1), ring(beams)
     clutter = (
         3 + rng.exponential(0.5, (40, beams)),
@@ -335,7 +335,7 @@ def test_independent_ranges_have_no_poles(beams, noise):
     )
     for ranges in clutter:
         assert len(gs.extract_features(ranges, scanner, "pole", noise=noise)) <= 1
-    # A pole before them is still found.
+    # A pole in front of them is still found.
     off = scanner.bearings - scanner.bearings[beams // 3]
     near = 0.8 * np.cos(off) - np.sqrt(np.maximum(0.12**2 - (0.8 * np.sin(off)) ** 2, 0))
     ranges = np.maximum(clutter[1], np.where(np.cos(off) > 0.9, 2.0, 0.0))

@@ -1,4 +1,4 @@
-"""Maps of landmarks from features: their places, their files, and a filter that localises with them alone."""
+"""Maps of landmarks from features: positions, files, and a filter that uses only landmarks."""
 
 from __future__ import annotations
 

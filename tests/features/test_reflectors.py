@@ -11,7 +11,7 @@ import gpusense as gs
 
 SCANNER = gs.Scanner.uniform(angle_min=-math.pi, angle_increment=math.radians(0.25), count=1440, range_max=30.0,
                              mount=(0.2, -0.1, 0.3))  # fmt: skip
-# Centres of cylinders in the scanner's frame, one of them behind it, where the beams begin and end.
+# Centres of cylinders in the scanner's frame, one of them behind, where the beams begin and end.
 CENTRES, RADIUS = np.array([(3.0, 1.0), (-5.0, 0.01), (0.5, -7.0)]), 0.045
 
 
@@ -51,7 +51,7 @@ def test_missing_readings_beside_each_other_are_no_feature(value):
     gone = ranges.copy()
     gone[[3, 4, 5, -2, -1, 0]] = value
     found = gs.extract_features(gone, SCANNER, "reflector", backend="numpy", intensities=light)
-    # One reflector lies behind the scanner, where its beams begin and end.
+    # One reflector is behind the scanner, where its beams begin and end.
     assert len(found) == 2
     assert not len(gs.extract_features(np.full(1440, value), SCANNER, backend="numpy", intensities=light))
 
@@ -75,7 +75,7 @@ def test_bad_intensities_are_named():
 
 
 def test_reflectors_of_a_recording(data_dir):
-    """Most scans show the six reflectors that the AGV of jarvis_lab navigates by, at their places on its map."""
+    """Most scans show the six reflectors of jarvis_lab's AGV at their positions on its map."""
     folder = data_dir / "jarvis_lab"
     bag = folder / "jarvis_complex_path_fast.bag"
     scans = list(gs.read_log(bag, topic="/driver_laser_navigation/laser_scan"))[::10]
@@ -85,7 +85,7 @@ def test_reflectors_of_a_recording(data_dir):
     ranges, light = (np.array([getattr(one, name) for one in scans])[valid] for name in ("ranges", "intensities"))
     found = gs.extract_features(ranges, scans[0].scanner, "reflector", intensities=light)
     mapped = gs.map_features(found, poses[valid], least=10)
-    # Medians of the positions that the sensor itself reports in beacons_scan, placed at the same poses.
+    # Medians of the positions that the sensor reports in beacons_scan, at the same poses.
     reported = [(5.818, 0.779), (-1.464, 4.212), (2.844, 4.328), (0.926, -2.365), (-6.722, -0.485), (-6.806, 3.058)]
     apart = np.hypot(*np.moveaxis(mapped.pose[:, None, :2] - reported, 2, 0))
     assert len(mapped) == 6 and sorted(apart.argmin(axis=1)) == list(range(6)) and apart.min(axis=1).max() < 0.09

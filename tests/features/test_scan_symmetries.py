@@ -1,4 +1,4 @@
-"""Features of scans that are turned, mirrored, or have their beams in another order."""
+"""Features of scans that are turned, mirrored, or have beams in another order."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ KINDS = ("line", "corner", "door", "hallway", "pole")
 
 
 def bearings_of(beams: int) -> np.ndarray:
-    """Return bearings over a full turn, or over three quarters of one where their number is odd."""
+    """Return bearings over a full turn, or over three quarters for an odd number."""
     if beams % 2:
         return np.linspace(-0.75 * math.pi, 0.75 * math.pi, beams)
     return 2 * math.pi / beams * np.arange(beams) - math.pi
@@ -33,7 +33,7 @@ def scans_of(seed: int, bearings: np.ndarray, noise: float, count: int) -> np.nd
 
 
 def assert_same(found: gs.Features, first: gs.Features, turn: float = 0.0, mirror: bool = False) -> None:
-    """Compare features with features that are mirrored at the x axis and then turned, in any order."""
+    """Compare features with features mirrored at the x axis and then turned, in any order."""
     side = -1.0 if mirror else 1.0
     c, s = math.cos(turn), math.sin(turn)
     xy = first.pose[:, :2] * (1, side) @ np.array([[c, s], [-s, c]])

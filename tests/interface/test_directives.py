@@ -101,7 +101,7 @@ def test_macros_of_several_lines_are_left_alone():
 
 
 def test_no_directive_of_a_kernel_is_left_to_the_compiler():
-    """Whatever the flags, the compiler sees only ``#define`` and ``#pragma``."""
+    """For any flags, the compiler sees only ``#define`` and ``#pragma``."""
     for name in opencl_names():
         for flags in (frozenset(), frozenset(FLAGS)):
             left = [

@@ -1,4 +1,4 @@
-"""Text of scalar functions with vectors in the place of numbers."""
+"""Text of scalar functions with vectors instead of numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Flags that are off leave no trace in the code; Warp's code rounds each operation and is made once."""
+"""Unset flags leave no trace in the code; Warp's code rounds each operation and is made once."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_flags_that_are_off_leave_no_trace_in_opencl(
     assert re.search(opencl, without_comments(assemble(file, frozenset({flag, *beside}))), re.MULTILINE)
     source = assemble(file, frozenset(beside))
     assert not re.search(opencl, without_comments(source), re.MULTILINE)
-    # The head asks the compiler whether the device fuses.
+    # The head tests at compile time whether the device fuses.
     assert "#if" not in source.split("#line 1", 1)[1]
 
 
@@ -194,7 +194,7 @@ def test_cuda_code_of_a_block_of_the_field_loads_as_little_as_can_be(
     flags = frozenset({"LOG_TABLE", "TWO_PART_POINTS", "ROUNDED_CELLS", "INSIDE"})
     code = cuda_code("field_blocks", flags, tmp_path)
     operations = cuda_operations_of(code)
-    # Where places of end points have an error bound, products and sums are fused.
+    # Positions of end points with an error bound fuse products and sums.
     assert "fma.rn.f32" in operations <= {f"{name}.rn.f32" for name in ("mul", "add", "sub", "fma")}
     blocks = re.split(r"^\$L\w+:|\bbra\b.*", code.partition(".entry")[2], flags=re.MULTILINE)
     whole = max(blocks, key=len)

@@ -1,4 +1,4 @@
-"""Orders of particles for GPUs: each run gives a permutation in which neighbours are near."""
+"""Orders of particles for GPUs: each run returns a permutation of near neighbours."""
 
 from __future__ import annotations
 
@@ -69,6 +69,6 @@ def test_neighbours_in_an_order_are_near(device: Backend) -> None:
     places = np.column_stack([cell, np.cos(heading), np.sin(heading)])
     apart = np.abs(np.diff(places[order], axis=0)).mean(axis=0)
     before = np.abs(np.diff(places, axis=0)).mean(axis=0)
-    # Threads that run at once exchange neighbours within a bin.
+    # Concurrent threads exchange neighbours within a bin.
     assert (apart[:2] < 0.3 * before[:2]).all()
     assert (apart < 0.9 * before).all()

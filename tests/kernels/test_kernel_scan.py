@@ -1,4 +1,4 @@
-"""Readings that are placed on the device are those that the host prepares: choice, places, bits and constant."""
+"""Readings placed on the device equal the host's: choice, positions, bits and constant."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SPECIAL = [
 
 
 def scans(real: type, count: int) -> list[np.ndarray]:
-    """Return scans of ranges alone, with readings of every class, and without any range."""
+    """Return scans of only ranges, with readings of every class, and without any range."""
     rng = np.random.default_rng(count)
     plain = rng.uniform(0.3, 4.9, count)
     mixed = np.where(rng.random(count) < 0.5, rng.choice(SPECIAL, count), plain)
@@ -102,8 +102,7 @@ def test_readings_are_placed_as_the_host_prepares_them(
 
 
 def test_readings_that_keep_their_places(device: Backend) -> None:
-    """ALL_READINGS keeps readings in place; a table's ranges stay below its last bin, and cones have several
-    vectors."""
+    """ALL_READINGS keeps readings in place; a table's ranges stay below its last bin, cones have several vectors."""
     (_, ranges, *_), count = scans(np.float32, 53), 53
     scanner = gs.Scanner(np.linspace(-3, 3, count), RANGE, NEAREST, cone=0.2, cone_rays=3)
     vectors = ray_vectors(scanner.ray_bearings, scanner.mount)
@@ -137,7 +136,7 @@ def test_an_even_choice_is_that_of_the_host() -> None:
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_poses_are_placed_along_with_readings(precision: type, device: Backend) -> None:
-    """Poses are placed like those of place_poses, however many work-items precede them for readings."""
+    """Poses equal those from place_poses for any number of preceding work-items for readings."""
     rng, count, beams, grid = np.random.default_rng(5), 150, 53, gs.OccupancyGrid(np.zeros((9, 12), np.int8), 0.5)
     poses = np.stack([rng.uniform(-1, 7, count), rng.uniform(-1, 5, count), rng.uniform(-4, 4, count)], axis=-1)
     poses[7, 1] = np.nan

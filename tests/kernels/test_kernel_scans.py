@@ -86,7 +86,7 @@ def test_blocks_of_fields_of_scans(names: tuple[str, ...], spread: int, device: 
         device, "field_blocks", flags, items(COUNT, spread, 64, 64), *given, guards, START,
         room_for(COUNT, blocks, REAL), window, COUNT, most, spread, ScanBatch(PER_SCAN, 0),
     )  # fmt: skip
-    # Each particle has the blocks of its scan, and no others.
+    # Each particle has only the blocks of its scan.
     assert differing(found["parts"], reference["parts"]) == 0
     written = np.count_nonzero(found["parts"].reshape(-1)[: COUNT * blocks].reshape(blocks, COUNT) != -77, axis=0)
     assert (
@@ -99,7 +99,7 @@ def test_blocks_of_fields_of_scans(names: tuple[str, ...], spread: int, device: 
 def test_sums_of_scans(block: int, names: tuple[str, ...], device: Backend) -> None:
     counts = np.array([5, 0, 48, 16], np.int32)
     parts = np.random.default_rng(4).uniform(0.1, 3, 48 * COUNT).astype(REAL)
-    # Parts beyond the end of a scan are not counted.
+    # Ignore parts beyond the end of a scan.
     place_scan = (an_order(COUNT) if "ORDERED" in names else np.arange(COUNT)) // PER_SCAN
     added = strands_in(counts) if "STRANDED" in names else counts
     parts.reshape(48, COUNT)[np.arange(48)[:, None] >= added[place_scan]] = np.nan

@@ -115,7 +115,7 @@ def sides_of(planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def score(planes: np.ndarray) -> np.ndarray:
-    """Return the length for which the ray in the middle of the sector stays in each rectangle."""
+    """Return the length of the sector's middle ray within each rectangle."""
     sectors = planes.shape[1]
     width, height = sides_of(planes)
     middle = np.array([slope(sectors, sector) for sector in range(sectors)])[:, :, None, None]
@@ -249,7 +249,7 @@ def test_free_cells_of_a_part_leave_the_others_alone(occupied: np.ndarray, devic
 
 
 def edits(rng: np.random.Generator, shape: tuple[int, int]) -> list[Window]:
-    """Return edits of single cells, among them the four corners, and of windows, among them those at borders."""
+    """Return edits of single cells, including the four corners, and of windows, including windows at borders."""
     rows, cols = shape
     places = [(0, 0), (0, cols - 1), (rows - 1, 0), (rows - 1, cols - 1), (rows // 2, cols // 2)]
     windows = [Window(row, col, 1, 1) for row, col in places]

@@ -20,7 +20,7 @@ COUNT = 1 << 22
 
 
 def spread(low: float, high: float) -> np.ndarray:
-    """Return positive float32 numbers from low to high, both included, evenly by bits and by value."""
+    """Return positive float32 numbers from low to high, inclusive, evenly by bits and by value."""
     ends = np.array([low, high], np.float32)
     bits = np.linspace(*ends.view(np.int32).astype(np.float64), COUNT // 2).astype(np.int32).view(np.float32)
     return np.concatenate([bits, np.linspace(*ends, COUNT // 2, dtype=np.float32)])
@@ -146,7 +146,7 @@ def test_the_log_of_erfc_is_within_two_eps(evaluate):
 
 
 def test_ends(in_either):
-    """Check exact values, far arguments, and that no value depends on a neighbour."""
+    """Check exact values, far arguments, and independence of neighbours."""
 
     def at(function: str, *numbers: float) -> list[float]:
         given = np.resize(np.array(numbers, np.float32), LANES)

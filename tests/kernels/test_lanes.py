@@ -1,4 +1,4 @@
-"""Kernels that compute 16 particles or beams at once: the bits of the scalar ones, leftovers included."""
+"""Kernels of 16 particles or beams at once have the scalar kernels' bits, including leftovers."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_lanes_have_the_bits_of_one(particles, beams, outside, in_lanes, compile
     assert all(compiled_lanes[kernel] == {LANES} for kernel in KINDS)
     for name in ("ranges", "field log p", "field parts"):
         assert differing(found[name], one[name]) == 0, name
-    # The elementary functions of drivers differ for vectors.
+    # Drivers' elementary functions differ for vectors.
     allowed = beam_tolerance(np.float32).twice()
     for name in ("beam parts", "beam log p", "smooth field parts", "smooth field log p"):
         assert allowed.difference(found[name], one[name]) <= allowed.value, name
@@ -166,7 +166,7 @@ def test_a_particle_does_not_depend_on_its_lane(in_lanes):
 
 @pytest.mark.parametrize("resolution", [1e-4, 1e-3, 0.05, 3.0])
 def test_end_points_next_to_edges_and_far_away(resolution, in_lanes):
-    """Readings of up to 2^20 cells, mostly whole numbers, at headings of quarter turns and close to them."""
+    """Readings of up to 2^20 cells, mostly integers, at and near headings of quarter turns."""
     rng = np.random.default_rng(5)
     grid = gs.OccupancyGrid(rng.choice([0, 100], (90, 70), p=[0.9, 0.1]), resolution)
     scanner = gs.Scanner(np.append(np.arange(32) * math.pi / 4, rng.uniform(-3, 3, 50)), (1 << 20) * resolution)

@@ -1,4 +1,4 @@
-"""Landmarks and point sensors in lanes: the scalar kernels' values, and no particle depends on its lane."""
+"""Landmarks and point sensors in lanes have the scalar kernels' values, independent of the lane."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Every kernel, with each caster, table and body in lanes, under a checker of memory.
 
-The checker must find no access outside a buffer and no data race, and results must be the reference's. Oclgrind
+The checker must find no access outside a buffer and no data race, and results must equal the reference's. Oclgrind
 interprets OpenCL kernels and checks each access; Warp's debug mode checks array bounds. Each runs in a separate
 process; gpusense never chooses either.
 """

@@ -28,7 +28,7 @@ from gpusense.world.windows import Window
 
 WORST = TOLERANCES["cosines and sines of headings"].value
 PRECISIONS = ("float32", "float64")
-FAMOUS = 6381956970095103 * 2.0**797  # of all float64 numbers the nearest to a multiple of pi/2
+FAMOUS = 6381956970095103 * 2.0**797  # the float64 number nearest to a multiple of pi/2
 
 
 # ---- headings

@@ -29,7 +29,7 @@ from gpusense.tables.rectangles import Planes
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_long_corridors(backend, precision):
-    """Rays of 20 000 cells, parallel to an axis or oblique, end at the far wall, whatever cells they pass."""
+    """Rays of 20 000 cells, parallel to an axis or oblique, end at the far wall through any cells."""
     length = 20_000
     occupied = np.zeros((9, length), bool)
     occupied[:, -1] = True
@@ -106,7 +106,7 @@ def test_origins_nearly_as_far_off_as_a_range_may_be_long(precision, backend):
         assert differing(cast(scene, backend, precision, Planes(sectors)), found) == 0
     assert differing(found, cast(scene, "numpy", precision)) == 0
     if precision == "float64" and backend == "numpy":
-        # The walk begins near the map, at an exact place on the ray.
+        # The walk begins near the map, at an exact point of the ray.
         for i in range(0, 600, 4):
             ray, skipped = scene.ray(i), int(away[i]) - 100
             near = ray.moved(*(skipped * Fraction(d) for d in ray.direction), 0)

@@ -64,7 +64,7 @@ def test_every_backend_has_the_bits_of_numpy_for_any_number_of_sectors(family, b
     bits = np.dtype(precision).str.replace("f", "u")
     for scene in scenes_of(family):
         expected = cast(scene, "numpy", precision)
-        # In lanes as well, where the device has them.
+        # Also in lanes, if the device has lanes.
         for wide in (False, True) if get_backend(backend).info.lanes > 1 else (False,):
             found = cast(scene, backend, precision, Planes(sectors), wide=wide)
             wrong = np.flatnonzero(expected.view(bits) != found.view(bits))
@@ -104,7 +104,7 @@ def test_a_diagonal_pair_of_walls_never_leaks(backend):
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_no_pair_of_walls_leaks_at_any_slope(precision, backend):
-    """Rays aim at the common corner of two walls as exactly as floats allow; a wall stops them however they round."""
+    """Rays aim at the common corner of two walls as exactly as floats allow; a wall stops them for any rounding."""
     rng = np.random.default_rng(13)
     for number in range(40):
         sign = rng.choice([-1, 1], 2)

@@ -17,7 +17,7 @@ from gpusense.interface.signatures import KERNELS
 
 OPENCL, WARP, NUMPY = LANGUAGES = "OpenCL", "Warp", "NumPy"
 FOLDERS = {WARP: kernel_root() / "warp", NUMPY: Path(gpusense.reference.__file__).parent}
-# Functions that make a file's Warp functions and kernels for a set of flags; they are no part of the concept.
+# Factories of a file's Warp functions and kernels for a set of flags, not part of the concept.
 FACTORIES = {"functions", "make"}
 # Files of a single language that are not concepts.
 OTHER_FILES = {
@@ -124,7 +124,7 @@ def opencl_functions(text: str) -> list[str]:
 
 
 def python_functions(text: str) -> list[str]:
-    """Return the names of a Python file's functions, in order, nested ones included and factories left out."""
+    """Return the names of a Python file's functions in order, including nested ones and without factories."""
     found = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)]
     found.sort(key=lambda node: node.lineno)
     return list(dict.fromkeys(node.name for node in found if node.name not in FACTORIES))

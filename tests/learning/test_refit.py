@@ -1,4 +1,4 @@
-"""Parameters fitted to readings that a model with known parameters drew lie within three standard errors of these.
+"""Parameters fitted to a model's drawn readings are within three standard errors of the model's.
 
 Seeds are fixed. For another seed each number exceeds three standard errors with probability 0.0027.
 """
@@ -24,7 +24,7 @@ INSIDE = gs.worlds.cloud_uniform(GRID, 600, np.random.default_rng(2))
 
 
 def assert_found(found: Mapping[str, float], truth: Mapping[str, float], errors: Mapping[str, float]) -> None:
-    """Check every number that has a standard error; at least one has."""
+    """Check every number with a standard error, at least one."""
     known = [name for name in truth if np.isfinite(errors.get(name, np.nan))]
     assert known
     for name in known:

@@ -1,4 +1,4 @@
-"""Readings far from all particles: particles reach them without becoming copies of one, or the estimate reports it."""
+"""Readings far from all particles: particles reach them without collapsing to one, or the estimate reports it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gpusense.localization.cloud_state import is_starved, summary_of
 
 
 def follow(backend, prior, sigma, far, corrections, **options):
-    """Return estimates of a robot at x = far, y = 0 by a filter that starts with a normal density around the origin."""
+    """Return estimates of a robot at x = far, y = 0 by a filter with a normal start around the origin."""
     model = gs.PositionModel(gs.PositionParameters(sigma=sigma), backend=backend)
     pf = gs.ParticleFilter(model, particles=2000, seed=1, **options)
     pf.initialize(mean=(0, 0, 0), covariance=np.diag([prior**2, prior**2, 1.0]))

@@ -1,4 +1,4 @@
-"""One table of defaults: the library, the commands and the page have its values."""
+"""Library, commands and page share one table of defaults."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_library_and_commands_have_its_values():
         command.add_arguments(parsers[-1])
     assert parsers[0].get_default("temperature") == DEFAULTS.temperature
     assert parsers[1].get_default("particles") == DEFAULTS.particles
-    # Options that override a file of parameters have no default; their help has the table's value.
+    # Options that override a file of parameters have no default; their help states the table's value.
     text = re.sub(r"\s+", " ", parsers[0].format_help())
     alpha = shown(DEFAULTS.alpha).replace(",", "")
     for value in (f"default: {DEFAULTS.particles}", alpha, f"default: {DEFAULTS.reverse})"):

@@ -59,7 +59,7 @@ def test_errors_fall_with_the_root_of_the_number_of_particles():
 
 
 def test_many_particles_take_no_more_stages_than_they_need(backend):
-    # With a ratio r of the variances of fix and prior, r (2 + r) / (1 + r)^2 = 7.5 % of the particles are effective.
+    # For a ratio r of the variances of fix and prior, r (2 + r) / (1 + r)^2 = 7.5 % of the particles are effective.
     def state(count, deviation):
         sigma = deviation * np.sqrt(0.04)
         model = gs.PositionModel(gs.PositionParameters(sigma=sigma, z_rand=0.0), backend=backend)
@@ -127,7 +127,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_one_others(backend):
     one, two = tracked(backend)[0], tracked(backend)[0]
     assert np.array_equal(one.host_particles(), two.host_particles())
     assert np.array_equal(one.host_weights(), two.host_weights())
-    # Random numbers are common to all backends: their estimates differ by less than those of two seeds.
+    # Random numbers are common to all backends: estimates differ less than for two seeds.
     reference = tracked("numpy")[0].estimate().pose
     assert np.abs(one.estimate().pose - reference).max() < 0.03
 
@@ -196,7 +196,7 @@ def test_recovery_from_a_kidnapping():
             pf.correct(walls(pose))
             pf.predict((0, 0, 0), (0, 0, 0))
         found = pf.estimate("cluster").pose
-        # The room has a twin: half a turn about its centre.
+        # The room equals itself after half a turn about its centre.
         twin = np.array([8.4 - 6.5, 6.4 - 5.0, -1.0 + np.pi])
         assert min(np.hypot(*(found - one)[:2]) for one in (pose, twin)) < 0.5, recovery
 
@@ -319,13 +319,13 @@ def test_readings_may_be_overwritten_after_the_correction(backend):
 
 
 def test_a_filter_that_never_draws_keeps_what_it_knows(backend):
-    """With a threshold below 1 / N, no weight may round to the integer 0."""
+    """At a threshold below 1 / N, no weight may round to the integer 0."""
     pf = gs.ParticleFilter(gps(backend), particles=1000, seed=2, threshold=1e-15, stages=1)
     pf.initialize(mean=(0, 0, 0), covariance=np.diag([0.09, 0.09, 1e-6]))
     for _ in range(3):
         pf.correct(np.zeros(2))
     found = pf.estimate()
-    # Three fixes with the variance of the start leave a quarter of it.
+    # Three fixes with the start's variance leave a quarter of it.
     np.testing.assert_allclose(np.diag(found.covariance)[:2], 0.09 / 4, rtol=0.2)
     assert 100 < found.effective_sample_size < 1000
 

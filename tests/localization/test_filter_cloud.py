@@ -1,4 +1,4 @@
-"""Each member of the interface between a filter and its particles, on every backend."""
+"""The interface between a filter and its particles, on every backend."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def cloud(backend) -> FilterCloud:
 
 @pytest.fixture
 def other(backend) -> FilterCloud:
-    """Return a cloud with more room, which must have the same bits."""
+    """Return a cloud with more room, for the same bits."""
     return made(backend, 3 * COUNT)
 
 
@@ -130,7 +130,7 @@ def test_seconds_are_those_of_waiting_for_scores(cloud, backend):
     cloud.correct(step())
     first = cloud.scoring_seconds
     cloud.correct(step())
-    # A recorded program takes no time for itself.
+    # A recorded program takes no separate time.
     recorded = get_backend(backend).info.kind == "gpu"
     assert first == cloud.scoring_seconds == 0 if recorded else 0 < first < cloud.scoring_seconds < 60
 

@@ -35,7 +35,7 @@ def test_a_stage_on_a_gpu_is_one_recorded_program(warp_as_gpu):
         pf, pose = tracked(stages)
         numbers, covariance = pf.mean_and_covariance()
         assert np.hypot(*(numbers - pose)[:2]) < 0.1 and covariance[0, 0] < 0.01
-        # The first corrections, which leave the estimate to separate launches.
+        # The first corrections leave the estimate to separate launches.
         programs = {key: program.recording for key, program in pf._cloud._recordings.items() if not key[3]}
         found = {key[1].number: recording.explain() for key, recording in programs.items()}
         # A move, 3 launches for the scores, 4 for weights, and the draw.
@@ -93,11 +93,11 @@ def test_corrections_judge_the_pose_that_each_step_asks_for(backend, monkeypatch
             estimates.append((*one.pose, one.p_lost, one.explained))
         return estimates, len(alone)
 
-    # More beams than are judged, and fewer.
+    # More and fewer beams than the judged number.
     for readings in (np.ones(60, bool), np.arange(60) % 3 == 0):
         (together, few), (apart, many) = run(True, readings), run(False, readings)
         assert together == apart and min(one[-1] for one in together) > 0.8
-        # A filter's first scans are judged alone.
+        # A filter's first scans are judged separately.
         assert many == 10 and few <= 5
 
 

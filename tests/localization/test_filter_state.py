@@ -14,7 +14,7 @@ import gpusense as gs
 
 
 def continued(pf, first=3, steps=4):
-    """Return all outputs of a filter as it continues, its state included."""
+    """Continue a filter, and return all outputs and its state."""
     shown = []
     for step in range(first, first + steps):
         pf.predict(*odometry(step))
@@ -68,11 +68,11 @@ def test_a_state_before_the_first_correction(steps, backend):
 
 
 def test_a_long_run_is_repeated_from_the_middle(needs):
-    """Learned temperature and verdict memory count: after 12 scans they are no longer the first ones."""
+    """Learned temperature and verdict memory matter: after 12 scans they have changed."""
     pf = begun(gs.ParticleFilter(field(needs("opencl")), particles=300, seed=8), 8)
     assert pf.temperatures[0] != gs.ParticleFilter(field("opencl"), particles=300).temperatures[0]
     other = restored(pf, lambda: gs.ParticleFilter(field("numpy"), **pf.state().options))
-    # On another device temperatures and weights agree to the roundings of log-likelihoods.
+    # On another device temperatures and weights agree up to rounding of log-likelihoods.
     assert everything(other) == everything(pf)
     assert continued(restored(pf, lambda: gs.ParticleFilter(field("opencl"), **pf.state().options)), 8) == continued(
         pf, 8
@@ -88,7 +88,7 @@ def test_a_state_has_no_device_and_tells_its_options():
     assert np.array_equal(state.particles, pf.host_particles()) and np.array_equal(state.weights, pf.host_weights())
     assert state.options["particles"] == (50, 100) and state.options["temperature"] == 0.5
     assert len(pickle.dumps(state)) < 40_000
-    # A copy: the filter's own particles cannot be changed by it.
+    # A copy, independent of the filter's particles.
     state.particles[:] = 7
     assert not np.any(pf.host_particles() == 7)
 

@@ -1,4 +1,4 @@
-"""A call of a filter that was interrupted at any line has changed all of the filter's state or none.
+"""A call of a filter interrupted at any line has changed all of the filter's state or none.
 
 Tests of models cover interrupts in models and devices; these cover the filter's own state.
 """
@@ -18,7 +18,7 @@ from support.tracking_scene import field
 import gpusense as gs
 from gpusense.localization import journal, starts
 
-# Rooms whose lines are interrupted: the rooms below them do not use filters.
+# Rooms with lines to interrupt: lower rooms do not use filters.
 ROOMS = ("localization", "sweeps")
 CALLS: dict[str, Callable[[Filter], Any]] = {
     "predict": lambda pf: pf.predict(*odometry(4)),
@@ -38,7 +38,7 @@ LOOKS = ("estimate", "host_weights", "flush")
 
 @pytest.fixture(autouse=True)
 def few_tries(monkeypatch):
-    """Let a reset try few poses: for any number, a state has all of it or nothing."""
+    """Let a reset try few poses, since atomicity is independent of their number."""
     monkeypatch.setattr(starts, "_LEAST_TRIES", 300)
 
 
@@ -67,7 +67,7 @@ class Interrupted:
         assert (self._after == self._before) == (call in LOOKS)
 
     def _prepare(self) -> None:
-        """Give the filter a motion that has not run."""
+        """Give the filter a postponed motion."""
         self.pf.restore(self._start)
         self.pf.predict(*odometry(3))
 
@@ -78,7 +78,7 @@ class Interrupted:
         return [line for line in lines if any(f"/gpusense/{room}/" in line[0].co_filename for room in ROOMS)]
 
     def check(self, line: Line) -> bool:
-        """Interrupt the call at a line, and repeat it where it has changed nothing."""
+        """Interrupt the call at a line, and repeat it if it has changed nothing."""
         self._prepare()
         assert everything(self.pf) == self._before
         self._prepare()
@@ -92,7 +92,7 @@ class Interrupted:
 
 
 def interrupt_lines(name: str, backend: str, call: str, most: int | None) -> None:
-    """Interrupt a call at all of its lines, or at no more than a number of them, which differ by filter and call."""
+    """Interrupt a call at all lines, or at a limited number that differ by filter and call."""
     case = Interrupted(name, backend, call)
     lines = case.lines()
     every = 1 if most is None else max(len(lines) // most, 1)

@@ -40,7 +40,7 @@ LOOKS: dict[str, Callable[[gs.ParticleFilter], Any]] = {
 
 
 def reading(name, pose, rng):
-    """Return what a sensor measures at a pose; now and then something that contradicts it, or nothing."""
+    """Return a sensor's measurement at a pose, sometimes a contradiction or nothing."""
     odd = rng.random() < 0.15
     if name in ("field", "beam"):
         scanner = SCANNER if name == "field" else BEHIND
@@ -102,14 +102,14 @@ def calls(names, seed):
         elif what < 0.2:
             yield lambda pf: kept.append(pf.state())
         elif what < 0.3:
-            # Each run restores the state that it has kept itself.
+            # Each run restores its saved state.
             yield lambda pf: kept and pf.restore(kept[-1])
         elif what < 0.33:
             yield lambda pf, again=(seed, step): begin(pf, names, again)
 
 
 def ran(seed, backend, look):
-    """Return all of a filter after random calls, with looks between them."""
+    """Return the complete filter after random calls and looks."""
     pf, names = made(seed, backend)
     for call in calls(names, seed):
         call(pf)
@@ -168,7 +168,7 @@ def test_copies_of_particles_count_once_until_a_motion(threshold, backend):
     pf.initialize(mean=START, covariance=np.diag([1.0, 1.0, 0.01]))
     found = []
     for number in range(60):
-        # Fixes on both sides in turns, so that each leaves fewer particles.
+        # Alternate fixes on both sides, each leaving fewer particles.
         pf.correct(START[:2] + (0.2 if number % 2 else -0.2))
         found.append(pf.estimate().effective_sample_size)
         _, copies = np.unique(pf.host_particles(), axis=0, return_inverse=True)

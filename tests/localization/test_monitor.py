@@ -13,7 +13,7 @@ CELLS = np.pad(np.zeros((60, 80), int), 1, constant_values=100)
 CELLS[1:40, 51] = 100
 CELLS[45:50, 10:20] = 100
 GRID = gs.OccupancyGrid(CELLS, 0.1)
-# A laser of 200 degrees, so that a turned one sees something else.
+# A laser of 200 degrees sees differently after a turn.
 SCANNER = gs.Scanner.uniform(angle_min=-1.75, angle_increment=3.5 / 70, count=71, range_max=12.0)
 POSES = [np.array([2.0 + 0.2 * k, 2.0, 0.1 * k]) for k in range(10)]
 
@@ -128,7 +128,7 @@ def test_several_sensors_and_landmarks():
             seen = np.column_stack([np.hypot(*d.T), gs.wrap_angle(np.arctan2(d[:, 1], d[:, 0]) - pose[2])])
             found = monitor.update(pose + np.array([off, off, 0.0]), {front: scan_at(pose), landmarks: (seen,)})
         assert found.verdict == word
-    # Landmarks alone, with a covariance of 0.
+    # Only landmarks, with a covariance of 0.
     for off, word in ((0.0, "tracking"), (2.5, "lost")):
         monitor = gs.PoseMonitor(landmarks)
         for pose in POSES:

@@ -1,4 +1,4 @@
-"""Noise of an odometer, learned from logs with reference poses."""
+"""Learn the noise of an odometer from logs with reference poses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_motion_noise_is_learned():
         sign = -1 if rng.random() < 0.05 else 1
         truth.append(_step(truth[-1], one + noise[0], sign * (trans + noise[1]), two + noise[2]))
     fit = gs.fit_odometry_motion(np.array(odometry), np.array(truth))
-    # Mean squares of 3000 steps have a standard deviation of 3 %; turns and translations share the noise of a turn.
+    # Mean squares of 3000 steps have a deviation of 3 %; turns and translations share the noise of a turn.
     assert (np.array(fit.motion.alpha) / alpha)[[0, 1, 2]] == pytest.approx(np.ones(3), rel=0.35)
     assert fit.inflation < 1.8 and 0.03 < fit.motion.reverse < 0.07 and fit.motion.sideways < 0.002
     np.testing.assert_allclose(fit.motion.systematic, 0, atol=0.02)

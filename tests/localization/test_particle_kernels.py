@@ -193,7 +193,7 @@ def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC, l
     return found
 
 
-# The largest one has more blocks than a work-item sums.
+# The largest cloud has more blocks than a work-item sums.
 @pytest.mark.parametrize("count", [1, 37, 1500])
 @pytest.mark.parametrize("flags", [PLAIN, frozenset({"FLOAT64"})], ids=["float32", "float64"])
 @pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
@@ -285,7 +285,7 @@ def test_estimates_are_the_moments_of_the_cloud(backend, name):
     assert numbers[c.WIDE_HEADINGS] == (turn > 1)
 
 
-# Deviations of turns: none, of a jump of 100 m, and the largest that a filter uses.
+# Deviations of turns: none, for a jump of 100 m, and the largest of a filter.
 @pytest.mark.parametrize("deviation", [0.1, 14.2, 1e5])
 @pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
 @pytest.mark.parametrize("kind", [c.STRAIGHT, c.VELOCITY_MODEL])
@@ -321,7 +321,7 @@ def test_an_estimate_after_a_jump_has_the_moments_of_wrapped_headings(backend):
     pf.predict((0.0, 0.0, 0.0), (100.0, 0.0, 0.0))
     found, poses = pf.estimate(), pf.host_particles()
     assert np.abs(poses[:, 2]).max() <= np.pi
-    # Uniform on the circle, nearly: one deviation of any heading about any mean. Also beyond the limit.
+    # Nearly uniform on the circle: one deviation of any heading about any mean. Also beyond the limit.
     far = gs.OdometryMotion().sampled((0.0, 0.0, 0.0), (1e9, 0.0, 0.0))
     assert far.deviation[0] > 1e8 and settings_of(far)[0][4] == 1e5
     assert 1.6 < np.sqrt(found.covariance[2, 2]) < 2.0 and abs(found.pose[2]) <= np.pi

@@ -19,7 +19,7 @@ def estimate(covariance, p_lost=0.0, size=500.0):
 
 
 def turned(large, small, angle):
-    """Return a covariance with these deviations along turned axes."""
+    """Return a covariance with deviations along turned axes."""
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     covariance = np.diag([0.0, 0.0, 0.01])
     covariance[:2, :2] = turn @ np.diag([large**2, small**2]) @ turn.T
@@ -96,7 +96,7 @@ def test_a_risk_that_no_data_support_is_refused(judged, risk) -> None:
 
 
 def at_poses(poses, backend="numpy"):
-    """Return a filter without a map whose particles are copies of poses."""
+    """Return a filter without a map, with particles that are copies of poses."""
     pf = gs.ParticleFilter(gs.PositionModel(gs.PositionParameters(), backend=backend), particles=len(poses))
     pf.initialize_from(SimpleNamespace(log_p=np.zeros(len(poses)), positions=poses))
     return pf
@@ -108,7 +108,7 @@ def test_a_cloud_of_a_filter_has_its_quantile(backend: str) -> None:
     pf.initialize(mean=(5.0, 5.0, 0.0), covariance=np.diag([0.01, 0.01, 0.0001]))
     assert pf.estimate().protection_level(0.05) == pytest.approx(0.1 * math.sqrt(-2 * math.log(0.05)), rel=0.03)
     assert pf.estimate().widening == 1
-    # Particles that lie apart count by their distances: 3 % of them are 0.9 m off, the others in a heap.
+    # Spread-out particles count by their distances: 3 % are 0.9 m off, all others coincide.
     poses = np.random.default_rng(0).normal((5.0, 5.0, 0.0), (0.01, 0.01, 0.12), (4000, 3))
     poses[:120, 0] += 0.9
     pf = at_poses(poses, backend)

@@ -46,7 +46,7 @@ def test_a_fix_may_have_its_own_covariance():
 
 
 def test_landmarks_take_features_with_or_without_their_landmarks():
-    # Wide enough that a fifth of the particles is effective in one stage.
+    # Wide enough for a fifth of the particles to be effective in one stage.
     parameters = gs.LandmarkParameters(sigma_range=1.0, sigma_bearing=1.0)
     model = gs.LandmarkModel(gs.LandmarkMap([[2.0, 2.0], [1.0, 4.0]]), parameters, backend="numpy")
     features = np.array([[1.0, 0.0], [2.0, 1.5]])

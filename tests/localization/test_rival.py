@@ -1,4 +1,4 @@
-"""The rival of a filter: it costs a sound track nothing, finds a carried robot, and keeps a place that looks alike."""
+"""The rival of a filter leaves a sound track alone, finds a carried robot, and keeps a similar place."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def test_poses_are_drawn_by_their_likelihood():
 
 @pytest.mark.parametrize("kind", ["field", "beam"])
 def test_a_carried_robot_is_found_within_a_few_scans(model, kind):
-    """The search is over the whole map, so neither the place nor the number of particles matters."""
+    """The search covers the whole map: neither place nor number of particles matters."""
     if kind == "beam":
         model = gs.BeamModel(GRID, SCANNER, gs.BeamParameters(z_hit=0.8, z_short=0.1, z_max=0.0, z_rand=0.1,
                              sigma_hit=0.05, lambda_short=0.5), backend="opencl")  # fmt: skip
@@ -177,7 +177,7 @@ def test_the_likeliest_poses_of_a_map_hold_the_right_one():
 
 @pytest.mark.filterwarnings("ignore::gpusense.PlausibilityWarning")
 def test_no_pose_is_likelier_than_others_where_a_cell_holds_the_whole_scan():
-    """All headings and nearly all cells are alike, so a search would only list millions of poses."""
+    """All headings and nearly all cells are equivalent: a search would only list millions of poses."""
     coarse = gs.OccupancyGrid(GRID.cells, 1000.0)
     field = gs.LikelihoodFieldModel(coarse, SCANNER, backend="opencl")
     (ranges,) = scans([(3.0, 9.5, 0.3)])
@@ -185,7 +185,7 @@ def test_no_pose_is_likelier_than_others_where_a_cell_holds_the_whole_scan():
 
 
 def test_a_second_rival_has_nothing_of_the_first(backend, monkeypatch):
-    """A state does not depend on rivals that the filter has given up: a copy made before them continues alike."""
+    """A state is independent of ended rivals: an earlier copy continues equally."""
     monkeypatch.setattr("gpusense.localization.starts._LEAST_TRIES", 300)
     pf = scene.begun(scene.FILTERS["sensors, resetting"](backend), 4, everywhere=True)
     pf.predict(*scene.odometry(3))
@@ -226,7 +226,7 @@ def test_a_wrong_map_is_no_evidence_where_no_other_place_fits_better():
     model = gs.LikelihoodFieldModel(crowded_map(path, 160), SCANNER, FIELD, backend="opencl")
     found = track(path, scans(path), begun(model, path[0]))
     assert max(error(*pair) for pair in zip(found, path, strict=True)) < 0.2
-    # Most beams contradict the map. By them alone the last p_lost was 0.9, and its mean 0.6.
+    # Most beams contradict the map. Judged only by beams, the last p_lost was 0.9 and its mean 0.6.
     assert np.median([one.explained for one in found]) < 0.5
     assert found[-1].p_lost < 0.1 and np.mean([one.p_lost for one in found]) < 0.1
 
@@ -241,7 +241,7 @@ def test_a_robot_that_is_carried_away_on_a_wrong_map_is_lost_and_found():
 
 
 def test_the_comparison_has_the_best_other_place(model):
-    """Compare with poses all over the map: the robot's own place is the best one where the estimate is elsewhere."""
+    """Compare with poses all over the map: the robot's place is the best if the estimate is elsewhere."""
     here, there = np.array([4.0, 3.5, 0.3]), np.array([9.0, 9.0, 2.0])
     ranges, spread = scans([here], people=0.6)[0], np.diag([0.01, 0.01, 0.001])
     anywhere = np.random.default_rng(0).uniform((0, 0, -3), (20, 12, 3), (4000, 3))
@@ -256,7 +256,7 @@ def test_the_comparison_has_the_best_other_place(model):
         assert compared.score[apart].max() == pytest.approx(reached - compared.walls, abs=1e-3)
         assert compared.is_found == is_found and compared.beams == pytest.approx(temperature * SCANNER.count)
         assert compared.ratio < -1.5 if is_found else compared.ratio > 0.2
-    # Poses of the search are 0.1 m and 3 degrees apart, and the nearest one is a little less likely.
+    # Poses of the search are 0.1 m and 3 degrees apart, and the nearest is slightly less likely.
     others = log_p[are_apart(np.vstack([here, there, anywhere]), there)]
     assert compared.lead > temperature * float(others.max() - log_p[1]) - 1.0 and compared.walls < 0
 
@@ -270,7 +270,7 @@ def test_a_comparison_needs_information_and_has_limits():
     # A scan with hardly any information is no evidence.
     assert abs(ratio(0.0, 0.01, is_found=True)) < 0.05
     assert math.isnan(ratio(math.nan, 10.0)) and math.isnan(ratio(1.0, 0.0))
-    # The lead of a place that its own beams contradict says nothing, and a pose that none leads stays right.
+    # The lead of a place that its beams contradict is meaningless, and a pose without rival stays right.
     even = math.log((math.exp(ratio(9.0, 10.0)) + 1) / 2)
     assert ratio(9.0, 10.0, walls=0.0) == pytest.approx(even) and 0 < ratio(9.0, 10.0, walls=5.0) < 0.1
     assert ratio(-2.0, 10.0, walls=5.0) == ratio(-2.0, 10.0)

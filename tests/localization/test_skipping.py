@@ -1,4 +1,4 @@
-"""Skipped beams: those of people, no whole scan, none while the particles lie apart."""
+"""Skipped beams: beams on people, never a whole scan, none while the particles are spread out."""
 
 from __future__ import annotations
 

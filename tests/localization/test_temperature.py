@@ -10,8 +10,8 @@ import gpusense as gs
 from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around
 
 HALF = np.array([3.0, 2.0])
-# For 40 scans with four blocks, F_4 has a standard deviation of 0.15, and F_4 / F_16 one of 0.2, which counts up to
-# three times, and only above 1.
+# For 40 scans with four blocks, F_4 has a standard deviation of 0.15, and F_4 / F_16 of 0.2, weighted up to three
+# times, and only above 1.
 LEAST, MOST = 0.5, 1.3
 
 
@@ -27,13 +27,13 @@ def room(headings, count, span=np.pi):
 
 
 def autoregressive(rng, count, phi):
-    """Return normal errors of variance 1 whose autocorrelation is phi^l."""
+    """Return normal errors of variance 1 and autocorrelation phi^l."""
     noise = rng.normal(size=count + 200) * np.sqrt(1 - phi * phi)
     return lfilter([1.0], [1.0, -phi], noise)[200:]
 
 
 def learned(draw, count, scans=150, sigma=0.05):
-    """Return the learned temperature of scans with drawn errors, and the one at which the mean NEES of fits is 3."""
+    """Return the learned temperature of scans with drawn errors, and the temperature for a mean NEES of 3."""
     rng, found, squared = np.random.default_rng(3), BeamCorrelation(), []
     for _ in range(scans):
         gradients, ways = room(rng.uniform(0, 2 * np.pi), count)
@@ -58,7 +58,7 @@ def test_short_correlations_have_the_temperature_of_theory(count, phi):
 @pytest.mark.parametrize(("count", "phi"), [(180, 0.8), (180, 0.95), (60, 0.8)])
 def test_long_correlations_make_normalised_errors_of_fits_right(count, phi):
     found, wanted = learned(lambda rng, n: autoregressive(rng, n, phi), count)
-    # Their variance stops growing at the scale of the whole scan, which no block shows: at most 3 times too careful.
+    # Their variance stops growing at the scale of the whole scan, invisible to blocks: at most 3 times too careful.
     assert wanted / 3 < found.temperature(count) < 1.2 * wanted
     plain = learned(lambda rng, n: rng.normal(size=n), count)[0]
     assert found.temperature(count) < 0.5 * plain.temperature(count)
@@ -82,7 +82,7 @@ def test_errors_that_repeat_are_found_in_turned_scans(phi):
         heading += 2 * np.pi / bins * rng.integers(-20, 20)
         gradients, ways = room(heading, 360)
         errors = sigma * field[np.rint(ways / (2 * np.pi) * bins).astype(int) % bins]
-        # The filter knows the pose better than a scan does.
+        # The filter knows the pose better than a scan.
         axes = axes_of(0.5 * np.linalg.inv(gradients.T @ gradients / sigma**2))
         moved = errors - poses_around(np.zeros(3), axes) @ gradients.T
         for one in (found, apart):
@@ -121,7 +121,7 @@ def test_models_of_scans_are_calibrated():
     smooth = exact + 0.05 * lfilter(np.full(6, 6**-0.5), [1.0], rng.normal(size=(30, 365)))[:, 5:]
     found = [gs.calibrate_temperature(model, scans, poses) for scans in (white, smooth)]
     assert found[0] > LEAST
-    # Errors of ranges count by the cosine of the incidence, which differs between neighbours: they are less correlated.
+    # Errors of ranges count by the cosine of the incidence; it differs between neighbours and reduces correlation.
     assert LEAST / 6 < found[1] < 1.6 / 6
     with pytest.raises(ValueError, match="scans: must be at least 5"):
         gs.calibrate_temperature(model, white[:4], poses[:4])

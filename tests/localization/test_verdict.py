@@ -1,4 +1,4 @@
-"""The verdict of a filter: judged beams, the belief that a pose is wrong, the share of the spread, and the words."""
+"""The verdict of a filter: judged beams, belief that a pose is wrong, spread, and words."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STILL = np.zeros((3, 3))
 
 
 def house(unknown: bool = False) -> gs.OccupancyGrid:
-    """Return a room of 8 m x 6 m with a wall across it at x = 5 that has a door, and unknown cells around the room."""
+    """Return a room of 8 m x 6 m with a wall with a door across it at x = 5, and unknown cells around."""
     cells = np.pad(np.zeros((60, 80), int), 1, constant_values=100)
     cells[1:40, 51] = 100
     if unknown:
@@ -87,7 +87,7 @@ def test_a_diagonal_pair_of_walls_stops_a_beam():
         pose = np.array([*rng.uniform(1.0, 2.0, 2), 0.0])
         scanner = gs.Scanner(rng.uniform(0.3, 1.2, 16), range_max=12.0)
         found = passages(grid, scanner, pose, np.full(16, 6.0))
-        # A ray that leaves the map first meets no wall of it.
+        # A ray that leaves the map first meets no wall.
         assert found.count(THROUGH) == 16
 
 
@@ -102,7 +102,7 @@ def test_the_map_may_lie_anywhere_and_be_turned(origin):
 def test_every_device_judges_beams_alike(backend, as_gpu, gpu):
     as_gpu(gpu)
     rng = np.random.default_rng(3)
-    # With short ranges the device holds parts of the map.
+    # Short ranges put only parts of the map on the device.
     for share, side, farthest in ((0.003, 0.05, 12.0), (0.05, 0.3, 12.0), (0.3, 0.1, 12.0), (0.02, 0.3, 2.0)):
         scanner = gs.Scanner(SCANNER.bearings, range_max=farthest)
         cells = np.where(rng.random((70, 50)) < share, 100, 0)
@@ -145,7 +145,8 @@ def test_the_belief_is_the_exact_filter_of_two_states():
     """Compare increments of an autoregressive process of Gaussian ratios with the joint density of all ratios."""
     rng = np.random.default_rng(0)
     for gap in (0.0, 0.5, 2.0):
-        # Ratios of N(+-m, 2 m) are those of normal data; the distance `gap` between scans gives their correlation.
+        # N(+-m, 2 m) is the distribution of ratios of normal data; the distance `gap` between scans sets their
+        # correlation.
         rho, mean = STAYS * math.exp(-gap / LENGTH), 1.3
         ratios = rng.normal(mean, math.sqrt(2 * mean), 6)
         covariance = 2 * mean * rho ** np.abs(np.subtract.outer(np.arange(6), np.arange(6)))
@@ -172,11 +173,11 @@ def test_comparisons_are_a_second_series_of_the_belief():
         pose = (gap * k, 0.0, 0.0)
         belief = belief.judged(pose, scan).compared_with(pose, math.nan).compared_with(pose, comparison)
     assert belief.log_odds - start == pytest.approx(exact, abs=1e-9)
-    # At a place that scans have chosen, they fit best there; what speaks against it counts.
+    # Scans fit a place that they have chosen; only contradictions count.
     chosen = Belief.anywhere()
     assert chosen.compared_with((0.0, 0.0, 0.0), -4.0).wrong > 0.45
     assert chosen.compared_with((0.0, 0.0, 0.0), 1.2).wrong > 0.7
-    # So is a place after scans without a common pose, whatever was compared before.
+    # Likewise for a place after scans without a tracked pose, for any earlier comparison.
     wide = Belief().compared_with((0.0, 0.0, 0.0), 1.2).widened()
     repeated = wide.compared_with((9.0, 9.0, 0.0), -4.0).log_odds
     assert repeated == pytest.approx(wide._changed(-4.0 * (1 - STAYS) / (1 + STAYS)).log_odds)
@@ -190,7 +191,7 @@ def test_transitions_of_the_belief():
     far = Belief(pose=(0.0, 0.0, 0.0)).counted().counted().judged((2.0, 0.0, 0.0), math.nan)
     stays = 1 - (1 - FOUND) ** 2
     assert far.wrong == pytest.approx(0.1 * (1 - stays) + 0.9 * (1 - math.exp(-2 * PER_SCAN - 2 * PER_METRE)))
-    # A standing robot learns next to nothing from its hundredth scan, and a change is seen at once.
+    # A standing robot learns almost nothing from its hundredth scan, and a change is detected at once.
     standing = Belief()
     for _ in range(100):
         standing = standing.counted().judged((0.0, 0.0, 0.0), 2.0)
@@ -212,7 +213,7 @@ def test_agreement_with_a_place_that_scans_have_chosen_is_no_evidence():
 
 
 def test_a_short_log_leaves_places_that_look_alike():
-    """Agreement excludes wrong places that differ; the others remain until the robot has seen more."""
+    """Agreement excludes wrong places that differ; similar places remain until the robot has seen more."""
     near = far = Belief.anywhere()
     for k in range(1, 30):
         near = near.counted().judged((0.01 * k, 0.0, 0.0), -4.0)
@@ -254,7 +255,7 @@ def test_words():
         return word_of(p_lost, wrong, wide=wide, apart=apart)
 
     assert word(0.02, 0.02) == "tracking" and word(0.3, 0.3) == "uncertain" and word(0.7, 0.7) == "lost"
-    # A wide cloud is never tracked; where scans contradict it, it is lost, unless it has several places.
+    # A wide cloud is never tracking; contradicted by scans it is lost, unless it covers several places.
     assert word(0.02, 0.01, wide=True) == "uncertain" and word(0.9, 0.8, wide=True) == "lost"
     assert word(1.0, 0.6, wide=True, apart=True) == "uncertain"
 

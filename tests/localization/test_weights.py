@@ -105,7 +105,7 @@ def test_residual_draws_keep_whole_copies(weights, count):
 
 def test_the_rest_of_residual_draws_and_strata_have_their_distributions():
     weights, rng, repeats = np.array([0.55, 0.3, 0.15]), np.random.default_rng(4), 4000
-    # 5 w = 2.75, 1.5, 0.75: two of the remainders, 0.75, 0.5 and 0.75, are drawn one after the other.
+    # 5 w = 2.75, 1.5, 0.75: two of the remainders, 0.75, 0.5 and 0.75, are drawn in turn.
     rest = [resample(weights, 5, rng, method="residual") for _ in range(repeats)]
     extra = [tuple(np.bincount(chosen, minlength=3) - (2, 1, 0)) for chosen in rest]
     p = np.array([0.75, 0.5, 0.75]) / 2

@@ -1,4 +1,4 @@
-"""Bags that grow without bound: chunks, messages and files that decompress beyond their limits, and YAML."""
+"""Bags that grow without bound: chunks, messages and files that decompress beyond limits, and YAML."""
 
 from __future__ import annotations
 

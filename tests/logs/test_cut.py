@@ -44,7 +44,7 @@ def test_a_last_line_without_an_end_is_whole_and_others_are_errors(tmp_path, lin
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert count(path) == 6
-    # With an end, and in the middle.
+    # With a line break, and in the middle.
     for text in ("\n".join([*lines, lines[0][:30], ""]), "\n".join([lines[0], lines[1][:30], *lines])):
         path.write_text(text)
         with pytest.raises(ValueError, match=r"run\.log:"):
@@ -99,7 +99,7 @@ def test_trajectories_and_runs_of_landmarks_are_read_up_to_their_cut(tmp_path):
 
 
 def bag(folder: Path, kind: str) -> tuple[Path, Path]:
-    """Write a bag of 2000 scans; return it, and its file of messages."""
+    """Write a bag of 2000 scans; return it and its file of messages."""
     with Writer(folder, kind) as writer:
         for i in range(2000):
             writer.scan(0.1 * i + 1, np.linspace(1, 5, 200) + i / 1000, -1.0, 0.01)

@@ -1,4 +1,4 @@
-"""Text files that are read line by line: compressed ones that hold far more than their size are refused."""
+"""Text files read line by line: compressed files that expand too far are refused."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gpusense.evaluation.range_data import data_of_pairs
 
 
 def bomb(file, piece, count):
-    """Write ``count`` times ``piece`` as a gzip file without holding the text."""
+    """Write ``count`` times ``piece`` as a gzip file, without the text in memory."""
     packer = zlib.compressobj(9, wbits=31)
     with file.open("wb") as stream:
         for _ in range(count):

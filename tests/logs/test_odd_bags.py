@@ -1,4 +1,4 @@
-"""Bags as recorders and users leave them: journals, names, missing metadata, several odometries and echoes."""
+"""Odd bags of recorders and users: journals, names, missing metadata, several odometries and echoes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def bag_of(folder: Path, kind: str, name: str = "run", begin: int = 0) -> Path:
 
 
 def times(path: Path, **options: Any) -> list[float]:
-    """Return the times of a log's scans, which must give no warning."""
+    """Return the times of a log's scans, without any warning."""
     scans, told = read(path, **options)
     assert told == []
     return [scan.time for scan in scans]
@@ -77,7 +77,7 @@ def test_a_killed_recorder_loses_nothing_that_it_committed(tmp_path: Path, mode:
     folder = recorded(tmp_path, mode)
     before = {file.name: file.read_bytes() for file in folder.iterdir()}
     assert len(before) == (3 if mode == "wal-shm" else 2)
-    # A folder without metadata.yaml, or the file alone.
+    # A folder without metadata.yaml, or only the file.
     assert times(folder if whole else folder / "killed.db3") == [1.0, 2.0, 3.0]
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
     if whole and mode == "wal":
@@ -265,7 +265,7 @@ def turning(folder: Path, kind: str, amplitude: float, turns: float) -> Path:
         bag.transform(1.0, "mast", LASER, (0.1, 0.0), 0.0)
         for k in range(5):
             bag.transform(1.0 + k, BASE, "mast", (amplitude * k, 0.0), turns * k, topic="/tf")
-        # Before the first, between two, and after the last transform.
+        # Before, between, and after the transforms.
         for time in (0.5, 2.5, 3.0, 6.0):
             bag.scan(time, [2.0] * 5, -0.2, 0.1)
     return bag.path

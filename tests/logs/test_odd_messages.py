@@ -198,7 +198,7 @@ def test_one_odd_scan_leaves_the_others_as_they_are(tmp_path: Path, name: str, p
     odd = scans[place]
     known = np.isfinite(odd.ranges)
     truth = wall(FIRST, STEP, BEAMS)
-    # A reading moves by half a step at most.
+    # A reading moves by at most half a step.
     assert np.abs(odd.ranges - truth)[known].max(initial=0.0) < 0.6 * STEP * np.abs(np.gradient(truth, STEP)).max()
     least = {"empty": 0, "one beam": 1, "half the view": 169, "near": 150, "blind": 100}.get(name, BEAMS - 1)
     assert known.sum() >= least

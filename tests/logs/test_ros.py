@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and 2 and MCAP files, which the library rosbags writes here."""
+"""Bags of ROS 1 and 2 and MCAP files, written by the library rosbags."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ each_kind = pytest.mark.parametrize("kind", KINDS)
 
 
 def small_bag(folder: Path, kind: str) -> Path:
-    """Write three scans among odometry, with a mount through a frame in between."""
+    """Write three scans among odometry, with a mount through an intermediate frame."""
     with Writer(folder, kind) as bag:
         bag.transform(9.0, BASE, "plate", (0.1, 0.0), math.pi / 2)
         bag.transform(9.0, "plate", LASER, (0.2, 0.0), -math.pi / 4)

@@ -106,7 +106,7 @@ def test_a_recording_that_starts_again_forgets_its_end_in_all_links() -> None:
     assert buffer.look_up("odom", "laser", 2.0)[0, 3] == 7.0
     with pytest.raises(TransformError, match="arm ends at 1"):
         buffer.look_up("base", "arm", 15.0)
-    # Disorder within two seconds is none.
+    # Disorder within two seconds is ignored.
     assert not buffer.add(message("odom", "base", 1.5, (6.0, 0.0, 0.0)))
     assert buffer.look_up("odom", "base", 1.75)[0, 3] == 6.5
 
@@ -116,7 +116,7 @@ def test_one_old_stamp_in_a_log_drops_nothing() -> None:
     moving(buffer, "odom", "base", 10.0, 11.0, 12.0, 0.0, 13.0)
     moving(buffer, "base", "arm", 10.0, 13.0)
     assert [buffer.look_up("odom", "base", time)[0, 3] for time in (10.0, 11.5, 13.0)] == [10.0, 11.5, 13.0]
-    # Two are a recording that starts again.
+    # Two are a restarted recording.
     moving(buffer, "odom", "base", 2.0, 2.5, 3.0)
     assert [buffer.look_up("odom", "base", time)[0, 3] for time in (2.25, 2.75)] == [2.25, 2.75]
     with pytest.raises(TransformError, match="no transform from base to arm yet"):

@@ -1,4 +1,4 @@
-"""Logs that gpusense writes can be read: CARMEN logs and bags, whole or not at all."""
+"""Logs written by gpusense can be read: CARMEN logs and bags, atomically."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ UNIT = 4096
 
 
 def fraction_cells(start, end):
-    """Return the cells of a ray in order, by the fractions of the ray at boundaries, x first where they are equal."""
+    """Return the cells of a ray in order of the fractions at boundaries; x precedes y at ties."""
     x, y = (Fraction(int(v), UNIT) for v in start)
     dx, dy = (Fraction(int(v), UNIT) - w for v, w in zip(end, (x, y), strict=True))
     col, row = math.floor(x), math.floor(y)
@@ -179,7 +179,7 @@ def test_odd_scans_agree_with_the_map_of_the_even_ones(tmp_path, data_dir):
 
 
 def integer_cells(start, end):
-    """Yield the cells of a ray between places in units of 1/4096 cell, from counts of crossings alone."""
+    """Yield the cells of a ray between points in units of 1/4096 cell, from counts of crossings."""
     (x, y), (to_x, to_y) = start, end
     step = [1 if to_x >= x else -1, 1 if to_y >= y else -1]
     first = [UNIT - v % UNIT if s > 0 else v % UNIT for v, s in zip(start, step, strict=True)]
@@ -195,7 +195,7 @@ def integer_cells(start, end):
 
 
 FAR = [  # start and end in cells; all but the last cross a map of 40 x 50 cells, or end in it
-    ((-524_230.5, -524_240.25), (20.25, 30.75)),  # as long as a ray may be
+    ((-524_230.5, -524_240.25), (20.25, 30.75)),  # of the largest length
     ((270_000.125, 12.5), (20.375, 12.5)),
     ((25.5, 265_000.75), (25.75, 3.5)),
     ((-262_145.0, 30.0), (262_100.0, 21.0)),
@@ -275,7 +275,7 @@ def test_bands_of_rows_make_the_same_map(backend, yaw):
 
 
 def test_the_counts_of_a_large_map_take_little_memory_beside_it():
-    """It was 41 bytes a cell once. NumPy's counts are memory of this process, so all of it is measured."""
+    """It was 41 bytes a cell once. NumPy's counts are in this process's memory, so all is measured."""
     scans, poses, scanner = world_of_scans(count=40, side=150.0)
     options = dict(resolution=0.05, origin=(0, 0, 0), shape=(3000, 3000), backend="numpy")
     gs.build_map(scans[:1], poses[:1], scanner, **options)
@@ -305,7 +305,7 @@ def test_scans_of_several_scanners_make_the_map_of_one_with_all_beams(backend: s
     poses, ranges = rng.uniform(-2, 2, (9, 3)), rng.uniform(0.1, 9.5, (9, 60))
     ranges[:, ::7] = np.inf
     whole = gs.Scanner(bearings, range_max=9.0)
-    # The beams of two others, one of which is mounted elsewhere, so that its beams have other bearings.
+    # The beams of two other scanners; another mount changes the bearings of one.
     turned = (0.4, -0.3, 0.6)
     parts = [gs.Scanner(bearings[:25], 9.0), gs.Scanner(bearings[25:] - turned[2], 7.0, mount=(0.0, 0.0, turned[2]))]
     scans = [z for row in ranges for z in (row[:25], row[25:])]

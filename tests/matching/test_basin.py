@@ -1,4 +1,4 @@
-"""Starts on both sides of a match tell few pairs among furniture from none along a corridor."""
+"""Starts on both sides of a match distinguish few pairs among furniture from none along a corridor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOUNTED = gs.Scanner(FRONT.bearings, FRONT.range_max, mount=(0.4, -0.2, 0.3))
 
 
 def seen(walls: np.ndarray, pose: np.ndarray, scanner: gs.Scanner, during: np.ndarray | None) -> np.ndarray:
-    """Return the readings of a robot at a pose at the first beam, which moves until the last one."""
+    """Return the readings of a moving robot at a pose at the first beam."""
     if during is None:
         return segments_scan(walls, tuple(gs.compose_poses(pose, np.array(scanner.mount))), scanner)
     shares = np.linspace(0, 1, scanner.count)
@@ -38,7 +38,7 @@ def pairs(
 def lost_and_held(
     one: np.ndarray, two: np.ndarray, scanner: gs.Scanner, guess: np.ndarray, during: np.ndarray | None = None
 ) -> tuple[np.ndarray, gs.ScanMatch, np.ndarray]:
-    """Return the numbers of matches that lose a direction, these matches, and whether each is held."""
+    """Return the matches that lose a direction, with their numbers, and whether each is held."""
     device = present("opencl")
     moved = None if during is None else np.tile(during, (len(one), 1))
     match = gs.match_scan(
@@ -95,7 +95,7 @@ def test_recorded_matches_that_are_held_are_right(data_dir):
 
 @pytest.mark.parametrize("noise", [0.002, 0.15])
 def test_starts_have_the_noise_of_the_match(monkeypatch, noise):
-    """A noise that the caller has chosen is neither rounded nor limited."""
+    """A noise from the caller is neither rounded nor limited."""
     one, two = pairs([CORRIDOR, CORRIDOR], np.array([0.1, 0.0, 0.0]), FRONT)
     match = gs.match_scan(one, two, FRONT, backend="numpy", noise=noise)
     used: list[float] = []

@@ -1,4 +1,4 @@
-"""Point-to-line ICP: the kernels of each language, and their nearest points against all points."""
+"""Point-to-line ICP: kernels of each language, and nearest points against all points."""
 
 from __future__ import annotations
 
@@ -65,14 +65,14 @@ EACH = [
 @pytest.mark.long
 @pytest.mark.parametrize(("limit", "team", "scanner", "thin", "precision"), EACH)
 def test_a_team_of_work_items_agrees_with_the_reference(device, monkeypatch, limit, team, scanner, thin, precision):
-    """GPUs match in teams that their groups hold; here processors do."""
+    """GPUs match in teams within their groups; here processors do."""
     sizes = pretend_gpu(device, monkeypatch, limit)
     test_devices_agree_with_the_reference(device, precision, scanner, thin)
     assert sizes == [(4 * 3 * team,)]
 
 
 def pretend_gpu(device, monkeypatch, limit=1024) -> list[tuple[int, ...]]:
-    """Match in teams as GPUs with groups of at most ``limit`` do; return the list of the sizes of launches."""
+    """Match in teams like GPUs with groups of at most ``limit``; return the list of sizes of launches."""
     sizes: list[tuple[int, ...]] = []
     starts = device.run
     monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1))
@@ -131,7 +131,7 @@ def test_lines_are_total_least_squares():
 
 
 def test_the_step_is_gauss_newtons():
-    """Information and gradient are those of finite differences of weighted errors at fixed pairs and weights."""
+    """Information and gradient equal finite differences of weighted errors at fixed pairs and weights."""
     rng = np.random.default_rng(2)
     angle = rng.uniform(-3, 3, 20)
     line = np.column_stack([np.cos(angle), np.sin(angle), rng.normal(size=20), np.ones(20)])

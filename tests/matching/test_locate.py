@@ -144,7 +144,7 @@ def test_refinement_finds_the_maximum_between_the_poses_of_the_grid(backend):
     assert coarse.pose is coarse.modes[0].pose
     np.testing.assert_array_equal(found.modes[0].pose, coarse.pose)
     assert np.hypot(*(found.pose - coarse.pose)[:2]) > 0.01
-    # No pose of a fine grid around it is likelier; smooth maxima differ from best poses by less than its steps.
+    # No pose of a fine grid around it is likelier; smooth maxima differ from best poses by less than a step.
     steps = np.stack(np.meshgrid(*3 * [np.arange(-2, 3)]), axis=-1).reshape(-1, 3) * (0.005, 0.005, 0.002)
     around = smooth.log_likelihood(found.pose + steps, ranges)
     best = found.pose + steps[around.argmax()]

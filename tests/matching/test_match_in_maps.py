@@ -1,4 +1,4 @@
-"""Matches of scans to maps, and by methods that make a map of a single scan."""
+"""Matches of scans to maps, and by methods that make a map from a single scan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Matches of a log's scans share points and lines, and equal matches of the pairs."""
+"""Matches of a log's scans share points and lines, and equal single matches of the pairs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gpusense.matching.noise import match_noise, scan_noise
 
 @pytest.mark.parametrize("moving", [False, True])
 def test_matches_of_a_log_are_those_of_its_pairs(moving):
-    """A scan with pairs of several levels of noise has lines for each of them."""
+    """A scan in pairs of several noise levels has lines for each level."""
     rng = np.random.default_rng(0)
     path = np.cumsum(rng.uniform(-0.1, 0.15, (9, 3)), axis=0)
     noise = np.array([0.01, 0.04, 0.01, 0.02, 0.08, 0.01, 0.02, 0.01, 0.04])

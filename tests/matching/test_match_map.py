@@ -19,7 +19,7 @@ def house() -> np.ndarray:
 
 
 def cut(grid: gs.OccupancyGrid, pose, shape=(40, 50), resolution=0.1) -> gs.OccupancyGrid:
-    """Return the part of a map that a local map covers at a pose in its frame."""
+    """Return the part of a map under a local map at a pose in its frame."""
     local = gs.OccupancyGrid(np.zeros(shape, int), resolution, (-1.5, -2.0, 0.0))
     rows, cols = (index.ravel() for index in np.indices(shape))
     xy = local.cell_centers(rows, cols)

@@ -40,7 +40,7 @@ def test_one_call_is_many_calls(pairs):
         assert alone.status == together.status[i]
         for name in ("covariance", "information", "p_right", "evidence", "score", "lever", "noise"):
             np.testing.assert_array_equal(getattr(together[i], name), getattr(alone, name), err_msg=name)
-        # Axes of a single match are computed without LAPACK, and their signs are arbitrary.
+        # Axes of a single match come without LAPACK, with arbitrary signs.
         np.testing.assert_allclose(together[i].eigenvalues, alone.eigenvalues, rtol=1e-12)
         np.testing.assert_allclose(np.abs(together[i].directions @ alone.directions.T), np.eye(3), atol=1e-9)
     shared = gs.match_scan(first[0], np.stack([first[0]] * 2), RING, backend="numpy")
@@ -65,14 +65,14 @@ def test_the_mount_moves_the_frame(pairs):
 
 
 def test_covariance_is_that_of_the_errors():
-    """The mean normalised squared error of 150 noisy pairs of a room lies near its expectation, 3."""
+    """The mean normalised squared error of 150 noisy pairs of a room is near its expectation, 3."""
     rng = np.random.default_rng(4)
     first, second, truth = random_pairs(150, RING, seed=5)
     first, second = (scan + rng.normal(0, 0.01, scan.shape) for scan in (first, second))
     match = gs.match_scan(first, second, RING, truth, backend="opencl", method="icp")
     error = match.pose - truth
     squared = np.einsum("si,sij,sj->s", error, np.linalg.inv(match.covariance), error) / 3
-    # Corners and occlusions make errors larger than those of noise alone.
+    # Corners and occlusions add to the errors of noise.
     assert 0.6 < np.median(squared) / 0.79 < 1.8
 
 
@@ -105,7 +105,7 @@ def test_covariance_is_that_of_correlated_errors(rho):
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.9])
 def test_blocks_tell_the_inflation_of_the_variance(rho):
-    """It is (1 + rho) / (1 - rho) with a correlation of rho^k over k points."""
+    """It is (1 + rho) / (1 - rho) for a correlation of rho^k over k points."""
     numbers = successive(np.random.default_rng(0), (1000, 500), rho)
     squares = np.mean([block_squares(row) for row in numbers], axis=0)
     assert inflation_of(squares.tolist()) == pytest.approx((1 + rho) / (1 - rho), rel=0.1)

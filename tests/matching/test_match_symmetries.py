@@ -1,4 +1,4 @@
-"""Matches of scans and maps that are turned, mirrored, or have their beams in another order."""
+"""Matches of scans and maps that are turned, mirrored, or have beams in another order."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_matches_turn_and_mirror_with_scans(method, noise):
         np.testing.assert_allclose(turned(seen, -angle)[:, :2], found[:, :2], atol=1e-6)
         np.testing.assert_allclose(seen[:, 2], found[:, 2], atol=1e-6)
     if noise != "auto":
-        # The noise of a scan is that of some of its beams, which depend on the sense of bearings.
+        # The noise of a scan comes from some beams, which depend on the sense of bearings.
         assert_near(match(-BEARINGS) * (1, -1, -1), found)
         assert_near(match(-BEARINGS[::-1], first[:, ::-1], second[:, ::-1]) * (1, -1, -1), found)
 

@@ -1,4 +1,4 @@
-"""Verdicts of matches on themselves: lost directions, windows, noise, and probabilities."""
+"""Verdicts of matches: lost directions, windows, noise, and probabilities."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gpusense.matching.observability import covariance_of, critical_ratio, obser
 from gpusense.matching.result import STATUSES
 from gpusense.matching.triangles import matrices_of, triangle_of
 
-# A corridor longer than the range of the scanners, and a room that is nowhere like ROOM.
+# A corridor longer than the scanners' range, and a room unlike ROOM everywhere.
 CORRIDOR = np.array([[-200.0, -1.2, 200.0, -1.2], [-200.0, 1.4, 200.0, 1.4]])
 
 
@@ -45,7 +45,7 @@ def test_corridors_never_converge_and_every_finite_deviation_is_right(beams, noi
     assert match.usable.mean() > 0.95
     seen = match.usable
     off, variance = (match.pose - truth)[seen], np.einsum("sii->si", match.covariance)[seen]
-    # The position along the corridor; that across it as well, unless the corridor follows an axis.
+    # The position along the corridor; also across it, unless the corridor follows an axis.
     assert np.isinf(variance[:, 0]).all()
     assert np.isinf(variance[:, 1]).all() or heading < 0.1
     assert np.isfinite(variance[:, 2]).all()
@@ -133,7 +133,7 @@ def test_noise_of_a_call_does_not_depend_on_its_other_scans():
     match = gs.match_scan(one, two, RING, truth, backend="numpy")
     assert len(np.unique(match.noise)) > 1
     assert (np.abs(np.log(match.noise / noise[:, 0])) < 2 * math.log(ROOT)).all()
-    # Several scans with one reference, from guesses of which some need a search.
+    # Several scans with one reference; some guesses need a search.
     guess = truth + [[0.0, 0.0, 0.0], [0.9, 0.3, 0.5]] * 3
     shared = gs.match_scan(one[0], two, RING, guess, backend="numpy")
     assert len(np.unique(shared.noise)) > 1
@@ -199,7 +199,7 @@ def test_covariances_of_noisy_dense_scans_are_right():
 
 
 def test_observability_is_invariant_and_lost_wholly():
-    """A direction with no more information than noise alone would give is lost in all its coordinates."""
+    """A direction with no more information than from noise is lost in all its coordinates."""
     lost = np.array([0.3, -1.5, 1.0])
     frame = np.linalg.qr(np.column_stack([lost, np.eye(3)[:, :2]]))[0]
     spurious = 2.0 * np.outer(frame[:, 0], frame[:, 0])[None]
@@ -212,7 +212,7 @@ def test_observability_is_invariant_and_lost_wholly():
     assert np.isinf(np.diagonal(covariance_of(information, 1.0, (1.0, 1.0))[0])).all()
     strong = observed_information(triangle_of(10 * total), triangle_of(spurious), 1.0, 30.0, 1.5)
     assert strong.lost == 0
-    # An observed information loses the part that noise contributes, and nothing else.
+    # An observed information loses only the part from noise.
     expected = 10 * total - spurious - 1e-3 * np.eye(3)
     np.testing.assert_allclose(matrices_of(strong.information), expected, rtol=1e-12)
 

@@ -67,7 +67,7 @@ CASES = {
 
 
 def assert_same(found: gs.ScanMatch, expected: gs.ScanMatch) -> None:
-    """Compare the bits of two matches; the axes of a single match are rounded otherwise, and their signs arbitrary."""
+    """Compare the bits of two matches; axes of a single match are rounded differently and have arbitrary signs."""
     for field in dataclasses.fields(gs.ScanMatch):
         one, other = getattr(found, field.name), getattr(expected, field.name)
         if field.name == "eigenvalues":
@@ -129,7 +129,7 @@ def test_levels_of_noise_are_those_to_which_the_noise_of_matches_is_rounded():
 
 
 def test_scanners_and_options_in_turns_keep_their_programs(device):
-    """Matches of one workspace in turns have the results of first calls, although their programs share buffers."""
+    """Alternating matches of a workspace have the results of first calls, although their programs share buffers."""
     first, second, _ = random_pairs(1, RING, seed=2)
     wide = gs.match_scan(first[0], second[0], RING, backend=device)
     front = gs.match_scan(*scans(DENSE, 0.015), DENSE, backend=device)
@@ -165,7 +165,7 @@ def test_a_match_without_a_search_takes_a_single_wait(device, monkeypatch, guess
 
 @pytest.mark.parametrize("scans_of_call", [1, 2, 3, 64])
 def test_squared_ranges_are_added_in_the_order_of_beams(scans_of_call):
-    """NumPy adds rows by pairs, or in lanes; kernels add one after another."""
+    """NumPy adds rows pairwise or in lanes; kernels add sequentially."""
     z = np.random.default_rng(scans_of_call).uniform(0.1, 29.0, (scans_of_call, RING.count))
     expected = np.zeros(scans_of_call)
     for beam in np.argsort(np.mod(RING.bearings, 2 * np.pi), kind="stable"):

@@ -1,4 +1,4 @@
-"""The best poses of a grid: branch and bound against brute force, which NumPy sums here pose by pose."""
+"""The best poses of a grid: branch and bound against brute force, pose by pose in NumPy."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def scene(tables: int, *, beyond: int = 0):
 
 
 def brute_force(scores, points, grid, stride, beyond):
-    """Return (S, A, H, W) sums, each cell looked up by itself."""
+    """Return (S, A, H, W) sums, looking up each cell separately."""
     sums = np.zeros((len(points), grid.headings.shape[1], grid.height, grid.width), np.int64)
     rows, cols = scores.shape[1:]
     for s, a in np.ndindex(sums.shape[:2]):

@@ -1,4 +1,4 @@
-"""Matches in maps that do not determine the pose: honest covariances and failures, by every method, in any frame."""
+"""Matches in maps that do not determine the pose: honest covariances and failures by every method in any frame."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ each_method = pytest.mark.parametrize("method", METHODS)
 
 
 def drawn(segments, origin=(0.0, 0.0, 0.0)):
-    """Return a map of 12 m x 12 m of walls; the scene's origin is in its middle. Long walls end at its edges."""
+    """Return a map of 12 m x 12 m of walls around the scene's origin; long walls end at its edges."""
     cells = np.zeros((120, 120), int)
     along = np.linspace(0, 1, 8000)[:, None]
     for segment in segments:

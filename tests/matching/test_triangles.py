@@ -1,4 +1,4 @@
-"""Closed forms of symmetric matrices, for arrays of matches and for a single one, against ``numpy.linalg``."""
+"""Closed forms of symmetric matrices, for one or several matches, against ``numpy.linalg``."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gpusense.matching.uncertainty import noise_of
 
 
 def drawn(count: int) -> np.ndarray:
-    """Return positive definite matrices whose eigenvalues differ by factors of up to 10^6."""
+    """Return positive definite matrices with eigenvalue ratios of up to 10^6."""
     rng = np.random.default_rng(3)
     axes = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
     return (axes * 10 ** rng.uniform(-3, 3, (count, 1, 3))) @ axes.transpose(0, 2, 1)
@@ -79,7 +79,7 @@ def test_one_ratio_has_the_noise_that_it_has_among_others():
 
 @pytest.mark.parametrize("count", [1, 40])
 def test_the_inverse_of_a_matrix_that_is_not_definite_is_nan(count):
-    """Zero, singular, indefinite and negative ones, alone and among definite ones."""
+    """Zero, singular, indefinite and negative ones, alone and among others."""
     others = np.array([np.zeros((3, 3)), np.ones((3, 3)), np.diag([1.0, 1.0, 0.0]), np.diag([1.0, 0.0, 1.0]),
                        np.diag([0.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0]), np.diag([1.0, 1.0, -2.0]), -np.eye(3),
                        np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])])  # fmt: skip

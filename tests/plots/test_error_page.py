@@ -1,4 +1,4 @@
-"""The page of error against run time: the script chooses and ranks as Python does; a report's page in a browser."""
+"""The page of error against run time: the script chooses and ranks like Python; a report's page in a browser."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_the_script_shows_the_best_setting_of_a_method() -> None:
 
 
 def report_of(**changes: Any) -> dict[str, Any]:
-    """Return a report of two maps: ``exact``, twice as slow as ``march`` in the second, and right everywhere."""
+    """Return a report of two maps: ``exact`` is twice as slow as ``march`` in the second, and right everywhere."""
     points = [
         made_point(scene=scene, cloud=cloud, method=method, code=f"make({method})", ranges=wrong(share),
                    processor_s=seconds, exact=method == "exact")

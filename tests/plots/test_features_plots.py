@@ -1,4 +1,4 @@
-"""Pictures of features and landmarks show each of them once."""
+"""Pictures show each feature and landmark once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures: places, colours, and files written whole."""
+"""Pictures: positions, colours, and atomic files."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_particles_are_coloured_by_likelihood_with_the_best_on_top():
     _, ax = new_axes()
     cloud = plots.draw_particles(ax, poses, [-1.0, -100.0, -np.inf, -5.0])
     assert np.asarray(cloud.get_offsets())[:, 0].tolist() == [3, 2, 4, 1]
-    # Half of the finite values lie within the scale, which ends at their median.
+    # The scale ends at the median, with half of the finite values.
     assert cloud.get_clim() == (-5.0, -1.0)
     assert np.isfinite(cloud.get_array()).all()
     assert plots.draw_particles(ax, poses, [-1.0, -100.0, -np.inf, -5.0], depth=50).get_clim() == (-51.0, -1.0)

@@ -1,4 +1,4 @@
-"""Pictures of where a robot may stand: curves go through the truth, densities are those of SciPy, files are written."""
+"""Pictures of possible positions: curves pass through the truth, densities equal SciPy's, files are written."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_curves_go_through_the_truth_and_fit_their_measurement(measured, curves)
     assert position_plots.draw_solution_set(ax, XY, **measured) == curves
     (collection,) = ax.collections
     for points in collection.get_segments():
-        # Curves are drawn as chords of at most 1/100 of their length.
+        # Curves consist of chords of at most 1/100 of their length.
         ends = points[1:] - points[:-1]
         along = np.clip(np.sum((POSE[:2] - points[:-1]) * ends, axis=1) / np.sum(ends**2, axis=1), 0, 1)
         assert np.hypot(*(points[:-1] + along[:, None] * ends - POSE[:2]).T).min() < 1e-3
@@ -75,7 +75,7 @@ def test_log_density_is_the_product_of_gaussians(heading):
         off = np.angle(np.exp(1j * (BEARINGS - seen + theta)))
         best = np.maximum(best, stats.norm.logpdf(off, 0, 0.3).sum(axis=-1))
     bearings = position_plots.position_log_density(points, XY, bearings=BEARINGS, heading=heading, sigma_bearing=0.3)
-    # Where residuals nearly wrap, two headings are good; the start at the circular mean may find the other one.
+    # If residuals nearly wrap, two headings are good; the start at the circular mean may find either.
     near = best > best.max() - 12
     np.testing.assert_allclose(bearings[near], best[near], atol=1e-9 if heading else 1e-4)
     assert (bearings <= best + 1e-4).all()

@@ -1,4 +1,4 @@
-"""Bad input to the functions that find positions is refused with the exact message."""
+"""Bad input to position functions is refused with the exact message."""
 
 from __future__ import annotations
 

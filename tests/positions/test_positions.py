@@ -13,8 +13,8 @@ import gpusense as gs
 from gpusense.positions.problem import LOSSES
 
 each_case = pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
-# Without noise, least squares ends at residuals of the size of rounding, 1e-15 m here, times the condition numbers:
-# below 100 for XY, and below 1e7 for the worst of random scenes.
+# Noiseless least squares ends at residuals of rounding, 1e-15 m, times the condition numbers: below 100 for XY, and
+# below 1e7 for the worst random scene.
 NEAR = dict(rtol=0, atol=1e-9)
 FOUND = 1e-7
 
@@ -25,7 +25,7 @@ def turned(angle):
 
 
 def near_truth(fix, truth):
-    """Return the solution of a fix that is nearest to the truth (two circles have two)."""
+    """Return a fix's solution nearest to the truth (two circles have two solutions)."""
     return fix.solutions[np.argmin(np.hypot(*(fix.solutions[:, :2] - truth[:2]).T))]
 
 
@@ -52,7 +52,7 @@ def test_truth_is_found(case):
 
 @each_case
 def test_covariance_is_that_of_the_derivatives(case):
-    """It is G S G^T with derivatives G of the whole solution by central differences, also for unequal weights."""
+    """It is G S G^T with derivatives G of the complete solution by central differences, also for unequal weights."""
     xy, clean = XY[: case.beacons], case.measure(XY[: case.beacons], POSE)
     sigma = case.sigmas(case.beacons)
     options = {} if case.kind == "triangle" else {"weights": 0.5 + np.arange(case.beacons)}
@@ -121,7 +121,7 @@ def test_turn_shift_scale_and_order(case):
 
 @pytest.mark.parametrize("case", [c for c in CASES if c.kind != "ranges"], ids=lambda case: case.name)
 def test_whole_turns_change_nothing(case):
-    """Bearings and headings have any size; for a robot that looks along -x they are on both sides of pi."""
+    """Bearings and headings of any size are valid; for a robot that looks along -x they are on both sides of pi."""
     xy = XY[: case.beacons] - (20.0, 0.0)
     pose = np.array([2.5, 0.5, 0.01])
     values = case.measure(xy, pose)
@@ -165,7 +165,7 @@ def lowest(case, xy, values, sigma, theta, loss, scale, centre):
 @pytest.mark.parametrize("name", ["five ranges", "four rays", "five bearings", "four of both"])
 @pytest.mark.parametrize("loss", ["linear", "cauchy"])
 def test_the_global_minimum_is_found(name, loss):
-    """With coarse noise and a gross outlier, no start of a lattice leads below the cost that was found."""
+    """Despite coarse noise and a gross outlier, no start of a lattice leads to a lower cost."""
     case = next(case for case in CASES if case.name == name)
     rng = np.random.default_rng(8)
     for _ in range(2):
@@ -189,7 +189,7 @@ def test_robust_losses_forget_an_outlier(name, loss):
     error = np.abs(apart(case.solve(xy, values, POSE[2], **options).best, POSE)[:2]).max()
     plain = np.abs(apart(case.solve(xy, values, POSE[2], sigma=sigma).best, POSE)[:2]).max()
     assert error < 0.1 * plain
-    # A weight of 0 leaves the beacon out, and its residual is not reported.
+    # A weight of 0 ignores the beacon, and its residual is not reported.
     weights = np.where(np.arange(8) == 3, 0.0, 1.0)
     fix = case.solve(xy, values, POSE[2], sigma=sigma, weights=weights)
     np.testing.assert_allclose(apart(fix.best, POSE), 0, **NEAR)
@@ -212,7 +212,7 @@ def test_losses_are_those_of_scipy(loss):
 
 
 def test_many_beacons():
-    """There are more pairs and triples than are tried; the answer does not depend on the choice."""
+    """Only some pairs and triples are tried; the result is independent of the choice."""
     rng = np.random.default_rng(9)
     xy = rng.uniform(-50, 50, (200, 2))
     for case in CASES:

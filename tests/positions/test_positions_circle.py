@@ -1,4 +1,4 @@
-"""Robots on one circle with their beacons: bearings alone leave a circle of poses, at any place in the world."""
+"""Robots on a circle with their beacons: bearings leave a circle of poses, anywhere in the world."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import gpusense as gs
 
 
 def scene(seed: int, off: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return 3 to 7 beacons on a circle, a robot whose distance from it is a share of its radius, and bearings."""
+    """Return 3 to 7 beacons on a circle, a robot at a distance relative to the radius, and bearings."""
     rng = np.random.default_rng(seed)
     count = int(rng.integers(3, 8))
     radius, angles = rng.uniform(1, 50), rng.uniform(0, 2 * np.pi, count + 1)

@@ -1,4 +1,4 @@
-"""Geometry with no position, two, or infinitely many: each is named, with all quantities that it determines."""
+"""Geometry with no, two, or infinitely many positions is named, with all determined quantities."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gpusense.positions.fix import STATUSES
 SQUARE = np.array([(0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)])
 LINE = np.array([(0.0, 0.0), (1.0, 0.5), (4.0, 2.0), (6.0, 3.0)])
 UTM = np.array([5e6, 4.5e5])
-# The placing of a scene: all statuses survive it.
+# All statuses survive moving a scene.
 PLACES = {
     "here": lambda xy: xy,
     "far and turned": lambda xy: xy @ np.array([(0.6, 0.8), (-0.8, 0.6)]) * 8.0 + UTM,
@@ -131,7 +131,7 @@ def test_ranges_at_a_beacon():
 
 
 def test_noise_that_hides_which_side():
-    """Beacons 1 cm off a line: with ranges good to 1 mm one side is right, with 10 cm both are possible."""
+    """Beacons 1 cm off a line: ranges with errors of 1 mm determine the side, errors of 10 cm leave both."""
     xy = LINE + np.array([(0, 0), (-0.01, 0.02), (0.01, -0.02), (0, 0)])
     ranges = ranges_to(xy, (1.0, 3.0))
     fine, coarse, unknown = (gs.trilaterate(xy, ranges, sigma=sigma) for sigma in (0.001, 0.1, None))
@@ -157,7 +157,7 @@ def test_lines_of_sight_that_do_not_meet(place):
     ]:
         fix = gs.triangulate(xy, bearings, along)
         assert (fix.status, fix.degenerate, len(fix)) == (status, True, 0), bearings
-    # The robot is between them: the first is behind on the left, the second ahead on the left.
+    # The robot is between two beacons: one behind on the left, one ahead on the left.
     assert gs.triangulate(xy, (3.0, 0.5), along).status == "unique"
     assert gs.triangulate(place(SQUARE[:3]), [0.5, 0.5, 0.5], 0.0).status == "parallel"
 
@@ -215,7 +215,7 @@ def test_three_bearings_in_bad_places(place):
     # Beacons in the wrong order around the robot.
     inside = bearings_to(xy, (*place(np.array([(3.0, 1.5)]))[0], 0.0))
     assert gs.triangulate_triangle(xy, -inside).status in ("behind", "unique")
-    # At a beacon the other two and any bearing of it still give the pose.
+    # At a beacon the other two, and any bearing of this one, determine the pose.
     others = bearings_to(xy[1:], (*xy[0], 0.3))
     for any_bearing in (0.5, -2.0):
         fix = gs.triangulate_triangle(xy, [any_bearing, *others])

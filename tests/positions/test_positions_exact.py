@@ -28,13 +28,13 @@ def exact_circles(xy, ranges):
 
 @pytest.mark.parametrize("origin", FAR, ids=["near", "UTM"])
 def test_two_circles(origin):
-    """The error is a few roundings of the three lengths, which flat triangles magnify by 1 / sin(angle)."""
+    """The error is a few roundings of the three lengths, magnified by 1 / sin(angle) in flat triangles."""
     rng = np.random.default_rng(1)
     sines, tested = [], 0
     for _ in range(400):
         base, far = 10 ** rng.uniform(-3, 6, 2)
         turn, where = rng.uniform(-np.pi, np.pi, 2)
-        # Half of the robots stand almost in line with the beacons.
+        # Half of the robots are almost in line with the beacons.
         where *= rng.choice([1.0, 10 ** rng.uniform(-6, 0)])
         xy = np.array([(0, 0), (base * np.cos(turn), base * np.sin(turn))]) + origin
         robot = xy[0] + far * np.array([np.cos(turn + where), np.sin(turn + where)])
@@ -64,7 +64,7 @@ def test_two_circles(origin):
 
 
 def test_flat_triangles_keep_their_digits():
-    """For a triangle of 1 m at 1e6 m, the plain formula for y is off in its first digits, ours by a few eps."""
+    """For a triangle of 1 m at 1e6 m, the plain formula for y is wrong in its first digits, ours by a few eps."""
     xy, ranges = np.array([(0.0, 0.0), (1e6, 0.0)]), np.array([5e5, 5e5 + 2.0**-20])
     plain = math.sqrt(ranges[0] ** 2 - ((1e12 + ranges[0] ** 2 - ranges[1] ** 2) / 2e6) ** 2)
     points, height = exact_circles(xy, ranges)

@@ -1,4 +1,4 @@
-"""Beacons that a real robot saw (a camera's fiducials, ENMT482), against its pose from SLAM."""
+"""Beacons seen by a real robot (a camera's fiducials, ENMT482) against its pose from SLAM."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 import gpusense as gs
 
-# Errors of single sightings against the reference pose, the map's and the reference's own errors included.
+# Errors of single sightings against the reference pose, including errors of map and reference.
 SIGMA_RANGE, SIGMA_BEARING = 0.06, 0.03
 
 
@@ -46,7 +46,7 @@ def quantiles(values):
 
 
 def test_two_fiducials(sightings):
-    """Fixes are as near the reference as single sightings: some cm, and cm for 0.01 rad over a few metres.
+    """Fixes are as near the reference as single sightings: some cm, plus cm for 0.01 rad over a few metres.
 
     The bounds include the errors of map and reference: ranges of sightings are off by 5 cm in the median and 13 cm at
     90 %, their bearings by 0.008 and 0.03 rad.
@@ -96,7 +96,7 @@ def test_cylinders_of_the_lego_robot(data_dir):
     """Compare fixes by three and more cylinders in a lidar's scan with the overhead camera's position.
 
     The camera identifies the cylinders: ranges must agree within 12 cm, and bearings, at the heading that explains most
-    of them, within 0.06 rad. The axis lies 9 cm behind the mean of the points that are found.
+    of them, within 0.06 rad. The axis is 9 cm behind the mean of the found points.
     """
     folder = data_dir / "brenner_lego"
     landmarks = np.loadtxt(folder / "robot_arena_landmarks.txt", usecols=(2, 3)) / 1000

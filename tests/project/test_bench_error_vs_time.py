@@ -146,7 +146,7 @@ def test_other_matchers_find_the_motion(
 
 
 def test_filters_of_others_follow_the_robot(measure: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each uses every scan with the setting's beams; a filter that cannot be compiled is left out."""
+    """Each uses every scan with the setting's beams; a filter that does not compile is omitted."""
     module, taken = importlib.import_module("rival_filters"), []
 
     class Follower:
@@ -177,7 +177,7 @@ def test_filters_of_others_follow_the_robot(measure: ModuleType, monkeypatch: py
 def test_tasks_are_measured(
     measure: ModuleType, needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Known correspondences of landmarks are the truth, the likeliest ones are not; the rows have all times."""
+    """Known correspondences of landmarks are true, the likeliest ones are not; the rows have all times."""
     tasks, selection = importlib.import_module("needs"), needs("opencl")
     monkeypatch.setattr(tasks, "PARTICLES", 300)
     given = argparse.Namespace(need=["landmarks"], rounds=2, seconds=99.0, longest=99.0, commit="abc", no_peers=True)

@@ -219,7 +219,7 @@ def test_fits_of_real_sensors_run(needs: Callable[[str], str], data_dir: Path, t
     logs = run_script("studies/fit_real.py", *arguments, output=tmp_path / "logs")
     own = logs["sets"][0]["incidence"]
     assert len(own["fit"]["fits"]) == 3 and 0 < own["gain"] < 1 and own["gain_error"] < 0.2
-    # Both sonars sit a little off the reference; the laser's is a set-up error of millimetres.
+    # Both sonars are slightly off the reference; the laser is off by millimetres.
     bias = {row["set"]: row["fit"]["range_bias"] for row in report["sets"]}
     assert abs(bias["sonar1"] + 0.027) < 0.01 and abs(bias["sonar2"]) < 0.01 and 0 < bias["lidar_wall"] < 0.01
 
@@ -289,7 +289,7 @@ def test_stretches_of_machine_code_end_at_labels_and_branches(
 
 
 def test_scenes_of_the_compiled_peers_are_those_of_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The script that compiled the peers makes the maps, readings and options whose weights the tests have."""
+    """The script that compiled the peers makes the maps, readings and options of the tests' weights."""
     monkeypatch.syspath_prepend(str(BENCH))
     script = importlib.import_module("accuracy.peers")
     stored = json.loads((ROOT / "tests/models/scan/peer_weights.json").read_text(encoding="utf-8"))
@@ -328,7 +328,7 @@ def test_calibration_runs(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_rays_per_core_runs(needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every caster has rows of both clouds; a stand-in replaces range_libc."""
+    """Every caster has rows of both clouds; a substitute replaces range_libc."""
     monkeypatch.syspath_prepend(str(BENCH))
     script = importlib.import_module("speed.rays_per_core")
 

@@ -1,4 +1,4 @@
-"""Every document, compressed file and image of a user is read by a function with bounds; exceptions have a reason."""
+"""Bounded functions read every document, compressed file and image of a user; exceptions have a reason."""
 
 from __future__ import annotations
 

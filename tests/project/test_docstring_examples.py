@@ -1,4 +1,4 @@
-"""Examples in docstrings run in separate namespaces, and print the results that they show."""
+"""Examples in docstrings run in separate namespaces and print the shown results."""
 
 from __future__ import annotations
 

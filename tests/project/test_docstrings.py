@@ -1,4 +1,4 @@
-"""Every public name has a short example, and every public method a docstring, which it may inherit."""
+"""Every public name has a short example, and every public method a docstring, possibly inherited."""
 
 import ast
 import inspect

@@ -1,4 +1,4 @@
-"""docs/error-vs-time.md is made of committed reports of current code; the interactive page in Node and Chromium."""
+"""docs/error-vs-time.md comes from committed reports of current code; the interactive page in Node and Chromium."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_a_report_is_stored_as_a_table(reports: ModuleType, tmp_path: Path) -> N
 
 @pytest.fixture
 def history(tmp_path: Path) -> Path:
-    """Make a repository of five commits, two of which change kernels, and a side branch."""
+    """Make a repository of five commits, two with changed kernels, and a side branch."""
 
     def git(*words: str) -> None:
         own = ["-c", "user.name=a", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false"]
@@ -191,7 +191,7 @@ def test_the_answers_by_hand(page: ModuleType, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_of_times_gives_the_same_answers(page: ModuleType, tmp_path: Path, seed: int) -> None:
-    """All times of two runs differ by up to a tenth, and each answer has the same method."""
+    """Times of two runs differ by up to a tenth, and each answer names the same method."""
     import random
 
     noise, found = random.Random(seed), []
@@ -203,7 +203,7 @@ def test_noise_of_times_gives_the_same_answers(page: ModuleType, tmp_path: Path,
 
 
 def test_answers_of_the_last_page_stand(page: ModuleType, tmp_path: Path) -> None:
-    """The beam model is slower than the field by less than noise of two days, then by more."""
+    """The beam model is slower than the field by less than the noise of two days, then by more."""
     found = []
     for seconds in (0.0029, 0.0033):
         write_tasks(tmp_path, [*ROWS, task("beam", "500 x 60", seconds, 0.006)])
@@ -241,7 +241,7 @@ def test_two_reports_of_a_device_are_refused(page: ModuleType, tmp_path: Path) -
 
 
 def test_methods_of_one_kind_of_cloud_are_on_the_interactive_page_alone(page: ModuleType, tmp_path: Path) -> None:
-    """A table that was left out for tracking clouds has no error there, and is in no table of the page."""
+    """A table omitted for tracking clouds has no error there, and is in no table of the page."""
     points = [
         made_point(problem="beam", cloud=cloud, method=method, status="left out" if alone else "ok")
         for method, cloud, alone in (("exact", "global", False), ("exact", "tracking", False),

@@ -52,7 +52,7 @@ def test_pages_fetch_nothing(written: dict[str, str], name: str) -> None:
 
 
 def in_node(code: str, data: Any) -> Any:
-    """Return the value of a line of JavaScript that may use the figures' functions and ``data``."""
+    """Return the value of a JavaScript expression with the figures' functions and ``data``."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("Node is not installed; pages compare themselves with the numbers that are checked above")
@@ -78,7 +78,7 @@ def test_the_script_has_the_densities_of_gpusense(figures: ModuleType) -> None:
 
 
 def models_of(data: Any) -> tuple[gs.BeamModel, gs.LikelihoodFieldModel, list[float]]:
-    """Return both models and the readings out of the data of a page."""
+    """Return both models and the readings from a page's data."""
     cells = np.array(list(data["map"]["cells"]), np.int8).reshape(data["map"]["rows"], -1) * 100
     grid = gs.OccupancyGrid(cells, resolution=data["map"]["resolution"])
     scanner = gs.Scanner(data["scan"]["bearings"], range_max=data["scan"]["range_max"])

@@ -1,7 +1,7 @@
 """Imports of the package form no circle, including imports in functions, under TYPE_CHECKING and by ``importlib``.
 
-The linter enforces the order of rooms, but does not see names of modules in strings. Here a string that names a module,
-as in a table of modules that are imported on use, counts as its import, and an f-string as imports of all that it fits.
+The linter enforces the order of rooms, but does not see names of modules in strings. Here a string that names a
+module, as in a table of lazy imports, counts as its import, and an f-string as imports of all matching modules.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from support.paths import ROOT
 
 Graph = dict[str, set[str]]
 PACKAGE = "gpusense"
-# Strings that name a module without an import of it, by module and pattern, with the reason.
+# Strings that name a module without importing it, by module and pattern, with the reason.
 NO_IMPORTS = {
     ("gpusense.backends.proof", "gpusense.evaluation.proof"): "a child process runs it, and imports it first",
     ("gpusense.reference.ranges", "gpusense.reference.{}"): "only the bodies of casters, which import no others",
@@ -30,12 +30,12 @@ def module_of(file: Path) -> str:
 
 
 def docstrings(tree: ast.Module) -> set[int]:
-    """Return the identities of the nodes that are docstrings, or strings that nothing uses."""
+    """Return the identities of docstring nodes and of unused strings."""
     return {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
 
 
 def pattern_of(node: ast.JoinedStr) -> str:
-    """Return an f-string with ``{}`` in place of its values."""
+    """Return an f-string with ``{}`` instead of its values."""
     return "".join(str(one.value) if isinstance(one, ast.Constant) else "{}" for one in node.values)
 
 
@@ -61,7 +61,7 @@ def imports_of(sources: Mapping[str, str], packages: Collection[str] = ()) -> Gr
 
     Args:
         sources: Source of each module by its dotted name.
-        packages: Names of those that are packages.
+        packages: Names of packages among them.
     """
     graph: Graph = {}
     for name, source in sources.items():
@@ -81,7 +81,7 @@ def imports_of(sources: Mapping[str, str], packages: Collection[str] = ()) -> Gr
 
 
 def circles(graph: Graph) -> list[set[str]]:
-    """Return the sets of nodes that reach one another."""
+    """Return the sets of mutually reachable nodes."""
     reached: Graph = {}
     for start in graph:
         seen: set[str] = set()
@@ -105,7 +105,7 @@ def rooms_of(graph: Graph) -> Graph:
 
 @pytest.fixture(scope="module")
 def graph() -> Graph:
-    """Return the imports of the package's modules, without the root's, which names all rooms."""
+    """Return the imports of the package's modules, except the root, which names all rooms."""
     files = {module_of(file): file for file in (ROOT / PACKAGE).rglob("*.py")}
     packages = [name for name, file in files.items() if file.name == "__init__.py"]
     found = imports_of({name: file.read_text(encoding="utf-8") for name, file in files.items()}, packages)

@@ -68,7 +68,7 @@ def test_no_file_imports_a_test_or_a_conftest():
 
 
 def test_helpers_define_no_fixture():
-    """A fixture is defined in a ``conftest.py``, or in the one test file that uses it."""
+    """A fixture is defined in a ``conftest.py``, or in the only test file that uses it."""
     assert {path.name: found for path in SUPPORT if (found := fixtures(tree_of(path)))} == {}
 
 
@@ -81,6 +81,6 @@ def test_this_looks_at_all_there_is():
 
 
 def test_the_quick_subset_has_files_of_today():
-    """A file that moves must not drop out of the subset unnoticed."""
+    """A moved file must not silently leave the subset."""
     names = ast.literal_eval(re.search(r"^QUICK = (\(.*?^\))", (TESTS / "conftest.py").read_text(), re.M | re.S)[1])
     assert [name for name in names if not (TESTS / name).exists()] == []

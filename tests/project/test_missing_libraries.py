@@ -1,4 +1,4 @@
-"""A library that is absent gives one line with a command that installs it, and exit code 2."""
+"""An absent library causes one line with a command that installs it, and exit code 2."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_libraries_are_those_of_the_project():
         assert Requirement(needed.package).name in extra[needed.extra], module
     for name in ("dask", "pyarrow"):
         assert extras.REQUIREMENTS[name].extra == "sweep"
-    # numpy is imported at once, and wheels of drivers are no modules.
+    # numpy is always imported, and wheels of drivers are no modules.
     assert {one.package.lower() for one in extras.REQUIREMENTS.values() if not one.extra} == {
         name.lower() for name in extra[""] - {"numpy", "pocl-binary-distribution"}
     }

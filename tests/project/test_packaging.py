@@ -1,4 +1,4 @@
-"""The package finds its kernels however it was installed, and importing it stays cheap."""
+"""The package finds its kernels in every kind of installation, and importing it stays cheap."""
 
 import importlib.metadata
 import json
@@ -22,7 +22,7 @@ from gpusense.interface.kernel_files import opencl_source
 
 COPIED = ("bench", "docs", "examples", "gpusense", "kernels", "tests")
 
-# Layouts that are built or installed from a copy of the checkout.
+# Layouts built or installed from a copy of the checkout.
 BUILT = ("wheel", "sdist", "editable")
 
 needs_warp = pytest.mark.skipif(find_spec("warp") is None, reason="Warp has no wheel for this platform")
@@ -117,7 +117,7 @@ def run(arguments: list[str | Path], *, cwd: Path, environment: dict[str, str] |
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Return the contents of the files under a folder by their relative names, caches left out."""
+    """Return the contents of the files under a folder by relative name, without caches."""
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in folder.rglob("*")
@@ -170,14 +170,14 @@ def wheel_of_sdist(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 @pytest.fixture(scope="module")
 def editable_python(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the interpreter of a new virtual environment into which pip -e installs the copied checkout."""
+    """Return the interpreter of a new virtual environment with the copied checkout installed by pip -e."""
     environment = tmp_path_factory.mktemp("editable") / "venv"
     run([sys.executable, "-m", "venv", "--without-pip", environment], cwd=environment.parent)
     scripts = environment / ("Scripts" if os.name == "nt" else "bin")
     python = scripts / ("python.exe" if os.name == "nt" else "python")
     where = "import sysconfig; print(sysconfig.get_path('purelib'))"
     site = run([python, "-c", where], cwd=environment).strip()
-    # Use this environment's libraries; by its name, the file is read after the editable install's.
+    # Use this environment's libraries; the file's name sorts it after the editable install's.
     paths = dict.fromkeys([sysconfig.get_path("purelib"), sysconfig.get_path("platlib")])
     Path(site, "zz_borrowed.pth").write_text("\n".join(paths), encoding="utf-8")
     pip = [sys.executable, "-m", "pip", "--python", python, "install", "--no-index", "--no-deps"]

@@ -30,7 +30,7 @@ def there(queue):
 
 @pytest.fixture
 def as_gpu(queue, monkeypatch):
-    """Return the queue's backend with its device as a GPU: bound calls record their launches there."""
+    """Return the queue's backend with its device as a GPU, where bound calls record launches."""
     device = get_backend(queue)
     monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1))
     return device

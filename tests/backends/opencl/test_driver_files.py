@@ -1,4 +1,4 @@
-"""Which OpenCL drivers the loader gets: the system's, pyopencl's, and Intel's from its wheel."""
+"""OpenCL drivers for the loader: the system's, pyopencl's, and Intel's from its wheel."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def machine(tmp_path, monkeypatch):
 
 @pytest.fixture
 def intel(machine, monkeypatch):
-    """Install a stand-in for Intel's wheel."""
+    """Install a substitute for Intel's wheel."""
     library = machine / "lib" / "libintelocl.so"
     library.parent.mkdir()
     library.write_text("")
@@ -67,7 +67,7 @@ def test_intels_runtime_joins_the_drivers_that_the_loader_finds_by_itself(machin
     choice = drivers.choice()
     assert choice.drivers is not None and choice.failure == "" and choice.left_out == ()
     variables = drivers._variables(choice.drivers)
-    # A library next to its file is named by its path; the system's are found as before.
+    # A library next to its file is named by its path; the loader finds the system's libraries.
     assert named(variables) == ["libgpu.so.1", str(machine / "pyopencl" / ".libs" / "libpocl.so"), str(intel)]
     assert not (Path(variables["PYOPENCL_HOME"]) / ".libs").exists()
 
@@ -105,7 +105,7 @@ def test_half_a_wheel_is_none(machine, intel, monkeypatch, problem):
 
 @pytest.fixture
 def trials(machine, monkeypatch):
-    """Let child processes fail as listed, in turn; return the list of drivers that each one loaded."""
+    """Let successive child processes fail as listed; return the list of drivers that each one loaded."""
     failures, loaded = [], []
 
     def run_text(arguments, job, variables):
@@ -171,7 +171,7 @@ print(json.dumps([found, sorted(changed - {"PYOPENCL_HOME"})]))
 
 @pytest.mark.slow
 def test_a_runtime_from_a_wheel_is_found_proved_and_used_beside_pocl(needs, tmp_path):
-    """A stand-in for Intel's library, in a wheel of that name."""
+    """A wheel of the name contains a substitute for Intel's library."""
     needs("opencl")
     wheel = tmp_path / "site"
     (wheel / "intel_opencl_rt-1.0.dist-info").mkdir(parents=True)

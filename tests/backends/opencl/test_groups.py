@@ -1,4 +1,4 @@
-"""Work-groups on OpenCL devices that hold few work-items of a kernel."""
+"""Work-groups on OpenCL devices with small limits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import gpusense as gs
 
 @pytest.mark.parametrize("limit", [1, 24])
 def test_groups_shrink_to_the_limit_of_a_kernel(as_gpu, monkeypatch, limit):
-    """A kernel that needs many registers has smaller groups, with the same results."""
+    """A kernel with many registers gets smaller groups, with the same results."""
     import pyopencl as cl
 
     expected = gs.BeamModel(GRID, SCANNER, backend=as_gpu).log_likelihood(cloud(1, 100), scan(1))
@@ -27,7 +27,7 @@ def test_groups_shrink_to_the_limit_of_a_kernel(as_gpu, monkeypatch, limit):
 
 
 def test_groups_fill_the_vectors_of_llvmpipe(as_gpu, monkeypatch):
-    """Lanes without a work-item would go on in loops; see ``group_multiple``."""
+    """Lanes without a work-item would continue in loops; see ``group_multiple``."""
     import pyopencl as cl
 
     # Scalar kernels of a processor in groups of 1, 16 and 64 work-items.

@@ -1,4 +1,4 @@
-"""Arrays of pyopencl on a user's queue: they stay where they are, and results are such arrays."""
+"""Arrays of pyopencl on a user's queue stay in place, and results are such arrays."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def call_of(method: str, backend: Any) -> Any:
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 @pytest.mark.parametrize("method", METHODS)
 def test_poses_on_the_device_stay_there(method, real, queue, there, copies):
-    """Results have the bits of those of NumPy's poses, and are arrays on the queue; out= is filled in place."""
+    """Results have the bits of results for NumPy's poses, and are arrays on the queue; out= is filled in place."""
     call, poses = call_of(method, queue), cloud(1).astype(real)
     expected, given = call(poses), there(poses)
     call(given)
@@ -72,7 +72,7 @@ def test_several_scans(kind, share, queue, there, monkeypatch):
         assert (model._last.together > 1) == share
         assert differing(model.log_likelihood(there(poses), there(scans)).get(), expected) == 0
         out = there(np.zeros((4, count), np.float32))
-        # Poses that begin anywhere in their buffer are copied.
+        # Poses at any offset in their buffer are copied.
         among = there(np.concatenate([np.zeros(5, np.float32), poses.ravel()]))[5:].reshape(4, count, 3)
         assert among.offset == 20
         assert model.log_likelihood(among, scans, out=out) is out and differing(out.get(), expected) == 0
@@ -90,7 +90,7 @@ def test_pieces_of_calls(queue, there, monkeypatch):
 
 @pytest.mark.parametrize("kind", MODELS)
 def test_pieces_with_which_the_device_cannot_begin(kind, as_gpu, queue, there, monkeypatch):
-    """Such pieces are written elsewhere and copied; bound calls, which copy nothing, use larger pieces."""
+    """Such pieces are written elsewhere and copied; bound calls copy nothing and use larger pieces."""
     monkeypatch.setattr(run, "CHUNK", 49)
     poses = cloud(3, 300).astype(np.float32)
     model, caster = kind(GRID, NEAR, backend=queue, precision="float64"), gs.RayCaster(GRID, 5.0, backend=queue)
@@ -128,7 +128,7 @@ def test_parts_of_parts(queue, there, monkeypatch):
 
 
 def test_arrays_of_a_memory_pool(as_gpu, queue, monkeypatch):
-    """Their buffers are of another class."""
+    """Their buffers have another class."""
     import pyopencl.array
     import pyopencl.tools
 
@@ -157,7 +157,7 @@ def test_arrays_in_shared_virtual_memory(queue):
 
 
 def test_other_processes_are_refused(as_gpu, queue, there, monkeypatch):
-    """The child of a fork has another process number, and drivers do not work in it."""
+    """A forked child has another process number, and drivers do not work there."""
     call = FIELD(GRID, NEAR, backend=queue).bind(there(cloud(1)), there(mixed(1)))
     call()
     call.check()
@@ -171,7 +171,7 @@ def test_other_processes_are_refused(as_gpu, queue, there, monkeypatch):
 
 @pytest.mark.parametrize("kind", MODELS)
 def test_an_error_leaves_no_verdict_behind(kind, queue, there, monkeypatch):
-    """A pose that is not finite, in a call that ended early, does not affect the next call."""
+    """A call that ended early with a pose that is not finite does not affect the next call."""
     model, poses = kind(GRID, SCANNER, backend=queue), cloud(1)
     expected = model.log_likelihood(there(poses), scan(1)).get()
     bad = poses.copy()
@@ -252,7 +252,7 @@ def test_backends_of_queues(queue):
 
 
 def test_a_queue_of_an_unusable_device_is_refused_with_the_reason(queue, monkeypatch):
-    """Devices of queues are proved as those of selection strings are."""
+    """Devices of queues are proved like devices of selection strings."""
     import pyopencl as cl
 
     info, another = get_backend(queue).info, cl.CommandQueue(queue.context)
@@ -308,7 +308,7 @@ def test_arrays_of_other_places(queue, there, needs):
 
 
 def test_readings_with_gaps(queue, there):
-    """Readings are copied to the host, gaps and all."""
+    """Readings are copied to the host, including gaps."""
     model = FIELD(GRID, SCANNER, backend=queue)
     twice = np.repeat(scan(1), 2)
     twice[1::2] = np.nan

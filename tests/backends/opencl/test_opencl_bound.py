@@ -69,14 +69,14 @@ def test_bound_calls_on_another_queue(as_gpu, queue, there):
     properties = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
     with pytest.raises(ValueError, match="stream: must be an in-order queue"):
         call(cl.CommandQueue(queue.context, properties=properties))
-    # No memory that a queue still uses is freed.
+    # Memory in use by a queue is never freed.
     call(other)
     del call
     gc.collect()
 
 
 def test_a_bound_call_binds_no_argument_again(as_gpu, queue, there, monkeypatch):
-    """A call is three launches with kernel objects that it does not share."""
+    """A call is three launches with private kernel objects."""
     from gpusense.backends.opencl import replay as _opencl_replay
 
     model = FIELD(GRID, NEAR, backend=queue)

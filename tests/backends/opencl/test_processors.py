@@ -92,7 +92,7 @@ X86 = "x86_64-unknown-linux-gnu"
 
 
 def width_of(flags: str) -> int:
-    """Return the width of the processor's widest vectors, as PoCL reports it."""
+    """Return the width of the processor's widest vectors by PoCL."""
     return 16 if "avx512f" in flags.split() else 8 if "avx" in flags.split() else 4
 
 
@@ -130,7 +130,7 @@ def test_no_name_stands_for_instruction_sets_that_the_processor_lacks():
 
 
 def test_a_processor_that_no_library_fits_is_reported(of):
-    """A Xeon Phi: PoCL takes its library for AVX-512, most of which the processor lacks."""
+    """On a Xeon Phi PoCL takes its library for AVX-512, although the processor lacks most of it."""
     of(f"{HASWELL} avx512f avx512cd avx512er avx512pf")
     made = Described(X86, "knl", width=16)
     assert pocl.lacking_for(made.device) == ["avx512bw", "avx512dq", "avx512vl"]

@@ -12,7 +12,7 @@ from gpusense.backends.opencl.launch import watch
 
 
 class Event:
-    """An event that ends after some looks."""
+    """An event that ends after some polls."""
 
     def __init__(self, looks: float) -> None:
         self.looks = looks
@@ -32,7 +32,7 @@ def test_a_launch_is_watched_until_it_ends_but_not_long():
 
 def test_launches_are_watched_that_leave_a_processor(needs, monkeypatch):
     needs("opencl")
-    # Only PoCL's launches are watched: without it this fails, as the tests of its calls do.
+    # Only PoCL's launches are watched, so this needs PoCL.
     device, watched = get_backend("opencl:pocl"), []
     monkeypatch.setattr(of_backend, "watch", lambda event: (watched.append(event), watch(event)))
     first, second, guess = (values[0] for values in random_pairs(1, RING, seed=3))

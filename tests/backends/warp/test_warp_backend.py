@@ -120,7 +120,7 @@ def run_quietly(folder: Path, **variables: str) -> None:
 def test_warp_starts_without_a_word_and_keeps_its_settings(needs: Callable[[str], str], tmp_path: Path) -> None:
     needs("warp")
     run_quietly(tmp_path, GPUSENSE_CACHE="")
-    # Warp's own folder is left alone.
+    # Warp's default folder is untouched.
     assert list(tmp_path.rglob("*.gpusense")) and not list(tmp_path.rglob("*.o"))
 
 
@@ -240,7 +240,7 @@ OLDER = 'pip install "warp-lang<1.18"'
     "driver, toolkit, reason",
     [
         ((12, 4), (13, 4), f"CUDA 12.4, and Warp {{}} needs CUDA 13 (R580 or newer): update the driver, or {OLDER}"),
-        # No Warp that gpusense allows runs with this driver.
+        # No supported Warp runs with this driver.
         ((11, 8), (13, 4), "CUDA 11.8, and Warp {} needs CUDA 13 (R580 or newer): update the driver"),
         ((11, 8), (12, 9), "CUDA 11.8, and Warp {} needs CUDA 12 (R525 or newer): update the driver"),
         ((13, 0), (14, 1), "CUDA 13.0, and Warp {} needs CUDA 14: update the driver"),

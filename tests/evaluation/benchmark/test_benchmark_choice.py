@@ -26,7 +26,7 @@ LISTED = [
     ("error", "seconds", "chosen"),
     [
         (1e-5, None, "model itself"),
-        # Equally fast: the one of fewer assumptions.
+        # Equally fast: fewer assumptions win.
         (0.01, None, "little off, varied"),
         (0.01, 1.15, "little off, twice varied, once"),
         (1.0, None, "rough"),
@@ -42,14 +42,14 @@ def test_choice_by_hand(error, seconds, chosen):
 
 
 def test_front_by_hand():
-    """An error of rounding is none: the slower of two exact methods is beaten."""
+    """Rounding errors do not count: the slower of two exact methods is beaten."""
     names = [one.method for one in choice.front(LISTED)]
     assert names == ["model itself", "little off, varied", "little off, twice varied, once", "rough"]
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_noise_of_other_days_changes_no_choice(seed):
-    """All times are up to a tenth longer or shorter: the same methods, whatever the limit is on."""
+    """Change all times by up to a tenth: the methods stay the same for any limit."""
     draw = random.Random(seed)
     noisy = [dataclasses.replace(each, seconds=each.seconds * draw.uniform(0.9, 1.1)) for each in LISTED]
     for error, seconds in ((1e-5, None), (0.01, None), (1.0, None), (None, 10.0), (None, 2.0), (None, 0.5)):
@@ -77,7 +77,7 @@ def test_of_equal_methods_nothing_measured_decides():
 @pytest.mark.parametrize(
     ("error", "seconds", "changes", "stands"),
     [
-        # Up to 1.5 times the fastest and 1.5 times the most exact one; not beyond, and not beyond a limit.
+        # Up to 1.5 times the fastest and the most exact method, but not beyond, nor beyond a limit.
         (1.0, None, {"seconds": 1.5}, True), (1.0, None, {"seconds": 1.6}, False),
         (None, 9.0, {"error": 0.15}, True), (None, 9.0, {"error": 0.16}, False), (None, 9.0, {"seconds": 1.6}, False),
         (0.2, None, {"error": 0.19, "doubt": 1.2}, True), (0.2, None, {"error": 0.21}, False),

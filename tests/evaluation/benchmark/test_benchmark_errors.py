@@ -87,7 +87,7 @@ def test_log_p_errors_by_hand():
 
 
 def test_posterior_errors_by_hand():
-    """Weights 1/2 and 1/2 that should be 3/4 and 1/4, of particles 4 m and a quarter turn apart."""
+    """Weights 1/2 and 1/2 instead of 3/4 and 1/4, of particles 4 m and a quarter turn apart."""
     poses = np.array([[10.0, 2.0, 0.0], [14.0, 2.0, math.pi / 2]])
     errors = accuracy.posterior_errors(np.log([7.0, 7.0]), np.log([3.0, 1.0]), poses)
     turn = math.pi / 4 - math.atan2(0.25, 0.75)
@@ -111,7 +111,7 @@ def test_temperature_makes_a_tenth_of_the_particles_share():
 
 
 def test_comparable_temperatures_undo_a_factor():
-    """Log-likelihoods that are a third of the exact ones have the exact weights at three times the temperature."""
+    """A third of the exact log-likelihoods has the exact weights at three times the temperature."""
     rng = np.random.default_rng(0)
     right = -50 * rng.random(300)
     size = gs.normalize_weights(0.2 * right).effective_sample_size
@@ -120,7 +120,7 @@ def test_comparable_temperatures_undo_a_factor():
 
 
 def test_thinned_beams_count_as_often_as_they_stand_for():
-    """Every fourth beam approximates the posterior of all beams at four times the temperature, and not at the same
+    """Every fourth beam approximates the posterior of all beams at four times the temperature, not at the same
     one."""
     scene = quick_scene("building", beams=360, particles=200)
     truth = accuracy.Truth(scene, scene.clouds["tracking"], get_backend("numpy"))
@@ -135,7 +135,7 @@ def test_thinned_beams_count_as_often_as_they_stand_for():
 
 
 def test_fine_posterior_of_a_normal_density():
-    """Deviations and mean equal the density's, however narrow, up to the grid's spacing."""
+    """Deviations and mean equal the density's up to the grid's spacing, even if narrow."""
     mean, sigma = np.array([3.01, -2.0, 0.4]), np.array([0.004, 0.03, 0.001])
     fine = fine_posterior.fine_posterior(lambda x: -0.5 * np.square((x - mean) / sigma).sum(axis=1), (3.0, -2.0, 0.41))
     np.testing.assert_allclose(fine.deviation, sigma, rtol=0.01)

@@ -205,7 +205,7 @@ def test_named_worlds_can_be_driven_through(name):
     run = gs.worlds.simulate_run(one, SCANNER, scans=80, seed=0)
     assert np.ptp(run.poses[:, :2], axis=0).max() > 1.5
     if name == "twins":
-        # Equal after half a turn, but for the pillar.
+        # Equal after half a turn, except for the pillar.
         turned = one.occupied[::-1, ::-1]
         assert 0 < (one.occupied != turned).sum() < 0.002 * one.occupied.size
 

@@ -41,7 +41,7 @@ def test_independent_readings_have_the_same_errors_in_blocks(needs) -> None:
 
 
 def test_repeated_readings_know_no_more_than_one(needs) -> None:
-    """Each block has a reading 9 times: errors are those of single readings, 3 times those of independent ones."""
+    """Each block repeats a reading 9 times: errors equal those of single readings, 3 times the independent errors."""
     backend = needs("opencl")
     z, expected = draw(TYPICAL, 3000, 4)
     once = gs.fit_beam_parameters(z, expected, RANGE_MAX, backend=backend, blocks=np.arange(3000))

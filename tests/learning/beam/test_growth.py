@@ -50,7 +50,7 @@ def test_all_parameters_are_found(needs) -> None:
         assert errors[name] == pytest.approx(fit.independent_errors[name], rel=0.2)
     assert "sigma_growth" in str(fit) and "over 1200 blocks" in str(fit)
     np.testing.assert_allclose(np.delete(fit.responsibilities, 7, axis=0).sum(axis=1), 1, rtol=1e-9)
-    # The model's own log-likelihood, at poses whose expected ranges are known: one beam towards a wall.
+    # The model's log-likelihood at poses of known expected ranges: one beam towards a wall.
     grid = gs.OccupancyGrid([[0] * 120 + [100]], 0.1)
     scanner = gs.Scanner([0.0], range_max=10.0)
     poses = np.column_stack([12.0 - expected[:200], np.full(200, 0.05), np.zeros(200)])

@@ -57,7 +57,7 @@ def test_the_likelihood_never_falls_and_is_that_of_the_mixture() -> None:
 
 @functools.cache
 def fitted_by_scipy(count: int) -> tuple[float, np.ndarray]:
-    """Return the largest log-likelihood by SciPy's t distribution, and where its simplex finds it from the truth."""
+    """Return the largest log-likelihood by SciPy's t distribution, and its location by a simplex from the truth."""
     z, expected = (each[:count] for each in drawn(STUDENT))
     none = np.isinf(z)
 
@@ -84,7 +84,7 @@ def test_the_fit_is_that_of_scipy(backend: str) -> None:
     assert fit.converged and best - 1e-6 <= fit.log_likelihood <= best + 1e-4
     for name, value in zip(("sigma_hit", "lambda_short", "hit_dof"), np.exp(at[3:]), strict=True):
         assert getattr(fit.parameters, name) == pytest.approx(value, rel=0.01 * fit.independent_errors[name] / value)
-    # Standard errors are those of SciPy's second derivatives, and those over blocks of independent readings.
+    # Standard errors equal those from SciPy's second derivatives, and over blocks of independent readings.
     assert fit.standard_errors["hit_dof"] == pytest.approx(fit.independent_errors["hit_dof"], rel=0.3)
 
 

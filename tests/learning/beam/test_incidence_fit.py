@@ -17,7 +17,7 @@ EDGE = np.pi / 4
 
 
 def scene(counts: tuple[int, int], seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw readings, expected ranges and angles below and above 45 degrees, each with its own parameters."""
+    """Draw readings, expected ranges and angles, with different parameters below and above 45 degrees."""
     rng = np.random.default_rng(seed)
     expected = rng.uniform(1, 9, sum(counts))
     angles = np.concatenate([rng.uniform(0, EDGE, counts[0]), rng.uniform(EDGE, np.pi / 2, counts[1])])
@@ -89,7 +89,7 @@ def test_bins_have_a_shape_of_hits_of_their_own(needs) -> None:
         assert abs(found.sigma_hit - truth.sigma_hit) < 4 * error["sigma_hit"]
         # 1 / hit_dof is nearly normal, hit_dof is not.
         assert abs(1 / found.hit_dof - 1 / truth.hit_dof) < 4 * error["hit_dof"] / found.hit_dof**2
-    # A bin without a reading keeps the parameters of all.
+    # A bin without readings keeps the pooled parameters.
     held = gs.fit_incidence_parameters(z[:400], expected[:400], angles[:400], RANGE_MAX, bins=2, **options)
     for name, value in held.parameters.parameters[1].to_dict().items():
         assert value == (pooled := getattr(held.pooled.parameters, name)) or value == pytest.approx(pooled, rel=1e-4), (
@@ -152,7 +152,7 @@ def test_a_model_gives_readings_the_likelihood_of_their_fit(backend: str) -> Non
     model = gs.BeamModel(grid, scanner, incidence=fit.parameters, backend=backend)
     parts = [model.log_likelihood(pose[None], scan, per_beam=True)[1] for pose, scan in zip(poses, z, strict=True)]
     total = np.sum(parts, dtype=np.float64)
-    # Densities and ranges are float32, and the fit takes them for float64: sigma is 0.05 m, eps of 4 m is 5e-7 m.
+    # Densities and ranges are float32, but float64 to the fit: sigma is 0.05 m, eps of 4 m is 5e-7 m.
     assert total == pytest.approx(fit.log_likelihood, rel=1e-5)
     without = gs.IncidenceParameters(fit.parameters.edges, fit.parameters.parameters)
     blind = gs.BeamModel(grid, scanner, incidence=without, backend=backend)

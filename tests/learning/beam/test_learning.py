@@ -1,4 +1,4 @@
-"""Fits of the beam model's parameters: against the truth, against each other, and on every backend."""
+"""Fits of the beam model's parameters against the truth, against each other, and on every backend."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_fifty_scenes_from_mild_to_stiff(needs) -> None:
         truth = np.array(list(scene.parameters.to_dict().values()))
         known = identified(fit)
         off += list((values(fit) - truth)[known] / errors(fit)[known])
-        # The truth is a point like any other, and is never better than the fit.
+        # The truth is never better than the fit.
         at_truth = log_mixture(
             np.minimum(z, scene.range_max), expected, range_max=scene.range_max, **scene.parameters.to_dict()
         ).sum()
@@ -97,7 +97,7 @@ def test_the_log_likelihood_is_the_sum_of_the_mixture(backend: str) -> None:
 
 
 def test_a_fit_of_the_model_scores_highest(needs) -> None:
-    """BeamModel itself scores the fitted parameters higher than any near them."""
+    """BeamModel scores the fitted parameters higher than any nearby ones."""
     grid = gs.OccupancyGrid(np.pad(np.zeros((80, 120), np.int8), 1, constant_values=100), 0.1)
     scanner = gs.Scanner(np.linspace(-np.pi, np.pi, 1500, endpoint=False), 9.0)
     pose = [[4.0, 3.0, 0.3]]
@@ -149,7 +149,7 @@ def test_hill_climbing_leaves_a_ridge_that_no_coordinate_climbs(needs) -> None:
     best = gs.fit_beam_parameters(z, expected, scene.range_max, backend=backend)
     fit = gs.fit_beam_parameters(z, expected, scene.range_max, method="hill_climb", initial=start, backend=backend)
     assert fit.converged and abs(fit.log_likelihood - best.log_likelihood) < 1e-6
-    # A fit that was cut short does not claim to have converged.
+    # A truncated fit does not claim convergence.
     fit = gs.fit_beam_parameters(
         z, expected, scene.range_max, method="hill_climb", initial=start, max_iterations=8, backend=backend
     )
@@ -172,7 +172,7 @@ def test_the_genetic_search_needs_no_good_start(needs) -> None:
     assert (values(fit) == values(again)).all()
 
 
-# Expected ranges near range_max with a wide p_hit, which range_max cuts off; near ones, which cut off p_short.
+# Expected ranges near range_max truncate a wide p_hit; near ones truncate p_short.
 @pytest.mark.parametrize(
     ("truth", "span", "name"),
     [(FAR, (0.8, 1.0), "sigma_hit"), (gs.BeamParameters(0.6, 0.2, 0.1, 0.1, 0.3, 0.3), (0.02, 0.2), "lambda_short")],

@@ -1,4 +1,4 @@
-"""The sums that learning uses: against mpmath, against the densities, and alike on every backend."""
+"""Sums for learning against mpmath, against the densities, and equal on every backend."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def density_of_hit(u: mp.mpf, form: mp.mpf | None) -> mp.mpf:
 
 
 def mass_of_hit(low: mp.mpf, high: mp.mpf, form: mp.mpf | None) -> mp.mpf:
-    """Return its mass between two places."""
+    """Return its mass between two points."""
     if form is None:
         return mp.ncdf(high) - mp.ncdf(low)
     below, above = (
@@ -53,7 +53,7 @@ def mass_of_hit(low: mp.mpf, high: mp.mpf, form: mp.mpf | None) -> mp.mpf:
 
 
 def exact_objective(z: list[float], expected: list[float], prior: Prior | None, x: list[mp.mpf]) -> mp.mpf:
-    """Return log-likelihood and prior at (log weights, log sigma, log rate, bias, form), by mpmath."""
+    """Return log-likelihood and prior at (log weights, log sigma, log rate, bias, form) by mpmath."""
     total = sum(mp.exp(log) for log in x[:4])
     hit, short, top, rand = (mp.exp(log) / total for log in x[:4])
     sigma, rate, bias, form = mp.exp(x[4]), mp.exp(x[5]), x[6], x[7] if len(x) > 7 else None
@@ -176,7 +176,7 @@ def test_sums_are_alike_on_every_backend(precision: type, name: str, backend: st
 @pytest.mark.parametrize("lanes", [1, 16])
 def test_lanes_of_pairs_sum_to_the_same(lanes: int, needs: Callable[[str], str]) -> None:
     opencl = get_backend(needs("opencl"))
-    # Nothing near, range_max ahead, both ends and values just before them, and ordinary pairs; not a multiple of 16.
+    # Nothing near, range_max ahead, both ends and values just before, and ordinary pairs; not a multiple of 16.
     z, expected = draw(TYPICAL, 1003, 8, low=0, high=1)
     expected[:40:4], expected[1:40:4], z[2:40:4] = 0, RANGE_MAX, 0
     z[3:40:4] = expected[3:40:4]
@@ -186,7 +186,7 @@ def test_lanes_of_pairs_sum_to_the_same(lanes: int, needs: Callable[[str], str])
     try:
         opencl.info = dataclasses.replace(before, kind="cpu", lanes=lanes)
         for precision in PRECISIONS:
-            # Both begin with the same rounded pairs.
+            # Both use the same rounded pairs.
             pairs = z.astype(precision), expected.astype(precision)
             # Squares of u at sigma = 0.01 carry the rounding of sigma to float32, beyond the tolerance.
             known = [at for name, at in POINTS.items() if precision is np.float64 or name != "steep"]

@@ -1,4 +1,4 @@
-"""The offset of correct ranges that a fit reports without having it among its parameters."""
+"""The offset of correct ranges that a fit reports outside its parameters."""
 
 from __future__ import annotations
 

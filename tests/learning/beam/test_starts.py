@@ -1,4 +1,4 @@
-"""Fits whose likelihood has several maxima: the highest is found, or the status reports a higher one."""
+"""Fits of likelihoods with several maxima find the highest, or the status reports a higher maximum."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_the_status_reports_that_another_start_is_better() -> None:
 
 
 def scene(seed: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """Draw readings with few short ones, so that the likelihood hardly depends on z_short."""
+    """Draw readings with few short ones: the likelihood hardly depends on z_short."""
     rng = np.random.default_rng(seed)
     range_max, n = float(rng.choice([10, 50, 82])), int(rng.choice([200, 1000, 4000]))
     expected = (rng.uniform(0.02, 0.98, n) if seed % 2 == 0 else rng.uniform(0.02, 0.3, n)) * range_max

@@ -55,7 +55,7 @@ def spread_exactly(d: int, s: float):
 
 
 def walk(causes: list[list[Fraction]]) -> list[Fraction]:
-    """Return P of each step and of no return, from each cause's probability to trigger at a step that it reaches."""
+    """Return P of each step and of no return, from each cause's probability of triggering at a reached step."""
     reached, row = Fraction(1), []
     for probabilities in zip(*causes, strict=True):
         none = math.prod((1 - p for p in probabilities), start=Fraction(1))
@@ -82,7 +82,7 @@ def separate_exactly(c: gs.DiscreteCauses, bins: int, j: int) -> list[Fraction]:
 def shared_exactly(p: gs.BeamParameters, bins: int, j: int) -> list[Fraction]:
     w, last = mp.mpf(RANGE) / bins, min(j + 1, bins)
     mass = [spread_exactly(abs(i - j), float(w) / p.sigma_hit) for i in range(bins)]
-    if sum(mass) == 0:  # All of it is beyond, infinitely far for 60 digits: the nearest step has it.
+    if sum(mass) == 0:  # All mass is beyond, infinitely far for 60 digits: the nearest step gets it.
         mass[-1] = mp.mpf(1)
     hit = [exact(m / sum(mass)) for m in mass]
     decay = [mp.exp(-mp.mpf(p.lambda_short) * w * i) if i < last else mp.mpf(0) for i in range(bins)]
@@ -97,7 +97,7 @@ def shared_exactly(p: gs.BeamParameters, bins: int, j: int) -> list[Fraction]:
 
 
 def assert_close(log_p: np.ndarray, truth: list[Fraction]) -> None:
-    """Check a sum of a dozen logarithms, each exact to some eps of itself, within 64 eps."""
+    """Check a sum of a dozen logarithms, each exact to some relative eps, within 64 eps."""
     for found, wanted in zip(log_p, truth, strict=True):
         if wanted < Fraction(10) ** -50:  # 60 digits do not distinguish it from 0.
             assert found < -110
@@ -128,7 +128,7 @@ def test_shared_causes_are_those_of_exact_arithmetic(name, bins):
 
 @pytest.mark.parametrize("s", [1e-8, 1e-3, 0.1, 0.49, 0.5, 0.51, 2.0, 40.0, 1e6])
 def test_the_spread_of_a_detection_keeps_its_digits_everywhere(s):
-    """The truth is second differences, with as many more digits as they lose."""
+    """The truth is second differences, with compensating digits."""
 
     def tail(x):
         return mp.npdf(x) - x * mp.erfc(x / mp.sqrt(2)) / 2
@@ -187,7 +187,7 @@ def test_rows_sum_to_1_and_no_logarithm_is_nan(bins):
 
 
 def test_a_reading_is_impossible_only_where_it_is():
-    """Logarithms do not underflow: without random triggers, a reading 300 deviations away is still possible."""
+    """Logarithms do not underflow: even without random triggers, a reading 300 deviations away is possible."""
     far = gs.DiscreteBeamModel(gs.DiscreteCauses(0.0, 0.0, 0.9, 0.01), RANGE, 100).log_probabilities
     assert np.isfinite(far[:-1]).all() and far.min() < -1e4
     # A beam that no cause triggers has no return.
@@ -215,7 +215,7 @@ def test_causes_that_trigger_earlier_hide_later_ones():
         assert (np.diff(each, axis=1) <= 0).all()
     for fewer, more in itertools.pairwise(rates):
         assert (more <= fewer + 1e-14).all() and (more[:, 1] < fewer[:, 1]).all()
-    # With independent causes, far obstacles would be detected as often as near ones.
+    # Independent causes would detect far obstacles as often as near ones.
     p = gs.DiscreteBeamModel(gs.DiscreteCauses(0.5, 0.0, 1.0, 0.0), RANGE, 60).probabilities
     np.testing.assert_allclose(np.diagonal(p)[:-1], np.exp(-0.5 * 0.1 * np.arange(60)), rtol=1e-13)
 
@@ -238,7 +238,7 @@ def assert_first_order(errors: list[float]) -> None:
 
 @pytest.mark.parametrize("name", ["all", "no max", "hit"])
 def test_the_mixture_is_the_limit_of_shared_causes(name):
-    """At every z but next to p_short's jump at z*, as long as some mass is left beyond."""
+    """At every z except near p_short's jump at z*, as long as some mass is beyond."""
     p, expected = MIXTURES[name].replace(lambda_short=0.4), np.append(np.linspace(0.41, 5.83, 37), RANGE)
     z = np.linspace(0.01, RANGE - 1.0, 173)
     each = np.broadcast_arrays(z, expected[:, None])
@@ -288,7 +288,7 @@ def test_readings_are_classed_as_everywhere_and_looked_up():
     assert found[:3].tolist() == [0, 0, 0]
     assert found[3:6].tolist() == [row[0] - log_width, row[14] - log_width, row[80] - log_width]
     assert found[6:].tolist() == [row[81]] * 3
-    # A float32 range_max is where nothing is expected.
+    # Nothing is expected at a float32 range_max.
     assert table.log_likelihood(np.array([1.5]), np.array([top]))[0] == table.log_probabilities[81, 14] - log_width
     assert bins_of(np.array([0.0, 1.0, 6.0 - 1e-15, math.inf, math.nan]), RANGE, 6).tolist() == [0, 1, 5, 6, -1]
 

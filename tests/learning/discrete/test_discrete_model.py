@@ -1,4 +1,4 @@
-"""Scans scored with a discrete model are its direct look-ups on every backend, and learning finds its causes."""
+"""Scans scored with a discrete model equal direct look-ups on every backend, and learning finds its causes."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_the_plan_says_so():
 
 
 def simulated(causes: gs.DiscreteCauses, count: int, bins: int = BINS, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Draw readings from the table's rows, at random places in their steps."""
+    """Draw readings from the table's rows, uniform within their steps."""
     random = np.random.default_rng(seed)
     expected = random.uniform(0.2, 1.1 * RANGE, count)
     cumulative = np.cumsum(gs.DiscreteBeamModel(causes, RANGE, bins).probabilities, axis=1)
@@ -135,7 +135,7 @@ def simulated(causes: gs.DiscreteCauses, count: int, bins: int = BINS, seed: int
     gs.DiscreteCauses(1.0, 0.2, 0.4, 0.2),
 ])  # fmt: skip
 def test_learning_finds_the_causes(truth):
-    """Causes are within 4 standard errors, which 12 normal numbers exceed once in 1300 times, and none can improve."""
+    """Causes are within 4 standard errors (12 normal numbers exceed them once in 1300 runs), and none can improve."""
     z, expected = simulated(truth, 30_000)
     table = gs.DiscreteBeamModel.learn(z, expected, RANGE, BINS)
     fit = table.fit

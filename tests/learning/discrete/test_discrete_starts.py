@@ -1,4 +1,4 @@
-"""Learning the discrete model where its likelihood has several maxima, or does not depend on all causes."""
+"""Learning the discrete model from likelihoods with several maxima, or independent of some causes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_no_point_of_a_grid_is_likelier_than_the_fit(seed: int) -> None:
 
 
 def test_a_flat_direction_leaves_the_other_standard_errors() -> None:
-    """With the obstacle in the last step, both rates end there, and only their sum matters."""
+    """The obstacle is in the last step: both rates end there, and only their sum matters."""
     rng = np.random.default_rng(0)
     expected = np.full(3000, 5 * (1 - 0.5 / 50))
     z, u = expected + rng.normal(0, 0.1, 3000), rng.uniform(size=3000)

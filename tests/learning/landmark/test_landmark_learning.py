@@ -46,7 +46,7 @@ def test_truth_is_within_three_standard_errors(view, known):
 
 
 def test_detections_are_counted():
-    # False positives replace features, so that the landmark counts as seen by chance only.
+    # False positives replace features, so that the landmark is seen only by chance.
     seen = world.simulate(1, scans=300)
     for known in (True, False):
         found = fit(seen, known)
@@ -58,7 +58,7 @@ def test_detections_are_counted():
 
 @pytest.mark.parametrize("view", VIEWS)
 def test_likelihood_is_the_models(view):
-    """The likelihood is LandmarkModel's for known landmarks, and its sum over a map in full view for unknown ones."""
+    """The likelihood equals LandmarkModel's for known landmarks, or its sum over a fully visible map."""
     seen = world.simulate(5, field_of_view=view, scans=8)
     found = fit(seen, field_of_view=view)
     lm = gs.LandmarkMap(seen.xy)
@@ -88,7 +88,7 @@ def test_gradient_is_the_slope(view, known):
     pairs = inner.make_pairs(
         seen.poses[seen.scan], features, seen.xy, np.arange(12.0), seen.ids if known else None, limits
     )
-    # Deviations are as large as the limits, so that truncation matters.
+    # Deviations as large as the limits make truncation matter.
     for point in (inner.Point((3.0, 0.9, 2.0), 0.8, (0.2, -0.1)), inner.Point((0.1, 0.04, 0.3), 0.9, (0.0, 0.0))):
         value = inner.evaluate(pairs, point)
         for k in range(6):

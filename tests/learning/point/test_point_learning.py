@@ -61,7 +61,7 @@ def test_gradients_are_those_of_differences(name: str, problem: Problem, at: lis
 
 
 def no_better(problem: Problem, theta: np.ndarray, value: float) -> None:
-    """Check an optimum with another optimiser, which starts there and at disturbed places."""
+    """Check an optimum with another optimiser, from the optimum and from disturbed points."""
     low, high = problem.bounds()
     scales = problem.scales(theta)
     for seed in range(3):
@@ -272,7 +272,7 @@ def refuses() -> Any:
     return check
 
 
-# Of the two orders of the parts a search reaches either: with seed 0 rounding decides, with seed 2 it is the second.
+# A search reaches either order of the parts: for seed 0 rounding decides, for seed 2 it is the second.
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_mixture_has_one_order_whatever_the_order_of_the_readings(seed: int) -> None:
     p = gs.BeaconParameters(

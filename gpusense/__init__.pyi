@@ -86,8 +86,10 @@ from gpusense.positions.bearings import triangulate_triangle as triangulate_tria
 from gpusense.positions.fix import PositionFix as PositionFix
 from gpusense.positions.locate import locate as locate
 from gpusense.positions.ranges import trilaterate as trilaterate
+from gpusense.tables.crowd import Shapes as Shapes
 from gpusense.tables.distances import distance_transform as distance_transform
 from gpusense.tables.normals import surface_normals as surface_normals
+from gpusense.tables.worlds import Worlds as Worlds
 from gpusense.world.deskew import deskew_scan as deskew_scan
 from gpusense.world.grid import OccupancyGrid as OccupancyGrid
 from gpusense.world.landmarks import LandmarkMap as LandmarkMap

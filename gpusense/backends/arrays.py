@@ -187,6 +187,39 @@ def adopt_readings(array: object, backend: Backend, beams: int, *, in_place: boo
     return adopted
 
 
+def adopt_numbers(array: object, backend: Backend, name: str) -> Adopted:
+    """Return a C-contiguous array of float32 or float64 numbers on the device.
+
+    Raises:
+        TypeError: Other numbers, or an array on another device.
+        ValueError: Not C-contiguous.
+    """
+    adopted = _adopt(array, backend, name)
+    _check_numbers(adopted, name)
+    return adopted
+
+
+def adopt_integers(array: object, backend: Backend, name: str, kinds: tuple[str, ...]) -> Adopted:
+    """Return a C-contiguous array of integers on the device.
+
+    Args:
+        array: The array.
+        backend: The device.
+        name: The array's name in messages.
+        kinds: Names of the types that it may have.
+
+    Raises:
+        TypeError: Integers of another type, or an array on another device.
+        ValueError: Not C-contiguous.
+    """
+    adopted = _adopt(array, backend, name)
+    if adopted.dtype.name not in kinds:
+        raise TypeError(f"{name}: must hold {' or '.join(kinds)} on the device, got {adopted.dtype.name}")
+    if not adopted.contiguous:
+        raise ValueError(f"{name}: must be C-contiguous on the device, got strides {adopted.strides}")
+    return adopted
+
+
 def _check_numbers(adopted: Adopted, name: str) -> None:
     """Refuse numbers of another type than float32 or float64, and arrays that are not C-contiguous."""
     if adopted.dtype not in (np.float32, np.float64):

@@ -89,6 +89,8 @@ class Recorder(Proxy):
             "sensor": {"SENSOR_TABLE"} & flags,
             "normals": {"INCIDENCE"} & flags,
             "map_table": {},
+            "world": {"WORLDS"} & flags,
+            "shapes": {},
             "start": {"SCANS"} & flags,
             "constant_terms": {"SCANS"} & flags,
         }

@@ -45,6 +45,8 @@ FLAGS = {
     "ROUNDED_CELLS": "cells are found by rounding; points near an edge are then repeated with more digits",
     "INSIDE": "no end point of the cloud leaves the field's table",
     "SCANS": "several scans are scored together, each with readings and particles of its own",
+    "WORLDS": "each particle is in one of several maps",
+    "SHAPES": "worlds have moving shapes",
     "PER_BEAM": "the log-likelihood of each reading is wanted",
     "BILINEAR": "the field is interpolated",
     "LOG_TABLE": "the field's table holds log densities, not distances",

@@ -13,7 +13,7 @@ _NEVER: dict[str, frozenset[str]] = {
     "cast_ranges": frozenset(),
     "e_step": _SCALAR - {"FLOAT64"},
     "score_beams": frozenset(),
-    "score_field": frozenset({"ALL_READINGS"}),
+    "score_field": frozenset({"ALL_READINGS", "WORLDS"}),
     "score_features": _SCALAR | {"LINE"},
 }
 _NEEDED: dict[str, tuple[set[str], ...]] = {
@@ -42,7 +42,10 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
 # By kernel: flags with which its body in lanes computes in float64 where real numbers are float32.
 _DOUBLE: dict[str, frozenset[str]] = {"score_field": frozenset({"BILINEAR"})}
 # By kernel: flags with which Warp's body has no loops that become vectors, and flags that it requires.
-_NO_LOOPS = {"score_beams": frozenset({"FLOAT64", "SENSOR_TABLE"}), "score_field": frozenset({"ALL_READINGS"})}
+_NO_LOOPS = {
+    "score_beams": frozenset({"FLOAT64", "SENSOR_TABLE"}),
+    "score_field": frozenset({"ALL_READINGS", "SHAPES"}),
+}
 _IN_LOOPS: dict[str, frozenset[str]] = {"score_beams": frozenset(), "score_field": frozenset({"BILINEAR"})}
 # Flags of teams, the largest first.
 _TEAMS = (frozenset({"IN_TEAMS"}), frozenset({"IN_TEAMS", "SMALL_TEAMS"}))

@@ -57,6 +57,16 @@ class RangeScale(NamedTuple):
     range_max: real
 
 
+class Crowd(NamedTuple):
+    """Moving shapes of each world, the numbers of all its shapes, and the side of a cell [m]; see ``shapes``."""
+
+    discs: int
+    boxes: int
+    segments: int
+    stride: int
+    side: real
+
+
 class Cone(NamedTuple):
     """Number of rays of a sensor's cone, and the least cosine of an angle of incidence with a return."""
 
@@ -314,9 +324,9 @@ class BeamRules(NamedTuple):
 STRUCTS: dict[str, type[tuple[Any, ...]]] = {
     struct.__name__: struct
     for struct in (
-        Window, Frame, Caster, RangeScale, Cone, MixtureTables, MixtureTerms, FieldTerms, FeatureTerms, PositionTerms,
-        HeadingTerms, BeaconTerms, ContactTerms, Score, ScanBatch, ReadingRules, Buckets, SensorView, ScoreTable,
-        MatchRules, BeamRules,
+        Window, Frame, Caster, RangeScale, Crowd, Cone, MixtureTables, MixtureTerms, FieldTerms, FeatureTerms,
+        PositionTerms, HeadingTerms, BeaconTerms, ContactTerms, Score, ScanBatch, ReadingRules, Buckets, SensorView,
+        ScoreTable, MatchRules, BeamRules,
     )
 }  # fmt: skip
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.backends import Backend
+from gpusense.tables.worlds import Worlds
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.plausible import look_at_scene
 from gpusense.world.scanner import Scanner
@@ -18,14 +19,14 @@ from gpusense.world.sensor_table import SensorTable
 _MOST_CELLS_PER_RANGE = 1 << 20
 
 
-def check_scene(grid: object, range_max: float) -> OccupancyGrid:
+def check_scene(grid: object, range_max: float) -> OccupancyGrid | Worlds:
     """Return the map, after a check of its cells against the range.
 
     Raises:
-        TypeError: Not an OccupancyGrid.
+        TypeError: Neither an OccupancyGrid nor Worlds.
         ValueError: More than 1 048 576 cells per range_max.
     """
-    checked = checks.instance("grid", grid, OccupancyGrid)
+    checked = grid if isinstance(grid, Worlds) else checks.instance("grid", grid, OccupancyGrid)
     look_at_scene(range_max, math.hypot(checked.width, checked.height))
     cells = range_max / checked.resolution
     if cells > _MOST_CELLS_PER_RANGE:
@@ -33,9 +34,12 @@ def check_scene(grid: object, range_max: float) -> OccupancyGrid:
     return checked
 
 
-def map_words(grid: OccupancyGrid) -> str:
+def map_words(grid: OccupancyGrid | Worlds) -> str:
     """Return the size and the resolution of a map, as ``repr`` of models shows them."""
     rows, cols = grid.shape
+    if isinstance(grid, Worlds):
+        size = f"{rows} x {cols}" if (grid.sizes == grid.sizes[0]).all() else f"up to {rows} x {cols}"
+        return f"{len(grid)} worlds of {size} cells, resolution={grid.resolution}"
     return f"{rows} x {cols} cells, resolution={grid.resolution}"
 
 

@@ -19,6 +19,7 @@ from gpusense.interface.constants import LARGEST_HEADING
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
+from gpusense.models.world_index import InWorlds, WorldIndex, no_worlds
 from gpusense.tables.reachable import MapState, ReachableMap
 from gpusense.world.frames import Cells, Mount, frame_of, place_poses
 from gpusense.world.windows import Corners, Window
@@ -58,6 +59,9 @@ class Poses:
     """
 
     hull: Corners | None = None
+
+    # The worlds of the poses; None in a single map.
+    inside: WorldIndex | None = None
 
     def __init__(
         self, poses: object, backend: Backend, name: str = "poses", *, scans: int | None = None, in_place: bool = False,
@@ -174,6 +178,7 @@ class PlacedPoses(NamedTuple):
         flags: Flags of the kernels that place them.
         source: The poses of the request; None where the host has placed them.
         lanes: Particles that the device computes at once.
+        inside: The worlds of the poses; None in a single map.
     """
 
     count: int  # type: ignore[assignment]  # hides tuple.count
@@ -185,6 +190,7 @@ class PlacedPoses(NamedTuple):
     flags: frozenset[str]
     source: Buffer = None
     lanes: int = 1
+    inside: InWorlds | None = None
 
     @property
     def cell(self) -> Buffer:
@@ -209,7 +215,30 @@ class PlacedPoses(NamedTuple):
     @property
     def key(self) -> Hashable:
         """All values on which the launches depend, except buffers."""
-        return self.flags, self.count, self.frame.window
+        inside = self.inside
+        where = None if inside is None else (inside.crowd, inside.wide, inside.wide_ignore)
+        return self.flags, self.count, self.frame.window, where
+
+    @property
+    def world_flags(self) -> frozenset[str]:
+        """Flags of kernels that cast rays in worlds."""
+        return _PLAIN if self.inside is None else self.inside.flags
+
+    @property
+    def world(self) -> Buffer:
+        """Two pairs of numbers of each pose; see the kernel file ``shapes``."""
+        return self.space.empty("world", 4 * self.count, _INT)
+
+    def changing(self) -> dict[str, object]:
+        """Return the arguments of ``place_in_worlds`` that change from call to call, by name."""
+        return {} if self.inside is None else dict(index=self.inside.index, ignore=self.inside.ignore)
+
+    def places(self) -> dict[str, object]:
+        """Return the arguments of kernels that cast rays in worlds, by name."""
+        if self.inside is None:
+            return no_worlds(self.space, self.real)
+        table = self.inside.worlds.crowd.table(self.real)
+        return dict(world=self.world, shapes=table, crowd=self.inside.crowd)
 
     def arguments(self) -> dict[str, object]:
         """Return the arguments of ``place_poses`` by name."""
@@ -223,6 +252,16 @@ class PlacedPoses(NamedTuple):
         """Return the launch that places them; none where the host has placed them."""
         if self.source is None:
             return ()
+        if self.inside is not None:
+            inside, arguments = self.inside, self.arguments()
+            del arguments["window"]
+            return (
+                launch(
+                    "place_in_worlds", self.flags | inside.flags, (self.count,), **arguments, index=inside.index,
+                    ignore=inside.ignore, frames=inside.worlds.frames, world=self.world, worlds=len(inside.worlds),
+                    wide=inside.wide, wide_ignore=inside.wide_ignore,
+                ),
+            )  # fmt: skip
         return (
             launch(
                 "place_poses", with_lanes_flag(self.lanes, "place_poses", self.flags), (self.count,), **self.arguments()
@@ -247,11 +286,14 @@ def place(
     count, corners = part[1] - part[0], poses.corners(part, backend, space)
     flags = poses.flags(corners)
     source, lows = poses.buffer(backend, space, part), 4 * count if careful else 4
+    inside = None if poses.inside is None else poses.inside.buffers(backend, space, part)
     if source is None:
+        if inside is not None:
+            raise ValueError(f"grid: must be a single map on {backend.info.name}, which has no float64, got Worlds")
         _place_on_host(poses, part, frame, space, real, careful=careful)
         return PlacedPoses(count, corners, frame, space, real, lows, flags)
     flags |= flags_if(FLOAT64=real == _DOUBLE, TWO_PART_POINTS=careful)
-    return PlacedPoses(count, corners, frame, space, real, lows, flags, source, backend.info.lanes)
+    return PlacedPoses(count, corners, frame, space, real, lows, flags, source, backend.info.lanes, inside)
 
 
 def pose_status(space: Workspace) -> Buffer:

@@ -139,8 +139,11 @@ def finish_all(spaces: Sequence[tuple[Workspace, bool]], name: str = "poses") ->
         # The first wait already covers all work on the device.
         space.wait()
     bad = [space for (space, _), state in zip(spaces, states, strict=True) if state[0]]
+    no_world = any(state[0] > 1 for state in states)
     for space in bad:
         space.upload(flag, np.zeros(2, dtype))
         space.wait()
+    if no_world:
+        raise ValueError("world: every index must be one of the worlds, got an index on the device that is not")
     if bad:
         raise ValueError(f"{name}: must be finite, got a pose on the device that is not")

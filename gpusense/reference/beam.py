@@ -29,16 +29,19 @@ def ray_limit(
 def cast_beam(
     flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
     ray: np.ndarray, rays: int, window: structs.Window, cone: structs.Cone, caster: structs.Caster,
-    scale: structs.RangeScale,
+    scale: structs.RangeScale, shapes: np.ndarray, world: np.ndarray, crowd: structs.Crowd,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return the (N * R,) expected ranges of rays or cones [m], and the cosines of incidence of cones; none of rays."""
     if "CONES" in flags:
         t, cosine, _ = echoes(
-            flags, map_table, normals, window, pose_cell, pose, ray, rays, cone, scale.limit, caster
+            flags, map_table, normals, window, pose_cell, pose, ray, rays, cone, scale.limit, caster, shapes, world,
+            crowd,
         )  # fmt: skip
         return expected_range(flags, t, scale), cosine
     ranges = np.empty(len(pose) * rays, pose.dtype)
-    cast_ranges(flags, map_table, pose_cell, pose, ray, ranges, window, len(pose), rays, caster, scale)
+    cast_ranges(
+        flags, map_table, world, shapes, pose_cell, pose, ray, ranges, window, len(pose), rays, caster, scale, crowd
+    )
     return ranges, np.empty(0, pose.dtype)
 
 
@@ -77,12 +80,12 @@ def readings_of_scan(
 
 
 def score_beams(
-    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
-    ray: np.ndarray, first: np.ndarray, reading: np.ndarray, terms: structs.MixtureTerms, masses: np.ndarray,
-    edges: np.ndarray, sensor: np.ndarray, start: np.ndarray, constant_terms: np.ndarray, log_p: np.ndarray,
-    parts: np.ndarray, window: structs.Window, particles: int, rays: int, readings: int, tables: structs.MixtureTables,
-    cone: structs.Cone, caster: structs.Caster, scale: structs.RangeScale, score: structs.Score,
-    batch: structs.ScanBatch,
+    flags: frozenset[str], map_table: np.ndarray, world: np.ndarray, shapes: np.ndarray, normals: np.ndarray, pose_cell:
+    np.ndarray, pose: np.ndarray, ray: np.ndarray, first: np.ndarray, reading: np.ndarray, terms: structs.MixtureTerms,
+    masses: np.ndarray, edges: np.ndarray, sensor: np.ndarray, start: np.ndarray, constant_terms: np.ndarray, log_p:
+    np.ndarray, parts: np.ndarray, window: structs.Window, particles: int, rays: int, readings: int, tables:
+    structs.MixtureTables, cone: structs.Cone, caster: structs.Caster, scale: structs.RangeScale, crowd: structs.Crowd,
+    score: structs.Score, batch: structs.ScanBatch,
 ) -> None:  # fmt: skip
     """Score scans; ray r has the readings first[r] to first[r + 1] - 1, and ``score`` has the constant term.
 
@@ -92,10 +95,10 @@ def score_beams(
         for scan, part in particles_of_scans(particles, batch):
             begin, scan_rays, scan_first, scan_reading = readings_of_scan(flags, scan, start, first, reading)
             score_beams(
-                flags - {"SCANS"}, map_table, normals, pose_cell[part], pose[part], ray[begin * cone.rays :],
-                scan_first, scan_reading, terms, masses, edges, sensor, start, constant_terms, log_p[part], parts,
-                window, part.stop - part.start, scan_rays, int(scan_first[scan_rays]), tables, cone, caster, scale,
-                structs.Score(constant_terms[scan], score.temperature), batch,
+                flags - {"SCANS"}, map_table, world[2 * part.start :], shapes, normals, pose_cell[part], pose[part],
+                ray[begin * cone.rays :], scan_first, scan_reading, terms, masses, edges, sensor, start, constant_terms,
+                log_p[part], parts, window, part.stop - part.start, scan_rays, int(scan_first[scan_rays]), tables,
+                cone, caster, scale, crowd, structs.Score(constant_terms[scan], score.temperature), batch,
             )  # fmt: skip
         return
     block = max((1 << 20) // max(readings * cone.rays, 1), 1)
@@ -104,8 +107,9 @@ def score_beams(
         end = min(begin + block, particles)
         part, bin_terms = slice(begin, end), terms
         ranges, cosine = cast_beam(
-            flags, map_table, normals, pose_cell[part], pose[part], ray, rays, window, cone, caster, scale
-        )
+            flags, map_table, normals, pose_cell[part], pose[part], ray, rays, window, cone, caster, scale, shapes,
+            world[2 * begin : 2 * end], crowd,
+        )  # fmt: skip
         if "INCIDENCE" in flags:
             bin_terms = incidence_terms(terms, edges, tables.incidence_bins, cosine.reshape(-1, rays)[:, ray_of])
         expected = ranges.reshape(end - begin, rays)[:, ray_of]
@@ -120,12 +124,12 @@ def score_beams(
 
 
 def beam_tiles(
-    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
-    order: np.ndarray, ray: np.ndarray, first: np.ndarray, reading: np.ndarray, terms: structs.MixtureTerms,
-    masses: np.ndarray, edges: np.ndarray,
-    sensor: np.ndarray, start: np.ndarray, parts: np.ndarray, window: structs.Window, particles: int, rays: int,
-    readings: int, tables: structs.MixtureTables, cone: structs.Cone, caster: structs.Caster, scale: structs.RangeScale,
-    spread: int, batch: structs.ScanBatch,
+    flags: frozenset[str], map_table: np.ndarray, world: np.ndarray, shapes: np.ndarray, normals: np.ndarray, pose_cell:
+    np.ndarray, pose: np.ndarray, order: np.ndarray, ray: np.ndarray, first: np.ndarray, reading: np.ndarray, terms:
+    structs.MixtureTerms, masses: np.ndarray, edges: np.ndarray, sensor: np.ndarray, start: np.ndarray, parts:
+    np.ndarray, window: structs.Window, particles: int, rays: int, readings: int, tables: structs.MixtureTables, cone:
+    structs.Cone, caster: structs.Caster, scale: structs.RangeScale, crowd: structs.Crowd, spread: int, batch:
+    structs.ScanBatch,
 ) -> None:  # fmt: skip
     """Write the term of reading k to parts[place + k * particles]; GPUs do so in tiles of particles and rays.
 
@@ -141,19 +145,19 @@ def beam_tiles(
             each = strands_in(each) if "STRANDED" in flags else each
             scan_parts = np.empty((part.stop - part.start) * each, pose.dtype)
             beam_tiles(
-                flags - {"SCANS", "ORDERED"}, map_table, normals, pose_cell[part], pose[part], order,
-                ray[begin * cone.rays :], scan_first, scan_reading, terms, masses, edges, sensor, start, scan_parts,
-                window, part.stop - part.start, scan_rays, int(scan_first[scan_rays]), tables, cone, caster, scale,
-                spread, batch,
+                flags - {"SCANS", "ORDERED"}, map_table, world[2 * part.start :], shapes, normals, pose_cell[part],
+                pose[part], order, ray[begin * cone.rays :], scan_first, scan_reading, terms, masses, edges, sensor,
+                start, scan_parts, window, part.stop - part.start, scan_rays, int(scan_first[scan_rays]), tables, cone,
+                caster, scale, crowd, spread, batch,
             )  # fmt: skip
             at = places[part] + np.arange(each)[:, None] * particles
             parts[at] = scan_parts.reshape(at.shape)
         return
     real, single = pose.dtype.type, np.empty(particles * readings, pose.dtype)
     score_beams(
-        flags | {"PER_BEAM"}, map_table, normals, pose_cell, pose, ray, first, reading, terms, masses, edges, sensor,
-        start, sensor, np.empty(particles, pose.dtype), single, window, particles, rays, readings, tables, cone, caster,
-        scale, structs.Score(real(0), real(1)), batch,
+        flags | {"PER_BEAM"}, map_table, world, shapes, normals, pose_cell, pose, ray, first, reading, terms, masses,
+        edges, sensor, start, sensor, np.empty(particles, pose.dtype), single, window, particles, rays, readings,
+        tables, cone, caster, scale, crowd, structs.Score(real(0), real(1)), batch,
     )  # fmt: skip
     term = single.reshape(particles, readings)
     term = strand_sums(term) if "STRANDED" in flags else term

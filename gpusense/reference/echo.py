@@ -12,6 +12,8 @@ import numpy as np
 from gpusense.interface import structs
 from gpusense.reference.ranges import BLOCK, caster_of
 from gpusense.reference.ray import Ray, crossed, expected_range, make_ray, off_grid
+from gpusense.reference.raycast import sectors_of
+from gpusense.reference.shapes import nearest_shape, particles_of_worlds, world_begin, world_window
 
 
 def is_wall(normal: np.ndarray) -> np.ndarray:
@@ -59,7 +61,8 @@ def incidence_terms(
 
 def nearest_echo(
     flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, window: structs.Window, cell: np.ndarray,
-    pose: np.ndarray, ray: np.ndarray, critical: float, limit: float, caster: structs.Caster,
+    pose: np.ndarray, ray: np.ndarray, critical: float, limit: float, caster: structs.Caster, shapes: np.ndarray,
+    world: np.ndarray, crowd: structs.Crowd,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Return the nearest returns of M cones.
 
@@ -76,6 +79,9 @@ def nearest_echo(
         critical: Least cosine.
         limit: Longest distance in cells.
         caster: The knobs of the caster.
+        shapes: The shapes of all worlds.
+        world: (2 M, 2) numbers of the worlds of the cones; not read without SHAPES.
+        crowd: The numbers of shapes.
 
     Returns:
         (M,) distances in cells, limit where nothing returns, and cosines and sines of angles of incidence. A beam
@@ -85,7 +91,9 @@ def nearest_echo(
     nearest = np.full(len(cell), limit, pose.dtype)
     cosine, sine = np.full_like(nearest, 2), np.zeros_like(nearest)
     for i in range(ray.shape[1]):
-        t = caster_of(flags).cast_ray(flags, map_table, window, cell, pose, ray[:, i], limit, caster)
+        met = t = caster_of(flags).cast_ray(flags, map_table, window, cell, pose, ray[:, i], limit, caster)
+        if "SHAPES" in flags:
+            t, shape_cosine = nearest_shape(shapes, world, crowd, cell, pose, ray[:, i], met)
         heard = t < nearest
         if "INCIDENCE" in flags:
             r = make_ray(pose, ray[:, i])
@@ -93,6 +101,9 @@ def nearest_echo(
             known, (dx, dy) = ~np.isnan(normal[:, 0]), r.direction
             straight = np.where(known, np.abs(dx * normal[:, 0] + dy * normal[:, 1]), real(1))
             aslant = np.where(known, np.abs(dx * normal[:, 1] - dy * normal[:, 0]), real(0))
+            if "SHAPES" in flags:
+                straight = np.where(t < met, shape_cosine, straight)
+                aslant = np.where(t < met, np.sqrt(np.maximum((1 - straight) * (1 + straight), 0)), aslant)
             heard &= straight >= critical
             cosine[heard], sine[heard] = straight[heard], aslant[heard]
         nearest[heard] = t[heard]
@@ -100,9 +111,10 @@ def nearest_echo(
 
 
 def cast_echoes(
-    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
-    ray: np.ndarray, ranges: np.ndarray, incidence: np.ndarray, window: structs.Window, particles: int, rays: int,
-    cone: structs.Cone, caster: structs.Caster, scale: structs.RangeScale,
+    flags: frozenset[str], map_table: np.ndarray, world: np.ndarray, shapes: np.ndarray, normals: np.ndarray,
+    pose_cell: np.ndarray, pose: np.ndarray, ray: np.ndarray, ranges: np.ndarray, incidence: np.ndarray,
+    window: structs.Window, particles: int, rays: int, cone: structs.Cone, caster: structs.Caster,
+    scale: structs.RangeScale, crowd: structs.Crowd,
 ) -> None:  # fmt: skip
     """Cast the cones of all particles to expected ranges and angles of incidence, NaN without a return.
 
@@ -113,7 +125,8 @@ def cast_echoes(
         part = slice(first, min(first + block, particles))
         entries = slice(part.start * rays, part.stop * rays)
         t, cosine, sine = echoes(
-            flags, map_table, normals, window, pose_cell[part], pose[part], ray, rays, cone, scale.limit, caster
+            flags, map_table, normals, window, pose_cell[part], pose[part], ray, rays, cone, scale.limit, caster,
+            shapes, world[2 * part.start : 2 * part.stop], crowd,
         )  # fmt: skip
         ranges[entries] = expected_range(flags, t, scale)
         if "INCIDENCE" in flags:
@@ -124,8 +137,23 @@ def cast_echoes(
 def echoes(
     flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, window: structs.Window, cell: np.ndarray,
     pose: np.ndarray, ray: np.ndarray, rays: int, cone: structs.Cone, limit: float, caster: structs.Caster,
+    shapes: np.ndarray, world: np.ndarray, crowd: structs.Crowd,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Return ``nearest_echo`` of all cones at all poses, (N * rays,) each."""
+    if "WORLDS" in flags:
+        found = np.empty((3, len(pose), rays), pose.dtype)
+        for part in particles_of_worlds(world, len(pose)):
+            n = int(part[0])
+            found[:, part] = np.stack(echoes(
+                flags - {"WORLDS"}, map_table[world_begin(world, n, 4 * sectors_of(flags)) :],
+                normals[world_begin(world, n, 1) :], world_window(world, n), cell[part], pose[part], ray, rays, cone,
+                limit, caster, shapes, world.reshape(-1, 4)[part].reshape(-1, 2), crowd,
+            )).reshape(3, len(part), rays)  # fmt: skip
+        t, cosine, sine = found.reshape(3, -1)
+        return t, cosine, sine
+    of_rays = np.repeat(world.reshape(-1, 4), rays, axis=0).reshape(-1, 2) if "SHAPES" in flags else world
     lanes = (np.repeat(cell, rays, axis=0), np.repeat(pose, rays, axis=0))
     cones = np.tile(ray[: rays * cone.rays].reshape(rays, cone.rays, 2), (len(pose), 1, 1))
-    return nearest_echo(flags, map_table, normals, window, *lanes, cones, cone.critical, limit, caster)
+    return nearest_echo(
+        flags, map_table, normals, window, *lanes, cones, cone.critical, limit, caster, shapes, of_rays, crowd
+    )

@@ -13,25 +13,41 @@ from gpusense.reference.beam import sum_terms
 from gpusense.reference.error_free import block_sums
 from gpusense.reference.field_term import reading_value
 from gpusense.reference.scans import particles_of_scans
+from gpusense.reference.shapes import particles_of_worlds, world_begin, world_window
 
 BLOCK = 1 << 18
 
 
 def score_field(
-    flags: frozenset[str], table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
-    point: np.ndarray, point_low: np.ndarray, terms: structs.FieldTerms, start: np.ndarray, constant_terms: np.ndarray,
-    log_p: np.ndarray, parts: np.ndarray, window: structs.Window, particles: int, readings: int, guard: float,
-    score: structs.Score, batch: structs.ScanBatch,
+    flags: frozenset[str], table: np.ndarray, world: np.ndarray, shapes: np.ndarray, pose_cell: np.ndarray,
+    pose: np.ndarray, pose_low: np.ndarray, point: np.ndarray, point_low: np.ndarray, terms: structs.FieldTerms,
+    start: np.ndarray, constant_terms: structs.FieldTerms, log_p: np.ndarray, parts: np.ndarray, window: structs.Window,
+    particles: int, readings: int, guard: float, score: structs.Score, batch: structs.ScanBatch, crowd: structs.Crowd,
 ) -> None:  # fmt: skip
     """Score scans; the table holds log densities, or capped distances in metres where it is interpolated."""
     if "SCANS" in flags:
         for scan, part in particles_of_scans(particles, batch):
             first, last = start[scan], start[scan + 1]
             score_field(
-                flags - {"SCANS"}, table, pose_cell[part], pose[part], pose_low[part], point[first:last],
-                point_low[first:last], terms, start, constant_terms, log_p[part], parts, window, part.stop - part.start,
-                int(last - first), guard, structs.Score(constant_terms[scan], score.temperature), batch,
+                flags - {"SCANS"}, table, world[2 * part.start :], shapes, pose_cell[part], pose[part], pose_low[part],
+                point[first:last], point_low[first:last], terms, start, constant_terms, log_p[part], parts, window,
+                part.stop - part.start, int(last - first), guard,
+                structs.Score(constant_terms[scan], score.temperature), batch, crowd,
             )  # fmt: skip
+        return
+    if "WORLDS" in flags:
+        for part in particles_of_worlds(world, particles):
+            n, own = int(part[0]), np.empty(len(part), log_p.dtype)
+            own_parts = np.empty(len(part) * readings if "PER_BEAM" in flags else 0, parts.dtype)
+            score_field(
+                flags - {"WORLDS"}, table[world_begin(world, n, 1) :], world.reshape(-1, 4)[part].reshape(-1, 2),
+                shapes, pose_cell[part], pose[part], pose_low[part] if "TWO_PART_POINTS" in flags else pose_low, point,
+                point_low, terms, start, constant_terms, own, own_parts, world_window(world, n), len(part), readings,
+                guard, score, batch, crowd,
+            )  # fmt: skip
+            log_p[part] = own
+            if "PER_BEAM" in flags:
+                parts[: particles * readings].reshape(particles, readings)[part] = own_parts.reshape(-1, readings)
         return
     block = max(BLOCK // max(readings, 1), 1)
     points = point[None, :readings]
@@ -40,7 +56,7 @@ def score_field(
         low = pose_low[part, None] if "TWO_PART_POINTS" in flags else pose_low[None, :1]
         term = reading_value(
             flags, table, pose_cell[part, None], pose[part, None], low, points, point_low[None, :readings], terms,
-            window,
+            window, shapes, world[2 * begin : 2 * part.stop], crowd,
         )  # fmt: skip
         if "PER_BEAM" in flags:
             parts[begin * readings : part.stop * readings] = term.ravel()
@@ -48,9 +64,10 @@ def score_field(
 
 
 def field_blocks(
-    flags: frozenset[str], table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
-    point: np.ndarray, point_low: np.ndarray, terms: structs.FieldTerms, guard: np.ndarray, start: np.ndarray,
-    parts: np.ndarray, window: structs.Window, particles: int, readings: int, spread: int, batch: structs.ScanBatch,
+    flags: frozenset[str], table: np.ndarray, world: np.ndarray, shapes: np.ndarray, pose_cell: np.ndarray,
+    pose: np.ndarray, pose_low: np.ndarray, point: np.ndarray, point_low: np.ndarray, terms: structs.FieldTerms,
+    guard: np.ndarray, start: np.ndarray, parts: np.ndarray, window: structs.Window, particles: int, readings: int,
+    spread: int, batch: structs.ScanBatch, crowd: structs.Crowd,
 ) -> None:  # fmt: skip
     """Write the sums of blocks of readings to parts[n + block * particles]; on GPUs a work-item takes single blocks."""
     if "SCANS" in flags:
@@ -59,17 +76,18 @@ def field_blocks(
             blocks, count = -(-int(last - first) // BLOCK_TERMS), part.stop - part.start
             scan_parts = np.empty(count * blocks, pose.dtype)
             field_blocks(
-                flags - {"SCANS"}, table, pose_cell[part], pose[part], pose_low[part], point[first:last],
-                point_low[first:last], terms, guard, start, scan_parts, window, count, int(last - first), spread, batch,
+                flags - {"SCANS"}, table, world[2 * part.start :], shapes, pose_cell[part], pose[part], pose_low[part],
+                point[first:last], point_low[first:last], terms, guard, start, scan_parts, window, count,
+                int(last - first), spread, batch, crowd,
             )  # fmt: skip
             at = np.arange(part.start, part.stop) + np.arange(blocks)[:, None] * particles
             parts[at] = scan_parts.reshape(at.shape)
         return
     real, each = pose.dtype.type, np.empty(particles * readings, pose.dtype)
     score_field(
-        flags | {"PER_BEAM"}, table, pose_cell, pose, pose_low, point, point_low, terms, start, guard,
+        flags | {"PER_BEAM"}, table, world, shapes, pose_cell, pose, pose_low, point, point_low, terms, start, guard,
         np.empty(particles, pose.dtype), each, window, particles, readings, real(0), structs.Score(real(0), real(1)),
-        batch,
+        batch, crowd,
     )  # fmt: skip
     each = each.reshape(particles, readings)
     sums = block_sums(each)

@@ -12,6 +12,7 @@ from gpusense.interface import structs
 from gpusense.reference.end_point import EndPoint, end_point, field_cell
 from gpusense.reference.error_free import Pair, pair_product, pair_sum
 from gpusense.reference.hit_shape import shape_exponent
+from gpusense.reference.shapes import shape_distance
 
 
 def between(flags: frozenset[str], weight_a: Pair, a: Pair, weight_b: Pair, b: Pair) -> Pair:
@@ -63,17 +64,43 @@ def log_field(flags: frozenset[str], distance: Pair, terms: structs.FieldTerms) 
     return np.log(p)
 
 
+def end_in_cells(pose: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Return end points relative to the pose's cell, in cells."""
+    x, y = point[..., 0], point[..., 1]
+    cosine, sine = pose[..., 2], pose[..., 3]
+    return np.stack([pose[..., 0] + (cosine * x - sine * y), pose[..., 1] + (sine * x + cosine * y)], axis=-1)
+
+
+def _near(
+    shapes: np.ndarray, world: np.ndarray, crowd: structs.Crowd, origin: np.ndarray, pose: np.ndarray, point: np.ndarray
+) -> np.ndarray:
+    """Return distances [m] from the end points of (M, 1, ...) poses and (1, K, 2) points to the nearest shapes."""
+    with np.errstate(invalid="ignore"):
+        ends = end_in_cells(pose, point)
+    count, readings = ends.shape[:2]
+    cells, of_ends = np.repeat(origin[:, 0], readings, axis=0), np.repeat(world.reshape(-1, 4), readings, axis=0)
+    away = shape_distance(shapes, of_ends.reshape(-1, 2), crowd, cells, ends.reshape(-1, 2))
+    return (pose.dtype.type(crowd.side) * away).reshape(count, readings)
+
+
 def reading_value(
     flags: frozenset[str], table: np.ndarray, origin: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
-    point: np.ndarray, point_low: np.ndarray, terms: structs.FieldTerms, window: structs.Window,
+    point: np.ndarray, point_low: np.ndarray, terms: structs.FieldTerms, window: structs.Window, shapes: np.ndarray,
+    world: np.ndarray, crowd: structs.Crowd,
 ) -> np.ndarray:  # fmt: skip
     """Return the terms of readings: (M, 1, ...) poses and their cells with (1, K, 2) points give (M, K) terms."""
     end = end_point(flags, pose, pose_low, point, point_low)
     col, row = end.col + origin[..., 0], end.row + origin[..., 1]
     if "BILINEAR" in flags:
-        term = log_field(flags, bilinear(flags, table, col, row, end, window), terms)
+        distance = bilinear(flags, table, col, row, end, window)
+        if "SHAPES" in flags:
+            near = _near(shapes, world, crowd, origin, pose, point)
+            distance = np.minimum(distance[0], near), np.where(near < distance[0], 0, distance[1])
+        term = log_field(flags, distance, terms)
     else:
         term = table[field_cell(col, row, window)]
+        if "SHAPES" in flags:
+            term = np.minimum(term, _near(shapes, world, crowd, origin, pose, point))
         term = term if "LOG_TABLE" in flags else log_field(flags, (term, np.zeros_like(term)), terms)
     if "ALL_READINGS" in flags:
         x = point[..., 0]

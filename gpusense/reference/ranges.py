@@ -10,6 +10,8 @@ import numpy as np
 from gpusense.interface import structs
 from gpusense.interface.casters import caster_file
 from gpusense.reference.ray import expected_range
+from gpusense.reference.raycast import sectors_of
+from gpusense.reference.shapes import nearest_shape, particles_of_worlds, world_begin, world_window
 
 BLOCK = 1 << 15
 
@@ -19,27 +21,50 @@ def caster_of(flags: frozenset[str]) -> ModuleType:
     return importlib.import_module(f"gpusense.reference.{caster_file(flags)}")
 
 
+def cast_in_worlds(
+    flags: frozenset[str], map_table: np.ndarray, world: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
+    ray: np.ndarray, window: structs.Window, rays: int, limit: float, caster: structs.Caster,
+) -> np.ndarray:  # fmt: skip
+    """Return the (N * R,) distances in cells of all rays of some particles, each in its world."""
+    cast_ray, count = caster_of(flags).cast_ray, len(pose)
+    if "WORLDS" not in flags:
+        lanes = (np.repeat(pose_cell, rays, axis=0), np.repeat(pose, rays, axis=0))
+        return cast_ray(flags, map_table, window, *lanes, np.tile(ray[:rays], (count, 1)), limit, caster)
+    t = np.empty((count, rays), pose.dtype)
+    planes = 4 * sectors_of(flags)
+    for part in particles_of_worlds(world, count):
+        n = int(part[0])
+        lanes = (np.repeat(pose_cell[part], rays, axis=0), np.repeat(pose[part], rays, axis=0))
+        table, beams = map_table[world_begin(world, n, planes) :], np.tile(ray[:rays], (len(part), 1))
+        t[part] = cast_ray(flags, table, world_window(world, n), *lanes, beams, limit, caster).reshape(-1, rays)
+    return t.reshape(-1)
+
+
 def cast_ranges(
-    flags: frozenset[str], map_table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, ray: np.ndarray,
-    ranges: np.ndarray, window: structs.Window, particles: int, rays: int, caster: structs.Caster,
-    scale: structs.RangeScale,
+    flags: frozenset[str], map_table: np.ndarray, world: np.ndarray, shapes: np.ndarray, pose_cell: np.ndarray,
+    pose: np.ndarray, ray: np.ndarray, ranges: np.ndarray, window: structs.Window, particles: int, rays: int,
+    caster: structs.Caster, scale: structs.RangeScale, crowd: structs.Crowd,
 ) -> None:  # fmt: skip
     """Cast all rays of all particles."""
-    cast_ray = caster_of(flags).cast_ray
     block = max(BLOCK // max(rays, 1), 1)
     for first in range(0, particles, block):
         part = slice(first, min(first + block, particles))
-        count = part.stop - first
-        lanes = (np.repeat(pose_cell[part], rays, axis=0), np.repeat(pose[part], rays, axis=0))
-        beams = np.tile(ray[:rays], (count, 1))
-        t = cast_ray(flags, map_table, window, *lanes, beams, scale.limit, caster)
+        own = world[2 * part.start : 2 * part.stop]
+        t = cast_in_worlds(flags, map_table, own, pose_cell[part], pose[part], ray, window, rays, scale.limit, caster)
+        if "SHAPES" in flags:
+            lanes = (np.repeat(pose_cell[part], rays, axis=0), np.repeat(pose[part], rays, axis=0))
+            of_rays = np.repeat(own.reshape(-1, 4), rays, axis=0).reshape(-1, 2)
+            beams = np.tile(ray[:rays], (part.stop - first, 1))
+            t = nearest_shape(shapes, of_rays, crowd, *lanes, beams, t)[0]
         ranges[first * rays : part.stop * rays] = expected_range(flags, t, scale)
 
 
 def cast_tiles(
-    flags: frozenset[str], map_table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, order: np.ndarray,
-    ray: np.ndarray, ranges: np.ndarray, window: structs.Window, particles: int, rays: int, caster: structs.Caster,
-    scale: structs.RangeScale, spread: int,
+    flags: frozenset[str], map_table: np.ndarray, world: np.ndarray, shapes: np.ndarray, pose_cell: np.ndarray,
+    pose: np.ndarray, order: np.ndarray, ray: np.ndarray, ranges: np.ndarray, window: structs.Window, particles: int,
+    rays: int, caster: structs.Caster, scale: structs.RangeScale, crowd: structs.Crowd, spread: int,
 ) -> None:  # fmt: skip
     """Cast all rays of all particles; GPUs do so in tiles of particles and rays."""
-    cast_ranges(flags, map_table, pose_cell, pose, ray, ranges, window, particles, rays, caster, scale)  # fmt: skip
+    cast_ranges(
+        flags, map_table, world, shapes, pose_cell, pose, ray, ranges, window, particles, rays, caster, scale, crowd
+    )

@@ -16,6 +16,11 @@ from gpusense.reference.rectangles import OCCUPIED, padded_in_groups
 GROUP = 8
 
 
+def sectors_of(flags: frozenset[str]) -> int:
+    """Return the sectors of each quadrant."""
+    return 4 if "SECTORS_4" in flags else 2 if "SECTORS_2" in flags else 1
+
+
 def sector_of(sectors: int, speed_x: np.ndarray, speed_y: np.ndarray) -> np.ndarray:
     """Return the sector of a direction within its quadrant, from flat to steep.
 
@@ -41,7 +46,7 @@ def cast_ray(
     r = make_ray(pose, ray)
     origin, k, t, ranges, active = start_casts(flags, r, cell, window, limit)
     quadrant = np.where(r.step[0] > 0, 0, 1) + np.where(r.step[1] > 0, 0, 2)
-    sectors = 4 if "SECTORS_4" in flags else 2 if "SECTORS_2" in flags else 1
+    sectors = sectors_of(flags)
     plane = quadrant * sectors + sector_of(sectors, *r.speed)
     group = GROUP if "ROW_GROUPS" in flags else 1
     table = plane * (-(-(window.rows + 2) // group) * group * (window.cols + 2))

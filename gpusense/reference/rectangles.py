@@ -6,6 +6,9 @@ idea follows the anisotropic Chebyshev distance maps of Deakin and Knackstedt (2
 by a ring of zeros; quadrant q extends to (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4
 sectors from flat to steep. Planes store rows one after the other, or in groups: a group is stored column by column.
 
+Planes of several worlds of one size are made together: the runs of row i of world w are line i * worlds + w, and
+place[w] is the world's first cell in tables with a ring of two cells.
+
 Planes can be updated after a change of the cells in rows [top, bottom) and columns [left, right) of the map: only cells
 whose rectangles can contain one of these are computed. The input has a band of rows, from row first on.
 """
@@ -115,11 +118,20 @@ def _quadrants(
 
 
 def rectangles_rows(
-    flags: frozenset[str], runs: np.ndarray, stack: np.ndarray, rectangles: np.ndarray, rows: int, cols: int,
-    sectors: int, first: int, band: int, top: int, left: int, bottom: int, right: int,
+    flags: frozenset[str], runs: np.ndarray, place: np.ndarray, stack: np.ndarray, rectangles: np.ndarray, rows: int,
+    cols: int, sectors: int, first: int, band: int, top: int, left: int, bottom: int, right: int, worlds: int,
 ) -> None:  # fmt: skip
     """Find the widest rectangles of sufficient height along rows, from free cells in columns."""
+    if worlds > 1:
+        lines = runs[: 2 * band * worlds * cols].reshape(2 * band, worlds, cols)
+        for w in range(worlds):
+            rectangles_rows(
+                flags, lines[:, w].reshape(-1), place[w:], stack, rectangles, rows, cols, sectors, first, band, top,
+                left, bottom, right, 1,
+            )  # fmt: skip
+        return
     free = runs[: 2 * band * cols].reshape(2, band, cols)
+    rectangles = rectangles[4 * sectors * int(place[0]) :]
     planes = rectangles[: 4 * sectors * (rows + 2) * (cols + 2)].reshape(4, sectors, rows + 2, cols + 2)
     for quadrant, (dx, _), (row, col) in _quadrants(rows, cols, top, left, bottom, right):
         reached_part = planes[quadrant, :, row.start + 1 : row.stop + 1, col.start + 1 : col.stop + 1]
@@ -142,11 +154,21 @@ def free_rows(
 
 
 def rectangles_scan(
-    flags: frozenset[str], runs: np.ndarray, rectangles: np.ndarray, rows: int, cols: int, sectors: int, first: int,
-    band: int, top: int, left: int, bottom: int, right: int, lines: int, group: int,
+    flags: frozenset[str], runs: np.ndarray, place: np.ndarray, rectangles: np.ndarray, rows: int, cols: int,
+    sectors: int, first: int, band: int, top: int, left: int, bottom: int, right: int, worlds: int, lines: int,
+    group: int,
 ) -> None:  # fmt: skip
     """Find the highest rectangles of sufficient width along columns, from free cells in rows."""
+    if worlds > 1:
+        rows_of = runs[: 2 * band * worlds * cols].reshape(2 * band, worlds, cols)
+        for w in range(worlds):
+            rectangles_scan(
+                flags, rows_of[:, w].reshape(-1), place[w:], rectangles, rows, cols, sectors, first, band, top, left,
+                bottom, right, 1, lines, group,
+            )  # fmt: skip
+        return
     free = runs[: 2 * band * cols].reshape(2, band, cols)
+    rectangles = rectangles[4 * sectors * int(place[0]) :]
     planes = rectangles[: 4 * sectors * lines * (cols + 2)].reshape(4, sectors, lines * (cols + 2))
     for quadrant, (_, dy), (row, col) in _quadrants(rows, cols, top, left, bottom, right):
         line, column = np.ogrid[row, col]

@@ -14,6 +14,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import Backend, Selection, get_backend
 from gpusense.backends.base import Buffer
+from gpusense.backends.workspace import Workspace
 from gpusense.tables.cells import as_bytes, check_size, packed
 from gpusense.world.windows import LONGEST_SIDE
 
@@ -56,6 +57,28 @@ def _by_lines(backend: Backend, obstacles: np.ndarray, squared: Buffer, most: in
     along, starts = (backend.empty(rows * cols, _INT) for _ in range(2))
     backend.compile("distance_lines", _NO_FLAGS)((cols,), occupied, along, cols, rows, 1, cols)
     backend.compile("distance_envelope", _NO_FLAGS)((rows,), along, starts, squared, rows, cols, cols, 1)
+
+
+def squared_of_stack(backend: Backend, space: Workspace, occupied: Buffer, rows: int, cols: int, worlds: int) -> Buffer:
+    """Start computing the squared distances of several maps of one size, whose rows are interleaved [cells^2].
+
+    Args:
+        backend: The device.
+        space: Holds the distances.
+        occupied: (rows, worlds, cols) bytes.
+        rows: Rows of each map.
+        cols: Columns of each map.
+        worlds: Number of maps.
+
+    Returns:
+        (rows, worlds, cols) int32.
+    """
+    count, width = rows * worlds * cols, worlds * cols
+    along, starts, squared = (space.empty(name, count, _INT) for name in ("along", "starts", "squared"))
+    backend.compile("distance_lines", _NO_FLAGS)((width,), occupied, along, width, rows, 1, width)
+    envelope = backend.compile("distance_envelope", _NO_FLAGS)
+    envelope((rows * worlds,), along, starts, squared, rows * worlds, cols, cols, 1)
+    return squared
 
 
 def _by_cells(backend: Backend, obstacles: np.ndarray, squared: Buffer, most: int) -> None:

@@ -8,9 +8,11 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
+from gpusense.interface.launches import launch
 from gpusense.peers.weights import OVERLAID, Beluga, Peer
 from gpusense.tables.cells import check_size
-from gpusense.tables.distances import NO_OBSTACLE, squared_distances
+from gpusense.tables.distances import NO_OBSTACLE, squared_distances, squared_of_stack
+from gpusense.tables.worlds import Stack, Table, Worlds
 from gpusense.world.field_density import FieldDensity
 from gpusense.world.likelihood import Likelihood
 from gpusense.world.parameters import LikelihoodFieldParameters
@@ -87,6 +89,38 @@ class FieldTable:
         everything = Window(margin - RING, margin - RING, *size)
         self._fill(backend, walled, density, table, everything, 0, size[1])
         return table
+
+    def of_worlds(self, worlds: Worlds, unknown: str) -> Buffer:
+        """Return the tables of all worlds, made on the device; models of the same parameters share them.
+
+        Raises:
+            ValueError: Squared distances up to ``max_distance`` have too many values.
+        """
+        margin = self._margin
+
+        def fill(stack: Stack, table: Buffer) -> None:
+            density = self._density_of(stack.rows, stack.cols)
+            if density is None:
+                rule = f"must be at most {math.isqrt(_LONGEST_DENSITY) - 1} cells in Worlds of this size"
+                raise ValueError(f"max_distance: {rule}, got {self._parameters.max_distance} m")
+            backend, cap = worlds.backend, len(density) - 1
+            occupied, _ = worlds.marked(stack, unknown, margin)
+            rows, cols = stack.rows + 2 * margin, stack.cols + 2 * margin
+            squared = squared_of_stack(backend, stack.space, occupied, rows, cols, stack.worlds)
+            size = (stack.cols + 2 * RING, (stack.rows + 2 * RING) * stack.worlds)
+            backend.run((
+                launch(
+                    "fill_worlds", self._flags & {"FLOAT64"}, size, squared=squared, density=backend.upload(density),
+                    place=stack.place, table=table, rows=stack.rows, cols=stack.cols, worlds=stack.worlds,
+                    margin=margin, cap=cap, beyond=self._outside_value.item(),
+                ),
+            ))  # fmt: skip
+
+        def make() -> Table:
+            return Table(worlds.allocate(1, self._real), self._real.itemsize * worlds.cells, fill)
+
+        key = ("field", self._parameters, self._range_max, self._margin, unknown, self._log_table, self._real)
+        return worlds.table(key, make).buffer
 
     def refresh(self, backend: Backend, obstacles: np.ndarray, table: Buffer, changed: Window) -> bool:
         """Update ``table`` in place after obstacles changed, where clamped distances can differ.

@@ -18,7 +18,9 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense._util.typing import Space
+from gpusense.backends.base import Buffer
 from gpusense.tables.outlines import REACH, SPANS, Outlines
+from gpusense.tables.worlds import Stack, Table, Worlds
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.windows import Window, whole
 
@@ -100,6 +102,20 @@ def normal_table(obstacles: np.ndarray, window: Window, outside: str, real: np.d
         _replace_straight(normals, surrounded)
         table[first : first + rows] = normals
     return table
+
+
+def normals_of_worlds(worlds: Worlds, unknown: str, outside: str, real: np.dtype) -> Table:
+    """Return the normals of all worlds on their device; models share them. The host computes them world by world."""
+
+    def fill(stack: Stack, table: Buffer) -> None:
+        for index in stack.indices.tolist():
+            obstacles = worlds.obstacles(index, unknown)
+            worlds.put(index, table, normal_table(obstacles, Window(0, 0, *obstacles.shape), outside, real), 2)
+
+    def make() -> Table:
+        return Table(worlds.allocate(2, real), 2 * real.itemsize * worlds.cells, fill)
+
+    return worlds.table(("normals", unknown, outside, real), make)
 
 
 def _surrounded(obstacles: np.ndarray, part: Window, outside: bool) -> np.ndarray:

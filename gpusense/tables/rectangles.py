@@ -11,7 +11,9 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
+from gpusense.backends.workspace import Workspace
 from gpusense.tables.cells import as_bytes, check_size, packed
+from gpusense.tables.worlds import Stack, Table, Worlds
 from gpusense.world.windows import Window
 
 _INT = np.dtype(np.int32)
@@ -59,7 +61,7 @@ class Planes:
         return 4 * self.sectors * self.lines(rows) * (cols + 2)
 
 
-def planes_of(backend: Backend, rows: int, cols: int) -> Planes:
+def planes_of(backend: Backend, rows: int, cols: int, all_cells: int = 0) -> Planes:
     """Return the planes of a map on a device.
 
     GPUs gain most from sectors, since a warp waits for its slowest ray. Memory limits rays once planes exceed a GPU's
@@ -70,7 +72,7 @@ def planes_of(backend: Backend, rows: int, cols: int) -> Planes:
     sectors = 1 if backend.info.backend == "numpy" else 4 if gpu and cells <= _FOUR_SECTORS else 2
     while sectors > 1 and (
         4 * sectors * (rows + ROWS + 2) * (cols + 4) >= 1 << 31
-        or 8 * sectors * (rows + ROWS + 2) * (cols + 4) > backend.info.max_buffer
+        or 8 * sectors * max((rows + ROWS + 2) * (cols + 4), all_cells) > backend.info.max_buffer
     ):
         sectors //= 2
     return Planes(sectors, ROWS if gpu and cells > _CACHED else 1)
@@ -98,18 +100,76 @@ def empty_rectangles(
     end = min(right + RECTANGLE_REACH, cols)
     near = obstacles[first : bottom + RECTANGLE_REACH]
     band = len(near)
-    runs = backend.empty(2 * band * cols, _BYTE)
-    place = (rows, cols, planes.sectors, first, band, top, left, bottom, right)
+    space, place = Workspace(backend), backend.upload(np.zeros(1, _INT))
+    changed_part = (rows, cols, planes.sectors, first, band, top, left, bottom, right)
     if backend.info.kind == "cpu":
-        strips, height = -(-(end - begin) // 64), min(changed.rows + RECTANGLE_REACH, rows)
-        columns = backend.compile("free_columns", _NO_FLAGS)
-        columns((strips, 2), backend.upload(as_bytes(near)), runs, band, cols, begin, end)
-        stack = backend.empty(_STACK * height, _INT)
-        backend.compile("rectangles_rows", _NO_FLAGS)((height, 4), runs, stack, rectangles, *place)
+        marked = backend.upload(as_bytes(near))
     else:
-        words, bits = -(-cols // 32), backend.upload(packed(near))
-        backend.compile("free_rows", _NO_FLAGS)((end - begin, band), bits, runs, band, cols, words, begin, end)
-        size = (min(changed.cols + RECTANGLE_REACH, cols), min(changed.rows + RECTANGLE_REACH, rows), 4)
-        backend.compile("rectangles_scan", _NO_FLAGS)(size, runs, rectangles, *place, planes.lines(rows), planes.group)
+        marked = backend.upload(packed(near))
+    _make(backend, space, marked, place, rectangles, planes, changed_part, (begin, end), 1)
     backend.synchronize()
     return rectangles
+
+
+def rectangles_of_worlds(worlds: Worlds, unknown: str) -> tuple[Table, frozenset[str]]:
+    """Return the planes of empty rectangles of all worlds, which models share, and their flags."""
+    backend = worlds.backend
+    rows, cols = worlds.shape
+    planes = planes_of(backend, rows, cols, worlds.cells)
+    planes = Planes(planes.sectors)
+
+    def fill(stack: Stack, table: Buffer) -> None:
+        occupied, bits = worlds.marked(stack, unknown)
+        whole = (stack.rows, stack.cols, planes.sectors, 0, stack.rows, 0, 0, stack.rows, stack.cols)
+        marked = occupied if backend.info.kind == "cpu" else bits
+        _make(backend, stack.space, marked, stack.place, table, planes, whole, (0, stack.cols), stack.worlds)
+
+    def make() -> Table:
+        each = 4 * planes.sectors
+        return Table(worlds.allocate(each, _SHORT), 2 * each * worlds.cells, fill)
+
+    return worlds.table(("rectangles", unknown), make), planes.flags
+
+
+def _make(
+    backend: Backend,
+    space: Workspace,
+    marked: Buffer,
+    place: Buffer,
+    rectangles: Buffer,
+    planes: Planes,
+    changed_part: tuple[int, ...],
+    columns: tuple[int, int],
+    worlds: int,
+) -> None:
+    """Start the launches that make planes of some worlds.
+
+    Args:
+        backend: The device.
+        space: Memory of runs and stacks.
+        marked: Obstacles of a band of rows, whose lines are interleaved: bytes on a processor, else bits.
+        place: First cell of each world in tables with a ring.
+        rectangles: The planes.
+        planes: How they are stored.
+        changed_part: Rows, columns, sectors, the band's first row and its rows, and the changed window.
+        columns: The first column of runs and the one after the last.
+        worlds: Number of worlds.
+    """
+    rows, cols, _, _, band, top, left, bottom, right = changed_part
+    begin, end = columns
+    runs = space.empty("runs", 2 * band * cols * worlds, _BYTE)
+    if backend.info.kind == "cpu":
+        # Columns do not depend on each other, so those of all worlds are columns of one map.
+        first, last = (begin, end) if worlds == 1 else (0, cols * worlds)
+        strips, height = -(-(last - first) // 64), min(bottom - top + RECTANGLE_REACH, rows)
+        columns_kernel = backend.compile("free_columns", _NO_FLAGS)
+        columns_kernel((strips, 2), marked, runs, band, cols * worlds, first, last)
+        stack = space.empty("stack", _STACK * height * worlds, _INT)
+        rows_kernel = backend.compile("rectangles_rows", _NO_FLAGS)
+        rows_kernel((height, 4 * worlds), runs, place, stack, rectangles, *changed_part, worlds)
+        return
+    words, lines = -(-cols // 32), band * worlds
+    backend.compile("free_rows", _NO_FLAGS)((end - begin, lines), marked, runs, lines, cols, words, begin, end)
+    size = (min(right - left + RECTANGLE_REACH, cols), min(bottom - top + RECTANGLE_REACH, rows), 4 * worlds)
+    scan = backend.compile("rectangles_scan", _NO_FLAGS)
+    scan(size, runs, place, rectangles, *changed_part, worlds, planes.lines(rows), planes.group)

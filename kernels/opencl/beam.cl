@@ -15,12 +15,19 @@ real ray_limit(const real z, global const MixtureTerms *terms, const RangeScale 
 // Return the expected range of beam r, of a ray or a cone of rays, and the cosine of incidence of a cone.
 real2 cast_beam(global const entry *map_table, global const real2 *normals, const Window window, const int2 cell,
                 const real4 pose, global const real2 *ray, const int r, const Cone cone, const real limit,
-                const Caster caster, const RangeScale scale) {
+                const Caster caster, const RangeScale scale, global const real *shapes, global const int2 *world,
+                const Crowd crowd, const int n) {
 #if CONES
-    const Echo echo = nearest_echo(map_table, normals, window, cell, pose, ray + r * cone.rays, cone, limit, caster);
+    const Echo echo = nearest_echo(map_table, normals, window, cell, pose, ray + r * cone.rays, cone, limit, caster,
+                                   shapes, world, crowd, n);
     return (real2)(expected_range(echo.t, scale), echo.cosine);
 #else
-    return (real2)(expected_range(cast_ray(map_table, window, cell, pose, ray[r], limit, caster), scale), 1);
+    const real met = cast_ray(map_table, window, cell, pose, ray[r], limit, caster);
+#if SHAPES
+    return (real2)(expected_range(nearest_shape(shapes, world, crowd, n, cell, pose, ray[r], met).x, scale), 1);
+#else
+    return (real2)(expected_range(met, scale), 1);
+#endif
 #endif
 }
 
@@ -75,14 +82,21 @@ kernel void score_beams(ARGUMENTS) {
     const int size = rays, begin = 0;
     const real constant_term = score.constant_term;
 #endif
+#if WORLDS
+    const Window seen = world_window(world, n);
+    map_table += world_begin(world, n, PLANES);
+    normals += world_begin(world, n, 1);
+#else
+    const Window seen = window;
+#endif
     real2 total = (real2)(constant_term, 0);
     real strands[STRANDS] = {0, 0, 0, 0};
 #if !LINEAR
     int impossible = 0;
 #endif
     for (int r = 0; r < size; ++r) {
-        const real2 expected = cast_beam(map_table, normals, window, pose_cell[n], pose[n], ray, r, cone,
-                                         ray_limit(reading[r], terms, scale), caster, scale);
+        const real2 expected = cast_beam(map_table, normals, seen, pose_cell[n], pose[n], ray, r, cone,
+                                         ray_limit(reading[r], terms, scale), caster, scale, shapes, world, crowd, n);
 #if INCIDENCE
         global const MixtureTerms *bin_terms = incidence_terms(terms, edges, tables.incidence_bins, expected.y);
 #else
@@ -147,14 +161,21 @@ kernel void beam_tiles(ARGUMENTS) {
 #else
     const int size = rays, begin = 0;
 #endif
+#if WORLDS
+    const Window seen = world_window(world, n);
+    map_table += world_begin(world, n, PLANES);
+    normals += world_begin(world, n, 1);
+#else
+    const Window seen = window;
+#endif
 #if STRANDED
     real sum = 0;
     for (int r = tile_group(item, spread) * BLOCK_TERMS + item % TILE_RAYS; r < size;) {
 #else
     for (int r = tile_ray(item, spread); r < size; r += tile_step(spread)) {
 #endif
-        const real2 expected = cast_beam(map_table, normals, window, cell, sensor_pose, ray, r, cone,
-                                         ray_limit(reading[r], terms, scale), caster, scale);
+        const real2 expected = cast_beam(map_table, normals, seen, cell, sensor_pose, ray, r, cone,
+                                         ray_limit(reading[r], terms, scale), caster, scale, shapes, world, crowd, n);
 #if INCIDENCE
         global const MixtureTerms *bin_terms = incidence_terms(terms, edges, tables.incidence_bins, expected.y);
 #else

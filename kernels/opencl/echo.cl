@@ -2,7 +2,7 @@
 // incidence lies between the ray and the normal of the surface that it hits. The table of normals has a ring of cells
 // around the map. It holds 0 for free cells and NaN for occupied cells without a normal, at which the cosine counts as
 // 1.
-// requires: caster mixture
+// requires: caster mixture shapes
 
 #if CONES
 // Distance in cells, and cosine and sine of the angle of incidence. A beam without a return gets limit, 2 and 0: 2
@@ -54,7 +54,8 @@ global const MixtureTerms *incidence_terms(global const MixtureTerms *terms, glo
 // Return the nearest return of a cone's rays. A ray whose angle of incidence has a cosine below critical has none: the
 // surface reflects it like a mirror.
 Echo nearest_echo(global const entry *map_table, global const real2 *normals, const Window window, const int2 cell,
-                  const real4 pose, global const real2 *ray, const Cone cone, const real limit, const Caster caster) {
+                  const real4 pose, global const real2 *ray, const Cone cone, const real limit, const Caster caster,
+                  global const real *shapes, global const int2 *world, const Crowd crowd, const int n) {
     Echo echo = {limit, 2, 0};
     for (int i = 0; i < cone.rays; ++i) {
         // Most casters may stop at the nearest return so far; casters of tables and lines may not.
@@ -65,9 +66,22 @@ Echo nearest_echo(global const entry *map_table, global const real2 *normals, co
 #if BRESENHAM
         farthest = limit;
 #endif
-        const real t = cast_ray(map_table, window, cell, pose, ray[i], farthest, caster);
+        const real met = cast_ray(map_table, window, cell, pose, ray[i], farthest, caster);
+#if SHAPES
+        const real2 shape = nearest_shape(shapes, world, crowd, n, cell, pose, ray[i], met);
+        const real t = shape.x;
+#else
+        const real t = met;
+#endif
         if (!(t < echo.t)) continue;
 #if INCIDENCE
+#if SHAPES
+        if (t < met) {
+            if (shape.y < cone.critical) continue;
+            echo = (Echo){t, shape.y, sqrt((1 - shape.y) * (1 + shape.y))};
+            continue;
+        }
+#endif
         const Ray r = make_ray(pose, ray[i]);
         const real2 normal = hit_normal(normals, window, cell, r, t);
         const int known = !isnan(normal.x);
@@ -86,8 +100,15 @@ Echo nearest_echo(global const entry *map_table, global const real2 *normals, co
 kernel void cast_echoes(ARGUMENTS) {
     const int k = get_global_id(0), n = get_global_id(1);
     if (k >= rays || n >= particles) return;
-    const Echo echo = nearest_echo(map_table, normals, window, pose_cell[n], pose[n], ray + k * cone.rays, cone,
-                                   scale.limit, caster);
+#if WORLDS
+    const Window seen = world_window(world, n);
+    map_table += world_begin(world, n, PLANES);
+    normals += world_begin(world, n, 1);
+#else
+    const Window seen = window;
+#endif
+    const Echo echo = nearest_echo(map_table, normals, seen, pose_cell[n], pose[n], ray + k * cone.rays, cone,
+                                   scale.limit, caster, shapes, world, crowd, n);
     ranges[(long)n * rays + k] = expected_range(echo.t, scale);
 #if INCIDENCE
 #if COSINES

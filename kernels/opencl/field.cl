@@ -72,11 +72,18 @@ kernel void score_field(ARGUMENTS) {
 #else
     const real4 low = (real4)(0);
 #endif
+#if WORLDS
+    const Window seen = world_window(world, n);
+    table += world_begin(world, n, 1);
+#else
+    const Window seen = window;
+#endif
     real2 total = (real2)(constant_term, 0);
     real block = 0;
     for (int k = 0; k < size; ++k) {
         const real term =
-            reading_value(table, origin, pose[n], low, point[k], point_low[k], terms, window, guard);
+            reading_value(table, origin, pose[n], low, point[k], point_low[k], terms, seen, guard, shapes, world, crowd,
+                          n);
 #if PER_BEAM
         parts[(long)n * readings + k] = term;
 #endif
@@ -111,15 +118,22 @@ kernel void field_blocks(ARGUMENTS) {
 #else
     const real4 low = (real4)(0);
 #endif
+#if WORLDS
+    const Window seen = world_window(world, n);
+    table += world_begin(world, n, 1);
+#else
+    const Window seen = window;
+#endif
     for (int block = (item / GROUP) & ((1 << spread) - 1); block * BLOCK_TERMS < size; block += 1 << spread) {
         const int begin = block * BLOCK_TERMS, end = min(begin + BLOCK_TERMS, size);
 #if ROUNDED_CELLS
-        const real sum = rounded_block(table, origin, sensor_pose, low, point, point_low, begin, end, terms->z_max, window,
+        const real sum = rounded_block(table, origin, sensor_pose, low, point, point_low, begin, end, terms->z_max, seen,
                                        guard[block]);
 #else
         real sum = 0;
         for (int k = begin; k < end; ++k)
-            sum += reading_value(table, origin, sensor_pose, low, point[k], point_low[k], terms, window, guard[block]);
+            sum += reading_value(table, origin, sensor_pose, low, point[k], point_low[k], terms, seen, guard[block],
+                                 shapes, world, crowd, n);
 #endif
         parts[n + (long)block * particles] = sum;
     }

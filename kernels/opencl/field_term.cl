@@ -1,6 +1,6 @@
 // Term of one reading in the likelihood field (book table 6.3): log p of the distance from an end point to the nearest
 // obstacle, looked up in the cell of the end point or interpolated between four cells.
-// requires: end_point hit_shape
+// requires: end_point hit_shape shapes
 
 #if BILINEAR
 // Return the weighted sum of a and b, all of two parts. No term is negative, so small values keep their digits.
@@ -62,24 +62,43 @@ real log_field(const real2 distance, global const FieldTerms *terms) {
 }
 #endif
 
+#if SHAPES
+// Return an end point relative to the pose's cell, in cells.
+real2 end_in_cells(const real4 pose, const real2 point) {
+    return (real2)(pose.x + (pose.z * point.x - pose.w * point.y), pose.y + (pose.w * point.x + pose.z * point.y));
+}
+#endif
+
 // Return the term of one reading. The table holds log densities, or cubes of densities (CUBES), or, where it is
 // interpolated, capped distances in metres.
 real reading_value(global const real *table, const int2 origin, const real4 pose, const real4 low, const real2 point,
-                   const real2 point_low, global const FieldTerms *terms, const Window window, const real guard) {
+                   const real2 point_low, global const FieldTerms *terms, const Window window, const real guard,
+                   global const real *shapes, global const int2 *world, const Crowd crowd, const int n) {
 #if ALL_READINGS
     if (isnan(point.x)) return 0;
     if (isinf(point.x)) return terms->z_max;  // 3: failure
 #endif
 #if BILINEAR
     const EndPoint end = end_point(pose, low, point, point_low, (real)0.5, guard);
-    return log_field(bilinear(table, origin + end.cell, end, window), terms);
+    const real2 distance = bilinear(table, origin + end.cell, end, window);
+#if SHAPES
+    const real near = crowd.side * shape_distance(shapes, world, crowd, n, origin, end_in_cells(pose, point));
+    return log_field(near < distance.x ? (real2)(near, 0) : distance, terms);
+#else
+    return log_field(distance, terms);
+#endif
 #else
     const EndPoint end = end_point(pose, low, point, point_low, 0, guard);
     const real value = table[field_cell(origin.x + end.cell.x, origin.y + end.cell.y, window)];
 #if LOG_TABLE
     return value;
 #else
+#if SHAPES
+    const real near = crowd.side * shape_distance(shapes, world, crowd, n, origin, end_in_cells(pose, point));
+    return log_field((real2)(near < value ? near : value, 0), terms);
+#else
     return log_field((real2)(value, 0), terms);
+#endif
 #endif
 #endif
 }

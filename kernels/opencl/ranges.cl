@@ -1,11 +1,22 @@
 // Expected ranges of poses and bearings by any caster.
-// requires: caster tiles
+// requires: caster tiles shapes
 
 // Cast rays: one work-item takes a particle and ray.
 kernel void cast_ranges(ARGUMENTS) {
     const int k = get_global_id(0), n = get_global_id(1);
     if (k >= rays || n >= particles) return;
-    const real t = cast_ray(map_table, window, pose_cell[n], pose[n], ray[k], scale.limit, caster);
+#if WORLDS
+    const Window seen = world_window(world, n);
+    map_table += world_begin(world, n, PLANES);
+#else
+    const Window seen = window;
+#endif
+    const real met = cast_ray(map_table, seen, pose_cell[n], pose[n], ray[k], scale.limit, caster);
+#if SHAPES
+    const real t = nearest_shape(shapes, world, crowd, n, pose_cell[n], pose[n], ray[k], met).x;
+#else
+    const real t = met;
+#endif
     ranges[(long)n * rays + k] = expected_range(t, scale);
 }
 
@@ -21,8 +32,19 @@ kernel void cast_tiles(ARGUMENTS) {
 #endif
     const int2 cell = pose_cell[n];
     const real4 sensor_pose = pose[n];
+#if WORLDS
+    const Window seen = world_window(world, n);
+    map_table += world_begin(world, n, PLANES);
+#else
+    const Window seen = window;
+#endif
     for (int k = tile_ray(item, spread); k < rays; k += tile_step(spread)) {
-        const real t = cast_ray(map_table, window, cell, sensor_pose, ray[k], scale.limit, caster);
+        const real met = cast_ray(map_table, seen, cell, sensor_pose, ray[k], scale.limit, caster);
+#if SHAPES
+        const real t = nearest_shape(shapes, world, crowd, n, cell, sensor_pose, ray[k], met).x;
+#else
+        const real t = met;
+#endif
         ranges[n * rays + k] = expected_range(t, scale);
     }
 }

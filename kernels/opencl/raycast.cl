@@ -15,6 +15,9 @@ typedef ushort entry;
 #endif
 #endif
 
+// Planes of a map.
+#define PLANES (4 * SECTORS)
+
 // Return the sector of a direction within its quadrant, from flat to steep. A wrong sector would cost steps, but not
 // change the result.
 int sector_of(const real speed_x, const real speed_y) {

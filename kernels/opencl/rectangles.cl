@@ -7,6 +7,9 @@
 // Planes store rows one after the other, or in groups: a group is stored column by column, so that vertical neighbours
 // are as close in memory as horizontal neighbours.
 //
+// Planes of several worlds of one size are made together: the runs of row i of world w are line i * worlds + w, and
+// place[w] is the world's first cell in tables with a ring of two cells.
+//
 // Planes can be updated after a change of the cells in rows [top, bottom) and columns [left, right) of the map: only
 // cells whose rectangles can contain one of these are computed. For new planes all cells have changed. The input has a
 // band of whole rows of the map, from row first on.
@@ -59,20 +62,22 @@ kernel void free_columns(ARGUMENTS) {
 }
 
 // Find the rectangles along rows, from the far end of a row to its begin. For processors: one work-item takes a row and
-// quadrant. The widest rectangle of sufficient height is at most one column wider than its neighbour's. The stack has
-// the columns that bound its height, each lower than all before it: free cells in the upper 16 bits, and the last 16
-// bits of the column, which give the distance.
+// quadrant of a world. The widest rectangle of sufficient height is at most one column wider than its neighbour's. The
+// stack has the columns that bound its height, each lower than all before it: free cells in the upper 16 bits, and the
+// last 16 bits of the column, which give the distance.
 kernel void rectangles_rows(ARGUMENTS) {
-    const int quadrant = get_global_id(1), dx = quadrant & 1 ? -1 : 1, dy = quadrant & 2 ? -1 : 1;
+    const int quadrant = get_global_id(1) & 3, dx = quadrant & 1 ? -1 : 1, dy = quadrant & 2 ? -1 : 1;
+    const int w = get_global_id(1) >> 2;
     const int row = reach_begin(dy, top) + get_global_id(0);
-    if (row >= reach_end(dy, bottom, rows)) return;
-    global const uchar *run = runs + (long)((dy > 0 ? 0 : band) + row - first) * cols;
-    global int *waiting = stack + ((long)(row - reach_begin(dy, top)) * 4 + quadrant) * STACK;
+    if (row >= reach_end(dy, bottom, rows) || w >= worlds) return;
+    global const uchar *run = runs + ((long)((dy > 0 ? 0 : band) + row - first) * worlds + w) * cols;
+    global int *waiting = stack + ((long)(row - reach_begin(dy, top)) * 4 * worlds + 4 * w + quadrant) * STACK;
     const int begin = reach_begin(dx, left), end = reach_end(dx, right, cols);
     const int scanned = dx > 0 ? min(end + RECTANGLE_REACH, cols) - begin : end - max(begin - RECTANGLE_REACH, 0);
     for (int sector = 0; sector < sectors; ++sector) {
         const int2 middle = slope(sectors, sector);
-        global ushort *out = rectangles + (long)(quadrant * sectors + sector) * (rows + 2) * (cols + 2);
+        global ushort *out = rectangles + (long)place[w] * 4 * sectors +
+                             (long)(quadrant * sectors + sector) * (rows + 2) * (cols + 2);
         int oldest = 0, newest = 0, width = 0;
         for (int i = 0; i < scanned; ++i) {
             const int col = dx > 0 ? begin + scanned - 1 - i : end - scanned + i, here = run[col];
@@ -112,14 +117,17 @@ kernel void free_rows(ARGUMENTS) {
 // Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a cell and
 // quadrant; the first work-item of a quadrant takes the first of its cells.
 kernel void rectangles_scan(ARGUMENTS) {
-    const int quadrant = get_global_id(2), dx = quadrant & 1 ? -1 : 1, dy = quadrant & 2 ? -1 : 1;
+    const int quadrant = get_global_id(2) & 3, w = get_global_id(2) >> 2;
+    const int dx = quadrant & 1 ? -1 : 1, dy = quadrant & 2 ? -1 : 1;
     const int col = reach_begin(dx, left) + get_global_id(0), row = reach_begin(dy, top) + get_global_id(1);
-    if (col >= reach_end(dx, right, cols) || row >= reach_end(dy, bottom, rows)) return;
-    global const uchar *run = runs + (long)(quadrant & 1) * band * cols + (long)(row - first) * cols + col;
+    if (col >= reach_end(dx, right, cols) || row >= reach_end(dy, bottom, rows) || w >= worlds) return;
+    global const uchar *run =
+        runs + (long)(quadrant & 1) * band * worlds * cols + ((long)(row - first) * worlds + w) * cols + col;
     const long plane = (long)lines * (cols + 2);
-    global ushort *out = rectangles + quadrant * sectors * plane + padded_in_groups(row, col, cols, group);
+    global ushort *out = rectangles + (long)place[w] * 4 * sectors + quadrant * sectors * plane;
+    out += padded_in_groups(row, col, cols, group);
     const int room = min(dy > 0 ? rows - row : row + 1, LONGEST);
-    const long step = (long)dy * cols;
+    const long step = (long)dy * worlds * cols;
     int width = LONGEST, sector = 0, height = 1;
     int2 middle = slope(sectors, 0);
     while (sector < sectors) {

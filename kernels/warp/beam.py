@@ -10,10 +10,12 @@ import warp as wp
 
 from . import compat, echo, error_free, mixture, sensor_table
 from . import ray as ray_file
+from . import shapes as shapes_file
 from .error_free import BLOCK_TERMS, STRANDS
 from .lanes import mixture as lane_mixture
-from .prelude import kernel, precision, reader, work_item, writer
+from .prelude import behind, kernel, precision, reader, work_item, writer
 from .ranges import caster_of
+from .shapes import world_begin, world_window
 from .tiles import TILE_RAYS, tile_group, tile_place, tile_ray, tile_step
 
 
@@ -46,6 +48,10 @@ def make(name, flags):
     CONES = "CONES" in flags
     INCIDENCE = "INCIDENCE" in flags
     SCANS = "SCANS" in flags
+    WORLDS, SHAPES = "WORLDS" in flags, "SHAPES" in flags
+    nearest_shape = shapes_file.functions(flags).nearest_shape
+    table_behind, normals_behind = behind(ENTRY), behind(vec2)
+    PLANES = getattr(casting.functions(flags), "PLANES", 0)
     nearest_echo = echo.functions(flags).nearest_echo
     incidence_terms = echo.functions(flags).incidence_terms
     block_numbers = wp.types.vector(length=BLOCK_TERMS, dtype=real)
@@ -67,13 +73,19 @@ def make(name, flags):
     def cast_beam(
         map_table: wp.array(dtype=ENTRY), normals: wp.array(dtype=vec2), window: types.Window, cell: wp.vec2i,
         sensor_pose: vec4, ray: wp.array(dtype=vec2), r: wp.int32, cone: types.Cone, limit: real,
-        caster: types.Caster, scale: types.RangeScale,
+        caster: types.Caster, scale: types.RangeScale, shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i),
+        crowd: types.Crowd, n: wp.int32,
     ):  # fmt: skip
         if CONES:
-            heard = nearest_echo(map_table, normals, window, cell, sensor_pose, ray, r * cone.rays, cone, limit, caster)
+            heard = nearest_echo(
+                map_table, normals, window, cell, sensor_pose, ray, r * cone.rays, cone, limit, caster, shapes, world,
+                crowd, n,
+            )  # fmt: skip
             return vec2(expected_range(heard.t, scale), heard.cosine)
         else:
             t = cast_ray(map_table, window, cell, sensor_pose, ray_at(ray, r), limit, caster)
+            if SHAPES:
+                t = nearest_shape(shapes, world, crowd, n, cell, sensor_pose, ray_at(ray, r), t).x
             return vec2(expected_range(t, scale), ONE)
 
     # Return the term of one reading in the sum.
@@ -128,8 +140,9 @@ def make(name, flags):
     # fewer than 2^31 parts.
     @kernel(flags, entry=ENTRY)
     def score_beams(
-        map_table, normals, pose_cell, pose, ray, first, reading, terms, masses, edges, sensor, start, constant_terms,
-        log_p, parts, window, particles, rays, readings, tables, cone, caster, scale, score, batch,
+        map_table, world, shapes, normals, pose_cell, pose, ray, first, reading, terms, masses, edges, sensor, start,
+        constant_terms, log_p, parts, window, particles, rays, readings, tables, cone, caster, scale, crowd, score,
+        batch,
     ):  # fmt: skip
         n = wp.tid()
         if n >= particles:
@@ -147,6 +160,13 @@ def make(name, flags):
         count = int(size)
         if SHARED_RAYS:
             count = first[before + size] - readings_before
+        table = map_table
+        walls = normals
+        seen_part = window
+        if WORLDS:
+            table = table_behind(map_table, world_begin(world, n, PLANES))
+            walls = normals_behind(normals, world_begin(world, n, 1))
+            seen_part = world_window(world, n)
         total = vec2(constant_term, ZERO)
         impossible = int(0)
         z, expected, cosine, values = block_numbers(), block_numbers(), block_numbers(), block_numbers()
@@ -166,14 +186,16 @@ def make(name, flags):
                     # Readings of a ray are neighbours.
                     while ray_end <= k + i:
                         seen = cast_beam(
-                            map_table, normals, window, cell, sensor_pose, ray, before + r, cone, limit, caster, scale
-                        )
+                            table, walls, seen_part, cell, sensor_pose, ray, before + r, cone, limit, caster, scale,
+                            shapes, world, crowd, n,
+                        )  # fmt: skip
                         r += 1
                         ray_end = first[before + r] - readings_before
                 else:
                     seen = cast_beam(
-                        map_table, normals, window, cell, sensor_pose, ray, before + k + i, cone, limit, caster, scale
-                    )
+                        table, walls, seen_part, cell, sensor_pose, ray, before + k + i, cone, limit, caster, scale,
+                        shapes, world, crowd, n,
+                    )  # fmt: skip
                 expected[i] = seen.x
                 if INCIDENCE:
                     cosine[i] = seen.y
@@ -218,8 +240,8 @@ def make(name, flags):
     # the number at place k is the sum of strand k, and a work-item takes whole strands.
     @kernel(flags, entry=ENTRY)
     def beam_tiles(
-        map_table, normals, pose_cell, pose, order, ray, first, reading, terms, masses, edges, sensor, start, parts,
-        window, particles, rays, readings, tables, cone, caster, scale, spread, batch,
+        map_table, world, shapes, normals, pose_cell, pose, order, ray, first, reading, terms, masses, edges, sensor,
+        start, parts, window, particles, rays, readings, tables, cone, caster, scale, crowd, spread, batch,
     ):  # fmt: skip
         item = work_item(wp.tid())
         place = tile_place(item, spread)
@@ -235,6 +257,13 @@ def make(name, flags):
         readings_before = int(0)
         if SCANS:
             before, size, readings_before = readings_of_scan(n // batch.per_scan, start, first)
+        table = map_table
+        walls = normals
+        seen_part = window
+        if WORLDS:
+            table = table_behind(map_table, world_begin(world, n, PLANES))
+            walls = normals_behind(normals, world_begin(world, n, 1))
+            seen_part = world_window(world, n)
         strand_sum = real(0.0)
         if STRANDED:
             r = tile_group(item, spread) * BLOCK_TERMS + item % TILE_RAYS
@@ -245,8 +274,9 @@ def make(name, flags):
             if STOPS:
                 limit = ray_limit(number_at(reading, readings_before + r), terms, scale)
             expected = cast_beam(
-                map_table, normals, window, cell, sensor_pose, ray, before + r, cone, limit, caster, scale
-            )
+                table, walls, seen_part, cell, sensor_pose, ray, before + r, cone, limit, caster, scale, shapes, world,
+                crowd, n,
+            )  # fmt: skip
             bin_terms = terms
             if INCIDENCE:
                 bin_terms = incidence_terms(terms, edges, tables.incidence_bins, expected.y)

@@ -12,10 +12,12 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import ray as ray_file
-from .prelude import kernel, precision
+from . import shapes as shapes_file
+from .prelude import behind, kernel, precision
 from .ranges import caster_of
 from .ray import off_grid
 from .rectangles import padded
+from .shapes import world_begin, world_window
 
 
 @functools.cache
@@ -29,6 +31,8 @@ def functions(flags):
     geometry = ray_file.functions(flags)
     Ray, make_ray = geometry.Ray, geometry.make_ray
     crossed, whole = geometry.crossed, geometry.whole
+    nearest_shape = shapes_file.functions(flags).nearest_shape
+    SHAPES = "SHAPES" in flags
     INCIDENCE = "INCIDENCE" in flags
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
     TO_THE_LIMIT = bool({"LOOKUP", "BRESENHAM"} & flags)
@@ -91,6 +95,7 @@ def functions(flags):
     def nearest_echo(
         map_table: wp.array(dtype=ENTRY), normals: wp.array(dtype=vec2), window: types.Window, cell: wp.vec2i,
         pose: vec4, ray: wp.array(dtype=vec2), first: wp.int32, cone: types.Cone, limit: real, caster: types.Caster,
+        shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32,
     ):  # fmt: skip
         echo = Echo()
         echo.t = limit
@@ -100,7 +105,12 @@ def functions(flags):
             farthest = real(echo.t)
             if TO_THE_LIMIT:
                 farthest = limit
-            t = cast_ray(map_table, window, cell, pose, ray[i], farthest, caster)
+            met = cast_ray(map_table, window, cell, pose, ray[i], farthest, caster)
+            t = met
+            shape = vec2()
+            if SHAPES:
+                shape = nearest_shape(shapes, world, crowd, n, cell, pose, ray[i], met)
+                t = shape.x
             if t < echo.t:
                 if INCIDENCE:
                     r = make_ray(pose, ray[i])
@@ -108,11 +118,15 @@ def functions(flags):
                     # A comparison, since compilers of processors call isnan.
                     known = normal.x == normal.x
                     cosine = wp.where(known, wp.abs(r.direction.x * normal.x + r.direction.y * normal.y), ONE)
+                    if SHAPES:
+                        cosine = wp.where(t < met, shape.y, cosine)
                     if cosine >= cone.critical:
                         echo.t = t
                         echo.cosine = cosine
                         aslant = wp.abs(r.direction.x * normal.y - r.direction.y * normal.x)
                         echo.sine = wp.where(known, aslant, ZERO)
+                        if SHAPES:
+                            echo.sine = wp.where(t < met, wp.sqrt((ONE - cosine) * (ONE + cosine)), echo.sine)
                 else:
                     echo.t = t
         return echo
@@ -125,7 +139,10 @@ def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real = types.real
-    ENTRY = caster_of(flags).ENTRY
+    casting = caster_of(flags)
+    ENTRY, PLANES = casting.ENTRY, getattr(casting.functions(flags), "PLANES", 0)
+    table_behind, normals_behind = behind(ENTRY), behind(types.vec2)
+    WORLDS = "WORLDS" in flags
     nearest_echo = functions(flags).nearest_echo
     expected_range = ray_file.functions(flags).expected_range
     INCIDENCE = "INCIDENCE" in flags
@@ -136,14 +153,23 @@ def make(name, flags):
     # 2 without a return. One work-item takes a particle and cone; a launch has fewer than 2^31.
     @kernel(flags, entry=ENTRY)
     def cast_echoes(
-        map_table, normals, pose_cell, pose, ray, ranges, incidence, window, particles, rays, cone, caster, scale
-    ):
+        map_table, world, shapes, normals, pose_cell, pose, ray, ranges, incidence, window, particles, rays, cone,
+        caster, scale, crowd,
+    ):  # fmt: skip
         n, k = wp.tid()
         if k >= rays or n >= particles:
             return
+        table = map_table
+        walls = normals
+        seen = window
+        if WORLDS:
+            table = table_behind(map_table, world_begin(world, n, PLANES))
+            walls = normals_behind(normals, world_begin(world, n, 1))
+            seen = world_window(world, n)
         echo = nearest_echo(
-            map_table, normals, window, pose_cell[n], pose[n], ray, k * cone.rays, cone, scale.limit, caster
-        )
+            table, walls, seen, pose_cell[n], pose[n], ray, k * cone.rays, cone, scale.limit, caster, shapes, world,
+            crowd, n,
+        )  # fmt: skip
         ranges[n * rays + k] = expected_range(echo.t, scale)
         if INCIDENCE and COSINES:
             incidence[n * rays + k] = echo.cosine

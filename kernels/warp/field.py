@@ -13,7 +13,8 @@ from . import error_free, field_term
 from .end_point import field_cell
 from .error_free import BLOCK_TERMS
 from .lanes import field_term as lane_field_term
-from .prelude import field_readers, kernel, precision, reader, work_item
+from .prelude import behind, field_readers, kernel, precision, reader, work_item
+from .shapes import world_begin, world_window
 
 # Particles per work-group of field_blocks.
 GROUP = wp.constant(64)
@@ -35,6 +36,7 @@ def make(name, flags):
     PER_BEAM = "PER_BEAM" in flags
     ROUNDED_CELLS = "ROUNDED_CELLS" in flags
     SCANS = "SCANS" in flags
+    WORLDS, rest_of = "WORLDS" in flags, behind(real)
     ZERO, HALF = real(0.0), real(0.5)
     # Constants of loops that Warp shall unroll.
     WHOLE_BLOCK, HALF_BLOCK = 16, 8
@@ -136,12 +138,17 @@ def make(name, flags):
     # Score scans: one work-item takes a particle.
     @kernel(flags)
     def score_field(
-        table, pose_cell, pose, pose_low, point, point_low, terms, start, constant_terms, log_p, parts, window,
-        particles, readings, guard, score, batch,
+        table, world, shapes, pose_cell, pose, pose_low, point, point_low, terms, start, constant_terms, log_p, parts,
+        window, particles, readings, guard, score, batch, crowd,
     ):  # fmt: skip
         n = wp.tid()
         if n >= particles:
             return
+        field = table
+        seen = window
+        if WORLDS:
+            field = rest_of(table, world_begin(world, n, 1))
+            seen = world_window(world, n)
         origin = pose_cell[n]
         sensor_pose = pose[n]
         sensor_low = vec4()
@@ -195,7 +202,7 @@ def make(name, flags):
                 k += width
         elif IN_LANES:
             total = staged_sum(
-                table, origin, sensor_pose, sensor_low, point, point_low, terms, parts, window, begin, size,
+                field, origin, sensor_pose, sensor_low, point, point_low, terms, parts, seen, begin, size,
                 n * readings, total,
             )  # fmt: skip
         else:
@@ -204,7 +211,9 @@ def make(name, flags):
                 to_low = vec2()
                 if TWO_PART_POINTS:
                     to_low = point_low[begin + k]
-                term = reading_value(table, origin, sensor_pose, sensor_low, to, to_low, terms, window, guard)
+                term = reading_value(
+                    field, origin, sensor_pose, sensor_low, to, to_low, terms, seen, guard, shapes, world, crowd, n
+                )
                 if PER_BEAM:
                     parts[n * readings + k] = term
                 block += term
@@ -220,13 +229,18 @@ def make(name, flags):
     # the longest one.
     @kernel(flags)
     def field_blocks(
-        table, pose_cell, pose, pose_low, point, point_low, terms, guard, start, parts, window, particles, readings,
-        spread, batch,
+        table, world, shapes, pose_cell, pose, pose_low, point, point_low, terms, guard, start, parts, window,
+        particles, readings, spread, batch, crowd,
     ):  # fmt: skip
         item = work_item(wp.tid())
         n = ((item // GROUP) >> spread) * GROUP + item % GROUP
         if n >= particles:
             return
+        field = table
+        seen = window
+        if WORLDS:
+            field = rest_of(table, world_begin(world, n, 1))
+            seen = world_window(world, n)
         origin = cell_at(pose_cell, n)
         sensor_pose = pose_at(pose, n)
         sensor_low = vec4()
@@ -248,7 +262,7 @@ def make(name, flags):
             block_guard = number_at(guard, guards + block)
             if ROUNDED_CELLS:
                 total = rounded_block(
-                    table, origin, sensor_pose, sensor_low, point, point_low, begin, end, term_of.z_max(terms), window,
+                    field, origin, sensor_pose, sensor_low, point, point_low, begin, end, term_of.z_max(terms), seen,
                     block_guard,
                 )  # fmt: skip
             else:
@@ -259,8 +273,9 @@ def make(name, flags):
                         to_low = point_at(point_low, k)
                     to = point_at(point, k)
                     total += reading_value(
-                        table, origin, sensor_pose, sensor_low, to, to_low, terms, window, block_guard
-                    )
+                        field, origin, sensor_pose, sensor_low, to, to_low, terms, seen, block_guard, shapes, world,
+                        crowd, n,
+                    )  # fmt: skip
                     k += 1
             parts[n + block * particles] = total
             block += 1 << spread

@@ -11,6 +11,7 @@ import warp as wp
 
 from . import end_point as end_points
 from . import error_free, hit_shape
+from . import shapes as shapes_file
 from .end_point import field_cell
 from .prelude import precision, reader
 
@@ -29,6 +30,8 @@ def functions(flags):
     number_at = reader(real)
     ALL_READINGS = "ALL_READINGS" in flags
     BILINEAR = "BILINEAR" in flags
+    SHAPES = "SHAPES" in flags
+    shape_distance = shapes_file.functions(flags).shape_distance
     HIT = "HIT" in flags
     LINEAR = "LINEAR" in flags
     LOG_TABLE = "LOG_TABLE" in flags
@@ -103,12 +106,18 @@ def functions(flags):
             else:
                 return hit
 
+    # Return an end point relative to the pose's cell, in cells.
+    @wp.func
+    def end_in_cells(pose: vec4, point: vec2):
+        return vec2(pose.x + (pose.z * point.x - pose.w * point.y), pose.y + (pose.w * point.x + pose.z * point.y))
+
     # Return the term of one reading. The table holds log densities, or cubes of densities (CUBES), or, where it is
     # interpolated, capped distances in metres.
     @wp.func
     def reading_value(
         table: wp.array(dtype=real), origin: wp.vec2i, pose: vec4, low: vec4, point: vec2, point_low: vec2,
-        terms: wp.array(dtype=types.FieldTerms), window: types.Window, guard: real,
+        terms: wp.array(dtype=types.FieldTerms), window: types.Window, guard: real, shapes: wp.array(dtype=real),
+        world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32,
     ):  # fmt: skip
         if ALL_READINGS:
             if wp.isnan(point.x):
@@ -118,12 +127,20 @@ def functions(flags):
         end = end_point(pose, low, point, point_low, SHIFT, guard)
         cell = origin + end.cell
         if BILINEAR:
-            return log_field(bilinear(table, cell, end, window), terms)
+            distance = bilinear(table, cell, end, window)
+            if SHAPES:
+                near = crowd.side * shape_distance(shapes, world, crowd, n, origin, end_in_cells(pose, point))
+                if near < distance.x:
+                    distance = vec2(near, ZERO)
+            return log_field(distance, terms)
         else:
             value = number_at(table, field_cell(cell.x, cell.y, window))
             if LOG_TABLE:
                 return value
             else:
+                if SHAPES:
+                    near = crowd.side * shape_distance(shapes, world, crowd, n, origin, end_in_cells(pose, point))
+                    value = wp.where(near < value, near, value)
                 return log_field(vec2(value, ZERO), terms)
 
     # Return the term of a reading by rounding alone, and the distance of the end point from the cell's centre. A

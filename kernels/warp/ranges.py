@@ -8,7 +8,9 @@ import warp as wp
 from gpusense.interface.casters import caster_file
 
 from . import ray as ray_file
-from .prelude import kernel, precision, reader, work_item, writer
+from . import shapes as shapes_file
+from .prelude import behind, kernel, precision, reader, work_item, writer
+from .shapes import world_begin, world_window
 from .tiles import tile_place, tile_ray, tile_step
 
 
@@ -26,21 +28,37 @@ def make(name, flags):
     ENTRY = casting.ENTRY
     cast_ray = casting.functions(flags).cast_ray
     expected_range = ray_file.functions(flags).expected_range
+    nearest_shape = shapes_file.functions(flags).nearest_shape
+    rest_of, PLANES = behind(ENTRY), getattr(casting.functions(flags), "PLANES", 0)
+    WORLDS, SHAPES = "WORLDS" in flags, "SHAPES" in flags
     ORDERED = "ORDERED" in flags
     cell_at, pose_at, ray_at, put = reader(wp.vec2i), reader(vec4), reader(vec2), writer(real)
 
     # Cast rays: one work-item takes a particle and ray. A launch has fewer than 2^31.
     @kernel(flags, entry=ENTRY)
-    def cast_ranges(map_table, pose_cell, pose, ray, ranges, window, particles, rays, caster, scale):
+    def cast_ranges(
+        map_table, world, shapes, pose_cell, pose, ray, ranges, window, particles, rays, caster, scale, crowd
+    ):  # fmt: skip
         n, k = wp.tid()
         if k >= rays or n >= particles:
             return
-        t = cast_ray(map_table, window, cell_at(pose_cell, n), pose_at(pose, n), ray_at(ray, k), scale.limit, caster)
+        table = map_table
+        seen = window
+        if WORLDS:
+            table = rest_of(map_table, world_begin(world, n, PLANES))
+            seen = world_window(world, n)
+        cell = cell_at(pose_cell, n)
+        t = cast_ray(table, seen, cell, pose_at(pose, n), ray_at(ray, k), scale.limit, caster)
+        if SHAPES:
+            t = nearest_shape(shapes, world, crowd, n, cell, pose_at(pose, n), ray_at(ray, k), t).x
         put(ranges, n * rays + k, expected_range(t, scale))
 
     # Cast rays in tiles of particles and rays, for GPUs.
     @kernel(flags, entry=ENTRY)
-    def cast_tiles(map_table, pose_cell, pose, order, ray, ranges, window, particles, rays, caster, scale, spread):
+    def cast_tiles(
+        map_table, world, shapes, pose_cell, pose, order, ray, ranges, window, particles, rays, caster, scale, crowd,
+        spread,
+    ):  # fmt: skip
         item = work_item(wp.tid())
         place = tile_place(item, spread)
         if place >= particles:
@@ -50,9 +68,16 @@ def make(name, flags):
             n = order[place]
         cell = cell_at(pose_cell, n)
         sensor_pose = pose_at(pose, n)
+        table = map_table
+        seen = window
+        if WORLDS:
+            table = rest_of(map_table, world_begin(world, n, PLANES))
+            seen = world_window(world, n)
         k = tile_ray(item, spread)
         while k < rays:
-            t = cast_ray(map_table, window, cell, sensor_pose, ray_at(ray, k), scale.limit, caster)
+            t = cast_ray(table, seen, cell, sensor_pose, ray_at(ray, k), scale.limit, caster)
+            if SHAPES:
+                t = nearest_shape(shapes, world, crowd, n, cell, sensor_pose, ray_at(ray, k), t).x
             put(ranges, n * rays + k, expected_range(t, scale))
             k += tile_step(spread)
 

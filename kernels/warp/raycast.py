@@ -37,6 +37,9 @@ def functions(flags):
     ZERO, ABOVE_COUNT = real(0.0), real(float(COUNT) + 1.0)
     FLATTEST, STEEPEST = real(0.41421356), real(2.4142136)
 
+    # Planes of a map.
+    PLANES = 4 * SECTORS
+
     # Return the sector of a direction within its quadrant, from flat to steep. A wrong sector would cost steps, but not
     # change the result.
     @wp.func

@@ -11,6 +11,9 @@ have fewer than 2^31 cells, so indices fit int32.
 Planes store rows one after the other, or in groups: a group is stored column by column, so that vertical neighbours are
 as close in memory as horizontal neighbours.
 
+Planes of several worlds of one size are made together: the runs of row i of world w are line i * worlds + w, and
+place[w] is the world's first cell in tables with a ring of two cells.
+
 Planes can be updated after a change of the cells in rows [top, bottom) and columns [left, right) of the map: only cells
 whose rectangles can contain one of these are computed. For new planes all cells have changed. The input has a band of
 whole rows of the map, from row first on.
@@ -19,7 +22,7 @@ whole rows of the map, from row first on.
 import warp as wp
 
 from .bits import cells_left, cells_right
-from .prelude import kernel
+from .prelude import behind, kernel
 
 LONGEST = wp.constant(255)
 # The entry of an occupied cell; ring cells have 0.
@@ -28,6 +31,7 @@ OCCUPIED = wp.constant(1)
 RECTANGLE_REACH = wp.constant(254)
 # Capacity of the stack of columns that may bound a rectangle.
 STACK = wp.constant(256)
+behind_of = behind(wp.uint16)
 
 
 # Return the index of a cell in a padded plane.
@@ -93,19 +97,24 @@ def free_columns(occupied, runs, band, cols, begin, end):
 
 
 # Find the rectangles along rows, from the far end of a row to its begin. For processors: one work-item takes a row and
-# quadrant. The widest rectangle of sufficient height is at most one column wider than its neighbour's. The stack has
-# the columns that bound its height, each lower than all before it: free cells in the upper 16 bits, and the last 16
-# bits of the column, which give the distance.
+# quadrant of a world. The widest rectangle of sufficient height is at most one column wider than its neighbour's. The
+# stack has the columns that bound its height, each lower than all before it: free cells in the upper 16 bits, and the
+# last 16 bits of the column, which give the distance.
 @kernel()
-def rectangles_rows(runs, stack, rectangles, rows, cols, sectors, first, band, top, left, bottom, right):
-    quadrant, item = wp.tid()
+def rectangles_rows(
+    runs, place, stack, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds
+):  # fmt: skip
+    way, item = wp.tid()
+    quadrant = way & 3
+    w = way >> 2
     dx = wp.where((quadrant & 1) != 0, -1, 1)
     dy = wp.where((quadrant & 2) != 0, -1, 1)
     row = reach_begin(dy, top) + item
-    if row >= reach_end(dy, bottom, rows):
+    if row >= reach_end(dy, bottom, rows) or w >= worlds:
         return
-    run = (wp.where(dy > 0, 0, band) + row - first) * cols
-    waiting = (item * 4 + quadrant) * STACK
+    planes = behind_of(rectangles, wp.int64(place[w]) * wp.int64(4 * sectors))
+    run = ((wp.where(dy > 0, 0, band) + row - first) * worlds + w) * cols
+    waiting = (item * 4 * worlds + way) * STACK
     begin = reach_begin(dx, left)
     end = reach_end(dx, right, cols)
     scanned = wp.where(dx > 0, wp.min(end + RECTANGLE_REACH, cols) - begin, end - wp.max(begin - RECTANGLE_REACH, 0))
@@ -142,7 +151,7 @@ def rectangles_rows(runs, stack, rectangles, rows, cols, sectors, first, band, t
                 sides = wp.where(width > 0, width + 256 * height, OCCUPIED)
                 if lower * middle[1] > width * middle[0]:
                     sides = width + 1 + 256 * lower
-                rectangles[out + padded(row, col, cols)] = wp.uint16(sides)
+                planes[out + padded(row, col, cols)] = wp.uint16(sides)
 
 
 # Count the free cells along rows, to the right (direction 0) and to the left (direction 1), for columns in [begin,
@@ -163,15 +172,20 @@ def free_rows(bits, runs, band, cols, words, begin, end):
 # Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a cell and
 # quadrant; the first work-item of a quadrant takes the first of its cells.
 @kernel()
-def rectangles_scan(runs, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, lines, group):
-    quadrant, row_item, col_item = wp.tid()
+def rectangles_scan(
+    runs, place, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds, lines, group
+):  # fmt: skip
+    way, row_item, col_item = wp.tid()
+    quadrant = way & 3
+    w = way >> 2
     dx = wp.where((quadrant & 1) != 0, -1, 1)
     dy = wp.where((quadrant & 2) != 0, -1, 1)
     col = reach_begin(dx, left) + col_item
     row = reach_begin(dy, top) + row_item
-    if col >= reach_end(dx, right, cols) or row >= reach_end(dy, bottom, rows):
+    if col >= reach_end(dx, right, cols) or row >= reach_end(dy, bottom, rows) or w >= worlds:
         return
-    run = (quadrant & 1) * band * cols + (row - first) * cols + col
+    planes = behind_of(rectangles, wp.int64(place[w]) * wp.int64(4 * sectors))
+    run = (quadrant & 1) * band * worlds * cols + ((row - first) * worlds + w) * cols + col
     plane = lines * (cols + 2)
     out = quadrant * sectors * plane + padded_in_groups(row, col, cols, group)
     room = wp.min(wp.where(dy > 0, rows - row, row + 1), LONGEST)
@@ -179,7 +193,7 @@ def rectangles_scan(runs, rectangles, rows, cols, sectors, first, band, top, lef
     height = int(1)
     sector = int(0)
     middle = slope(sectors, 0)
-    step = dy * cols
+    step = dy * worlds * cols
     while sector < sectors:
         # While no sector can end, read four rows between two decisions, so that reads do not wait for each other.
         if height + 3 <= room:
@@ -198,7 +212,7 @@ def rectangles_scan(runs, rectangles, rows, cols, sectors, first, band, top, lef
             sides = wp.where(height > 1, width + 256 * (height - 1), OCCUPIED)
             if narrower * middle[0] > (height - 1) * middle[1]:
                 sides = narrower + 256 * height
-            rectangles[out + sector * plane] = wp.uint16(sides)
+            planes[out + sector * plane] = wp.uint16(sides)
             sector += 1
             middle = slope(sectors, sector)
         width = narrower

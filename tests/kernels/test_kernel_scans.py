@@ -6,7 +6,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.kernel_scenes import EXACT, LASER, SCALE, assert_near, nothing, on_both, planes_of, scene_flags
+from support.kernel_scenes import (
+    EXACT,
+    LASER,
+    NO_CROWD,
+    SCALE,
+    assert_near,
+    nothing,
+    on_both,
+    one_world,
+    planes_of,
+    scene_flags,
+)
 from support.score_scenes import (
     OCCUPIED,
     RANGE,
@@ -49,7 +60,8 @@ def field(names: tuple[str, ...]) -> tuple[list[np.ndarray], frozenset[str], Win
     scene = field_scene("log table", REAL, all_readings=False)
     some = np.resize(np.arange(150), COUNT)
     scene |= {key: scene[key][some] for key in ("pose_cell", "pose", "pose_low")}
-    given = [scene[key] for key in ("table", "pose_cell", "pose", "pose_low", "point", "point_low", "terms")]
+    names_of = ("pose_cell", "pose", "pose_low", "point", "point_low", "terms")
+    given = [scene["table"], *one_world(REAL), *(scene[key] for key in names_of)]
     rows, cols = scene["table"].shape
     return (
         given,
@@ -61,13 +73,13 @@ def field(names: tuple[str, ...]) -> tuple[list[np.ndarray], frozenset[str], Win
 @pytest.mark.parametrize("ahead", AHEAD)
 def test_fields_of_scans(ahead: int, device: Backend) -> None:
     given, flags, window = field(())
-    given[1:4] = [each[ahead:] for each in given[1:4]]
+    given[3:6] = [each[ahead:] for each in given[3:6]]
     count, most = COUNT - ahead, int(np.diff(START).max())
-    guard = float(guards_of(given[4]).max())
+    guard = float(guards_of(given[6]).max())
     reference, found = on_both(
         device, "score_field", flags, (count,), *given, START, np.array(FIXED, REAL), np.full(count, np.nan, REAL),
         nothing(REAL), window, count, most, guard, Score(0.0, 0.75),
-        ScanBatch(PER_SCAN, ahead),
+        ScanBatch(PER_SCAN, ahead), NO_CROWD,
     )  # fmt: skip
     assert differing(found["log_p"], reference["log_p"]) == 0
     # The scan without readings has its constant term.
@@ -81,10 +93,10 @@ def test_blocks_of_fields_of_scans(names: tuple[str, ...], spread: int, device: 
     given, flags, window = field(names)
     most = int(np.diff(START).max())
     blocks = -(-most // BLOCK_TERMS)
-    guards = np.full(SCANS * blocks, guards_of(given[4]).max(), REAL)
+    guards = np.full(SCANS * blocks, guards_of(given[6]).max(), REAL)
     reference, found = on_both(
         device, "field_blocks", flags, items(COUNT, spread, 64, 64), *given, guards, START,
-        room_for(COUNT, blocks, REAL), window, COUNT, most, spread, ScanBatch(PER_SCAN, 0),
+        room_for(COUNT, blocks, REAL), window, COUNT, most, spread, ScanBatch(PER_SCAN, 0), NO_CROWD,
     )  # fmt: skip
     # Each particle has only the blocks of its scan.
     assert differing(found["parts"], reference["parts"]) == 0
@@ -133,9 +145,10 @@ def test_beams_of_scans(names: tuple[str, ...], device: Backend) -> None:
         cell, pose = (each[ahead:] for each in poses(COUNT, REAL))
         count = COUNT - ahead
         reference, found = on_both(
-            device, "score_beams", flags, (count,), planes_of(OCCUPIED), nothing(REAL, 2), cell, pose, *arrays,
+            device, "score_beams", flags, (count,), planes_of(OCCUPIED), *one_world(REAL),
+            nothing(REAL, 2), cell, pose, *arrays,
             np.array(FIXED, REAL), np.full(count, np.nan, REAL), nothing(REAL), WINDOW, count, rays, most,
-            *LASER, EXACT, SCALE, Score(0.0, 0.75), ScanBatch(PER_SCAN, ahead),
+            *LASER, EXACT, SCALE, NO_CROWD, Score(0.0, 0.75), ScanBatch(PER_SCAN, ahead),
         )  # fmt: skip
         expected = reference["log_p"].astype(np.float64)
         bound = 2 * per_scan(np.full((count, max(most, 1)), 10.0), REAL, fixed=3.0, temperature=0.75)
@@ -150,8 +163,9 @@ def test_tiles_of_beams_of_scans(names: tuple[str, ...], device: Backend) -> Non
     each, added = (strands_in(most), strands_in(counts)) if "STRANDED" in names else (most, counts)
     for spread in (0, 3):
         reference, found = on_both(
-            device, "beam_tiles", flags, items(COUNT, spread), planes_of(OCCUPIED), nothing(REAL, 2), cell, pose, order,
-            *arrays, room_for(COUNT, each, REAL), WINDOW, COUNT, rays, most, *LASER, EXACT, SCALE, spread,
+            device, "beam_tiles", flags, items(COUNT, spread), planes_of(OCCUPIED), *one_world(REAL),
+            nothing(REAL, 2), cell, pose, order,
+            *arrays, room_for(COUNT, each, REAL), WINDOW, COUNT, rays, most, *LASER, EXACT, SCALE, NO_CROWD, spread,
             ScanBatch(PER_SCAN, 0),
         )  # fmt: skip
         expected = reference["parts"].astype(np.float64)

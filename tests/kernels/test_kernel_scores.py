@@ -10,6 +10,7 @@ from support.kernel_scenes import (
     EXACT,
     GRIDS,
     LASER,
+    NO_CROWD,
     ONE_SCAN,
     SCALE,
     adversarial_poses,
@@ -17,6 +18,7 @@ from support.kernel_scenes import (
     directions,
     nothing,
     on_both,
+    one_world,
     planes_of,
     ranges_on_both,
     run,
@@ -56,9 +58,11 @@ def test_beams_agree_with_the_reference(name: str, names: tuple[str, ...], real:
     count, readings, fixed, temperature = len(pose), len(reading), -3.25, 0.5
     parts = np.full((count, readings), np.nan, real)
     found = run(
-        device, "score_beams", flags, (count,), planes_of(occupied), nothing(real, 2), cell, pose, ray, first, reading,
+        device, "score_beams", flags, (count,), planes_of(occupied), *one_world(real),
+        nothing(real, 2), cell, pose, ray, first, reading,
         terms, nothing(real), nothing(real), nothing(real), first, nothing(real), np.empty(count, real), parts,
-        window_of(occupied), count, len(ray), readings, *LASER, EXACT, SCALE, Score(fixed, temperature), ONE_SCAN,
+        window_of(occupied), count, len(ray), readings, *LASER, EXACT, SCALE, NO_CROWD,
+        Score(fixed, temperature), ONE_SCAN,
     )  # fmt: skip
 
     # The truth: the float64 reference on the same rounded readings, terms and expected ranges.
@@ -78,9 +82,10 @@ def test_no_readings_give_exactly_what_is_fixed(device: Backend) -> None:
     cell, pose = adversarial_poses(occupied, real, outside=False)
     count, none = len(pose), np.zeros(0, real)
     found = run(
-        device, "score_beams", frozenset(flags), (count,), planes_of(occupied), nothing(real, 2), cell, pose,
+        device, "score_beams", frozenset(flags), (count,), planes_of(occupied), *one_world(real),
+        nothing(real, 2), cell, pose,
         np.zeros((0, 2), real), np.zeros(1, np.int32), none, terms, none, none, none, np.zeros(1, np.int32), none,
-        np.empty(count, real), none, window_of(occupied), count, 0, 0, *LASER, EXACT, SCALE,
+        np.empty(count, real), none, window_of(occupied), count, 0, 0, *LASER, EXACT, SCALE, NO_CROWD,
         Score(-1.5, 1.0), ONE_SCAN,
     )  # fmt: skip
     assert (found["log_p"] == -1.5).all()
@@ -95,9 +100,10 @@ def score_field(device: Backend, flags: frozenset[str], scene: dict[str, np.ndar
     count, readings = scene["parts"].shape
     finite = scene["point"][np.isfinite(scene["point"])]
     guard = 8 * np.finfo(real).eps * (np.abs(finite).max(initial=0.0) + 2)
+    table, *others = scene.values()
     return on_both(
-        device, "score_field", flags, (count,), *scene.values(), Window(0, 0, rows - 4, cols - 4), count, readings,
-        guard, Score(*fixed), ONE_SCAN,
+        device, "score_field", flags, (count,), table, *one_world(real), *others, Window(0, 0, rows - 4, cols - 4),
+        count, readings, guard, Score(*fixed), ONE_SCAN, NO_CROWD,
     )  # fmt: skip
 
 

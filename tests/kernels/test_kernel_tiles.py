@@ -11,6 +11,7 @@ from support.kernel_scenes import (
     EXACT,
     GROUPED,
     LASER,
+    NO_CROWD,
     ONE_SCAN,
     PLANES,
     PRECISIONS,
@@ -18,6 +19,7 @@ from support.kernel_scenes import (
     assert_near,
     nothing,
     on_both,
+    one_world,
     planes_of,
     run,
     scene_flags,
@@ -61,11 +63,11 @@ def cast_tiles(device: Backend, real: type, count: int, rays: int, spread: int, 
     order = an_order(count) if "ORDERED" in names else np.zeros(1, np.int32)
     flags = scene_flags(real, "ORIGINS_OUTSIDE", *names)
     ranges = np.full((count, rays), np.nan, real)
-    rest = (WINDOW, count, rays, EXACT, SCALE)
-    planes, numpy = planes_of(OCCUPIED), get_backend("numpy")
-    expected = run(numpy, "cast_ranges", flags, (rays, count), planes, cell, pose, ray, ranges, *rest)["ranges"]
+    rest = (WINDOW, count, rays, EXACT, SCALE, NO_CROWD)
+    planes, numpy = (planes_of(OCCUPIED), *one_world(real)), get_backend("numpy")
+    expected = run(numpy, "cast_ranges", flags, (rays, count), *planes, cell, pose, ray, ranges, *rest)["ranges"]
     found = [
-        run(one, "cast_tiles", flags, items(count, spread), planes, cell, pose, order, ray, ranges, *rest, spread)
+        run(one, "cast_tiles", flags, items(count, spread), *planes, cell, pose, order, ray, ranges, *rest, spread)
         for one in (numpy, device)
     ]
     assert differing(found[0]["ranges"], expected) == 0
@@ -92,20 +94,21 @@ def test_tiles_of_ranges_in_every_form_of_planes(form: Planes, device: Backend) 
     real, count, rays = np.float32, 777, 53
     (cell, pose), ray = poses(count, real), rays_of(rays, real)
     ranges, none = np.full((count, rays), np.nan, real), np.zeros(1, np.int32)
-    rest = (ray, ranges, WINDOW, count, rays, EXACT, SCALE)
+    rest = (ray, ranges, WINDOW, count, rays, EXACT, SCALE, NO_CROWD)
     flags, numpy = scene_flags(real, "ORIGINS_OUTSIDE", "OUTSIDE_OCCUPIED"), get_backend("numpy")
-    expected = run(numpy, "cast_ranges", flags, (rays, count), planes_of(OCCUPIED), cell, pose, *rest)
+    expected = run(numpy, "cast_ranges", flags, (rays, count), planes_of(OCCUPIED), *one_world(real), cell, pose, *rest)
     flags |= form.flags
     planes = planes_of(OCCUPIED, form, "gpu")
-    found = run(device, "cast_tiles", flags, items(count, 1), planes, cell, pose, none, *rest, 1)
+    found = run(device, "cast_tiles", flags, items(count, 1), planes, *one_world(real), cell, pose, none, *rest, 1)
     assert differing(found["ranges"], expected["ranges"]) == 0
 
 
 def test_launches_of_no_particles_write_nothing(device: Backend) -> None:
     (cell, pose), ranges, none = poses(1, np.float32), np.full(8, 5, np.float32), np.zeros(1, np.int32)
     found = run(
-        device, "cast_tiles", scene_flags(np.float32), (TILE,), planes_of(OCCUPIED), cell, pose, none,
-        rays_of(4, np.float32), ranges, WINDOW, 0, 4, EXACT, SCALE, 0,
+        device, "cast_tiles", scene_flags(np.float32), (TILE,), planes_of(OCCUPIED), *one_world(np.float32),
+        cell, pose, none,
+        rays_of(4, np.float32), ranges, WINDOW, 0, 4, EXACT, SCALE, NO_CROWD, 0,
     )  # fmt: skip
     assert (found["ranges"] == 5).all()
 
@@ -128,9 +131,10 @@ def beam_tiles(
     readings, order = len(reading), an_order(count)
     each = strands_in(readings) if "STRANDED" in names else readings
     expected, found = on_both(
-        device, "beam_tiles", flags, items(count, spread), planes_of(OCCUPIED), nothing(real, 2), cell, pose, order,
+        device, "beam_tiles", flags, items(count, spread), planes_of(OCCUPIED), *one_world(real),
+        nothing(real, 2), cell, pose, order,
         ray, first, reading, terms, *[nothing(real)] * 3, first, room_for(count, each, real),
-        WINDOW, count, rays, readings, *LASER, EXACT, SCALE, spread, ONE_SCAN,
+        WINDOW, count, rays, readings, *LASER, EXACT, SCALE, NO_CROWD, spread, ONE_SCAN,
     )  # fmt: skip
     untouched = np.count_nonzero(expected["parts"] == -77)
     assert np.count_nonzero(found["parts"] == -77) == untouched
@@ -212,11 +216,12 @@ def field_blocks(
     scene |= {key: scene[key][:readings] for key in ("point", "point_low")}
     (rows, cols), blocks = scene["table"].shape, -(-readings // BLOCK_TERMS)
     guards = guards_of(scene["point"])
-    given = [scene[key] for key in ("table", "pose_cell", "pose", "pose_low", "point", "point_low", "terms")]
+    names_of = ("pose_cell", "pose", "pose_low", "point", "point_low", "terms")
+    given = [scene["table"], *one_world(real), *(scene[key] for key in names_of)]
     sizes = (Window(0, 0, rows - 4, cols - 4), count, readings)
     reference, found = on_both(
         device, "field_blocks", flags, items(count, spread, 64, 64), *given, guards, NOWHERE,
-        room_for(count, blocks, real), *sizes, spread, ONE_SCAN,
+        room_for(count, blocks, real), *sizes, spread, ONE_SCAN, NO_CROWD,
     )  # fmt: skip
     untouched = np.count_nonzero(reference["parts"] == -77)
     assert np.count_nonzero(found["parts"] == -77) == untouched
@@ -224,7 +229,7 @@ def field_blocks(
     parts = np.empty((count, readings), real)
     log_p = np.empty(count, real)
     numpy = get_backend("numpy")
-    alone = (NOWHERE, np.zeros(1, real), log_p, parts, *sizes, guards.max(), Score(0.0, 1.0), ONE_SCAN)
+    alone = (NOWHERE, np.zeros(1, real), log_p, parts, *sizes, guards.max(), Score(0.0, 1.0), ONE_SCAN, NO_CROWD)
     parts = run(numpy, "score_field", flags, (count,), *given, *alone)["parts"]
     bound = 2 * per_beam(parts, real) + 16 * np.finfo(real).eps * np.abs(np.where(np.isfinite(parts), parts, 0))
     bound = np.stack([bound[:, i : i + BLOCK_TERMS].sum(axis=1) for i in range(0, readings, BLOCK_TERMS)], axis=1)
@@ -261,14 +266,14 @@ def test_blocks_of_end_points_inside(readings: int, device: Backend) -> None:
     point = np.round(rng.uniform(0, 12, (readings, 1)) * 4) / 4 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     scene["pose_cell"] = rng.integers((14, 14), (cols - 14, rows - 14), (count, 2)).astype(np.int32)
     high = point.astype(np.float32)
-    given = [scene[key] for key in ("table", "pose_cell", "pose", "pose_low")]
+    given = [scene["table"], *one_world(np.float32), *(scene[key] for key in ("pose_cell", "pose", "pose_low"))]
     given += [high, (point - high).astype(np.float32), scene["terms"]]
     blocks, found = -(-readings // BLOCK_TERMS), []
     for names in ((), ("ROUNDED_CELLS",), ("ROUNDED_CELLS", "INSIDE")):
         flags = scene_flags(np.float32, *FIELDS["log table"], "TWO_PART_POINTS", *names)
         both = on_both(
             device, "field_blocks", flags, items(count, 0, 64, 64), *given, guards_of(high),
-            NOWHERE, np.empty(count * blocks, np.float32), WINDOW, count, readings, 0, ONE_SCAN,
+            NOWHERE, np.empty(count * blocks, np.float32), WINDOW, count, readings, 0, ONE_SCAN, NO_CROWD,
         )  # fmt: skip
         found += [one["parts"] for one in both]
     assert all(differing(one, found[0]) == 0 for one in found)

@@ -50,6 +50,7 @@ TEAMS = "work-items of a GPU share points or steps; the reference takes all of t
 LANES = "bodies in lanes take the function from the scalar text; Warp and NumPy have no such bodies"
 QUICK = "kernels round end points first and repeat the doubtful ones with twice the digits; the reference repeats all"
 STAGES = "on Warp's processor device each stage of a block is a loop; OpenCL has lanes for it"
+WORLD_BY_WORLD = "a work-item moves pointers to its world; the reference takes all particles of a world at once"
 KERNELS_ONLY, REFERENCE_ONLY = (OPENCL, WARP), (NUMPY,)
 
 ON_PURPOSE = [
@@ -77,6 +78,9 @@ ON_PURPOSE = [
     Purpose("heading", "cos_sin_of", (OPENCL,), LANES),
     Purpose("heading", "two_sum_float64 high_half_float64 pair_product_float64", (OPENCL,), FLOAT64),
     Purpose("hit_shape", "mass_place mass_at", (WARP,), STAGES),
+    Purpose("ranges", "cast_in_worlds", REFERENCE_ONLY, WORLD_BY_WORLD),
+    Purpose("raycast", "sectors_of", REFERENCE_ONLY, "SECTORS is a constant of the kernels"),
+    Purpose("shapes", "particles_of_worlds", REFERENCE_ONLY, WORLD_BY_WORLD),
     Purpose("icp_step", "add_to_blocks close_blocks", KERNELS_ONLY, "points come one after another"),
     Purpose("icp_step", "cooperates", (WARP,), "OpenCL's processors have teams as well"),
     Purpose("icp_step", "log_share add_over_team add_joint_blocks", KERNELS_ONLY, TEAMS),

@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from gpusense.backends import Backend, get_backend
 from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.interface.signatures import KERNELS
-from gpusense.interface.structs import Caster, Cone, MixtureTables, RangeScale, ScanBatch, Window
+from gpusense.interface.structs import Caster, Cone, Crowd, MixtureTables, RangeScale, ScanBatch, Window
 from gpusense.tables.rectangles import ROWS, Planes, empty_rectangles
 
 PRECISIONS = (np.float32, np.float64)
@@ -23,6 +23,7 @@ UNREACHABLE = (1 << 31) - 1
 PLANES = (Planes(1), Planes(2), Planes(4))
 GROUPED = Planes(2, ROWS)
 SCALE = RangeScale(LIMIT, RESOLUTION, LIMIT * RESOLUTION)
+NO_CROWD = Crowd(0, 0, 0, 0, 0.0)
 # Particles of each scan and particles before a launch, not read for a single scan.
 ONE_SCAN = ScanBatch(1, 0)
 
@@ -112,6 +113,11 @@ def window_of(cells: np.ndarray) -> Window:
     return Window(0, 0, *cells.shape)
 
 
+def one_world(real: type) -> tuple[np.ndarray, np.ndarray]:
+    """Return the arguments ``world`` and ``shapes``, which kernels of a single map do not read."""
+    return np.zeros((1, 2), np.int32), np.zeros(1, real)
+
+
 def nothing(real: type, numbers: int = 1) -> np.ndarray:
     return np.zeros((1, numbers) if numbers > 1 else 1, real)
 
@@ -157,7 +163,7 @@ def ranges_on_both(
     ray = directions(real)
     ranges = np.full((len(pose), len(ray)), np.nan, real)
     size, counts = (len(ray), len(pose)), (len(pose), len(ray))
-    rest = (cell, pose, ray, ranges, window_of(occupied), *counts, EXACT, SCALE)
+    rest = (*one_world(real), cell, pose, ray, ranges, window_of(occupied), *counts, EXACT, SCALE, NO_CROWD)
     reference = run(get_backend("numpy"), "cast_ranges", flags, size, planes_of(occupied), *rest)
     flags |= form.flags
     found = run(

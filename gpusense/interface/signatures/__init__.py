@@ -15,6 +15,7 @@ from gpusense.interface.signatures import (
     particle_kernels,
     point_kernels,
     scan_kernels,
+    world_kernels,
 )
 from gpusense.interface.signatures.rows import LANES, Argument, Kernel, lanes_of, team_of
 
@@ -24,6 +25,7 @@ __all__ = ["KERNELS", "LANES", "Argument", "Kernel", "lanes_of", "team_of"]
 KERNELS: dict[str, Kernel] = {
     **map_kernels.KERNELS,
     **scan_kernels.KERNELS,
+    **world_kernels.KERNELS,
     **point_kernels.KERNELS,
     **learning_kernels.KERNELS,
     **matching_kernels.KERNELS,

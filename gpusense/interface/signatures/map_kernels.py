@@ -7,7 +7,7 @@ from gpusense.interface.signatures.rows import WINDOW, Kernel, kernel
 _MAP = ("int rows", "int cols")
 _PLANES = "ushort rectangles [4 * sectors * (rows + 2) * (cols + 2)]"
 _CHANGED = (
-    *_MAP, "int sectors", "int first", "int band", "int top", "int left", "int bottom", "int right",
+    *_MAP, "int sectors", "int first", "int band", "int top", "int left", "int bottom", "int right", "int worlds",
 )  # fmt: skip
 
 KERNELS: dict[str, Kernel] = {
@@ -35,15 +35,15 @@ KERNELS: dict[str, Kernel] = {
         "int band", "int cols", "int begin", "int end", group=1,
     ),
     "rectangles_rows": kernel(
-        "rectangles", "row quadrant", "uchar runs [2 * band * cols]", "out int stack [1024 * rows]",
-        f"out {_PLANES}", *_CHANGED, group=1,
+        "rectangles", "row quadrant", "uchar runs [2 * band * cols * worlds]", "int place [worlds]",
+        "out int stack [1024 * rows * worlds]", f"out {_PLANES}", *_CHANGED, group=1,
     ),
     "free_rows": kernel(
         "rectangles", "col row", "int bits [band * words]", "out uchar runs [2 * band * cols]", "int band", "int cols",
         "int words", "int begin", "int end",
     ),
     "rectangles_scan": kernel(
-        "rectangles", "col row quadrant", "uchar runs [2 * band * cols]",
+        "rectangles", "col row quadrant", "uchar runs [2 * band * cols * worlds]", "int place [worlds]",
         "out ushort rectangles [4 * sectors * lines * (cols + 2)]", *_CHANGED, "int lines", "int group",
     ),
     "fill_lookup": kernel(

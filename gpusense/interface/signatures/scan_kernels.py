@@ -9,8 +9,10 @@ from gpusense.interface.signatures.rows import PLACED, POSES, WINDOW, Kernel, ke
 _NORMALS = ("real2 normals [(window.rows + 2) * (window.cols + 2)]",)
 _CONES = "real2 ray [rays * cone.rays]"
 # A map's table for a caster, which defines its entries and their number.
-_CAST = ("entry map_table [map]",)
-_CASTING = ("Caster caster", "RangeScale scale")
+# World and shapes are read with WORLDS and SHAPES; see the kernel file ``shapes``.
+_WORLDS = ("int2 world [2 * particles]", "real shapes [crowd.stride]")
+_CAST = ("entry map_table [map]", *_WORLDS)
+_CASTING = ("Caster caster", "RangeScale scale", "Crowd crowd")
 # Poses on their way into a window of the grid.
 _GIVEN = (
     "coordinate poses [particles * 3]", "out int2 pose_cell [particles]", "out real4 pose [particles]",
@@ -88,12 +90,12 @@ KERNELS: dict[str, Kernel] = {
         "int particles",
     ),
     "field_blocks": kernel(
-        "field", "item", _FIELD_TABLE, *PLACED, *_POINTS, "real guard [readings]", "int start [scans + 1]",
+        "field", "item", _FIELD_TABLE, *_WORLDS, *PLACED, *_POINTS, "real guard [readings]", "int start [scans + 1]",
         "out real parts [readings * particles]", WINDOW, "int particles", "int readings", "int spread",
-        "ScanBatch batch",
+        "ScanBatch batch", "Crowd crowd",
     ),
     "score_field": kernel(
-        "field", "particle", _FIELD_TABLE, *PLACED, *_POINTS, *_SCANS, *_RESULT, WINDOW, "int particles",
-        "int readings", "real guard", *_SCORE, in_lanes=True,
+        "field", "particle", _FIELD_TABLE, *_WORLDS, *PLACED, *_POINTS, *_SCANS, *_RESULT, WINDOW, "int particles",
+        "int readings", "real guard", *_SCORE, "Crowd crowd", in_lanes=True,
     ),
 }  # fmt: skip

@@ -23,9 +23,11 @@ from gpusense.models.scan.mixture import mixture_on_device
 from gpusense.models.scan.model import ScanModel
 from gpusense.models.scan.rules import Beams
 from gpusense.models.scan.sampling import drawing_of, poses_to_draw_at
+from gpusense.models.world_index import check_no_worlds, index_of
 from gpusense.peers.weights import Peer, check_weights, choose
 from gpusense.tables import casters
 from gpusense.tables.casters import Caster
+from gpusense.tables.worlds import Worlds
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.likelihood import Likelihood
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
@@ -79,7 +81,7 @@ class BeamModel(ScanModel):
 
     def __init__(
         self,
-        grid: OccupancyGrid,
+        grid: OccupancyGrid | Worlds,
         scanner: Scanner,
         parameters: BeamParameters | SensorTable | None = None,
         *,
@@ -96,6 +98,7 @@ class BeamModel(ScanModel):
         specialize: bool = True,
     ) -> None:
         weights = choose(compat)
+        check_no_worlds(grid, compat)
         if isinstance(parameters, SensorTable):
             check_discrete(parameters, scanner, compat, sensor_table)
         density = density_of(parameters, weights.beam, incidence, sensor_table=sensor_table, compat=compat)
@@ -177,11 +180,13 @@ class BeamModel(ScanModel):
         with self._lock:
             self._caster.update(cells, region)
 
-    def expected_ranges(self, poses: AnyArray, *, out: Any = None) -> Any:
+    def expected_ranges(self, poses: AnyArray, *, world: Any = None, ignore: Any = None, out: Any = None) -> Any:
         """Return z* of every beam of the scanner at each pose; for a cone, the range of the nearest return.
 
         Args:
             poses: (N, 3) robot poses in the world [m, m, rad]; arrays of other libraries as in ``log_likelihood``.
+            world: As in ``log_likelihood``.
+            ignore: As in ``log_likelihood``.
             out: The array for the ranges, as in ``log_likelihood``.
 
         Returns:
@@ -191,13 +196,15 @@ class BeamModel(ScanModel):
             TypeError, ValueError: Poses that are not (N, 3) finite numbers.
         """
         with self._lock:
-            return self._cast(poses, out, incidence=False)
+            return self._cast(poses, out, world, ignore, incidence=False)
 
-    def incidence(self, poses: AnyArray, *, out: Any = None) -> Any:
+    def incidence(self, poses: AnyArray, *, world: Any = None, ignore: Any = None, out: Any = None) -> Any:
         """Return the angle of incidence of every beam of the scanner at each pose; see ``RayCaster.incidence``.
 
         Args:
             poses: As for ``expected_ranges``.
+            world: As in ``log_likelihood``.
+            ignore: As in ``log_likelihood``.
             out: The array for the angles, as in ``log_likelihood``.
 
         Returns:
@@ -209,9 +216,11 @@ class BeamModel(ScanModel):
         """
         require_exact("caster", self._caster.method)
         with self._lock:
-            return self._cast(poses, out, incidence=True)
+            return self._cast(poses, out, world, ignore, incidence=True)
 
-    def sample(self, poses: AnyArray, seed: int = 0, *, step: int = 0, out: Any = None) -> Any:
+    def sample(
+        self, poses: AnyArray, seed: int = 0, *, step: int = 0, world: Any = None, ignore: Any = None, out: Any = None
+    ) -> Any:
         """Draw readings from p(z | x, m) of every beam of the scanner at each pose.
 
         A reading depends only on the seed, the step, and the indices of pose and beam, by the counter-based generator
@@ -228,6 +237,8 @@ class BeamModel(ScanModel):
                 in ``log_likelihood``.
             seed: Seed of the random numbers, 0 to 2^64 - 1.
             step: Step of a run, or of the first of S scans, 0 to 2^31 - 1; each step has different random numbers.
+            world: As in ``log_likelihood``; with (S, N, 3) poses (S * N,) indices.
+            ignore: As in ``log_likelihood``.
             out: The array for the readings, as in ``log_likelihood``.
 
         Returns:
@@ -250,6 +261,7 @@ class BeamModel(ScanModel):
         if self._setting.weights.is_peer:
             raise ValueError(f"compat: must be None where readings are drawn, got {self.compat!r}, no density")
         checked, shape = poses_to_draw_at(poses, self._setting.backend)
+        checked.inside = index_of(self._caster.grid, world, ignore, checked.count, self._setting.backend)
         drawing = drawing_of(
             self._density, self.scanner.range_max, self._setting.real, seed=seed, step=step, per_scan=shape[-1]
         )
@@ -262,10 +274,10 @@ class BeamModel(ScanModel):
     def _notes(self) -> SceneNotes:
         return scene_notes(self._beam_pipeline, self._last, self._density, self._weights_note())
 
-    def _cast(self, poses: AnyArray, out: Any, *, incidence: bool) -> Any:
+    def _cast(self, poses: AnyArray, out: Any, world: Any, ignore: Any, *, incidence: bool) -> Any:
         pipeline = self._beam_pipeline
         cones = dataclasses.replace(pipeline.cones, incidence=incidence)
-        return self._caster.cast(poses, pipeline.cone_vectors, out, cones)
+        return self._caster.cast(poses, pipeline.cone_vectors, out, cones, world=world, ignore=ignore)
 
 
 def _method_of(caster: object, weights: Likelihood) -> Caster:

@@ -114,10 +114,14 @@ class BeamPipeline(ScanPipeline):
 
     def conditions(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None) -> frozenset[str]:
         shared = "SHARED_RAYS" in readings.flags
-        return self.caster.flags | flags_if(
-            ORIGINS_OUTSIDE=not (self.specialize and all_within(placed, 0)),
-            ORDERED=tiles is not None and tiles.order is not None,
-            STRANDED=tiles is not None and not shared and stranded(readings.rays, tiles.spread),
+        return (
+            self.caster.flags
+            | placed.world_flags
+            | flags_if(
+                ORIGINS_OUTSIDE=not (self.specialize and all_within(placed, 0)),
+                ORDERED=tiles is not None and tiles.order is not None,
+                STRANDED=tiles is not None and not shared and stranded(readings.rays, tiles.spread),
+            )
         )
 
     def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
@@ -141,7 +145,7 @@ class BeamPipeline(ScanPipeline):
             map_table=scoring.table, normals=caster.normals(window, self.cones.flags), pose_cell=placed.cell,
             pose=placed.pose, window=window, particles=count, rays=readings.rays, readings=readings.readings,
             parts=parts.buffer, caster=caster.method.struct(), scale=caster.scale, batch=scoring.batch,
-            **self._constants, **readings.arguments,
+            **placed.places(), **self._constants, **readings.arguments,
         )  # fmt: skip
         if scoring.tiles is None:
             common |= self.numbers(scoring)

@@ -19,6 +19,7 @@ from gpusense.models.scan.cones import Cones, require_exact
 from gpusense.models.scan.map_caster import MapCaster
 from gpusense.tables import casters
 from gpusense.tables.casters import Caster
+from gpusense.tables.worlds import Worlds
 from gpusense.world.frames import Mount, ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.plausible import look_at_bearings
@@ -30,7 +31,7 @@ class RayCaster(Pickled):
     """Distance to the first occupied cell along rays.
 
     Args:
-        grid: The map.
+        grid: The map, or many of them.
         range_max: Longest range [m], > 0; the range of a ray without a nearer obstacle.
         caster: A name of ``RayCaster.methods()``, or a caster of ``gs.casters`` with its knobs, such as
             ``gs.casters.March(tolerance=0.02)``; ``"exact"`` by default.
@@ -56,7 +57,7 @@ class RayCaster(Pickled):
 
     def __init__(
         self,
-        grid: OccupancyGrid,
+        grid: OccupancyGrid | Worlds,
         range_max: float,
         *,
         caster: CasterName | Caster | None = None,
@@ -100,8 +101,8 @@ class RayCaster(Pickled):
         return tuple(casters.CASTERS.values())
 
     @property
-    def grid(self) -> OccupancyGrid:
-        """The current map."""
+    def grid(self) -> OccupancyGrid | Worlds:
+        """The current map, or the worlds."""
         return self._caster.grid
 
     @property
@@ -169,13 +170,19 @@ class RayCaster(Pickled):
             raise ValueError(f"method: must be 'lookup' for a table to be saved, got {self.caster.name!r}")
         self._caster.save(checks.path("path", path), self.caster.bins)
 
-    def cast(self, poses: AnyArray, bearings: AnyArray, *, out: Any = None) -> Any:
+    def cast(
+        self, poses: AnyArray, bearings: AnyArray, *, world: Any = None, ignore: Any = None, out: Any = None
+    ) -> Any:
         """Return expected ranges.
 
         Args:
             poses: (N, 3) ray origins and headings in the world [m, m, rad]. Arrays of other libraries are used
                 without a copy, and ranges are arrays of the same library; see ``BeamModel.log_likelihood``.
             bearings: (K,) directions relative to the heading [rad].
+            world: (N,) indices of the poses' worlds, or one for all poses, of a caster of :class:`Worlds`; on the
+                device int32 or int64. It may be left out where there is a single world.
+            ignore: (N,) indices of the shapes that poses do not see, or one for all; -1 for none. A robot that is one
+                of the shapes does not see itself.
             out: The array for the ranges: (N, K) in the caster's precision, C-contiguous, in the memory of the poses.
 
         Returns:
@@ -185,9 +192,11 @@ class RayCaster(Pickled):
         Raises:
             TypeError, ValueError: Arguments that are not finite numbers of these shapes.
         """
-        return self._caster.cast(poses, self._vectors(bearings), out)
+        return self._caster.cast(poses, self._vectors(bearings), out, world=world, ignore=ignore)
 
-    def incidence(self, poses: AnyArray, bearings: AnyArray, *, out: Any = None) -> Any:
+    def incidence(
+        self, poses: AnyArray, bearings: AnyArray, *, world: Any = None, ignore: Any = None, out: Any = None
+    ) -> Any:
         """Return angles of incidence, between each ray and the normal of the surface that it hits.
 
         Normals are computed as by ``surface_normals``, in the cell in which the exact ray ends. A cell without a normal
@@ -196,6 +205,8 @@ class RayCaster(Pickled):
         Args:
             poses: As for ``cast``.
             bearings: As for ``cast``.
+            world: As for ``cast``.
+            ignore: As for ``cast``.
             out: The array for the angles, as for ``cast``.
 
         Returns:
@@ -206,7 +217,7 @@ class RayCaster(Pickled):
         """
         vectors = self._vectors(bearings)
         require_exact("method", self.caster)
-        return self._caster.cast(poses, vectors, out, Cones(incidence=True))
+        return self._caster.cast(poses, vectors, out, Cones(incidence=True), world=world, ignore=ignore)
 
     def _vectors(self, bearings: AnyArray) -> Any:
         """Return (K, 2) cosines and sines of bearings; the first calls check for degrees."""

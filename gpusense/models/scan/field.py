@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
@@ -21,7 +22,9 @@ from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.model import ScanModel
 from gpusense.models.scan.request import make_request
 from gpusense.models.scan.rules import Beams
+from gpusense.models.world_index import check_no_worlds
 from gpusense.peers.weights import Peer, check_weights, choose
+from gpusense.tables.worlds import Worlds
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import LikelihoodFieldParameters
 from gpusense.world.scanner import Scanner
@@ -63,7 +66,7 @@ class LikelihoodFieldModel(ScanModel):
 
     def __init__(
         self,
-        grid: OccupancyGrid,
+        grid: OccupancyGrid | Worlds,
         scanner: Scanner,
         parameters: LikelihoodFieldParameters | None = None,
         *,
@@ -77,6 +80,7 @@ class LikelihoodFieldModel(ScanModel):
         specialize: bool = True,
     ) -> None:
         weights = choose(compat)
+        check_no_worlds(grid, compat)
         self.parameters = weights.field if parameters is None else parameters
         checks.instance("parameters", self.parameters, LikelihoodFieldParameters)
         check_weights(self.parameters, compat)
@@ -97,7 +101,17 @@ class LikelihoodFieldModel(ScanModel):
 
     @property
     def _pipeline(self) -> FieldPipeline:
-        return self._field_pipeline
+        # Shapes need the distances of the field, not its densities.
+        worlds = self._field_pipeline.worlds
+        return self._field_pipeline if worlds is None or not worlds.crowd.crowd.stride else self._with_shapes
+
+    @functools.cached_property
+    def _with_shapes(self) -> FieldPipeline:
+        """The stages of a model of worlds with moving shapes."""
+        return FieldPipeline(
+            self._setting, self._field_pipeline.map.grid, self.parameters, unknown=self.unknown, outside=self.outside,
+            shapes=True,
+        )  # fmt: skip
 
     @property
     def table_bytes(self) -> int:
@@ -127,6 +141,8 @@ class LikelihoodFieldModel(ScanModel):
                 "interpolation: must be 'bilinear' for gradients, got a field with 'nearest': pass "
                 "LikelihoodFieldParameters(interpolation='bilinear')"
             )
+        if self._worlds is not None:
+            raise ValueError(f"grid: must be a single map for gradients, got {self._worlds}")
         request = make_request(self._setting, poses, ranges)
         with self._lock, self._workspace:
             numbers = gradients(self._field_pipeline, request, self._workspace)
@@ -136,7 +152,7 @@ class LikelihoodFieldModel(ScanModel):
         return log_p.reshape(shape), gradient.reshape(*shape, 3), information.reshape(*shape, 3, 3)
 
     def _differentiable(self, ranges: AnyArray) -> Differentiable | None:
-        if self.parameters.interpolation != "bilinear":
+        if self.parameters.interpolation != "bilinear" or self._worlds is not None:
             return None
         return Differentiable(
             lambda poses: self.log_likelihood(poses, ranges), lambda poses: self.gradient(poses, ranges)[:2],

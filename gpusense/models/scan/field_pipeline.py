@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -20,8 +20,10 @@ from gpusense.models.scan.pipeline import ScanLaunch, ScanPipeline, Tiles
 from gpusense.models.scan.readings import Readings, Sensing
 from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.tiles import ENOUGH_SHORT, all_within, spread_of, sum_launch
+from gpusense.models.world_index import check_worlds
 from gpusense.tables.field import RING, FieldTable
 from gpusense.tables.reachable import ReachableMap
+from gpusense.tables.worlds import WorldMap, Worlds
 from gpusense.world.field_density import FieldDensity
 from gpusense.world.frames import split
 from gpusense.world.grid import OccupancyGrid
@@ -53,15 +55,17 @@ class FieldPipeline(ScanPipeline):
     def __init__(
         self,
         setting: ModelContext,
-        grid: OccupancyGrid,
+        grid: OccupancyGrid | Worlds,
         parameters: LikelihoodFieldParameters,
         *,
         unknown: str,
         outside: str,
+        shapes: bool = False,
     ) -> None:
         super().__init__(setting)
         bilinear, weights = parameters.interpolation == "bilinear", setting.weights
-        self.log_table = (self.specialize or weights.is_peer) and not bilinear
+        # Distances to shapes are compared with those to walls.
+        self.log_table = (self.specialize or weights.is_peer) and not bilinear and not shapes
         self.careful = self.real == np.float32
         self.quick = self.careful and self.log_table and self.specialize
         self.components, terms = self._mixture(parameters, bilinear=bilinear, cubes=setting.cubes)
@@ -74,6 +78,11 @@ class FieldPipeline(ScanPipeline):
         )  # fmt: skip
         reach = (range_max + parameters.max_distance) / grid.resolution
         self._resolution = grid.resolution
+        self.worlds = grid if isinstance(grid, Worlds) else None
+        if isinstance(grid, Worlds):
+            worlds = check_worlds(grid, self.backend)
+            self.map = cast(ReachableMap, WorldMap(worlds, lambda: self.table.of_worlds(worlds, unknown)))
+            return
         self.map = ReachableMap(
             self.backend, grid, unknown, self.scanner.mount, reach, self.table.make, self.specialize,
             self.table.refresh, obstacles_of=weights.field_obstacles, neighbors=weights.neighbors,
@@ -83,6 +92,8 @@ class FieldPipeline(ScanPipeline):
     def table_bytes(self) -> int:
         """Bytes of the map's table on the device; 0 before it is made."""
         window = self.map.window
+        if self.worlds is not None:
+            return self.real.itemsize * self.worlds.cells
         return 0 if window is None else self.real.itemsize * (window.rows + 2 * RING) * (window.cols + 2 * RING)
 
     def _mixture(
@@ -159,8 +170,10 @@ class FieldPipeline(ScanPipeline):
         return spread_of(particles, -(-readings.readings // BLOCK_TERMS), ENOUGH_SHORT)
 
     def conditions(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None) -> frozenset[str]:
+        if placed.inside is not None and not self.quick:
+            return placed.world_flags
         inside = tiles is not None and self.quick and all_within(placed, readings.reach, RING)
-        return _INSIDE if inside else _NONE
+        return (_INSIDE if inside else _NONE) | placed.world_flags
 
     def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
         flags = self.components | conditions
@@ -186,7 +199,7 @@ class FieldPipeline(ScanPipeline):
         common = dict(
             table=scoring.table, pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, terms=self.terms,
             window=placed.frame.window, particles=count, readings=readings.readings, batch=scoring.batch,
-            parts=parts.buffer, **readings.arguments,
+            parts=parts.buffer, **placed.places(), **readings.arguments,
         )  # fmt: skip
         if scoring.tiles is None:
             # Lanes of a work-item are particles, which belong to one scan; lanes of loops are readings.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -23,10 +23,13 @@ from gpusense.models.run import Piece, chunk_of, finish, run_pieces
 from gpusense.models.scan.cones import LASER, Cones
 from gpusense.models.scan.sampling import Drawing
 from gpusense.models.scan.tiles import all_within, order_of, tiles_of
+from gpusense.models.world_index import check_worlds, index_of
 from gpusense.tables import casters
 from gpusense.tables.caster_base import Caster, CasterInput
 from gpusense.tables.lookup_files import describe, write_lookup
 from gpusense.tables.reachable import MapState, ObstaclesOf, ReachableMap, TableMemoryError, obstacles_of
+from gpusense.tables.rectangles import rectangles_of_worlds
+from gpusense.tables.worlds import WorldMap, Worlds
 from gpusense.world.frames import Mount
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.windows import Window
@@ -52,7 +55,7 @@ class MapCaster:
         self,
         backend: Backend,
         real: np.dtype,
-        grid: OccupancyGrid,
+        grid: OccupancyGrid | Worlds,
         mount: Mount,
         range_max: float,
         method: Caster,
@@ -68,10 +71,19 @@ class MapCaster:
         # Window of the normals of the map's walls, the normals, and their size [bytes].
         self._normals: tuple[Window, Buffer, int] | None = None
         self._no_normals = backend.upload(np.zeros(2, real))
-        self.map = ReachableMap(
-            backend, grid, unknown, mount, self.limit + method.beyond, self._prepare, crop and not method.whole,
-            self._refresh, obstacles_of=obstacles_of,
-        )  # fmt: skip
+        self._unknown = unknown
+        self._worlds = grid if isinstance(grid, Worlds) else None
+        self.map: ReachableMap
+        if isinstance(grid, Worlds):
+            if not isinstance(method, casters.Exact):
+                raise ValueError(f"caster: must be 'exact' in Worlds, got {method.name!r}")
+            # The same interface, with the table of all worlds.
+            self.map = cast(ReachableMap, WorldMap(check_worlds(grid, backend), self._prepare_worlds))
+        else:
+            self.map = ReachableMap(
+                backend, grid, unknown, mount, self.limit + method.beyond, self._prepare, crop and not method.whole,
+                self._refresh, obstacles_of=obstacles_of,
+            )  # fmt: skip
         # The exact caster has no flag.
         caster = {method.entry.flag: method.entry.flag != ""}
         self._fixed_flags = flags_if(OUTSIDE_OCCUPIED=outside == "occupied", **caster)
@@ -83,9 +95,9 @@ class MapCaster:
         self._lock = threading.Lock()
 
     @property
-    def grid(self) -> OccupancyGrid:
+    def grid(self) -> OccupancyGrid | Worlds:
         """The current map."""
-        return self.map.grid
+        return self.map.grid if self._worlds is None else self._worlds
 
     @property
     def table_bytes(self) -> int:
@@ -100,6 +112,10 @@ class MapCaster:
         """
         if "INCIDENCE" not in flags:
             return self._no_normals
+        if self._worlds is not None:
+            from gpusense.tables.normals import normals_of_worlds
+
+            return normals_of_worlds(self._worlds, self._unknown, self.outside, self.real).buffer
         if self._normals is None or self._normals[0] != window:
             from gpusense.tables.normals import normal_table
 
@@ -125,6 +141,14 @@ class MapCaster:
         table = self.method.prepare(backend, CasterInput(obstacles, self.limit, self.outside))
         self._table_bytes = table.size
         self.flags = self._fixed_flags | table.flags
+        return table.buffer
+
+    def _prepare_worlds(self) -> Buffer:
+        """Return the empty rectangles of all worlds."""
+        assert self._worlds is not None
+        table, flags = rectangles_of_worlds(self._worlds, self._unknown)
+        self._table_bytes = table.size
+        self.flags = self._fixed_flags | flags
         return table.buffer
 
     def _refresh(self, backend: Backend, obstacles: np.ndarray, table: Buffer, changed: Window) -> bool:
@@ -154,7 +178,10 @@ class MapCaster:
             obstacles = state.window.cut(self.map.obstacles)
         write_lookup(path, entries, describe(obstacles, self.limit, self.outside, bins))
 
-    def cast(self, poses: object, vectors: np.ndarray, out: object = None, cones: Cones = LASER) -> Any:
+    def cast(
+        self, poses: object, vectors: np.ndarray, out: object = None, cones: Cones = LASER, *, world: Any = None,
+        ignore: Any = None,
+    ) -> Any:  # fmt: skip
         """Cast rays, in pieces that fit the memory.
 
         Args:
@@ -162,12 +189,15 @@ class MapCaster:
             vectors: (K, 2) ray vectors, or (K, C, 2) of cones.
             out: The array for the result, or None.
             cones: Cones of the sensor.
+            world: (N,) indices of the poses' worlds.
+            ignore: (N,) indices of the shapes that poses do not see.
 
         Returns:
             (N, K) expected ranges, or angles of incidence.
         """
         rays = len(vectors)
         checked = Poses(poses, self.backend, late=rays > 0)
+        checked.inside = index_of(self.grid, world, ignore, checked.count, self.backend)
         result = Result(poses, out, (checked.count, rays), self.real, self.backend, on_device=checked.on_device)
         if checked.count * rays:
             with self._lock, self._workspace:
@@ -231,7 +261,8 @@ class MapCaster:
 
     def _flags(self, placed: PlacedPoses, cones: Cones) -> frozenset[str]:
         """Return the flags that cast the rays of placed poses; the poses must have been placed."""
-        return self.flags | self._precision_flags | cones.flags | flags_if(ORIGINS_OUTSIDE=not all_within(placed, 0))
+        outside = flags_if(ORIGINS_OUTSIDE=not all_within(placed, 0))
+        return self.flags | self._precision_flags | cones.flags | placed.world_flags | outside
 
     def _run(
         self, placed: PlacedPoses, state: MapState, ray: Buffer, rays: int, cones: Cones, flags: frozenset[str],
@@ -240,6 +271,7 @@ class MapCaster:
         """Cast the rays of placed poses to ranges and, with INCIDENCE, angles of incidence; repeat kept programs."""
         normals = self.normals(state.window, cones.flags)
         changing = dict(poses=placed.source, ranges=ranges, incidence=incidence, normals=normals)
+        changing |= placed.changing()
         self._workspace.run(
             (flags, placed.key, rays, cones), changing,
             lambda: (*placed.launches(), *self._program(placed, state.table, ray, rays, cones, flags, changing)),
@@ -255,6 +287,7 @@ class MapCaster:
         common = dict(
             map_table=table, pose_cell=placed.cell, pose=placed.pose, ray=ray, window=placed.frame.window,
             particles=count, rays=rays, caster=self.method.struct(), scale=self.scale, ranges=ranges,
+            **placed.places(),
         )  # fmt: skip
         if "CONES" in flags:
             heard = dict(normals=results["normals"], incidence=results["incidence"], cone=cones.struct)

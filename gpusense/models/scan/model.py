@@ -30,6 +30,7 @@ from gpusense.models.scan.request import Request, make_request
 from gpusense.models.scan.rules import Beams, ModelContext, Rules, check_beams
 from gpusense.models.scan.scoring import LastCall, run
 from gpusense.peers.weights import Peer, choose
+from gpusense.tables.worlds import Worlds
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
@@ -44,7 +45,7 @@ class ScanModel(Pickled):
 
     def __init__(
         self,
-        grid: OccupancyGrid,
+        grid: OccupancyGrid | Worlds,
         scanner: Scanner,
         *,
         backend: Selection,
@@ -90,7 +91,7 @@ class ScanModel(Pickled):
     @functools.cached_property
     def _short(self) -> ShortCalls | None:
         """Calls of few particles that repeat a size; None if the model has none."""
-        if not self.backend.replays:
+        if not self.backend.replays or self._worlds is not None:
             return None
         from gpusense.models.scan.packed_call import ShortCalls
 
@@ -161,6 +162,12 @@ class ScanModel(Pickled):
         return self._pipeline.grid
 
     @property
+    def _worlds(self) -> Worlds | None:
+        """The worlds; None of a model of a single map."""
+        grid: OccupancyGrid | Worlds = self.grid
+        return grid if isinstance(grid, Worlds) else None
+
+    @property
     def device(self) -> BackendInfo:
         """The device the model is compiled for."""
         return self._setting.backend.info
@@ -187,21 +194,42 @@ class ScanModel(Pickled):
 
     @overload
     def log_likelihood(
-        self, poses: AnyArray, ranges: AnyArray, *, per_beam: Literal[False] = ..., out: Any = ...
+        self,
+        poses: AnyArray,
+        ranges: AnyArray,
+        *,
+        world: Any = ...,
+        ignore: Any = ...,
+        per_beam: Literal[False] = ...,
+        out: Any = ...,
     ) -> np.ndarray: ...
 
     @overload
     def log_likelihood(
-        self, poses: AnyArray, ranges: AnyArray, *, per_beam: Literal[True], out: Any = ...
+        self,
+        poses: AnyArray,
+        ranges: AnyArray,
+        *,
+        world: Any = ...,
+        ignore: Any = ...,
+        per_beam: Literal[True],
+        out: Any = ...,
     ) -> tuple[np.ndarray, np.ndarray]: ...
 
     @overload
     def log_likelihood(
-        self, poses: AnyArray, ranges: AnyArray, *, per_beam: bool, out: Any = ...
+        self, poses: AnyArray, ranges: AnyArray, *, world: Any = ..., ignore: Any = ..., per_beam: bool, out: Any = ...
     ) -> np.ndarray | tuple[np.ndarray, np.ndarray]: ...
 
     def log_likelihood(
-        self, poses: AnyArray, ranges: AnyArray, *, per_beam: bool = False, out: Any = None
+        self,
+        poses: AnyArray,
+        ranges: AnyArray,
+        *,
+        world: Any = None,
+        ignore: Any = None,
+        per_beam: bool = False,
+        out: Any = None,
     ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
         """Return log p(z | x, m) of a scan for each particle, natural logarithm.
 
@@ -215,7 +243,9 @@ class ScanModel(Pickled):
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], or (S, N, 3) for S scans. On a device:
                 float32 or float64 and C-contiguous.
             ranges: (K,) readings [m], or (S, K). NaN, -inf and readings below range_min are missing, +inf and readings
-                of range_max or more are max readings.
+                of range_max or more are max readings. Of a model of :class:`Worlds` also (N, K), a scan of each robot.
+            world: (N,) indices of the poses' worlds, or one for all, of a model of worlds; see ``RayCaster.cast``.
+            ignore: (N,) indices of the shapes that poses do not see, or one for all; -1 for none.
             per_beam: Also return the term of each reading, before the temperature; NumPy arrays.
             out: The array for the log-likelihoods, also returned: of their shape and precision, C-contiguous, in the
                 memory of the poses. After an error its contents are undefined.
@@ -239,12 +269,14 @@ class ScanModel(Pickled):
             calls = self._differentiable(ranges)
             if calls is not None:
                 return cast(np.ndarray, log_likelihood_of(poses, ranges, calls))
-        if self._short is not None:
+        if self._short is not None and self._worlds is None:
             with self._lock:
                 result = self._short.score(poses, ranges, out, per_beam=per_beam)
             if result is not None:
                 return result
-        request = make_request(self._setting, poses, ranges, out, per_beam=per_beam)
+        request = make_request(
+            self._setting, poses, ranges, out, per_beam=per_beam, worlds=self._worlds, world=world, ignore=ignore
+        )
         with self._lock, self._workspace:
             run(self._pipeline, request, self._workspace, self._last_call)
             finish(self._workspace, request.poses.on_device)

@@ -7,11 +7,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gpusense._util import checks
 from gpusense.backends import arrays
 from gpusense.backends.results import Result
 from gpusense.models.poses import Poses
 from gpusense.models.scan.classed import check_ranges
 from gpusense.models.scan.rules import ModelContext
+from gpusense.models.world_index import WorldIndex
+from gpusense.tables.worlds import Worlds
 
 FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
 # Poses that several models share, checked once, by the number of scans.
@@ -29,6 +32,7 @@ class Request(NamedTuple):
         parts: (S, N, K) log-likelihoods of the readings; (S, N, 0) where they are not requested.
         per_beam: True if they are requested, of a scanner with beams.
         before: Called once readings are on the device; it starts the launches that write the poses.
+        own_scans: True if each of (N, 3) poses has a scan of its own.
     """
 
     ranges: np.ndarray
@@ -38,6 +42,7 @@ class Request(NamedTuple):
     parts: np.ndarray
     per_beam: bool
     before: Callable[[], None] | None = None
+    own_scans: bool = False
 
     @property
     def scans(self) -> int:
@@ -47,7 +52,7 @@ class Request(NamedTuple):
     @property
     def per_scan(self) -> int:
         """N."""
-        return self.shape[-1]
+        return 1 if self.own_scans else self.shape[-1]
 
     def result_parts(self) -> np.ndarray:
         """Return the log-likelihoods of the readings, (N, K) or (S, N, K)."""
@@ -63,6 +68,9 @@ def make_request(
     per_beam: bool = False,
     known: Known | None = None,
     before: Callable[[], None] | None = None,
+    worlds: Worlds | None = None,
+    world: Any = None,
+    ignore: Any = None,
 ) -> Request:
     """Check the arguments of a call.
 
@@ -74,6 +82,9 @@ def make_request(
         per_beam: True if the log-likelihoods of the readings are requested.
         known: Poses that were checked before.
         before: See Request.
+        worlds: The worlds of a model of worlds.
+        world: (N,) indices of the poses' worlds.
+        ignore: (N,) indices of the shapes that poses do not see.
     """
     backend, real, scanner = setting.backend, setting.real, setting.rules.scanner
     beams = scanner.count
@@ -83,6 +94,20 @@ def make_request(
         readings = check_ranges(arrays.copied_to_host(ranges, backend, "ranges"), scanner)
     known = {} if known is None else known
     shape: tuple[int, ...]
+    if worlds is not None:
+        checked = Poses(poses, backend, late=True)
+        if readings.ndim == 2 and len(readings) != checked.count:
+            got = checks.shape_text(readings.shape)
+            raise ValueError(f"ranges: shape must be ({beams},) or ({checked.count}, {beams}), got {got}")
+        checked.inside = WorldIndex(worlds, world, ignore, checked.count, backend)
+        own_scans, shape = readings.ndim == 2, (checked.count,)
+        readings = readings if own_scans else readings[None]
+        result = Result(poses, out, shape, real, backend, on_device=checked.on_device)
+        parts = np.zeros((len(readings), 1 if own_scans else shape[0], beams if per_beam else 0), real)
+        return Request(readings, checked, shape, result, parts, per_beam and beams > 0, before, own_scans)
+    for name, value in (("world", world), ("ignore", ignore)):
+        if value is not None:
+            raise ValueError(f"{name}: must be None for a model of a single map, got {checks.show(value)}")
     if readings.ndim == 1:
         checked = known[None] = known.get(None) or Poses(poses, backend, late=True)
         readings, shape = readings[None], (checked.count,)

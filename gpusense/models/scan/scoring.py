@@ -103,7 +103,7 @@ class _Scorer:
             # As late as possible: a processor's threads are then awake for the launches that follow.
             self._begin()
             flags = space.run(
-                key, dict(pipeline.numbers(scoring), poses=placed.source, log_p=log_p),
+                key, dict(pipeline.numbers(scoring), poses=placed.source, log_p=log_p, **placed.changing()),
                 lambda: pipeline.program(scoring), version=state.version,
             )  # fmt: skip
         self._last.kernels = pipeline.kernel_names[scoring.tiles is not None]

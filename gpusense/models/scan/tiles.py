@@ -27,7 +27,7 @@ ENOUGH_SHORT = 1 << 19
 
 def all_within(placed: PlacedPoses, reach: float, ring: int = 0) -> bool:
     """Return whether all cells within ``reach`` of the sensors are surely in the window and a ring around it."""
-    if placed.corners is None:
+    if placed.corners is None or not (placed.inside is None or placed.inside.worlds.uniform):
         return False
     window, frame = placed.frame.window, placed.frame
     left, right, low, high = extent(frame.cells, placed.corners, frame.mount)
@@ -69,7 +69,7 @@ class Order:
 def order_of(space: Workspace, placed: PlacedPoses, rays: int, real: np.dtype) -> Order | None:
     """Return an order of the particles where sorting pays, and upload its bounds."""
     count = placed.count
-    if count * rays < LEAST_ORDERED[0] or count < LEAST_ORDERED[1]:
+    if placed.inside is not None or count * rays < LEAST_ORDERED[0] or count < LEAST_ORDERED[1]:
         return None
     return Order(
         placed, space.upload("bounds", _UNBOUNDED), space.empty("bins", ALL_BINS, _INT),

@@ -88,6 +88,13 @@ kernel void score_beams(ARGUMENTS) {
 #else
     const int count = size;
 #endif
+#if WORLDS
+    const Window seen = world_window(world, n);
+    map_table += world_begin(world, n, PLANES);
+    normals += world_begin(world, n, 1);
+#else
+    const Window seen = window;
+#endif
     real2 total = (real2)(constant_term, 0);
     real4 strands = 0;
     ilanes impossible = 0;
@@ -103,8 +110,9 @@ kernel void score_beams(ARGUMENTS) {
                 at[i] = r;
             }
             for (; returns.cast <= r; returns.cast += LANES) {
-                const EchoLanes new = nearest_echo_lanes(map_table, normals, window, pose_cell[n], pose[n], ray,
-                                                         returns.cast, size, cone, scale.limit, caster);
+                const EchoLanes new = nearest_echo_lanes(map_table, normals, seen, pose_cell[n], pose[n], ray,
+                                                         returns.cast, size, cone, scale.limit, caster, shapes, world,
+                                                         crowd, n);
                 store_lanes(new.t, (returns.cast / LANES) % 2, returns.t);
                 store_lanes(new.cosine, (returns.cast / LANES) % 2, returns.cosine);
             }
@@ -116,8 +124,8 @@ kernel void score_beams(ARGUMENTS) {
             echo[v] = (EchoLanes){load_lanes(0, t), load_lanes(0, cosine)};
 #else
             const lanes limit = ray_limit_lanes(load_some(reading + k, count - k), terms, scale);
-            echo[v] = nearest_echo_lanes(map_table, normals, window, pose_cell[n], pose[n], ray, k, size, cone, limit,
-                                         caster);
+            echo[v] = nearest_echo_lanes(map_table, normals, seen, pose_cell[n], pose[n], ray, k, size, cone, limit,
+                                         caster, shapes, world, crowd, n);
 #endif
         }
         DensityParts parts_of[VECTORS];

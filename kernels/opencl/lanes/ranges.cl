@@ -1,5 +1,5 @@
 // Expected ranges of poses and bearings, LANES rays at once: cast_ranges of ranges.cl.
-// requires: lanes/caster lanes/rays
+// requires: lanes/caster lanes/rays lanes/shapes
 
 // Rays of a work-item, whatever the precision.
 #define WORK_RAYS 16
@@ -8,10 +8,21 @@
 kernel void cast_ranges(ARGUMENTS) {
     const int begin = WORK_RAYS * get_global_id(0), n = get_global_id(1);
     if (n >= particles) return;
+#if WORLDS
+    const Window seen = world_window(world, n);
+    map_table += world_begin(world, n, PLANES);
+#else
+    const Window seen = window;
+#endif
     for (int first = begin; first < begin + WORK_RAYS && first < rays; first += LANES) {
         lanes x, y;
         load_ray_lanes(ray, first, rays, 1, &x, &y);
-        const lanes t = cast_ray_lanes(map_table, window, pose_cell[n], pose[n], x, y, scale.limit, caster);
+        const lanes met = cast_ray_lanes(map_table, seen, pose_cell[n], pose[n], x, y, scale.limit, caster);
+#if SHAPES
+        const lanes t = nearest_shape_lanes(shapes, world, crowd, n, pose_cell[n], pose[n], x, y, met).hi;
+#else
+        const lanes t = met;
+#endif
         const lanes range = range_lanes(t, scale);
         global real *out = ranges + (long)n * rays + first;
         if (first + LANES <= rays) {

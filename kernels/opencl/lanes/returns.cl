@@ -1,6 +1,6 @@
 // Nearest returns of LANES cones of one pose at once, and the cosines of their angles of incidence: echo.cl in lanes,
 // with the same bits. A laser's cone is one ray.
-// requires: lanes/caster lanes/rays
+// requires: lanes/caster lanes/rays lanes/shapes
 
 // Distances in cells, and cosines of the angles of incidence; without a return limit and 2.
 typedef struct {
@@ -57,7 +57,8 @@ void hit_normal_lanes(global const real2 *normals, const Window window, const in
 // Nothing beyond a lane's limit counts.
 EchoLanes nearest_echo_lanes(global const entry *map_table, global const real2 *normals, const Window window,
                              const int2 cell, const real4 pose, global const real2 *ray, const int first,
-                             const int count, const Cone cone, const lanes limit, const Caster caster) {
+                             const int count, const Cone cone, const lanes limit, const Caster caster,
+                             global const real *shapes, global const int2 *world, const Crowd crowd, const int n) {
     lanes x, y;
 #if CONES
     EchoLanes echo = {limit, 2};
@@ -71,7 +72,13 @@ EchoLanes nearest_echo_lanes(global const entry *map_table, global const real2 *
 #if BRESENHAM
         farthest = limit;
 #endif
-        const lanes t = cast_ray_lanes(map_table, window, cell, pose, x, y, farthest, caster);
+        const lanes met = cast_ray_lanes(map_table, window, cell, pose, x, y, farthest, caster);
+#if SHAPES
+        const LanePair shape = nearest_shape_lanes(shapes, world, crowd, n, cell, pose, x, y, met);
+        const lanes t = shape.hi;
+#else
+        const lanes t = met;
+#endif
         ilanes nearer = t < echo.t;
         if (!any_lane(nearer)) continue;
 #if INCIDENCE
@@ -79,7 +86,11 @@ EchoLanes nearest_echo_lanes(global const entry *map_table, global const real2 *
         direct_lanes(pose, x, y, &dx, &dy);
         hit_normal_lanes(normals, window, cell, pose, dx, dy, nearer ? t : (lanes)0, &normal_x, &normal_y);
         const lanes along = dx * normal_x + dy * normal_y;
+#if SHAPES
+        const lanes cosine = t < met ? shape.lo : normal_x == normal_x ? fabs(along) : (lanes)1;
+#else
         const lanes cosine = normal_x == normal_x ? fabs(along) : (lanes)1;
+#endif
         nearer &= ~(cosine < cone.critical);
         echo.cosine = nearer ? cosine : echo.cosine;
 #endif
@@ -88,6 +99,11 @@ EchoLanes nearest_echo_lanes(global const entry *map_table, global const real2 *
     return echo;
 #else
     load_ray_lanes(ray, first, count, 1, &x, &y);
-    return (EchoLanes){cast_ray_lanes(map_table, window, cell, pose, x, y, limit, caster), 2};
+    const lanes met = cast_ray_lanes(map_table, window, cell, pose, x, y, limit, caster);
+#if SHAPES
+    return (EchoLanes){nearest_shape_lanes(shapes, world, crowd, n, cell, pose, x, y, met).hi, 2};
+#else
+    return (EchoLanes){met, 2};
+#endif
 #endif
 }

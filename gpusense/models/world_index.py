@@ -1,0 +1,157 @@
+"""The worlds of a request's poses: checks of indices, and placement of poses in their worlds."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.backends import Backend, arrays
+from gpusense.backends.base import Buffer
+from gpusense.backends.workspace import Workspace
+from gpusense.interface.flags import flags_if
+from gpusense.interface.structs import Crowd
+from gpusense.tables.crowd import NO_CROWD
+from gpusense.tables.worlds import Worlds
+from gpusense.world.grid import OccupancyGrid
+
+_INT = np.dtype(np.int32)
+_ON_DEVICE = ("int32", "int64")
+
+
+class WorldIndex:
+    """The world of each pose, and the shape that it does not see.
+
+    Args:
+        worlds: The worlds.
+        world: (N,) indices, or one for all poses; None with a single world.
+        ignore: (N,) indices of shapes, -1 for none, or one for all poses; None ignores none.
+        count: N.
+        backend: The device.
+
+    Raises:
+        TypeError: Not integers, or on the device neither int32 nor int64.
+        ValueError: A wrong shape, or an index in host memory of no world.
+    """
+
+    def __init__(self, worlds: Worlds, world: Any, ignore: Any, count: int, backend: Backend) -> None:
+        self.worlds = worlds
+        if world is None:
+            if len(worlds) > 1:
+                raise ValueError(f"world: must be an index of one of {len(worlds)} worlds for each pose, got None")
+            world = 0
+        self._world = _indices("world", world, count, backend, len(worlds))
+        self._ignore = None if ignore is None else _indices("ignore", ignore, count, backend, None)
+
+    def buffers(self, backend: Backend, space: Workspace, part: tuple[int, int]) -> InWorlds:
+        """Return the indices of some poses on the device."""
+        worlds, crowd = self.worlds, self.worlds.crowd.crowd
+        index, wide = _buffer("world", self._world, backend, space, part)
+        ignore, wide_ignore = index, wide
+        if crowd.stride:
+            ignored = np.full(part[1], -1, _INT) if self._ignore is None else self._ignore
+            ignore, wide_ignore = _buffer("ignore", ignored, backend, space, part)
+        return InWorlds(worlds, index, ignore, wide, wide_ignore)
+
+
+class InWorlds(NamedTuple):
+    """Worlds of some poses on the device.
+
+    Attributes:
+        worlds: The worlds.
+        index: Index of the world of each pose.
+        ignore: Index of the shape that each pose does not see; not read without shapes.
+        wide: Numbers of 32 bits of each index of a world.
+        wide_ignore: The same of each index of a shape.
+    """
+
+    worlds: Worlds
+    index: Buffer
+    ignore: Buffer
+    wide: int
+    wide_ignore: int
+
+    @property
+    def crowd(self) -> Crowd:
+        """The numbers of shapes."""
+        return self.worlds.crowd.crowd
+
+    @property
+    def flags(self) -> frozenset[str]:
+        """Flags of kernels that cast rays of these poses."""
+        return flags_if(WORLDS=True, SHAPES=self.crowd.stride > 0)
+
+
+def index_of(grid: OccupancyGrid | Worlds, world: Any, ignore: Any, count: int, backend: Backend) -> WorldIndex | None:
+    """Return the worlds of poses; None for a single map.
+
+    Raises:
+        ValueError: A world or a shape is named for a single map.
+    """
+    if isinstance(grid, Worlds):
+        return WorldIndex(grid, world, ignore, count, backend)
+    for name, value in (("world", world), ("ignore", ignore)):
+        if value is not None:
+            raise ValueError(f"{name}: must be None for a model of a single map, got {checks.show(value)}")
+    return None
+
+
+def check_worlds(worlds: Worlds, backend: Backend) -> Worlds:
+    """Return worlds after a check of their device.
+
+    Raises:
+        ValueError: They are on another device than the model.
+    """
+    if worlds.backend is not backend:
+        here, there = backend.info.selection, worlds.device.selection
+        raise ValueError(f"grid: must be Worlds on the model's device {here!r}, got backend={there!r}; "
+                         f"pass backend={there!r}, or make the worlds on {here!r}")  # fmt: skip
+    return worlds
+
+
+def check_no_worlds(grid: object, compat: object) -> None:
+    """Refuse peers' formulas in worlds.
+
+    Raises:
+        ValueError: ``compat`` is set for a model of worlds.
+    """
+    if isinstance(grid, Worlds) and compat is not None:
+        raise ValueError(f"compat: must be None in Worlds, got {checks.show(compat)}")
+
+
+def no_worlds(space: Workspace, real: np.dtype) -> dict[str, Any]:
+    """Return the arguments of kernels that cast rays in a single map."""
+    return dict(world=space.empty("no world", 2, _INT), shapes=space.empty("no shapes", 1, real), crowd=NO_CROWD)
+
+
+def _indices(name: str, value: Any, count: int, backend: Backend, worlds: int | None) -> Any:
+    """Return (N,) indices as int32 in host memory, or as an array on the device."""
+    if type(value) is not np.ndarray and arrays.on_device(value):
+        adopted = arrays.adopt_integers(value, backend, name, _ON_DEVICE)
+        if adopted.shape != (count,):
+            raise ValueError(f"{name}: shape must be ({count},), got {checks.shape_text(adopted.shape)}")
+        return adopted
+    read = checks.as_array(name, arrays.to_host(value, name))
+    if read.dtype.kind not in "iu":
+        cure = "numpy.flatnonzero(mask)" if read.dtype.kind == "b" else f"{name}.astype(int)"
+        raise TypeError(f"{name}: must hold integers, got dtype {read.dtype}; pass {cure}")
+    shape = () if read.ndim == 0 else (count,)
+    if read.shape != shape:
+        raise ValueError(f"{name}: shape must be ({count},), got {checks.shape_text(read.shape)}")
+    if worlds is not None:
+        checks.indices(name, np.atleast_1d(read), worlds)
+    return np.ascontiguousarray(np.broadcast_to(read, (count,)), _INT)
+
+
+def _buffer(name: str, given: Any, backend: Backend, space: Workspace, part: tuple[int, int]) -> tuple[Buffer, int]:
+    """Return some indices on the device, and the numbers of 32 bits of each."""
+    begin, end = part
+    if isinstance(given, np.ndarray):
+        return space.upload(f"{name} index", given[begin:end]), 1
+    wide = given.dtype.itemsize // 4
+    if begin * wide * 4 % backend.alignment == 0:
+        return backend.part(given.buffer, begin * wide, (end - begin) * wide, _INT), wide
+    copied = space.empty(f"{name} part", (end - begin) * wide, _INT)
+    backend.copy(given.buffer, copied, 4 * (end - begin) * wide, begin=4 * begin * wide)
+    return copied, wide

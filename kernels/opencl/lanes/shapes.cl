@@ -1,0 +1,37 @@
+// Moving shapes along LANES rays of one pose at once: shapes.cl in lanes.
+// requires: shapes lanes/rays
+
+#if SHAPES
+// in lanes: meet_disc meet_box meet_segment
+
+// Return the nearest of the shapes that a particle sees along rays and of obstacles at distances t.
+LanePair nearest_shape_lanes(global const real *shapes, global const int2 *world, const Crowd crowd, const int n,
+                             const int2 cell, const real4 pose, const lanes ray_x, const lanes ray_y, const lanes t) {
+    lanes dx, dy;
+    direct_lanes(pose, ray_x, ray_y, &dx, &dy);
+    const int2 seen = world[2 * n + 1];
+    global const real *one = shapes + (long)seen.x * crowd.stride;
+    LanePair nearest = {t, 2};
+    const int boxes = crowd.discs + crowd.boxes;
+    for (int i = 0; i < boxes + crowd.segments; ++i) {
+        const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
+        LanePair met;
+        if (i < crowd.discs) {
+            met = meet_disc_lanes(dx, dy, x, y, one[2]);
+            one += DISC;
+        } else if (i < boxes) {
+            met = meet_box_lanes(dx, dy, x, y, one[2], one[3], one[4], one[5]);
+            one += BOX;
+        } else {
+            const real end_x = (one[2] - cell.x) - pose.x, end_y = (one[3] - cell.y) - pose.y;
+            met = meet_segment_lanes(dx, dy, x, y, end_x, end_y);
+            one += SEGMENT;
+        }
+        if (i == seen.y) continue;
+        const ilanes nearer = met.hi < nearest.hi;
+        nearest.hi = nearer ? met.hi : nearest.hi;
+        nearest.lo = nearer ? met.lo : nearest.lo;
+    }
+    return nearest;
+}
+#endif

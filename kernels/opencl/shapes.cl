@@ -1,0 +1,129 @@
+// Moving shapes of a world: discs, boxes and segments, in cells of its grid. A disc has 4 numbers: centre and radius,
+// and one that is not used. A box has 8: centre, cosine and sine of its direction, half its length and width, and two
+// that are not used. A segment has 4: its ends. A shape whose numbers are NaN is met by no ray. WORLDS: world has two
+// pairs of numbers for each particle: the first cell of its world among all worlds and the world's size, rows times
+// 2^16 plus columns; the world's index and the index of the shape that it does not see.
+// requires: ray
+
+// Return the part of the grid that a particle's world fills.
+Window world_window(global const int2 *world, const int n) {
+    const int size = world[2 * n].y;
+    const Window window = {0, 0, size >> 16, size & 0xffff};
+    return window;
+}
+
+// Return the first entry of a particle's world in a table with ``each`` entries for a cell.
+long world_begin(global const int2 *world, const int n, const int each) { return (long)world[2 * n].x * each; }
+
+// Numbers of shapes.
+#define DISC 4
+#define BOX 8
+#define SEGMENT 4
+
+#if SHAPES
+// Return the distance along a ray to a disc, infinite where it is not met, and the cosine of the angle of incidence;
+// inside the disc 0 and 1. Places are relative to the ray's origin.
+real2 meet_disc(const real dx, const real dy, const real x, const real y, const real radius) {
+    const real along = dx * x + dy * y, aside = dx * y - dy * x;
+    const real square = (radius - aside) * (radius + aside), half_chord = sqrt(square > 0 ? square : (real)0);
+    const real near = along - half_chord, far = along + half_chord;
+    const real t = near > 0 ? near : (real)0, cosine = radius > 0 ? half_chord / radius : (real)1;
+    return (real2)((square >= 0) & (far >= 0) ? t : (real)INFINITY, near > 0 ? cosine : (real)1);
+}
+
+// Return the same of a box, whose direction has a cosine and sine.
+real2 meet_box(const real dx, const real dy, const real x, const real y, const real cosine, const real sine,
+               const real half_length, const real half_width) {
+    const real u = cosine * dx + sine * dy, v = cosine * dy - sine * dx;
+    const real p = -(cosine * x + sine * y), q = -(cosine * y - sine * x);
+    const real fast_u = fabs(u), fast_v = fabs(v);
+    const real inv_u = 1 / (fast_u < TINY ? TINY : fast_u), inv_v = 1 / (fast_v < TINY ? TINY : fast_v);
+    const real from_u = u < 0 ? -p : p, from_v = v < 0 ? -q : q;
+    const real flat_u = fabs(p) <= half_length ? (real)-INFINITY : (real)INFINITY;
+    const real flat_v = fabs(q) <= half_width ? (real)-INFINITY : (real)INFINITY;
+    const real in_u = fast_u < TINY ? flat_u : (-half_length - from_u) * inv_u;
+    const real in_v = fast_v < TINY ? flat_v : (-half_width - from_v) * inv_v;
+    const real out_u = fast_u < TINY ? (real)INFINITY : (half_length - from_u) * inv_u;
+    const real out_v = fast_v < TINY ? (real)INFINITY : (half_width - from_v) * inv_v;
+    const real in = in_u > in_v ? in_u : in_v, out = out_u < out_v ? out_u : out_v;
+    const real t = in > 0 ? in : (real)0, straight = in_u > in_v ? fast_u : fast_v;
+    return (real2)((in <= out) & (out >= 0) ? t : (real)INFINITY, in > 0 ? straight : (real)1);
+}
+
+// Return the same of a segment; a ray along it meets its nearer end.
+real2 meet_segment(const real dx, const real dy, const real x, const real y, const real end_x, const real end_y) {
+    const real along = dx * x + dy * y, end_along = dx * end_x + dy * end_y;
+    const real aside = dx * y - dy * x, end_aside = dx * end_y - dy * end_x;
+    const real width = end_aside - aside, length = end_along - along;
+    const real nearer = along < end_along ? along : end_along, farther = along < end_along ? end_along : along;
+    const real across = along - aside / (width == 0 ? (real)1 : width) * length;
+    const real clipped = across < nearer ? nearer : across > farther ? farther : across;
+    const real on_line = nearer > 0 ? nearer : farther < 0 ? (real)-1 : (real)0;
+    const real t = width == 0 ? (aside == 0 ? on_line : (real)-1) : clipped;
+    const real straight = fabs(width) / sqrt(width == 0 ? (real)1 : width * width + length * length);
+    const real met = t >= 0 ? t : (real)INFINITY;
+    return (real2)((aside <= 0) & (end_aside >= 0) | (aside >= 0) & (end_aside <= 0) ? met : (real)INFINITY, straight);
+}
+
+// Return the nearest of the shapes that a particle sees along a ray and of an obstacle at a distance t: the distance in
+// cells, and the cosine of the angle of incidence, 2 where no shape is nearer than t.
+real2 nearest_shape(global const real *shapes, global const int2 *world, const Crowd crowd, const int n,
+                    const int2 cell, const real4 pose, const real2 ray, const real t) {
+    const real2 direction = ray_direction(pose, ray);
+    const int2 seen = world[2 * n + 1];
+    global const real *one = shapes + (long)seen.x * crowd.stride;
+    real2 nearest = (real2)(t, 2);
+    int i = 0;
+    for (; i < crowd.discs; ++i, one += DISC) {
+        const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
+        const real2 met = meet_disc(direction.x, direction.y, x, y, one[2]);
+        if (met.x < nearest.x && i != seen.y) nearest = met;
+    }
+    for (; i < crowd.discs + crowd.boxes; ++i, one += BOX) {
+        const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
+        const real2 met = meet_box(direction.x, direction.y, x, y, one[2], one[3], one[4], one[5]);
+        if (met.x < nearest.x && i != seen.y) nearest = met;
+    }
+    for (; i < crowd.discs + crowd.boxes + crowd.segments; ++i, one += SEGMENT) {
+        const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
+        const real end_x = (one[2] - cell.x) - pose.x, end_y = (one[3] - cell.y) - pose.y;
+        const real2 met = meet_segment(direction.x, direction.y, x, y, end_x, end_y);
+        if (met.x < nearest.x && i != seen.y) nearest = met;
+    }
+    return nearest;
+}
+
+// Return the distance from a point to the nearest shape that a particle sees, infinite without one, 0 inside a shape.
+// The point is relative to the cell.
+real shape_distance(global const real *shapes, global const int2 *world, const Crowd crowd, const int n,
+                    const int2 cell, const real2 point) {
+    real nearest = INFINITY;
+    const int2 seen = world[2 * n + 1];
+    global const real *one = shapes + (long)seen.x * crowd.stride;
+    const int boxes = crowd.discs + crowd.boxes;
+    for (int i = 0; i < boxes + crowd.segments; ++i) {
+        const real x = (one[0] - cell.x) - point.x, y = (one[1] - cell.y) - point.y;
+        real away;
+        if (i < crowd.discs) {
+            away = sqrt(x * x + y * y) - one[2];
+            one += DISC;
+        } else if (i < boxes) {
+            const real u = fabs(one[2] * x + one[3] * y) - one[4], v = fabs(one[2] * y - one[3] * x) - one[5];
+            const real out_u = u > 0 ? u : 0, out_v = v > 0 ? v : 0;
+            away = sqrt(out_u * out_u + out_v * out_v);
+            // The comparisons above turn NaN into 0.
+            away = x - x == 0 ? away : (real)NAN;
+            one += BOX;
+        } else {
+            const real to_x = ((one[2] - cell.x) - point.x) - x, to_y = ((one[3] - cell.y) - point.y) - y;
+            const real square = to_x * to_x + to_y * to_y, part = -(x * to_x + y * to_y) / (square > 0 ? square : 1);
+            const real on = part > 0 ? (part < 1 ? part : (real)1) : (real)0;
+            const real off_x = x + on * to_x, off_y = y + on * to_y;
+            away = sqrt(off_x * off_x + off_y * off_y);
+            one += SEGMENT;
+        }
+        if (i != seen.y && away < nearest) nearest = away;
+    }
+    return nearest > 0 ? nearest : 0;
+}
+#endif

@@ -1,0 +1,162 @@
+// Many worlds in one table: their cells, obstacles and tables, moving shapes, and poses placed in them. Worlds of one
+// size are made together. Their rows are interleaved: line i is row i / worlds of world i % worlds. place has the first
+// cell of each in tables with a ring of two cells. frames has 8 numbers for each world: x and y of its origin, cosine
+// and sine of its yaw, rows, columns, its first cell, and one that is not used.
+// requires: placement shapes
+
+// Cells above this one are unknown.
+#define MOST_KNOWN 127
+#define FRAME_NUMBERS 8
+#define RING 2
+
+// Copy the cells of some worlds to their places. One work-item takes a cell.
+kernel void put_cells(ARGUMENTS) {
+    const int i = get_global_id(0), w = get_global_id(1);
+    if (i >= count || w >= worlds) return;
+    store[(long)place[w] + i] = cells[(long)w * count + i];
+}
+
+// Return whether a cell stops a beam.
+int stops_beam(const int cell, const int threshold, const int unknown) {
+    return cell > MOST_KNOWN ? unknown : cell >= threshold;
+}
+
+// Mark the obstacles of worlds as bytes and as bits, with a margin of obstacles around each world. One work-item takes
+// 32 cells of a line.
+kernel void mark_obstacles(ARGUMENTS) {
+    const int word = get_global_id(0), line = get_global_id(1), width = cols + 2 * margin;
+    if (word >= words || line >= (rows + 2 * margin) * worlds) return;
+    const int row = line / worlds - margin, w = line % worlds;
+    uint marked = 0;
+    for (int i = 0; i < 32 && 32 * word + i < width; ++i) {
+        const int col = 32 * word + i - margin;
+        const int inside = col >= 0 && col < cols && row >= 0 && row < rows;
+        const int stops = inside ? stops_beam(store[place[w] + (long)row * cols + col], threshold, unknown) : 1;
+        occupied[(long)line * width + 32 * word + i] = (uchar)stops;
+        marked |= (uint)stops << i;
+    }
+    bits[(long)line * words + word] = (int)marked;
+}
+
+// Fill the tables of likelihood fields of worlds from squared distances, whose map has a margin. One work-item takes a
+// cell.
+kernel void fill_worlds(ARGUMENTS) {
+    const int col = get_global_id(0), line = get_global_id(1), width = cols + 2 * RING;
+    if (col >= width || line >= (rows + 2 * RING) * worlds) return;
+    const int row = line / worlds, w = line % worlds;
+    const int from_row = row - RING + margin, from_col = col - RING + margin;
+    const int inside = from_row >= 0 && from_row < rows + 2 * margin && from_col >= 0 && from_col < cols + 2 * margin;
+    const long at = ((long)from_row * worlds + w) * (cols + 2 * margin) + from_col;
+    table[place[w] + (long)row * width + col] = inside ? density[min(squared[at], cap)] : beyond;
+}
+
+// Return the frame of a world; the scanner's position and the resolution are those of all worlds.
+Frame frame_in(global const double *frames, const int index, const Frame frame) {
+    global const double *numbers = frames + (long)index * FRAME_NUMBERS;
+    Frame moved = frame;
+    moved.origin_x = numbers[0], moved.origin_y = numbers[1];
+    moved.yaw_cos = numbers[2], moved.yaw_sin = numbers[3];
+    return moved;
+}
+
+// Place poses in their worlds; see place_pose. An index of no world sets the second bit of pose_status, and the pose
+// sees nothing. One work-item takes a particle.
+kernel void place_in_worlds(ARGUMENTS) {
+    const int particle = get_global_id(0);
+    if (particle >= particles) return;
+    // Indices of 64 bits have 0 in the upper half.
+    const int chosen = index[wide * particle], whole = wide == 1 || index[2 * particle + 1] == 0;
+    const int known = whole && chosen >= 0 && chosen < worlds, w = known ? chosen : 0;
+    global const double *numbers = frames + (long)w * FRAME_NUMBERS;
+    const Window window = {0, 0, (int)numbers[4], (int)numbers[5]};
+    place_pose(particle, poses, pose_cell, pose, pose_low, pose_status, frame_in(frames, w, frame), window);
+    if (!known) {
+        atomic_or(&pose_status[0], 2);
+        pose_cell[particle] = (int2)(-(int)FARTHEST, -(int)FARTHEST);
+    }
+    world[2 * particle] = (int2)((int)numbers[6], window.rows << 16 | window.cols);
+#if SHAPES
+    world[2 * particle + 1] = (int2)(w, ignore[wide_ignore * particle]);
+#else
+    world[2 * particle + 1] = (int2)(w, -1);
+#endif
+}
+
+// Return a point of the world in cells of a frame.
+double2 point_in(const double x, const double y, const Frame here) {
+    double u = x - here.origin_x, v = y - here.origin_y;
+    if (here.yaw_sin != 0) {
+        const double before = u;
+        u = here.yaw_cos * u + here.yaw_sin * v;
+        v = here.yaw_cos * v - here.yaw_sin * before;
+    }
+    return (double2)(within_reach(u / here.resolution), within_reach(v / here.resolution));
+}
+
+// Place moving shapes of one kind, with 3 (discs), 5 (boxes) or 4 numbers (segments), in the cells of their worlds. A
+// shape with a number that is not finite, or with a negative size, is none. One work-item takes a shape.
+kernel void place_shapes(ARGUMENTS) {
+    const int i = get_global_id(0), w = get_global_id(1);
+    if (i >= count || w >= worlds) return;
+    global const coordinate *from = raw + ((long)w * count + i) * numbers;
+    const int each = numbers == 5 ? BOX : DISC;
+    global real *to = shapes + (long)w * stride + begin + i * each;
+    const Frame here = frame_in(frames, w, frame);
+    double sum = 0;
+    for (int k = 0; k < numbers; ++k) sum += (double)from[k] - (double)from[k];
+    const double length = from[numbers == 3 ? 2 : 3];
+    if (!(sum == 0) || (numbers != 4 && length < 0) || (numbers == 5 && from[4] < 0)) {
+        for (int k = 0; k < each; ++k) to[k] = NAN;
+        return;
+    }
+    const double2 centre = point_in(from[0], from[1], here);
+    to[0] = (real)centre.x;
+    to[1] = (real)centre.y;
+    if (numbers == 3) {
+        to[2] = (real)(length / here.resolution);
+        to[3] = 0;
+    } else if (numbers == 4) {
+        const double2 other = point_in(from[2], length, here);
+        to[2] = (real)other.x;
+        to[3] = (real)other.y;
+    } else {
+        double2 turned = cos_sin(from[2]);
+        if (here.yaw_sin != 0) {
+            turned = (double2)(turned.x * here.yaw_cos + turned.y * here.yaw_sin,
+                               turned.y * here.yaw_cos - turned.x * here.yaw_sin);
+        }
+        to[2] = (real)turned.x;
+        to[3] = (real)turned.y;
+        to[4] = (real)(length / here.resolution / 2);
+        to[5] = (real)(from[4] / here.resolution / 2);
+        to[6] = to[7] = 0;
+    }
+}
+
+// Tell which discs about poses, with a radius in cells, meet an obstacle or a shape. One work-item takes a particle.
+kernel void find_collisions(ARGUMENTS) {
+    const int n = get_global_id(0);
+    if (n >= particles) return;
+    const Window window = world_window(world, n);
+    const int2 cell = pose_cell[n];
+    const real2 point = (real2)(pose[n].x, pose[n].y);
+#if SHAPES
+    int met = shape_distance(shapes, world, crowd, n, cell, point) <= radius;
+#else
+    int met = 0;
+#endif
+    const int reach = (int)radius + 1;
+    const int first_row = max(cell.y - reach, 0), last_row = min(cell.y + reach, window.rows - 1);
+    const int first_col = max(cell.x - reach, 0), last_col = min(cell.x + reach, window.cols - 1);
+    for (int row = first_row; row <= last_row; ++row) {
+        const real below = row - cell.y - point.y, above = -(below + 1);
+        const real off_y = below > 0 ? below : above > 0 ? above : 0;
+        for (int col = first_col; col <= last_col; ++col) {
+            const real left = col - cell.x - point.x, right = -(left + 1);
+            const real off_x = left > 0 ? left : right > 0 ? right : 0;
+            const int near = off_x * off_x + off_y * off_y <= radius * radius;
+            if (near && stops_beam(store[world[2 * n].x + (long)row * window.cols + col], threshold, unknown)) met = 1;
+        }
+    }
+    hit[n] = (uchar)met;
+}

@@ -1,0 +1,187 @@
+"""Moving shapes of a world: discs, boxes and segments, in cells of its grid.
+
+A disc has 4 numbers: centre and radius, and one that is not used. A box has 8: centre, cosine and sine of its
+direction, half its length and width, and two that are not used. A segment has 4: its ends. A shape whose numbers are
+NaN is met by no ray. WORLDS: world has two pairs of numbers for each particle: the first cell of its world among all
+worlds and the world's size, rows times 2^16 plus columns; the world's index and the index of the shape that it does not
+see.
+"""
+
+import functools
+import math
+from types import SimpleNamespace
+
+import warp as wp
+
+from . import ray as ray_file
+from .prelude import Window, precision, reader
+
+DISC, BOX, SEGMENT = wp.constant(4), wp.constant(8), wp.constant(4)
+cell_at = reader(wp.vec2i)
+
+
+# Return the part of the grid that a particle's world fills.
+@wp.func
+def world_window(world: wp.array(dtype=wp.vec2i), n: wp.int32):
+    size = cell_at(world, 2 * n).y
+    window = Window()
+    window.rows = size >> 16
+    window.cols = size & 0xFFFF
+    return window
+
+
+# Return the first entry of a particle's world in a table with ``each`` entries for a cell.
+@wp.func
+def world_begin(world: wp.array(dtype=wp.vec2i), n: wp.int32, each: wp.int32):
+    return wp.int64(cell_at(world, 2 * n).x) * wp.int64(each)
+
+
+@functools.cache
+def functions(flags):
+    """Make the functions of the file for a set of flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    ray_direction = ray_file.functions(flags).ray_direction
+    number_at = reader(real)
+    ZERO, ONE, TWO, MINUS_ONE = real(0.0), real(1.0), real(2.0), real(-1.0)
+    TINY, NEVER, ALWAYS, UNKNOWN = real(1e-30), real(math.inf), real(-math.inf), real(math.nan)
+
+    # Return the distance along a ray to a disc, infinite where it is not met, and the cosine of the angle of incidence;
+    # inside the disc 0 and 1. Places are relative to the ray's origin.
+    @wp.func
+    def meet_disc(dx: real, dy: real, x: real, y: real, radius: real):
+        along = dx * x + dy * y
+        aside = dx * y - dy * x
+        square = (radius - aside) * (radius + aside)
+        half_chord = wp.sqrt(wp.where(square > ZERO, square, ZERO))
+        near = along - half_chord
+        far = along + half_chord
+        t = wp.where(near > ZERO, near, ZERO)
+        cosine = wp.where(radius > ZERO, half_chord / wp.where(radius > ZERO, radius, ONE), ONE)
+        return vec2(wp.where(square >= ZERO and far >= ZERO, t, NEVER), wp.where(near > ZERO, cosine, ONE))
+
+    # Return the same of a box, whose direction has a cosine and sine.
+    @wp.func
+    def meet_box(
+        dx: real, dy: real, x: real, y: real, cosine: real, sine: real, half_length: real, half_width: real
+    ):  # fmt: skip
+        u = cosine * dx + sine * dy
+        v = cosine * dy - sine * dx
+        p = -(cosine * x + sine * y)
+        q = -(cosine * y - sine * x)
+        fast_u = wp.abs(u)
+        fast_v = wp.abs(v)
+        inv_u = ONE / wp.where(fast_u < TINY, TINY, fast_u)
+        inv_v = ONE / wp.where(fast_v < TINY, TINY, fast_v)
+        from_u = wp.where(u < ZERO, -p, p)
+        from_v = wp.where(v < ZERO, -q, q)
+        flat_u = wp.where(wp.abs(p) <= half_length, ALWAYS, NEVER)
+        flat_v = wp.where(wp.abs(q) <= half_width, ALWAYS, NEVER)
+        in_u = wp.where(fast_u < TINY, flat_u, (-half_length - from_u) * inv_u)
+        in_v = wp.where(fast_v < TINY, flat_v, (-half_width - from_v) * inv_v)
+        out_u = wp.where(fast_u < TINY, NEVER, (half_length - from_u) * inv_u)
+        out_v = wp.where(fast_v < TINY, NEVER, (half_width - from_v) * inv_v)
+        into = wp.where(in_u > in_v, in_u, in_v)
+        out = wp.where(out_u < out_v, out_u, out_v)
+        t = wp.where(into > ZERO, into, ZERO)
+        straight = wp.where(in_u > in_v, fast_u, fast_v)
+        return vec2(wp.where(into <= out and out >= ZERO, t, NEVER), wp.where(into > ZERO, straight, ONE))
+
+    # Return the same of a segment; a ray along it meets its nearer end.
+    @wp.func
+    def meet_segment(dx: real, dy: real, x: real, y: real, end_x: real, end_y: real):
+        along = dx * x + dy * y
+        end_along = dx * end_x + dy * end_y
+        aside = dx * y - dy * x
+        end_aside = dx * end_y - dy * end_x
+        width = end_aside - aside
+        length = end_along - along
+        nearer = wp.where(along < end_along, along, end_along)
+        farther = wp.where(along < end_along, end_along, along)
+        across = along - aside / wp.where(width == ZERO, ONE, width) * length
+        clipped = wp.where(across < nearer, nearer, wp.where(across > farther, farther, across))
+        on_line = wp.where(nearer > ZERO, nearer, wp.where(farther < ZERO, MINUS_ONE, ZERO))
+        t = wp.where(width == ZERO, wp.where(aside == ZERO, on_line, MINUS_ONE), clipped)
+        straight = wp.abs(width) / wp.sqrt(wp.where(width == ZERO, ONE, width * width + length * length))
+        meets = (aside <= ZERO and end_aside >= ZERO) or (aside >= ZERO and end_aside <= ZERO)
+        return vec2(wp.where(meets and t >= ZERO, t, NEVER), straight)
+
+    # Return the nearest of the shapes that a particle sees along a ray and of an obstacle at a distance t: the distance
+    # in cells, and the cosine of the angle of incidence, 2 where no shape is nearer than t.
+    @wp.func
+    def nearest_shape(
+        shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32, cell: wp.vec2i,
+        pose: vec4, ray: vec2, t: real,
+    ):  # fmt: skip
+        direction = ray_direction(pose, ray)
+        seen = cell_at(world, 2 * n + 1)
+        one = seen.x * crowd.stride
+        nearest = vec2(t, TWO)
+        i = int(0)
+        while i < crowd.discs + crowd.boxes + crowd.segments:
+            x = (number_at(shapes, one) - real(cell.x)) - pose.x
+            y = (number_at(shapes, one + 1) - real(cell.y)) - pose.y
+            a = number_at(shapes, one + 2)
+            b = number_at(shapes, one + 3)
+            met = vec2(NEVER, TWO)
+            if i < crowd.discs:
+                met = meet_disc(direction.x, direction.y, x, y, a)
+                one += DISC
+            elif i < crowd.discs + crowd.boxes:
+                met = meet_box(
+                    direction.x, direction.y, x, y, a, b, number_at(shapes, one + 4), number_at(shapes, one + 5)
+                )
+                one += BOX
+            else:
+                end_x = (a - real(cell.x)) - pose.x
+                end_y = (b - real(cell.y)) - pose.y
+                met = meet_segment(direction.x, direction.y, x, y, end_x, end_y)
+                one += SEGMENT
+            if met.x < nearest.x and i != seen.y:
+                nearest = met
+            i += 1
+        return nearest
+
+    # Return the distance from a point to the nearest shape that a particle sees, infinite without one, 0 inside a
+    # shape. The point is relative to the cell.
+    @wp.func
+    def shape_distance(
+        shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32, cell: wp.vec2i,
+        point: vec2,
+    ):  # fmt: skip
+        nearest = real(NEVER)
+        seen = cell_at(world, 2 * n + 1)
+        one = seen.x * crowd.stride
+        i = int(0)
+        while i < crowd.discs + crowd.boxes + crowd.segments:
+            x = (number_at(shapes, one) - real(cell.x)) - point.x
+            y = (number_at(shapes, one + 1) - real(cell.y)) - point.y
+            away = real(NEVER)
+            if i < crowd.discs:
+                away = wp.sqrt(x * x + y * y) - number_at(shapes, one + 2)
+                one += DISC
+            elif i < crowd.discs + crowd.boxes:
+                u = wp.abs(number_at(shapes, one + 2) * x + number_at(shapes, one + 3) * y) - number_at(shapes, one + 4)
+                v = wp.abs(number_at(shapes, one + 2) * y - number_at(shapes, one + 3) * x) - number_at(shapes, one + 5)
+                out_u = wp.where(u > ZERO, u, ZERO)
+                out_v = wp.where(v > ZERO, v, ZERO)
+                # The comparisons turn NaN into 0.
+                away = wp.where(x == x, wp.sqrt(out_u * out_u + out_v * out_v), UNKNOWN)
+                one += BOX
+            else:
+                to_x = ((number_at(shapes, one + 2) - real(cell.x)) - point.x) - x
+                to_y = ((number_at(shapes, one + 3) - real(cell.y)) - point.y) - y
+                square = to_x * to_x + to_y * to_y
+                part = -(x * to_x + y * to_y) / wp.where(square > ZERO, square, ONE)
+                on = wp.where(part > ZERO, wp.where(part < ONE, part, ONE), ZERO)
+                off_x = x + on * to_x
+                off_y = y + on * to_y
+                away = wp.sqrt(off_x * off_x + off_y * off_y)
+                one += SEGMENT
+            if i != seen.y and away < nearest:
+                nearest = away
+            i += 1
+        nearest = wp.where(nearest > ZERO, nearest, ZERO)
+        return nearest
+
+    return SimpleNamespace(**locals())

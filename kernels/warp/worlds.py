@@ -1,0 +1,225 @@
+"""Many worlds in one table: their cells, obstacles and tables, moving shapes, and poses placed in them.
+
+Worlds of one size are made together. Their rows are interleaved: line i is row i / worlds of world i % worlds. place
+has the first cell of each in tables with a ring of two cells. frames has 8 numbers for each world: x and y of its
+origin, cosine and sine of its yaw, rows, columns, its first cell, and one that is not used.
+"""
+
+import functools
+import math
+
+import warp as wp
+
+from . import heading, placement
+from . import shapes as shapes_file
+from .placement import FARTHEST, ZERO, within_reach
+from .prelude import kernel, precision, work_item
+from .shapes import BOX, DISC, world_window
+
+# Cells above this one are unknown.
+MOST_KNOWN = wp.constant(127)
+FRAME_NUMBERS = wp.constant(8)
+RING = wp.constant(2)
+
+
+# Copy the cells of some worlds to their places. One work-item takes a cell.
+@kernel()
+def put_cells(cells, place, store, count, worlds):
+    w, i = wp.tid()
+    if i >= count or w >= worlds:
+        return
+    store[place[w] + i] = cells[w * count + i]
+
+
+# Return whether a cell stops a beam.
+@wp.func
+def stops_beam(cell: wp.int32, threshold: wp.int32, unknown: wp.int32):
+    return wp.where(cell > MOST_KNOWN, unknown, wp.where(cell >= threshold, 1, 0))
+
+
+# Mark the obstacles of worlds as bytes and as bits, with a margin of obstacles around each world. One work-item takes
+# 32 cells of a line.
+@kernel()
+def mark_obstacles(store, place, occupied, bits, rows, cols, worlds, words, margin, threshold, unknown):
+    line, word = wp.tid()
+    width = cols + 2 * margin
+    if word >= words or line >= (rows + 2 * margin) * worlds:
+        return
+    row = line // worlds - margin
+    w = line % worlds
+    marked = wp.uint32(0)
+    for i in range(wp.min(32, width - 32 * word)):
+        col = 32 * word + i - margin
+        stops = int(1)
+        if col >= 0 and col < cols and row >= 0 and row < rows:
+            stops = stops_beam(int(store[place[w] + row * cols + col]), threshold, unknown)
+        occupied[line * width + 32 * word + i] = wp.uint8(stops)
+        marked = marked | (wp.uint32(stops) << wp.uint32(i))
+    bits[line * words + word] = wp.int32(marked)
+
+
+@functools.cache
+def make(name, flags):
+    """Make a kernel of the file for a set of flags."""
+    if name in ("put_cells", "mark_obstacles"):
+        return globals()[name]
+    types = precision(flags)
+    real, vec2 = types.real, types.vec2
+    coordinate = wp.float32 if "POSES_FLOAT32" in flags else wp.float64
+    place_pose = placement.functions(flags).place_pose
+    cos_sin = heading.functions(flags & {"HUGE_HEADINGS"}).cos_sin
+    SHAPES = "SHAPES" in flags
+    shape_distance = shapes_file.functions(flags).shape_distance
+    NUMBER_ZERO, NUMBER_ONE = real(0.0), real(1.0)
+    NEVER, NONE, TWO = real(math.inf), real(math.nan), wp.float64(2.0)
+
+    # Fill the tables of likelihood fields of worlds from squared distances, whose map has a margin. One work-item takes
+    # a cell.
+    @kernel(flags)
+    def fill_worlds(squared, density, place, table, rows, cols, worlds, margin, cap, beyond):
+        line, col = wp.tid()
+        width = cols + 2 * RING
+        if col >= width or line >= (rows + 2 * RING) * worlds:
+            return
+        row = line // worlds
+        w = line % worlds
+        from_row = row - RING + margin
+        from_col = col - RING + margin
+        value = beyond
+        if from_row >= 0 and from_row < rows + 2 * margin and from_col >= 0 and from_col < cols + 2 * margin:
+            at = (from_row * worlds + w) * (cols + 2 * margin) + from_col
+            value = density[wp.min(squared[at], cap)]
+        table[place[w] + row * width + col] = value
+
+    # Return the frame of a world; the scanner's position and the resolution are those of all worlds.
+    @wp.func
+    def frame_in(frames: wp.array(dtype=wp.float64), index: wp.int32, frame: types.Frame):
+        first = index * FRAME_NUMBERS
+        moved = types.Frame()
+        moved.origin_x = frames[first]
+        moved.origin_y = frames[first + 1]
+        moved.resolution = frame.resolution
+        moved.mount_x = frame.mount_x
+        moved.mount_y = frame.mount_y
+        moved.yaw_cos = frames[first + 2]
+        moved.yaw_sin = frames[first + 3]
+        return moved
+
+    # Place poses in their worlds; see place_pose. An index of no world sets the second bit of pose_status, and the pose
+    # sees nothing. One work-item takes a particle.
+    @kernel(flags)
+    def place_in_worlds(
+        poses, index, ignore, frames, pose_cell, pose, pose_low, world, pose_status, frame, particles, worlds,
+        wide, wide_ignore,
+    ):  # fmt: skip
+        particle = work_item(wp.tid())
+        if particle >= particles:
+            return
+        # Indices of 64 bits have 0 in the upper half.
+        chosen = index[wide * particle]
+        known = chosen >= 0 and chosen < worlds
+        if wide == 2:
+            known = known and index[2 * particle + 1] == 0
+        w = wp.where(known, chosen, 0)
+        first = w * FRAME_NUMBERS
+        window = types.Window()
+        window.rows = int(frames[first + 4])
+        window.cols = int(frames[first + 5])
+        place_pose(particle, poses, pose_cell, pose, pose_low, pose_status, frame_in(frames, w, frame), window)
+        if not known:
+            wp.atomic_max(pose_status, 0, 2)
+            pose_cell[particle] = wp.vec2i(-int(FARTHEST), -int(FARTHEST))
+        world[2 * particle] = wp.vec2i(int(frames[first + 6]), (window.rows << 16) | window.cols)
+        if SHAPES:
+            world[2 * particle + 1] = wp.vec2i(w, ignore[wide_ignore * particle])
+        else:
+            world[2 * particle + 1] = wp.vec2i(w, -1)
+
+    # Return a point of the world in cells of a frame.
+    @wp.func
+    def point_in(x: wp.float64, y: wp.float64, here: types.Frame):
+        u = x - here.origin_x
+        v = y - here.origin_y
+        if here.yaw_sin != ZERO:
+            before = u
+            u = here.yaw_cos * u + here.yaw_sin * v
+            v = here.yaw_cos * v - here.yaw_sin * before
+        return wp.vec2d(within_reach(u / here.resolution), within_reach(v / here.resolution))
+
+    # Place moving shapes of one kind, with 3 (discs), 5 (boxes) or 4 numbers (segments), in the cells of their worlds.
+    # A shape with a number that is not finite, or with a negative size, is none. One work-item takes a shape.
+    @kernel(flags)
+    def place_shapes(raw, frames, shapes, frame, count, numbers, begin, stride, worlds):
+        w, i = wp.tid()
+        if i >= count or w >= worlds:
+            return
+        at = (w * count + i) * numbers
+        to = w * stride + begin + i * wp.where(numbers == 5, BOX, DISC)
+        here = frame_in(frames, w, frame)
+        total = wp.float64(0.0)
+        for k in range(numbers):
+            value = wp.float64(raw[at + k])
+            total += value - value
+        length = wp.float64(raw[at + wp.where(numbers == 3, 2, 3)])
+        none = not (total == ZERO)
+        if numbers != 4 and length < ZERO:
+            none = bool(True)
+        if numbers == 5:
+            if wp.float64(raw[at + 4]) < ZERO:
+                none = bool(True)
+        if none:
+            for k in range(wp.where(numbers == 5, BOX, DISC)):
+                shapes[to + k] = NONE
+            return
+        centre = point_in(wp.float64(raw[at]), wp.float64(raw[at + 1]), here)
+        shapes[to] = real(centre.x)
+        shapes[to + 1] = real(centre.y)
+        if numbers == 3:
+            shapes[to + 2] = real(length / here.resolution)
+            shapes[to + 3] = NUMBER_ZERO
+        elif numbers == 4:
+            other = point_in(wp.float64(raw[at + 2]), length, here)
+            shapes[to + 2] = real(other.x)
+            shapes[to + 3] = real(other.y)
+        else:
+            turned = cos_sin(wp.float64(raw[at + 2]))
+            cosine = turned.x
+            sine = turned.y
+            if here.yaw_sin != ZERO:
+                cosine = turned.x * here.yaw_cos + turned.y * here.yaw_sin
+                sine = turned.y * here.yaw_cos - turned.x * here.yaw_sin
+            shapes[to + 2] = real(cosine)
+            shapes[to + 3] = real(sine)
+            shapes[to + 4] = real(length / here.resolution / TWO)
+            shapes[to + 5] = real(wp.float64(raw[at + 4]) / here.resolution / TWO)
+            shapes[to + 6] = NUMBER_ZERO
+            shapes[to + 7] = NUMBER_ZERO
+
+    # Tell which discs about poses, with a radius in cells, meet an obstacle or a shape. One work-item takes a particle.
+    @kernel(flags)
+    def find_collisions(store, world, shapes, pose_cell, pose, hit, particles, radius, crowd, threshold, unknown):
+        n = wp.tid()
+        if n >= particles:
+            return
+        window = world_window(world, n)
+        cell = pose_cell[n]
+        point = vec2(pose[n].x, pose[n].y)
+        met = int(0)
+        if SHAPES:
+            if shape_distance(shapes, world, crowd, n, cell, point) <= radius:
+                met = 1
+        reach = int(radius) + 1
+        for row in range(wp.max(cell.y - reach, 0), wp.min(cell.y + reach, window.rows - 1) + 1):
+            below = real(row - cell.y) - point.y
+            above = -(below + NUMBER_ONE)
+            off_y = wp.where(below > NUMBER_ZERO, below, wp.where(above > NUMBER_ZERO, above, NUMBER_ZERO))
+            for col in range(wp.max(cell.x - reach, 0), wp.min(cell.x + reach, window.cols - 1) + 1):
+                left = real(col - cell.x) - point.x
+                right = -(left + NUMBER_ONE)
+                off_x = wp.where(left > NUMBER_ZERO, left, wp.where(right > NUMBER_ZERO, right, NUMBER_ZERO))
+                if off_x * off_x + off_y * off_y <= radius * radius:
+                    if stops_beam(int(store[world[2 * n].x + row * window.cols + col]), threshold, unknown) != 0:
+                        met = 1
+        hit[n] = wp.uint8(met)
+
+    return locals()[name]

@@ -1,0 +1,201 @@
+"""Many worlds at once: rays have the bits of single maps, on every backend."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gpusense as gs
+
+BEARINGS = np.linspace(-3.0, 3.0, 21)
+RANGE = 6.0
+
+
+def some_cells(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    """Return cells of which some are walls and some are unknown."""
+    cells = (rng.random(shape) < 0.05).astype(np.int8) * np.int8(100)
+    cells[rng.random(shape) < 0.03] = -1
+    return cells
+
+
+def poses_in(rng: np.random.Generator, grid: gs.OccupancyGrid, count: int) -> np.ndarray:
+    """Return poses in a grid and around it."""
+    rows, cols = grid.shape
+    places = grid.cell_centers(rng.integers(-4, rows + 4, count), rng.integers(-4, cols + 4, count))
+    places += rng.uniform(-0.5, 0.5, places.shape) * grid.resolution
+    return np.column_stack([places, rng.uniform(-9, 9, count)])
+
+
+def same_bits(found: np.ndarray, wanted: np.ndarray) -> None:
+    """Compare arrays of floats bit by bit."""
+    assert found.dtype == wanted.dtype
+    assert found.tobytes() == wanted.tobytes()
+
+
+@pytest.fixture(scope="module")
+def grids() -> list[gs.OccupancyGrid]:
+    """Return maps of several sizes, with origins far away and turned."""
+    rng = np.random.default_rng(1)
+    sizes = [(1, 1), (20, 70), (130, 9), (20, 70), (33, 64)]
+    origins = [(0, 0, 0), (1, 2, 3), (-5e5, 4e6, 1), (0.3, 0, 0), (0, 0, -0.4)]
+    return [gs.OccupancyGrid(some_cells(rng, *size), 0.1, at) for size, at in zip(sizes, origins, strict=True)]
+
+
+@pytest.mark.parametrize("options", [{}, {"unknown": "occupied", "outside": "occupied"}, {"precision": "float64"}])
+def test_ranges_and_incidence_have_the_bits_of_single_maps(
+    options: dict[str, Any], grids: list[gs.OccupancyGrid], backend: str
+) -> None:
+    rng = np.random.default_rng(2)
+    index = rng.permutation(np.arange(len(grids)).repeat(12))
+    poses = np.concatenate([poses_in(rng, grids[w], 1) for w in index])
+    caster = gs.RayCaster(gs.Worlds(grids, backend=backend), RANGE, backend=backend, **options)
+    ranges = caster.cast(poses, BEARINGS, world=index)
+    angles = caster.incidence(poses, BEARINGS, world=index)
+    for w, grid in enumerate(grids):
+        single = gs.RayCaster(grid, RANGE, backend=backend, **options)
+        same_bits(ranges[index == w], single.cast(poses[index == w], BEARINGS))
+        same_bits(angles[index == w], single.incidence(poses[index == w], BEARINGS))
+
+
+def test_worlds_of_one_size_have_one_frame_or_one_each(backend: str) -> None:
+    rng = np.random.default_rng(3)
+    cells, origins = some_cells(rng, 7, 24, 40), rng.uniform(-3, 3, (7, 3))
+    for origin in ((1.0, -2.0, 0.5), origins):
+        worlds = gs.Worlds(cells, 0.2, origin, backend=backend)
+        index = rng.integers(0, 7, 30)
+        poses = np.concatenate([poses_in(rng, worlds.grid(w), 1) for w in index])
+        ranges = gs.RayCaster(worlds, RANGE, backend=backend).cast(poses, BEARINGS, world=index)
+        for w in range(7):
+            grid = gs.OccupancyGrid(cells[w], 0.2, np.broadcast_to(origin, (7, 3))[w])
+            assert worlds.grid(w) == grid
+            single = gs.RayCaster(grid, RANGE, backend=backend).cast(poses[index == w], BEARINGS)
+            same_bits(ranges[index == w], single)
+
+
+def test_gpus_make_and_read_the_same_tables(as_gpu: Any, grids: list[gs.OccupancyGrid]) -> None:
+    rng = np.random.default_rng(4)
+    index = np.arange(len(grids)).repeat(8)
+    poses = np.concatenate([poses_in(rng, grids[w], 1) for w in index])
+    device = as_gpu()
+    found = gs.RayCaster(gs.Worlds(grids, backend=device), RANGE, backend=device).cast(poses, BEARINGS, world=index)
+    device = as_gpu(False)
+    caster = gs.RayCaster(gs.Worlds(grids, backend=device), RANGE, backend=device)
+    same_bits(found, caster.cast(poses, BEARINGS, world=index))
+
+
+def test_replaced_worlds_have_the_bits_of_new_maps(grids: list[gs.OccupancyGrid], backend: str) -> None:
+    rng = np.random.default_rng(5)
+    worlds = gs.Worlds(grids, backend=backend)
+    caster = gs.RayCaster(worlds, RANGE, backend=backend)
+    index = np.arange(len(grids)).repeat(6)
+    poses = np.concatenate([poses_in(rng, grids[w], 1) for w in index])
+    caster.cast(poses, BEARINGS, world=index)
+    caster.incidence(poses, BEARINGS, world=index)
+    changed = {w: some_cells(rng, *grids[w].shape) for w in (3, 1)}
+    worlds.replace([3, 1], np.stack(list(changed.values())))
+    ranges = caster.cast(poses, BEARINGS, world=index)
+    angles = caster.incidence(poses, BEARINGS, world=index)
+    for w, grid in enumerate(grids):
+        now = gs.OccupancyGrid(changed.get(w, grid.cells), grid.resolution, grid.origin)
+        assert worlds.grid(w) == now
+        single = gs.RayCaster(now, RANGE, backend=backend)
+        same_bits(ranges[index == w], single.cast(poses[index == w], BEARINGS))
+        same_bits(angles[index == w], single.incidence(poses[index == w], BEARINGS))
+
+
+def test_one_world_needs_no_index(backend: str) -> None:
+    grid = gs.OccupancyGrid(some_cells(np.random.default_rng(6), 20, 20), 0.1)
+    worlds = gs.Worlds([grid], backend=backend)
+    assert len(worlds) == 1
+    found = gs.RayCaster(worlds, RANGE, backend=backend).cast([(1.0, 1.0, 0.3)], BEARINGS)
+    same_bits(found, gs.RayCaster(grid, RANGE, backend=backend).cast([(1.0, 1.0, 0.3)], BEARINGS))
+
+
+CELLS = np.zeros((2, 3, 4), np.int8)
+
+
+@pytest.mark.parametrize(
+    ("cells", "options", "error", "words"),
+    [
+        (CELLS.astype(bool), {}, TypeError, r"^cells: must hold integers.*bool; pass 100 \* cells"),
+        (CELLS.astype(float), {}, TypeError, r"^cells: must hold integers.*float64; pass \(100 \* cells\)"),
+        (CELLS[0], {}, ValueError, r"^cells: shape must be \(M, H, W\).*\(3, 4\)"),
+        (CELLS[:0], {}, ValueError, r"^cells: shape must be \(M, H, W\)"),
+        ([], {}, ValueError, r"^cells: shape must be"),
+        (CELLS + 101, {}, ValueError, r"^cells: every value must be from -1 to 100, got 101"),
+        (CELLS, {"resolution": 0.0}, ValueError, r"^resolution: "),
+        (CELLS, {"origin": (0.0, 0.0)}, ValueError, r"^origin: "),
+        (CELLS, {"origin": np.zeros((3, 3))}, ValueError, r"^origin: shape must be \(2, 3\)"),
+        (CELLS, {"occupied_threshold": 0}, ValueError, r"^occupied_threshold: "),
+    ],
+)
+def test_bad_cells_are_refused(cells: Any, options: dict[str, Any], error: type, words: str) -> None:
+    with pytest.raises(error, match=words):
+        gs.Worlds(cells, backend="numpy", **options)
+
+
+def test_grids_must_agree_in_resolution() -> None:
+    grids = [gs.OccupancyGrid(CELLS[0], 0.1), gs.OccupancyGrid(CELLS[0], 0.2)]
+    with pytest.raises(ValueError, match=r"^resolution: must be the same for all worlds, got \[0.1, 0.2\]"):
+        gs.Worlds(grids, backend="numpy")
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({}, ValueError, r"^world: must be an index of one of 2 worlds for each pose, got None"),
+        ({"world": [0, 2]}, ValueError, r"^world: every index must be in \[0, 2\), got 2"),
+        ({"world": [0, -1]}, ValueError, r"^world: every index must be in \[0, 2\), got -1"),
+        ({"world": [0]}, ValueError, r"^world: shape must be \(2,\), got \(1,\)"),
+        ({"world": [0.0, 1.0]}, TypeError, r"^world: must hold integers, got dtype float64"),
+        ({"world": [True, False]}, TypeError, r"^world: must hold integers, got dtype bool"),
+    ],
+)
+def test_bad_indices_are_refused(options: dict[str, Any], error: type, words: str) -> None:
+    caster = gs.RayCaster(gs.Worlds(CELLS, backend="numpy"), RANGE, backend="numpy")
+    with pytest.raises(error, match=words):
+        caster.cast(np.zeros((2, 3)), [0.0], **options)
+
+
+def test_a_single_map_takes_no_index() -> None:
+    caster = gs.RayCaster(gs.OccupancyGrid(CELLS[0]), RANGE, backend="numpy")
+    with pytest.raises(ValueError, match=r"^world: must be None for a model of a single map, got 0"):
+        caster.cast([(0.0, 0.0, 0.0)], [0.0], world=0)
+
+
+def test_models_must_be_on_the_device_of_the_worlds(needs: Any) -> None:
+    worlds = gs.Worlds(CELLS, backend="numpy")
+    with pytest.raises(ValueError, match=r"^grid: must be Worlds on the model's device .*, got backend='numpy'"):
+        gs.RayCaster(worlds, RANGE, backend=needs("opencl"))
+    with pytest.raises(ValueError, match=r"^caster: must be 'exact' in Worlds, got 'march'"):
+        gs.RayCaster(worlds, RANGE, backend="numpy", method="march")
+
+
+@pytest.mark.parametrize(
+    ("index", "cells", "error", "words"),
+    [
+        ([0, 2], CELLS, ValueError, r"^index: every index must be in \[0, 2\), got 2"),
+        ([1, 1], CELLS, ValueError, r"^index: every world must occur once"),
+        ([0], CELLS, ValueError, r"^cells: sizes must be those of the worlds"),
+        ([0, 1], CELLS[:, :2], ValueError, r"^cells: sizes must be those of the worlds"),
+        ([0, 1], CELLS.astype(bool), TypeError, r"^cells: must hold integers"),
+    ],
+)
+def test_bad_replacements_change_nothing(index: Any, cells: Any, error: type, words: str) -> None:
+    worlds = gs.Worlds(CELLS, backend="numpy")
+    with pytest.raises(error, match=words):
+        worlds.replace(index, cells)
+    assert (worlds.grid(0).cells == 0).all()
+
+
+def test_worlds_that_do_not_fit_say_how_many_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    import dataclasses
+
+    from gpusense.backends import get_backend
+
+    device = get_backend("numpy")
+    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, max_buffer=1100))
+    with pytest.raises(MemoryError, match=r"^cells: must fit into the memory of .*: 2 of 10 worlds of 1 bytes a cell"):
+        gs.Worlds(np.zeros((10, 16, 16), np.int8), backend=device)

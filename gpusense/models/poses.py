@@ -19,8 +19,8 @@ from gpusense.interface.constants import LARGEST_HEADING
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
-from gpusense.models.world_index import InWorlds, WorldIndex, no_worlds
 from gpusense.tables.reachable import MapState, ReachableMap
+from gpusense.tables.world_index import InWorlds, WorldIndex, no_worlds
 from gpusense.world.frames import Cells, Mount, frame_of, place_poses
 from gpusense.world.windows import Corners, Window
 

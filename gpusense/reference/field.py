@@ -21,7 +21,7 @@ BLOCK = 1 << 18
 def score_field(
     flags: frozenset[str], table: np.ndarray, world: np.ndarray, shapes: np.ndarray, pose_cell: np.ndarray,
     pose: np.ndarray, pose_low: np.ndarray, point: np.ndarray, point_low: np.ndarray, terms: structs.FieldTerms,
-    start: np.ndarray, constant_terms: structs.FieldTerms, log_p: np.ndarray, parts: np.ndarray, window: structs.Window,
+    start: np.ndarray, constant_terms: np.ndarray, log_p: np.ndarray, parts: np.ndarray, window: structs.Window,
     particles: int, readings: int, guard: float, score: structs.Score, batch: structs.ScanBatch, crowd: structs.Crowd,
 ) -> None:  # fmt: skip
     """Score scans; the table holds log densities, or capped distances in metres where it is interpolated."""
@@ -36,18 +36,18 @@ def score_field(
             )  # fmt: skip
         return
     if "WORLDS" in flags:
-        for part in particles_of_worlds(world, particles):
-            n, own = int(part[0]), np.empty(len(part), log_p.dtype)
-            own_parts = np.empty(len(part) * readings if "PER_BEAM" in flags else 0, parts.dtype)
+        for here in particles_of_worlds(world, particles):
+            n, own = int(here[0]), np.empty(len(here), log_p.dtype)
+            own_parts = np.empty(len(here) * readings if "PER_BEAM" in flags else 0, parts.dtype)
             score_field(
-                flags - {"WORLDS"}, table[world_begin(world, n, 1) :], world.reshape(-1, 4)[part].reshape(-1, 2),
-                shapes, pose_cell[part], pose[part], pose_low[part] if "TWO_PART_POINTS" in flags else pose_low, point,
-                point_low, terms, start, constant_terms, own, own_parts, world_window(world, n), len(part), readings,
+                flags - {"WORLDS"}, table[world_begin(world, n, 1) :], world.reshape(-1, 4)[here].reshape(-1, 2),
+                shapes, pose_cell[here], pose[here], pose_low[here] if "TWO_PART_POINTS" in flags else pose_low, point,
+                point_low, terms, start, constant_terms, own, own_parts, world_window(world, n), len(here), readings,
                 guard, score, batch, crowd,
             )  # fmt: skip
-            log_p[part] = own
+            log_p[here] = own
             if "PER_BEAM" in flags:
-                parts[: particles * readings].reshape(particles, readings)[part] = own_parts.reshape(-1, readings)
+                parts[: particles * readings].reshape(particles, readings)[here] = own_parts.reshape(-1, readings)
         return
     block = max(BLOCK // max(readings, 1), 1)
     points = point[None, :readings]

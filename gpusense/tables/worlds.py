@@ -5,21 +5,27 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
+from gpusense._util.typing import Space
 from gpusense.backends import Backend, BackendInfo, Selection, arrays, get_backend
 from gpusense.backends.base import Adopted, Buffer
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import launch
+from gpusense.interface.structs import Frame
 from gpusense.tables.crowd import CrowdTable, Shapes
 from gpusense.world.frames import frame_of
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.grid_frame import check_resolution
 from gpusense.world.windows import LONGEST_SIDE, Window
+
+if TYPE_CHECKING:
+    from gpusense.tables.world_index import InWorlds
 
 _INT, _BYTE = np.dtype(np.int32), np.dtype(np.uint8)
 _NO_FLAGS: frozenset[str] = frozenset()
@@ -270,6 +276,82 @@ class Worlds:
         self.backend.synchronize()
         self._space.wait()
 
+    def collides(
+        self, poses: Any, radius: float, *, world: Any = None, ignore: Any = None, unknown: Space = "free"
+    ) -> Any:
+        """Tell which discs about poses meet an obstacle or a moving shape.
+
+        The squares of occupied cells and the shapes are met exactly, to the rounding of float32 in cells. Space outside
+        a world is free.
+
+        Args:
+            poses: (N, 3) poses (x, y, theta) in the world [m, m, rad], an array as ``RayCaster.cast`` takes it.
+            radius: Radius of the discs [m], >= 0.
+            world: (N,) indices of the poses' worlds, or one for all; it may be left out where there is a single world.
+            ignore: (N,) indices of the shapes that poses do not meet, or one for all; -1 for none.
+            unknown: Treatment of unknown cells: ``"free"`` or ``"occupied"``.
+
+        Returns:
+            (N,) bool; for poses on the device an array of the same library with 0 and 1.
+
+        Raises:
+            TypeError, ValueError: An argument breaks a rule above, or a pose is not finite.
+
+        Example:
+            >>> import numpy as np, gpusense as gs
+            >>> cells = np.zeros((1, 4, 4), np.int8)
+            >>> cells[0, 0, 3] = 100
+            >>> worlds = gs.Worlds(cells, resolution=1.0, backend="numpy")
+            >>> worlds.collides([(2.2, 0.5, 0.0), (2.7, 0.5, 0.0)], radius=0.5).tolist()
+            [False, True]
+        """
+        from gpusense.tables.world_index import WorldIndex
+
+        cells = checks.real("radius", radius, low=0) / self._resolution
+        checks.choice("unknown", unknown, ("free", "occupied"))
+        backend, single, there = self.backend, False, arrays.on_device(poses)
+        if there:
+            buffer, count, single, _ = arrays.adopt_poses(poses, backend, "poses")
+        else:
+            host = checks.array("poses", arrays.host_poses(poses, "poses"), ("N", 3))
+            buffer, count = backend.upload(host), len(host)
+        inside = WorldIndex(self, world, ignore, count, backend).buffers(backend, self._space, (0, count))
+        hit = backend.blank(count, _BYTE) if there else backend.empty(count, _BYTE)
+        if count:
+            self._collide(buffer, count, single, inside, hit, cells, int(unknown == "occupied"))
+        if there:
+            return arrays.lent(poses, backend, hit, (count,), _BYTE)
+        return backend.download(hit, np.empty(count, np.uint8)).view(bool)
+
+    def _collide(
+        self, poses: Buffer, count: int, single: bool, inside: InWorlds, hit: Buffer, radius: float, unknown: int
+    ) -> None:
+        """Place poses, and tell which discs about them, with a radius in cells, meet anything."""
+        space, real = self._space, np.dtype(np.float32)
+        cell, pose = space.empty("cell", 2 * count, _INT), space.empty("pose", 4 * count, real)
+        world, status = space.empty("placed", 4 * count, _INT), self.backend.upload(np.zeros(2, _INT))
+        frame = Frame(0.0, 0.0, self._resolution, 0.0, 0.0, 1.0, 0.0)
+        flags = inside.flags | flags_if(POSES_FLOAT32=single, HUGE_HEADINGS=True)
+        self.backend.run((
+            launch(
+                "place_in_worlds", flags, (count,), poses=poses, index=inside.index, ignore=inside.ignore,
+                frames=self.frames, pose_cell=cell, pose=pose, pose_low=space.empty("low", 4, real), world=world,
+                pose_status=status, frame=frame, particles=count, worlds=len(self), wide=inside.wide,
+                wide_ignore=inside.wide_ignore,
+            ),
+            launch(
+                "find_collisions", inside.flags, (count,), store=self._store, world=world,
+                shapes=self.crowd.table(real), pose_cell=cell, pose=pose, hit=hit, particles=count, radius=radius,
+                crowd=inside.crowd, threshold=self._threshold, unknown=unknown,
+            ),
+        ))  # fmt: skip
+        state = self.backend.download(status, np.zeros(2, _INT))
+        space.wait()
+        if state[0] > 1:
+            raise ValueError("world: every index must be one of the worlds, got an index on the device that is not")
+        if state[0]:
+            raise ValueError("poses: must be finite, got a pose on the device that is not")
+
     # ---- tables
 
     def table(self, key: Hashable, make: Callable[[], Table]) -> Table:
@@ -356,7 +438,9 @@ class Worlds:
                 self._put(np.array([index]), cells[None])
             return
         count = int(np.prod(given.shape[1:]))
-        buffer = given.buffer if isinstance(given, Adopted) else None
+        # Warp tells bytes with and without a sign apart.
+        whole = isinstance(given, Adopted)
+        buffer = self.backend.part(given.buffer, 0, count * len(indices), _BYTE) if whole else None
         step = len(indices) if buffer is not None else max((1 << 28) // count, 1)
         for first in range(0, len(indices), step):
             part = indices[first : first + step]

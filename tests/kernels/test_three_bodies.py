@@ -78,6 +78,7 @@ ON_PURPOSE = [
     Purpose("heading", "cos_sin_of", (OPENCL,), LANES),
     Purpose("heading", "two_sum_float64 high_half_float64 pair_product_float64", (OPENCL,), FLOAT64),
     Purpose("hit_shape", "mass_place mass_at", (WARP,), STAGES),
+    Purpose("field_term", "_near", REFERENCE_ONLY, ARRAYS),
     Purpose("ranges", "cast_in_worlds", REFERENCE_ONLY, WORLD_BY_WORLD),
     Purpose("raycast", "sectors_of", REFERENCE_ONLY, "SECTORS is a constant of the kernels"),
     Purpose("shapes", "particles_of_worlds", REFERENCE_ONLY, WORLD_BY_WORLD),

@@ -22,8 +22,8 @@ from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.model import ScanModel
 from gpusense.models.scan.request import make_request
 from gpusense.models.scan.rules import Beams
-from gpusense.models.world_index import check_no_worlds
 from gpusense.peers.weights import Peer, check_weights, choose
+from gpusense.tables.world_index import check_no_worlds
 from gpusense.tables.worlds import Worlds
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import LikelihoodFieldParameters

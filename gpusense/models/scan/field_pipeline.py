@@ -20,9 +20,9 @@ from gpusense.models.scan.pipeline import ScanLaunch, ScanPipeline, Tiles
 from gpusense.models.scan.readings import Readings, Sensing
 from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.tiles import ENOUGH_SHORT, all_within, spread_of, sum_launch
-from gpusense.models.world_index import check_worlds
 from gpusense.tables.field import RING, FieldTable
 from gpusense.tables.reachable import ReachableMap
+from gpusense.tables.world_index import check_worlds
 from gpusense.tables.worlds import WorldMap, Worlds
 from gpusense.world.field_density import FieldDensity
 from gpusense.world.frames import split

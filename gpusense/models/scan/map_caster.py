@@ -23,12 +23,12 @@ from gpusense.models.run import Piece, chunk_of, finish, run_pieces
 from gpusense.models.scan.cones import LASER, Cones
 from gpusense.models.scan.sampling import Drawing
 from gpusense.models.scan.tiles import all_within, order_of, tiles_of
-from gpusense.models.world_index import check_worlds, index_of
 from gpusense.tables import casters
 from gpusense.tables.caster_base import Caster, CasterInput
 from gpusense.tables.lookup_files import describe, write_lookup
 from gpusense.tables.reachable import MapState, ObstaclesOf, ReachableMap, TableMemoryError, obstacles_of
 from gpusense.tables.rectangles import rectangles_of_worlds
+from gpusense.tables.world_index import check_worlds, index_of
 from gpusense.tables.worlds import WorldMap, Worlds
 from gpusense.world.frames import Mount
 from gpusense.world.grid import OccupancyGrid

@@ -13,7 +13,7 @@ from gpusense.backends.results import Result
 from gpusense.models.poses import Poses
 from gpusense.models.scan.classed import check_ranges
 from gpusense.models.scan.rules import ModelContext
-from gpusense.models.world_index import WorldIndex
+from gpusense.tables.world_index import WorldIndex
 from gpusense.tables.worlds import Worlds
 
 FLOATS = (np.dtype(np.float32), np.dtype(np.float64))

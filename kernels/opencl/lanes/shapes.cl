@@ -1,5 +1,5 @@
 // Moving shapes along LANES rays of one pose at once: shapes.cl in lanes.
-// requires: shapes lanes/rays
+// requires: shapes lanes/rays lanes/error_free
 
 #if SHAPES
 // in lanes: meet_disc meet_box meet_segment

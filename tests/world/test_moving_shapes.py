@@ -1,0 +1,256 @@
+"""Moving shapes of worlds, against analytic intersections in float64."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gpusense as gs
+
+RANGE = 8.0
+BEARINGS = np.linspace(-math.pi, math.pi, 45)
+ORIGINS = [(0.0, 0.0, 0.0), (-3.0, 1.0, 0.7), (2.0, 2.0, -2.0)]
+
+
+def wall_free(backend: str, **options: Any) -> gs.Worlds:
+    """Return three worlds without walls, with origins of their own."""
+    return gs.Worlds(np.zeros((3, 120, 120), np.int8), 0.1, ORIGINS, backend=backend, **options)
+
+
+def disc_range(x: float, y: float, dx: float, dy: float, disc: np.ndarray) -> float:
+    """Return the distance to a disc by the quadratic formula."""
+    ex, ey = x - disc[0], y - disc[1]
+    b, c = ex * dx + ey * dy, ex * ex + ey * ey - disc[2] ** 2
+    if c <= 0:
+        return 0.0
+    root = b * b - c
+    return -b - math.sqrt(root) if root >= 0 and b < 0 else math.inf
+
+
+def segment_range(x: float, y: float, dx: float, dy: float, segment: np.ndarray) -> float:
+    """Return the distance to a segment by Cramer's rule."""
+    ex, ey = segment[2] - segment[0], segment[3] - segment[1]
+    px, py = segment[0] - x, segment[1] - y
+    determinant = dx * ey - dy * ex
+    if determinant == 0:
+        return math.inf
+    t, u = (px * ey - py * ex) / determinant, (px * dy - py * dx) / determinant
+    return t if t >= 0 and 0 <= u <= 1 else math.inf
+
+
+def box_range(x: float, y: float, dx: float, dy: float, box: np.ndarray) -> float:
+    """Return the distance to a box by its four sides, 0 inside."""
+    cosine, sine = math.cos(box[2]), math.sin(box[2])
+    u = cosine * (x - box[0]) + sine * (y - box[1])
+    v = cosine * (y - box[1]) - sine * (x - box[0])
+    if abs(u) <= box[3] / 2 and abs(v) <= box[4] / 2:
+        return 0.0
+    corners = [(a * box[3] / 2, b * box[4] / 2) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    places = [(box[0] + cosine * a - sine * b, box[1] + sine * a + cosine * b) for a, b in corners]
+    sides = [np.array([*places[k], *places[(k + 1) % 4]]) for k in range(4)]
+    return min(segment_range(x, y, dx, dy, side) for side in sides)
+
+
+KINDS = {"discs": disc_range, "boxes": box_range, "segments": segment_range}
+
+
+def truth(shapes: gs.Shapes, poses: np.ndarray, index: np.ndarray, ignore: np.ndarray) -> np.ndarray:
+    """Return the ranges of all rays in float64."""
+    found = np.full((len(poses), len(BEARINGS)), RANGE)
+    for n, (x, y, theta) in enumerate(poses):
+        for k, bearing in enumerate(BEARINGS):
+            dx, dy = math.cos(theta + bearing), math.sin(theta + bearing)
+            number = 0
+            for kind, meet in KINDS.items():
+                each = getattr(shapes, kind)
+                for shape in [] if each is None else each[index[n]]:
+                    if number != ignore[n] and np.isfinite(shape).all():
+                        found[n, k] = min(found[n, k], meet(x, y, dx, dy, shape))
+                    number += 1
+    return found
+
+
+def some_shapes(rng: np.random.Generator, worlds: int = 3) -> gs.Shapes:
+    """Return shapes of every kind, among them absent ones, points, and boxes without a width."""
+    discs = np.concatenate([rng.uniform(-2, 8, (worlds, 4, 2)), rng.uniform(0, 1.2, (worlds, 4, 1))], axis=2)
+    boxes = np.concatenate([rng.uniform(-2, 8, (worlds, 3, 2)), rng.uniform(-9, 9, (worlds, 3, 1)),
+                            rng.uniform(0.1, 2, (worlds, 3, 2))], axis=2)  # fmt: skip
+    segments = rng.uniform(-2, 8, (worlds, 3, 4))
+    discs[:, 1] = np.nan
+    discs[0, 2, 2] = np.nan
+    boxes[1, 0, 3] = 0.0
+    segments[2, 1, 3] = np.nan
+    return gs.Shapes(discs=discs, boxes=boxes, segments=segments)
+
+
+def compare(found: np.ndarray, wanted: np.ndarray) -> None:
+    """Compare ranges to float32, except for the few rays that graze an edge."""
+    off = np.abs(found - wanted) > 2e-5
+    assert off.mean() < 0.002, np.argwhere(off)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_ranges_are_those_of_the_nearest_shape(precision: Any, backend: str) -> None:
+    rng = np.random.default_rng(1)
+    worlds, shapes = wall_free(backend), some_shapes(rng)
+    caster = gs.RayCaster(worlds, RANGE, backend=backend, precision=precision)
+    index, ignore = np.arange(3).repeat(15), rng.integers(-1, 10, 45)
+    poses = np.column_stack([rng.uniform(-2, 8, (45, 2)), rng.uniform(-9, 9, 45)])
+    assert (caster.cast(poses, BEARINGS, world=index) == RANGE).all()
+    worlds.shapes = shapes
+    compare(caster.cast(poses, BEARINGS, world=index, ignore=ignore), truth(shapes, poses, index, ignore))
+    nothing = np.full(45, -1)
+    compare(caster.cast(poses, BEARINGS, world=index), truth(shapes, poses, index, nothing))
+    moved = some_shapes(rng)
+    worlds.shapes = moved
+    compare(caster.cast(poses, BEARINGS, world=index), truth(moved, poses, index, nothing))
+    worlds.shapes = gs.Shapes()
+    assert (caster.cast(poses, BEARINGS, world=index) == RANGE).all()
+
+
+def test_all_backends_have_the_same_ranges(backend: str) -> None:
+    rng = np.random.default_rng(2)
+    shapes, index = some_shapes(rng), rng.integers(0, 3, 40)
+    poses = np.column_stack([rng.uniform(-2, 8, (40, 2)), rng.uniform(-9, 9, 40)])
+    found = []
+    for name in ("numpy", backend):
+        worlds = wall_free(name)
+        worlds.shapes = shapes
+        found.append(gs.RayCaster(worlds, RANGE, backend=name).cast(poses, BEARINGS, world=index))
+    assert np.abs(found[1] - found[0]).max() <= 2e-6
+
+
+CASES = [
+    (dict(discs=[[[3.0, 1.0, 1.0]]]), 3.0, "a disc that the ray grazes"),
+    (dict(discs=[[[1.0, 0.0, 2.0]]]), 0.0, "inside a disc"),
+    (dict(discs=[[[-3.0, 0.0, 1.0]]]), 5.0, "a disc behind"),
+    (dict(discs=[[[2.0, 0.0, 0.0]]]), 2.0, "a point ahead"),
+    (dict(discs=[[[2.0, 0.0, -1.0]]]), 5.0, "a disc without a radius"),
+    (dict(boxes=[[[3.0, 0.0, 0.0, 1.0, 1.0]]]), 2.5, "a box ahead"),
+    (dict(boxes=[[[3.0, 0.0, math.pi / 4, 2.0, 2.0]]]), 3 - math.sqrt(2), "the corner of a box"),
+    (dict(boxes=[[[0.0, 0.0, 1.0, 1.0, 1.0]]]), 0.0, "inside a box"),
+    (dict(boxes=[[[3.0, 0.0, 0.0, 0.0, 1.0]]]), 3.0, "a box without a length"),
+    (dict(boxes=[[[3.0, 0.0, 0.0, 1.0, 0.0]]]), 2.5, "a box without a width, along the ray"),
+    (dict(boxes=[[[3.0, 0.6, 0.0, 1.0, 1.0]]]), 5.0, "a box beside the ray"),
+    (dict(segments=[[[2.0, -1.0, 2.0, 1.0]]]), 2.0, "a segment across"),
+    (dict(segments=[[[2.0, 0.0, 4.0, 0.0]]]), 2.0, "a segment along the ray"),
+    (dict(segments=[[[-2.0, 0.0, 4.0, 0.0]]]), 0.0, "a segment through the origin"),
+    (dict(segments=[[[-2.0, -1.0, -2.0, 1.0]]]), 5.0, "a segment behind"),
+    (dict(segments=[[[2.0, 0.0, 2.0, 1.0]]]), 2.0, "the end of a segment"),
+    (dict(segments=[[[math.nan, 0.0, 2.0, 1.0]]]), 5.0, "no segment"),
+]
+
+
+def test_special_cases(backend: str) -> None:
+    """A ray along x from a point between two cells, on every kind of edge."""
+    worlds = gs.Worlds(np.zeros((1, 8, 8), np.int8), 1.0, (-4.0, -4.0, 0.0), backend=backend)
+    caster = gs.RayCaster(worlds, 5.0, backend=backend)
+    for shapes, wanted, name in CASES:
+        worlds.shapes = gs.Shapes(**shapes)
+        assert caster.cast([(0.0, 0.0, 0.0)], [0.0])[0, 0] == pytest.approx(wanted, abs=1e-6), name
+
+
+def test_walls_hide_shapes_and_shapes_hide_walls(backend: str) -> None:
+    cells = np.zeros((1, 5, 20), np.int8)
+    cells[0, :, 12] = 100
+    worlds = gs.Worlds(cells, 0.5, backend=backend)
+    worlds.shapes = gs.Shapes(discs=[[[4.0, 1.25, 0.5], [8.0, 1.25, 0.5]]])
+    caster = gs.RayCaster(worlds, 20.0, backend=backend)
+    ranges = caster.cast([(1.0, 1.25, 0.0)], [0.0, math.pi / 2], ignore=0)
+    assert ranges[0, 0] == pytest.approx(5.0)
+    assert caster.cast([(1.0, 1.25, 0.0)], [0.0])[0, 0] == pytest.approx(2.5)
+    angles = caster.incidence([(1.0, 1.5, 0.0)], [0.0])
+    assert angles[0, 0] == pytest.approx(math.asin(0.25 / 0.5), abs=1e-5)
+
+
+def test_models_see_shapes(backend: str) -> None:
+    scanner = gs.Scanner(np.linspace(-1, 1, 9), range_max=6.0)
+    cells = np.zeros((2, 40, 60), np.int8)
+    cells[:, :, 55] = 100
+    worlds = gs.Worlds(cells, 0.1, backend=backend)
+    poses, index = np.array([(1.0, 2.0, 0.1), (1.5, 2.2, -0.2)]), np.array([1, 0])
+    beam = gs.BeamModel(worlds, scanner, backend=backend)
+    field = gs.LikelihoodFieldModel(worlds, scanner, backend=backend)
+    before = field.log_likelihood(poses, np.full((2, 9), 1.0), world=index)
+    worlds.shapes = gs.Shapes(discs=[[[3.0, 2.0, 0.4]], [[2.4, 2.1, 0.3]]], segments=[[[2, 3, 4, 3]], [[2, 1, 4, 1.5]]])
+    expected = beam.expected_ranges(poses, world=index)
+    caster = gs.RayCaster(worlds, 6.0, backend=backend)
+    assert (expected == caster.cast(poses, scanner.bearings, world=index)).all()
+    assert (expected < 3).any()
+    # The scan that shows the shapes is likelier than a scan of the walls alone.
+    walls = gs.RayCaster(gs.Worlds(cells, 0.1, backend=backend), 6.0, backend=backend)
+    others = walls.cast(poses, scanner.bearings, world=index)
+    for model in (beam, field):
+        seen = model.log_likelihood(poses, expected, world=index)
+        assert (seen > model.log_likelihood(poses, others, world=index)).all()
+    after = field.log_likelihood(poses, np.full((2, 9), 1.0), world=index)
+    assert (after >= before).all() and (after > before).any()
+
+
+def test_fields_measure_the_distance_to_the_nearest_of_walls_and_shapes(backend: str) -> None:
+    parameters = gs.LikelihoodFieldParameters(z_hit=0.9, z_rand=0.1, sigma_hit=0.3, max_distance=2.0)
+    scanner = gs.Scanner([0.0], range_max=6.0)
+    worlds = gs.Worlds(np.zeros((1, 40, 60), np.int8), 0.1, backend=backend)
+    worlds.shapes = gs.Shapes(discs=[[[3.0, 2.0, 0.5]]])
+    for interpolation in ("nearest", "bilinear"):
+        import dataclasses
+
+        given = dataclasses.replace(parameters, interpolation=interpolation)
+        model = gs.LikelihoodFieldModel(worlds, scanner, given, backend=backend)
+        for z, away in ((1.0, 0.5), (1.3, 0.2), (2.2, 0.0), (4.0, 1.5), (5.5, 2.0)):
+            density = 0.9 * math.exp(-0.5 * (away / 0.3) ** 2) / (0.3 * math.sqrt(2 * math.pi)) + 0.1 / 6
+            found = model.log_likelihood([(1.0, 2.0, 0.0)], [z])[0]
+            assert found == pytest.approx(math.log(density), abs=2e-4), (interpolation, z)
+
+
+def test_collisions(backend: str) -> None:
+    cells = np.zeros((2, 10, 10), np.int8)
+    cells[0, 5, 5], cells[1, 2, 2] = 100, -1
+    worlds = gs.Worlds(cells, 1.0, [(0, 0, 0), (10.0, 0.0, math.pi / 2)], backend=backend)
+    assert worlds.collides([(4.6, 5.5, 0.0), (4.4, 5.5, 0.0)], 0.5, world=0).tolist() == [True, False]
+    diagonal = [(5 - 0.36, 5 - 0.36, 0.0), (5 - 0.35, 5 - 0.35, 0.0), (5.5, 5.5, 1.0), (-3.0, 5.0, 0.0)]
+    assert worlds.collides(diagonal, 0.5, world=[0] * 4).tolist() == [False, True, True, False]
+    # The second world is turned by a right angle: its cell (2, 2) is [7, 8) x [2, 3).
+    assert worlds.collides([(7.5, 2.5, 0.0)], 0.0, world=1).tolist() == [False]
+    beside = worlds.collides([(7.5, 2.5, 0.0), (8.4, 2.5, 0.0)], 0.3, world=1, unknown="occupied")
+    assert beside.tolist() == [True, False]
+    worlds.shapes = gs.Shapes(
+        discs=[[[2.0, 2.0, 0.5]], [[9.0, 9.0, 0.5]]], boxes=[[[2.0, 8.0, 0.5, 2.0, 1.0]]] * 2,
+        segments=[[[8.0, 1.0, 8.0, 3.0]], [[math.nan] * 4]],
+    )  # fmt: skip
+    poses = [(2.9, 2.0, 0.0), (3.1, 2.0, 0.0), (2.0, 8.0, 0.0), (7.6, 2.0, 0.0), (8.0, 3.4, 0.0), (8.0, 3.6, 0.0)]
+    assert worlds.collides(poses, 0.5, world=0).tolist() == [True, False, True, True, True, False]
+    assert worlds.collides(poses, 0.5, world=0, ignore=[0, 0, 1, 2, 2, 2]).tolist() == [False] * 6
+    with pytest.raises(ValueError, match=r"^radius: must be finite and >= 0"):
+        worlds.collides(poses, -1.0, world=0)
+    with pytest.raises(ValueError, match=r"^poses: .*finite"):
+        worlds.collides([(math.nan, 0.0, 0.0)], 1.0, world=0)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "error", "words"),
+    [
+        (dict(discs=np.zeros((2, 1, 4))), ValueError, r"^discs: shape must be \(M, N, 3\)"),
+        (dict(boxes=np.zeros((2, 5))), ValueError, r"^boxes: shape must be \(M, N, 5\)"),
+        (dict(segments="no"), TypeError, r"^segments: "),
+        (
+            dict(discs=np.zeros((2, 1, 3)), boxes=np.zeros((3, 1, 5))),
+            ValueError,
+            r"of the same number of worlds",
+        ),
+    ],
+)
+def test_bad_shapes_are_refused(shapes: dict[str, Any], error: type, words: str) -> None:
+    with pytest.raises(error, match=words):
+        gs.Shapes(**shapes)
+
+
+def test_shapes_must_be_of_these_worlds() -> None:
+    worlds = wall_free("numpy")
+    with pytest.raises(ValueError, match=r"^shapes: must be of 3 worlds, got 2"):
+        worlds.shapes = gs.Shapes(discs=np.zeros((2, 1, 3)))
+    with pytest.raises(TypeError, match=r"^shapes: must be Shapes, got"):
+        worlds.shapes = np.zeros((3, 1, 3))  # type: ignore[assignment]

@@ -272,8 +272,8 @@ class _Run:
             self._floor_there = low.copy()
         counter, slot = self._counter()
         self._backend.compile("divide_blocks", _NO_FLAGS)(
-            (count,), tables.level(level), self._points, self._images, self._first, blocks, self._allowed[level],
-            self._low, made, counter, tables.shape, count, self._grid.height, self._grid.width,
+            (count,), tables.level(level), tables.level(level + 1), self._points, self._images, self._first, blocks,
+            self._allowed[level], self._low, made, counter, tables.shape, count, self._grid.height, self._grid.width,
             -(-self._grid.width >> level), self._turns, level, tables.stride, slot,
         )  # fmt: skip
         self._evaluated += 4 * count

@@ -90,9 +90,9 @@ def choose_blocks(
 
 
 def divide_blocks(
-    flags: frozenset[str], table: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray,
-    block: np.ndarray, allowed: np.ndarray, low: np.ndarray, part: np.ndarray, count: np.ndarray, scores: ScoreTable,
-    blocks: int, height: int, width: int, columns: int, turns: int, level: int, spacing: int,
+    flags: frozenset[str], table: np.ndarray, above: np.ndarray, point: np.ndarray, image: np.ndarray,
+    first: np.ndarray, block: np.ndarray, allowed: np.ndarray, low: np.ndarray, part: np.ndarray, count: np.ndarray,
+    scores: ScoreTable, blocks: int, height: int, width: int, columns: int, turns: int, level: int, spacing: int,
     slot: int,
 ) -> None:  # fmt: skip
     """Divide blocks into quarters of 2^level x 2^level, and collect the allowed ones that reach low of their scan."""

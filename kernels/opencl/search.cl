@@ -92,25 +92,27 @@ kernel void choose_blocks(ARGUMENTS) {
 }
 
 // Divide blocks of positions into quarters of 2^level x 2^level, and collect the allowed ones whose scores are at least low
-// of their scan, in no certain order. The caller clears count[slot]. One work-item takes a block.
+// of their scan, in no certain order. above has the tables of the blocks. The caller clears count[slot]. One work-item takes
+// a block.
 kernel void divide_blocks(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= blocks) return;
     const int item = block[4 * n], row = block[4 * n + 1], col = block[4 * n + 2], quarter = 1 << level;
     const int stride = padded_stride(scores), size = padded_lines(scores) * stride, reach = spacing * quarter;
     const int last = first[item + 1], least = low[item / turns], below = reach * stride;
-    int total[4] = {0, 0, 0, 0};
+    int total[4] = {0, 0, 0, 0}, rest = block[4 * n + 3];
     for (int k = first[item]; k < last; ++k) {
-        global const uchar *cells = table + image[k] * size +
-                                    block_index(scores, point[k].y + spacing * row, point[k].x + spacing * col, reach, reach);
-        total[0] += cells[0];
-        total[1] += cells[reach];
-        total[2] += cells[below];
-        total[3] += cells[below + reach];
-        // No sum of the remaining points can reach the least score.
-        if (k % 32 == 31) {
+        const int cell = image[k] * size +
+                         block_index(scores, point[k].y + spacing * row, point[k].x + spacing * col, reach, reach);
+        total[0] += table[cell];
+        total[1] += table[cell + reach];
+        total[2] += table[cell + below];
+        total[3] += table[cell + below + reach];
+        rest -= above[cell];
+        // The remaining points add no more than they do to the block's bound.
+        if (k % 16 == 15) {
             const int upper = total[0] > total[1] ? total[0] : total[1], lower = total[2] > total[3] ? total[2] : total[3];
-            if ((upper > lower ? upper : lower) + 255 * (last - k - 1) < least) return;
+            if ((upper > lower ? upper : lower) + rest < least) return;
         }
     }
     for (int i = 0; i < 4; ++i) {

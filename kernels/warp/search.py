@@ -132,11 +132,12 @@ def choose_blocks(score, best, low, high, block, count, rows, height, width, tur
 
 
 # Divide blocks of positions into quarters of 2^level x 2^level, and collect the allowed ones whose scores are at least
-# low of their scan, in no certain order. The caller clears count[slot]. One work-item takes a block.
+# low of their scan, in no certain order. above has the tables of the blocks. The caller clears count[slot]. One
+# work-item takes a block.
 @kernel()
 def divide_blocks(
-    table, point, image, first, block, allowed, low, part, count, scores, blocks, height, width, columns, turns, level,
-    spacing, slot,
+    table, above, point, image, first, block, allowed, low, part, count, scores, blocks, height, width, columns, turns,
+    level, spacing, slot,
 ):  # fmt: skip
     n = wp.tid()
     if n >= blocks:
@@ -152,16 +153,18 @@ def divide_blocks(
     least = low[item // turns]
     below = reach * stride
     total = wp.vec4i()
+    rest = block[4 * n + 3]
     for k in range(first[item], last):
         cell = point[k]
         begin = image[k] * size
         begin += block_index(scores, cell.y + spacing * row, cell.x + spacing * col, reach, reach)
+        rest = rest - int(above[begin])
         total[0] = total[0] + int(table[begin])
         total[1] = total[1] + int(table[begin + reach])
         total[2] = total[2] + int(table[begin + below])
         total[3] = total[3] + int(table[begin + below + reach])
-        # No sum of the remaining points can reach the least score.
-        if k % 32 == 31 and wp.max(total) + 255 * (last - k - 1) < least:
+        # The remaining points add no more than they do to the block's bound.
+        if k % 16 == 15 and wp.max(total) + rest < least:
             return
     for i in range(4):
         part_row = row + i // 2 * quarter

@@ -77,13 +77,15 @@ def test_kernels_have_the_sums_of_the_reference(name, needs):
     # The margin holds the value of cells beyond the table.
     table = np.full((2, 52, 63), 9, np.uint8)
     table[:, 16:-16, 16:-16] = rng.integers(0, 256, (2, 20, 31))
+    above = np.full_like(table, 255)
     first, runs = np.array([0, 40, 40, 700], np.int32), np.array([33, 0, 650], np.int32)
     point = rng.integers(-60, 90, (700, 2)).astype(np.int32)
     image, weight = rng.integers(0, 2, 700).astype(np.int32), rng.integers(1, 65, 700).astype(np.int32)
     allowed = (rng.random((11, 21)) < 0.4).astype(np.uint8)
     allowed[:8, :16] = 0
     bounds = rng.integers(-1, 50, (3, 11, 21)).astype(np.int32)
-    block = np.stack([rng.integers(0, 3, 200), *rng.integers(0, 11, (2, 200)), np.zeros(200)], 1).astype(np.int32)
+    block = np.column_stack([rng.integers(0, 3, 200), rng.integers(0, 11, (200, 2)), np.full(200, 178500)])
+    block = block.astype(np.int32)
     low, high = np.array([[30], [45]], np.int32)
     mask = (rng.random((6, 11)) < 0.6).astype(np.uint8)
     end, start = rng.uniform(-40, 40, (30, 2)), rng.uniform(-9, 9, (2, 2))
@@ -101,7 +103,7 @@ def test_kernels_have_the_sums_of_the_reference(name, needs):
         ("row_maxima", (33,), bounds, np.zeros(66, np.int32), 33, 21),
         ("choose_blocks", (33,), bounds, bounds.max(axis=2).repeat(2), low, high, np.zeros(4 * 693, np.int32), counts,
          33, 11, 21, 3, 1, 693, 1),
-        ("divide_blocks", (200,), table, point, image, first, block, mask, np.array([1500], np.int32),
+        ("divide_blocks", (200,), table, above, point, image, first, block, mask, np.array([1500], np.int32),
          np.zeros(16 * 200, np.int32), counts, shape, 200, 12, 22, 11, 3, 1, 2, 1),
     ]  # fmt: skip
     device = get_backend(needs(name))

@@ -66,9 +66,9 @@ KERNELS: dict[str, Kernel] = {
         "int level", "int room", "int slot",
     ),
     "divide_blocks": kernel(
-        "search", "block", _CELLS, "int2 point [points]", "int image [points]", "int first [items + 1]",
-        "int block [4 * blocks]", "uchar allowed [rows * columns]", "int low [scans]", "out int part [16 * blocks]",
-        "out int count [counts]", "ScoreTable scores", "int blocks", "int height", "int width", "int columns",
-        "int turns", "int level", "int spacing", "int slot",
+        "search", "block", _CELLS, _CELLS.replace("table", "above", 1), "int2 point [points]", "int image [points]",
+        "int first [items + 1]", "int block [4 * blocks]", "uchar allowed [rows * columns]", "int low [scans]",
+        "out int part [16 * blocks]", "out int count [counts]", "ScoreTable scores", "int blocks", "int height",
+        "int width", "int columns", "int turns", "int level", "int spacing", "int slot",
     ),
 }  # fmt: skip

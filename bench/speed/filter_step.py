@@ -6,12 +6,17 @@ The scene is a generated building with the cloud of a tracked robot. One stage i
 four stages, of which a step on a processor takes those that the cloud needs. Steps of three filters run in turns:
 without recovery and verdict, with the verdict and ``estimate``, and the default filter, also with recovery.
 
+``--histogram STEPS`` measures instead the default filter as it is called (``predict``, ``correct``, ``estimate``) on a
+simulated run whose robot moves: quantiles of the steps after the first 100, since a control loop lives by its slowest
+step, and a histogram by ratios to the median.
+
 ``--peers`` measures instead, in turns on one simulated run, the default filter with its estimate and those filters of
 nav2_amcl and Beluga that filters.py can compile. Their field has the same parameters, its densities multiplied.
 """
 
 from __future__ import annotations
 
+import itertools
 import sys
 import time
 from pathlib import Path
@@ -94,6 +99,36 @@ def _in_a_row(pf: gs.ParticleFilter, steps: int, recording: Any) -> float:
     return min(times)
 
 
+# Edges of the histogram, as multiples of the median.
+EDGES = (0.0, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0, np.inf)
+WARM = 100
+
+
+def measure_steps(backend: str, particles: int, beams: int, steps: int) -> dict[str, object]:
+    """Return quantiles [ms] and a histogram of the steps of the default filter, and of their processor time."""
+    scanner = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / (beams - 1), count=beams, range_max=20.0)
+    grid = building()
+    run = gs.worlds.simulate_run(grid, scanner, scans=WARM + steps, seed=1)
+    field = gs.LikelihoodFieldParameters(sigma_hit=0.1)
+    pf = gs.ParticleFilter(gs.LikelihoodFieldModel(grid, scanner, field, backend=backend), particles=particles, seed=1)
+    pf.initialize(mean=run.poses[0], covariance=np.diag([0.01, 0.01, 0.0025]))
+    times = []
+    for before, odometry, ranges in zip(run.odometry, run.odometry[1:], run.scans[1:], strict=False):
+        begin, processor = time.perf_counter(), time.process_time()
+        pf.predict(before, odometry)
+        pf.correct(ranges)
+        pf.estimate()
+        times.append((time.perf_counter() - begin, time.process_time() - processor))
+    elapsed, used = (1000 * np.array(times[WARM:])).T
+    share = np.histogram(elapsed / np.median(elapsed), EDGES)[0] / len(elapsed)
+    quantiles = [[float(np.quantile(kept, q)) for q in (0.5, 0.9, 0.99, 1.0)] for kept in (elapsed, used)]
+    error = float(np.hypot(*(pf.estimate().pose - run.poses[-1])[:2]))
+    return dict(
+        backend=backend, particles=particles, beams=beams, steps=len(elapsed), wall_ms=quantiles[0],
+        processor_ms=quantiles[1], histogram=share.tolist(), error_m=error,
+    )  # fmt: skip
+
+
 def measure_peers(backend: str, particles: int, beams: int, scans: int) -> list[dict[str, object]]:
     """Return the median and least milliseconds of a step of each filter: motion, weights, resampling, and a pose."""
     scanner = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / (beams - 1), count=beams, range_max=20.0)
@@ -141,9 +176,26 @@ def main() -> None:
     parser = make_parser(__doc__, backend="auto")
     parser.add_argument("--steps", type=int, default=100, help="steps of 2000 particles; larger clouds take fewer")
     parser.add_argument("--size", type=int, nargs=2, action="append", metavar=("PARTICLES", "BEAMS"), help="repeatable")
+    parser.add_argument("--histogram", type=int, metavar="STEPS", help="measure single steps of the default filter")
     parser.add_argument("--peers", action="store_true", help="compare with nav2_amcl's and Beluga's filters")
     args = parser.parse_args()
     rows: list[dict[str, object]] = []
+    if args.histogram:
+        bins = [f"{low:g}-{high:g}" for low, high in itertools.pairwise(EDGES)]
+        heads = (
+            "particles x beams",
+            "50, 90, 99, 100 % ms",
+            "of the processor",
+            *(f"{one} medians, %" for one in bins),
+        )
+        print(f"| {' | '.join(heads)} |\n|{' --- |' * len(heads)}")
+        for particles, beams in args.size or SIZES:
+            one = measure_steps(args.backend, particles, beams, args.histogram)
+            rows.append(one)
+            numbers = [", ".join(f"{t:.3f}" for t in one[name]) for name in ("wall_ms", "processor_ms")]  # type: ignore
+            shares = [f"{100 * share:.1f}" for share in one["histogram"]]  # type: ignore
+            print(f"| {' | '.join([f'{particles} x {beams}', *numbers, *shares])} |", flush=True)
+        return _write(args, rows)
     if args.peers:
         names = ("filter", "particles x beams", "median ms", "least ms", "of all cores, median ms")
         print(f"| {' | '.join(names)} |\n|{' --- |' * len(names)}")

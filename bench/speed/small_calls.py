@@ -150,6 +150,7 @@ class Bench:
                 if self.gpu:
                     there = functools.partial(on_device, self.device)
                     self.bound(f"{what}, bound, on the device", model, poses, scans[0], kernels, there)
+                    self.bound(f"{what}, bound, poses on the device", model, poses, scans[0], kernels, there, np.array)
 
     def kernels(self, make: Callable[..., Any], poses: np.ndarray, scan: np.ndarray) -> float:
         """Return the median seconds of the launches of a call."""
@@ -178,16 +179,22 @@ class Bench:
             into = functools.partial(call, poses=there, out=out)
             self.add(f"{what}, on the device, out={label}", ways(into, into), kernels, count)
             anew = functools.partial(call, poses=there)
-            self.add(f"{what}, on the device{label}", ways(anew, anew), kernels, count)
+            self.add(f"{what}, poses on the device{label}", ways(anew, anew), kernels, count)
+            ranges = [on_device(self.device, scan) for scan in scans]
+
+            def both(number: int) -> Any:
+                return model.log_likelihood(there, ranges[number % len(ranges)])
+
+            self.add(f"{what}, poses and ranges on the device{label}", ways(both, anew), kernels, count)
 
     def bound(
         self, what: str, model: Any, poses: np.ndarray, scan: np.ndarray, kernels: float,
-        there: Callable[[np.ndarray], Any],
+        there: Callable[[np.ndarray], Any], ranges_there: Callable[[np.ndarray], Any] | None = None,
     ) -> None:  # fmt: skip
         """Add rows of a bound call against an ordinary one with the same arrays and readings on the host."""
         result = np.zeros(len(poses), np.float32)
         placed, out, other = there(poses), there(result), there(result)
-        call = model.bind(placed, there(scan), out=out)
+        call = model.bind(placed, (ranges_there or there)(scan), out=out)
 
         def repeated(_: int, count: int) -> Any:
             for _ in range(count):

@@ -48,9 +48,7 @@ def bind(
     if not in_host and not obstacle and pipeline.backend.info.kind == "gpu":
         return DeviceCall(pipeline, lock, poses, ranges, out)
     host = _HostCall(pipeline, score, poses, ranges, out)
-    if len(in_host) == 1:
-        obstacle = obstacle or f"{in_host[0]} are in host memory"
-    elif not in_host:
+    if not in_host:
         obstacle = obstacle or "processors score scans that the host prepares"
     host.reason = obstacle or host.long_reason()
     if not host.reason:
@@ -102,7 +100,8 @@ class _HostCall(BoundCall):
         poses, ranges = self.arrays
         if not self.pipeline.backend.replays:
             return f"{self.pipeline.backend.info.selection} starts launches fast enough without a recording"
-        if not all(type(a) is np.ndarray and a.dtype in (np.float32, np.float64) for a in (poses, ranges, self.out)):
+        here = [a for a in (poses, ranges, self.out) if not arrays.on_device(a)]
+        if not all(type(a) is np.ndarray and a.dtype in (np.float32, np.float64) for a in here):
             return "only NumPy arrays of float32 or float64 are copied with a recorded program"
         if not fits(len(poses), len(ranges)):
             return f"poses and ranges take more than {LARGEST >> 10} KiB"
@@ -121,7 +120,16 @@ class _StagedCall(BoundCall):
     def __init__(self, host: _HostCall, lock: threading.Lock) -> None:
         self._host, self.out, (self._poses, self._ranges) = host, host.out, host.arrays
         count = len(self._poses)
-        self._packed = PackedCall(host.pipeline, lock, count, self._ranges.dtype)
+        there = {
+            name: array
+            for name, array in (("poses", self._poses), ("ranges", self._ranges), ("out", self.out))
+            if type(array) is not np.ndarray
+        }
+        limits = None if "ranges" in there else self._ranges.dtype
+        self._packed = PackedCall(host.pipeline, lock, count, limits, **there)
+        # Arrays of the host, whose numbers every call copies.
+        self._copied = [None if name in there else array for name, array in (
+            ("poses", self._poses), ("ranges", self._ranges), ("out", self.out))]  # fmt: skip
         self._lock = threading.Lock()
 
     def __call__(self, stream: Any = None) -> Any:
@@ -129,7 +137,7 @@ class _StagedCall(BoundCall):
             return self._host(stream)
         try:
             with self._lock:
-                if self._packed.score(self._poses, self._ranges, self.out):
+                if self._packed.score(*self._copied):
                     return self.out
         except MemoryError:
             # This call would need the whole table of a changed map; the ordinary call needs only a part.

@@ -107,7 +107,7 @@ class ScanModel(Pickled):
         """The last call; a short one is repeated as one of any size, since only those report what they leave out."""
         call = None if self._short is None else self._short.last
         if call is not None:
-            poses, ranges = (array.copy() for array in call.arrays)
+            poses, ranges = (array.copy() if type(array) is np.ndarray else array for array in call.arrays)
             request = make_request(self._setting, poses, ranges)
             with self._lock, self._workspace:
                 self._run(request)

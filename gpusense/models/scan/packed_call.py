@@ -1,4 +1,6 @@
-"""Calls of few particles in NumPy arrays on a GPU: inputs go to the device as one array, results come back as one.
+"""Calls of few particles on a GPU: inputs of the host go to the device as one array, results come back as one.
+
+Arrays on the device are copied to the places of the recorded program, or used in place by bound calls.
 
 A copy of few numbers takes as long as a launch, and the device classes a scan faster than the host. Therefore the
 recording of :class:`.bound.DeviceCall` follows the copy, and the device classes the readings. On CUDA, copies and
@@ -7,14 +9,18 @@ launches form one graph. Bound calls of such arrays work like this, and so do or
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from gpusense.backends import Backend, arrays
+from gpusense.backends.base import Buffer
 from gpusense.backends.programs import ProgramCache
+from gpusense.backends.results import Result
 from gpusense.backends.workspace import Workspace
 from gpusense.models.poses import corners_of
 from gpusense.models.scan.bound import DeviceCall
@@ -27,6 +33,10 @@ from gpusense.world.windows import Corners
 LARGEST = 256 << 10
 _DOUBLE, _INT = np.dtype(np.float64), np.dtype(np.int32)
 _FLOATS = (np.dtype(np.float32), _DOUBLE)
+# Types of poses and readings on the device (None on the host), type of the limits; buffers; owners of their memory.
+_Adoption: TypeAlias = tuple[
+    tuple[np.dtype | None, np.dtype | None, np.dtype], tuple[Buffer | None, Buffer | None], tuple[Any, ...]
+]
 # Alignment of arrays that are copied as one [bytes], enough for every device.
 _ALIGNED = 1024
 # Number of sizes of short calls that are kept; ordinary calls of a size before the first short one; largest map that
@@ -74,69 +84,87 @@ class _Pack:
         self.views, self.parts = [], []
         for begin, (count, dtype_of) in zip(begins, arrays, strict=True):
             self.views.append(numbers[begin : begin + count * dtype_of.itemsize].view(dtype_of))
-            self.parts.append(backend.part(self.on_device, begin // dtype_of.itemsize, count, dtype_of))
+            part = backend.part(self.on_device, begin // dtype_of.itemsize, count, dtype_of) if count else None
+            self.parts.append(part)
 
 
 class PackedCall:
-    """The recorded program of a number of poses.
+    """The recorded program of a number of poses, of which host arrays are copied with the launches.
 
-    Poses and readings are float64 on the device, exact for float32. Limits of readings are rounded to the precision of
-    the readings, as on the host.
+    Poses and readings of the host are float64 on the device, exact for float32. Limits of readings are rounded to the
+    precision of the readings, as on the host.
 
     Args:
         pipeline: The stages of the model.
         lock: Held while the program is recorded.
         count: Number of poses.
-        limits: The type of the readings.
+        limits: The type of the readings; None for the type of those on the device.
         corners: Corners of the box of the first poses; None for the table of the whole map.
+        poses: (N, 3) poses on the device, used in place; None for poses of the host.
+        ranges: (K,) readings on the device, used in place; None for readings of the host.
+        out: (N,) array on the device for the log-likelihoods; None for one of the host.
 
     Attributes:
         arrays: The poses and the readings of the last call.
     """
 
     def __init__(
-        self, pipeline: ScanPipeline, lock: threading.Lock, count: int, limits: np.dtype, corners: Corners | None = None
-    ) -> None:
+        self, pipeline: ScanPipeline, lock: threading.Lock, count: int, limits: np.dtype | None,
+        corners: Corners | None = None, *, poses: Any = None, ranges: Any = None, out: Any = None,
+    ) -> None:  # fmt: skip
         self._backend = backend = pipeline.backend
         readings, real = pipeline.scanner.count, pipeline.real
-        self._inputs = _Pack(backend, _DOUBLE, (3 * count, _DOUBLE), (readings, _DOUBLE))
-        self._outputs = _Pack(backend, real, (count, real), (2, _INT))
-        self.arrays = self._inputs.views[0].reshape(count, 3), self._inputs.views[1]
-        poses, ranges = self._inputs.parts
-        log_p, status = self._outputs.parts
-        self._device = DeviceCall(
-            pipeline, lock, backend.lend(poses, (count, 3), _DOUBLE), backend.lend(ranges, (readings,), _DOUBLE),
-            backend.lend(log_p, (count,), real), status, limits, corners,
-        )  # fmt: skip
+        self._inputs = _Pack(
+            backend, _DOUBLE, (3 * count if poses is None else 0, _DOUBLE), (readings if ranges is None else 0, _DOUBLE)
+        )
+        self._outputs = _Pack(backend, real, (count if out is None else 0, real), (2, _INT))
+        self._copied = self._inputs.views[0].reshape(-1, 3), self._inputs.views[1]
+        self.arrays = tuple(
+            here if there is None else there for here, there in zip(self._copied, (poses, ranges), strict=True)
+        )
+        parts, (log_p, status) = self._inputs.parts, self._outputs.parts
+        poses = backend.lend(parts[0], (count, 3), _DOUBLE) if poses is None else poses
+        ranges = backend.lend(parts[1], (readings,), _DOUBLE) if ranges is None else ranges
+        out = backend.lend(log_p, (count,), real) if out is None else out
+        self._device = DeviceCall(pipeline, lock, poses, ranges, out, status, limits, corners)
         self._space = Workspace(backend)
 
-    def score(self, poses: np.ndarray, ranges: np.ndarray, out: np.ndarray, corners: Corners | None = None) -> bool:
+    def score(
+        self, poses: np.ndarray | None, ranges: np.ndarray | None, out: np.ndarray | None,
+        corners: Corners | None = None, then: Callable[[], None] | None = None,
+    ) -> bool:  # fmt: skip
         """Score poses, and write their log-likelihoods.
 
         Args:
-            poses: (N, 3) poses.
-            ranges: (K,) readings.
-            out: (N,) array for the log-likelihoods.
+            poses: (N, 3) poses; None for those on the device.
+            ranges: (K,) readings; None for those on the device.
+            out: (N,) array for the log-likelihoods; None for the one on the device.
             corners: Corners of the box of the poses; None for the table of the whole map.
+            then: Function that starts copies of the result on the device.
 
         Returns:
-            False where a pose is not finite; nothing is written then.
+            False where a pose is not finite; nothing is written on the host then.
 
         Raises:
             MemoryError: The device cannot hold the map's table.
         """
         backend, inputs, outputs = self._backend, self._inputs, self._outputs
-        (own_poses, own_ranges), (log_p, status) = self.arrays, outputs.views
-        own_poses[...] = poses
-        own_ranges[...] = ranges
+        log_p, status = outputs.views
+        for here, numbers in zip(self._copied, (poses, ranges), strict=True):
+            if numbers is not None:
+                here[...] = numbers
         with self._space:
-            backend.upload(inputs.host, inputs.on_device, wait=False)
+            if inputs.host.size:
+                backend.upload(inputs.host, inputs.on_device, wait=False)
             self._device.begin(corners)
             backend.download(outputs.on_device, outputs.host, wait=not backend.in_batch)
+            if then is not None:
+                then()
             if backend.in_batch:
                 backend.synchronize()
         if not status[0]:
-            out[...] = log_p
+            if out is not None:
+                out[...] = log_p
             return True
         status[...] = 0
         backend.upload(status, outputs.parts[1])
@@ -145,6 +173,52 @@ class PackedCall:
     def explain(self) -> str:
         """Return in one line how the launches are started."""
         return self._device.explain()
+
+
+class _There:
+    """Arrays on the device that ordinary calls copy to the places of a recorded program, as each call has other arrays.
+
+    Args:
+        backend: The device.
+        count: Number of poses.
+        readings: Number of readings.
+        kinds: Types of poses and of readings on the device; None for those of the host.
+        real: Type of the result.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        count: int,
+        readings: int,
+        kinds: tuple[np.dtype | None, np.dtype | None],
+        real: np.dtype,
+    ) -> None:
+        self._backend = backend
+        self.given: dict[str, Any] = {}
+        self._places: list[tuple[Buffer, int] | None] = []
+        for name, kind, shape in zip(("poses", "ranges"), kinds, ((count, 3), (readings,)), strict=True):
+            place = None
+            if kind is not None:
+                size = math.prod(shape)
+                place = backend.blank(size, kind), size * kind.itemsize
+                self.given[name] = backend.lend(place[0], shape, kind)
+            self._places.append(place)
+        self._result = None
+        if kinds[0] is not None:
+            self._result = backend.blank(count, real), count * real.itemsize
+            self.given["out"] = backend.lend(self._result[0], (count,), real)
+
+    def take(self, *buffers: Buffer | None) -> None:
+        """Start copying poses and readings to their places."""
+        for place, buffer in zip(self._places, buffers, strict=True):
+            if place is not None:
+                self._backend.copy(buffer, *place)
+
+    def deliver(self, target: Buffer) -> None:
+        """Start copying the result."""
+        if self._result is not None:
+            self._backend.copy(self._result[0], target, self._result[1])
 
 
 class ShortCalls:
@@ -162,7 +236,7 @@ class ShortCalls:
     def __init__(self, pipeline: ScanPipeline) -> None:
         self._pipeline = pipeline
         self.last: PackedCall | None = None
-        self._calls = ProgramCache[PackedCall](_MOST_SIZES)
+        self._calls = ProgramCache[tuple[PackedCall, _There]](_MOST_SIZES)
         # Number of calls by size so far.
         self._seen = ProgramCache[int](_MOST_SIZES)
         # A private lock, since the scoring thread holds the model's lock.
@@ -186,45 +260,92 @@ class ShortCalls:
             per_beam: True if the log-likelihoods of the readings are requested.
         """
         self.last = None
-        if per_beam or type(poses) is not np.ndarray or type(ranges) is not np.ndarray:
+        pipeline, size = self._pipeline, self._pipeline.scanner.count
+        if per_beam or getattr(ranges, "shape", None) != (size,):
             return None
-        pipeline, count = self._pipeline, len(poses) if poses.ndim else 0
-        if poses.shape != (count, 3) or ranges.shape != (pipeline.scanner.count,):
+        count = poses.shape[0] if getattr(poses, "shape", ())[1:] == (3,) else 0
+        kinds = self._kinds(poses, ranges)
+        if kinds is None or not is_short(count, size) or not fits(count, size) or not self._takes(count, out, kinds):
             return None
-        if poses.dtype not in _FLOATS or ranges.dtype not in _FLOATS or not self._takes(count, out):
+        there = self._adopted(poses, ranges, kinds)
+        if there is None or not self._repeats((count, *there[0])):
             return None
-        corners = self._corners(poses) if self._repeats(count, ranges.dtype) else None
-        if corners is None or (pipeline.setting.temperature < 1 and not self._has_range(ranges)):
+        corners = None if kinds[0] else self._corners(poses)
+        if not kinds[0] and corners is None:
             return None
-        result = np.empty(count, pipeline.real) if out is None else out
-        key = (count, ranges.dtype)
+        if pipeline.setting.temperature < 1 and (kinds[1] or not self._has_range(ranges)):
+            return None
         try:
-            call = self._calls.get(key)
-            call = call or self._calls.keep(key, PackedCall(pipeline, self._lock, count, ranges.dtype, corners))
-            call.score(poses, ranges, result, corners)
+            return self._scored(poses, ranges, out, count, there, corners)
         except MemoryError:
             # The buffers of both kinds of calls may not fit the device at once.
             self._calls.clear()
             return None
+
+    def _kinds(self, poses: Any, ranges: Any) -> tuple[bool, bool] | None:
+        """Return whether poses and readings are on the device; None for arrays that the ordinary call must read."""
+        kinds = []
+        for array in (poses, ranges):
+            if type(array) is np.ndarray:
+                if array.dtype not in _FLOATS:
+                    return None
+                kinds.append(False)
+            elif self._pipeline.backend.reads(array) and arrays.on_device(array):
+                kinds.append(True)
+            else:
+                return None
+        # The first scans are inspected on the host.
+        return None if kinds[1] and self._pipeline.rules.first_scans.left else (kinds[0], kinds[1])
+
+    def _adopted(self, poses: Any, ranges: Any, kinds: tuple[bool, bool]) -> _Adoption | None:
+        """Return the types of arrays and their buffers; None for arrays that the ordinary call must refuse."""
+        backend, single = self._pipeline.backend, _FLOATS[0]
+        kind: np.dtype | None = None
+        buffer, owner = None, None
+        try:
+            if kinds[0]:
+                buffer, _, is_single, owner = arrays.adopt_poses(poses, backend, "poses")
+                kind = single if is_single else _DOUBLE
+            if not kinds[1]:
+                return (kind, None, ranges.dtype), (buffer, None), (owner,)
+            adopted = arrays.adopt_readings(ranges, backend, self._pipeline.scanner.count, in_place=False)
+        except (TypeError, ValueError):
+            return None
+        return (kind, adopted.dtype, adopted.dtype), (buffer, adopted.buffer), (owner, adopted)
+
+    def _scored(self, poses: Any, ranges: Any, out: Any, count: int, there: _Adoption, corners: Corners | None) -> Any:
+        """Score poses; None where one of them is not finite."""
+        pipeline, backend = self._pipeline, self._pipeline.backend
+        kinds, buffers, _ = there
+        result = Result(poses, out, (count,), pipeline.real, backend, on_device=kinds[0] is not None)
+        kept = self._calls.get((count, *kinds))
+        if kept is None:
+            places = _There(backend, count, pipeline.scanner.count, kinds[:2], pipeline.real)
+            call = PackedCall(pipeline, self._lock, count, kinds[2], corners, **places.given)
+            kept = self._calls.keep((count, *kinds), (call, places))
+        call, places = kept
+        places.take(*buffers)
+        host = [None if buffer is not None else array for array, buffer in zip((poses, ranges), buffers, strict=True)]
+        flat = None if kinds[0] is not None else result.flat
+        if not call.score(host[0], host[1], flat, corners, functools.partial(places.deliver, result.flat)):
+            return None
         self.last = call
         if pipeline.rules.first_scans.left:
             pipeline.rules.first_scans.look_at("ranges", ranges[None], pipeline.rules.map_size)
-        return result
+        return result.user_array()
 
-    def _takes(self, count: int, out: Any) -> bool:
-        """Return whether the call has the size of a short call, and results can be written."""
-        if not is_short(count, self._pipeline.scanner.count) or not fits(count, self._pipeline.scanner.count):
-            return False
-        if out is None:
+    def _takes(self, count: int, out: Any, kinds: tuple[bool, bool]) -> bool:
+        """Return whether results can be written."""
+        if out is None or kinds[0]:
             return True
         usable = type(out) is np.ndarray and out.dtype == self._pipeline.real and out.shape == (count,)
         return usable and out.flags.c_contiguous and out.flags.writeable
 
-    def _repeats(self, count: int, limits: np.dtype) -> bool:
+    def _repeats(self, key: tuple[Any, ...]) -> bool:
         """Count a call of a size, and return whether the size has occurred often."""
-        seen = self._seen.get((count, limits)) or 0
+        seen = self._seen.get(key) or 0
         if seen < _BEFORE:
-            self._seen.keep((count, limits), seen + 1)
+            self._seen.keep(key, seen + 1)
         return seen >= _BEFORE
 
     def _has_range(self, ranges: np.ndarray) -> bool:

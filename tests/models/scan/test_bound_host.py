@@ -139,12 +139,71 @@ def test_arrays_of_the_host_on_every_backend(kind, backend):
         call()
 
 
-@pytest.mark.parametrize("compat", [None, "amcl"])
-def test_calls_that_take_the_ordinary_path_on_a_device(compat, batching):
-    """Poses or readings are on the host, or the host prepares the readings for weights."""
-    model = FIELD(GRID, NEAR, backend=batching[0], compat=compat)
+@pytest.mark.sampled(0.5)
+@pytest.mark.parametrize("case", CASES)
+def test_arrays_on_the_device_repeat_a_recording(case, batching):
+    """Each call has other arrays, some of the host: one graph, and the bits, results and errors of ordinary calls."""
+    device, started = batching
+    model, plain = (CASES[case](backend=device) for _ in range(2))
+    plain._short = None
+    beams, short = model.scanner.count, model._short is not None
+    for real, there in ((np.float32, (True, False)), (np.float64, (True, True)), (np.float64, (False, True))):
+        for seed, scan in enumerate((*SCANS, *SCANS[:2], *SCANS[:2])):
+            host = cloud(seed).astype(real), scan[:beams].astype(real)
+            poses, ranges = (to_device(one) if on else one for one, on in zip(host, there, strict=True))
+            out = to_device(np.zeros(COUNT, model.precision)) if seed % 2 and there[0] else None
+            before = len(started)
+            found = model.log_likelihood(poses, ranges, out=out)
+            graphs = len(started) - before
+            expected = plain.log_likelihood(poses, ranges)
+            assert type(found) is type(expected) and (out is None or found is out)
+            found, expected = (one.numpy() if there[0] else one for one in (found, expected))
+            assert differing(found, expected) == 0, (seed, there)
+        recorded = short and (model.temperature == 1 or not there[1])
+        assert (model._short is not None and model._short.last is not None) == recorded
+        assert not recorded or graphs == 1
+        assert model.explain() == plain.explain()
+        if there[0]:
+            host[0][3, 1] = np.nan
+            for _ in range(2):
+                with pytest.raises(ValueError, match="poses: must be finite, got a pose on the device"):
+                    model.log_likelihood(to_device(host[0]), ranges)
+            host[0][3, 1] = 1.0
+            found, expected = (one.log_likelihood(to_device(host[0]), ranges) for one in (model, plain))
+            assert differing(found.numpy(), expected.numpy()) == 0
+    with pytest.raises(TypeError, match="must hold float32 or float64"):
+        model.log_likelihood(to_device(np.zeros((COUNT, 3), np.int32)), scan[:beams])
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_bound_calls_copy_the_arrays_of_the_host_alone(kind, batching):
+    model = kind(GRID, NEAR, backend=batching[0])
+    for there in ((True, False), (False, True)):
+        host = cloud(1), mixed(1)
+        poses, ranges = (to_device(one) if on else one for one, on in zip(host, there, strict=True))
+        call = model.bind(poses, ranges)
+        assert type(call) is binding._StagedCall and call.waits and type(call.out) is type(poses)
+        for seed in range(4):
+            for array, numbers in ((poses, cloud(seed)), (ranges, mixed(seed))):
+                if isinstance(array, np.ndarray):
+                    array[...] = numbers
+                else:
+                    array.assign(numbers)
+            found, expected = call(), model.log_likelihood(poses, ranges)
+            found, expected = (one.numpy() if there[0] else one for one in (found, expected))
+            assert differing(found, expected) == 0
+    poses, ranges = cloud(1), mixed(1)
+    poses[3, 1] = np.nan
+    call = model.bind(to_device(poses), ranges)
+    for _ in range(2):
+        with pytest.raises(ValueError, match="poses: must be finite, got a pose on the device"):
+            call()
+
+
+def test_weights_for_which_the_host_prepares_readings_take_the_ordinary_path(batching):
+    model = FIELD(GRID, NEAR, backend=batching[0], compat="amcl")
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
-    pairs = [(poses, mixed(1)), (cloud(1), ranges), *([(poses, ranges)] if compat else [])]
+    pairs = [(poses, mixed(1)), (cloud(1), ranges), (poses, ranges)]
     expected = model.log_likelihood(cloud(1), mixed(1))
     for some, readings in pairs:
         call = model.bind(some, readings)

@@ -16,6 +16,7 @@ from gpusense.localization.spread import WIDE, WIDE_TURN
 
 if TYPE_CHECKING:
     from gpusense.evaluation.tracking import Track
+    from gpusense.localization.diagnosis import Diagnosis
     from gpusense.localization.filter import ParticleFilter
     from gpusense.plots.animation import Animation
     from gpusense.plots.viewer import Recording
@@ -47,7 +48,7 @@ def report(
     from gpusense.evaluation.trajectory_files import write_tum
 
     result = summary(track)
-    found = None if result["verdict"] == "tracking" else pf.diagnose()
+    found = _diagnosis(pf, track, tracking=result["verdict"] == "tracking")
     result["evidence"] = None if found is None else asdict(found) | {"text": found.text}
     first = 0 if args.tum_from == "start" else len(track.poses) if track.converged is None else track.converged
     if args.tum is not None:
@@ -74,6 +75,22 @@ def report(
     return result
 
 
+def _diagnosis(pf: ParticleFilter, track: Track, *, tracking: bool) -> Diagnosis | None:
+    """Return the evidence of a run; for a run that tracks, only if its odometry, mount or times are wrong."""
+    from gpusense.localization.run_causes import diagnose_run
+    from gpusense.localization.scan_motion import Moment
+
+    moments = [
+        Moment(step.scan.ranges, pose, step.odometry, step.scan.time, step.sensor)
+        for step, pose in zip(track.steps, track.poses, strict=True)
+    ]
+    found = diagnose_run(pf.models, moments, search=not tracking)
+    if tracking:
+        return found if found.cause in ("odometry", "mount", "time") else None
+    # The last scan alone may show more: people, a far turned mount.
+    return pf.diagnose() if found.cause in ("none", "unknown") else found
+
+
 def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track) -> None:
     """Print the verdict with the error in one line, and then the last pose and the errors."""
     deviations = [math.sqrt(max(value, 0.0)) for value in track.covariances[-1].diagonal()]
@@ -83,6 +100,8 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track
     print_result(_verdict(result, deviations) + error)
     if result["scans"] < chosen:
         print(f"interrupted: results of {result['scans']} of {chosen} scans")
+    if result["verdict"] == "tracking" and result["evidence"] is not None:
+        print_fact("but", result["evidence"]["text"])
     print_fact("last pose", f"{_pose(track.poses[-1])}; deviations {_deviations(deviations)}")
     print_fact("scans", f"{result['scans']}, {sum(result[f'ms_{part}'] for part in _PARTS):.2g} ms each")
     if result["scans"] > 1 and not result["odometry_moves"]:

@@ -17,7 +17,7 @@ from gpusense.localization.sensors import Sensor
 from gpusense.localization.verdict import sightings
 
 Floats = NDArray[np.float64]
-Cause = Literal["none", "people", "start", "mount", "map", "unknown"]
+Cause = Literal["none", "people", "start", "moved", "mount", "map", "scale", "odometry", "time", "unknown"]
 
 # Number of poses tried elsewhere on the map, of refined best poses, and of refinements of each; largest displacement.
 _TRIED, _REFINED, _AROUND, _REACH = 8192, 12, 64, (0.4, 0.4, 0.2)
@@ -50,7 +50,13 @@ class Diagnosis:
         mirrored: Whether the readings seem to be in the opposite order.
         cause: Likely cause: "none" (nothing contradicts the pose), "people" (some beams are short, none long), "start"
             (the robot is elsewhere on this map), "mount" (the scanner has another mount), "map" (no place of the map
-            explains the scan) or "unknown".
+            explains the scan) or "unknown". By the scans of a run also "moved" (all places are moved from the poses in
+            the same way), "scale" (the map has another resolution), "odometry" (scans that match one another contradict
+            it) and "time" (the scans fit the odometry of another time).
+        motion: How the motion between the scans of a run compares with the odometry, in words.
+        moved: (x, y, theta) displacement of the places on the map from the poses, at their centre; None without one.
+        scale: True lengths by those of the map; 1 if they agree.
+        delay: Time by which the odometry that fits a scan is later than the scan [s]; 0 if the times agree.
 
     Example:
         >>> import gpusense as gs
@@ -68,6 +74,10 @@ class Diagnosis:
     turned: float | None = None
     mirrored: bool = False
     cause: Cause = "unknown"
+    motion: str = ""
+    moved: tuple[float, float, float] | None = None
+    scale: float = 1.0
+    delay: float = 0.0
 
     @property
     def counted(self) -> int:
@@ -82,6 +92,8 @@ class Diagnosis:
             parts.append("the pose is inside solid cells")
         if self.off:
             parts.append("the pose is in unknown cells or off the map")
+        if self.motion:
+            parts.append(self.motion)
         cause = self._cause()
         return "; ".join([*parts, f"likely cause: {cause}"] if cause else parts)
 
@@ -97,10 +109,21 @@ class Diagnosis:
     def _cause(self) -> str:
         if self.cause == "start" and self.elsewhere is not None:
             return "wrong start, or carried away: x = {:.1f}, y = {:.1f}, theta = {:.2f} fits".format(*self.elsewhere)
+        if self.cause == "moved" and self.moved is not None:
+            return "map or start moved: places are off the poses by x = {:.1f}, y = {:.1f}, theta = {:.2f}".format(
+                *self.moved
+            )
         if self.cause == "mount":
             how = "mirrored" if self.mirrored else f"turned by {math.degrees(self.turned or 0.0):.0f} degrees"
             return f"wrong mount: the scan fits {how}"
-        return {"people": "people or furniture that the map lacks", "map": "wrong map"}.get(self.cause, "")
+        return {
+            "people": "people or furniture that the map lacks",
+            "map": "wrong map",
+            "scale": f"wrong resolution: true lengths are {self.scale:.2f} times those of the map",
+            "odometry": "wrong odometry",
+            "time": f"wrong times: the scans fit the odometry {abs(self.delay):.2f} s "
+            f"{'later' if self.delay > 0 else 'earlier'}",
+        }.get(self.cause, "")
 
     def __str__(self) -> str:
         return self.text

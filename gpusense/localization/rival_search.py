@@ -32,7 +32,7 @@ from gpusense.world.scanner import classify_ranges, float64_readings
 # Candidates of each search on a map; effective number of initial candidates of a rival; beams of a scan in a search.
 _CANDIDATES, _EFFECTIVE, _BEAMS = 40, 5, 60
 # Covariance of a candidate: half the distances between poses of the search, squared.
-_SPREAD_OF_POSE = np.diag([0.05**2, 0.05**2, 0.025**2])
+SPREAD_OF_POSE = np.diag([0.05**2, 0.05**2, 0.025**2])
 # Field parameters of a search, wider than the filter's, since the poses are farther apart.
 _FIELD = LikelihoodFieldParameters(z_hit=0.7, z_max=0.0, z_rand=0.3, sigma_hit=0.15)
 # Number of random poses, and effective number of initial poses of a rival.
@@ -122,7 +122,7 @@ class RivalSearch:
     def _ratios(self, poses: np.ndarray, readings: Sequence[SensorReadings]) -> np.ndarray:
         """Return the log-likelihood ratios (M,) of "wrong" against "right" for poses; 0 without evidence from scans."""
         known = dict(readings)
-        ratios = [ratio_of_scan(sightings(self._sensors, known, pose, _SPREAD_OF_POSE)) for pose in poses]
+        ratios = [ratio_of_scan(sightings(self._sensors, known, pose, SPREAD_OF_POSE)) for pose in poses]
         return np.nan_to_num(np.array(ratios))
 
     def _on_map(self, readings: Sequence[SensorReadings]) -> np.ndarray:
@@ -131,14 +131,18 @@ class RivalSearch:
             sensor = self._sensors[index]
             if sensor.calibrates:
                 on_host = np.asarray(arrays.copied_to_host(reading[0], sensor.backend, "ranges"))
-                field, scanner = self._field_of(sensor), sensor.model.scanner
-                ranges = float64_readings(on_host, scanner)
-                returned = classify_ranges(ranges, scanner.range_min, scanner.range_max)[0]
-                longer = np.where(ranges < np.median(ranges[returned]), np.nan, ranges) if returned.any() else ranges
-                return np.vstack([likely_poses(field, each, _CANDIDATES) for each in (ranges, longer)])
+                scanner = sensor.model.scanner
+                return self.likely(sensor, float64_readings(on_host, scanner))
         return np.empty((0, 3))
 
-    def _field_of(self, sensor: Sensor) -> LikelihoodFieldModel:
+    def likely(self, sensor: Sensor, ranges: np.ndarray) -> np.ndarray:
+        """Return the likeliest poses (M, 3) of a scan (K,) on the whole map, by all beams and by the longer half."""
+        scanner = sensor.model.scanner
+        returned = classify_ranges(ranges, scanner.range_min, scanner.range_max)[0]
+        longer = np.where(ranges < np.median(ranges[returned]), np.nan, ranges) if returned.any() else ranges
+        return np.vstack([likely_poses(self.field_of(sensor), each, _CANDIDATES) for each in (ranges, longer)])
+
+    def field_of(self, sensor: Sensor) -> LikelihoodFieldModel:
         """Return the cached field of a sensor's map for searches."""
         grid, scanner = sensor.model.grid, sensor.model.scanner
         if self._field is None or self._field.grid is not grid or self._field.scanner is not scanner:

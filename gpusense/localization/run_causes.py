@@ -1,0 +1,357 @@
+"""The likely cause of a wrong pose, by the scans of a whole run.
+
+Evidence is of three kinds. The motion between scans contradicts the odometry, or not
+(:mod:`gpusense.localization.scan_motion`). A few scans in a row, with their relative poses by matching, fit somewhere
+on the map: as they are; as a laser upside down would see it; or with another scale of the map. And their places agree
+with the judged poses, or are all moved from them in the same way. :func:`likely_cause` decides by this evidence alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.interface.constants import AGREES, SHORT, THROUGH
+from gpusense.localization.belief import motion_between
+from gpusense.localization.diagnosis import Diagnosis, evidence_of
+from gpusense.localization.pose_algebra import compose_poses, invert_poses, pose_difference, wrap_angle
+from gpusense.localization.ratio import ratio_of_scan
+from gpusense.localization.rival_search import SPREAD_OF_POSE, RivalSearch
+from gpusense.localization.scan_motion import Moment, ScanMotion, Window, mirrored_motion, scan_motion
+from gpusense.localization.sensors import Sensor, sensors_of
+from gpusense.localization.spread import FAR, FAR_TURN
+from gpusense.localization.verdict import sightings
+from gpusense.world.scanner import float64_readings
+
+Floats = NDArray[np.float64]
+
+# Windows whose places are searched; candidates that all scans weigh, and that are refined; poses around each.
+_PLACES, _WEIGHED, _REFINED, _AROUND, _REACH = 5, 20, 5, 64, (0.1, 0.1, 0.05)
+# Scans of a window that are searched at each scale.
+_QUICK = 3
+# Least shares of the beams of a window that agree at its place: of beams that meet walls, and of all informative ones.
+_AGREE, _AGREE_OF_ALL = 0.92, 0.5
+# Scales of the map that are tried.
+_SCALES = tuple(float(scale) for scale in (0.5, *np.geomspace(1 / 1.4, 1.4, 24), 2.0))
+# Least share of windows that fit where a hypothesis holds, and where it holds throughout; largest where it does not.
+_MOST, _ALMOST_ALL, _FEW = 0.6, 0.75, 0.4
+# Share of short beams above which people or furniture are meant; drift of the odometry, as a share of its way [rad/m].
+_CROWD, _DRIFT = 0.2, 0.1
+# Largest distance between a place and the judged pose that agree [m, rad], and between common displacements.
+_SAME, _SAME_TURN = 0.5, 0.2
+_STILL = np.zeros((3, 3))
+
+
+class Place(NamedTuple):
+    """Likeliest place of a window on the map.
+
+    Attributes:
+        pose: (3,) pose of the robot at its first scan.
+        share: Share of its beams that agree, of those that give evidence.
+        fits: Whether it explains all scans of the window.
+        short: Share of its beams that end in mapped free space.
+    """
+
+    pose: Floats
+    share: float
+    fits: bool
+    short: float = 0.0
+
+
+class RunEvidence(NamedTuple):
+    """Evidence of a run.
+
+    Attributes:
+        motion: Agreement of the scans' motion with the odometry.
+        windows: Number of windows that were judged.
+        at_poses: Share of them that fit at the judged poses.
+        at_last: Whether the last window does.
+        short: Share of the beams of windows that end in free space, among those that fit.
+        as_is: Share of windows that fit somewhere on the map.
+        mirrored: Share that fits somewhere as a laser upside down sees it.
+        scaled: Share that fits somewhere on a map of another scale.
+        scale: That scale: true lengths by those of the map.
+        moved: Common displacement of the places from the judged poses, in the map; None without one.
+        last: Place of the last window, if it fits as it is.
+    """
+
+    motion: ScanMotion
+    windows: int = 0
+    at_poses: float = 0.0
+    at_last: bool = False
+    short: float = 0.0
+    as_is: float = 0.0
+    mirrored: float = 0.0
+    scaled: float = 0.0
+    scale: float = 1.0
+    moved: tuple[float, float, float] | None = None
+    last: tuple[float, float, float] | None = None
+
+
+def diagnose_run(models: Any, moments: Sequence[Moment], *, search: bool = True) -> Diagnosis:
+    """Return the evidence of the scans of a run, and the likely cause of a contradiction.
+
+    Args:
+        models: The model of the scans, or several of one device.
+        moments: Scans with the judged poses, and with odometry and times where they are known, in order of time.
+        search: Whether to search places on the map; otherwise the odometry alone is judged, and a map is not blamed.
+    """
+    sensors = sensors_of(models)
+    scanning = [one for one in moments if sensors[one.sensor].calibrates]
+    if not scanning:
+        return Diagnosis(0, 0, 0)
+    # The laser of most scans stands for all.
+    numbers = [one.sensor for one in scanning]
+    index = max(set(numbers), key=lambda number: (numbers.count(number), -number))
+    chosen = [one for one in scanning if one.sensor == index]
+    sensor = sensors[index]
+    motion = scan_motion(chosen, sensor.model.scanner, sensor.model.device.selection)
+    places = _Places(sensor, chosen)
+    evidence = places.evidence(motion) if search else RunEvidence(motion)
+    last = moments[-1]
+    beams = evidence_of(sightings(sensors, {last.sensor: (last.ranges,)}, np.asarray(last.pose, np.float64), _STILL))
+    return likely_cause(beams, evidence, search=search)
+
+
+def likely_cause(beams: Diagnosis, evidence: RunEvidence, *, search: bool = True) -> Diagnosis:
+    """Return a diagnosis with the likely cause by evidence of a run.
+
+    Args:
+        beams: Evidence of the last scan's beams.
+        evidence: Evidence of the run.
+        search: Whether places were searched.
+    """
+    motion = evidence.motion
+    found = replace(beams, motion=_motion_text(motion), cause="unknown")
+    flipped = replace(found, cause="mount", turned=motion.turned if motion.mirrored else 0.0, mirrored=True)
+    if motion.cause == "mount":
+        if not motion.mirrored:
+            return replace(found, cause="mount", turned=motion.turned)
+        if not search or evidence.mirrored >= max(_MOST, evidence.as_is):
+            return flipped
+    if search and evidence.as_is < _MOST:
+        if evidence.mirrored >= _MOST:
+            return flipped
+        if evidence.scaled >= _MOST:
+            return replace(found, cause="scale", scale=evidence.scale)
+        fitting = max(evidence.as_is, evidence.mirrored, evidence.scaled)
+        return replace(found, cause="map" if evidence.windows and fitting <= _FEW else "unknown")
+    if motion.cause == "time":
+        return replace(found, cause="time", delay=motion.delay)
+    if motion.cause in ("odometry", "mount"):
+        return replace(found, cause="odometry")
+    if not search or (evidence.at_poses >= _MOST and evidence.at_last):
+        return replace(found, cause="people" if evidence.short > _CROWD else "none")
+    if evidence.moved is not None:
+        return replace(found, cause="moved", moved=evidence.moved)
+    if evidence.last is not None:
+        return replace(found, cause="start", elsewhere=evidence.last)
+    return found
+
+
+def _motion_text(motion: ScanMotion) -> str:
+    """Return the evidence of the motion between scans in words; nothing without enough matches."""
+    if math.isnan(motion.way):
+        return ""
+    verb = "agree with" if motion.cause == "none" else "contradict"
+    turn = f"{motion.way:.2g} m and {math.degrees(motion.turn):.2g} degrees in the median"
+    return f"{motion.matched} of {motion.pairs} pairs of scans match and {verb} the odometry: {turn}"
+
+
+class _Places:
+    """Places of windows on the map.
+
+    Args:
+        sensor: The sensor of all scans.
+        moments: The scans.
+    """
+
+    def __init__(self, sensor: Sensor, moments: Sequence[Moment]) -> None:
+        self._sensor, self._moments = sensor, moments
+        self._search, self._field = RivalSearch([sensor]), None
+
+    def evidence(self, motion: ScanMotion) -> RunEvidence:
+        """Return the evidence of a run with the motion between its scans."""
+        windows = self._chosen(motion.windows)
+        count = len(windows)
+        judged = [self._at_poses(window) for window in windows]
+        fitting = [one for one in judged if one.fits]
+        known = RunEvidence(
+            motion, count, len(fitting) / count, judged[-1].fits,
+            float(np.mean([one.short for one in fitting])) if fitting else 0.0,
+        )  # fmt: skip
+        if known.at_last and known.at_poses >= _ALMOST_ALL:
+            return known._replace(as_is=known.at_poses)
+        steady = motion.cause == "none"
+        found = [self.place(window) for window in windows]
+        fits = self._consistent(windows, found, steady=steady)
+        known = known._replace(as_is=max(float(fits.mean()), known.at_poses))
+        here = np.array([one.fits and self._is_near(window, one) for window, one in zip(windows, found, strict=True)])
+        known = known._replace(
+            at_poses=max(known.at_poses, float(here.mean())), at_last=known.at_last or bool(here[-1])
+        )
+        if found[-1].fits:
+            x, y, theta = (float(value) for value in found[-1].pose)
+            known = known._replace(last=(x, y, theta))
+        known = known._replace(moved=self._displacement(windows, found, fits))
+        if known.as_is >= _MOST and not motion.mirrored:
+            return known
+        steady = steady or motion.mirrored
+        flipped = [self.place(window, mirrored=True) for window in windows]
+        known = known._replace(mirrored=float(self._consistent(windows, flipped, steady=steady).mean()))
+        if max(known.as_is, known.mirrored) >= _MOST:
+            return known
+        scaled, scale = self._scale(windows, steady=steady)
+        return known._replace(scaled=scaled, scale=scale)
+
+    def _chosen(self, windows: list[Window]) -> list[Window]:
+        """Return the windows that are judged: the first, the last, and long ones between them."""
+        if not windows:
+            every = np.linspace(0, len(self._moments) - 1, min(_PLACES, len(self._moments))).astype(int)
+            return [Window((int(k),), np.zeros((1, 3))) for k in every]
+        parts = np.array_split(np.arange(len(windows)), min(_PLACES, len(windows)))
+        longest = [max(part.tolist(), key=lambda k: len(windows[k].relative)) for part in parts]
+        return [windows[k] for k in sorted({0, *longest[1:-1], len(windows) - 1})]
+
+    def _consistent(
+        self, windows: list[Window], places: list[Place], *, steady: bool, scale: float = 1.0
+    ) -> NDArray[np.bool_]:
+        """Return which places fit, and have another one that fits at the distance of the odometry.
+
+        Args:
+            windows: The windows.
+            places: Their places.
+            steady: Whether the odometry is right; without it every place that fits counts.
+            scale: True lengths by those of the map.
+        """
+        fits = np.array([one.fits for one in places])
+        odometry = [self._moments[window.moments[0]].odometry for window in windows]
+        if not steady or len(windows) < 3 or any(one is None for one in odometry):
+            return fits
+        moved, found = np.array(odometry, np.float64), np.array([one.pose for one in places])
+        by_odometry = pose_difference(moved[:, None], moved[None]) / np.array([scale, scale, 1.0])
+        apart = pose_difference(by_odometry, pose_difference(found[:, None], found[None]))
+        way, turn = np.hypot(*np.moveaxis(by_odometry[..., :2], -1, 0)), np.abs(by_odometry[..., 2])
+        near = np.hypot(*np.moveaxis(apart[..., :2], -1, 0)) < 2 * _SAME + _DRIFT * way
+        near &= np.abs(apart[..., 2]) < _SAME_TURN + _DRIFT * (turn + way)
+        near &= fits[:, None] & fits[None] & ~np.eye(len(fits), dtype=bool)
+        return np.asarray(near.any(axis=1))
+
+    def _scale(self, windows: list[Window], *, steady: bool) -> tuple[float, float]:
+        """Return the share of windows that fit with the best scale of the map, and this scale."""
+        tried = windows[len(windows) // 2]
+        places = [self.place(tried, scale=scale, quick=True) for scale in _SCALES]
+        scale = _SCALES[max(range(len(_SCALES)), key=lambda k: (places[k].fits, places[k].share))]
+        found = [self.place(window, scale=scale) for window in windows]
+        return float(self._consistent(windows, found, steady=steady, scale=scale).mean()), scale
+
+    def _displacement(
+        self, windows: list[Window], places: list[Place], fits: NDArray[np.bool_]
+    ) -> tuple[float, float, float] | None:
+        """Return the motion of the map by which all places that fit come from the judged poses; None without one."""
+        if fits.sum() < 3 or not fits[0]:
+            return None
+        before = np.array([self._pose(window) for window in windows])[fits]
+        after = np.array([one.pose for one in places])[fits]
+        moves = compose_poses(after, invert_poses(before))
+        middle = moves[np.argsort(moves[:, 2])[len(moves) // 2]]
+        apart = pose_difference(compose_poses(middle, before), after)
+        center = np.array([*before[:, :2].mean(axis=0), 0.0])
+        x, y, theta = (float(value) for value in compose_poses(middle, center) - center)
+        same = (np.hypot(*apart[:, :2].T) < 2 * _SAME) & (np.abs(wrap_angle(apart[:, 2])) < _SAME_TURN)
+        is_moved = math.hypot(x, y) > _SAME or abs(theta) > _SAME_TURN
+        return (x, y, theta) if same.mean() >= _ALMOST_ALL and is_moved else None
+
+    def _is_near(self, window: Window, place: Place) -> bool:
+        """Tell whether a place is the judged pose of its window."""
+        way, turn = motion_between(place.pose, self._pose(window))
+        return way < FAR and turn < FAR_TURN
+
+    def _pose(self, window: Window) -> Floats:
+        return np.asarray(self._moments[window.moments[0]].pose, np.float64)
+
+    def place(self, window: Window, *, mirrored: bool = False, scale: float = 1.0, quick: bool = False) -> Place:
+        """Return the likeliest place of a window on the map.
+
+        Args:
+            window: The window.
+            mirrored: Whether to take the laser as upside down.
+            scale: True lengths by those of the map.
+            quick: Whether to search a few scans of it, for few candidates.
+        """
+        scans, relative = self._seen(window, mirrored, scale)
+        if quick:
+            scans, relative = scans[:_QUICK], relative[:_QUICK]
+        field = self._search.field_of(self._sensor)
+        ends = [0] if quick else sorted({0, len(scans) - 1})
+        poses = np.vstack([
+            compose_poses(found, invert_poses(relative[k]))
+            for k in ends
+            if len(found := self._search.likely(self._sensor, scans[k]))
+        ] or [np.empty((0, 3))])  # fmt: skip
+        # Among people a field prefers places with many walls, so beams through walls count first.
+        for number, count in ((1, _WEIGHED), (len(scans), 2 if quick else _REFINED)):
+            ratios = np.array([self._ratio(scans[:number], relative, pose) for pose in poses])
+            poses = poses[np.argsort(ratios, kind="stable")[:count]]
+        if not len(poses):
+            return Place(np.zeros(3), 0.0, fits=False)
+
+        def score(tried: Floats) -> Floats:
+            total = np.zeros(len(tried))
+            for one, scan in zip(relative, scans, strict=True):
+                total += np.asarray(field.log_likelihood(compose_poses(tried, one), scan), np.float64)
+            return total
+
+        rng, judged = np.random.default_rng(0), []
+        for best in poses:
+            for reach in (1.0, 0.3):
+                offsets = rng.uniform(-reach, reach, (_AROUND, 3)) * _REACH
+                offsets[0] = 0.0
+                tried = best + offsets
+                best = tried[int(np.argmax(score(tried)))]
+            judged.append(self._judged(scans, compose_poses(best, relative)))
+        return max(judged, key=lambda one: (one.fits, one.share))
+
+    def _ratio(self, scans: list[Floats], relative: Floats, pose: Floats) -> float:
+        """Return the sum of the ratios of scans at a coarse pose."""
+        ratios = [
+            ratio_of_scan(sightings([self._sensor], {0: (scan,)}, compose_poses(pose, part), SPREAD_OF_POSE))
+            for part, scan in zip(relative, scans, strict=False)
+        ]
+        return float(np.nan_to_num(ratios).sum())
+
+    def _at_poses(self, window: Window) -> Place:
+        """Judge the scans of a window at their poses."""
+        poses = np.array([np.asarray(self._moments[k].pose, np.float64) for k in window.moments])
+        return self._judged([self._ranges(k) for k in window.moments], poses)
+
+    def _ranges(self, moment: int) -> Floats:
+        return float64_readings(np.asarray(self._moments[moment].ranges), self._sensor.model.scanner)
+
+    def _judged(self, scans: list[Floats], poses: Floats) -> Place:
+        """Return the place of scans with all their beams judged at (L, 3) poses."""
+        pairs = zip(poses, scans, strict=True)
+        seen = [one for pose, scan in pairs for one in sightings([self._sensor], {0: (scan,)}, pose, _STILL)]
+        agree, through, short = (sum(one.count(kind) for one in seen) for kind in (AGREES, THROUGH, SHORT))
+        every = agree + through + short
+        is_right = agree > _AGREE * (agree + through) and agree > _AGREE_OF_ALL * every
+        is_right = is_right and not any(one.inside or one.off for one in seen)
+        return Place(poses[0], agree / max(every, 1), is_right, short / max(every, 1))
+
+    def _seen(self, window: Window, mirrored: bool, scale: float) -> tuple[list[Floats], Floats]:
+        """Return the scans of a window and their relative poses, as on a map of another scale or by a turned laser."""
+        scanner, relative = self._sensor.model.scanner, window.relative
+        scans = [self._ranges(k) for k in window.moments[: len(relative)]]
+        if mirrored:
+            scans, relative = [scan[::-1] for scan in scans], mirrored_motion(relative, scanner)
+        if scale != 1:
+            scans = [np.where(scan >= scanner.range_max, np.inf, scan / scale) for scan in scans]
+            # A reading beyond the laser's range is no sign of free space.
+            scans = [np.where(np.isfinite(scan) & (scan >= scanner.range_max), np.nan, scan) for scan in scans]
+            relative = relative * np.array([1 / scale, 1 / scale, 1.0])
+        return scans, relative

@@ -13,8 +13,8 @@ from typing import Any
 from gpusense._util import pictures
 from gpusense._version import __version__ as __version__
 
-# The public names by their modules. Type checkers read the stub beside this file, which is made from this table:
-# run ``PYTHONPATH=tests python -m support.public_names`` after a change.
+# The public names by their modules. Type checkers read the stub of this package, made from this table: run
+# ``PYTHONPATH=tests python -m support.public_names`` after a change.
 _NAMES = {
     "backends": ("Device", "devices"),
     "chaining.chain": ("chain_scans",),

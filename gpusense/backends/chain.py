@@ -29,7 +29,7 @@ class Failure:
         selection: Its selection string; empty without one.
         reason: The reason, with the remedy.
         line: Device and reason, as messages have them.
-        lasting: Whether the reason is an earlier verdict, already reported.
+        lasting: True if the reason is an earlier, already reported verdict.
     """
 
     selection: str

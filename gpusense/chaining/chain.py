@@ -73,7 +73,7 @@ def chain_scans(
             scanner's length.
         scanner: Their scanner, or several; its mount is the sensor's pose on the robot.
         odometry: (S, 3) poses of the odometer at the scans [m, m, rad]. None: no odometry.
-        sensor: (S,) index of the scanner of each scan; with several scanners only.
+        sensor: (S,) index of the scanner of each scan; only for several scanners.
         times: (S,) times of the first beams [s]. None: unknown.
         duration: Time from the first beam of a scan to the last one [s], to correct scans for the robot's motion; needs
             ``times``. Beams are measured evenly in time in their order, in reverse, or all at once; the order in which

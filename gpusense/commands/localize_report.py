@@ -176,7 +176,7 @@ def _verdict(result: dict[str, Any], deviations: list[float]) -> str:
 
 
 def _doubt(deviations: list[float]) -> str:
-    """Return the reason why a pose is uncertain: wide particles, or scans that other places explain as well."""
+    """Return the reason why a pose is uncertain: wide particles, or scans that other places also explain."""
     position, heading = max(deviations[:2]), deviations[2]
     if position > WIDE or heading > WIDE_TURN:
         return f"the particles lie {position:.1f} m and {math.degrees(heading):.0f} degrees apart"

@@ -67,7 +67,7 @@ def _wrapped(text: str, width: int, indent: str = "") -> str:
 def print_table(
     columns: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[str] = (), optional: Sequence[str] = ()
 ) -> None:
-    """Print a table: by rich on a terminal, as plain text elsewhere.
+    """Print a table by rich on a terminal, otherwise as plain text.
 
     On a narrow terminal, each row becomes a paragraph with one value per line.
 
@@ -75,7 +75,7 @@ def print_table(
         columns: Names of the columns.
         rows: Cells of each row.
         right: Names of the columns that are right-aligned.
-        optional: Names of the columns that are left out on narrow terminals, in this order.
+        optional: Names of columns to omit on narrow terminals, in this order.
     """
     lines = table_lines(columns, rows, right=right)
     if not is_terminal(sys.stdout):
@@ -169,12 +169,12 @@ def table_lines(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right:
 
 
 def counted(number: int, noun: str, plural: str | None = None) -> str:
-    """Return a number of things in words: ``"1 scan"``, ``"3 scans"``."""
+    """Return a number with a noun: ``"1 scan"``, ``"3 scans"``."""
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 
 def length(metres: float) -> str:
-    """Format a length with two digits and the unit that suits it."""
+    """Format a length with two digits in a suitable unit."""
     if metres < 0.01:
         return f"{metres * 1000:.2g} mm"
     return f"{metres * 100:.2g} cm" if metres < 0.995 else f"{metres:.1f} m"

@@ -59,7 +59,7 @@ correlation of beams at the logged poses of the first 100 chosen scans. --temper
 The verdict is whether the logged poses explain the beams of their scans. On a wrong map beams pass through walls: the
 message states their share and the place of most of them. Cases in between are uncertain.
 
-With -v a row is printed as soon as its scan is scored. Ctrl-C ends the run with the results so far.
+-v prints a row for each scan at once. Ctrl-C ends the run with the results so far.
 
 Exit codes: 0 the log fits the map, 1 it does not or the verdict is uncertain, or two backends rank the particles
 differently by more than rounding explains, 2 bad input, 130 interrupted, 143 terminated.
@@ -220,7 +220,7 @@ def print_report(
 
 
 def pose_name(args: argparse.Namespace) -> str:
-    """Return the report's name of a scan's pose, which comes from the log or from ``--reference``."""
+    """Return the report's name for the scans' poses, from the log or from ``--reference``."""
     return "logged pose" if args.reference is None else "reference pose"
 
 

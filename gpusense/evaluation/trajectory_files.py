@@ -20,7 +20,7 @@ from gpusense.logs import Pose
 Floats = NDArray[np.float64]
 # Largest time between two poses of a trajectory that are interpolated, and between equal times [s].
 _FARTHEST, _SAME_TIME = 0.5, 1e-3
-# Largest coordinate [m]; those of UTM reach 1e7.
+# Largest coordinate [m]; UTM reaches 1e7.
 _LARGEST = 1e9
 # Comment of a trajectory with indices of scans instead of times.
 _INDICES = "# indices of scans, not times"

@@ -32,7 +32,7 @@ _LEAST_NOISE, _LARGEST_NOISE = 3e-3, 0.1
 _READINGS = 1 << 22
 # Largest step between the bearings of neighbouring beams [usual steps].
 _NEIGHBOURS = 1.5
-# Standard deviation of the common error of a reflector's ranges [m]: bright echoes are timed early or late.
+# Standard deviation of the common error of a reflector's ranges [m]: bright echoes arrive early or late.
 _TOGETHER = 0.01
 
 
@@ -132,9 +132,9 @@ def _shapes(
     return {kind: finder() for kind, finder in finders.items() if kind in kinds}
 
 
-# Least turn between two walls [rad], and most points between them.
+# Least angle between two walls [rad], and most points between them.
 _LEAST_TURN, _BETWEEN = math.radians(25), 2
-# Lines meet if the vertex is at most this many beams and deviations from the end of each.
+# Lines meet if the vertex is within this many beams and deviations of both ends.
 _BEAMS, _DEVIATIONS = 1.5, 3.0
 
 
@@ -149,7 +149,7 @@ def find_corners(segments: Segments, straight: np.ndarray, mount: tuple[float, f
     inverse = np.linalg.inv(normals)
     vertex = (inverse @ np.stack([segments.distance[one], segments.distance[two]], axis=1)[..., None])[..., 0]
     along = np.stack([_along(vertex, alpha), _along(vertex, beta)], axis=1)
-    # Derivatives of the vertex's distance from each line by the angle and the distance of the line.
+    # Derivatives of the vertex's distance from each line by the line's angle and distance.
     row = np.zeros((len(one), 2, 4))
     row[:, 0, 0], row[:, 0, 1], row[:, 1, 2], row[:, 1, 3] = -along[:, 0], 1, -along[:, 1], 1
     jacobian = np.zeros((len(one), 3, 4))
@@ -161,7 +161,7 @@ def find_corners(segments: Segments, straight: np.ndarray, mount: tuple[float, f
     spread = np.sqrt(np.einsum("cii->c", covariance[:, :2, :2]))
     space = (_BEAMS + between)[:, None] * np.stack([segments.spacing[one, 1], segments.spacing[two, 0]], axis=1)
     gap = np.stack([along[:, 0] - segments.ends[one, 1], segments.ends[two, 0] - along[:, 1]], axis=1)
-    # Within this distance of the vertex a point lies on both lines, up to noise.
+    # Within this distance of the vertex noise hides which line a point belongs to.
     noise = np.sqrt(np.maximum(segments.variance[one], segments.variance[two]))
     reach = _DEVIATIONS * (spread + noise / np.abs(np.sin(turn)))
     meets = (np.abs(gap) <= space + reach[:, None]).all(axis=1)
@@ -178,7 +178,7 @@ def _along(vertex: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def _neighbours(segments: Segments, straight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return pairs of successive lines with at most a few points between them, and the number of these points."""
+    """Return pairs of successive lines with few points between them, and these numbers of points."""
     one = np.flatnonzero(straight)
     two, between, linked = one, np.zeros(len(one), np.int64), np.ones(len(one), bool)
     found = []
@@ -192,7 +192,7 @@ def _neighbours(segments: Segments, straight: np.ndarray) -> tuple[np.ndarray, n
     return tuple(np.concatenate(part) for part in zip(*found, strict=True))  # type: ignore[return-value]
 
 
-# Least intensity of a bright beam, and of a reflector's brightest beam [medians of the scan].
+# Least intensities of a bright beam and of a reflector's brightest beam [medians of the scan].
 _BRIGHT, _BRIGHTEST = 2.0, 3.0
 # Least beams, largest width [m], and largest step of ranges between neighbours [m].
 _LEAST_BEAMS, _WIDEST, _STEP = 2, 0.4, 0.2
@@ -218,7 +218,7 @@ def find_reflectors(ranges: np.ndarray, intensities: np.ndarray, scanner: Scanne
 
 
 def _runs(bright: np.ndarray, r: np.ndarray, steps: np.ndarray, step: float) -> list[np.ndarray]:
-    """Return runs of bright beams in the order of bearings, across the last beam if beams cover a full turn."""
+    """Return runs of bright beams by bearing, continued across the last beam if beams cover a full turn."""
     count = len(bright)
     # Only bright beams have finite ranges.
     r = np.where(bright, r, 0.0)
@@ -235,7 +235,7 @@ def _runs(bright: np.ndarray, r: np.ndarray, steps: np.ndarray, step: float) -> 
 def _reflector(
     light: np.ndarray, r: np.ndarray, bearing: np.ndarray, usual: float, step: float
 ) -> tuple[float, float, float, float, float] | None:
-    """Return distance, bearing, width, variance of the bearing and number of beams of a run; None for other runs."""
+    """Return distance, bearing, width, bearing variance and beams of a reflector's run, else None."""
     peak = float(light.max())
     inner = light >= 0.5 * (peak + usual)
     count = int(np.count_nonzero(inner))

@@ -45,7 +45,7 @@ def map_features(
     Args:
         features: Features of S scans.
         poses: (S, 3) poses of the robot at the scans [m, m, rad].
-        kinds:         kinds: Kinds out of "line", "corner", "door", "pole" and "reflector".
+        kinds: Kinds out of "line", "corner", "door", "pole" and "reflector".
         pose_deviation: Standard deviations of the poses: position [m] and heading [rad].
         least: Least number of features of a landmark, in different scans.
 
@@ -142,8 +142,8 @@ def _free_places(grid: OccupancyGrid, spacing: float) -> Floats:
     return np.column_stack([ox + c * x - s * y, oy + s * x + c * y, np.zeros(len(x))])
 
 
-# Features belong to one landmark within this many deviations, widened by this distance [m], if their directions [rad]
-# and sizes [m or rad] differ by at most these.
+# Features form one landmark if they are within this many deviations plus this distance [m], and differ at most by this
+# direction [rad] and these sizes [m or rad].
 _DEVIATIONS, _FLOOR, _TURN = 4.0, 0.03, 0.4
 
 
@@ -158,7 +158,7 @@ class InWorld:
 
 
 def in_world(features: Features, poses: Floats, spread: Floats) -> InWorld:
-    """Return features in the world, with the errors of poses in their covariances."""
+    """Return features in the world; covariances include the errors of poses."""
     at = poses[features.scan]
     c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
     turn = np.stack([c, -s, s, c], axis=1).reshape(-1, 2, 2)
@@ -182,7 +182,7 @@ def clustered(features: Features, poses: Floats, spread: Floats, kind: str, leas
 
 
 class _Clusters:
-    """Landmarks that grow, the most certain features first."""
+    """Growing landmarks, the most certain features first."""
 
     def __init__(self, kind: str) -> None:
         self._kind = kind
@@ -193,7 +193,7 @@ class _Clusters:
         self._size = np.zeros(0)
 
     def nearest(self, world: InWorld, i: int) -> int:
-        """Return the landmark to which a feature may belong, or -1."""
+        """Return the nearest landmark that a feature may belong to, or -1."""
         off = self._pose[:, :2] - world.pose[i, :2]
         near = np.flatnonzero(np.abs(off).max(axis=1, initial=0) < 2.0)
         if not len(near):
@@ -227,7 +227,7 @@ class _Clusters:
 
 
 def _fused(world: InWorld, label: np.ndarray, kind: str, least: int) -> FeatureMap:
-    """Return landmarks: the weighted means of their features."""
+    """Return each landmark as the weighted mean of its features."""
     poses, covariances, sizes, counts = [], [], [], []
     for j in range(int(label.max(initial=-1)) + 1):
         rows = np.flatnonzero(label == j)

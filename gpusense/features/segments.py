@@ -272,7 +272,7 @@ def beams_of(ranges: np.ndarray, scanner: Scanner, points: ScanPoints) -> Beams:
 
 
 def _beams_of_points(points: ScanPoints, bearing: np.ndarray, scan: np.ndarray, state: np.ndarray) -> np.ndarray:
-    """Return the beam of each point; points are the hits beyond a micrometre, in order."""
+    """Return the beam of each point; points are hits beyond a micrometre, in order."""
     hits = state == Reading.HIT
     if np.count_nonzero(hits) == len(scan):
         return np.nonzero(hits)[1]

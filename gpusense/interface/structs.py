@@ -300,11 +300,10 @@ class MatchRules(NamedTuple):
 class BeamRules(NamedTuple):
     """Companions of a scan's rays in a part of the map, and rules for its readings; see the kernel file ``passages``.
 
-    The part begins at the column ``left`` and the row ``top`` of the map. Companions start at the offset ``beside``
-    from the beam, or at the position's deviation up to ``most_beside`` [m]. They diverge by ``apart``, or by the
-    deviation of the heading up to ``most_apart``, and by ``cone`` [rad]. Tolerances of readings are ``part`` of them,
-    at least ``least`` and the deviation of the position; rays are walked up to ``limit`` [m]. Walls have the value
-    ``occupied`` or more.
+    The part begins at the column ``left`` and the row ``top`` of the map. Companions start ``beside`` off the beam, or
+    at the position's deviation up to ``most_beside`` [m]. They diverge by ``apart``, or by the deviation of the
+    heading up to ``most_apart``, and by ``cone`` [rad]. Tolerances of readings are ``part`` of them, at least ``least``
+    and the deviation of the position; rays are walked up to ``limit`` [m]. Walls have the value ``occupied`` or more.
     """
 
     beside: double

@@ -72,7 +72,7 @@ class Comparison(NamedTuple):
     Attributes:
         ratio: Log-likelihood ratio of "wrong" against "right".
         pose: Compared pose; None before.
-        chosen:         chosen: True if scans choose the next pose among many.
+        chosen: True if scans choose the next pose among many.
     """
 
     ratio: float = 0.0

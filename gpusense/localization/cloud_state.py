@@ -110,7 +110,7 @@ class Summary(NamedTuple):
         temperature: Share of the temperature used by all stages.
         degenerate: Whether no particle was possible.
         stages: Number of stages that ran.
-        numbers:         numbers: The state in the kernels' layout.
+        numbers: The state in the kernels' layout.
         resampled: Whether particles were drawn at the end.
     """
 
@@ -165,7 +165,7 @@ def meaningful(numbers: np.ndarray, averages: bool) -> np.ndarray:
     """Clear unused numbers of a state: stages that did not run, and unused averages.
 
     Args:
-        numbers:         numbers: The state in the kernels' layout.
+        numbers: The state in the kernels' layout.
         averages: Whether recovery follows the averages of the likelihood.
     """
     end, result = summary_of(numbers).stages * STAGE, np.zeros(STATE)

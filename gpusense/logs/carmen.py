@@ -43,7 +43,7 @@ _FRONT = (b"FLASER", b"ROBOTLASER1")
 _REAR = (b"RLASER", b"ROBOTLASER2")
 _KNOWN = (*_FRONT, *_REAR, b"ODOM")
 _TAIL = 3  # time of measurement, host, logger's time
-# Largest difference of bearings from even steps [rad].
+# Largest deviation of bearings from even steps [rad].
 _EVEN = 1e-9
 
 
@@ -218,7 +218,7 @@ def _range_max_of(path: Path, name: bytes) -> float:
     return largest if times >= 3 else math.nextafter(largest, math.inf)
 
 
-# Decimals of readings [m]; of poses [m, rad]; the host in each message.
+# Decimals of readings [m] and of poses [m, rad]; host in each message.
 _READING, _POSE, _HOST = 4, 6, "simulated"
 
 
@@ -255,7 +255,7 @@ def _numbers(values: Iterable[float], decimals: int) -> str:
 
 
 def _within(scan: Scan) -> Iterable[float]:
-    """Return readings in which ranges below range_max stay below it after rounding."""
+    """Return readings that stay below range_max after rounding, if they are."""
     if np.isnan(scan.ranges).any():
         raise ValueError(f"ranges: must be no NaN in a CARMEN log, got one in the scan at {scan.time}")
     limit, unit = scan.scanner.range_max, 10.0**-_READING

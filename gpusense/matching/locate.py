@@ -85,7 +85,7 @@ def locate_scan(
 
     Args:
         model: A likelihood field; its beams, parameters and device are used.
-        ranges: (K,) readings [m], or (S, K) of S scans, which are searched together.
+        ranges: (K,) readings [m], or (S, K) for a joint search of S scans.
         resolution: Distance between neighbouring positions [m], > 0; rounded to whole cells, at least one.
         angle: Angle between neighbouring headings [rad], up to a right angle; lowered to the next that divides
             a right angle.

@@ -232,7 +232,7 @@ def refine_modes(
 
     Returns:
         (M, 3) poses [m, m, rad] and (M,) log-likelihoods, the best first, and the gain of the best one over the lattice
-        [nats], which is large where the lattice is coarser than the peaks of the model.
+        [nats], large if the lattice is coarser than the peaks of the model.
     """
     poses, log_p = likelihood.modes(4 * count)
     if not len(poses):

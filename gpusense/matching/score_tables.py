@@ -42,7 +42,7 @@ def field_scores(distances: np.ndarray, sigma: float, max_distance: float) -> np
 
 
 class Folded(NamedTuple):
-    """Tables of a level as images, one for each first cell of blocks.
+    """Tables of a level as images, one per first cell of blocks.
 
     Attributes:
         table: The images.
@@ -122,7 +122,7 @@ class ScoreTables:
     def folded(self, level: int) -> Folded:
         """Return the tables of a level in which blocks of positions are neighbours.
 
-        Their cells begin at multiples of a step, so a cell covers as many more cells as points may lie beside them.
+        Their cells begin at multiples of a step, so a cell covers additional cells for points off the multiples.
         """
         period, step = self.stride << level, self.step(level)
         if period == 1:

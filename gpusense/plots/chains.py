@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PATH, DOUBTED, KEY = CLOUD, ESTIMATE, "#1f3552"
-# Number of ellipses that are drawn.
+# Number of ellipses.
 _ELLIPSES = 40
 
 

@@ -30,7 +30,7 @@ BEAM, ROBOT, FRAME = "#0077b6", "#d7263d", "#9aa5b1"
 # Meanings that have one colour in all pictures.
 REFERENCE, ESTIMATE, CLOUD, CLOSED = "#8fa3b8", "#e4572e", "#4c78a8", "#3c8d4f"
 VERDICTS = {"tracking": "#2a7f3f", "uncertain": "#b26b00", "lost": "#b3261e"}
-# Colours from unlikely to likely with falling lightness, readable on paper, in grey and under colour blindness.
+# Colours from unlikely to likely with falling lightness, readable on paper, in grey and with colour blindness.
 SCALE = ("#eef1f5", "#ffd166", "#f3722c", "#b5179e", "#3a0ca3")
 # Dots per inch of a saved image; clouds of points are also rasterised in vector formats.
 DPI = 150

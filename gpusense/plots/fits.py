@@ -156,7 +156,7 @@ def surface_figure(data: RangeData, parameters: BeamParameters) -> Figure:
     log_p = log_mixture(middle[:, None], middle, range_max=data.range_max, **parameters.to_dict())
     finite = log_p[np.isfinite(log_p)]
     low = float(finite.min()) if len(finite) else -1.0
-    # The scale ends at the median of readings away from the ridge, so that causes beside it can be seen.
+    # The scale ends at the median of readings away from the ridge, so that other causes are visible.
     low = max(low, float(np.quantile(finite, 0.02)), float(finite.max()) - 12) if len(finite) else low
     image = ax.imshow(np.maximum(log_p, low), origin="lower", extent=(0, top, 0, top), aspect="auto", cmap=colours())
     figure.colorbar(image, ax=ax, label="log p(z | z*) [log 1/m]", extend="min")

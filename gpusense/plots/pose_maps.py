@@ -34,7 +34,7 @@ def draw_pose_likelihood(ax: Axes, likelihood: PoseLikelihood, *, depth: float |
     Args:
         ax: Axes to draw onto, usually after :func:`draw_map`.
         likelihood: A result of :func:`gpusense.pose_likelihood`.
-        depth: Extent of the colour scale below the best value [nats]; by default half of the positions lie on it.
+        depth: Extent of the colour scale below the best value [nats]; the default covers half of the positions.
 
     Returns:
         The image, for :func:`add_colour_bar`.

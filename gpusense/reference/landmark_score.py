@@ -25,8 +25,8 @@ def score_features(
 ) -> None:  # fmt: skip
     """Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one.
 
-    PER_BEAM: ``parts`` has the term of each feature, and ``which`` the index of its likeliest landmark, -1 where a
-    false positive is likelier. ``share`` is log(1 / landmarks), the prior of a landmark, if MARGINAL, else 0.
+    PER_BEAM: ``parts`` receives the term of each feature, and ``which`` the index of its likeliest landmark, -1 if a
+        false positive is likelier. ``share`` is log(1 / landmarks), the prior of a landmark, if MARGINAL, else 0.
     """
     numbers = feature.reshape(-1)[: FEATURE * features].reshape(-1, FEATURE)
     for begin in range(0, particles, BLOCK):

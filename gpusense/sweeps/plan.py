@@ -26,7 +26,7 @@ def read_plan(path: str | os.PathLike[str]) -> tuple[Job, ...]:
 
     The file has ``task``, ``options`` of all jobs, and ``axes``. An axis is a list of values of the option or field of
     its name, or a mapping from labels to mappings of several; ``seed`` may be the number of seeds, from 0. The last
-    axis changes fastest. A plan cannot name code to execute, since its task is one of the package.
+    axis changes fastest. A plan cannot name code to execute, since its task belongs to the package.
 
     Args:
         path: A YAML file of plain values.

@@ -18,7 +18,7 @@ real cast_ray(global const entry *map_table, const Window window, const int2 cel
     real t = start.t;
     if (t >= limit) return limit;
     int state = map_table[padded(cell.y + r.step_y * k_y, cell.x + r.step_x * k_x, window.cols)];
-    // A step beyond limit still ends in the table. With several exits of the loop Mesa's llvmpipe has wrong ranges.
+    // A step beyond limit still ends in the table. Several exits of the loop give wrong ranges on Mesa's llvmpipe.
     while (state == 0 && t < limit) {
         const real t_x = ((real)k_x + r.a_x) * r.inv_x;
         const real t_y = ((real)k_y + r.a_y) * r.inv_y;

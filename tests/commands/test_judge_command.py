@@ -53,7 +53,7 @@ def test_right_poses_pass(tmp_path, capsys):
     assert first.startswith(f"right for {(SCANS - 1) * STEP:.0f} of {(SCANS - 1) * STEP:.0f} s")
     code, found = judged(capsys, call(tmp_path, log, "--poses", "amcl_pose"))
     assert code == 0 and not found["lost"] and found["source"] == "/amcl_pose"
-    # The radius is that of the stated covariance.
+    # The radius follows from the stated covariance.
     assert 0.01 < found["radii"][-1] < 0.2
 
 

@@ -50,7 +50,7 @@ def test_covariances_set_the_radius(model):
     spread = np.broadcast_to(np.diag([1e-4, 1e-4, 1e-4]), (SCANS, 3, 3)).copy()
     spread[40] = np.nan
     found = gs.judge_trajectory(model, scans(), truth(), covariances=spread, risk=0.1, searches=0)
-    # Without a covariance a pose that is not lost is within 1 m.
+    # If the covariance is unknown, a pose that is not lost is within 1 m.
     assert found.radii[40] == 1.0 and 0.02 < found.radii[41] < 0.1
 
 

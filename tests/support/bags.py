@@ -109,7 +109,7 @@ class Writer:
              covariance: Any = None, stamp: float | None = None) -> None:  # fmt: skip
         """Write a PoseWithCovarianceStamped, or a PoseStamped for ``covariance=None``.
 
-        ``covariance`` has the variances of x, y and yaw.
+        ``covariance`` contains the variances of x, y and yaw.
         """
         point = self.make("geometry_msgs/msg/Point", x=x, y=y, z=0.0)
         pose = self.make("geometry_msgs/msg/Pose", position=point, orientation=self.quaternion(yaw))

@@ -76,7 +76,7 @@ def write_bag(
         source: "covariance", "stamped" or "odometry" for the type of messages on /amcl_pose; "tf"; or "none".
         kind: Kind of the bag.
         frame: Frame of the poses.
-        readings: (S, K) readings; None for those of the true poses.
+        readings: (S, K) readings; None for the true poses.
     """
     gs.write_map(room(), folder / "map.yaml")
     scans_at = ranges() if readings is None else readings

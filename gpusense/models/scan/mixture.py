@@ -193,7 +193,7 @@ def _rand(p: BeamParameters, range_max: float) -> float:
 
 
 def _scales(p: BeamParameters) -> dict[str, float]:
-    """Return the factor of the squared distance in the exponent of a normal, and that of a distance in erf."""
+    """Return the factors of the squared distance in a normal's exponent and of a distance in erf."""
     return {"square_scale": 0.5 / p.sigma_hit / p.sigma_hit, "erf_scale": math.sqrt(0.5) / p.sigma_hit}
 
 

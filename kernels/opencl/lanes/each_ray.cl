@@ -1,4 +1,4 @@
-// Rays of LANES beams of one pose cast one by one, by any caster, also from origins outside the grid.
+// Cast rays of LANES beams of a pose one by one, by any caster, also from origins outside the grid.
 // requires: caster lanes/types
 
 // Return the distances in cells to the first occupied cells, limits where none is nearer.

@@ -7,7 +7,7 @@
 #else
 #define SMALL_DECAY 2.98023224e-08f
 #endif
-// Numbers of a bin of angles of incidence, and a field of the terms; those of a bin begin bin_at numbers later.
+// Numbers of a bin of angles of incidence, and a field of the terms; a bin's terms begin bin_at numbers later.
 #define MIXTURE_TERMS ((int)(sizeof(MixtureTerms) / sizeof(real)))
 #if INCIDENCE
 #define TERM(field) GATHER(lanes, (&terms->field), bin_at)

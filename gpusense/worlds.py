@@ -4,7 +4,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gpusense.evaluation.named_worlds import named_world
+    from gpusense.evaluation.buildings import named_world
     from gpusense.evaluation.simulation.changes import change_world
     from gpusense.evaluation.simulation.files import write_run
     from gpusense.evaluation.simulation.run import SimulatedRun, simulate_run

@@ -23,8 +23,7 @@ from gpusense.evaluation.machine import machine, machine_line
 from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
-    from gpusense.evaluation.landmark_motion import DriftingOdometry
-    from gpusense.evaluation.landmark_runs import Track
+    from gpusense.evaluation.landmark_runs import DriftingOdometry, Track
     from gpusense.learning.landmark.result import LandmarkFit
     from gpusense.learning.landmark.suspicious import Suspicions
     from gpusense.logs.records import LandmarkRun
@@ -101,7 +100,7 @@ def _probability(text: str) -> float:
 def run(args: argparse.Namespace) -> int:
     """Fit the noise, check the map, associate, localise, and print the results."""
     from gpusense.evaluation import landmark_runs
-    from gpusense.evaluation.landmark_motion import run_motion
+    from gpusense.evaluation.landmark_runs import run_motion
     from gpusense.logs.mrclam import read_mrclam
     from gpusense.models.landmark.model import LandmarkModel
 

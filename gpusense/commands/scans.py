@@ -123,7 +123,7 @@ def read_scans(args: argparse.Namespace, *, posed: bool = True) -> list[tuple[in
 
 def read_scan(args: argparse.Namespace) -> Scan:
     """Read the scan ``--scan`` of ``--log``, the first one by default."""
-    from gpusense.logs.merge import read_laser
+    from gpusense.logs.reader import read_laser
 
     wanted, index = args.scan or 0, 0
     with options_named():

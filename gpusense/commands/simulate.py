@@ -164,7 +164,7 @@ def _check_output(args: argparse.Namespace) -> str:
 
 def _generated(name: str, seed: int) -> OccupancyGrid:
     """Return a generated world by a name such as ``office`` or ``office:3``."""
-    from gpusense.evaluation.named_worlds import WORLDS
+    from gpusense.evaluation.buildings import WORLDS
 
     kind, colon, number = name.partition(":")
     if kind not in WORLDS or (colon and not (number.isascii() and number.isdigit() and len(number) < 10)):

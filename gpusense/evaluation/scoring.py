@@ -24,8 +24,7 @@ from gpusense.evaluation.agreement import Agreement, Comparison, Model
 from gpusense.evaluation.worlds import cloud_around, cloud_uniform
 from gpusense.localization.weights import normalize_weights
 from gpusense.logs import Pose, Scan
-from gpusense.logs.merge import read_laser
-from gpusense.logs.reader import LogOptions
+from gpusense.logs.reader import LogOptions, read_laser
 from gpusense.logs.records import check_scanner
 from gpusense.models.scan.rules import choose_beams
 from gpusense.world.grid import OccupancyGrid
@@ -195,7 +194,7 @@ def chosen_scans(
         every: Stride of the scans.
         offset: Index of the first scan.
         limit: Largest number of scans; None for all.
-        topic: The laser, see :func:`gpusense.logs.merge.read_laser`; None for the only or main laser.
+        topic: The laser, see :func:`gpusense.logs.reader.read_laser`; None for the only or main laser.
         options: See :func:`gpusense.read_log`.
     """
     last = None if limit is None else offset + every * limit

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from gpusense.evaluation.trajectory_files import poses_at
 from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
 from gpusense.logs import Odometry, Pose, Scan
-from gpusense.logs.merge import read_lasers
-from gpusense.logs.reader import LogOptions
+from gpusense.logs.reader import LogOptions, read_lasers
 from gpusense.logs.records import check_scanner
 from gpusense.world.scanner import Scanner
 

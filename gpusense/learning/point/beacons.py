@@ -21,8 +21,7 @@ from gpusense.learning.point.problem import (
     of_weight,
     places_of,
 )
-from gpusense.learning.point.report import report
-from gpusense.learning.point.result import PointFit
+from gpusense.learning.point.result import PointFit, report
 from gpusense.learning.point.search import maximize
 from gpusense.world.hit_shapes import NORMAL, StudentHit
 from gpusense.world.range_causes import RandomDensity

@@ -13,8 +13,7 @@ from gpusense._util import checks
 from gpusense._util.angles import wrapped
 from gpusense.learning.point.densities import von_mises, wrapped_normal
 from gpusense.learning.point.problem import Floats, Problem, check_labels, mix, number_blocks, of_weight
-from gpusense.learning.point.report import report
-from gpusense.learning.point.result import PointFit
+from gpusense.learning.point.result import PointFit, report
 from gpusense.learning.point.search import maximize
 from gpusense.world.sensor_parameters import HeadingParameters
 

@@ -42,18 +42,18 @@ def make(name, flags):
     RAND = "RAND" in flags
     S0, S1, S2, S3, S4, S5, S6, S7, S8, S9 = (real(term) for term in SINE)
 
-    # Return sin(r / 2) of an angle in [-pi, pi].
     @wp.func
     def half_sine(residual: vec2):
+        """Return sin(r / 2) of an angle in [-pi, pi]."""
         x = HALF * residual.x
         z = x * x
         higher = S5 + z * (S6 + z * (S7 + z * (S8 + z * S9)))
         series = S0 + z * (S1 + z * (S2 + z * (S3 + z * (S4 + z * higher))))
         return two_sum(x, HALF * residual.y + x * (z * series))
 
-    # Return the log of the ratio of the sum over all turns to the normal of the nearest turn.
     @wp.func
     def log_other_turns(residual: vec2, decay: real):
+        """Return the log of the ratio of the sum over all turns to the normal of the nearest turn."""
         size = wp.abs(residual.x)
         low = residual.y
         if residual.x < ZERO:
@@ -71,10 +71,11 @@ def make(name, flags):
             k += 1
         return log_one_plus(others)
 
-    # Return the log of the ratio of the Fourier series to its first term, by Clenshaw's recurrence. waves are
-    # 2 q^(n n).
     @wp.func
     def log_waves(residual: vec2, waves: wp.array(dtype=real)):
+        """Return the log of the ratio of the Fourier series to its first term, by Clenshaw's recurrence. waves are 2
+        q^(n n).
+        """
         sine = half_sine(residual)
         cosine = ONE - TWO * sine.x * sine.x
         newer = real(0.0)
@@ -87,10 +88,13 @@ def make(name, flags):
             n -= 1
         return log_one_plus(cosine * newer - older)
 
-    # Score positions: one work-item takes a particle. The exponent is (x_scale x)^2 + (shear x +
-    # y_scale y)^2, where (x, y) is the offset from the reading to the sensor.
     @kernel(flags)
     def score_position(place, terms, log_p, particles, temperature):
+        """Score positions: one work-item takes a particle.
+
+        The exponent is (x_scale x)^2 + (shear x + y_scale y)^2, where (x, y) is the offset from the reading to the
+        sensor.
+        """
         n = wp.tid()
         if n >= particles:
             return
@@ -106,9 +110,9 @@ def make(name, flags):
             log_density = either(log_density, terms[0].random)
         log_p[n] = temperature * log_density
 
-    # Score headings: one work-item takes a particle. Residuals are headings minus the reading, in [-pi, pi].
     @kernel(flags)
     def score_heading(residual, terms, waves, log_p, particles, kind, temperature):
+        """Score headings: one work-item takes a particle. Residuals are headings minus the reading, in [-pi, pi]."""
         n = wp.tid()
         if n >= particles:
             return

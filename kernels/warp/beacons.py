@@ -37,9 +37,9 @@ def make(name, flags):
     ERF_ONE = real(6.0 if "FLOAT64" in flags else 4.0)
     RAND = "RAND" in flags
 
-    # Return the log of a truncated normal; near and far are the distances from its mean to the ends.
     @wp.func
     def log_normal(residual: vec2, near: real, far: real, scale: vec2, peak: vec2):
+        """Return the log of a truncated normal; near and far are the distances from its mean to the ends."""
         below = near * scale.x
         above = far * scale.x
         exponent = bounded_square(pair_product(residual, scale))
@@ -48,9 +48,9 @@ def make(name, flags):
             untruncated = untruncated - wp.log(HALF * (wp.erf(below) + wp.erf(above)))
         return untruncated
 
-    # Return the mass of a Student t between -t and t; t >= 0 is in units of its scale and sqrt(nu).
     @wp.func
     def t_mass(any_t: real, terms: wp.array(dtype=types.BeaconTerms), series: wp.array(dtype=real), count: wp.int32):
+        """Return the mass of a Student t between -t and t; t >= 0 is in units of its scale and sqrt(nu)."""
         t = wp.min(any_t, STEEPEST)
         cosine = ONE / wp.sqrt(ONE + t * t)
         square = cosine * cosine
@@ -64,24 +64,24 @@ def make(name, flags):
             factor = factor * cosine
         return terms[0].arc * wp.atan(t) + factor * total
 
-    # Return the log of a truncated Student t: -(nu + 1) / 2 log((1 + u^2 / nu) / k), where k includes the peak.
     @wp.func
     def log_student_t(
         residual: vec2, near: real, far: real, terms: wp.array(dtype=types.BeaconTerms), series: wp.array(dtype=real),
         count: wp.int32,
     ):  # fmt: skip
+        """Return the log of a truncated Student t: -(nu + 1) / 2 log((1 + u^2 / nu) / k), where k includes the peak."""
         squared = bounded_square(pair_product(residual, vec2(terms[0].scale, terms[0].scale_low)))
         x = pair_sum(vec2(terms[0].offset, terms[0].offset_low), squared)
         below = t_mass(near * terms[0].t_scale, terms, series, count)
         above = t_mass(far * terms[0].t_scale, terms, series, count)
         return (terms[0].peak - terms[0].power * (wp.log(x.x) + x.y / x.x)) - wp.log(HALF * (below + above))
 
-    # Return log p of one range at a distance.
     @wp.func
     def log_range(
         d: vec2, beacon: wp.array(dtype=real), base: wp.int32, terms: wp.array(dtype=types.BeaconTerms),
         series: wp.array(dtype=real), count: wp.int32, kind: wp.int32,
     ):  # fmt: skip
+        """Return log p of one range at a distance."""
         first = two_sum(d.x, -beacon[base + 4])
         r = two_sum(first.x, first.y + (d.y - beacon[base + 5]))
         near = wp.clamp(d.x + beacon[base + 6], ZERO, terms[0].range_max)
@@ -101,10 +101,12 @@ def make(name, flags):
             log_p = either(log_p, terms[0].random)
         return log_p
 
-    # Sum log p of the ranges over beacons: one work-item takes a particle. The first count numbers of the series belong
-    # to a t.
     @kernel(flags)
     def score_beacons(place, beacon, terms, series, log_p, particles, beacons, count, kind, temperature):
+        """Sum log p of the ranges over beacons: one work-item takes a particle.
+
+        The first count numbers of the series belong to a t.
+        """
         n = wp.tid()
         if n >= particles:
             return

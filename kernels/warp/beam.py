@@ -60,15 +60,14 @@ def make(name, flags):
     ZERO, ONE = real(0.0), real(1.0)
     NEVER = real(-math.inf)
 
-    # Return the distance in cells to which the ray of a reading is cast.
     @wp.func
     def ray_limit(z: real, terms: wp.array(dtype=types.MixtureTerms), scale: types.RangeScale):
+        """Return the distance in cells to which the ray of a reading is cast."""
         if STOPS:
             return wp.min(last_range(z, terms) / scale.resolution, scale.limit)
         else:
             return scale.limit
 
-    # Return the expected range of beam r, of a ray or a cone of rays, and the cosine of incidence of a cone.
     @wp.func
     def cast_beam(
         map_table: wp.array(dtype=ENTRY), normals: wp.array(dtype=vec2), window: types.Window, cell: wp.vec2i,
@@ -76,6 +75,7 @@ def make(name, flags):
         caster: types.Caster, scale: types.RangeScale, shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i),
         crowd: types.Crowd, n: wp.int32,
     ):  # fmt: skip
+        """Return the expected range of beam r, of a ray or a cone of rays, and the cosine of incidence of a cone."""
         if CONES:
             heard = nearest_echo(
                 map_table, normals, window, cell, sensor_pose, ray, r * cone.rays, cone, limit, caster, shapes, world,
@@ -88,12 +88,12 @@ def make(name, flags):
                 t = nearest_shape(shapes, world, crowd, n, cell, sensor_pose, ray_at(ray, r), t).x
             return vec2(expected_range(t, scale), ONE)
 
-    # Return the term of one reading in the sum.
     @wp.func
     def reading_term(
         z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real),
         sensor: wp.array(dtype=real), tables: types.MixtureTables, range_max: real,
     ):  # fmt: skip
+        """Return the term of one reading in the sum."""
         if ALL_READINGS:
             if wp.isnan(z):
                 return ZERO
@@ -109,41 +109,43 @@ def make(name, flags):
         else:
             return log_density(z, expected, terms, masses)
 
-    # Return the sums of a block's strands.
     @wp.func
     def strands_of(values: block_numbers):
+        """Return the sums of a block's strands."""
         strands = vec4(values[0], values[1], values[2], values[3])
         strands += vec4(values[4], values[5], values[6], values[7])
         strands += vec4(values[8], values[9], values[10], values[11])
         strands += vec4(values[12], values[13], values[14], values[15])
         return strands
 
-    # Return the logarithm of a scan from its sum.
     @wp.func
     def scan_log(total: real):
+        """Return the logarithm of a scan from its sum."""
         if CUBES:
             return wp.log(total)
         else:
             return total
 
-    # Return a scan's first ray, its number of rays, and its first reading.
     @wp.func
     def readings_of_scan(scan: wp.int32, start: wp.array(dtype=wp.int32), first: wp.array(dtype=wp.int32)):
+        """Return a scan's first ray, its number of rays, and its first reading."""
         before = start[scan]
         readings_before = int(before)
         if SHARED_RAYS:
             readings_before = first[before]
         return before, start[scan + 1] - before, readings_before
 
-    # Score scans: one work-item takes a particle. Where rays are shared, ray r has the readings first[r] to first[r +
-    # 1] - 1. SCANS: the rays of a scan begin at start[scan], and first counts the readings of all scans. A launch has
-    # fewer than 2^31 parts.
     @kernel(flags, entry=ENTRY)
     def score_beams(
         map_table, world, shapes, normals, pose_cell, pose, ray, first, reading, terms, masses, edges, sensor, start,
         constant_terms, log_p, parts, window, particles, rays, readings, tables, cone, caster, scale, crowd, score,
         batch,
     ):  # fmt: skip
+        """Score scans: one work-item takes a particle.
+
+        Where rays are shared, ray r has the readings first[r] to first[r + 1] - 1. SCANS: the rays of a scan begin at
+        start[scan], and first counts the readings of all scans. A launch has fewer than 2^31 parts.
+        """
         n = wp.tid()
         if n >= particles:
             return
@@ -236,13 +238,15 @@ def make(name, flags):
         else:
             log_p[n] = score.temperature * scan_log(total.x + total.y)
 
-    # Write the term of reading k to parts[place + k * particles], in tiles of particles and rays, for GPUs. STRANDED:
-    # the number at place k is the sum of strand k, and a work-item takes whole strands.
     @kernel(flags, entry=ENTRY)
     def beam_tiles(
         map_table, world, shapes, normals, pose_cell, pose, order, ray, first, reading, terms, masses, edges, sensor,
         start, parts, window, particles, rays, readings, tables, cone, caster, scale, crowd, spread, batch,
     ):  # fmt: skip
+        """Write the term of reading k to parts[place + k * particles], in tiles of particles and rays, for GPUs.
+
+        STRANDED: the number at place k is the sum of strand k, and a work-item takes whole strands.
+        """
         item = work_item(wp.tid())
         place = tile_place(item, spread)
         if place >= particles:

@@ -8,9 +8,9 @@ NONE = wp.constant(0x7FFFFFFF)
 ALL_BITS = wp.constant(wp.uint32(0xFFFFFFFF))
 
 
-# Return the index of the lowest 1 of a word that is not 0.
 @wp.func
 def lowest_bit(word: wp.uint32):
+    """Return the index of the lowest 1 of a word that is not 0."""
     rest = word
     place = int(0)
     if rest & wp.uint32(0xFFFF) == wp.uint32(0):
@@ -30,9 +30,9 @@ def lowest_bit(word: wp.uint32):
     return place
 
 
-# Return the index of the highest 1 of a word that is not 0.
 @wp.func
 def highest_bit(word: wp.uint32):
+    """Return the index of the highest 1 of a word that is not 0."""
     rest = word
     place = int(0)
     if rest >> wp.uint32(16) != wp.uint32(0):
@@ -52,10 +52,11 @@ def highest_bit(word: wp.uint32):
     return place
 
 
-# Count the cells from a cell to the first occupied one to its right, itself included; NONE if none is within most
-# cells. An occupied cell beyond most cells may also be returned. The row begins at index begin.
 @wp.func
 def cells_right(bits: wp.array(dtype=wp.int32), begin: wp.int32, words: wp.int32, col: wp.int32, most: wp.int32):
+    """Count the cells from a cell to the first occupied one to its right, itself included; NONE if none is within most
+    cells. An occupied cell beyond most cells may also be returned. The row begins at index begin.
+    """
     last = wp.min((col + most) >> 5, words - 1)
     i = col >> 5
     word = wp.uint32(bits[begin + i]) & (ALL_BITS << wp.uint32(col & 31))
@@ -68,9 +69,9 @@ def cells_right(bits: wp.array(dtype=wp.int32), begin: wp.int32, words: wp.int32
     return cells
 
 
-# Count the cells to the first occupied one to its left.
 @wp.func
 def cells_left(bits: wp.array(dtype=wp.int32), begin: wp.int32, col: wp.int32, most: wp.int32):
+    """Count the cells to the first occupied one to its left."""
     last = wp.max(col - most, 0) >> 5
     i = col >> 5
     word = wp.uint32(bits[begin + i]) & (ALL_BITS >> wp.uint32(31 - (col & 31)))

@@ -17,10 +17,11 @@ INFINITE, MINUS_INFINITE = wp.constant(wp.float64(float("inf"))), wp.constant(wp
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
 
-    # Write the least of some numbers, and the largest of the numbers that lie apart from them: one work-item takes
-    # every items-th number. NaN remains.
     @kernel(flags)
     def bound_numbers(number, bounds, count, apart, items):
+        """Write the least of some numbers, and the largest of the numbers that lie apart from them: one work-item takes
+        every items-th number. NaN remains.
+        """
         i = wp.tid()
         if i >= items:
             return

@@ -33,12 +33,14 @@ def functions(flags):
     BELUGA_LINES = "BELUGA_LINES" in flags
     ZERO = real(0.0)
 
-    # Return the distance in cells from the origin's cell to the first occupied cell of the line, limit without one.
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY), window: types.Window, cell: wp.vec2i, pose: vec4, ray: vec2, limit: real,
         caster: types.Caster,
     ):  # fmt: skip
+        """Return the distance in cells from the origin's cell to the first occupied cell of the line, limit without
+        one.
+        """
         r = make_ray(pose, ray)
         if ORIGINS_OUTSIDE and OUTSIDE_OCCUPIED:
             if off_grid(cell.x, cell.y, window.rows, window.cols):

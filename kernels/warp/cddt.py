@@ -33,12 +33,12 @@ def functions(flags):
     # Coordinates are clamped to this many cells: no map has as many, and indices still fit.
     FARTHEST, NOWHERE = real(1048576.0), real(-1048576.0)
 
-    # Return the distance in cells to the first obstacle of the line, limit where none is nearer.
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY), window: types.Window, cell: wp.vec2i, pose: vec4, ray: vec2, limit: real,
         caster: types.Caster,
     ):  # fmt: skip
+        """Return the distance in cells to the first obstacle of the line, limit where none is nearer."""
         lines = map_table[0]
         first = 1 + 3 * caster.bins
         if off_grid(cell.x, cell.y, window.rows, window.cols):

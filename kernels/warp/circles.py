@@ -42,19 +42,19 @@ def functions(flags):
         edge: vec4
         sigma: real
 
-    # Return a point of a part, which may wrap around to the scan's first point.
     @wp.func
     def point_of(point: wp.array(dtype=vec4), mine: Part, k: wp.int32):
+        """Return a point of a part, which may wrap around to the scan's first point."""
         return point[mine.begin + (mine.first - mine.begin + k) % mine.size]
 
-    # Return an angle in -pi to pi.
     @wp.func
     def wrapped(angle: real):
+        """Return an angle in -pi to pi."""
         return angle - WHOLE_TURN * wp.floor(angle / WHOLE_TURN + HALF)
 
-    # Return centre and radius of the pole between two bearings that has the mean range of some points.
     @wp.func
     def pole_guess(point: wp.array(dtype=vec4), mine: Part):
+        """Return centre and radius of the pole between two bearings that has the mean range of some points."""
         width = HALF * wrapped(mine.edge[1] - mine.edge[0])
         sine = wp.sin(wp.min(width, WIDEST))
         middle = mine.edge[0] + width
@@ -65,9 +65,9 @@ def functions(flags):
         distance = total / real(mine.count) / (ONE - ROUND * sine)
         return vec3(distance * wp.cos(middle), distance * wp.sin(middle), distance * sine)
 
-    # Return centre and radius by linear least squares (Kasa 1976).
     @wp.func
     def arc_guess(point: wp.array(dtype=vec4), mine: Part):
+        """Return centre and radius by linear least squares (Kasa 1976)."""
         mean_x = real(0.0)
         mean_y = real(0.0)
         for k in range(mine.count):
@@ -101,9 +101,9 @@ def functions(flags):
             guess = vec3(mean_x + a, mean_y + b, wp.sqrt(a * a + b * b + total / real(mine.count)))
         return guess
 
-    # Return -1 where beams meet the near side of a circle, as at a pole, and 1 for the far side.
     @wp.func
     def side_of(point: wp.array(dtype=vec4), mine: Part, guess: vec3):
+        """Return -1 where beams meet the near side of a circle, as at a pole, and 1 for the far side."""
         beyond = real(0.0)
         for k in range(mine.count):
             p = point_of(point, mine, k)
@@ -113,16 +113,16 @@ def functions(flags):
             side = real(1.0)
         return side
 
-    # Return the sums with the row of derivatives (a, b, c) and an error.
     @wp.func
     def add_error(sums: sums10, a: real, b: real, c: real, error: real):
+        """Return the sums with the row of derivatives (a, b, c) and an error."""
         return sums + sums10(
             error * error, a * error, b * error, c * error, a * a, a * b, a * c, b * b, b * c, c * c
         )  # fmt: skip
 
-    # Return the sums with the bearing of an edge, the right one (-1) or the left one (1).
     @wp.func
     def edge_row(sums: sums10, circle: vec3, place: real, deviation: real, side: real):
+        """Return the sums with the bearing of an edge, the right one (-1) or the left one (1)."""
         distance = wp.sqrt(circle[0] * circle[0] + circle[1] * circle[1])
         sine = wp.min(circle[2] / distance, LARGEST)
         slope = side / wp.sqrt(ONE - sine * sine)
@@ -134,11 +134,13 @@ def functions(flags):
             (circle[0] / square - inward * circle[1]) / deviation, slope / distance / deviation, error / deviation,
         )  # fmt: skip
 
-    # Return the cost of a circle, its gradient and its information. Beams meet its near side (-1) or its far side (1);
-    # a beam that passes the circle is compared with its nearest point to it. Radial errors are distances from the
-    # circle.
     @wp.func
     def circle_sums(point: wp.array(dtype=vec4), mine: Part, side: real, circle: vec3, radial: wp.int32):
+        """Return the cost of a circle, its gradient and its information.
+
+        Beams meet its near side (-1) or its far side (1); a beam that passes the circle is compared with its nearest
+        point to it. Radial errors are distances from the circle.
+        """
         sums = sums10()
         sigma = mine.sigma
         least = STEEPEST * circle[2] * (STEEPEST * circle[2])
@@ -165,9 +167,9 @@ def functions(flags):
             sums = edge_row(sums, circle, mine.edge[1], mine.edge[3], ONE)
         return sums
 
-    # Return the step of centre and radius with the diagonal of the information raised.
     @wp.func
     def damped_step(sums: sums10, damping: real):
+        """Return the step of centre and radius with the diagonal of the information raised."""
         xx = sums[4] * (ONE + damping)
         yy = sums[7] * (ONE + damping)
         rr = sums[9] * (ONE + damping)
@@ -190,9 +192,9 @@ def functions(flags):
             )
         return step
 
-    # Write centre, radius, cost (-1 where no circle fits) and information of the circle through a part of a scan.
     @wp.func
     def fit_circle(point: wp.array(dtype=vec4), mine: Part, result: wp.array(dtype=real), place: wp.int32):
+        """Write centre, radius, cost (-1 where no circle fits) and information of a circle through part of a scan."""
         guess = vec3()
         if mine.edge[2] > ZERO:
             guess = pole_guess(point, mine)
@@ -238,10 +240,13 @@ def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     made = functions(flags)
 
-    # Fit circles to parts of scans, of a first point and a number of points. Edges are the bearings of the right and
-    # the left edge and their deviations; a deviation of 0 marks an edge that is not seen. One work-item takes a part.
     @kernel(flags)
     def fit_circles(point, start, noise, part, scan, edge, circle, scans, points, parts):
+        """Fit circles to parts of scans, of a first point and a number of points.
+
+        Edges are the bearings of the right and the left edge and their deviations; a deviation of 0 marks an edge that
+        is not seen. One work-item takes a part.
+        """
         k = wp.tid()
         if k >= parts:
             return

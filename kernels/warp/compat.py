@@ -22,10 +22,12 @@ def functions(flags):
     hit_mass, short_factor = parts.hit_mass, parts.short_factor
     AMCL = "AMCL" in flags
 
-    # Return the density to be cubed: amcl's without normalisers, Beluga's with both (book table 6.1). A reading of
-    # range_max is a max reading; amcl's longer readings are neither random nor max readings.
     @wp.func
     def compat_density(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return the density to be cubed: amcl's without normalisers, Beluga's with both (book table 6.1).
+
+        A reading of range_max is a max reading; amcl's longer readings are neither random nor max readings.
+        """
         off = z - expected
         p = terms[0].hit_peak * wp.exp(-(off * (off * terms[0].square_scale)))
         if AMCL:

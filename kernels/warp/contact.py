@@ -36,9 +36,9 @@ def make(name, flags):
     LOG_TWO_ROOT_PI = real(1.2655121234846454)
     LARGE = real(10.0 if "FLOAT64" in flags else 6.0)
 
-    # Return the gap between outline and obstacle, negative where they overlap; the squared distance is in cells.
     @wp.func
     def gap(squared: wp.int32, terms: wp.array(dtype=types.ContactTerms)):
+        """Return the gap between outline and obstacle, negative where they overlap; squared is in cells."""
         whole = two_sum(real(squared >> 12) * HIGH_PART, real(squared & 4095))
         d = wp.sqrt(whole.x)
         dd = two_product(d, d)
@@ -51,9 +51,9 @@ def make(name, flags):
         left = two_sum(away.x, -terms[0].reach)
         return two_sum(left.x, left.y + (away.y - terms[0].reach_low))
 
-    # Return log(erfc(x) / 2), by an asymptotic series where erfc nearly underflows.
     @wp.func
     def log_above(x: vec2):
+        """Return log(erfc(x) / 2), by an asymptotic series where erfc nearly underflows."""
         log_half = real(0.0)
         if x.x > LARGE:
             t = HALF / (x.x * x.x)
@@ -68,9 +68,9 @@ def make(name, flags):
             log_half = wp.log(HALF * wp.erfc(x.x))
         return log_half
 
-    # Return the log probability that a segment is pressed, or that it is not.
     @wp.func
     def log_bump(squared: wp.int32, pressed: wp.int32, terms: wp.array(dtype=types.ContactTerms)):
+        """Return the log probability that a segment is pressed, or that it is not."""
         x = pair_product(gap(squared, terms), vec2(terms[0].scale, terms[0].scale_low))
         hit = terms[0].log_missed
         no_hit = terms[0].log_quiet
@@ -79,13 +79,15 @@ def make(name, flags):
             no_hit = terms[0].log_false
         return either(hit + log_above(x), no_hit + log_above(-x))
 
-    # Sum log p over segments: one work-item takes a particle. Points start[s] to start[s + 1] - 1 belong to segment s;
-    # pressed[s] is not 0 where it is pressed.
     @kernel(flags)
     def score_contact(
         table, pose_cell, pose, pose_low, point, point_low, start, pressed, terms, log_p, window, particles, segments,
         guard, temperature,
     ):  # fmt: skip
+        """Sum log p over segments: one work-item takes a particle.
+
+        Points start[s] to start[s + 1] - 1 belong to segment s; pressed[s] is not 0 where it is pressed.
+        """
         n = wp.tid()
         if n >= particles:
             return

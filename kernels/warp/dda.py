@@ -26,12 +26,12 @@ def functions(flags):
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
     ZERO = real(0.0)
 
-    # Return the distance in cells to the first occupied cell, limit where none is nearer.
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY), window: types.Window, cell: wp.vec2i, pose: vec4, ray: vec2, limit: real,
         caster: types.Caster,
     ):  # fmt: skip
+        """Return the distance in cells to the first occupied cell, limit where none is nearer."""
         r = make_ray(pose, ray)
         if ORIGINS_OUTSIDE and OUTSIDE_OCCUPIED:
             if off_grid(cell.x, cell.y, window.rows, window.cols):

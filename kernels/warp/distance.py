@@ -17,10 +17,12 @@ NO_OBSTACLE = wp.constant(-1)
 UNREACHABLE = wp.constant(0x7FFFFFFF)
 
 
-# First pass: count the cells to the nearest occupied cell of the same line, NO_OBSTACLE without one. One work-item
-# takes a line.
 @kernel()
 def distance_lines(occupied, along, lines, length, line_stride, step):
+    """First pass: count the cells to the nearest occupied cell of the same line, NO_OBSTACLE without one.
+
+    One work-item takes a line.
+    """
     line = wp.tid()
     if line >= lines:
         return
@@ -44,16 +46,19 @@ def distance_lines(occupied, along, lines, length, line_stride, step):
                 along[begin + i * step] = after
 
 
-# Return the squared distance from cell i to the obstacle nearest to cell j across the lines.
 @wp.func
 def parabola(i: wp.int32, j: wp.int32, across: wp.int32):
+    """Return the squared distance from cell i to the obstacle nearest to cell j across the lines."""
     return (i - j) * (i - j) + across * across
 
 
-# Second pass: evaluate the lower envelope of the parabolas of the first pass. One work-item takes a line. The stack of
-# vertices shares squared, overwritten from its far end: entry q of the stack never passes the cell that reads it.
 @kernel()
 def distance_envelope(along, starts, squared, lines, length, line_stride, step):
+    """Second pass: evaluate the lower envelope of the parabolas of the first pass.
+
+    One work-item takes a line. The stack of vertices shares squared, overwritten from its far end: entry q of the stack
+    never passes the cell that reads it.
+    """
     line = wp.tid()
     if line >= lines:
         return
@@ -97,10 +102,12 @@ BLOCK_ROWS = wp.constant(32)
 STEP_ROWS = wp.constant(4)
 
 
-# First pass: count the cells to the nearest occupied cell of the same row, FAR where it is over reach. One work-item
-# takes a cell.
 @kernel()
 def distance_bits(bits, nearest, rows, cols, words, reach):
+    """First pass: count the cells to the nearest occupied cell of the same row, FAR where it is over reach.
+
+    One work-item takes a cell.
+    """
     row, col = wp.tid()
     if row >= rows or col >= cols:
         return
@@ -111,9 +118,9 @@ def distance_bits(bits, nearest, rows, cols, words, reach):
     nearest[row * cols + col] = wp.uint16(cells)
 
 
-# Find the minimum of each column of a block of rows. One work-item takes a column of a block.
 @kernel()
 def distance_blocks(nearest, blocks, rows, cols, count):
+    """Find the minimum of each column of a block of rows. One work-item takes a column of a block."""
     block, col = wp.tid()
     if block >= count or col >= cols:
         return
@@ -123,17 +130,19 @@ def distance_blocks(nearest, blocks, rows, cols, count):
     blocks[block * cols + col] = wp.uint16(least)
 
 
-# Return the sum of two squares.
 @wp.func
 def squares_sum(a: wp.uint32, b: wp.uint32):
+    """Return the sum of two squares."""
     return a * a + b * b
 
 
-# Second pass: find the least sum of squares along the column of a cell, UNREACHABLE where it is over most. One
-# work-item takes a cell. Near rows are read singly. Farther away, the minima of blocks give an upper bound first, and
-# then the blocks that may hold less.
 @kernel()
 def distance_search(nearest, blocks, squared, rows, cols, count, most):
+    """Second pass: find the least sum of squares along the column of a cell, UNREACHABLE where it is over most.
+
+    One work-item takes a cell. Near rows are read singly. Farther away, the minima of blocks give an upper bound first,
+    and then the blocks that may hold less.
+    """
     row, col = wp.tid()
     if row >= rows or col >= cols:
         return
@@ -188,11 +197,12 @@ def make(name, flags):
     if name != "fill_field":
         return globals()[name]
 
-    # Fill width x height cells of a field's table from squared distances: density has a value for each squared distance
-    # up to the cap. The cells begin at index begin of the table and at cell (from_col, from_row) of the grid; cells
-    # outside the grid get beyond.
     @kernel(flags)
     def fill_field(squared, density, table, rows, cols, cap, beyond, from_col, from_row, width, height, begin, stride):
+        """Fill width x height cells of a field's table from squared distances: density has a value for each squared
+        distance up to the cap. The cells begin at index begin of the table and at cell (from_col, from_row) of the
+        grid; cells outside the grid get beyond.
+        """
         j, i = wp.tid()
         if i >= width or j >= height:
             return

@@ -28,9 +28,9 @@ def make(name, flags):
     copy_particle, draw_particle = of.copy_particle, of.draw_particle
     copies_of, found_residual = of.copies_of, of.found_residual
 
-    # Count the deterministic copies of a block; the other columns are 0: one work-item takes a block.
     @kernel(flags)
     def count_copies(ends, state, sums, particles, block, blocks, drawn, stage):
+        """Count the deterministic copies of a block; the other columns are 0: one work-item takes a block."""
         b = wp.tid()
         begin = b * block
         if begin >= particles:
@@ -43,9 +43,9 @@ def make(name, flags):
         for k in range(1, WEIGHT_SUMS):
             sums[b * WEIGHT_SUMS + k] = ZERO
 
-    # Set the cumulative numbers of deterministic copies: one work-item takes a block.
     @kernel(flags)
     def set_copies(ends, state, sums, joined, copies, particles, block, blocks, fan, drawn, stage):
+        """Set the cumulative numbers of deterministic copies: one work-item takes a block."""
         b = wp.tid()
         begin = b * block
         if begin >= particles:
@@ -58,10 +58,11 @@ def make(name, flags):
             counted += copies_of(ends, total, drawn, n)
             copies[n] = counted
 
-    # Draw the particles of the next stage or step, or copy them where no resampling is due: one work-item takes a
-    # particle.
     @kernel(flags)
     def draw_particles(source, weight, ends, copies, settings, state, pool, target, after, particles, drawn, stage):
+        """Draw the particles of the next stage or step, or copy them where no resampling is due: one work-item takes a
+        particle.
+        """
         n = wp.tid()
         if n >= drawn:
             return

@@ -24,9 +24,9 @@ def functions(flags):
     """Make the functions of the file."""
     wrap_once = motion.functions(frozenset()).wrap_once
 
-    # Return the first index whose cumulative weight exceeds a mark.
     @wp.func
     def found_at(ends: wp.array(dtype=wp.float64), mark: wp.float64, particles: wp.int32):
+        """Return the first index whose cumulative weight exceeds a mark."""
         low = int(0)
         high = particles - 1
         while low < high:
@@ -37,9 +37,9 @@ def functions(flags):
                 low = middle + 1
         return low
 
-    # Return the deterministic copies of residual resampling: the integer part of the expected number of copies.
     @wp.func
     def copies_of(ends: wp.array(dtype=wp.float64), total: wp.float64, drawn: wp.int32, n: wp.int32):
+        """Return the deterministic copies of residual resampling: the integer part of the expected number of copies."""
         weight = ends[n]
         if n > 0:
             weight = ends[n] - ends[n - 1]
@@ -48,12 +48,12 @@ def functions(flags):
             copies = wp.floor(wp.float64(drawn) * weight / total)
         return copies
 
-    # Return the first index whose cumulative residual weight exceeds a fraction of all residual weights.
     @wp.func
     def found_residual(
         ends: wp.array(dtype=wp.float64), copies: wp.array(dtype=wp.float64), fraction: wp.float64, total: wp.float64,
         particles: wp.int32, drawn: wp.int32,
     ):  # fmt: skip
+        """Return the first index whose cumulative residual weight exceeds a fraction of all residual weights."""
         each = total / wp.float64(drawn)
         mark = fraction * (ends[particles - 1] - copies[particles - 1] * each)
         low = int(0)
@@ -66,24 +66,24 @@ def functions(flags):
                 low = middle + 1
         return low
 
-    # Return the mark at a fraction of the total, clamped to below the total.
     @wp.func
     def mark_of(fraction: wp.float64, total: wp.float64):
+        """Return the mark at a fraction of the total, clamped to below the total."""
         return wp.min(wp.floor(fraction * total), total - ONE)
 
-    # Return whether particles are copied, because no resampling is due.
     @wp.func
     def is_copied(state: wp.array(dtype=wp.float64), stage: wp.int32, particles: wp.int32, drawn: wp.int32):
+        """Return whether particles are copied, because no resampling is due."""
         due = state[stage * STAGE + RESAMPLED] != ZERO or drawn != particles
         return not due or not (state[stage * STAGE + TOTAL] > ZERO)
 
-    # Copy particle n with its weight, relative to the mean weight.
     @wp.func
     def copy_particle(
         source: wp.array(dtype=wp.float64), weight: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.float64),
         total: wp.float64, target: wp.array(dtype=wp.float64), after: wp.array(dtype=wp.float64), particles: wp.int32,
         n: wp.int32,
     ):  # fmt: skip
+        """Copy particle n with its weight, relative to the mean weight."""
         copied = n % particles
         for axis in range(3):
             target[3 * n + axis] = source[3 * copied + axis]
@@ -94,26 +94,26 @@ def functions(flags):
                 kept = weight[copied]
         after[n] = kept
 
-    # Return the random words of a draw in a stream of its stage.
     @wp.func
     def words_of(settings: wp.array(dtype=wp.float64), stage: wp.int32, index: wp.uint32, stream: wp.int32):
+        """Return the random words of a draw in a stream of its stage."""
         of_stage = wp.uint32(DRAW_STREAM + DRAW_STREAMS * stage + stream)
         step = wp.uint32(settings[STEP])
         return random_words(index, step, of_stage, wp.uint32(settings[SEED]), wp.uint32(settings[SEED + 1]))
 
-    # Return the random number of a draw's mark; systematic resampling uses the number of index 0 for all draws.
     @wp.func
     def start_of(settings: wp.array(dtype=wp.float64), stage: wp.int32, index: wp.uint32):
+        """Return the random number of a draw's mark; systematic resampling uses the number of index 0 for all draws."""
         words = words_of(settings, stage, index, 0)
         return uniform_of(words[0])
 
-    # Draw particle n from the one with index chosen: move it by jitter where a stage follows, or inject a pose.
     @wp.func
     def draw_particle(
         source: wp.array(dtype=wp.float64), ends: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.float64),
         state: wp.array(dtype=wp.float64), pool: wp.array(dtype=wp.float64), target: wp.array(dtype=wp.float64),
         after: wp.array(dtype=wp.float64), particles: wp.int32, stage: wp.int32, n: wp.int32, chosen: wp.int32,
     ):  # fmt: skip
+        """Draw particle n from the one with index chosen: move it by jitter where a stage follows, or inject a pose."""
         index = wp.uint32(n)
         x = source[3 * chosen]
         y = source[3 * chosen + 1]

@@ -47,14 +47,16 @@ def functions(flags):
         cosine: real
         sine: real
 
-    # Return whether a normal belongs to an obstacle.
     @wp.func
     def is_wall(normal: vec2):
+        """Return whether a normal belongs to an obstacle."""
         return normal.x != ZERO or normal.y != ZERO
 
-    # Return the normal of a cell; beyond the ring cells are free, or with OUTSIDE_OCCUPIED occupied without a normal.
     @wp.func
     def normal_at(normals: wp.array(dtype=vec2), window: types.Window, col: wp.int32, row: wp.int32):
+        """Return the normal of a cell; beyond the ring cells are free, or with OUTSIDE_OCCUPIED occupied without a
+        normal.
+        """
         if off_grid(col + 1, row + 1, window.rows + 2, window.cols + 2):
             if OUTSIDE_OCCUPIED:
                 return vec2(NOWHERE, NOWHERE)
@@ -62,11 +64,13 @@ def functions(flags):
                 return vec2(ZERO, ZERO)
         return normals[padded(row, col, window.cols)]
 
-    # Return the normal of the cell in which a ray ends at a distance t. The distance determines the cell of the exact
-    # walk: it has crossed all boundaries in x up to t, and all boundaries in y before t, or up to t after a step in y.
-    # At a corner it steps in x first.
     @wp.func
     def hit_normal(normals: wp.array(dtype=vec2), window: types.Window, cell: wp.vec2i, r: Ray, t: real):
+        """Return the normal of the cell in which a ray ends at a distance t.
+
+        The distance determines the cell of the exact walk: it has crossed all boundaries in x up to t, and all
+        boundaries in y before t, or up to t after a step in y. At a corner it steps in x first.
+        """
         if t == ZERO:
             start_normal = normal_at(normals, window, cell.x, cell.y)
             if is_wall(start_normal):
@@ -79,24 +83,28 @@ def functions(flags):
         until = cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, True))
         return normal_at(normals, window, col, until)
 
-    # Return the terms of the mixture for the bin of an angle of incidence; edges are cosines of the bins' upper ends.
     @wp.func
     def incidence_terms(
         terms: wp.array(dtype=types.MixtureTerms), edges: wp.array(dtype=real), incidence_bins: wp.int32, cosine: real
     ):
+        """Return the terms of the mixture for the bin of an angle of incidence; edges are cosines of the bins' upper
+        ends.
+        """
         bin = int(0)
         while bin + 1 < incidence_bins and cosine <= edges[bin]:
             bin += 1
         return terms[bin:]
 
-    # Return the nearest return of a cone's rays, which begin at index first. A ray whose angle of incidence has a
-    # cosine below critical has none: the surface reflects it like a mirror.
     @wp.func
     def nearest_echo(
         map_table: wp.array(dtype=ENTRY), normals: wp.array(dtype=vec2), window: types.Window, cell: wp.vec2i,
         pose: vec4, ray: wp.array(dtype=vec2), first: wp.int32, cone: types.Cone, limit: real, caster: types.Caster,
         shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32,
     ):  # fmt: skip
+        """Return the nearest return of a cone's rays, which begin at index first.
+
+        A ray whose angle of incidence has a cosine below critical has none: the surface reflects it like a mirror.
+        """
         echo = Echo()
         echo.t = limit
         echo.cosine = TWO
@@ -149,13 +157,14 @@ def make(name, flags):
     COSINES = "COSINES" in flags
     NOWHERE = real(math.nan)
 
-    # Cast cones to expected ranges and angles of incidence, NaN without a return; with COSINES to the angles' cosines,
-    # 2 without a return. One work-item takes a particle and cone; a launch has fewer than 2^31.
     @kernel(flags, entry=ENTRY)
     def cast_echoes(
         map_table, world, shapes, normals, pose_cell, pose, ray, ranges, incidence, window, particles, rays, cone,
         caster, scale, crowd,
     ):  # fmt: skip
+        """Cast cones to expected ranges and angles of incidence, NaN without a return; with COSINES to the angles'
+        cosines, 2 without a return. One work-item takes a particle and cone; a launch has fewer than 2^31.
+        """
         n, k = wp.tid()
         if k >= rays or n >= particles:
             return

@@ -34,9 +34,9 @@ BIAS, MANTISSA_BITS = wp.constant(wp.int64(1023)), wp.constant(wp.int64(52))
 MANTISSA, HALF_BITS = wp.constant(wp.int64(0xFFFFFFFFFFFFF)), wp.constant(wp.int64(0x3FE0000000000000))
 
 
-# Return exp(x) for x <= 700; 0 below LEAST_EXPONENT.
 @wp.func
 def exp_of(x: wp.float64):
+    """Return exp(x) for x <= 700; 0 below LEAST_EXPONENT."""
     held = wp.where(x > LEAST_EXPONENT, x, ZERO)
     count = (held * INVERSE_LOG2 + ROUNDER) - ROUNDER
     r = (held - count * LOG2_HIGH) - count * LOG2_LOW
@@ -47,18 +47,18 @@ def exp_of(x: wp.float64):
     return wp.where(x > LEAST_EXPONENT, (ONE + (r + r * r * series)) * power, ZERO)
 
 
-# Return the power series of the logarithm and of the angle.
 @wp.func
 def odd_series(z: wp.float64):
+    """Return the power series of the logarithm and of the angle."""
     series = ODD[0]
     for i in range(1, 11):
         series = series * z + ODD[i]
     return series
 
 
-# Return log(x) of a normal number x > 0.
 @wp.func
 def log_of(x: wp.float64):
+    """Return log(x) of a normal number x > 0."""
     bits = wp.cast(x, wp.int64)
     m = wp.cast((bits & MANTISSA) | HALF_BITS, wp.float64)
     small = m < SQRT_HALF
@@ -69,9 +69,9 @@ def log_of(x: wp.float64):
     return exponent * LOG2_HIGH + (TWO * s + (TWO * s * z * odd_series(z) + exponent * LOG2_LOW))
 
 
-# Return the angle of a vector in [-pi, pi]; 0 for the vector 0.
 @wp.func
 def angle_of(x: wp.float64, y: wp.float64):
+    """Return the angle of a vector in [-pi, pi]; 0 for the vector 0."""
     size_x = wp.abs(x)
     size_y = wp.abs(y)
     high = wp.max(size_x, size_y)

@@ -15,9 +15,9 @@ from .prelude import Window, fused, precision
 FIELD_RING = wp.constant(2)
 
 
-# Return the index of a cell of the padded table; far cells become ring cells.
 @wp.func
 def field_cell(col: wp.int32, row: wp.int32, window: Window):
+    """Return the index of a cell of the padded table; far cells become ring cells."""
     c = wp.clamp(col, -FIELD_RING, window.cols + FIELD_RING - 1)
     r = wp.clamp(row, -FIELD_RING, window.rows + FIELD_RING - 1)
     return (r + FIELD_RING) * (window.cols + 2 * FIELD_RING) + c + FIELD_RING
@@ -45,9 +45,9 @@ def functions(flags):
     ROUNDING_BITS = wp.int32(0 if "FLOAT64" in flags else 0x4B400000)
     multiply_add = fused(real)
 
-    # Return frac + a b + sign c d to about twice the working precision; every factor is a sum of two numbers.
     @wp.func
     def careful_offset(frac: vec2, a: vec2, b: vec2, c: vec2, d: vec2, sign: real):
+        """Return frac + a b + sign c d to about twice the working precision; every factor is a sum of two numbers."""
         ab = two_product(a.x, b.x)
         cd = two_product(c.x, d.x)
         products = two_sum(ab.x, sign * cd.x)
@@ -55,11 +55,13 @@ def functions(flags):
         low = (a.x * b.y + a.y * b.x) + sign * (c.x * d.y + c.y * d.x)
         return vec2(total.x, ((ab.y + sign * cd.y) + (products.y + frac.y)) + (low + total.y))
 
-    # Return the whole cells below an offset of two parts, the remainder in [0, 1), and 1 minus it. Both are computed
-    # relative to the nearest edge, where small numbers keep their digits. An offset at most EDGE below an edge counts
-    # as on it, so that end points on edges fall into the same cell in every precision.
     @wp.func
     def whole_cells(offset: vec2):
+        """Return the whole cells below an offset of two parts, the remainder in [0, 1), and 1 minus it.
+
+        Both are computed relative to the nearest edge, where small numbers keep their digits. An offset at most EDGE
+        below an edge counts as on it, so that end points on edges fall into the same cell in every precision.
+        """
         nearest = wp.floor(offset.x + HALF)
         past = vec2((offset.x - nearest) + offset.y, ZERO)
         if EXACT_EXPONENT:
@@ -83,11 +85,12 @@ def functions(flags):
         to_next_x: vec2
         to_next_y: vec2
 
-    # Return the end point of a beam. point is the reading times the beam's (cos, sin), in cells; shift moves cell
-    # centres onto corners. An end point nearer to a cell's edge than guard, the bound of its rounding errors, is
-    # recomputed with twice the digits.
     @wp.func
     def end_point(pose: vec4, pose_low: vec4, point: vec2, point_low: vec2, shift: real, guard: real):
+        """Return the end point of a beam. point is the reading times the beam's (cos, sin), in cells; shift moves cell
+        centres onto corners. An end point nearer to a cell's edge than guard, the bound of its rounding errors, is
+        recomputed with twice the digits.
+        """
         end = EndPoint()
         x = vec2((pose.x - shift) + (pose.z * point.x - pose.w * point.y), ZERO)
         y = vec2((pose.y - shift) + (pose.w * point.x + pose.z * point.y), ZERO)
@@ -127,10 +130,12 @@ def functions(flags):
     """)
     def rounding_margin(guard: real) -> real: ...
 
-    # Nearest cell of an end point, plus ROUNDING_BITS: place, half a cell lower, is rounded to nearest. The second
-    # number is the place's distance from the cell's centre.
     @wp.func
     def rounded_cell(lowered: vec4, point: vec2):
+        """Nearest cell of an end point, plus ROUNDING_BITS: place, half a cell lower, is rounded to nearest.
+
+        The second number is the place's distance from the cell's centre.
+        """
         x = multiply_add(lowered.z, point.x, multiply_add(-lowered.w, point.y, lowered.x))
         y = multiply_add(lowered.w, point.x, multiply_add(lowered.z, point.y, lowered.y))
         to_x = x + ROUNDING
@@ -138,10 +143,13 @@ def functions(flags):
         near = wp.vec2i(wp.int32(wp.cast(to_x, bits)), wp.int32(wp.cast(to_y, bits)))
         return near, wp.max(wp.abs(x - (to_x - ROUNDING)), wp.abs(y - (to_y - ROUNDING)))
 
-    # Return the origin for table_cell, from the pose's cell. Where no end point of the cloud leaves the table (INSIDE),
-    # an index is a sum and a product modulo 2^32, and ROUNDING_BITS are subtracted once per pose.
     @wp.func
     def table_origin(origin: wp.vec2i, cols: wp.int32):
+        """Return the origin for table_cell, from the pose's cell.
+
+        Where no end point of the cloud leaves the table (INSIDE), an index is a sum and a product modulo 2^32, and
+        ROUNDING_BITS are subtracted once per pose.
+        """
         if INSIDE:
             stride = wp.uint32(cols + 2 * FIELD_RING)
             more = wp.uint32(FIELD_RING - ROUNDING_BITS)
@@ -150,9 +158,9 @@ def functions(flags):
         else:
             return wp.vec2i(origin.x - ROUNDING_BITS, origin.y - ROUNDING_BITS)
 
-    # Return the index of the cell of rounded_cell in the padded table, from the origin of table_origin.
     @wp.func
     def table_cell(near: wp.vec2i, start: wp.vec2i, window: Window):
+        """Return the index of the cell of rounded_cell in the padded table, from the origin of table_origin."""
         if INSIDE:
             return wp.int32(wp.uint32(near.y) * wp.uint32(start.y) + (wp.uint32(near.x) + wp.uint32(start.x)))
         else:

@@ -29,29 +29,30 @@ def functions(flags):
     at_once = fuses_on_gpu if "ROUNDED_CELLS" in flags else fuses
     SPLITTER = real(134217729.0 if "FLOAT64" in flags else 4097.0)
 
-    # Return a + b = sum.x + sum.y exactly.
     @wp.func
     def two_sum(a: real, b: real):
+        """Return a + b = sum.x + sum.y exactly."""
         total = a + b
         shift = total - a
         return vec2(total, (a - (total - shift)) + (b - shift))
 
-    # Return a + b = sum.x + sum.y exactly, where a's exponent is at least b's: Dekker's sum.
     @wp.func
     def ordered_sum(a: real, b: real):
+        """Return a + b = sum.x + sum.y exactly, where a's exponent is at least b's: Dekker's sum."""
         total = a + b
         return vec2(total, b - (total - a))
 
-    # Return the leading bits of a float, so few that the product of two such halves is exact.
     @wp.func
     def high_half(a: real):
+        """Return the leading bits of a float, so few that the product of two such halves is exact."""
         scaled = SPLITTER * a
         return scaled - (scaled - a)
 
-    # Return a * b = product.x + product.y exactly, barring overflow and underflow: by a fused multiply-add where the
-    # device has one.
     @wp.func
     def two_product(a: real, b: real):
+        """Return a * b = product.x + product.y exactly, barring overflow and underflow: by a fused multiply-add where
+        the device has one.
+        """
         product = a * b
         if at_once():
             return vec2(product, multiply_add(a, b, -product))
@@ -62,36 +63,39 @@ def functions(flags):
         error = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
         return vec2(product, error)
 
-    # Return c - a b, where c is a b rounded or nearly so.
     @wp.func
     def rest_of(a: real, b: real, c: real):
+        """Return c - a b, where c is a b rounded or nearly so."""
         if at_once():
             return multiply_add(-a, b, c)
         product = two_product(a, b)
         return (c - product.x) - product.y
 
-    # Add two numbers of two parts each, to about twice the working precision. When the first parts cancel, their sum is
-    # at least the last bit of either, so its exponent is no smaller than the second parts' exponent.
     @wp.func
     def pair_sum(a: vec2, b: vec2):
+        """Add two numbers of two parts each, to about twice the working precision.
+
+        When the first parts cancel, their sum is at least the last bit of either, so its exponent is no smaller than
+        the second parts' exponent.
+        """
         total = two_sum(a.x, b.x)
         return ordered_sum(total.x, total.y + (a.y + b.y))
 
-    # Multiply two numbers of two parts each, to about twice the working precision.
     @wp.func
     def pair_product(a: vec2, b: vec2):
+        """Multiply two numbers of two parts each, to about twice the working precision."""
         product = two_product(a.x, b.x)
         return ordered_sum(product.x, product.y + (a.x * b.y + a.y * b.x))
 
-    # Add a term to a compensated sum: total.x is the running sum, total.y the sum of its rounding errors.
     @wp.func
     def add_term(total: vec2, term: real):
+        """Add a term to a compensated sum: total.x is the running sum, total.y the sum of its rounding errors."""
         head = two_sum(total.x, term)
         return vec2(head.x, total.y + head.y)
 
-    # Add a block to a compensated sum, by its strands.
     @wp.func
     def add_strands(total: vec2, strands: vec4):
+        """Add a block to a compensated sum, by its strands."""
         return add_term(add_term(add_term(add_term(total, strands[0]), strands[1]), strands[2]), strands[3])
 
     return SimpleNamespace(**locals())

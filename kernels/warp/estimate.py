@@ -26,10 +26,11 @@ def make(name, flags):
     cos_sin = heading.functions(frozenset()).cos_sin
     wrap_once = motion.functions(frozenset()).wrap_once
 
-    # Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings: one work-item takes
-    # a number of lanes of a block.
     @kernel(flags)
     def sum_poses(poses, weight, estimate, sums, particles, block, lanes, second_pass):
+        """Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings: one work-item
+        takes a number of lanes of a block.
+        """
         i = wp.tid()
         each = ESTIMATE_LANES / lanes
         begin = i / each * block
@@ -70,10 +71,11 @@ def make(name, flags):
         for k in range(13):
             sums[i * ESTIMATE_SUMS + k] = total[k]
 
-    # Write the mean pose and the covariance about it from the sums of all groups, and whether headings require a second
-    # pass; that pass writes the covariance only. One work-item takes all.
     @kernel(flags)
     def finish_estimate(poses, sums, estimate, groups, second_pass):
+        """Write the mean pose and the covariance about it from the sums of all groups, and whether headings require a
+        second pass; that pass writes the covariance only. One work-item takes all.
+        """
         i = wp.tid()
         if i > 0:
             return
@@ -100,9 +102,9 @@ def make(name, flags):
         estimate[7] = total[10] / weight - y * angle
         estimate[8] = total[11] / weight - mean * (TWO * angle - mean)
 
-    # Divide weights by their sum, which the estimate holds: one work-item takes a particle.
     @kernel(flags)
     def normalize_weights(weight, estimate, share, particles):
+        """Divide weights by their sum, which the estimate holds: one work-item takes a particle."""
         n = wp.tid()
         if n < particles:
             share[n] = weight[n] / estimate[9]

@@ -47,13 +47,14 @@ def make(name, flags):
     block_exponents, block_logs = staged.block_exponents, staged.block_logs
     block_cells = wp.types.vector(length=BLOCK_TERMS, dtype=wp.int32)
 
-    # Return the sum of the readings from begin to end by rounded cells, again with more digits where an end point is
-    # too near to an edge.
     @wp.func
     def rounded_block(
         table: wp.array(dtype=real), origin: wp.vec2i, sensor_pose: vec4, sensor_low: vec4, point: wp.array(dtype=vec2),
         point_low: wp.array(dtype=vec2), begin: wp.int32, end: wp.int32, far: real, window: types.Window, guard: real,
     ):  # fmt: skip
+        """Return the sum of the readings from begin to end by rounded cells, again with more digits where an end point
+        is too near to an edge.
+        """
         lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
         start_cell = table_origin(origin, window.cols)
         sure = rounding_margin(guard)
@@ -93,10 +94,12 @@ def make(name, flags):
                 k += 1
         return total
 
-    # Return log p of a scan from its sum of two parts. An impossible reading keeps the first at -inf and turns the
-    # second into nan.
     @wp.func
     def field_log(total: vec2, temperature: real):
+        """Return log p of a scan from its sum of two parts.
+
+        An impossible reading keeps the first at -inf and turns the second into nan.
+        """
         if CUBES:
             return temperature * wp.log(total.x + total.y)
         else:
@@ -104,8 +107,6 @@ def make(name, flags):
                 return total.x
             return temperature * (total.x + total.y)
 
-    # Return the sum of the readings from begin on, in two parts, with that of total. Places, distances, exponents and
-    # densities of a block are computed each in a loop: on processors the first and the third become vector code.
     @wp.func
     def staged_sum(
         table: wp.array(dtype=real), origin: wp.vec2i, sensor_pose: vec4, sensor_low: vec4, point: wp.array(dtype=vec2),
@@ -113,6 +114,11 @@ def make(name, flags):
         parts: wp.array(dtype=real), window: types.Window,
         begin: wp.int32, size: wp.int32, first_part: wp.int32, before: vec2,
     ):  # fmt: skip
+        """Return the sum of the readings from begin on, in two parts, with that of total.
+
+        Places, distances, exponents and densities of a block are computed each in a loop: on processors the first and
+        the third become vector code.
+        """
         total = before
         filled = wp.min(size, BLOCK_TERMS)
         k = int(0)
@@ -135,12 +141,12 @@ def make(name, flags):
             k += BLOCK_TERMS
         return total
 
-    # Score scans: one work-item takes a particle.
     @kernel(flags)
     def score_field(
         table, world, shapes, pose_cell, pose, pose_low, point, point_low, terms, start, constant_terms, log_p, parts,
         window, particles, readings, guard, score, batch, crowd,
     ):  # fmt: skip
+        """Score scans: one work-item takes a particle."""
         n = wp.tid()
         if n >= particles:
             return
@@ -224,14 +230,16 @@ def make(name, flags):
             total = add_term(total, block)
         log_p[n] = field_log(total, score.temperature)
 
-    # Write the sums of blocks of readings to parts[n + block * particles], for GPUs. One work-item takes a
-    # particle and every 2^spread-th block. Each block has a separate guard; with SCANS each scan has as many guards as
-    # the longest one.
     @kernel(flags)
     def field_blocks(
         table, world, shapes, pose_cell, pose, pose_low, point, point_low, terms, guard, start, parts, window,
         particles, readings, spread, batch, crowd,
     ):  # fmt: skip
+        """Write the sums of blocks of readings to parts[n + block * particles], for GPUs.
+
+        One work-item takes a particle and every 2^spread-th block. Each block has a separate guard; with SCANS each
+        scan has as many guards as the longest one.
+        """
         item = work_item(wp.tid())
         n = ((item // GROUP) >> spread) * GROUP + item % GROUP
         if n >= particles:

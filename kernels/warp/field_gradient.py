@@ -49,9 +49,9 @@ def functions(flags):
             hit = (terms[0].hit_peak - exponent.x) + (terms[0].hit_peak_low - exponent.y)
             return ONE / (ONE + wp.exp(terms[0].rand_density - hit))
 
-    # Return the distance at an end point, and its derivatives in x and y, in metres per cell.
     @wp.func
     def distance_slope(table: wp.array(dtype=real), cell: wp.vec2i, end: EndPoint, window: types.Window):
+        """Return the distance at an end point, and its derivatives in x and y, in metres per cell."""
         a = number_at(table, field_cell(cell.x, cell.y, window))
         b = number_at(table, field_cell(cell.x + 1, cell.y, window))
         c = number_at(table, field_cell(cell.x, cell.y + 1, window))
@@ -82,10 +82,11 @@ def make(name, flags):
     SCANS = "SCANS" in flags
     ZERO, HALF, TWO = real(0.0), real(0.5), real(2.0)
 
-    # Return the sums with the gradient and information of a reading: slope is the distance, its low part and its
-    # derivatives in x and y, and arm the end point relative to the robot in the sensor's frame.
     @wp.func
     def add_slope(before: Sums, slope: vec4, weight: real, at: vec4, arm: vec2, resolution: real):
+        """Return the sums with the gradient and information of a reading: slope is the distance, its low part and its
+        derivatives in x and y, and arm the end point relative to the robot in the sensor's frame.
+        """
         sums = before
         x = slope.z / resolution
         y = slope.w / resolution
@@ -102,13 +103,14 @@ def make(name, flags):
         sums[8] += weight * turn * turn
         return sums
 
-    # Write log p, its gradient (3) and the information (9) of poses in the grid's frame, each times the temperature.
-    # One work-item takes a particle. mount is the sensor's place on the robot in cells.
     @kernel(flags)
     def field_gradient(
         table, pose_cell, pose, pose_low, point, point_low, terms, start, constant_terms, gradient, window, particles,
         readings, guard, mount_x, mount_y, resolution, score, batch,
     ):  # fmt: skip
+        """Write log p, its gradient (3) and the information (9) of poses in the grid's frame, each times the
+        temperature. One work-item takes a particle. mount is the sensor's place on the robot in cells.
+        """
         n = work_item(wp.tid())
         if n >= particles:
             return

@@ -40,24 +40,27 @@ def functions(flags):
     ZERO, ONE = real(0.0), real(1.0)
     SHIFT = real(0.5 if BILINEAR else 0.0)
 
-    # Return the weighted sum of a and b, all of two parts. No term is negative, so small values keep their digits.
     @wp.func
     def between(weight_a: vec2, a: vec2, weight_b: vec2, b: vec2):
+        """Return the weighted sum of a and b, all of two parts.
+
+        No term is negative, so small values keep their digits.
+        """
         if EXACT_EXPONENT:
             return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b))
         else:
             return vec2(weight_a.x * a.x + weight_b.x * b.x, ZERO)
 
-    # Interpolate between four distances, in two parts.
     @wp.func
     def interpolated(four: vec4, end: EndPoint):
+        """Interpolate between four distances, in two parts."""
         low = between(end.to_next_x, vec2(four.x, ZERO), end.rest_x, vec2(four.y, ZERO))
         high = between(end.to_next_x, vec2(four.z, ZERO), end.rest_x, vec2(four.w, ZERO))
         return between(end.to_next_y, low, end.rest_y, high)
 
-    # Interpolate the distance between the four cell centres around an end point, in two parts.
     @wp.func
     def bilinear(table: wp.array(dtype=real), cell: wp.vec2i, end: EndPoint, window: types.Window):
+        """Interpolate the distance between the four cell centres around an end point, in two parts."""
         four = vec4(
             number_at(table, field_cell(cell.x, cell.y, window)),
             number_at(table, field_cell(cell.x + 1, cell.y, window)),
@@ -66,10 +69,12 @@ def functions(flags):
         )
         return interpolated(four, end)
 
-    # Return the exponent of a normal in two parts, since for a high peak exponent and log peak nearly cancel.
-    # The numbers are FieldTerms of the signature table; hit_peak and rand_density are logarithms in the log domain.
     @wp.func
     def field_square(distance: vec2, terms: wp.array(dtype=types.FieldTerms)):
+        """Return the exponent of a normal in two parts, since for a high peak exponent and log peak nearly cancel.
+
+        The numbers are FieldTerms of the signature table; hit_peak and rand_density are logarithms in the log domain.
+        """
         if EXACT_EXPONENT:
             return pair_product(
                 pair_product(distance, distance), vec2(terms[0].square_scale, terms[0].square_scale_low)
@@ -77,9 +82,9 @@ def functions(flags):
         else:
             return vec2(distance.x * (distance.x * terms[0].square_scale), ZERO)
 
-    # Return the exponent of the density of a hit in two parts.
     @wp.func
     def field_exponent(distance: vec2, terms: wp.array(dtype=types.FieldTerms)):
+        """Return the exponent of the density of a hit in two parts."""
         return shape_exponent(field_square(distance, terms), terms[0].shape_power, terms[0].shape_rate)
 
     # Return log p of the distance from an end point to the nearest obstacle.
@@ -106,19 +111,22 @@ def functions(flags):
             else:
                 return hit
 
-    # Return an end point relative to the pose's cell, in cells.
     @wp.func
     def end_in_cells(pose: vec4, point: vec2):
+        """Return an end point relative to the pose's cell, in cells."""
         return vec2(pose.x + (pose.z * point.x - pose.w * point.y), pose.y + (pose.w * point.x + pose.z * point.y))
 
-    # Return the term of one reading. The table holds log densities, or cubes of densities (CUBES), or, where it is
-    # interpolated, capped distances in metres.
     @wp.func
     def reading_value(
         table: wp.array(dtype=real), origin: wp.vec2i, pose: vec4, low: vec4, point: vec2, point_low: vec2,
         terms: wp.array(dtype=types.FieldTerms), window: types.Window, guard: real, shapes: wp.array(dtype=real),
         world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32,
     ):  # fmt: skip
+        """Return the term of one reading.
+
+        The table holds log densities, or cubes of densities (CUBES), or, where it is interpolated, capped distances in
+        metres.
+        """
         if ALL_READINGS:
             if wp.isnan(point.x):
                 return ZERO
@@ -143,12 +151,14 @@ def functions(flags):
                     value = wp.where(near < value, near, value)
                 return log_field(vec2(value, ZERO), terms)
 
-    # Return the term of a reading by rounding alone, and the distance of the end point from the cell's centre. A
-    # missing or max reading has no cell: the sensor's cell is read and not used. The term of a max reading is far.
     @wp.func
     def quick_value(
         table: wp.array(dtype=real), start_cell: wp.vec2i, lowered: vec4, to: vec2, far: real, window: types.Window
     ):
+        """Return the term of a reading by rounding alone, and the distance of the end point from the cell's centre.
+
+        A missing or max reading has no cell: the sensor's cell is read and not used. The term of a max reading is far.
+        """
         if ALL_READINGS:
             is_range = wp.isfinite(to.x)
             near, off = rounded_cell(lowered, wp.where(is_range, to, vec2(ZERO, ZERO)))
@@ -161,12 +171,14 @@ def functions(flags):
             value = number_at(table, table_cell(near, start_cell, window))
         return value, off
 
-    # Return the term of a reading in a block where rounding is in doubt: doubtful cells are computed with more digits.
     @wp.func
     def careful_value(
         table: wp.array(dtype=real), origin: wp.vec2i, lowered: vec4, sensor_pose: vec4, sensor_low: vec4, to: vec2,
         to_low: vec2, far: real, window: types.Window, guard: real, sure: real,
     ):  # fmt: skip
+        """Return the term of a reading in a block where rounding is in doubt: doubtful cells are computed with more
+        digits.
+        """
         if ALL_READINGS:
             if wp.isnan(to.x):
                 return ZERO

@@ -65,9 +65,9 @@ def functions(flags):
     two_sum, pair_product = transformations.two_sum, transformations.pair_product
     HUGE_HEADINGS = "HUGE_HEADINGS" in flags
 
-    # Reduce a heading of at most LARGEST_HEADING to quarter turns modulo 4 and the sum of two numbers.
     @wp.func
     def reduce_ordinary(theta: wp.float64):
+        """Reduce a heading of at most LARGEST_HEADING to quarter turns modulo 4 and the sum of two numbers."""
         count = (theta * TWO_OVER_PI + ROUNDER) - ROUNDER
         # The first product and difference are exact, and so are the next two products.
         first = two_sum(theta - count * QUARTER_1, -(count * QUARTER_2))
@@ -75,9 +75,9 @@ def functions(flags):
         low = (first.y + second.y) - count * QUARTER_4
         return int(count) & 3, two_sum(second.x, low)
 
-    # Reduce a heading above LARGEST_HEADING, up to the largest number.
     @wp.func
     def reduce_huge(theta: wp.float64):
+        """Reduce a heading above LARGEST_HEADING, up to the largest number."""
         bits = wp.cast(wp.abs(theta), wp.uint64)
         mantissa = (bits & MASK_52) | ONE_52
         low_half = mantissa & MASK_32
@@ -124,9 +124,9 @@ def functions(flags):
         back = theta < ZERO
         return wp.where(back, -quadrant, quadrant) & 3, wp.where(back, wp.vec2d(-angle.x, -angle.y), angle)
 
-    # Return (cosine, sine) of a heading; for a heading that is not finite they are meaningless, but not NaN.
     @wp.func
     def cos_sin(theta: wp.float64):
+        """Return (cosine, sine) of a heading; for a heading that is not finite they are meaningless, but not NaN."""
         quadrant = int(0)
         rest = wp.vec2d()
         if HUGE_HEADINGS:

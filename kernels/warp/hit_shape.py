@@ -30,9 +30,9 @@ def functions(flags):
     TABLE_POWERS = wp.constant(8 if "FLOAT64" in flags else 5)
     ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
 
-    # Return the exponent E as a sum of two numbers.
     @wp.func
     def shape_exponent(t: vec2, power: real, rate: real):
+        """Return the exponent E as a sum of two numbers."""
         if STUDENT:
             more = rate * t.x
             log_more = log_one_plus(more)
@@ -45,30 +45,30 @@ def functions(flags):
         else:
             return t
 
-    # Return the weight E'(t).
     @wp.func
     def shape_weight(t: real, power: real, rate: real):
+        """Return the weight E'(t)."""
         if STUDENT:
             return power * rate / (ONE + rate * t)
         else:
             return ONE
 
-    # Return ``-u^2 E''(t) / E'(t)`` from ``square = u^2 E'(t)``.
     @wp.func
     def shape_bend(square: real, power: real):
+        """Return ``-u^2 E''(t) / E'(t)`` from ``square = u^2 E'(t)``."""
         if STUDENT:
             return square * (ONE / power)
         else:
             return ZERO
 
-    # Return the place of a distance in the table of masses, in cells.
     @wp.func
     def mass_place(b: real):
+        """Return the place of a distance in the table of masses, in cells."""
         return log_one_plus(b) * TABLE_PER_LOG
 
-    # Return the mass between the mean and a place of the table, which begins at an index of masses.
     @wp.func
     def mass_at(at: real, masses: wp.array(dtype=real), begin: wp.int32):
+        """Return the mass between the mean and a place of the table, which begins at an index of masses."""
         if not at < real(TABLE_CELLS):
             return HALF
         cell = wp.int32(at)
@@ -79,9 +79,9 @@ def functions(flags):
             mass = mass * share + number_at(masses, first + TABLE_POWERS - 2 - i)
         return mass
 
-    # Return the mass between the mean and a distance; the table begins at an index of masses.
     @wp.func
     def half_mass(b: real, masses: wp.array(dtype=real), place: wp.int32):
+        """Return the mass between the mean and a distance; the table begins at an index of masses."""
         return mass_at(mass_place(b), masses, place)
 
     return SimpleNamespace(**locals())

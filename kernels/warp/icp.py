@@ -15,13 +15,14 @@ def make(name, flags):
     match_in_turns = icp_match.functions(flags).match_in_turns
     TEAM = icp_step.functions(flags).TEAM
 
-    # Match scans: a work-item, or with IN_TEAMS a team of them, takes a pair (reference, second scan, level of its
-    # rules) and a guess (x, y, theta), the pose of the second scan in the reference's frame. one_way excludes the
-    # reference's points from the score.
     @kernel(flags)
     def match_scans(
         point, start, line, pair, guess, rules, result, scans, points, pairs, starts, levels, turns, far, far_turn
     ):  # fmt: skip
+        """Match scans: a work-item, or with IN_TEAMS a team of them, takes a pair (reference, second scan, level of its
+        rules) and a guess (x, y, theta), the pose of the second scan in the reference's frame. one_way excludes the
+        reference's points from the score.
+        """
         item = work_item(wp.tid())
         n = item // TEAM
         if n < pairs * starts:

@@ -31,9 +31,9 @@ def functions(flags):
     # Weight in the score of a point that the other scan did not see; a point that disagrees has weight 1.
     UNSEEN = real(0.13)
 
-    # Return the rules of a level.
     @wp.func
     def rules_of(rules: wp.array(dtype=real), level: wp.int32):
+        """Return the rules of a level."""
         first = level * MATCH_RULES
         of = MatchRules()
         of.iterations = int(rules[first])
@@ -52,9 +52,9 @@ def functions(flags):
         of.tolerance = rules[first + 13]
         return of
 
-    # Return a step of at most half the first capture radius and 0.3 rad, with the length that it had in w.
     @wp.func
     def limited_step(step: vec4, capture: real):
+        """Return a step of at most half the first capture radius and 0.3 rad, with the length that it had in w."""
         length = wp.sqrt(step.x * step.x + step.y * step.y)
         most = HALF * capture
         share = ONE
@@ -63,14 +63,15 @@ def functions(flags):
         turn = wp.max(wp.min(step.z, LARGEST_TURN), -LARGEST_TURN)
         return vec4(share * step.x, share * step.y, turn, length)
 
-    # Refine a guess until steps are below the tolerance: pose, last step, sums of the last iteration over pairs and
-    # blocks, iterations, and whether the last step was below ten tolerances. Every stride-th point and every skip-th of
-    # the reference take part until capture radius and scale have shrunk, with thin also afterwards.
     @wp.func
     def refine(
         point: wp.array(dtype=vec4), line: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, second: wp.int32,
         others: wp.int32, guess: vec4, rules: MatchRules, member: wp.int32,
     ):  # fmt: skip
+        """Refine a guess until steps are below the tolerance: pose, last step, sums of the last iteration over pairs
+        and blocks, iterations, and whether the last step was below ten tolerances. Every stride-th point and every
+        skip-th of the reference take part until capture radius and scale have shrunk, with thin also afterwards.
+        """
         pose = guess
         moved = vec4()
         sums = Sums()
@@ -112,12 +113,14 @@ def functions(flags):
                 scale = wp.max(scale * factor, rules.least_scale)
         return pose, moved, sums, blocks, iteration, calm
 
-    # Return how well two scans agree at a pose (x, y, theta), as the sum of both directions, or of one with one_way.
     @wp.func
     def mutual_agreement(
         point: wp.array(dtype=vec4), line: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, second: wp.int32,
         others: wp.int32, pose: vec4, rules: MatchRules, member: wp.int32,
     ):  # fmt: skip
+        """Return how well two scans agree at a pose (x, y, theta), as the sum of both directions, or of one with
+        one_way.
+        """
         both = vec4()
         if count > 0 and others > 0:
             c = wp.cos(pose.z)
@@ -137,14 +140,15 @@ def functions(flags):
                 )
         return both
 
-    # Match pair number which (reference, second scan, level of its rules) from a guess, write the result from out on,
-    # and return the pose.
     @wp.func
     def match_pair(
         point: wp.array(dtype=vec4), start: wp.array(dtype=wp.int32), line: wp.array(dtype=vec4),
         pair: wp.array(dtype=wp.int32), which: wp.int32, guess: vec4, rules: wp.array(dtype=real),
         result: wp.array(dtype=real), out: wp.int32, member: wp.int32,
     ):  # fmt: skip
+        """Match pair number which (reference, second scan, level of its rules) from a guess, write the result from out
+        on, and return the pose.
+        """
         first = start[pair[which]]
         count = start[pair[which] + 1] - first
         second = start[pair[which + 1]]
@@ -182,14 +186,15 @@ def functions(flags):
         result[out + 34] = moved.z
         return pose
 
-    # Match a pair from a guess, and with two turns again from its result if that is farther from the guess than a
-    # distance along an axis or a turn; otherwise the second result has 0 iterations.
     @wp.func
     def match_in_turns(
         point: wp.array(dtype=vec4), start: wp.array(dtype=wp.int32), line: wp.array(dtype=vec4),
         pair: wp.array(dtype=wp.int32), which: wp.int32, guess: vec4, rules: wp.array(dtype=real),
         result: wp.array(dtype=real), out: wp.int32, turns: wp.int32, far: real, far_turn: real, member: wp.int32,
     ):  # fmt: skip
+        """Match a pair from a guess, and with two turns again from its result if that is farther from the guess than a
+        distance along an axis or a turn; otherwise the second result has 0 iterations.
+        """
         start_pose = guess
         turn = int(0)
         if turns > 1 and member == 0:

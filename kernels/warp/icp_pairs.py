@@ -32,13 +32,14 @@ def functions(flags):
     # Rounding errors of bounds are far below this share.
     ALMOST = real(0.999)
 
-    # Return the nearest of every skip-th point of a scan that is nearer than the square root of squared, -1 without
-    # one; ahead points have a smaller bearing than the place.
     @wp.func
     def nearest_point(
         point: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, ahead: wp.int32, skip: wp.int32, place: vec2,
         squared: real,
     ):  # fmt: skip
+        """Return the nearest of every skip-th point of a scan that is nearer than the square root of squared, -1
+        without one; ahead points have a smaller bearing than the place.
+        """
         kept = (count + skip - 1) // skip
         before = (ahead + skip - 1) // skip
         length = place.x * place.x + place.y * place.y
@@ -74,10 +75,11 @@ def functions(flags):
                 k += 1
         return which
 
-    # Return the sums with a pair of a line and a place, and its weighted error; arm is the place relative to the second
-    # scan's origin.
     @wp.func
     def add_pairing(before: Sums, line: vec4, place: vec2, arm: vec2, scale: real, last: wp.bool):
+        """Return the sums with a pair of a line and a place, and its weighted error; arm is the place relative to the
+        second scan's origin.
+        """
         sums = before
         error = line.x * place.x + line.y * place.y - line.z
         ratio = error / scale
@@ -107,14 +109,15 @@ def functions(flags):
         sums[17] += ONE
         return sums, weight * error
 
-    # Return how well every stride-th point of one scan agrees with every skip-th point of another scan: sum of
-    # agreements, points that the other scan should see, points through which it saw, and points that it did not see.
-    # pose is (x, y, cos, sin).
     @wp.func
     def agreement(
         point: wp.array(dtype=vec4), line: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, second: wp.int32,
         others: wp.int32, stride: wp.int32, skip: wp.int32, pose: vec4, near: real, gap: real, member: wp.int32,
     ):  # fmt: skip
+        """Return how well every stride-th point of one scan agrees with every skip-th point of another scan: sum of
+        agreements, points that the other scan should see, points through which it saw, and points that it did not
+        see. pose is (x, y, cos, sin).
+        """
         used = (others + stride - 1) // stride
         share = int(1 << log_share(used))
         k = int(member * share)
@@ -156,14 +159,15 @@ def functions(flags):
                 total[j] = numbers[j]
         return total
 
-    # Return the sums over the pairs of a scan's points at a pose (x, y, cos, sin), and the sums of blocks, 0 unless
-    # full.
     @wp.func
     def sum_pairs(
         point: wp.array(dtype=vec4), line: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, second: wp.int32,
         others: wp.int32, stride: wp.int32, skip: wp.int32, pose: vec4, capture: real, scale: real, last: wp.bool,
         full: wp.bool, member: wp.int32,
     ):  # fmt: skip
+        """Return the sums over the pairs of a scan's points at a pose (x, y, cos, sin), and the sums of blocks, 0
+        unless full.
+        """
         used = (others + stride - 1) // stride
         log = log_share(used)
         begin = int(member << log)

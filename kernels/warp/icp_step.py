@@ -89,10 +89,11 @@ def functions(flags):
     @wp.func_native(_COOPERATES)
     def cooperates() -> bool: ...
 
-    # Return log2 of the points of a member, enough for all members to cover count; a team of one takes at least the
-    # longest block.
     @wp.func
     def log_share(count: wp.int32):
+        """Return log2 of the points of a member, enough for all members to cover count; a team of one takes at least
+        the longest block.
+        """
         members = int(1)
         log = int(MATCH_BLOCKS - 1)
         if IN_TEAMS and cooperates():
@@ -102,18 +103,19 @@ def functions(flags):
             log += 1
         return log
 
-    # Return the bearing of a place in [0, 2 pi).
     @wp.func
     def bearing_of(place: vec2):
+        """Return the bearing of a place in [0, 2 pi)."""
         bearing = wp.atan2(place.y, place.x)
         if bearing < ZERO:
             bearing += FULL_TURN
         return bearing
 
-    # Return the number of points of a scan with a smaller bearing: walk from a guess, which for neighbours is the
-    # previous number, up to a full turn.
     @wp.func
     def points_before(point: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, bearing: real, guess: wp.int32):
+        """Return the number of points of a scan with a smaller bearing: walk from a guess, which for neighbours is the
+        previous number, up to a full turn.
+        """
         i = int(guess)
         if FOUR * bearing < FULL_TURN and 4 * guess > 3 * count:
             i = 0
@@ -125,9 +127,9 @@ def functions(flags):
             i -= 1
         return i
 
-    # Solve the damped normal equations by Cholesky's factors: step in x, y and theta, and whether there is one.
     @wp.func
     def solve(sums: Sums):
+        """Solve the damped normal equations by Cholesky's factors: step in x, y and theta, and whether there is one."""
         damping = DAMPING * (sums[0] + sums[3]) + LEAST_DAMPING
         xx = sums[0] + damping
         yy = sums[3] + damping
@@ -152,9 +154,11 @@ def functions(flags):
         x = (u - b * y - c * theta) / a
         return vec4(x, y, theta, ONE)
 
-    # Return blocks with the number of the i-th point: element l is the sum of squared sums of blocks of 2^l points.
     @wp.func
     def add_to_blocks(before: Blocks, levels: wp.int32, i: wp.int32, number: real):
+        """Return blocks with the number of the i-th point: element l is the sum of squared sums of blocks of 2^l
+        points.
+        """
         blocks = before
         total = number
         waits = int(0)
@@ -168,9 +172,9 @@ def functions(flags):
                     total += blocks[MATCH_BLOCKS + level]
         return blocks
 
-    # Return blocks including the last, shorter ones.
     @wp.func
     def close_blocks(before: Blocks, levels: wp.int32, count: wp.int32):
+        """Return blocks including the last, shorter ones."""
         blocks = before
         rest = real(0.0)
         for level in range(MATCH_BLOCKS - 1):

@@ -54,15 +54,16 @@ def functions(flags):
         chosen: wp.int32
         total: vec2
 
-    # Return the row or column of the bucket at a position; positions outside get the nearest bucket.
     @wp.func
     def bucket_at(position: real, size: real, count: wp.int32):
+        """Return the row or column of the bucket at a position; positions outside get the nearest bucket."""
         return int(wp.clamp(wp.floor(position / size), ZERO, real(count - 1)))
 
-    # Return whether a landmark is in a feature's disc, within the limits of the sensor that the feature does not
-    # measure, and no farther from the end point than the square root of most.
     @wp.func
     def near(off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, most: real):
+        """Return whether a landmark is in a feature's disc, within the limits of the sensor that the feature does not
+        measure, and no farther from the end point than the square root of most.
+        """
         reach = feature[base + REACH]
         radius = feature[base + RADIUS]
         hole = feature[base + HOLE]
@@ -78,11 +79,13 @@ def functions(flags):
         d = wp.sqrt(squared)
         return d <= feature[base + FARTHEST] and turned[0] * off[0] + turned[2] * off[2] >= feature[base + AXIS] * d
 
-    # Return the square of the radius around a feature's end point outside which exponents are larger than exponent.
-    # Let r be the error of the range and b the error of the bearing: a landmark is sqrt(r^2 + 2 z (z + r) (1 - cos b))
-    # away, and 2 (1 - cos b) is at most b^2. A factor and SLACK cover rounding errors of such distances.
     @wp.func
     def squared_reach(exponent: real, feature: wp.array(dtype=real), base: wp.int32):
+        """Return the square of the radius around a feature's end point outside which exponents are larger than
+        exponent. Let r be the error of the range and b the error of the bearing: a landmark is sqrt(r^2 + 2 z (z +
+        r) (1 - cos b)) away, and 2 (1 - cos b) is at most b^2. A factor and SLACK cover rounding errors of such
+        distances.
+        """
         squared = real(0.0)
         if exponent > ZERO:
             r = wp.sqrt(exponent) * feature[base + RANGE_SPREAD]
@@ -91,12 +94,14 @@ def functions(flags):
             squared = WIDER * (r * r + z * (z + r) * (b * b)) + feature[base + SLACK]
         return squared
 
-    # Return whether a feature may be landmark j: near its end point, or for lines similar in direction and overlapping.
     @wp.func
     def may_match(
         off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, normal: wp.array(dtype=vec4),
         signature: wp.array(dtype=vec4), j: wp.int32, most: real,
     ):  # fmt: skip
+        """Return whether a feature may be landmark j: near its end point, or for lines similar in direction and
+        overlapping.
+        """
         may = bool(False)
         if LINE:
             may = overlaps(off, turned, feature, base, facing(normal[j], signature[j], turned), signature[j])
@@ -104,13 +109,13 @@ def functions(flags):
             may = near(off, turned, feature, base, most)
         return may
 
-    # Return log(z_detect p(f | j)) of one feature at the offset of landmark j.
     @wp.func
     def log_match(
         off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, normal: wp.array(dtype=vec4),
         signature: wp.array(dtype=vec4), j: wp.int32, terms: wp.array(dtype=types.FeatureTerms),
         arcs: wp.array(dtype=vec2),
     ):  # fmt: skip
+        """Return log(z_detect p(f | j)) of one feature at the offset of landmark j."""
         log_p = real(0.0)
         if LINE:
             seen = facing(normal[j], signature[j], turned)
@@ -119,9 +124,9 @@ def functions(flags):
             log_p = log_detection(off, turned, feature, base, signature[j], terms, arcs)
         return log_p
 
-    # Update a match by one more landmark.
     @wp.func
     def with_landmark(match: Match, log_p: real, j: wp.int32):
+        """Update a match by one more landmark."""
         if MARGINAL:
             if wp.isinf(match.log_p):
                 match.log_p = log_p
@@ -136,13 +141,13 @@ def functions(flags):
             match.chosen = j
         return match
 
-    # Return the match of a feature among the landmarks within its disc.
     @wp.func
     def search(
         landmark: wp.array(dtype=vec4), normal: wp.array(dtype=vec4), signature: wp.array(dtype=vec4),
         start: wp.array(dtype=wp.int32), place: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32,
         terms: wp.array(dtype=types.FeatureTerms), arcs: wp.array(dtype=vec2), buckets: types.Buckets,
     ):  # fmt: skip
+        """Return the match of a feature among the landmarks within its disc."""
         match = Match()
         match.log_p = NEVER
         match.best = NEVER

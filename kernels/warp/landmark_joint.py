@@ -35,14 +35,16 @@ def make(name, flags):
     # Largest number of features.
     LogEach = wp.types.vector(length=8, dtype=real)
 
-    # Let landmark j be seen by one more feature of each set, at most one feature per group; log_each has the features'
-    # log p. The particle's sets begin at index sums of best, and their features at index begin of choice and value.
     @wp.func
     def add_landmark(
         j: wp.int32, log_each: LogEach, feature: wp.array(dtype=real), best: wp.array(dtype=real),
         choice: wp.array(dtype=wp.int32), value: wp.array(dtype=real), sums: wp.int32, begin: wp.int32,
         features: wp.int32, sets: wp.int32, groups: wp.int32,
     ):  # fmt: skip
+        """Let landmark j be seen by one more feature of each set, at most one feature per group; log_each has the
+        features' log p. The particle's sets begin at index sums of best, and their features at index begin of choice
+        and value.
+        """
         # From the full set down, since smaller sets must not yet contain this landmark for the group.
         step = int(0)
         while step < groups * (sets - 1):
@@ -67,9 +69,9 @@ def make(name, flags):
                 k += 1
             step += 1
 
-    # Return log p of all features if those of set s have landmarks and the remaining ones are false positives.
     @wp.func
     def set_total(s: wp.int32, sum_of_set: real, feature: wp.array(dtype=real), features: wp.int32):
+        """Return log p of all features if those of set s have landmarks and the remaining ones are false positives."""
         total = real(sum_of_set)
         k = int(0)
         while k < features:
@@ -78,11 +80,11 @@ def make(name, flags):
             k += 1
         return total
 
-    # Return the set with the largest log p, and that. The particle's sets begin at index sums of best.
     @wp.func
     def best_set(
         best: wp.array(dtype=real), sums: wp.int32, feature: wp.array(dtype=real), features: wp.int32, sets: wp.int32
     ):
+        """Return the set with the largest log p, and that. The particle's sets begin at index sums of best."""
         most = real(-math.inf)
         chosen = int(0)
         s = int(0)
@@ -94,13 +96,14 @@ def make(name, flags):
             s += 1
         return chosen, most
 
-    # Find the best joint association: one work-item takes a particle. choice[s] has the landmark of each feature of set
-    # s, and value[s] its log p; sets is 2^features.
     @kernel(flags)
     def joint_features(
         landmark, normal, signature, pose_cell, pose, pose_low, feature, terms, arcs, best, choice, value, log_p, parts,
         which, landmarks, particles, features, sets, buckets, score,
     ):  # fmt: skip
+        """Find the best joint association: one work-item takes a particle. choice[s] has the landmark of each feature
+        of set s, and value[s] its log p; sets is 2^features.
+        """
         n = wp.tid()
         if n >= particles:
             return

@@ -25,14 +25,17 @@ def make(name, flags):
     PER_BEAM = "PER_BEAM" in flags
     ZERO, NEVER = real(0.0), real(-math.inf)
 
-    # Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one. One work-item
-    # takes a particle. PER_BEAM: parts has the term of each feature, and which the index of its likeliest landmark, -1
-    # where a false positive is likelier. share is log(1 / landmarks), the prior of a landmark, if MARGINAL, else 0.
     @kernel(flags)
     def score_features(
         landmark, normal, signature, start, pose_cell, pose, pose_low, feature, partner, terms, arcs, log_p, parts,
         which, buckets, landmarks, particles, features, share, score,
     ):  # fmt: skip
+        """Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one.
+
+        One work-item takes a particle. PER_BEAM: parts has the term of each feature, and which the index of its
+        likeliest landmark, -1 where a false positive is likelier. share is log(1 / landmarks), the prior of a landmark,
+        if MARGINAL, else 0.
+        """
         n = wp.tid()
         if n >= particles:
             return

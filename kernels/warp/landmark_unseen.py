@@ -19,19 +19,23 @@ def make(name, flags):
 
     FIELD = "FIELD" in flags
 
-    # Return whether a landmark is within range and, with a FIELD, the cosine of its angle to the sensor's axis is at
-    # least ``least``.
     @wp.func
     def in_view(off: vec4, cosine: real, sine: real, range_max: real, least: real):
+        """Return whether a landmark is within range and, with a FIELD, the cosine of its angle to the sensor's axis is
+        at least ``least``.
+        """
         d = wp.sqrt(off[0] * off[0] + off[2] * off[2])
         seen = d <= range_max
         if FIELD:
             seen = seen and cosine * off[0] + sine * off[2] >= least * d
         return seen
 
-    # Add log_missed to log_p for every landmark in view that belongs to no feature. One work-item takes a particle.
     @kernel(flags)
     def count_unseen(landmark, start, pose_cell, pose, pose_low, which, log_p, buckets, particles, features, view):
+        """Add log_missed to log_p for every landmark in view that belongs to no feature.
+
+        One work-item takes a particle.
+        """
         n = wp.tid()
         if n >= particles:
             return

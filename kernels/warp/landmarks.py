@@ -68,17 +68,18 @@ def functions(flags):
     A1, A2, A3, A4 = real(-1.0 / 3.0), real(1.0 / 5.0), real(-1.0 / 7.0), real(1.0 / 9.0)
     A5, A6, A7 = real(-1.0 / 11.0), real(1.0 / 13.0), real(-1.0 / 15.0)
 
-    # Return the place of a sensor in metres from the origin of the buckets; size, a power of two, is the side of a
-    # bucket.
     @wp.func
     def sensor_place(cell: wp.vec2i, pose: vec4, low: vec4, size: real):
+        """Return the place of a sensor in metres from the origin of the buckets; size, a power of two, is the side of a
+        bucket.
+        """
         x = two_sum(real(cell[0]), pose[0])
         y = two_sum(real(cell[1]), pose[1])
         return vec4(size * x[0], size * (x[1] + low[0]), size * y[0], size * (y[1] + low[1]))
 
-    # Return the direction of a feature in the world: the heading, turned by the bearing.
     @wp.func
     def direction(pose: vec4, pose_low: vec4, feature: wp.array(dtype=real), base: wp.int32):
+        """Return the direction of a feature in the world: the heading, turned by the bearing."""
         c = feature[base + COSINE]
         s = feature[base + SINE]
         c_low = feature[base + COSINE_LOW]
@@ -93,33 +94,33 @@ def functions(flags):
         y_low = (pose[3] * c_low + pose_low[3] * c) + (pose[2] * s_low + pose_low[2] * s)
         return vec4(x[0], x[1] + ((cc[1] - ss[1]) + x_low), y[0], y[1] + ((sc[1] + cs[1]) + y_low))
 
-    # Return the component of an offset to the left of a direction.
     @wp.func
     def across(off: vec4, turned: vec4):
+        """Return the component of an offset to the left of a direction."""
         right = two_product(turned[0], off[2])
         left = two_product(turned[2], off[0])
         total = two_sum(right[0], -left[0])
         low = (turned[0] * off[3] + turned[1] * off[2]) - (turned[2] * off[1] + turned[3] * off[0])
         return vec2(total[0], total[1] + ((right[1] - left[1]) + low))
 
-    # Return the component of an offset along a direction.
     @wp.func
     def along(off: vec4, turned: vec4):
+        """Return the component of an offset along a direction."""
         x = two_product(turned[0], off[0])
         y = two_product(turned[2], off[2])
         total = two_sum(x[0], y[0])
         low = (turned[0] * off[1] + turned[1] * off[0]) + (turned[2] * off[3] + turned[3] * off[2])
         return vec2(total[0], total[1] + ((x[1] + y[1]) + low))
 
-    # Return arctan t / t - 1 for |t| <= 1 / 16, by its power series in t^2.
     @wp.func
     def arc_series(t: real):
+        """Return arctan t / t - 1 for |t| <= 1 / 16, by its power series in t^2."""
         z = t * t
         return z * (A1 + z * (A2 + z * (A3 + z * (A4 + z * (A5 + z * (A6 + z * A7))))))
 
-    # Return the angle of an offset in (-pi, pi]: the arc of the nearest slope i / 8, and a series for the rest.
     @wp.func
     def angle_pair(side: vec2, ahead: vec2, arcs: wp.array(dtype=vec2)):
+        """Return the angle of an offset in (-pi, pi]: the arc of the nearest slope i / 8, and a series for the rest."""
         a = ahead
         b = side
         if ahead[0] < ZERO:
@@ -155,17 +156,15 @@ def functions(flags):
             arc = -arc
         return arc
 
-    # Return the mass of the normal around d on [0, range_max]; d is clamped to range_max.
     @wp.func
     def range_mass(d: vec2, scale: real, terms: wp.array(dtype=types.FeatureTerms)):
+        """Return the mass of the normal around d on [0, range_max]; d is clamped to range_max."""
         below = wp.min(d[0], terms[0].range_max) * scale
         above = wp.max((terms[0].range_max - d[0]) + (terms[0].range_max_low - d[1]), ZERO) * scale
         if wp.min(below, above) > ERF_ONE:
             return ONE
         return HALF * (wp.erf(below) + wp.erf(above))
 
-    # Return the mass of the normal around a landmark's bearing on the field of view; the bearing is clamped to its
-    # ends. Parts of the field more than half a turn away from the landmark are nearer in the other direction.
     @wp.func
     def field_mass(
         angle: vec2,
@@ -175,6 +174,9 @@ def functions(flags):
         terms: wp.array(dtype=types.FeatureTerms),
         arcs: wp.array(dtype=vec2),
     ):
+        """Return the mass of the normal around a landmark's bearing on the field of view; the bearing is clamped to its
+        ends. Parts of the field more than half a turn away from the landmark are nearer in the other direction.
+        """
         half = arcs[HALF_TURN]
         half_turn = half[0]
         whole = TWO * half_turn
@@ -193,20 +195,20 @@ def functions(flags):
             mass = mass + (wp.erf(half_turn * scale) - wp.erf((whole - right) * scale))
         return HALF * mass
 
-    # Add (residual * scale)^2 to an exponent, in two parts, since exponents and peaks may nearly cancel.
     @wp.func
     def add_square(total: vec2, residual: vec2, scale: real, scale_low: real):
+        """Add (residual * scale)^2 to an exponent, in two parts, since exponents and peaks may nearly cancel."""
         u = pair_product(residual, vec2(scale, scale_low))
         more = pair_sum(total, pair_product(u, u))
         # After an overflow there is no low part.
         return vec2(more[0], wp.where(wp.isfinite(more[1]), more[1], ZERO))
 
-    # Return log(z_detect p(f | j)) of one feature at an offset; signature is (s_j, low part, -log m_s, 0).
     @wp.func
     def log_detection(
         off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, signature: vec4,
         terms: wp.array(dtype=types.FeatureTerms), arcs: wp.array(dtype=vec2),
     ):  # fmt: skip
+        """Return log(z_detect p(f | j)) of one feature at an offset; signature is (s_j, low part, -log m_s, 0)."""
         exponent = vec2(ZERO, ZERO)
         mass = real(1.0)
         norm = real(0.0)

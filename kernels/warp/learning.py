@@ -49,11 +49,11 @@ def make(name, flags):
     HALF, TWO = real(0.5), real(2.0)
     NOTHING = real(math.nan)
 
-    # Return log p(z | z*) and the responsibilities of hit, short and rand, 0 where the density is 0.
     @wp.func
     def responsibilities(
         z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real)
     ):
+        """Return log p(z | z*) and the responsibilities of hit, short and rand, 0 where the density is 0."""
         hit = log_hit(z, expected, terms, masses)
         shorter = log_short(z, expected, terms)
         largest = wp.max(wp.max(hit, shorter), terms[0].rand_density)
@@ -65,15 +65,15 @@ def make(name, flags):
         p = p_hit + p_short + p_rand
         return vec4(largest + wp.log(p), p_hit / p, p_short / p, p_rand / p)
 
-    # Return the untruncated density of a hit at a distance of x scales, times sigma.
     @wp.func
     def hit_phi(x: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return the untruncated density of a hit at a distance of x scales, times sigma."""
         t = vec2(HALF * x * x, ZERO)
         return terms[0].unit_peak * wp.exp(-shape_exponent(t, terms[0].shape_power, terms[0].shape_rate).x)
 
-    # Return W u^2, and the derivatives h_s, h_m, h_ss, h_sm and h_mm of log p_hit of a pair.
     @wp.func
     def hit_slopes(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real)):
+        """Return W u^2, and the derivatives h_s, h_m, h_ss, h_sm and h_mm of log p_hit of a pair."""
         mean = mean_range(expected, terms)
         above = above_mean(expected, terms)
         u = hit_offset(z, expected, terms).x * terms[0].inverse_sigma
@@ -109,23 +109,25 @@ def make(name, flags):
             h_mm = ZERO
         return vec6(square, square - ONE + t, h_m, square * (bend - TWO) - t + w + t * t, h_sm, h_mm)
 
-    # Return the derivatives s_l and s_ll of log p_short of a pair.
     @wp.func
     def short_slopes(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return the derivatives s_l and s_ll of log p_short of a pair."""
         x = terms[0].lambda_short * expected
         f = short_factor(x)
         v = f - x
         return vec2(ONE - v - terms[0].lambda_short * z, v * (f - ONE) - terms[0].lambda_short * z)
 
-    # Add the terms of a pair to the sums. They are log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm,
-    # r_hit h_mm, r_short s_ll; r_hit W u^2, r_short z. INFORMATION: 1 where rand is the likeliest cause; the upper
-    # triangle of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m,
-    # r_hit h_m^2, r_short s_l^2.
     @wp.func
     def add_pair(
         z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real),
         before: sums_type,
     ):  # fmt: skip
+        """Add the terms of a pair to the sums.
+
+        They are log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm, r_hit h_mm, r_short s_ll; r_hit W
+        u^2, r_short z. INFORMATION: 1 where rand is the likeliest cause; the upper triangle of y y' with y = (r_hit,
+        r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m, r_hit h_m^2, r_short s_l^2.
+        """
         sums = before
         r = responsibilities(z, expected, terms, masses)
         hit = vec6()
@@ -169,9 +171,12 @@ def make(name, flags):
             sums[38] += r[2] * s_l * s_l
         return sums
 
-    # Sum over blocks of pairs: one work-item takes a block. Pair k of a block is pair block * across + k * along.
     @kernel(flags)
     def e_step(reading, expected, terms, masses, sums, blocks, readings, across, along, width):
+        """Sum over blocks of pairs: one work-item takes a block.
+
+        Pair k of a block is pair block * across + k * along.
+        """
         block = wp.tid()
         if block >= blocks:
             return
@@ -198,9 +203,9 @@ def make(name, flags):
             sums[block * width + j] = total[j] + total_low[j]
             j += 1
 
-    # Write log p and the responsibilities of each pair, NaN for padding. One work-item takes a block of pairs.
     @kernel(flags)
     def pair_causes(reading, expected, terms, masses, causes, blocks, readings, across, along):
+        """Write log p and the responsibilities of each pair, NaN for padding. One work-item takes a block of pairs."""
         block = wp.tid()
         if block >= blocks:
             return

@@ -51,17 +51,17 @@ def functions(flags):
     # From here on the error function is 1 to the last bit.
     ERF_ONE = real(6.0 if "FLOAT64" in flags else 4.0)
 
-    # Return the normal of a line of the map on the side that faces a feature's sensor.
     @wp.func
     def facing(normal: vec4, signature: vec4, turned: vec4):
+        """Return the normal of a line of the map on the side that faces a feature's sensor."""
         seen = normal
         if signature[1] > ZERO and normal[0] * turned[0] + normal[2] * turned[2] < ZERO:
             seen = -normal
         return seen
 
-    # Return whether a feature has about the direction of a line of the map, and overlaps it.
     @wp.func
     def overlaps(off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, normal: vec4, signature: vec4):
+        """Return whether a feature has about the direction of a line of the map, and overlaps it."""
         cosine = normal[0] * turned[0] + normal[2] * turned[2]
         sine = normal[0] * turned[2] - normal[2] * turned[0]
         foot = feature[base + RANGE_AT] * sine - (normal[0] * off[2] - normal[2] * off[0])
@@ -70,11 +70,13 @@ def functions(flags):
         beside = wp.min(one, other) <= signature[0] and wp.max(one, other) >= -signature[0]
         return cosine >= feature[base + AXIS] and beside
 
-    # Return the mass of the normal around a line's distance d on [0, range_max]; d is clamped to it. A line that is
-    # seen from both sides has two forms, (alpha_j, d) and (alpha_j + pi, -d): together they have the mass of d on
-    # [-range_max, range_max].
     @wp.func
     def distance_mass(d: vec2, scale: real, signature: vec4, terms: wp.array(dtype=types.FeatureTerms)):
+        """Return the mass of the normal around a line's distance d on [0, range_max]; d is clamped to it.
+
+        A line that is seen from both sides has two forms, (alpha_j, d) and (alpha_j + pi, -d): together they have the
+        mass of d on [-range_max, range_max].
+        """
         lower = real(0.0)
         if signature[1] > ZERO:
             lower = -terms[0].range_max
@@ -85,12 +87,12 @@ def functions(flags):
             return ONE
         return HALF * (wp.erf(below) + wp.erf(above))
 
-    # Return log(z_detect p(f | j)) of one feature at the offset of a line's middle.
     @wp.func
     def log_line(
         off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, normal: vec4, signature: vec4,
         terms: wp.array(dtype=types.FeatureTerms), arcs: wp.array(dtype=vec2),
     ):  # fmt: skip
+        """Return log(z_detect p(f | j)) of one feature at the offset of a line's middle."""
         da = angle_pair(across(turned, normal), along(turned, normal), arcs)
         d = along(off, normal)
         first = two_sum(feature[base + RANGE_AT], -d[0])

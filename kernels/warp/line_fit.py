@@ -16,12 +16,13 @@ def functions(flags):
     ZERO, ONE, HALF, MISSING = real(0.0), real(1.0), real(0.5), real(-1.0)
     WHOLE_TURN = real(6.283185307179586)
 
-    # Return the line through a point and its neighbours, a unit normal, an offset, and 1 / (sum of squared distances
-    # along the line), from sums of the neighbours' coordinates relative to the point and of their products; weight is
-    # the number of points. A point without neighbours gets the line perpendicular to its beam, and -1 instead of the
-    # sum.
     @wp.func
     def line_through(centre: vec4, total: vec2, xx: real, xy: real, yy: real, weight: real):
+        """Return the line through a point and its neighbours, a unit normal, an offset, and 1 / (sum of squared
+        distances along the line), from sums of the neighbours' coordinates relative to the point and of their
+        products; weight is the number of points. A point without neighbours gets the line perpendicular to its beam,
+        and -1 instead of the sum.
+        """
         mean_x = total.x / weight
         mean_y = total.y / weight
         a = xx - weight * mean_x * mean_x
@@ -48,13 +49,15 @@ def functions(flags):
         offset = normal_x * (centre.x + mean_x) + normal_y * (centre.y + mean_y)
         return vec4(normal_x, normal_y, offset, doubt)
 
-    # Return the line through the k-th point of a scan and reach neighbours on either side, up to most within a distance
-    # of width, none of them farther from the last one than slack plus ratio times its range, nor than gap in bearing.
     @wp.func
     def line_at(
         point: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, k: wp.int32, reach: wp.int32, most: wp.int32,
         ratio: real, slack: real, width: real, gap: real,
     ):  # fmt: skip
+        """Return the line through the k-th point of a scan and reach neighbours on either side, up to most within a
+        distance of width, none of them farther from the last one than slack plus ratio times its range, nor than gap
+        in bearing.
+        """
         centre = point[first + k]
         sum_x = real(0.0)
         sum_y = real(0.0)
@@ -94,12 +97,12 @@ def functions(flags):
                 j += 1
         return line_through(centre, vec2(sum_x, sum_y), xx, xy, yy, real(size))
 
-    # Write the lines of all points of a scan.
     @wp.func
     def fit_scan(
         point: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, reach: wp.int32, most: wp.int32, ratio: real,
         slack: real, width: real, gap: real, line: wp.array(dtype=vec4),
     ):  # fmt: skip
+        """Write the lines of all points of a scan."""
         for k in range(count):
             line[first + k] = line_at(point, first, count, k, reach, most, ratio, slack, width, gap)
 

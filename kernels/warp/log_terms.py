@@ -24,25 +24,25 @@ def functions(flags):
     ZERO, ONE = real(0.0), real(1.0)
     LARGEST_ROOT = real(1e140 if "FLOAT64" in flags else 1e17)
 
-    # Return the square of a sum of two numbers; roots are clamped, so that nothing becomes infinite.
     @wp.func
     def bounded_square(u: vec2):
+        """Return the square of a sum of two numbers; roots are clamped, so that nothing becomes infinite."""
         held = u
         if wp.abs(u.x) > LARGEST_ROOT:
             held = vec2(LARGEST_ROOT, ZERO)
         return pair_product(held, held)
 
-    # Return log(1 + x) for x > -1; on processors the rounding error of 1 + x is corrected to first order.
     @wp.func
     def log_one_plus(x: real):
+        """Return log(1 + x) for x > -1; on processors the rounding error of 1 + x is corrected to first order."""
         if fuses_on_gpu():
             return gpu_log1p(x)
         more = ONE + x
         return log(more) + (x - (more - ONE)) / more
 
-    # Return the log of the sum of two probabilities, from their logs; -inf only where both are 0.
     @wp.func
     def either(a: real, b: real):
+        """Return the log of the sum of two probabilities, from their logs; -inf only where both are 0."""
         high = wp.max(a, b)
         low = wp.min(a, b)
         log_sum = high

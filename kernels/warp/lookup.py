@@ -27,12 +27,12 @@ def functions(flags):
     ZERO = real(0.0)
     PARTS = real(65535.0)
 
-    # Return the distance in cells from the table, limit where no obstacle is nearer.
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY), window: types.Window, cell: wp.vec2i, pose: vec4, ray: vec2, limit: real,
         caster: types.Caster,
     ):  # fmt: skip
+        """Return the distance in cells from the table, limit where no obstacle is nearer."""
         col = int(cell.x)
         row = int(cell.y)
         r = make_ray(pose, ray)

@@ -31,12 +31,12 @@ def functions(flags):
     # Smallest step relative to the distance, so that every step changes the distance.
     LEAST_STEP = real(2.0**-22)
 
-    # Return the distance in cells to a point in an occupied cell, limit where none is nearer.
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY), window: types.Window, cell: wp.vec2i, pose: vec4, ray: vec2, limit: real,
         caster: types.Caster,
     ):  # fmt: skip
+        """Return the distance in cells to a point in an occupied cell, limit where none is nearer."""
         r = make_ray(pose, ray)
         t = real(0.0)
         if ORIGINS_OUTSIDE:

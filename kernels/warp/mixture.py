@@ -45,17 +45,19 @@ def functions(flags):
     TINY = real(1e-30)
     SMALLEST_RANGE = real(1e-37)
 
-    # Return the expected range of a reading beyond which log p is constant to the last bit: there it is that of p_rand,
-    # or of p_short far from its end, whatever the distance of the obstacle.
     @wp.func
     def last_range(z: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return the expected range of a reading beyond which log p is constant to the last bit: there it is that of
+        p_rand, or of p_short far from its end, whatever the distance of the obstacle.
+        """
         return wp.max(term_of.last_offset(terms) + term_of.last_slope(terms) * z, term_of.last_least(terms))
 
-    # Return the mass of the untruncated normal from a distance before its mean to one after it, a sum of positive
-    # terms. Most ranges are far from both ends, and nearly all from at least one; rays without an obstacle are at one
-    # end.
     @wp.func
     def hit_mass(before: real, after: real, erf_scale: real):
+        """Return the mass of the untruncated normal from a distance before its mean to one after it, a sum of positive
+        terms. Most ranges are far from both ends, and nearly all from at least one; rays without an obstacle are at
+        one end.
+        """
         below = before * erf_scale
         above = after * erf_scale
         nearer = wp.min(below, above)
@@ -69,11 +71,11 @@ def functions(flags):
             rest += wp.erf(nearer)
         return HALF * rest
 
-    # Return the mass of a hit of any shape on [0, range_max].
     @wp.func
     def mass_within(
         mean: real, above: real, scale: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real)
     ):
+        """Return the mass of a hit of any shape on [0, range_max]."""
         if MASS_TABLE:
             place = wp.int32(term_of.mass_table(terms))
             below = half_mass(mean * scale, masses, place)
@@ -81,18 +83,19 @@ def functions(flags):
         else:
             return hit_mass(mean, above, scale)
 
-    # Return the mean of p_hit.
     @wp.func
     def mean_range(expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return the mean of p_hit."""
         mean = expected
         if BIAS:
             mean = wp.clamp(expected + term_of.range_bias(terms), ZERO, term_of.range_max(terms))
         return mean
 
-    # Return the distance from the mean of p_hit to range_max, which keeps its digits where it is short: there z* is
-    # nearly range_max less the bias, and their difference is exact.
     @wp.func
     def above_mean(expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return the distance from the mean of p_hit to range_max, which keeps its digits where it is short: there z*
+        is nearly range_max less the bias, and their difference is exact.
+        """
         above = term_of.range_max(terms) - expected
         if BIAS:
             last = two_sum(term_of.range_max(terms), -term_of.range_bias(terms))
@@ -101,9 +104,9 @@ def functions(flags):
             )
         return above
 
-    # Return z minus the mean of p_hit as a sum of two numbers; z, z* and the bias nearly cancel.
     @wp.func
     def hit_offset(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return z minus the mean of p_hit as a sum of two numbers; z, z* and the bias nearly cancel."""
         if BIAS:
             mean = mean_range(expected, terms)
             off = vec2(z - mean, ZERO)
@@ -113,9 +116,9 @@ def functions(flags):
         else:
             return vec2(z - expected, ZERO)
 
-    # Return sigma_hit / sigma at a range: the first number times (1 + the second).
     @wp.func
     def hit_scale(expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return sigma_hit / sigma at a range: the first number times (1 + the second)."""
         scale = vec2(ONE, ZERO)
         if GROWTH:
             total = ONE + term_of.relative_growth(terms) * expected
@@ -130,10 +133,13 @@ def functions(flags):
                 scale = vec2(share, rest_of(total, share, ONE) + excess * share)
         return scale
 
-    # Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers. Exponent and log peak are large and nearly cancel where
-    # the density's peak is high; the second part keeps the digits that remain.
     @wp.func
     def normal_exponent(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers.
+
+        Exponent and log peak are large and nearly cancel where the density's peak is high; the second part keeps the
+        digits that remain.
+        """
         off = hit_offset(z, expected, terms)
         if EXACT_EXPONENT:
             if GROWTH:
@@ -155,16 +161,16 @@ def functions(flags):
                 scaled = off.x * hit_scale(expected, terms).x
             return vec2(scaled * (scaled * term_of.square_scale(terms)), ZERO)
 
-    # Return the exponent of a hit's density as a sum of two numbers.
     @wp.func
     def hit_exponent(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return the exponent of a hit's density as a sum of two numbers."""
         return shape_exponent(
             normal_exponent(z, expected, terms), term_of.shape_power(terms), term_of.shape_rate(terms)
         )
 
-    # Return log(z_hit p_hit(z | z*)); terms are in the log domain.
     @wp.func
     def log_hit(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real)):
+        """Return log(z_hit p_hit(z | z*)); terms are in the log domain."""
         exponent = hit_exponent(z, expected, terms)
         scale = hit_scale(expected, terms).x
         log_p = (term_of.hit_peak(terms) - exponent.x) + (term_of.hit_peak_low(terms) - exponent.y)
@@ -177,17 +183,19 @@ def functions(flags):
             return log_p
         return log_p - wp.log(mass)
 
-    # Return x / (1 - exp(-x)) for x >= 0 as h / tanh(h) + h with h = x / 2: exact at 0 and without cancellation.
     @wp.func
     def short_factor(x: real):
+        """Return x / (1 - exp(-x)), x >= 0, as h / tanh(h) + h with h = x / 2: exact at 0, without cancellation."""
         h = HALF * x
         if h > TINY:
             return h / wp.tanh(h) + h
         return ONE
 
-    # Return short_factor(x) / z* with one division: lambda / (1 - exp(-2 h)) = lambda (1 + t) / (2 t) with t = tanh(h).
     @wp.func
     def short_peak(rate: real, expected: real):
+        """Return short_factor(x) / z* with one division: lambda / (1 - exp(-2 h)) = lambda (1 + t) / (2 t) with t =
+        tanh(h).
+        """
         h = HALF * (rate * expected)
         above = ONE
         below = wp.max(expected, SMALLEST_RANGE)
@@ -197,9 +205,9 @@ def functions(flags):
             below = t + t
         return above / below
 
-    # Return log(z_short p_short(z | z*)); terms are in the log domain.
     @wp.func
     def log_short(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return log(z_short p_short(z | z*)); terms are in the log domain."""
         if z <= expected and expected > ZERO:
             return (
                 term_of.z_short(terms) + wp.log(short_peak(term_of.lambda_short(terms), expected))
@@ -207,12 +215,14 @@ def functions(flags):
         return NEVER
 
     if LINEAR:
-        # Return log p(z | z*). p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm
-        # suffices.
+
         @wp.func
         def log_density(
             z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real)
         ):
+            """Return log p(z | z*). p_rand > 0 bounds the sum from below, so components may underflow, and one
+            logarithm suffices.
+            """
             p = real(0.0)
             if HIT:
                 # 1: correct range.
@@ -242,12 +252,15 @@ def functions(flags):
             return wp.log(p + term_of.rand_density(terms))
 
     else:
-        # Return log p(z | z*). Without a sufficient p_rand every component stays a logarithm; -inf only where the
-        # mixture is 0.
+
         @wp.func
         def log_density(
             z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real)
         ):
+            """Return log p(z | z*).
+
+            Without a sufficient p_rand every component stays a logarithm; -inf only where the mixture is 0.
+            """
             hit = NEVER
             shorter = NEVER
             largest = NEVER

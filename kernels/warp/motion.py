@@ -32,24 +32,24 @@ def functions(flags):
     """Make the functions of the file; no flag changes them."""
     cos_sin = heading.functions(frozenset()).cos_sin
 
-    # Return the chord of an arc that turns by twice half_turn.
     @wp.func
     def chord_of(length: wp.float64, half_turn: wp.float64):
+        """Return the chord of an arc that turns by twice half_turn."""
         chord = length * (ONE - half_turn * half_turn / SIX)
         if wp.abs(half_turn) >= SMALL_ARC:
             turn = cos_sin(half_turn)
             chord = length * (turn.y / half_turn)
         return chord
 
-    # Wrap headings that are less than a turn outside [-pi, pi] to that interval.
     @wp.func
     def wrap_once(theta: wp.float64):
+        """Wrap headings that are less than a turn outside [-pi, pi] to that interval."""
         less = wp.where(theta < MINUS_HALF_TURN, theta + WHOLE_TURN, theta)
         return wp.where(theta > HALF_TURN, theta - WHOLE_TURN, less)
 
-    # Wrap any heading to [-pi, pi]; headings more than a turn outside it by their cosine and sine.
     @wp.func
     def wrap_any(theta: wp.float64):
+        """Wrap any heading to [-pi, pi]; headings more than a turn outside it by their cosine and sine."""
         wrapped = wrap_once(theta)
         if wp.abs(theta) > FARTHEST_ONCE:
             turn = cos_sin(theta)
@@ -66,9 +66,9 @@ def make(name, flags):
     chord_of, wrap_any, cos_sin = made.chord_of, made.wrap_any, made.cos_sin
     normal_pair = philox.functions(frozenset()).normal_pair
 
-    # Move particles from source to target, which may be the same array: one work-item takes a particle.
     @kernel(flags)
     def move_particles(source, settings, target, particles, kind):
+        """Move particles from source to target, which may be the same array: one work-item takes a particle."""
         n = wp.tid()
         if n >= particles:
             return

@@ -21,18 +21,18 @@ def functions(flags):
     two_sum, two_product = exact.two_sum, exact.two_product
     ZERO, TWO = real(0.0), real(2.0)
 
-    # Return the offset from a sensor to a landmark or beacon (x, y, and the low parts of both).
     @wp.func
     def offset(landmark: vec4, place: vec4):
+        """Return the offset from a sensor to a landmark or beacon (x, y, and the low parts of both)."""
         x = two_sum(landmark[0], -place[0])
         y = two_sum(landmark[1], -place[2])
         x = two_sum(x[0], x[1] + (landmark[2] - place[1]))
         y = two_sum(y[0], y[1] + (landmark[3] - place[3]))
         return vec4(x[0], x[1], y[0], y[1])
 
-    # Return the length of an offset: the rounded root, and the correction of one step of Newton's method.
     @wp.func
     def distance_pair(off: vec4):
+        """Return the length of an offset: the rounded root, and the correction of one step of Newton's method."""
         xx = two_product(off[0], off[0])
         yy = two_product(off[2], off[2])
         total = two_sum(xx[0], yy[0])

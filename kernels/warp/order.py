@@ -31,17 +31,18 @@ def make(name, flags):
     HALF_TURN, WHOLE_TURN = 32768, 65536
     PARTS = real(32.0)
 
-    # Return the heading relative to the first particle's, from -TURN / 2 to TURN / 2.
     @wp.func
     def relative_turn(pose: vec4, other: vec4):
+        """Return the heading relative to the first particle's, from -TURN / 2 to TURN / 2."""
         turn = int(turn_of(vec2(pose.z * other.z + pose.w * other.w, pose.w * other.z - pose.z * other.w)) * TURN)
         return wp.where(turn > HALF_TURN, turn - WHOLE_TURN, turn)
 
-    # Clear the bins and find the bounds: one work-item takes a bin, and the first SAMPLES of them a particle each.
-    # bounds, which the caller sets to -2^31, become the negated smallest and the largest row, column and heading of
-    # these particles; the last one becomes 0.
     @kernel(flags)
     def order_bounds(pose_cell, pose, bounds, bins, particles):
+        """Clear the bins and find the bounds: one work-item takes a bin, and the first SAMPLES of them a particle each.
+        bounds, which the caller sets to -2^31, become the negated smallest and the largest row, column and heading
+        of these particles; the last one becomes 0.
+        """
         bin = work_item(wp.tid())
         if bin >= ALL_BINS:
             return
@@ -59,15 +60,15 @@ def make(name, flags):
         wp.atomic_max(bounds, 4, -turn)
         wp.atomic_max(bounds, 5, turn)
 
-    # Return the index of one of BINS equal parts of the bounds; values beyond them belong to the outermost parts.
     @wp.func
     def part_of(value: wp.int32, least: wp.int32, most: wp.int32):
+        """Return the index of one of BINS equal parts of the bounds; the outermost parts hold values beyond them."""
         part = (real(value) - real(least)) * (PARTS / (real(most) - real(least) + ONE))
         return wp.where(part < ZERO, 0, wp.where(part >= PARTS, BINS - 1, int(part)))
 
-    # Find the bin of each particle, and count it there. One work-item takes a particle.
     @kernel(flags)
     def order_count(pose_cell, pose, bounds, bins, bin_of, particles):
+        """Find the bin of each particle, and count it there. One work-item takes a particle."""
         n = work_item(wp.tid())
         if n >= particles:
             return
@@ -82,9 +83,12 @@ def make(name, flags):
     return (kernels | {"order_starts": order_starts, "order_fill": order_fill})[name]
 
 
-# Replace the counts of bins by the indices at which they begin. One work-item takes a stretch of neighbouring bins.
 @kernel()
 def order_starts(bounds, bins):
+    """Replace the counts of bins by the indices at which they begin.
+
+    One work-item takes a stretch of neighbouring bins.
+    """
     stretch = work_item(wp.tid())
     if stretch >= ALL_BINS // STRETCH:
         return
@@ -102,9 +106,9 @@ def order_starts(bounds, bins):
         start += counts[i]
 
 
-# Put each particle at the next index of its bin. One work-item takes a particle.
 @kernel()
 def order_fill(bin_of, bins, order, particles):
+    """Put each particle at the next index of its bin. One work-item takes a particle."""
     n = work_item(wp.tid())
     if n >= particles:
         return

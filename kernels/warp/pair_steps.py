@@ -25,10 +25,11 @@ LEAST_BEAMS = wp.constant(12)
 NEAREST = wp.constant(wp.float64(1e-6))
 
 
-# Return the difference between a range and its prediction from neighbours on a straight wall, in standard deviations;
-# infinite where they are on different surfaces. left and right are the neighbours' weights.
 @wp.func
 def deviation_of(before: wp.float64, here: wp.float64, after: wp.float64, left: wp.float64, right: wp.float64):
+    """Return the difference between a range and its prediction from neighbours on a straight wall, in standard
+    deviations; infinite where they are on different surfaces. left and right are the neighbours' weights.
+    """
     expected = ONE / (left / before + right / after)
     limit = LARGEST_STEP * here
     deviation = wp.float64(FOREVER)
@@ -41,10 +42,11 @@ def deviation_of(before: wp.float64, here: wp.float64, after: wp.float64, left: 
     return deviation
 
 
-# Return the deviation of rounding to the steps in which some ascending ranges come, 0 without steps, or where it is
-# smaller than another deviation.
 @wp.func
 def rounding_of(number: wp.array(dtype=wp.float64), first: wp.int32, count: wp.int32, deviation: wp.float64):
+    """Return the deviation of rounding to the steps in which some ascending ranges come, 0 without steps, or where it
+    is smaller than another deviation.
+    """
     step = wp.float64(FOREVER)
     gaps = int(0)
     for i in range(1, count):
@@ -63,13 +65,16 @@ def rounding_of(number: wp.array(dtype=wp.float64), first: wp.int32, count: wp.i
     return rounding
 
 
-# Return the standard deviation of a scan's ranges, -1 where too few beams measure it. Every step-th beam but the ends
-# is a place; padded is their number as a multiple of 8. work has room for four lists of it.
 @wp.func
 def noise_of(
     reading: wp.array(dtype=wp.float64), first: wp.int32, weight: wp.array(dtype=wp.float64), places: wp.int32,
     padded: wp.int32, step: wp.int32, nearest: wp.float64, farthest: wp.float64, work: wp.array(dtype=wp.float64),
 ):  # fmt: skip
+    """Return the standard deviation of a scan's ranges, -1 where too few beams measure it.
+
+    Every step-th beam but the ends is a place; padded is their number as a multiple of 8. work has room for four lists
+    of it.
+    """
     number = int(0)
     for i in range(padded):
         work[i] = FOREVER
@@ -93,11 +98,12 @@ def noise_of(
     return wp.max(rounding_of(work, 3 * padded, number, deviation), deviation)
 
 
-# Return the level of noise of a pair: the first one whose largest noise is not exceeded, the last one beyond all of
-# them, or the assumed one where neither scan measures its noise. A level is its largest noise, and the slack of its
-# lines.
 @wp.func
 def level_of(noise: wp.float64, level: wp.array(dtype=wp.float64), levels: wp.int32, assumed: wp.int32):
+    """Return the level of noise of a pair: the first one whose largest noise is not exceeded, the last one beyond all
+    of them, or the assumed one where neither scan measures its noise. A level is its largest noise, and the slack of
+    its lines.
+    """
     number = int(0)
     while number < levels - 1 and noise > level[2 * number]:
         number += 1
@@ -112,13 +118,15 @@ def functions(flags):
     types = precision(flags)
     real, vec4 = types.real, types.vec4
 
-    # Write the points of a scan's hits from to on, and return their number and the sum of squared ranges. A beam is its
-    # cosine and sine, its bearing in [0, 2 pi), and the place of its reading; beams come by bearing.
     @wp.func
     def place_points(
         reading: wp.array(dtype=wp.float64), first: wp.int32, beam: wp.array(dtype=wp.float64), beams: wp.int32,
         nearest: wp.float64, farthest: wp.float64, point: wp.array(dtype=vec4), to: wp.int32,
     ):  # fmt: skip
+        """Write the points of a scan's hits from to on, and return their number and the sum of squared ranges.
+
+        A beam is its cosine and sine, its bearing in [0, 2 pi), and the place of its reading; beams come by bearing.
+        """
         count = int(0)
         squares = wp.float64(0.0)
         for i in range(beams):

@@ -61,29 +61,30 @@ def walkers() -> wp.int32: ...
 def least_of_team(own: wp.vec2d) -> wp.vec2d: ...
 
 
-# Return the value of a cell.
 @wp.func
 def value_at(cells: wp.array(dtype=wp.uint8), col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
+    """Return the value of a cell."""
     value = OFF
     if col >= 0 and row >= 0 and col < cols and row < rows:
         value = wp.int32(cells[row * cols + col])
     return value
 
 
-# Return whether a value marks a wall.
 @wp.func
 def is_wall(value: wp.int32, occupied: wp.int32):
+    """Return whether a value marks a wall."""
     return value >= occupied and value < UNKNOWN
 
 
-# Return the distances along a ray to the first wall, and to the first unknown cell before it [cells]; infinite for
-# none. A pair of walls that share a corner stops a ray. The steps are those from begin to before end. The cells are a
-# part of the map, which begins at a column and a row of the map.
 @wp.func
 def walk_ray(
     start: wp.vec2d, slope: wp.vec2d, begin: wp.int32, end: wp.int32, cells: wp.array(dtype=wp.uint8), part: wp.vec2i,
     rows: wp.int32, cols: wp.int32, occupied: wp.int32,
 ):  # fmt: skip
+    """Return the distances along a ray to the first wall, and to the first unknown cell before it [cells]; infinite for
+    none. A pair of walls that share a corner stops a ray. The steps are those from begin to before end. The cells
+    are a part of the map, which begins at a column and a row of the map.
+    """
     wall = wp.float64(FOREVER)
     unknown = wp.float64(FOREVER)
     col_before = int(0)
@@ -128,14 +129,15 @@ def make(name, flags):
     if IN_TEAMS:
         TEAM = FEWER_WALKERS if "SMALL_TEAMS" in flags else MOST_WALKERS
 
-    # Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1), which starts next to it and
-    # diverges.
     @wp.func
     def walk_beside(
         side: wp.float64, direction: wp.float64, origin: wp.vec2d, companion: wp.vec2d, steps: wp.int32,
         cells: wp.array(dtype=wp.uint8), part: wp.vec2i, rows: wp.int32, cols: wp.int32, cell: wp.float64,
         occupied: wp.int32, member: wp.int32,
     ):  # fmt: skip
+        """Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1), which starts next to
+        it and diverges.
+        """
         along = cos_sin(direction)
         slope = cos_sin(direction + side * companion.y)
         shift = side * companion.x
@@ -152,9 +154,9 @@ def make(name, flags):
             first = wp.vec2d(first.x, FOREVER)
         return first * cell
 
-    # Return where the beams of an estimated pose begin, along the map's axes [m].
     @wp.func
     def origin_of(estimate: wp.array(dtype=wp.float64), frame: Frame):
+        """Return where the beams of an estimated pose begin, along the map's axes [m]."""
         x = estimate[0] - frame.origin_x
         y = estimate[1] - frame.origin_y
         if frame.mount_x != ZERO or frame.mount_y != ZERO:
@@ -163,10 +165,12 @@ def make(name, flags):
             y += heading.y * frame.mount_x + heading.x * frame.mount_y
         return wp.vec2d(frame.yaw_cos * x + frame.yaw_sin * y, frame.yaw_cos * y - frame.yaw_sin * x)
 
-    # Return the largest deviation of an estimated position over directions [m], and the heading's deviation [rad]. Both
-    # are infinite if the covariance is not finite; a variance is negative by rounding.
     @wp.func
     def deviations_of(estimate: wp.array(dtype=wp.float64)):
+        """Return the largest deviation of an estimated position over directions [m], and the heading's deviation [rad].
+
+        Both are infinite if the covariance is not finite; a variance is negative by rounding.
+        """
         xx = wp.max(estimate[3], ZERO)
         xy = estimate[4]
         yy = wp.max(estimate[6], ZERO)
@@ -177,11 +181,13 @@ def make(name, flags):
         half_apart = (xx - yy) / TWO
         return wp.vec2d(wp.sqrt((xx + yy) / TWO + wp.sqrt(half_apart * half_apart + xy * xy)), wp.sqrt(tt))
 
-    # Judge the beams of an estimated pose: a work-item, or with IN_TEAMS a team of them, takes a beam. The scan has
-    # their directions relative to the heading, in the map's frame, then their readings (NaN for no beam). The result
-    # has their classes, then the distances to the first wall on the beam itself.
     @kernel(flags)
     def judge_beams(cells, estimate, scan, judged, frame, rules, rows, cols, beams):
+        """Judge the beams of an estimated pose: a work-item, or with IN_TEAMS a team of them, takes a beam.
+
+        The scan has their directions relative to the heading, in the map's frame, then their readings (NaN for no
+        beam). The result has their classes, then the distances to the first wall on the beam itself.
+        """
         item = work_item(wp.tid())
         b = item // TEAM
         member = item - b * TEAM

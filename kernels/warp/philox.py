@@ -21,9 +21,9 @@ SHIFT, NONE = wp.constant(wp.uint64(32)), wp.constant(wp.uint32(0))
 words_4 = wp.types.vector(length=4, dtype=wp.uint32)
 
 
-# Return four random words for a counter.
 @wp.func
 def random_words(particle: wp.uint32, step: wp.uint32, stream: wp.uint32, key_0: wp.uint32, key_1: wp.uint32):
+    """Return four random words for a counter."""
     c = words_4(particle, step, stream, NONE)
     k0 = key_0
     k1 = key_1
@@ -38,9 +38,9 @@ def random_words(particle: wp.uint32, step: wp.uint32, stream: wp.uint32, key_0:
     return c
 
 
-# Return numbers in (0, 1), the centres of 2^32 intervals.
 @wp.func
 def uniform_of(word: wp.uint32):
+    """Return numbers in (0, 1), the centres of 2^32 intervals."""
     return (wp.float64(word) + HALF) * WORD
 
 
@@ -49,9 +49,9 @@ def functions(flags):
     """Return the functions of the file; no flag changes them."""
     cos_sin = heading.functions(frozenset()).cos_sin
 
-    # Return two independent standard normal deviates.
     @wp.func
     def normal_pair(word_0: wp.uint32, word_1: wp.uint32):
+        """Return two independent standard normal deviates."""
         radius = wp.sqrt(MINUS_TWO * log_of(uniform_of(word_0)))
         turn = cos_sin(wp.float64(word_1) * WORD_TURN)
         return wp.vec2d(radius * turn.x, radius * turn.y)

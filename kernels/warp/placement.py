@@ -16,9 +16,9 @@ FARTHEST, MINUS_FARTHEST = wp.constant(wp.float64(1073741824.0)), wp.constant(wp
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 
 
-# Clamp a coordinate to +-FARTHEST cells; NaN, as after an overflow, becomes -FARTHEST.
 @wp.func
 def within_reach(position: wp.float64):
+    """Clamp a coordinate to +-FARTHEST cells; NaN, as after an overflow, becomes -FARTHEST."""
     above = wp.where(position > MINUS_FARTHEST, position, MINUS_FARTHEST)
     return wp.where(above < FARTHEST, above, FARTHEST)
 
@@ -33,16 +33,17 @@ def functions(flags):
     TWO_PART_POINTS = "TWO_PART_POINTS" in flags
     BELOW_ONE = real(1.0 - (2.0**-53 if "FLOAT64" in flags else 2.0**-24))
 
-    # Place a sensor: a pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low gets
-    # the rounding errors (low parts) of pose. pose_status, which the caller clears, becomes 1 at index 0 if a pose is
-    # not finite, and at index 1 if a sensor is outside the window. A non-finite pose becomes the farthest cell,
-    # fraction 0 and heading (1, 0): it sees nothing, and its indices stay in bounds.
     @wp.func
     def place_pose(
         particle: wp.int32, poses: wp.array(dtype=coordinate), pose_cell: wp.array(dtype=wp.vec2i),
         pose: wp.array(dtype=vec4), pose_low: wp.array(dtype=vec4), pose_status: wp.array(dtype=wp.int32),
         frame: types.Frame, window: types.Window,
     ):  # fmt: skip
+        """Place a sensor: a pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low
+        gets the rounding errors (low parts) of pose. pose_status, which the caller clears, becomes 1 at index 0 if a
+        pose is not finite, and at index 1 if a sensor is outside the window. A non-finite pose becomes the farthest
+        cell, fraction 0 and heading (1, 0): it sees nothing, and its indices stay in bounds.
+        """
         x = wp.float64(poses[3 * particle])
         y = wp.float64(poses[3 * particle + 1])
         theta = wp.float64(poses[3 * particle + 2])
@@ -98,9 +99,9 @@ def make(name, flags):
     placing = functions(flags)
     place_pose = placing.place_pose
 
-    # Place poses: one work-item takes a particle.
     @kernel(flags)
     def place_poses(poses, pose_cell, pose, pose_low, pose_status, frame, window, particles):
+        """Place poses: one work-item takes a particle."""
         particle = work_item(wp.tid())
         if particle >= particles:
             return

@@ -34,11 +34,11 @@ def make(name, flags):
     ORDERED = "ORDERED" in flags
     cell_at, pose_at, ray_at, put = reader(wp.vec2i), reader(vec4), reader(vec2), writer(real)
 
-    # Cast rays: one work-item takes a particle and ray. A launch has fewer than 2^31.
     @kernel(flags, entry=ENTRY)
     def cast_ranges(
         map_table, world, shapes, pose_cell, pose, ray, ranges, window, particles, rays, caster, scale, crowd
     ):  # fmt: skip
+        """Cast rays: one work-item takes a particle and ray. A launch has fewer than 2^31."""
         n, k = wp.tid()
         if k >= rays or n >= particles:
             return
@@ -53,12 +53,12 @@ def make(name, flags):
             t = nearest_shape(shapes, world, crowd, n, cell, pose_at(pose, n), ray_at(ray, k), t).x
         put(ranges, n * rays + k, expected_range(t, scale))
 
-    # Cast rays in tiles of particles and rays, for GPUs.
     @kernel(flags, entry=ENTRY)
     def cast_tiles(
         map_table, world, shapes, pose_cell, pose, order, ray, ranges, window, particles, rays, caster, scale, crowd,
         spread,
     ):  # fmt: skip
+        """Cast rays in tiles of particles and rays, for GPUs."""
         item = work_item(wp.tid())
         place = tile_place(item, spread)
         if place >= particles:

@@ -11,9 +11,9 @@ import warp as wp
 from .prelude import precision
 
 
-# Return whether a cell lies outside the grid.
 @wp.func
 def off_grid(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
+    """Return whether a cell lies outside the grid."""
     return col < 0 or col >= cols or row < 0 or row >= rows
 
 
@@ -60,16 +60,18 @@ def functions(flags):
         k_y: wp.int32
         t: real
 
-    # Return the unit direction in the grid's frame: pose (frac x, frac y, cos, sin) turned by the beam's (cos, sin).
     @wp.func
     def ray_direction(pose: vec4, ray: vec2):
+        """Return the unit direction in the grid's frame: pose (frac x, frac y, cos, sin) turned by the beam's (cos,
+        sin).
+        """
         dx = pose.z * ray.x - pose.w * ray.y
         dy = pose.w * ray.x + pose.z * ray.y
         return vec2(wp.where(wp.abs(dx) < TINY, ZERO, dx), wp.where(wp.abs(dy) < TINY, ZERO, dy))
 
-    # Return the ray of a pose and a beam.
     @wp.func
     def make_ray(pose: vec4, ray: vec2):
+        """Return the ray of a pose and a beam."""
         r = Ray()
         r.direction = ray_direction(pose, ray)
         r.right = r.direction.x >= ZERO
@@ -84,33 +86,36 @@ def functions(flags):
         r.a_y = wp.where(r.up, ONE - pose.y, pose.y)
         return r
 
-    # Return the last 32 bits of a count.
     @wp.func
     def as_bits(count: real):
+        """Return the last 32 bits of a count."""
         return wp.uint32(wp.cast(count, bits))
 
-    # Add a number of boundaries to a count.
     @wp.func
     def farther(count: real, more: wp.uint32):
+        """Add a number of boundaries to a count."""
         return wp.cast(wp.cast(count, bits) + bits(more), real)
 
-    # Return k of a count.
     @wp.func
     def whole(count: real):
+        """Return k of a count."""
         return wp.int32(as_bits(count) - FIRST)
 
-    # Count the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or with ``until`` at most t. Only the
-    # boundary nearest to the coordinate at t can be in doubt.
     @wp.func
     def crossed(t: real, speed: real, a: real, inv: real, until: wp.bool):
+        """Count the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or with ``until`` at most t.
+
+        Only the boundary nearest to the coordinate at t can be in doubt.
+        """
         count = wp.max((t * speed - a) + COUNT, COUNT)
         here = ((count - COUNT) + a) * inv
         return wp.where(here < t or (until and here == t), count + ONE, count)
 
-    # Return the walk at the ray's origin or, where that lies outside the grid, at the first cell inside; t is limit
-    # where a ray from outside does not meet the grid before limit.
     @wp.func
     def start_walk(r: Ray, cell: wp.vec2i, window: types.Window, limit: real):
+        """Return the walk at the ray's origin or, where that lies outside the grid, at the first cell inside; t is
+        limit where a ray from outside does not meet the grid before limit.
+        """
         walk = Walk()
         if ORIGINS_OUTSIDE:
             if off_grid(cell.x, cell.y, window.rows, window.cols):
@@ -133,9 +138,9 @@ def functions(flags):
                         walk.t = t
         return walk
 
-    # Return a direction as a part of a full turn in [0, 1], within 2e-6.
     @wp.func
     def turn_of(direction: vec2):
+        """Return a direction as a part of a full turn in [0, 1], within 2e-6."""
         x = wp.abs(direction.x)
         y = wp.abs(direction.y)
         a = wp.where(x > y, y / x, x / y)
@@ -146,16 +151,17 @@ def functions(flags):
         upper = wp.where(direction.x >= ZERO, quarter, HALF - quarter)
         return wp.where(direction.y >= ZERO, upper, ONE - upper)
 
-    # Return the angle bin with the nearest centre; centres are at 0, 1 / bins, ... of a turn.
     @wp.func
     def angle_bin(direction: vec2, bins: wp.int32):
+        """Return the angle bin with the nearest centre; centres are at 0, 1 / bins, ... of a turn."""
         index = int(turn_of(direction) * real(bins) + HALF)
         return wp.where(index >= bins, index - bins, index)
 
-    # Convert a distance in cells to metres, exactly range_max where nothing is nearer, or with AMCL_LINES where nothing
-    # is met.
     @wp.func
     def expected_range(t: real, scale: types.RangeScale):
+        """Convert a distance in cells to metres, exactly range_max where nothing is nearer, or with AMCL_LINES where
+        nothing is met.
+        """
         if AMCL_LINES:
             return wp.where(t == scale.limit, scale.range_max, t * scale.resolution)
         return wp.where(t >= scale.limit, scale.range_max, wp.min(t * scale.resolution, scale.range_max))

@@ -14,22 +14,24 @@ BITS = wp.constant(12)
 UNIT = wp.constant(1 << 12)
 
 
-# Return the distance along an axis to the first boundary that a ray crosses.
 @wp.func
 def to_boundary(inside: wp.int32, step: wp.int32):
+    """Return the distance along an axis to the first boundary that a ray crosses."""
     return wp.where(step > 0, UNIT - inside, inside)
 
 
-# Return whether a walk has left the extent of an axis for good.
 @wp.func
 def has_left(cell: wp.int32, step: wp.int32, cells: wp.int32):
+    """Return whether a walk has left the extent of an axis for good."""
     return wp.where(step > 0, cell >= cells, cell < 0)
 
 
-# Return the number of boundaries of an axis that a ray crosses before a boundary of the other axis.
-# Products of lengths fit in 64 bits, since rays span at most 2^19 cells.
 @wp.func
 def crossed_before(first: wp.int32, size: wp.int64, reached: wp.int64, other: wp.int64, ties: wp.int32):
+    """Return the number of boundaries of an axis that a ray crosses before a boundary of the other axis.
+
+    Products of lengths fit in 64 bits, since rays span at most 2^19 cells.
+    """
     room = reached * size - wp.int64(first) * other - wp.int64(1 - ties)
     crossed = wp.int64(0)
     if room >= wp.int64(0):
@@ -37,9 +39,9 @@ def crossed_before(first: wp.int32, size: wp.int64, reached: wp.int64, other: wp
     return crossed
 
 
-# Add the cells of rays to the counts; cells outside the grid are left out. One work-item takes a ray.
 @kernel()
 def count_rays(start_cell, start_inside, end_cell, end_inside, hit, hits, misses, rows, cols, rays):
+    """Add the cells of rays to the counts; cells outside the grid are left out. One work-item takes a ray."""
     n = wp.tid()
     if n >= rays:
         return

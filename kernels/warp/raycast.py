@@ -40,10 +40,12 @@ def functions(flags):
     # Planes of a map.
     PLANES = 4 * SECTORS
 
-    # Return the sector of a direction within its quadrant, from flat to steep. A wrong sector would cost steps, but not
-    # change the result.
     @wp.func
     def sector_of(speed_x: real, speed_y: real):
+        """Return the sector of a direction within its quadrant, from flat to steep.
+
+        A wrong sector would cost steps, but not change the result.
+        """
         sector = int(0)
         if SECTORS_2:
             sector = wp.where(speed_y > speed_x, 1, 0)
@@ -67,9 +69,9 @@ def functions(flags):
         step_y: wp.uint32
         skip: wp.uint32
 
-    # Return the track of a ray that begins in a cell through the plane of its direction.
     @wp.func
     def track_of(r: Ray, cell: wp.vec2i, window: types.Window):
+        """Return the track of a ray that begins in a cell through the plane of its direction."""
         plane = (wp.where(r.right, 0, 1) + wp.where(r.up, 0, 2)) * SECTORS + sector_of(r.speed_x, r.speed_y)
         stride = GROUP * (window.cols + 2)
         groups = (window.rows + 2 + GROUP - 1) // GROUP
@@ -85,9 +87,9 @@ def functions(flags):
             track.col += wp.uint32(stride * (cell.y + 1)) - track.step_y * FIRST
         return track
 
-    # Return the rectangle at the cell of a track behind k_x and k_y boundaries.
     @wp.func
     def rectangle_at(map_table: wp.array(dtype=ENTRY), track: Track, k_x: real, k_y: real):
+        """Return the rectangle at the cell of a track behind k_x and k_y boundaries."""
         col = track.col + track.step_x * as_bits(k_x)
         index = col + track.step_y * as_bits(k_y)
         if ROW_GROUPS:
@@ -95,12 +97,12 @@ def functions(flags):
             index = col + row + row // ROWS * track.skip
         return wp.uint32(entry_at(map_table, wp.int32(index)))
 
-    # Return the distance in cells to the first occupied cell, limit where none is nearer.
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY), window: types.Window, cell: wp.vec2i, pose: vec4, ray: vec2, limit: real,
         caster: types.Caster,
     ):  # fmt: skip
+        """Return the distance in cells to the first occupied cell, limit where none is nearer."""
         r = make_ray(pose, ray)
         if ORIGINS_OUTSIDE and OUTSIDE_OCCUPIED:
             if off_grid(cell.x, cell.y, window.rows, window.cols):

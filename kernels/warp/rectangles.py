@@ -34,34 +34,36 @@ STACK = wp.constant(256)
 behind_of = behind(wp.uint16)
 
 
-# Return the index of a cell in a padded plane.
 @wp.func
 def padded(row: wp.int32, col: wp.int32, cols: wp.int32):
+    """Return the index of a cell in a padded plane."""
     return (row + 1) * (cols + 2) + col + 1
 
 
-# Return the index of a cell in a padded plane of groups of rows.
 @wp.func
 def padded_in_groups(row: wp.int32, col: wp.int32, cols: wp.int32, group: wp.int32):
+    """Return the index of a cell in a padded plane of groups of rows."""
     return (row + 1) // group * (cols + 2) * group + (col + 1) * group + (row + 1) % group
 
 
-# Return the first cell along an axis whose rectangle can contain the cell low or one beyond it. Rectangles extend to
-# larger (way 1) or smaller (way -1) indices.
 @wp.func
 def reach_begin(way: wp.int32, low: wp.int32):
+    """Return the first cell along an axis whose rectangle can contain the cell low or one beyond it.
+
+    Rectangles extend to larger (way 1) or smaller (way -1) indices.
+    """
     return wp.where(way > 0, wp.max(low - RECTANGLE_REACH, 0), low)
 
 
-# Return one beyond the last cell whose rectangle can contain a cell before high.
 @wp.func
 def reach_end(way: wp.int32, high: wp.int32, size: wp.int32):
+    """Return one beyond the last cell whose rectangle can contain a cell before high."""
     return wp.where(way > 0, high, wp.min(high + RECTANGLE_REACH, size))
 
 
-# Return height and width in the proportion of the ray in the middle of a sector.
 @wp.func
 def slope(sectors: wp.int32, sector: wp.int32):
+    """Return height and width in the proportion of the ray in the middle of a sector."""
     if sectors == 1:
         return wp.vec2i(1, 1)
     if sectors == 2:
@@ -77,10 +79,11 @@ def slope(sectors: wp.int32, sector: wp.int32):
     return wp.vec2i(5, 1)
 
 
-# Count the free cells along columns of the band, to larger rows (direction 0) or smaller rows (direction 1), for
-# columns in [begin, end). For processors: one work-item takes 64 columns and a direction.
 @kernel()
 def free_columns(occupied, runs, band, cols, begin, end):
+    """Count the free cells along columns of the band, to larger rows (direction 0) or smaller rows (direction 1), for
+    columns in [begin, end). For processors: one work-item takes 64 columns and a direction.
+    """
     direction, strip = wp.tid()
     first = begin + 64 * strip
     until = wp.min(first + 64, end)
@@ -96,14 +99,16 @@ def free_columns(occupied, runs, band, cols, begin, end):
             runs[out + row * cols + col] = wp.uint8(free)
 
 
-# Find the rectangles along rows, from the far end of a row to its begin. For processors: one work-item takes a row and
-# quadrant of a world. The widest rectangle of sufficient height is at most one column wider than its neighbour's. The
-# stack has the columns that bound its height, each lower than all before it: free cells in the upper 16 bits, and the
-# last 16 bits of the column, which give the distance.
 @kernel()
 def rectangles_rows(
     runs, place, stack, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds
 ):  # fmt: skip
+    """Find the rectangles along rows, from the far end of a row to its begin.
+
+    For processors: one work-item takes a row and quadrant of a world. The widest rectangle of sufficient height is at
+    most one column wider than its neighbour's. The stack has the columns that bound its height, each lower than all
+    before it: free cells in the upper 16 bits, and the last 16 bits of the column, which give the distance.
+    """
     way, item = wp.tid()
     quadrant = way & 3
     w = way >> 2
@@ -154,10 +159,11 @@ def rectangles_rows(
                 planes[out + padded(row, col, cols)] = wp.uint16(sides)
 
 
-# Count the free cells along rows, to the right (direction 0) and to the left (direction 1), for columns in [begin,
-# end). For GPUs: one work-item takes a cell.
 @kernel()
 def free_rows(bits, runs, band, cols, words, begin, end):
+    """Count the free cells along rows, to the right (direction 0) and to the left (direction 1), for columns in [begin,
+    end). For GPUs: one work-item takes a cell.
+    """
     row, item = wp.tid()
     col = begin + item
     if row >= band or col >= end:
@@ -169,12 +175,14 @@ def free_rows(bits, runs, band, cols, words, begin, end):
     runs[band * cols + cell] = wp.uint8(wp.min(left, LONGEST))
 
 
-# Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a cell and
-# quadrant; the first work-item of a quadrant takes the first of its cells.
 @kernel()
 def rectangles_scan(
     runs, place, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds, lines, group
 ):  # fmt: skip
+    """Find the rectangles along columns: the higher a rectangle, the narrower.
+
+    For GPUs: one work-item takes a cell and quadrant; the first work-item of a quadrant takes the first of its cells.
+    """
     way, row_item, col_item = wp.tid()
     quadrant = way & 3
     w = way >> 2

@@ -30,9 +30,9 @@ def make(name, flags):
     two_sum, pair_sum = exact.two_sum, exact.pair_sum
     HUGE_HEADINGS = "HUGE_HEADINGS" in flags
 
-    # Return theta - target in [-pi, pi]; the target is in that interval.
     @wp.func
     def wrapped_difference(theta: wp.float64, target: wp.vec2d):
+        """Return theta - target in [-pi, pi]; the target is in that interval."""
         quadrant = int(0)
         rest = wp.vec2d()
         if HUGE_HEADINGS:
@@ -49,18 +49,21 @@ def make(name, flags):
         turns = wp.where(angle.x > HALF_TURN, MINUS_FOUR, wp.where(angle.x < MINUS_HALF_TURN, FOUR, ZERO))
         return pair_sum(angle, wp.vec2d(turns * QUARTER, turns * QUARTER_LOW))
 
-    # Round a coordinate to a sum of two numbers in the model's precision.
     @wp.func
     def rounded_place(at: wp.vec2d):
+        """Round a coordinate to a sum of two numbers in the model's precision."""
         high = wp.min(wp.max(at.x, MINUS_FARTHEST), FARTHEST)
         low = wp.where(high == at.x, at.y, ZERO)
         rounded = real(high)
         return vec2(rounded, real((high - wp.float64(rounded)) + low))
 
-    # Place sensors relative to an origin: x, its low part, y, its low part. One work-item takes a particle.
-    # pose_status, which the caller clears, becomes 1 at index 0 if a pose is not finite; its place is the origin.
     @kernel(flags)
     def place_relative(poses, place, pose_status, origin_x, origin_y, mount_x, mount_y, particles):
+        """Place sensors relative to an origin: x, its low part, y, its low part.
+
+        One work-item takes a particle. pose_status, which the caller clears, becomes 1 at index 0 if a pose is not
+        finite; its place is the origin.
+        """
         n = wp.tid()
         if n >= particles:
             return
@@ -84,10 +87,12 @@ def make(name, flags):
         at_y = rounded_place(y)
         place[n] = vec4(at_x.x, at_x.y, at_y.x, at_y.y)
 
-    # Subtract the target from headings and wrap to [-pi, pi], a sum of two numbers. One work-item takes a particle.
-    # pose_status is as for place_relative.
     @kernel(flags)
     def wrap_headings(poses, residual, pose_status, target, target_low, particles):
+        """Subtract the target from headings and wrap to [-pi, pi], a sum of two numbers.
+
+        One work-item takes a particle. pose_status is as for place_relative.
+        """
         n = wp.tid()
         if n >= particles:
             return

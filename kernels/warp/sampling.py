@@ -92,9 +92,9 @@ OUTERMOST_UNDER = wp.constant(factors_8(
 SHORT_SERIES = wp.constant(wp.float64(1e-4))
 
 
-# Return numbers in (0, 1) from two words, the centres of 2^52 intervals.
 @wp.func
 def fine_uniform(high: wp.uint32, low: wp.uint32):
+    """Return numbers in (0, 1) from two words, the centres of 2^52 intervals."""
     return ((wp.float64(high) * HALF_WORD + wp.float64(low >> WORD_SHIFT)) + HALF) * FINE
 
 
@@ -103,9 +103,9 @@ def functions(flags):
     """Make the functions of the file for a set of flags."""
     MASS_TABLE = "MASS_TABLE" in flags
 
-    # Return the mass of the standard normal between 0 and x >= 0.
     @wp.func
     def half_mass(x: wp.float64):
+        """Return the mass of the standard normal between 0 and x >= 0."""
         if x >= HALF_FROM:
             return HALF
         if x >= SERIES_END:
@@ -121,17 +121,17 @@ def functions(flags):
             total = total + term
         return x * (NORMAL_PEAK * exp_of(MINUS_HALF * square)) * total
 
-    # Return a polynomial by Horner's rule, the highest power first.
     @wp.func
     def polynomial(factor: factors_8, x: wp.float64):
+        """Return a polynomial by Horner's rule, the highest power first."""
         value = factor[0]
         for i in range(1, 8):
             value = value * x + factor[i]
         return value
 
-    # Return the x >= 0 with a mass of the standard normal between 0 and x, from 0 to MOST_HALF.
     @wp.func
     def half_quantile(mass: wp.float64):
+        """Return the x >= 0 with a mass of the standard normal between 0 and x, from 0 to MOST_HALF."""
         if mass <= CENTRAL:
             r = CENTRAL_OFFSET - mass * mass
             return mass * (polynomial(CENTRAL_OVER, r) / polynomial(CENTRAL_UNDER, r))
@@ -142,18 +142,18 @@ def functions(flags):
         outermost = root - OUTERMOST_OFFSET
         return polynomial(OUTERMOST_OVER, outermost) / polynomial(OUTERMOST_UNDER, outermost)
 
-    # Return a standard normal deviate between -low <= 0 and high >= 0.
     @wp.func
     def normal_within(u: wp.float64, low: wp.float64, high: wp.float64):
+        """Return a standard normal deviate between -low <= 0 and high >= 0."""
         below = half_mass(low)
         above = half_mass(high)
         mark = u * (below + above) - below
         size = half_quantile(wp.min(wp.abs(mark), MOST_HALF))
         return wp.min(wp.max(wp.where(mark < ZERO, -size, size), -low), high)
 
-    # Return the number of a table that begins at a place, at a logarithmic coordinate.
     @wp.func
     def tabulated(at: wp.float64, tables: wp.array(dtype=wp.float64), place: wp.int32):
+        """Return the number of a table that begins at a place, at a logarithmic coordinate."""
         steps = at * DRAW_PER_LOG
         cell = wp.int32(wp.min(steps, DRAW_LAST))
         share = steps - wp.float64(cell)
@@ -163,16 +163,16 @@ def functions(flags):
             value = value * share + tables[first + DRAW_POWERS - 2 - i]
         return value
 
-    # Return the mass of a hit between its mean and a distance of u scales, from its table.
     @wp.func
     def table_mass(u: wp.float64, tables: wp.array(dtype=wp.float64), place: wp.int32):
+        """Return the mass of a hit between its mean and a distance of u scales, from its table."""
         return wp.min(tabulated(log_of(ONE + wp.min(u, FARTHEST_HIT) * SQRT_HALF), tables, place), HALF)
 
-    # Return a deviate of a hit between -low <= 0 and high >= 0, from its tables.
     @wp.func
     def table_within(
         u: wp.float64, low: wp.float64, high: wp.float64, tables: wp.array(dtype=wp.float64), place: wp.int32
     ):
+        """Return a deviate of a hit between -low <= 0 and high >= 0, from its tables."""
         below = table_mass(low, tables, place)
         above = table_mass(high, tables, place)
         mark = u * (below + above) - below
@@ -180,9 +180,9 @@ def functions(flags):
         size = (exp_of(tabulated(level, tables, place + DRAW_CELLS * DRAW_POWERS)) - ONE) / SQRT_HALF
         return wp.min(wp.max(wp.where(mark < ZERO, -size, size), -low), high)
 
-    # Return a range drawn from p_short, up to the expected range (> 0).
     @wp.func
     def short_of(u: wp.float64, expected: wp.float64, decay: wp.float64):
+        """Return a range drawn from p_short, up to the expected range (> 0)."""
         x = decay * expected
         if x < SHORT_SERIES:
             square = u * u
@@ -190,12 +190,12 @@ def functions(flags):
             return wp.min(expected * (u + x * ((square - u) / TWO + x * bend)), expected)
         return wp.min(-log_of((ONE - u) + u * exp_of(-x)) / decay, expected)
 
-    # Return a reading drawn from the mixture; infinity without return, NaN where no reading is possible.
     @wp.func
     def reading_of(
         u: wp.float64, v: wp.float64, expected: wp.float64, mixture: wp.array(dtype=wp.float64), bins: wp.int32,
         range_max: wp.float64,
     ):  # fmt: skip
+        """Return a reading drawn from the mixture; infinity without return, NaN where no reading is possible."""
         p = DRAW_TERMS * bins
         first = mixture[p]
         second = first + wp.where(expected > ZERO, mixture[p + 1], ZERO)
@@ -217,12 +217,12 @@ def functions(flags):
             return short_of(v, expected, mixture[p + 7])
         return wp.where(mark < third, INFINITE, v * range_max)
 
-    # Return a reading drawn from a table: uniform in a drawn bin, at a margin from the bin's ends.
     @wp.func
     def cell_reading_of(
         u: wp.float64, v: wp.float64, column: wp.int32, chances: wp.array(dtype=wp.float64), cells: wp.int32,
         range_max: wp.float64, margin: wp.float64,
     ):  # fmt: skip
+        """Return a reading drawn from a table: uniform in a drawn bin, at a margin from the bin's ends."""
         row = column * (cells + 1)
         mark = u * chances[row + cells]
         low = int(0)
@@ -251,10 +251,12 @@ def make(name, flags):
     SENSOR_TABLE = "SENSOR_TABLE" in flags
     INCIDENCE = "INCIDENCE" in flags
 
-    # Replace expected ranges by readings; incidence holds cosines, and edges the cosines between bins. One work-item
-    # takes a particle and ray; a launch has fewer than 2^31.
     @kernel(flags)
     def draw_readings(incidence, mixture, edges, chances, settings, ranges, particles, rays, tables, scale):
+        """Replace expected ranges by readings; incidence holds cosines, and edges the cosines between bins.
+
+        One work-item takes a particle and ray; a launch has fewer than 2^31.
+        """
         i, k = wp.tid()
         if k >= rays or i >= particles:
             return

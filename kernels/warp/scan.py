@@ -21,9 +21,11 @@ ZERO = wp.constant(wp.float64(0.0))
 MISSING, FAR = wp.constant(wp.float64(math.nan)), wp.constant(wp.float64(math.inf))
 
 
-# Return whether an even choice of informative readings includes this rank: some i * informative / chosen equals it.
 @wp.func
 def is_chosen(rank: wp.int32, informative: wp.int32, chosen: wp.int32):
+    """Return whether an even choice of informative readings includes this rank: some i * informative / chosen equals
+    it.
+    """
     if chosen >= informative:
         return True
     if chosen == 0:
@@ -48,9 +50,9 @@ def make(name, flags):
     NOTHING, NEVER = real(0.0), real(-math.inf)
     NO_READING, AHEAD = real(math.nan), vec2(1.0, 0.0)
 
-    # Return reading k of the chosen beams, nan beyond the last.
     @wp.func
     def reading_of(k: wp.int32, ranges: wp.array(dtype=measured), beam: wp.array(dtype=wp.int32), beams: wp.int32):
+        """Return reading k of the chosen beams, nan beyond the last."""
         z = wp.float64(MISSING)
         if k < beams:
             if SOME_BEAMS:
@@ -59,9 +61,9 @@ def make(name, flags):
                 z = wp.float64(ranges[k])
         return z
 
-    # Return the number of informative readings; not counted where all are chosen.
     @wp.func
     def count_informative(ranges: wp.array(dtype=measured), beam: wp.array(dtype=wp.int32), rules: ReadingRules):
+        """Return the number of informative readings; not counted where all are chosen."""
         informative = int(rules.beams)
         if rules.chosen < rules.beams:
             informative = int(0)
@@ -72,12 +74,14 @@ def make(name, flags):
                     informative += 1
         return informative
 
-    # Read the 16 readings from first on. Return them, and the sets of ranges and of max readings: bit i is reading
-    # first + i.
     @wp.func
     def read_block(
         first: wp.int32, ranges: wp.array(dtype=measured), beam: wp.array(dtype=wp.int32), rules: ReadingRules
     ):
+        """Read the 16 readings from first on.
+
+        Return them, and the sets of ranges and of max readings: bit i is reading first + i.
+        """
         several = block_terms()
         for i in range(BLOCK_TERMS):
             several[i] = reading_of(first + i, ranges, beam, rules.beams)
@@ -88,9 +92,9 @@ def make(name, flags):
             fars = fars | (int(is_max(several[i], rules.farthest)) << i)
         return several, hits, fars
 
-    # Return the set of a block's informative readings that are chosen; rank belongs to the first reading.
     @wp.func
     def chosen_of(telling: wp.int32, rank: wp.int32, informative: wp.int32, chosen: wp.int32):
+        """Return the set of a block's informative readings that are chosen; rank belongs to the first reading."""
         used = int(telling)
         if chosen < informative:
             for i in range(BLOCK_TERMS):
@@ -99,10 +103,11 @@ def make(name, flags):
                     used = used & ~(1 << i)
         return used
 
-    # Return the sets of a block's chosen readings that get a place, as ranges and as max readings, and of all readings
-    # with a place; left readings remain from the first of the block on.
     @wp.func
     def placed_of(used: wp.int32, hits: wp.int32, fars: wp.int32, left: wp.int32, rules: ReadingRules):
+        """Return the sets of a block's chosen readings that get a place, as ranges and as max readings, and of all
+        readings with a place; left readings remain from the first of the block on.
+        """
         as_range = int(0)
         if rules.possible != 0:
             as_range = used & hits
@@ -114,10 +119,11 @@ def make(name, flags):
             placed = (1 << wp.min(left, BLOCK_TERMS)) - 1
         return as_range, as_far, placed
 
-    # Return a block's longest range among readings placed in the block of places from begin on; place belongs to the
-    # first reading.
     @wp.func
     def longest_beside(several: block_terms, as_range: wp.int32, placed: wp.int32, place: wp.int32, begin: wp.int32):
+        """Return a block's longest range among readings placed in the block of places from begin on; place belongs to
+        the first reading.
+        """
         longest = wp.float64(0.0)
         for i in range(BLOCK_TERMS):
             other = place + popcount(placed & ((1 << i) - 1))
@@ -126,14 +132,15 @@ def make(name, flags):
                 longest = wp.max(longest, several[i])
         return longest
 
-    # Fill a place with the end point of a reading: the reading times the vector of its beam, in cells, with the
-    # rounding error in point_low. The guard of a block of places is guard_scale (longest + 2 cells), of its longest
-    # reading.
     @wp.func
     def fill_end_point(
         place: wp.int32, value: wp.float64, vector: wp.vec2d, longest: wp.float64, point: wp.array(dtype=vec2),
         point_low: wp.array(dtype=vec2), guard: wp.array(dtype=real), resolution: wp.float64, guard_scale: wp.float64,
     ):  # fmt: skip
+        """Fill a place with the end point of a reading: the reading times the vector of its beam, in cells, with the
+        rounding error in point_low. The guard of a block of places is guard_scale (longest + 2 cells), of its
+        longest reading.
+        """
         cells = value / resolution
         length = wp.where(wp.isfinite(cells), cells, ZERO)
         x = vector.x * length
@@ -146,12 +153,14 @@ def make(name, flags):
         if place % BLOCK_TERMS == 0:
             guard[place // BLOCK_TERMS] = real(guard_scale * (longest / resolution + wp.float64(2.0)))
 
-    # Fill a place with a reading, at most top, and with the vectors of its beam, the first of which is read already.
     @wp.func
     def fill_rays(
         place: wp.int32, value: wp.float64, vector: wp.vec2d, vectors: wp.array(dtype=wp.float64), source: wp.int32,
         point: wp.array(dtype=vec2), reading: wp.array(dtype=real), each: wp.int32, top: wp.float64,
     ):  # fmt: skip
+        """Fill a place with a reading, at most top, and with the vectors of its beam, the first of which is read
+        already.
+        """
         point[place * each] = vec2(real(vector.x), real(vector.y))
         for j in range(1, each):
             point[place * each + j] = vec2(real(vectors[source + 2 * j]), real(vectors[source + 2 * j + 1]))
@@ -160,8 +169,6 @@ def make(name, flags):
             rounded = real(top)
         reading[place] = rounded
 
-    # Fill the place of an item's reading, if it has one, and with left_over the place of the item with a missing
-    # reading.
     @wp.func
     def fill_item(
         item: wp.int32, item_place: wp.int32, left_over: wp.bool, value: wp.float64, vector_of_item: wp.vec2d,
@@ -169,6 +176,9 @@ def make(name, flags):
         point_low: wp.array(dtype=vec2), reading: wp.array(dtype=real), guard: wp.array(dtype=real),
         resolution: wp.float64, rules: ReadingRules,
     ):  # fmt: skip
+        """Fill the place of an item's reading, if it has one, and with left_over the place of the item with a missing
+        reading.
+        """
         if END_POINTS:
             scale = rules.guard_scale
             if item_place < rules.places:
@@ -186,9 +196,6 @@ def make(name, flags):
                     point[item * each + j] = AHEAD
                 reading[item] = NO_READING
 
-    # Place one reading: find its place from all readings, and fill that place; an item beyond the readings fills a
-    # place at the end. 16 readings are read before any is used. A max reading is inf. constant_term is that of max
-    # readings without a place, -inf if there is a range where none is possible.
     @wp.func
     def place_reading(
         item: wp.int32, ranges: wp.array(dtype=measured), beam: wp.array(dtype=wp.int32),
@@ -196,6 +203,10 @@ def make(name, flags):
         reading: wp.array(dtype=real), guard: wp.array(dtype=real), constant_term: wp.array(dtype=real),
         resolution: wp.float64, rules: ReadingRules,
     ):  # fmt: skip
+        """Place one reading: find its place from all readings, and fill that place; an item beyond the readings fills a
+        place at the end. 16 readings are read before any is used. A max reading is inf. constant_term is that of max
+        readings without a place, -inf if there is a range where none is possible.
+        """
         # Values that are needed last are read first, so that nothing waits for them.
         source = 2 * item * rules.each
         item_reading = reading_of(item, ranges, beam, rules.beams)
@@ -250,13 +261,14 @@ def make(name, flags):
                 constant = NEVER
             constant_term[0] = constant
 
-    # Place readings and poses: one work-item takes a beam and place, in whole groups; after these, one takes a
-    # particle.
     @kernel(flags)
     def place_inputs(
         poses, pose_cell, pose, pose_low, pose_status, ranges, beam, vector, point, point_low, reading, guard,
         constant_term, frame, window, particles, head, rules,
     ):  # fmt: skip
+        """Place readings and poses: one work-item takes a beam and place, in whole groups; after these, one takes a
+        particle.
+        """
         item = work_item(wp.tid())
         particle = item - head
         if particle >= 0 and particle < particles:

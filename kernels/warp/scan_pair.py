@@ -16,14 +16,16 @@ def make(name, flags):
     place_points = pair_steps.functions(flags).place_points
     fit_scan = line_fit.functions(flags).fit_scan
 
-    # Place two scans of one scanner, a reference and a second one: points of their hits by bearing, with lines for the
-    # noise of the pair; the pair itself, with the row of its rules, which depends on its level of noise and on the
-    # stride of its second scan; and its level, points and sums of squared ranges. One work-item takes the pair.
     @kernel(flags)
     def place_pair(
         reading, beam, weight, level, work, point, line, start, pair, summary, beams, places, padded, step, nearest,
         farthest, levels, assumed, coarse, strides, reach, most, ratio, width, gap,
     ):  # fmt: skip
+        """Place two scans of one scanner, a reference and a second one: points of their hits by bearing, with lines for
+        the noise of the pair; the pair itself, with the row of its rules, which depends on its level of noise and on
+        the stride of its second scan; and its level, points and sums of squared ranges. One work-item takes the
+        pair.
+        """
         item = wp.tid()
         if item > 0:
             return

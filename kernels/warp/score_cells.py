@@ -10,22 +10,23 @@ SHIFT_ROWS = 8
 ScoreTable = precision(frozenset()).ScoreTable
 
 
-# Return the rows of a table with its margin.
 @wp.func
 def padded_lines(scores: ScoreTable):
+    """Return the rows of a table with its margin."""
     return scores.rows + 2 * scores.margin
 
 
-# Return the columns of a table with its margin.
 @wp.func
 def padded_stride(scores: ScoreTable):
+    """Return the columns of a table with its margin."""
     return scores.cols + 2 * scores.margin
 
 
-# Return the index of a cell in its table, from which cells up to rows lines and cols columns further are read; cells
-# beyond the margin have the value of the margin's outer cells.
 @wp.func
 def block_index(scores: ScoreTable, row: wp.int32, col: wp.int32, rows: wp.int32, cols: wp.int32):
+    """Return the index of a cell in its table, from which cells up to rows lines and cols columns further are read;
+    cells beyond the margin have the value of the margin's outer cells.
+    """
     line = wp.min(wp.max(row, -scores.margin), scores.rows + scores.margin - 1 - rows) + scores.margin
     begin = wp.min(wp.max(col, -scores.margin), scores.cols + scores.margin - 1 - cols) + scores.margin
     return line * padded_stride(scores) + begin

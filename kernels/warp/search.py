@@ -21,9 +21,9 @@ from .score_cells import SHIFT_ROWS, block_index, padded_lines, padded_stride
 Rows = wp.types.vector(length=SHIFT_ROWS, dtype=wp.int32)
 
 
-# Write the maximum of each cell and the cells up to reach rows and columns further. One work-item takes a cell.
 @kernel()
 def pool_scores(table, pooled, scores, reach):
+    """Write the maximum of each cell and the cells up to reach rows and columns further. One work-item takes a cell."""
     image, line, col = wp.tid()
     lines = padded_lines(scores)
     stride = padded_stride(scores)
@@ -37,10 +37,11 @@ def pool_scores(table, pooled, scores, reach):
     pooled[begin + line * stride + col] = wp.max(upper, lower)
 
 
-# Write every period-th row and column of each padded table as an image, for each of (period / step)^2 first cells, step
-# apart. One work-item takes a cell of an image.
 @kernel()
 def fold_scores(table, out, scores, folded, period, step, beyond):
+    """Write every period-th row and column of each padded table as an image, for each of (period / step)^2 first cells,
+    step apart. One work-item takes a cell of an image.
+    """
     image, line, col = wp.tid()
     lines = padded_lines(folded)
     stride = padded_stride(folded)
@@ -59,10 +60,11 @@ def fold_scores(table, out, scores, folded, period, step, beyond):
     out[(image * lines + line) * stride + col] = value
 
 
-# Sum the cells of each item's runs at all shifts by less than height rows and width columns; a shift that is not
-# allowed has -1. One work-item takes SHIFT_ROWS rows of a column of an item.
 @kernel()
 def shift_scores(table, run, image, weight, first, runs, allowed, score, scores, begin, items, height, width):
+    """Sum the cells of each item's runs at all shifts by less than height rows and width columns; a shift that is not
+    allowed has -1. One work-item takes SHIFT_ROWS rows of a column of an item.
+    """
     part, block, col = wp.tid()
     item = begin + part
     row = SHIFT_ROWS * block
@@ -91,9 +93,9 @@ def shift_scores(table, run, image, weight, first, runs, allowed, score, scores,
             score[item * height * width + n] = value
 
 
-# Find the largest score of each row of shifts, and its first column. One work-item takes a row of an item.
 @kernel()
 def row_maxima(score, best, rows, width):
+    """Find the largest score of each row of shifts, and its first column. One work-item takes a row of an item."""
     n = wp.tid()
     if n >= rows:
         return
@@ -107,11 +109,12 @@ def row_maxima(score, best, rows, width):
     best[2 * n + 1] = place
 
 
-# Collect the shifts whose scores are at least low and less than high of their scan, in no certain order: item, first
-# row and column of each block, and score. count[slot], which the caller clears, may exceed room: then some are left
-# out. best is the result of row_maxima. One work-item takes a row of an item.
 @kernel()
 def choose_blocks(score, best, low, high, block, count, rows, height, width, turns, level, room, slot):
+    """Collect the shifts whose scores are at least low and less than high of their scan, in no certain order: item,
+    first row and column of each block, and score. count[slot], which the caller clears, may exceed room: then some
+    are left out. best is the result of row_maxima. One work-item takes a row of an item.
+    """
     k = wp.tid()
     if k >= rows:
         return
@@ -131,14 +134,15 @@ def choose_blocks(score, best, low, high, block, count, rows, height, width, tur
                 block[4 * n + 3] = value
 
 
-# Divide blocks of positions into quarters of 2^level x 2^level, and collect the allowed ones whose scores are at least
-# low of their scan, in no certain order. above has the tables of the blocks. The caller clears count[slot]. One
-# work-item takes a block.
 @kernel()
 def divide_blocks(
     table, above, point, image, first, block, allowed, low, part, count, scores, blocks, height, width, columns, turns,
     level, spacing, slot,
 ):  # fmt: skip
+    """Divide blocks of positions into quarters of 2^level x 2^level, and collect the allowed ones whose scores are at
+    least low of their scan, in no certain order. above has the tables of the blocks. The caller clears count[slot].
+    One work-item takes a block.
+    """
     n = wp.tid()
     if n >= blocks:
         return

@@ -5,21 +5,22 @@ import warp as wp
 from .prelude import kernel
 
 
-# Return the quotient of integers, rounded down.
 @wp.func
 def floored(number: wp.int32, divisor: wp.int32):
+    """Return the quotient of integers, rounded down."""
     quotient = number // divisor
     if quotient * divisor > number:
         quotient = quotient - 1
     return quotient
 
 
-# Place the end points of a scan at a heading: the cells of points, and runs of neighbouring points of the same cell of
-# a folded table, by 64 at most. One work-item takes an item.
 @kernel()
 def place_ends(
     end, heading, start, first, image, point, run, run_image, weight, runs, items, turns, period, step, offset
 ):  # fmt: skip
+    """Place the end points of a scan at a heading: the cells of points, and runs of neighbouring points of the same
+    cell of a folded table, by 64 at most. One work-item takes an item.
+    """
     item = wp.tid()
     if item >= items:
         return

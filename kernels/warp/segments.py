@@ -33,21 +33,21 @@ def functions(flags):
     PARALLEL, TIED, TIED_AT = real(1e-6), real(3e-7), real(1e5)
     LAST_STEP = STEPS + 1
 
-    # Return the median of three numbers.
     @wp.func
     def middle_of_three(a: real, b: real, c: real):
+        """Return the median of three numbers."""
         return wp.max(wp.min(a, b), wp.min(wp.max(a, b), c))
 
-    # Return the weight of the row (x, y, 1) of point i; its range is the median of three neighbours.
     @wp.func
     def weight_at(point: wp.array(dtype=vec4), i: wp.int32, first: wp.int32, last: wp.int32, sigma: real):
+        """Return the weight of the row (x, y, 1) of point i; its range is the median of three neighbours."""
         r = point[i][3]
         middle = middle_of_three(point[wp.max(i - 1, first)][3], r, point[wp.min(i + 1, last - 1)][3])
         return middle * middle / (sigma * r)
 
-    # Return the rows with another row (a, b | v).
     @wp.func
     def add_row(rows: rows6, first: real, second: real, right: real):
+        """Return the rows with another row (a, b | v)."""
         a = first
         b = second
         v = right
@@ -78,28 +78,30 @@ def functions(flags):
             v = c * v - s * side
         return rows6(r11, r12, z1, r22, z2, rows[5] + v * v)
 
-    # Return the rows including a point's.
     @wp.func
     def with_point(rows: rows6, point: wp.array(dtype=vec4), i: wp.int32, first: wp.int32, last: wp.int32, sigma: real):
+        """Return the rows including a point's."""
         weight = weight_at(point, i, first, last, sigma)
         p = point[i]
         return add_row(rows, weight * p[0], weight * p[1], weight)
 
-    # Return the cost of a line through points first to last.
     @wp.func
     def cost_of(point: wp.array(dtype=vec4), first: wp.int32, last: wp.int32, sigma: real):
+        """Return the cost of a line through points first to last."""
         rows = rows6()
         for i in range(first, last):
             rows = with_point(rows, point, i, first, last, sigma)
         return rows[5]
 
-    # Return the first point of the second line of the best split, the cost reduction, and the unsplit cost. The point
-    # is -1 if no split can lower the cost by penalty.
     @wp.func
     def best_split(
         point: wp.array(dtype=vec4), first: wp.int32, last: wp.int32, cost: wp.array(dtype=real), sigma: real,
         penalty: real,
     ):  # fmt: skip
+        """Return the first point of the second line of the best split, the cost reduction, and the unsplit cost.
+
+        The point is -1 if no split can lower the cost by penalty.
+        """
         rows = rows6()
         for i in range(first, last):
             rows = with_point(rows, point, i, first, last, sigma)
@@ -123,17 +125,17 @@ def functions(flags):
             gain = cost[best]
         return best, gain, total
 
-    # Return whether something may be hidden between point k and the one before.
     @wp.func
     def is_apart(point: wp.array(dtype=vec4), k: wp.int32, gap: real):
+        """Return whether something may be hidden between point k and the one before."""
         return point[k][2] - point[k - 1][2] > gap
 
-    # Split a scan: each segment's first point gets its end, all other points -1.
     @wp.func
     def split_scan(
         point: wp.array(dtype=vec4), first: wp.int32, last: wp.int32, cost: wp.array(dtype=real),
         stop: wp.array(dtype=wp.int32), sigma: real, penalty: real, gap: real,
     ):  # fmt: skip
+        """Split a scan: each segment's first point gets its end, all other points -1."""
         begin = int(first)
         for k in range(first + 1, last):
             stop[k] = -1
@@ -151,12 +153,12 @@ def functions(flags):
             else:
                 i = end
 
-    # Merge neighbours that a single line fits at an extra cost below penalty.
     @wp.func
     def merge_segments(
         point: wp.array(dtype=vec4), first: wp.int32, last: wp.int32, stop: wp.array(dtype=wp.int32), sigma: real,
         penalty: real, gap: real,
     ):  # fmt: skip
+        """Merge neighbours that a single line fits at an extra cost below penalty."""
         i = int(first)
         while i < last and stop[i] < last:
             j = stop[i]
@@ -170,12 +172,12 @@ def functions(flags):
             else:
                 i = j
 
-    # Move the ends between neighbours to where both lines cost least.
     @wp.func
     def move_ends(
         point: wp.array(dtype=vec4), first: wp.int32, last: wp.int32, cost: wp.array(dtype=real),
         stop: wp.array(dtype=wp.int32), sigma: real, penalty: real, gap: real,
     ):  # fmt: skip
+        """Move the ends between neighbours to where both lines cost least."""
         i = int(first)
         while i < last and stop[i] < last:
             j = stop[i]
@@ -190,13 +192,14 @@ def functions(flags):
                     following = k
             i = following
 
-    # Write a, b, the triangular root of the information about (a, b), and the cost of a line through a part of a scan:
-    # -1 where no line fits, all 0 for two points.
     @wp.func
     def fit_line(
         point: wp.array(dtype=vec4), begin: wp.int32, size: wp.int32, first: wp.int32, count: wp.int32, sigma: real,
         line: wp.array(dtype=real), place: wp.int32,
     ):  # fmt: skip
+        """Write a, b, the triangular root of the information about (a, b), and the cost of a line through a part of a
+        scan: -1 where no line fits, all 0 for two points.
+        """
         a = real(0.0)
         b = real(0.0)
         rows = rows6()
@@ -248,10 +251,12 @@ def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     made = functions(flags)
 
-    # Split scans into segments: stop is the end of the segment that begins at a point, -1 at all other points. One
-    # work-item takes a scan.
     @kernel(flags)
     def split_scans(point, start, noise, cost, stop, scans, points, penalty, gap):
+        """Split scans into segments: stop is the end of the segment that begins at a point, -1 at all other points.
+
+        One work-item takes a scan.
+        """
         scan = wp.tid()
         if scan >= scans:
             return
@@ -265,10 +270,11 @@ def make(name, flags):
                 made.move_ends(point, first, last, cost, stop, sigma, penalty, gap)
             made.merge_segments(point, first, last, stop, sigma, penalty, gap)
 
-    # Fit lines to parts of scans: first point and number of points, which may wrap around to the scan's first point.
-    # One work-item takes a part.
     @kernel(flags)
     def fit_segments(point, start, noise, part, scan, line, scans, points, parts):
+        """Fit lines to parts of scans: first point and number of points, which may wrap around to the scan's first
+        point. One work-item takes a part.
+        """
         k = wp.tid()
         if k >= parts:
             return

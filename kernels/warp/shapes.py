@@ -20,9 +20,9 @@ DISC, BOX, SEGMENT = wp.constant(4), wp.constant(8), wp.constant(4)
 cell_at = reader(wp.vec2i)
 
 
-# Return the part of the grid that a particle's world fills.
 @wp.func
 def world_window(world: wp.array(dtype=wp.vec2i), n: wp.int32):
+    """Return the part of the grid that a particle's world fills."""
     size = cell_at(world, 2 * n).y
     window = Window()
     window.rows = size >> 16
@@ -30,9 +30,9 @@ def world_window(world: wp.array(dtype=wp.vec2i), n: wp.int32):
     return window
 
 
-# Return the first entry of a particle's world in a table with ``each`` entries for a cell.
 @wp.func
 def world_begin(world: wp.array(dtype=wp.vec2i), n: wp.int32, each: wp.int32):
+    """Return the first entry of a particle's world in a table with ``each`` entries for a cell."""
     return wp.int64(cell_at(world, 2 * n).x) * wp.int64(each)
 
 
@@ -46,10 +46,11 @@ def functions(flags):
     ZERO, ONE, TWO, MINUS_ONE = real(0.0), real(1.0), real(2.0), real(-1.0)
     TINY, NEVER, ALWAYS, UNKNOWN = real(1e-30), real(math.inf), real(-math.inf), real(math.nan)
 
-    # Return the distance along a ray to a disc, infinite where it is not met, and the cosine of the angle of incidence;
-    # inside the disc 0 and 1. Places are relative to the ray's origin.
     @wp.func
     def meet_disc(dx: real, dy: real, x: real, y: real, radius: real):
+        """Return the distance along a ray to a disc, infinite where it is not met, and the cosine of the angle of
+        incidence; inside the disc 0 and 1. Places are relative to the ray's origin.
+        """
         along = dx * x + dy * y
         aside = dx * y - dy * x
         square = (radius - aside) * (radius + aside)
@@ -60,11 +61,11 @@ def functions(flags):
         cosine = wp.where(radius > ZERO, half_chord / wp.where(radius > ZERO, radius, ONE), ONE)
         return vec2(wp.where(square >= ZERO and far >= ZERO, t, NEVER), wp.where(near > ZERO, cosine, ONE))
 
-    # Return the same of a box, whose direction has a cosine and sine.
     @wp.func
     def meet_box(
         dx: real, dy: real, x: real, y: real, cosine: real, sine: real, half_length: real, half_width: real
     ):  # fmt: skip
+        """Return the same of a box, whose direction has a cosine and sine."""
         u = cosine * dx + sine * dy
         v = cosine * dy - sine * dx
         p = -(cosine * x + sine * y)
@@ -87,9 +88,9 @@ def functions(flags):
         straight = wp.where(in_u > in_v, fast_u, fast_v)
         return vec2(wp.where(into <= out and out >= ZERO, t, NEVER), wp.where(into > ZERO, straight, ONE))
 
-    # Return the same of a segment; a ray along it meets its nearer end.
     @wp.func
     def meet_segment(dx: real, dy: real, x: real, y: real, end_x: real, end_y: real):
+        """Return the same of a segment; a ray along it meets its nearer end."""
         along = dx * x + dy * y
         end_along = dx * end_x + dy * end_y
         aside = dx * y - dy * x
@@ -106,13 +107,14 @@ def functions(flags):
         meets = (aside <= ZERO and end_aside >= ZERO) or (aside >= ZERO and end_aside <= ZERO)
         return vec2(wp.where(meets and t >= ZERO, t, NEVER), straight)
 
-    # Return the nearest of the shapes that a particle sees along a ray and of an obstacle at a distance t: the distance
-    # in cells, and the cosine of the angle of incidence, 2 where no shape is nearer than t.
     @wp.func
     def nearest_shape(
         shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32, cell: wp.vec2i,
         pose: vec4, ray: vec2, t: real,
     ):  # fmt: skip
+        """Return the nearest of the shapes that a particle sees along a ray and of an obstacle at a distance t: the
+        distance in cells, and the cosine of the angle of incidence, 2 where no shape is nearer than t.
+        """
         direction = ray_direction(pose, ray)
         seen = cell_at(world, 2 * n + 1)
         one = seen.x * crowd.stride
@@ -142,13 +144,14 @@ def functions(flags):
             i += 1
         return nearest
 
-    # Return the distance from a point to the nearest shape that a particle sees, infinite without one, 0 inside a
-    # shape. The point is relative to the cell.
     @wp.func
     def shape_distance(
         shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32, cell: wp.vec2i,
         point: vec2,
     ):  # fmt: skip
+        """Return the distance from a point to the nearest shape that a particle sees, infinite without one, 0 inside a
+        shape. The point is relative to the cell.
+        """
         nearest = real(NEVER)
         seen = cell_at(world, 2 * n + 1)
         one = seen.x * crowd.stride

@@ -34,9 +34,11 @@ eight = wp.types.vector(length=8, dtype=wp.float64)
 number_at = reader(wp.float64)
 
 
-# Return 8 numbers from first on, and missing in place of those from end on: a work-item waits once for all of them.
 @wp.func
 def eight_at(values: wp.array(dtype=wp.float64), first: wp.int32, end: wp.int32, missing: wp.float64):
+    """Return 8 numbers from first on, and missing in place of those from end on: a work-item waits once for all of
+    them.
+    """
     found = eight(missing)
     for i in range(8):
         if first + i < end:
@@ -44,18 +46,18 @@ def eight_at(values: wp.array(dtype=wp.float64), first: wp.int32, end: wp.int32,
     return found
 
 
-# Return the sum of 8 numbers, rounded down to integers.
 @wp.func
 def sum_eight(numbers: eight):
+    """Return the sum of 8 numbers, rounded down to integers."""
     total = wp.floor(numbers[0])
     for i in range(1, 8):
         total += wp.floor(numbers[i])
     return total
 
 
-# Return the largest of the scores from begin to before end.
 @wp.func
 def largest_of(largest: wp.array(dtype=wp.float64), begin: wp.int32, end: wp.int32):
+    """Return the largest of the scores from begin to before end."""
     high = NEVER + ZERO
     g = begin + 0
     while g < end:
@@ -66,40 +68,42 @@ def largest_of(largest: wp.array(dtype=wp.float64), begin: wp.int32, end: wp.int
     return high
 
 
-# Return the largest score; -inf if all particles with a weight are impossible next to particles without.
 @wp.func
 def possible_of(totals: wp.array(dtype=wp.float64), largest: wp.float64):
+    """Return the largest score; -inf if all particles with a weight are impossible next to particles without."""
     high = NEVER + ZERO
     if totals[RUNGS - 1] > ZERO:
         high = largest
     return high
 
 
-# Return the column of sums with the weights of a rung; the column of the previous weights where none is possible.
 @wp.func
 def column_of(high: wp.float64, rung: wp.int32):
+    """Return the column of sums with the weights of a rung; of the previous weights where none is possible."""
     column = rung
     if wp.isinf(high):
         column = 2 * RUNGS
     return column
 
 
-# Return the sum of a column over all blocks before one: over the blocks before it in its group, and over the groups
-# before it.
 @wp.func
 def sum_before(
     sums: wp.array(dtype=wp.float64), joined: wp.array(dtype=wp.float64), b: wp.int32, fan: wp.int32, column: wp.int32
 ):
+    """Return the sum of a column over all blocks before one: over the blocks before it in its group, and over the
+    groups before it.
+    """
     total = number_at(sums, b * WEIGHT_SUMS + column)
     if b >= fan:
         total += number_at(joined, b / fan * WEIGHT_SUMS + column)
     return total
 
 
-# Return the likelihoods of 8 scores relative to the largest, on the last rung; 1 where none is possible or nothing is
-# left. Their squares belong to the rung before: an error of 2^-53 grows to 2^-46 on the first rung.
 @wp.func
 def tempered(scores: eight, largest: wp.float64, left: wp.float64):
+    """Return the likelihoods of 8 scores relative to the largest, on the last rung; 1 where none is possible or nothing
+    is left. Their squares belong to the rung before: an error of 2^-53 grows to 2^-46 on the first rung.
+    """
     found = eight(ONE)
     if not wp.isinf(largest) and left > ZERO:
         for i in range(8):
@@ -107,18 +111,18 @@ def tempered(scores: eight, largest: wp.float64, left: wp.float64):
     return found
 
 
-# Return the part of the temperature that earlier stages have left.
 @wp.func
 def left_of(state: wp.array(dtype=wp.float64), stage: wp.int32):
+    """Return the part of the temperature that earlier stages have left."""
     left = ONE
     if stage > 0:
         left = state[(stage - 1) * STAGE + LEFT]
     return left
 
 
-# Return the first rung with the effective sample size least, or the last rung.
 @wp.func
 def rung_of(totals: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.float64), least: wp.float64):
+    """Return the first rung with the effective sample size least, or the last rung."""
     rung = RUNGS - 1
     for i in range(7):
         k = 6 - i
@@ -128,12 +132,12 @@ def rung_of(totals: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.floa
     return rung
 
 
-# Update the averages of the likelihood per beam, and the share of particles to inject.
 @wp.func
 def follow_evidence(
     total: wp.float64, before: wp.float64, largest: wp.float64, settings: wp.array(dtype=wp.float64),
     state: wp.array(dtype=wp.float64),
 ):  # fmt: skip
+    """Update the averages of the likelihood per beam, and the share of particles to inject."""
     if not wp.isinf(largest) and total > ZERO and before > ZERO:
         evidence = largest + log_of(total / before)
         mean = exp_of(wp.min(settings[PER_BEAM_SCALE] * evidence, LARGEST_EXPONENT))
@@ -151,12 +155,12 @@ def follow_evidence(
         state[INJECTED] = wp.min(wp.max(share, ZERO), settings[MOST_INJECTED])
 
 
-# Write the state of a stage that uses a rung; at stage 0, follow the evidence of the whole temperature.
 @wp.func
 def set_stage(
     totals: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.float64), state: wp.array(dtype=wp.float64),
     high: wp.float64, left: wp.float64, rung: wp.int32, particles: wp.int32, stage: wp.int32, stages: wp.int32,
 ):  # fmt: skip
+    """Write the state of a stage that uses a rung; at stage 0, follow the evidence of the whole temperature."""
     if stage == 0 and settings[DEPTH] == ONE:
         follow_evidence(totals[0], totals[2 * RUNGS], high, settings, state)
     size = totals[rung] * totals[rung] / (settings[SCALE] * totals[RUNGS + rung])

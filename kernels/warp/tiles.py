@@ -10,25 +10,25 @@ TILE_PARTICLES = wp.constant(16)
 TILE = wp.constant(64)
 
 
-# Return the place of a work-item's particle in the order.
 @wp.func
 def tile_place(item: wp.int32, spread: wp.int32):
+    """Return the place of a work-item's particle in the order."""
     return ((item // TILE) >> spread) * TILE_PARTICLES + item % TILE // TILE_RAYS
 
 
-# Return a work-item's group within its tile of particles.
 @wp.func
 def tile_group(item: wp.int32, spread: wp.int32):
+    """Return a work-item's group within its tile of particles."""
     return (item // TILE) & ((1 << spread) - 1)
 
 
-# Return the first ray of a work-item.
 @wp.func
 def tile_ray(item: wp.int32, spread: wp.int32):
+    """Return the first ray of a work-item."""
     return ((item // TILE) & ((1 << spread) - 1)) * TILE_RAYS + item % TILE_RAYS
 
 
-# Return the step from one ray of a work-item to its next.
 @wp.func
 def tile_step(spread: wp.int32):
+    """Return the step from one ray of a work-item to its next."""
     return TILE_RAYS << spread

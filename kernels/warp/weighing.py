@@ -41,10 +41,11 @@ sixteen = wp.types.vector(length=16, dtype=wp.float64)
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
 
-    # Add a sensor's log-likelihoods times its temperature to the scores, which sensor 0 begins, and find the largest:
-    # one work-item takes a block of particles.
     @kernel(flags)
     def add_scores(log_p, settings, score, largest, particles, block, sensor):
+        """Add a sensor's log-likelihoods times its temperature to the scores, which sensor 0 begins, and find the
+        largest: one work-item takes a block of particles.
+        """
         b = wp.tid()
         begin = b * block
         if begin >= particles:
@@ -59,20 +60,21 @@ def make(name, flags):
             high = wp.max(high, value)
         largest[b] = high
 
-    # Find the largest score of each group of fan blocks: one work-item takes a group of blocks.
     @kernel(flags)
     def join_scores(scores, largest, blocks, fan):
+        """Find the largest score of each group of fan blocks: one work-item takes a group of blocks."""
         g = wp.tid()
         begin = g * fan
         if begin < blocks:
             largest[g] = largest_of(scores, begin, wp.min(begin + fan, blocks))
 
-    # Sum the integer weights of each block on each rung, their squares, and the previous weights: one work-item takes a
-    # block. The first one writes the largest score.
     @kernel(flags)
     def weigh_particles(
         score, before, largest, settings, state, sums, highest, particles, block, blocks, groups, stage
     ):
+        """Sum the integer weights of each block on each rung, their squares, and the previous weights: one work-item
+        takes a block. The first one writes the largest score.
+        """
         b = wp.tid()
         begin = b * block
         if begin >= particles:
@@ -103,10 +105,11 @@ def make(name, flags):
         if b == 0:
             highest[0] = high
 
-    # Add up groups of fan rows of sums in order; a row becomes the sum of the rows before it in its group: one
-    # work-item takes a column of a group.
     @kernel(flags)
     def join_rows(sums, joined, rows, columns, fan):
+        """Add up groups of fan rows of sums in order; a row becomes the sum of the rows before it in its group: one
+        work-item takes a column of a group.
+        """
         i = wp.tid()
         row = i / columns * fan
         if row >= rows:
@@ -127,13 +130,15 @@ def make(name, flags):
             row += 16
         joined[i] = total
 
-    # Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The one after
-    # the last block writes the stage's state.
     @kernel(flags)
     def set_weights(
         score, before, highest, sums, joined, totals, settings, state, weight, ends, particles, block, blocks, fan,
         stage, stages,
     ):  # fmt: skip
+        """Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block.
+
+        The one after the last block writes the stage's state.
+        """
         b = wp.tid()
         if b > blocks:
             return

@@ -22,25 +22,27 @@ FRAME_NUMBERS = wp.constant(8)
 RING = wp.constant(2)
 
 
-# Copy the cells of some worlds to their places. One work-item takes a cell.
 @kernel()
 def put_cells(cells, place, store, count, worlds):
+    """Copy the cells of some worlds to their places. One work-item takes a cell."""
     w, i = wp.tid()
     if i >= count or w >= worlds:
         return
     store[place[w] + i] = cells[w * count + i]
 
 
-# Return whether a cell stops a beam.
 @wp.func
 def stops_beam(cell: wp.int32, threshold: wp.int32, unknown: wp.int32):
+    """Return whether a cell stops a beam."""
     return wp.where(cell > MOST_KNOWN, unknown, wp.where(cell >= threshold, 1, 0))
 
 
-# Mark the obstacles of worlds as bytes and as bits, with a margin of obstacles around each world. One work-item takes
-# 32 cells of a line.
 @kernel()
 def mark_obstacles(store, place, occupied, bits, rows, cols, worlds, words, margin, threshold, unknown):
+    """Mark the obstacles of worlds as bytes and as bits, with a margin of obstacles around each world.
+
+    One work-item takes 32 cells of a line.
+    """
     line, word = wp.tid()
     width = cols + 2 * margin
     if word >= words or line >= (rows + 2 * margin) * worlds:
@@ -73,10 +75,12 @@ def make(name, flags):
     NUMBER_ZERO, NUMBER_ONE = real(0.0), real(1.0)
     NEVER, NONE, TWO = real(math.inf), real(math.nan), wp.float64(2.0)
 
-    # Fill the tables of likelihood fields of worlds from squared distances, whose map has a margin. One work-item takes
-    # a cell.
     @kernel(flags)
     def fill_worlds(squared, density, place, table, rows, cols, worlds, margin, cap, beyond):
+        """Fill the tables of likelihood fields of worlds from squared distances, whose map has a margin.
+
+        One work-item takes a cell.
+        """
         line, col = wp.tid()
         width = cols + 2 * RING
         if col >= width or line >= (rows + 2 * RING) * worlds:
@@ -91,9 +95,9 @@ def make(name, flags):
             value = density[wp.min(squared[at], cap)]
         table[place[w] + row * width + col] = value
 
-    # Return the frame of a world; the scanner's position and the resolution are those of all worlds.
     @wp.func
     def frame_in(frames: wp.array(dtype=wp.float64), index: wp.int32, frame: types.Frame):
+        """Return the frame of a world; the scanner's position and the resolution are those of all worlds."""
         first = index * FRAME_NUMBERS
         moved = types.Frame()
         moved.origin_x = frames[first]
@@ -105,13 +109,16 @@ def make(name, flags):
         moved.yaw_sin = frames[first + 3]
         return moved
 
-    # Place poses in their worlds; see place_pose. An index of no world sets the second bit of pose_status, and the pose
-    # sees nothing. One work-item takes a particle.
     @kernel(flags)
     def place_in_worlds(
         poses, index, ignore, frames, pose_cell, pose, pose_low, world, pose_status, frame, particles, worlds,
         wide, wide_ignore,
     ):  # fmt: skip
+        """Place poses in their worlds; see place_pose.
+
+        An index of no world sets the second bit of pose_status, and the pose sees nothing. One work-item takes a
+        particle.
+        """
         particle = work_item(wp.tid())
         if particle >= particles:
             return
@@ -135,9 +142,9 @@ def make(name, flags):
         else:
             world[2 * particle + 1] = wp.vec2i(w, -1)
 
-    # Return a point of the world in cells of a frame.
     @wp.func
     def point_in(x: wp.float64, y: wp.float64, here: types.Frame):
+        """Return a point of the world in cells of a frame."""
         u = x - here.origin_x
         v = y - here.origin_y
         if here.yaw_sin != ZERO:
@@ -146,10 +153,12 @@ def make(name, flags):
             v = here.yaw_cos * v - here.yaw_sin * before
         return wp.vec2d(within_reach(u / here.resolution), within_reach(v / here.resolution))
 
-    # Place moving shapes of one kind, with 3 (discs), 5 (boxes) or 4 numbers (segments), in the cells of their worlds.
-    # A shape with a number that is not finite, or with a negative size, is none. One work-item takes a shape.
     @kernel(flags)
     def place_shapes(raw, frames, shapes, frame, count, numbers, begin, stride, worlds):
+        """Place moving shapes of one kind, with 3 (discs), 5 (boxes) or 4 numbers (segments), in the cells of their
+        worlds. A shape with a number that is not finite, or with a negative size, is none. One work-item takes a
+        shape.
+        """
         w, i = wp.tid()
         if i >= count or w >= worlds:
             return
@@ -195,9 +204,12 @@ def make(name, flags):
             shapes[to + 6] = NUMBER_ZERO
             shapes[to + 7] = NUMBER_ZERO
 
-    # Tell which discs about poses, with a radius in cells, meet an obstacle or a shape. One work-item takes a particle.
     @kernel(flags)
     def find_collisions(store, world, shapes, pose_cell, pose, hit, particles, radius, crowd, threshold, unknown):
+        """Tell which discs about poses, with a radius in cells, meet an obstacle or a shape.
+
+        One work-item takes a particle.
+        """
         n = wp.tid()
         if n >= particles:
             return

@@ -42,24 +42,26 @@ def functions(flags):
     # 1.5 * 2^52: a sum of it and an integer of either sign has the integer in its last 32 bits.
     INTEGERS = double(6755399441055744.0)
 
-    # Return a b + c, rounded once where the processor has a fused multiply-add.
     @wp.func
     def multiplied_lanes(a: double, b: double, c: double):
+        """Return a b + c, rounded once where the processor has a fused multiply-add."""
         if fuses():
             return multiply_add(a, b, c)
         return a * b + c
 
-    # Return the index of the cell of an end point in the padded table. Both cells of the ring hold the same value, so
-    # four neighbours are read even beyond an edge.
     @wp.func
     def table_place(col: wp.int32, row: wp.int32, window: types.Window):
+        """Return the index of the cell of an end point in the padded table.
+
+        Both cells of the ring hold the same value, so four neighbours are read even beyond an edge.
+        """
         c = wp.clamp(col + FIELD_RING, 0, window.cols + (2 * FIELD_RING - 2))
         r = wp.clamp(row + FIELD_RING, 0, window.rows + (2 * FIELD_RING - 2))
         return r * (window.cols + 2 * FIELD_RING) + c
 
-    # Read the distances of four neighbours. Look-ups keep a loop scalar.
     @wp.func
     def block_distances(cells: block_cells, table: wp.array(dtype=real), window: types.Window):
+        """Read the distances of four neighbours. Look-ups keep a loop scalar."""
         a, b, c, d = block_numbers(), block_numbers(), block_numbers(), block_numbers()
         stride = window.cols + 2 * FIELD_RING
         i = int(0)
@@ -116,9 +118,12 @@ def functions(flags):
             return exponent, exponent_low
 
     else:
-        # Return the square of an interpolated distance over 2 sigma^2 in two parts, given 1 / (2 sigma^2) as factor.
+
         @wp.func
         def square_lanes(four: vec4, rest_x: rest, rest_y: rest, factor: rest):
+            """Return the square of an interpolated distance over 2 sigma^2 in two parts, given 1 / (2 sigma^2) as
+            factor.
+            """
             left = rest(four.x)
             above = rest(four.z)
             if EXACT_EXPONENT:
@@ -134,15 +139,16 @@ def functions(flags):
                 distance = (ONE - rest_y) * near + rest_y * far
                 return vec2(distance * (distance * factor), ZERO)
 
-        # Places are computed in float64, and with EXACT_EXPONENT distances as well: sums of two numbers of float32 take
-        # three times as many operations. An end point on a cell's edge may count to either side, since the interpolated
-        # distance is the same.
         @wp.func
         def block_exponents(
             table: wp.array(dtype=real), origin: wp.vec2i, pose: vec4, low: vec4, point: wp.array(dtype=vec2),
             point_low: wp.array(dtype=vec2), terms: wp.array(dtype=types.FieldTerms), window: types.Window,
             begin: wp.int32, count: wp.int32,
         ):  # fmt: skip
+            """Places are computed in float64, and with EXACT_EXPONENT distances as well: sums of two numbers of float32
+            take three times as many operations. An end point on a cell's edge may count to either side, since the
+            interpolated distance is the same.
+            """
             cells = block_cells()
             rest_x, rest_y = block_rests(), block_rests()
             exponent, exponent_low = block_numbers(), block_numbers()
@@ -179,9 +185,9 @@ def functions(flags):
                 i += 1
             return exponent, exponent_low
 
-    # Return log p of the exponent of the density of a hit in two parts.
     @wp.func
     def log_of_exponent_lanes(exponent: real, exponent_low: real, terms: wp.array(dtype=types.FieldTerms)):
+        """Return log p of the exponent of the density of a hit in two parts."""
         if LINEAR:
             p = term_of.rand_density(terms)
             if HIT:
@@ -200,9 +206,9 @@ def functions(flags):
             else:
                 return log_hit
 
-    # Return log p of the exponents of a block.
     @wp.func
     def block_logs(exponent: block_numbers, exponent_low: block_numbers, terms: wp.array(dtype=types.FieldTerms)):
+        """Return log p of the exponents of a block."""
         values = block_numbers()
         i = int(0)
         while i < BLOCK_TERMS:

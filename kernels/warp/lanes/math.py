@@ -44,9 +44,9 @@ W4, W5, W6, W7 = _numbers(-0.000160394105, 0.00166702515, -0.000632835436, 0.000
 W8 = wp.constant(_number(-9.25621225e-06))
 
 
-# Return e^r - 1 and the count k of e^a. Polynomials are summed in pairs, which processors compute side by side.
 @wp.func
 def reduced_exp_lanes(a: wp.float32):
+    """Return e^r - 1 and the count k of e^a. Polynomials are summed in pairs, which processors compute side by side."""
     shifted = a * ONE_OVER_LOG2 + ROUNDER
     k = shifted - ROUNDER
     r = (a - k * LOG2_HIGH) - k * LOG2_LOW
@@ -55,25 +55,25 @@ def reduced_exp_lanes(a: wp.float32):
     return rest, wp.cast(shifted, wp.int32) - ROUNDER_BITS
 
 
-# Return e^a for a <= 0; 0 where it would be denormal.
 @wp.func
 def exp_lanes(a: wp.float32):
+    """Return e^a for a <= 0; 0 where it would be denormal."""
     rest, k = reduced_exp_lanes(a)
     power = (ONE + rest) * wp.cast((k + EXPONENT_BIAS) << MANTISSA_BITS, wp.float32)
     return wp.where(a < EXP_ZERO, ZERO, power)
 
 
-# Return 1 - e^a for a <= 0. Nothing cancels: where the count is 0, so is the first term.
 @wp.func
 def one_minus_exp_lanes(a: wp.float32):
+    """Return 1 - e^a for a <= 0. Nothing cancels: where the count is 0, so is the first term."""
     rest, k = reduced_exp_lanes(wp.where(a < EXP_LOST, EXP_LOST, a))
     scale = wp.cast((k + EXPONENT_BIAS) << MANTISSA_BITS, wp.float32)
     return (ONE - scale) - scale * rest
 
 
-# Return log(p) of a finite normal number p > 0.
 @wp.func
 def log_lanes(p: wp.float32):
+    """Return log(p) of a finite normal number p > 0."""
     above = wp.cast(p, wp.int32) - ROOT_HALF
     k = wp.float32(above >> MANTISSA_BITS)
     f = wp.cast((above & MANTISSA) + ROOT_HALF, wp.float32) - ONE
@@ -84,9 +84,9 @@ def log_lanes(p: wp.float32):
     return (f + ((cubic + k * LOG2_LOW) - HALF * square)) + k * LOG2_HIGH
 
 
-# Return erf(x) for x >= 0; exactly 1 from ERF_ONE on.
 @wp.func
 def erf_lanes(x: wp.float32):
+    """Return erf(x) for x >= 0; exactly 1 from ERF_ONE on."""
     b = wp.where(x < ERF_ONE, x, ERF_ONE)
     square = b * b
     low = (W0 + W1 * b) + square * (W2 + W3 * b)

@@ -52,9 +52,9 @@ def functions(flags):
     # Up to this 1 - exp(-x) is x within a quarter of the last bit.
     SMALL_DECAY = real(2.98023224e-08)
 
-    # Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers.
     @wp.func
     def normal_exponent_lanes(z: real, expected: real, scale: vec2, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers."""
         off = z - expected
         off_low = real(0.0)
         if BIAS:
@@ -82,23 +82,23 @@ def functions(flags):
                 off = off * scale.x
             return vec2(off * (off * term_of.square_scale(terms)), ZERO)
 
-    # Return the exponent of a hit's density as a sum of two numbers.
     @wp.func
     def hit_exponent_lanes(z: real, expected: real, scale: vec2, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return the exponent of a hit's density as a sum of two numbers."""
         normal = normal_exponent_lanes(z, expected, scale, terms)
         return shape_exponent(normal, term_of.shape_power(terms), term_of.shape_rate(terms))
 
-    # Return whether the mass of a hit on [0, range_max] may be less than 1.
     @wp.func
     def near_an_end(mean: real, above: real, scale: real):
+        """Return whether the mass of a hit on [0, range_max] may be less than 1."""
         if MASS_TABLE:
             return int(1)
         else:
             return int(wp.min(mean, above) * scale < ERF_ONE)
 
-    # Return the masses of hits of any shape on [0, range_max]. Look-ups in a table keep a loop scalar.
     @wp.func
     def masses_within(expected: block_numbers, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real)):
+        """Return the masses of hits of any shape on [0, range_max]. Look-ups in a table keep a loop scalar."""
         inside, far = block_numbers(), block_numbers()
         i = int(0)
         while i < BLOCK_TERMS:
@@ -120,18 +120,19 @@ def functions(flags):
                 i += 1
         return inside
 
-    # Return (1 - exp(-lambda z*)) / lambda, the length that divides p_short; where lambda z* is small, it is z* to the
-    # last bit.
     @wp.func
     def short_length_lanes(expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return (1 - exp(-lambda z*)) / lambda, the length that divides p_short; where lambda z* is small, it is z* to
+        the last bit.
+        """
         decay = term_of.lambda_short(terms)
         x = decay * expected
         length = wp.where(x > SMALL_DECAY, one_minus_exp_lanes(-x) * (ONE / decay), expected)
         return wp.max(length, SMALLEST_RANGE)
 
-    # Return the density of a hit before its division by its mass, or its logarithm.
     @wp.func
     def hit_density_lanes(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return the density of a hit before its division by its mass, or its logarithm."""
         scale = hit_scale(expected, terms)
         exponent = hit_exponent_lanes(z, expected, scale, terms)
         if LINEAR:
@@ -148,9 +149,9 @@ def functions(flags):
                 log_hit += log_lanes(scale.x)
             return log_hit
 
-    # Return the density of a short reading, or its logarithm.
     @wp.func
     def short_density_lanes(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return the density of a short reading, or its logarithm."""
         length = short_length_lanes(expected, terms)
         decay = term_of.lambda_short(terms)
         inside = z <= expected and expected > ZERO
@@ -159,9 +160,11 @@ def functions(flags):
         else:
             return wp.where(inside, (term_of.z_short(terms) - log_lanes(length)) - decay * z, NEVER)
 
-    # Return log p(z | z*) from the densities of components, or from their logarithms; -inf only where the mixture is 0.
     @wp.func
     def log_of_parts_lanes(hit: real, shorter: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return log p(z | z*) from the densities of components, or from their logarithms; -inf only where the mixture
+        is 0.
+        """
         random = term_of.rand_density(terms)
         if LINEAR:
             return log_lanes((random + hit) + shorter)
@@ -184,9 +187,9 @@ def functions(flags):
                     p += exp_lanes(wp.min(hit, shorter) - largest)
                 return wp.where(largest == NEVER, largest, largest + log_lanes(p))
 
-    # Return the density to be cubed, without a division by its hit's mass: compat_density of compat.py.
     @wp.func
     def compat_density_lanes(z: real, expected: real, hit: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return the density to be cubed, without a division by its hit's mass: compat_density of compat.py."""
         p = hit
         if AMCL:
             p += wp.where(
@@ -206,8 +209,6 @@ def functions(flags):
             )
             return p + wp.where(z >= term_of.range_max(terms), term_of.z_max(terms), term_of.rand_density(terms))
 
-    # Return the terms of a block of readings in the sum. Each stage is a loop, which becomes vector code; a hit's mass
-    # is computed where it may be less than 1 for some reading of the block.
     @apart
     def block_terms(
         z: block_numbers,
@@ -215,6 +216,11 @@ def functions(flags):
         terms: wp.array(dtype=types.MixtureTerms),
         masses: wp.array(dtype=real),
     ):
+        """Return the terms of a block of readings in the sum.
+
+        Each stage is a loop, which becomes vector code; a hit's mass is computed where it may be less than 1 for some
+        reading of the block.
+        """
         hits, results = block_numbers(), block_numbers()
         doubtful = int(0)
         i = int(0)
@@ -261,12 +267,12 @@ def functions(flags):
             i += 1
         return results
 
-    # Return the terms of a block of readings whose angles of incidence fall into several bins.
     @apart
     def block_of_bins(
         z: block_numbers, expected: block_numbers, cosine: block_numbers, terms: wp.array(dtype=types.MixtureTerms),
         masses: wp.array(dtype=real), edges: wp.array(dtype=real), incidence_bins: wp.int32,
     ):  # fmt: skip
+        """Return the terms of a block of readings whose angles of incidence fall into several bins."""
         values = block_numbers()
         bins = block_bins()
         bin = int(0)

@@ -133,6 +133,8 @@ def as_array(name: str, value: object, *, masked: bool = False) -> NDArray[Any]:
         value: Anything that ``numpy.asarray`` accepts.
         masked: Whether values may be masked; they become NaN, and integers become float64.
     """
+    if type(value) is np.ndarray:
+        return value
     check_values(name, value)
     try:
         plain: Any = masks.filled(value) if masked else masks.unmasked(name, value)
@@ -168,7 +170,7 @@ def array(
         fits = shape is None or _fits(value.shape, shape)
         if fits and (not finite or np.logical_and.reduce(np.isfinite(value), axis=None)):
             return value if largest == math.inf else _limited(name, value, largest)
-    values = as_array(name, value, masked=not finite)
+    values = value if type(value) is np.ndarray else as_array(name, value, masked=not finite)
     kinds, rule = "fiu", "must hold real numbers"
     if dtype is not None and np.dtype(dtype).kind in "iu":
         kinds, rule = "iu", "must hold integers"
@@ -288,10 +290,15 @@ def existing_file(file: Path) -> Path:
 
 
 def _fits(shape: tuple[int, ...], rule: Sequence[int | str]) -> bool:
-    return shape == rule or (
-        len(shape) == len(rule)
-        and all(isinstance(length, str) or length == size for size, length in zip(shape, rule, strict=True))
-    )
+    if shape == rule:
+        return True
+    if len(shape) != len(rule):
+        return False
+    # A generator would be one more call per item.
+    for size, length in zip(shape, rule, strict=True):  # noqa: SIM110
+        if not isinstance(length, str) and length != size:
+            return False
+    return True
 
 
 def _index_text(index: tuple[Any, ...]) -> str:

@@ -61,6 +61,8 @@ def to_host(array: object, name: str = "poses") -> object:
 
 def copied_to_host(array: object, backend: Backend, name: str) -> object:
     """Return readings as a NumPy array, NaN where masked; device arrays are copied after the device has finished."""
+    if type(array) is np.ndarray:
+        return array
     array = masks.filled(array)
     if not on_device(array):
         return to_host(array, name)
@@ -99,15 +101,14 @@ def host_poses(array: object, name: str, scans: int | None = None, *, single: bo
     return np.ascontiguousarray(checks.array(name, read, shape, finite=False)).reshape(-1, 3)
 
 
-def check_bounds(bounds: Bounds, poses: np.ndarray, name: str, scans: int | None = None) -> None:
-    """Refuse poses in host memory whose bounds, which calls need anyway, reveal NaN or infinities.
+def refuse_poses(poses: np.ndarray, name: str, scans: int | None = None) -> None:
+    """Raise the error of poses in host memory that are not finite.
 
     Raises:
-        ValueError: A value is not finite.
+        ValueError: Always; the message names the first bad value.
     """
-    if not all(map(math.isfinite, (*bounds[0], *bounds[1]))):
-        shape = ("N", 3) if scans is None else (scans, "N", 3)
-        checks.array(name, poses if scans is None else poses.reshape(scans, -1, 3), shape)
+    shape = ("N", 3) if scans is None else (scans, "N", 3)
+    checks.array(name, poses if scans is None else poses.reshape(scans, -1, 3), shape)
 
 
 def bounds_of(poses: np.ndarray) -> Bounds:

@@ -143,8 +143,9 @@ class Cloud(Particles):
             if last:
                 break
         self._last_stage = stage.number
-        self._estimated_of = (stage.places, self.count) if self._estimates_too else None
-        self.set_particles(stage.places, drawn)
+        places = stage.places
+        self._estimated_of = (places, self.count) if self._estimates_too else None
+        self.set_particles(places, drawn)
 
     def _deepen(self, stage: Stage, settings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Repeat a stage's weighing on lower rungs while too few particles have weight; return state and settings."""

@@ -88,15 +88,19 @@ class Journal:
             if kinds[kind] == _CONTAINER:
                 items = one.copy()
                 self._containers.append((one, items))
-                open_ += [item for item in (items.values() if kind is dict else items) if kinds[type(item)]]
+                for item in items.values() if kind is dict else items:
+                    if kinds[type(item)]:
+                        open_.append(item)
                 continue
             # Faster than choosing attributes, which ``restore`` does.
             kept = one.__dict__.copy()
             self._objects.append((one, kept))
-            if (parts := getattr(kind, "PARTS", None)) is not None:
-                open_ += [kept[name] for name in parts if kinds[type(kept[name])]]
-            else:
-                open_ += [item for name, item in kept.items() if kinds[type(item)] and name != _SENSORS]
+            parts = getattr(kind, "PARTS", None)
+            # Loops, as a comprehension is a call in Python 3.11.
+            for name in kept if parts is None else parts:
+                item = kept[name]
+                if kinds[type(item)] and (parts is not None or name != _SENSORS):
+                    open_.append(item)
 
     def is_running(self) -> bool:
         """Return whether the present call is within the journal's call."""

@@ -182,19 +182,19 @@ class OdometryMotion:
     def sampled_turns(self, first: float, trans: float, second: float) -> SampledMotion:
         """Return the numbers of a step from its motion; see :func:`odometry_turns`."""
         stretch, gain, drift = self.systematic
-        first, second = (turn * (1 + gain) + drift * trans / 2 for turn in (first, second))
+        half_drift = drift * trans / 2
+        first, second = first * (1 + gain) + half_drift, second * (1 + gain) + half_drift
         trans *= 1 + stretch
         a1, a2, a3, a4 = self.alpha
         at, ar = self.least
         # Noise is independent of the direction: turning by half a turn and back is no turn.
-        deviations = [math.sqrt(a1 * turn * turn + a2 * trans * trans + ar * ar) for turn in (first, second)]
+        before = math.sqrt(a1 * first * first + a2 * trans * trans + ar * ar)
+        after = math.sqrt(a1 * second * second + a2 * trans * trans + ar * ar)
         squares = first * first + second * second
         length = math.sqrt(a3 * trans * trans + a4 * squares + at * at)
         side = math.sqrt(self.sideways * squares + at * at) if self.sideways > 0 else 0.0
         reverse = self.reverse if abs(trans) >= SHORTEST else 0.0
-        return SampledMotion(
-            (first, trans, 0.0, second), (deviations[0], length, side, deviations[1]), STRAIGHT, reverse
-        )
+        return SampledMotion((first, trans, 0.0, second), (before, length, side, after), STRAIGHT, reverse)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -116,7 +116,7 @@ class Stage(NamedTuple):
     @property
     def places(self) -> Places:
         """The buffers after the stage."""
-        return Places(self.source, self.target, self.weight, self.after, self.state)
+        return Places(self.source, self.source ^ 1, self.weight, self.weight + 1, self.state)
 
 
 class Particles:

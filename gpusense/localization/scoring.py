@@ -31,6 +31,8 @@ def readings_of(readings: Any, sensors: Sequence[Sensor]) -> list[SensorReadings
             array holds several arguments; any other tuple is an array.
         sensors: The sensors.
     """
+    if type(readings) is np.ndarray and len(sensors) == 1:
+        return [(0, (readings,))]
     if isinstance(readings, Mapping):
         index = {id(sensor.model): i for i, sensor in enumerate(sensors)}
         for model in readings:

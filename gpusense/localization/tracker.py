@@ -213,10 +213,12 @@ class Tracker:
         """Return the settings of the present step with readings of the sensors ``indices``."""
         temperature, sensors = self.options.temperature, []
         wide = DEFAULTS.wide_share if self.wide and temperature == "auto" else 1.0
-        for sensor in (self.sensors[index] for index in indices):
+        one_peak = self.together
+        for index in indices:
+            sensor = self.sensors[index]
             sensors.append((sensor.temperature(temperature) * (wide if sensor.calibrates else 1.0), sensor.beams))
+            one_peak = one_peak and not sensor.ambiguous
         step, count = self.progress.step, self.cloud.count
-        one_peak = self.together and not any(self.sensors[index].ambiguous for index in indices)
         return settings_of_step(self.options, motion, step, count, self.pool, sensors, one_peak)
 
 

@@ -104,10 +104,16 @@ class Verdict:
 
     def is_informed_by(self, readings: Mapping[int, tuple[Any, ...]]) -> bool:
         """Return whether any of the readings comes from a sensor with a map, so that the pose is judged."""
-        return any(self._sensors[index].calibrates or index in self._evidence for index in readings)
+        # A generator would be one more call per reading.
+        for index in readings:  # noqa: SIM110
+            if self._sensors[index].calibrates or index in self._evidence:
+                return True
+        return False
 
     def watches(self, readings: Mapping[int, tuple[Any, ...]]) -> bool:
         """Return whether readings include features; their prediction is judged before the correction."""
+        if not self._evidence:
+            return False
         return any(index in self._evidence and _count(reading) for index, reading in readings.items())
 
     def predicted(self, poses: np.ndarray, weights: np.ndarray, readings: Mapping[int, tuple[Any, ...]]) -> None:

@@ -6,6 +6,7 @@ the values of device poses are not inspected before the launch that places them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable
 from typing import NamedTuple
 
@@ -115,7 +116,9 @@ class Poses:
             bounds = bounds_on_device(backend, space, self._ahead[2], count, single=self._dtype == _SINGLE)
         else:
             bounds = arrays.bounds_of(poses)
-        arrays.check_bounds(bounds, self.host, self._name, self._scans)
+        # The bounds, which calls need anyway, reveal NaN and infinities.
+        if not all(map(math.isfinite, (*bounds[0], *bounds[1]))):
+            arrays.refuse_poses(self.host, self._name, self._scans)
         self._last_corners = part, corners_of(bounds)
 
     def ensure_table(

@@ -1,4 +1,4 @@
-"""Python calls in a steady call of a device: each costs time, and their number is exact."""
+"""Python calls and files of a steady call of a device: each costs time or readers, and their number is exact."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ POSE = np.array([4.0, 3.0, 0.3])
 RANGES = gs.RayCaster(GRID, 9.0, backend="numpy").cast(POSE[None], SCANNER.bearings)[0]
 PACKAGE = Path(gs.__file__).parent
 # Largest number of calls of Python functions, NumPy's included, with Python 3.11. A step always judges its pose.
-MOST_FIELD, MOST_BEAMS, MOST_STEP, MOST_BOUND = 80, 90, 225, 90
+MOST_FIELD, MOST_BEAMS, MOST_CAST, MOST_MATCH, MOST_STEP, MOST_BOUND = 79, 85, 76, 240, 190, 90
 # Most stays of a call in rooms of the package; successive calls in a room are one stay.
 MOST_STAYS = 22
+# Most files of the package in a call.
+FILES_FIELD, FILES_BEAMS, FILES_CAST, FILES_MATCH, FILES_STEP = 19, 22, 18, 26, 36
 
 
 @pytest.fixture(autouse=True)
@@ -53,18 +55,24 @@ def calls_of(run: Callable[[], object]) -> int:
     return len(called_by(run))
 
 
+def files_of(called: list[CodeType]) -> list[Path]:
+    """Return the file of the package of each call, in order."""
+    files = (Path(code.co_filename) for code in called)
+    return [file.relative_to(PACKAGE) for file in files if file.is_relative_to(PACKAGE)]
+
+
 def stays(called: list[CodeType]) -> list[str]:
     """Return the rooms of the package that a call enters one after the other."""
-    files = (Path(code.co_filename) for code in called)
-    rooms = (file.relative_to(PACKAGE).parts[0] for file in files if file.is_relative_to(PACKAGE))
-    return [room for room, _ in itertools.groupby(rooms)]
+    return [room for room, _ in itertools.groupby(file.parts[0] for file in files_of(called))]
 
 
 @pytest.mark.parametrize(
-    ("kind", "most"), [(gs.LikelihoodFieldModel, MOST_FIELD), (gs.BeamModel, MOST_BEAMS)], ids=["field", "beams"]
+    ("kind", "most", "files"),
+    [(gs.LikelihoodFieldModel, MOST_FIELD, FILES_FIELD), (gs.BeamModel, MOST_BEAMS, FILES_BEAMS)],
+    ids=["field", "beams"],
 )
 @pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_a_steady_call(kind, most, precision, needs):
+def test_a_steady_call(kind, most, files, precision, needs):
     needs("opencl")
     model = kind(GRID, SCANNER, backend="opencl:pocl", precision=precision)
     poses = POSE + np.random.default_rng(0).normal(0, 0.05, (200, 3))
@@ -72,8 +80,25 @@ def test_a_steady_call(kind, most, precision, needs):
         model.log_likelihood(poses, RANGES)
     counts = [calls_of(lambda: model.log_likelihood(poses, RANGES)) for _ in range(3)]
     assert max(counts) <= most and len(set(counts)) == 1, counts
-    rooms = stays(called_by(lambda: model.log_likelihood(poses, RANGES)))
+    called = called_by(lambda: model.log_likelihood(poses, RANGES))
+    rooms = stays(called)
     assert {"models", "backends"} <= set(rooms) and len(rooms) <= MOST_STAYS, rooms
+    assert len(set(files_of(called))) <= files
+
+
+@pytest.mark.parametrize("what", ["cast", "match"])
+def test_a_steady_cast_and_match(what, needs):
+    """A cast repeats the program of an earlier one, as models do."""
+    needs("opencl")
+    caster, poses = gs.RayCaster(GRID, 9.0, backend="opencl:pocl"), np.tile(POSE, (200, 1))
+    run, most, files = {
+        "cast": (lambda: caster.cast(poses, SCANNER.bearings), MOST_CAST, FILES_CAST),
+        "match": (lambda: gs.match_scan(RANGES, RANGES, SCANNER, backend="opencl:pocl"), MOST_MATCH, FILES_MATCH),
+    }[what]
+    for _ in range(40):
+        run()
+    called = min((called_by(run) for _ in range(3)), key=len)
+    assert len(called) <= most and len(set(files_of(called))) <= files, (len(called), len(set(files_of(called))))
 
 
 def test_a_bound_call(needs):
@@ -101,3 +126,4 @@ def test_a_step_of_a_filter(recovery, needs):
         step()
     counts = [calls_of(step) for _ in range(21)]
     assert np.median(counts) <= MOST_STEP, counts
+    assert min(len(set(files_of(called_by(step)))) for _ in range(5)) <= FILES_STEP

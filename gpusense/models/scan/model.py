@@ -64,6 +64,8 @@ class ScanModel(Pickled):
     ) -> None:
         checks.instance("scanner", scanner, Scanner)
         check_scene(grid, scanner.range_max)
+        # The worlds; None in a single map.
+        self._worlds = grid if isinstance(grid, Worlds) else None
         self.scanner = scanner
         weights = choose(compat)
         self.compat = compat
@@ -160,12 +162,6 @@ class ScanModel(Pickled):
     def grid(self) -> OccupancyGrid:
         """The current map."""
         return self._pipeline.grid
-
-    @property
-    def _worlds(self) -> Worlds | None:
-        """The worlds; None of a model of a single map."""
-        grid: OccupancyGrid | Worlds = self.grid
-        return grid if isinstance(grid, Worlds) else None
 
     @property
     def device(self) -> BackendInfo:

@@ -96,6 +96,7 @@ def scene_of(data_dir, name):
     return selftest.scene_in(gs.read_map(data_dir / name), scanner, seed=5), backends
 
 
+@pytest.mark.long
 def test_end_points_on_edges_do_not_breach(data_dir):
     """Beams along the axes from poses on edges end on edges, for a mount of 0."""
     grid = gs.read_map(data_dir / "wean_hall/wean_10cm.yaml")
@@ -132,6 +133,7 @@ def test_ranges_are_numpys(data_dir, name):
         assert np.count_nonzero(expected < 20) > expected.size / 10
 
 
+@pytest.mark.long
 def test_yaw_of_a_map_turns_its_poses(data_dir):
     """Compare stata_basement (yaw of the origin 3.14) with the same cells without it."""
     grid = gs.read_map(data_dir / "ros_maps/stata_basement.yaml")

@@ -57,6 +57,7 @@ def exact_grid(precision: str) -> np.ndarray:
     return np.array(truth)
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.24)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_density_grid_against_60_digits(backend, precision):
@@ -199,6 +200,7 @@ def questions(draw):
     return weights, sigma, rate, columns, readings, draw(st.sampled_from([0.01, 1.0, 80.0, 1e4]))
 
 
+@pytest.mark.long
 @given(question=questions(), precision=st.sampled_from(PRECISIONS))
 @settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_stiff_question(backend, question, precision):

@@ -16,6 +16,7 @@ def errors(fit: gs.BeamFit) -> np.ndarray:
     return np.array(list(fit.standard_errors.values()))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bias", [0.0, 0.3])
 def test_gradients_of_blocks_add_up_to_the_gradient(bias: float, backend: str) -> None:
     z, expected = draw(TYPICAL, 700, 2, low=0, high=1)

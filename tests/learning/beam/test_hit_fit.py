@@ -88,6 +88,7 @@ def test_the_fit_is_that_of_scipy(backend: str) -> None:
     assert fit.standard_errors["hit_dof"] == pytest.approx(fit.independent_errors["hit_dof"], rel=0.3)
 
 
+@pytest.mark.long
 def test_bic_prefers_the_shape_of_the_readings() -> None:
     # The normal has 5 free parameters, Student's t one more.
     assert bic(fitted(STUDENT, "student"), 6) < bic(fitted(STUDENT, "normal"), 5) - 10
@@ -97,6 +98,7 @@ def test_bic_prefers_the_shape_of_the_readings() -> None:
     assert heavy.parameters.hit_dof > 20
 
 
+@pytest.mark.long
 def test_growth_offset_and_shape_are_fitted_together() -> None:
     truth = STUDENT.replace(range_bias=0.03, sigma_growth=0.015, hit_dof=4.0)
     z, expected = drawn(truth)
@@ -122,6 +124,7 @@ def test_gradients_are_those_of_differences(bias: bool, monkeypatch: pytest.Monk
     check_gradients(seen[0], theta, 1e-7)
 
 
+@pytest.mark.long
 def test_a_fit_may_start_from_its_shape() -> None:
     z, expected = (each[:1000] for each in drawn(STUDENT))
     options: Any = dict(backend="numpy", hit="student")

@@ -40,6 +40,7 @@ def test_every_bin_finds_its_own_parameters(backend: str) -> None:
     assert fit.log_likelihood > fit.pooled.log_likelihood + 500
 
 
+@pytest.mark.long
 def test_thin_bins_lean_on_the_pooled_fit() -> None:
     z, expected, angles = scene((4000, 12))
     distance = []
@@ -69,6 +70,7 @@ def test_an_empty_bin_keeps_the_pooled_parameters() -> None:
         gs.fit_incidence_parameters(z, expected, angles, RANGE_MAX, bins=4, backend="numpy", strength=0)
 
 
+@pytest.mark.long
 def test_bins_have_a_shape_of_hits_of_their_own(needs) -> None:
     rng = np.random.default_rng(3)
     truths = [
@@ -97,6 +99,7 @@ def test_bins_have_a_shape_of_hits_of_their_own(needs) -> None:
         )
 
 
+@pytest.mark.long
 def test_beams_that_hit_nothing_have_parameters_of_their_own() -> None:
     z, expected, angles = scene((600, 300))
     nothing = np.concatenate([angles, np.full(50, np.nan)])

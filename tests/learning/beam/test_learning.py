@@ -125,6 +125,7 @@ def test_a_fit_of_the_model_scores_highest(needs) -> None:
         assert score(near) < fit.log_likelihood
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize(("method", "scenes"), [("em", (15, 38)), ("gradient", (23,)), ("hill_climb", (31,))])
 def test_other_methods_reach_the_optimum_from_six_starts(method: str, scenes: tuple[int, ...], needs) -> None:
@@ -141,6 +142,7 @@ def test_other_methods_reach_the_optimum_from_six_starts(method: str, scenes: tu
             assert (np.abs(values(fit) - values(best)) < 1e-3 * errors(best)).all(), (scene.name, start)
 
 
+@pytest.mark.long
 def test_hill_climbing_leaves_a_ridge_that_no_coordinate_climbs(needs) -> None:
     backend = needs("opencl")
     scene = learning_scenes(50)[21]
@@ -157,6 +159,7 @@ def test_hill_climbing_leaves_a_ridge_that_no_coordinate_climbs(needs) -> None:
     assert not fit.converged and "no convergence within 8 iterations" in fit.status
 
 
+@pytest.mark.long
 def test_the_genetic_search_needs_no_good_start(needs) -> None:
     backend = needs("opencl")
     z, expected = draw(TYPICAL, 200, 3)

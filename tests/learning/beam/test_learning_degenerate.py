@@ -61,6 +61,7 @@ def test_degenerate_readings_give_finite_parameters_and_a_reason(name: str, meth
         assert str(fit)
 
 
+@pytest.mark.long
 def test_degenerate_readings_are_alike_on_every_backend(backend: str) -> None:
     for name, (z, expected, said) in DATA.items():
         fit = gs.fit_beam_parameters(z, expected, RANGE_MAX, backend=backend)

@@ -173,6 +173,7 @@ def test_sums_are_alike_on_every_backend(precision: type, name: str, backend: st
     assert alike(found, truth, precision)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lanes", [1, 16])
 def test_lanes_of_pairs_sum_to_the_same(lanes: int, needs: Callable[[str], str]) -> None:
     opencl = get_backend(needs("opencl"))

@@ -34,6 +34,7 @@ def test_the_reported_offset_is_that_of_the_joint_fit(seed: int, needs) -> None:
     assert not plain.bias_fitted and plain.log_likelihood < joint.log_likelihood
 
 
+@pytest.mark.long
 def test_the_reported_offset_is_the_maximum_of_the_profile(needs) -> None:
     """Away from both ends, fits without an offset of readings moved by b have the profile's log-likelihood."""
     rng = np.random.default_rng(5)

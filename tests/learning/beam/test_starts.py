@@ -47,6 +47,7 @@ def highest() -> float:
     return brute_force(*two_modes(), 8.0, 20)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["em", "gradient", "hill_climb"])
 def test_of_two_modes_the_one_at_the_expected_range_is_correct(method: str, highest: float, needs) -> None:
     z, expected = two_modes()

@@ -53,6 +53,7 @@ def looked_up(table: gs.DiscreteBeamModel, ranges: list[float], expected: np.nda
     return np.where(missing, 0, density.astype(expected.dtype))
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("name", TABLES)
 @pytest.mark.parametrize("precision", ["float32", "float64"])

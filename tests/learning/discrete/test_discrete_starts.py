@@ -29,6 +29,7 @@ def two_widths(seed: int) -> tuple[np.ndarray, np.ndarray, float]:
     return np.abs(z), expected, range_max
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("seed", [4, 5])
 def test_no_point_of_a_grid_is_likelier_than_the_fit(seed: int) -> None:

@@ -114,6 +114,7 @@ def test_offsets_of_beacons_are_found_and_improve_the_fit() -> None:
     assert gs.BeaconParameters.from_dict(each.to_dict()["parameters"]) == each.parameters
 
 
+@pytest.mark.long
 def test_errors_are_those_of_repeated_experiments_and_blocks_see_repeats() -> None:
     values, claimed = [], []
     for seed in range(40):

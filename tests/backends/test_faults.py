@@ -227,6 +227,7 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.long
 def test_a_long_batch_can_be_interrupted_and_the_model_still_works(backend, tmp_path):
     if backend.startswith("warp:cuda") or get_backend(backend).info.kind == "gpu":
         pytest.skip("a GPU is done before it can be interrupted")

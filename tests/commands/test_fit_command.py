@@ -293,6 +293,7 @@ def test_help_explains_itself(capsys):
     assert command.NAME == "fit"
 
 
+@pytest.mark.long
 def test_hits_of_a_student_are_fitted_written_and_read(capsys, recorded, tmp_path):
     pairs = ["--pairs", recorded / "pairs.csv", "--range-max", RANGE]
     code, out, _ = run(capsys, *pairs, "--hit", "student", "--holdout", "--out", tmp_path)

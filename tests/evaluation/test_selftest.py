@@ -126,6 +126,7 @@ def test_scene_has_the_hard_cases(scene):
     assert np.count_nonzero((cells == np.floor(cells)).all(axis=1)) >= 40
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("specialize", [True, False])
 @pytest.mark.parametrize("temperature", [1.0, 0.25])
 @pytest.mark.parametrize("precision", ["float32", "float64"])

@@ -93,6 +93,7 @@ def test_density_grid_covers_its_ranges(precision):
     assert np.mean(np.isinf(naive)) >= 0.15
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_every_row_is_ok(backend, precision, monkeypatch):

@@ -157,6 +157,7 @@ def test_cloud_around_is_stochastically_normal():
     assert np.array_equal(worlds.cloud_around(pose, 3, 0.0, 0.0, np.random.default_rng(6)), np.tile(pose, (3, 1)))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("expected", [0.0, 0.02, 4.0, RANGE_MAX])
 @pytest.mark.parametrize(
     "parameters",

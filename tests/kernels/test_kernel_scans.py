@@ -106,6 +106,7 @@ def test_blocks_of_fields_of_scans(names: tuple[str, ...], spread: int, device: 
     )
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("names", [(), ("ORDERED",), ("CUBES",), ("STRANDED",)])
 @pytest.mark.parametrize("block", [1, BLOCK_TERMS])
 def test_sums_of_scans(block: int, names: tuple[str, ...], device: Backend) -> None:

@@ -214,6 +214,7 @@ def test_rectangles_of_maps_with_more_rows_or_columns_than_16_bits_count(
         np.testing.assert_array_equal(made(as_kind(kind), seen, PLANES[1]), expected)
 
 
+@pytest.mark.sampled(1)
 @each_grid
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])
 def test_rectangles_have_the_bits_of_the_reference(
@@ -278,6 +279,7 @@ def made_anew(
     return found
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.12)
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])
 @pytest.mark.parametrize(

@@ -175,6 +175,7 @@ def test_tiles_of_beams_of_every_kind(name: str, names: tuple[str, ...], real: t
 # ---- sums
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("real", PRECISIONS)
 @pytest.mark.parametrize("names", [(), ("ORDERED",), ("CUBES",)])
 def test_sums_of_parts(names: tuple[str, ...], real: type, device: Backend) -> None:

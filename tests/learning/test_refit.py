@@ -31,6 +31,7 @@ def assert_found(found: Mapping[str, float], truth: Mapping[str, float], errors:
         assert abs(found[name] - truth[name]) < 3 * errors[name], (name, found[name], truth[name], errors[name])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("moments", [False, True])
 def test_the_beam_model_finds_its_parameters(moments):
     p = P if moments else P.replace(range_bias=0.0, sigma_growth=0.0)

@@ -91,6 +91,7 @@ def test_independent_motion_noise_is_not_inflated(steps, alpha):
     np.testing.assert_allclose(np.mean(ratio, axis=0), 1.0, atol=0.25)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("repeated", [0.0, 0.4, 0.7])
 def test_motion_noise_that_repeats_from_step_to_step_is_inflated(repeated):
     """Sums of errors with a correlation of rho^k over k steps have (1 + rho) / (1 - rho) times the variance."""

@@ -20,6 +20,7 @@ def test_only_plausible_increments_count(tmp_path: Path, increment: float, expec
     assert scan.duration == pytest.approx(expected)
 
 
+@pytest.mark.long
 def test_a_recorded_laser_takes_an_eighth_of_a_second(data_dir: Path) -> None:
     bag = data_dir / "jarvis_lab/jarvis_complex_path_fast.bag"
     for topic, expected in (("navigation", 0.125), ("security", 0.0)):

@@ -23,6 +23,7 @@ def bomb(file, piece, count):
     return file
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("piece", "count", "rule"),
     [(b"\n" * (1 << 20), 8, "lines in its compressed size"), (b"# " + b"x" * 65533 + b"\n", 6000, "bytes in its")],

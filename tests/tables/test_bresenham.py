@@ -29,6 +29,7 @@ def test_bresenham_by_hand(shape, range_max, line, backend):
         assert caster.cast([[0.5, 0.5, math.atan2(end[1], end[0])]], [0.0])[0, 0] == np.float32(expected)
 
 
+@pytest.mark.long
 def test_bresenham_slips_between_walls_that_touch_at_a_corner(backend):
     cells = np.zeros((6, 6), int)
     cells[1, 2] = cells[2, 1] = cells[4, 4] = 100

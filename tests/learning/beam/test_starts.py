@@ -114,6 +114,7 @@ def test_a_cause_that_a_search_left_out_too_early_comes_back() -> None:
     assert (np.diff(end.trace) >= -1e-9 * abs(end.value.objective)).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("range_max", [10.0, 80.0])
 @pytest.mark.parametrize("count", [1, 2, 200])
 def test_hill_climbing_does_not_warn_where_all_readings_are_0(count: int, range_max: float, needs, recwarn) -> None:

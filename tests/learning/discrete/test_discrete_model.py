@@ -69,6 +69,7 @@ def test_a_scan_is_the_sum_of_look_ups_on_every_backend(name, precision, backend
         assert (one.log_likelihood(poses, SCAN) == log_p).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gpu", [True, False])
 def test_tiles_and_orders_change_nothing(gpu, as_gpu):
     _, _, poses = scene()

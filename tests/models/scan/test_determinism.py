@@ -95,6 +95,7 @@ def call(request: pytest.FixtureRequest, kind: str, backend: str) -> Call:
     return shared(kind, request.param, backend)[1]
 
 
+@pytest.mark.sampled(1)
 def test_twice(kind, call, backend):
     first = call(cloud())
     same_bits(call(cloud()), first)
@@ -146,6 +147,7 @@ def test_any_order(call):
     same_bits(call(np.repeat(cloud()[:3], 50, axis=0)), np.repeat(whole[:3], 50, axis=0))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_after_running_out_of_memory(kind, precision, backend):
     """Pieces are halved until they fit; a piece of 256 particles must."""

@@ -104,6 +104,7 @@ def test_a_map_of_20_000_x_20_000_cells(needs):
         assert "of 20000 x 20000 cells" in model.explain()
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_denormal_direction_components_are_zero(backend, precision):
     """The kernel rounds components of a direction below 1e-30 to 0, for both signs and axes."""

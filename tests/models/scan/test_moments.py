@@ -142,6 +142,7 @@ def test_means_near_the_longest_range_keep_all_digits(shape, backend):
         assert np.abs(parts[0, 0] - truth[0]) <= per_beam(truth, np.float32)[0], sigmas
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shape", ["normal", "student"])
 def test_a_mean_that_rounds_to_the_longest_range_has_half_of_its_mass(shape, backend):
     """The sum of z* and the bias exceeds range_max by less than half of its last bit, many sigma."""

@@ -130,6 +130,7 @@ def test_bits_are_those_of_single_calls(name, gpu, as_gpu, monkeypatch):
         assert differing(one, expected) == 0 and differing(each, expected_parts) == 0
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("gpu", [False, True])
 @pytest.mark.parametrize("kind", [gs.BeamModel, gs.LikelihoodFieldModel])
 def test_scans_with_readings_share_one_set_of_launches(kind, gpu, as_gpu, monkeypatch):

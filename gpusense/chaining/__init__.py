@@ -1,1 +1,1 @@
-"""Trajectories from scans alone: chained matches over key scans, loop closures, and the pose graph of both."""
+"""Compute trajectories from scans: matches chained over key scans, loop closures, and their pose graph."""

@@ -1,8 +1,8 @@
-"""Find matches of places that agree with each other, the evidence that a place was seen again.
+"""Find matches of places that agree with each other, the evidence for a revisited place.
 
-Two matches T1 and T2 between the same passages agree if they and the paths along both passages form a loop that ends
-where it began. A match counts only while enough matches that agree with it also count. Across a break of the chain, and
-beyond the expected drift, the drift cannot confirm a match, so a group with more evidence is needed.
+Two matches T1 and T2 between the same passages agree if they and the paths along both passages form a closed loop. A
+match counts only while enough matches that agree with it also count. Across a break of the chain, and beyond the
+expected drift, the drift cannot confirm a match, and a group needs more evidence.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool]
 
-# Least number of matches that agree with a match, including itself.
+# Least number of agreeing matches, including the match.
 _AGREE = 3
-# Evidence that a group needs where nothing else is known, the sum of -log10(1 - p_right) with p_right clamped to a
-# maximum, and where 1 % of weak steps are breaks; different scans on both sides.
+# Necessary evidence of a group, the sum of -log10(1 - p_right) with clamped p_right: in general, and if 1 % of weak
+# steps are breaks; largest p_right; different scans on both sides.
 EVIDENCE, EVIDENCE_OVER_WEAK, _MOST_RIGHT, _SCANS = 6.5, 4.5, 0.999, 3
-# Compared matches are at most this far apart on both sides [m], and at most this many key scans; matches of a batch.
+# Largest distance between compared matches on both sides [m], and in key scans; matches of a batch.
 _PASSAGE, _KEYS, _MATCHES = 8.0, 64, 1024
 # Largest gap of a closed loop of two matches [m, rad], and its growth with the path [m/m, rad/m].
 _MISSED, _MISSED_TURN, _SHARE, _SHARE_TURN = 0.15, 0.03, 0.03, 0.01
@@ -34,12 +34,12 @@ _NONE = np.zeros(0, np.int64)
 
 
 def agreeing(matches: Links, poses: Floats, needed: Floats) -> Flags:
-    """Return which matches (L,) are supported by enough further matches of the same passages.
+    """Return the mask (L,) of matches that enough other matches of the same passages support.
 
     Args:
         matches: Matches of places.
         poses: (K, 3) poses of the key scans.
-        needed: (L,) evidence of the group to which a match must belong; 0: none.
+        needed: (L,) necessary evidence of a match's group; 0: none.
     """
     if not len(matches):
         return np.zeros(0, bool)
@@ -56,12 +56,12 @@ def agreeing(matches: Links, poses: Floats, needed: Floats) -> Flags:
 
 
 class Groups(NamedTuple):
-    """Groups of matches that agree with one another, directly or through further matches.
+    """Groups of matches that agree directly or through other matches.
 
     Attributes:
-        group: (L,) number of the group of each match; -1 where too few agree with it.
+        group: (L,) group of each match; -1 if too few agree with it.
         evidence: (G,) evidence of each group.
-        scans: (G,) number of different scans on the side where these are fewer.
+        scans: (G,) number of different scans on the side with fewer.
     """
 
     group: Integers
@@ -81,7 +81,7 @@ def groups_of(matches: Links, poses: Floats) -> Groups:
 
 
 def _supported(table: Any, kept: Flags) -> Flags:
-    """Return which matches (L,) agree with enough further matches that are themselves supported."""
+    """Return the mask (L,) of matches that agree with enough supported matches."""
     while True:
         fewer = kept & (table @ kept.astype(np.int64) >= _AGREE - 1)
         if (fewer == kept).all():
@@ -90,7 +90,7 @@ def _supported(table: Any, kept: Flags) -> Flags:
 
 
 def _groups(table: Any, kept: Flags, matches: Links) -> Groups:
-    """Return the groups of the kept matches only, fewer than L."""
+    """Return the groups of the kept matches."""
     from scipy.sparse.csgraph import connected_components
 
     rows = np.flatnonzero(kept)
@@ -107,7 +107,7 @@ def _groups(table: Any, kept: Flags, matches: Links) -> Groups:
 
 
 def _consistent(matches: Links, poses: Floats) -> Any:
-    """Return a sparse matrix (L, L), 1 where two matches of the same passages make a loop that closes."""
+    """Return a sparse matrix (L, L), 1 where two matches of the same passages close a loop."""
     from scipy import sparse
 
     path = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))

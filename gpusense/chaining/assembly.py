@@ -1,4 +1,4 @@
-"""Assemble the links of a chain: matches, odometry, and constant motion where both leave directions open."""
+"""Assemble the links of a chain: matches, odometry, and constant motion along remaining directions."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Flags = NDArray[np.bool]
 
 TEMPERATURE = 0.04
 """Factor of the information of matches: recorded scans have repeating errors that no single match reveals."""
-# Share of the largest eigenvalue below which the information of a scan's links leaves a direction open.
+# Least share of the largest eigenvalue for an observed direction of a scan's links.
 _OPEN = 1e-6
-# Relative gain of the cost below which the solution for a fit of the odometry's noise ends: the fitted variances change
-# by less than 0.1 %.
+# Least relative gain of the cost of a further iteration in fits of the odometry's noise: fitted variances change by
+# less than 0.1 %.
 _GAIN = 1e-5
 # Deviations of a pose along an unobserved direction [m, rad].
 _UNKNOWN, _UNKNOWN_TURN = 30.0, 3.0
@@ -30,7 +30,7 @@ _UNKNOWN, _UNKNOWN_TURN = 30.0, 3.0
 def weighed(front: Front) -> Links:
     """Return the matches so far with their information multiplied by the temperature.
 
-    Scans between two key scans are matched to both and share the errors of these, so both matches count as one.
+    Scans between two key scans are matched to both and share their errors, so both matches count as one.
     """
     links, keys = front.links, np.array(front.keys)
     is_key = np.zeros(front.done, bool)
@@ -44,7 +44,7 @@ def weighed(front: Front) -> Links:
 
 
 def links_of_odometry(front: Front, links: Links, reported: Floats, motion: OdometryMotion) -> Links:
-    """Return links of odometry: between successive key scans, and to scans without other links in some direction.
+    """Return links of odometry: between successive key scans, and to scans that lack other links in a direction.
 
     Args:
         front: The matches.
@@ -76,13 +76,13 @@ def fitted_odometry(front: Front, links: Links, reported: Floats) -> OdometryMot
 
 
 def constant_motion_links(poses: Floats, keys: NDArray[np.int64], jumped: Flags, links: Links) -> Links:
-    """Return links of constant motion where other links leave directions open; errors of such links accumulate.
+    """Return links of constant motion along directions that other links leave open; their errors accumulate.
 
     Args:
         poses: (M, 3) poses of the nodes.
         keys: (K,) numbers of the key scans.
         jumped: (M - 1,) whether the time jumps from a node to the next, and no match determines the motion.
-        links: All further links.
+        links: All other links.
     """
     second = np.arange(1, len(poses))[_is_open(len(poses), links)]
     first = keys[np.searchsorted(keys, second) - 1]

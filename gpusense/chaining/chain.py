@@ -1,4 +1,4 @@
-"""Compute a robot's trajectory from its scans, with or without odometry: matches, loops, and their pose graph."""
+"""Compute a robot's trajectory from its scans and optional odometry: matches, loops, and their pose graph."""
 
 from __future__ import annotations
 
@@ -57,31 +57,31 @@ def chain_scans(
     precision: Precision = "float32",
     backend: Selection = "auto",
 ) -> ScanChain:
-    """Return the trajectory of a robot from its scans and, where available, its odometry.
+    """Compute the trajectory of a robot from its scans and, if available, its odometry.
 
-    Each scan is matched to the one before, and to key scans around it (:func:`gpusense.match_scan`). Matches begin at
-    the odometry's motion; without odometry they begin at rest and at the motion of their neighbours. Places that are
-    seen again are searched for within the expected drift; closures are accepted where they are sure and agree with each
-    other. The poses are the least-squares solution with a robust kernel over all links. Directions that scans do not
-    observe are filled by the odometry, with noise fitted to the matches, or else by constant motion.
+    Each scan is matched to the previous scan, and to key scans around it (:func:`gpusense.match_scan`). Matches start
+    from the odometry's motion, or else from rest and from their neighbours' motion. Revisited places are searched for
+    within the expected drift; sure closures that agree with each other are accepted. The poses are the least-squares
+    solution with a robust kernel over all links. Odometry, with noise fitted to the matches, or else constant motion
+    fills directions that scans do not observe.
 
-    Scans are matched to scans of the same scanner; loops also match scanners of equal bearings, such as a front and a
-    rear one. A key scan is coupled with the scans of the other scanners before and after it.
+    Scans are matched to scans of the same scanner; loops also match scanners of equal bearings, such as front and
+    rear. A key scan is coupled with the scans of the other scanners before and after it.
 
     Args:
-        scans: (S, K) readings in the order of time [m], at least one; with several scanners S readings, each of its
+        scans: (S, K) readings in the order of time [m], at least one; for several scanners, S readings of each
             scanner's length.
-        scanner: Their scanner, or several; its mount is the sensor's pose on the robot.
+        scanner: The scanner, or several; the mount is the sensor's pose on the robot.
         odometry: (S, 3) poses of the odometer at the scans [m, m, rad]. None: no odometry.
         sensor: (S,) index of the scanner of each scan; only for several scanners.
         times: (S,) times of the first beams [s]. None: unknown.
         duration: Time from the first beam of a scan to the last one [s], to correct scans for the robot's motion; needs
-            ``times``. Beams are measured evenly in time in their order, in reverse, or all at once; the order in which
-            scans agree best is used. 0: at once. With several scanners optionally one number for each.
+            ``times``. Beams are measured at equal intervals in order, in reverse, or all at once; the order with the
+            best agreement of scans is used. 0: at once. For several scanners optionally a number each.
         motion: Noise of the odometry. None: fitted to the matches.
-        step: Motion by odometry below which a scan is not matched [m, rad]; such scans cost nothing.
-        key_step: Motion after which a scan becomes a key scan [m, rad].
-        close_loops: Search for places that are seen again.
+        step: Least motion by odometry of a matched scan [m, rad]; other scans cost nothing.
+        key_step: Motion between key scans [m, rad].
+        close_loops: Whether to search for revisited places.
         precision: Precision of the matches, ``"float32"`` or ``"float64"``.
         backend: The device, see :func:`gpusense.devices`.
 
@@ -109,7 +109,7 @@ def chain_scans(
 
 
 class Chainer:
-    """Chains scans incrementally; the trajectory so far can be read after each step. See :func:`chain_scans`."""
+    """Incremental :func:`chain_scans`; the trajectory so far can be read after each step."""
 
     def __init__(
         self,
@@ -165,7 +165,7 @@ class Chainer:
 
     @property
     def loops(self) -> Loops | None:
-        """The search for places that are seen again; None before it begins."""
+        """The search for revisited places; None before it begins."""
         return None if self._loops is None else self._loops[1]
 
     def steps(self) -> Iterator[str]:
@@ -187,7 +187,7 @@ class Chainer:
             yield from self._loops[1].steps()
 
     def _find_order(self, one: int) -> Iterator[str]:
-        """Determine the order in which a scanner's beams are measured, and restart its front end with it."""
+        """Determine the order of a scanner's beams in time, and restart its front end with this order."""
         assert self._times is not None
         data, duration = self._data, self._durations[one]
         matcher = Matcher(data.readings[one], data.scanners[one], self._options)
@@ -221,7 +221,7 @@ class Chainer:
             loops = self._loops[1]
             closures = loops.closures.renumbered(joint.keys)
             poses = _carried(poses, joint.keys, loops.solution.poses)
-        # The bend of a long chain is barely observable without closures, and the chain of matches bends least.
+        # The curvature of a long chain is barely observable without closures, and the chain of matches bends least.
         solution = solve(poses, Links.joined([links, closures]), settle=len(closures) > 0)
         spread = pose_covariances(solution)
         found = solution.links.kind == CLOSURE
@@ -254,7 +254,7 @@ class Chainer:
         return self._links_of[1]
 
     def _made_links(self, joint: Joint) -> Links:
-        """Make the links of matches and of odometry or constant motion; the odometry's noise is fitted once."""
+        """Make the links of matches and of odometry or constant motion; fit the odometry's noise once."""
         parts = [joint.renumbered(weighed(front), one) for one, front in enumerate(joint.fronts)]
         if self._odometry is None:
             links = Links.joined([*parts, joint.couplings(None, None)])
@@ -273,7 +273,7 @@ class Chainer:
         return Links.joined([*parts, joint.couplings(self._odometry[joint.nodes], self._motion)])
 
     def _placed(self, joint: Joint, solution: Solution, spread: Floats, corrections: Floats) -> ScanChain:
-        """Return the result for all scans so far; a scan that is no node has the pose of the last node."""
+        """Return the result for all scans so far; scans that are no nodes take the last node's pose."""
         count, nodes = self.scans, joint.nodes
         node = np.searchsorted(nodes, np.arange(count), "right") - 1
         poses, covariance = solution.poses[node], spread[node]
@@ -293,7 +293,7 @@ class Chainer:
         )  # fmt: skip
 
     def _motions(self, count: int) -> Floats | None:
-        """Return the motions during the scans so far; None where scans take no time."""
+        """Return the motions during the scans so far; None for instantaneous scans."""
         if all(front.matcher.motion is None for front in self._fronts):
             return None
         motions = np.zeros((len(self._data), 3))
@@ -305,7 +305,7 @@ class Chainer:
 
 
 def _carried(poses: Floats, keys: Integers, placed: Floats) -> Floats:
-    """Return poses moved with the key scans before them.
+    """Return poses moved with their preceding key scans.
 
     Args:
         poses: (N, 3) poses.

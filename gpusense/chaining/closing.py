@@ -1,11 +1,10 @@
-"""Loops: find places that are seen again, match them, check the matches against each other, and close.
+"""Close loops: find revisited places, match them, and check the matches against each other.
 
-Candidates are key scans that show the same cells of the plane. Each is matched in a window of three deviations of the
-expected drift in the pose graph so far. A closure is accepted if its p_right is high, it agrees with the drift, and
-further matches of the same passages agree with it (see ``agreement``). Small drifts are closed first, which reduces the
-larger ones. A broken chain between two places, or a distance beyond the drift, requires a group of agreeing matches.
-Over a weak step, which rests on few or unsure matches, a group of less evidence suffices. A closure across a break
-removes the break.
+Candidates are key scans that show the same cells of the plane, matched in a window of three deviations of the expected
+drift in the pose graph so far. A closure needs a high p_right, agreement with the drift, and further agreeing matches
+of the same passages (see ``agreement``). Small drifts are closed first to reduce larger ones. A broken chain between
+two places, or a distance beyond the drift, requires a group of agreeing matches; over a weak step, with few or unsure
+matches, less evidence suffices. A closure across a break removes the break.
 """
 
 from __future__ import annotations
@@ -37,20 +36,20 @@ _LEVELS = (
     ((4.0, 1.05), 2.0, 600),
     ((10.0, 1.6), 4.0, 150),
 )
-# Deviations of the drift that a window covers; largest squared distance of a closure from the drift [squared
-# deviations], and the same for a closure in a group.
+# Window in deviations of the drift; largest squared distance of a closure from the drift [squared deviations], also
+# within a group.
 _DEVIATIONS, _GATE, _FAR = 3.0, 16.0, 100.0
 # Least p_right of a closure.
 _SURE = 0.9
-# Closures of lower weight in the solution are dropped.
+# Least weight of a closure in the solution.
 _WEIGHT = 0.25
-# Closures far off the present solution are first solved with a kernel this many times as wide.
+# Widening of the kernel in the first solution with closures far off the present solution.
 _WIDE = 10.0
-# Every second key scan is compared with earlier ones, and not with direct neighbours of scans already compared.
+# Compare every second key scan with earlier ones, except direct neighbours of compared scans.
 _EACH, _NEIGHBOURS = 2, 3
-# A pair is searched again where its pose has moved by more than this share of the window.
+# Repeat the search of a pair after its pose has moved by more than this share of the window.
 _ELSEWHERE = 0.5
-# Relative gain of the cost below which a solution between rounds ends.
+# Least relative gain of the cost per iteration between rounds.
 _GAIN = 1e-4
 # Most rounds of a level, and the least motion of poses in a round that justifies another round [m].
 _ROUNDS, _MOVED = 5, 0.3
@@ -61,7 +60,7 @@ _NONE = np.zeros(0, np.int64)
 
 @dataclass(eq=False)
 class Loops:
-    """Closes loops of a graph of key scans, in steps.
+    """Step-by-step loop closure in a graph of key scans.
 
     Attributes:
         matcher: Matches scans.
@@ -76,7 +75,7 @@ class Loops:
         temperature: Factor of the information of matches.
         apart: Key scans of a pair are at least this many apart.
         matches: Sure matches of candidates so far.
-        searched: Number of candidates that were matched.
+        searched: Number of matched candidates.
     """
 
     matcher: TeamMatcher
@@ -118,7 +117,7 @@ class Loops:
         first, second, share = self._overlaps(cell)
         drift = _deviations(self._drift().relative(first, second))
         needed = _level_of(drift)
-        # Repeat with the next window, since deviations are estimates. The last window is for large drifts only.
+        # Repeat with the next window, since deviations are estimates; the last window is only for large drifts.
         again = (needed == level - 1) & (level < len(_LEVELS) - 1)
         needed = np.where(again, level, needed)
         new = (self.sequence[1][second] % _EACH == 0) & (needed <= level)
@@ -137,7 +136,7 @@ class Loops:
         return bool(len(first))
 
     def _overlaps(self, cell: float) -> tuple[Integers, Integers, Floats]:
-        """Return the pairs of key scans that share cells of a size by the solution so far."""
+        """Return the pairs of key scans that share cells of this size in the solution so far."""
         if self._overlaps_of is None or self._overlaps_of[0] is not self.solution or self._overlaps_of[1] != cell:
             found = overlaps(self.places, self.solution.poses, cell, self.apart, self.sequence)
             self._overlaps_of = self.solution, cell, found
@@ -150,7 +149,7 @@ class Loops:
         return self._drift_of[1]
 
     def _forget(self) -> None:
-        """Forget searches of pairs that have moved since."""
+        """Forget searches of pairs that have moved."""
         first, second, level, guess = self._tried
         moved = np.abs(relative(self.solution.poses, first, second) - guess)
         moved[:, 2] = np.abs(wrap_angle(moved[:, 2]))
@@ -185,7 +184,7 @@ class Loops:
         self._tried = first[last], second[last], level[last], guess[last]
 
     def _keep_matches(self, found: Links) -> None:
-        """Remember sure matches in place of earlier matches of the same pairs."""
+        """Replace earlier matches of the same pairs by sure matches."""
         again = np.isin(self._pairs(self.matches.first, self.matches.second), self._pairs(found.first, found.second))
         self.matches = Links.joined([self.matches[~again], found])
 
@@ -203,7 +202,7 @@ class Loops:
         return Links.joined(parts)
 
     def _accept(self) -> None:
-        """Accept the matches that agree with the drift and with each other, solve, and drop contradicted closures."""
+        """Accept matches that agree with the drift and with each other, solve, and drop contradicted closures."""
         left = self.matches
         squared = self._squared(left)
         across, over = (part[left.first] != part[left.second] for part in (self.broken, self.weak))
@@ -258,7 +257,7 @@ def joined_breaks(broken: Integers, closures: Links) -> Integers:
 
 
 def _level_of(drift: Floats) -> Integers:
-    """Return the level (L,) whose window holds the drift (L, 2): the smallest, or the last one."""
+    """Return the smallest level (L,) with a window around the drift (L, 2), or the last one."""
     windows = np.array([window for window, _, _ in _LEVELS[:-1]])
     level: Integers = (_DEVIATIONS * drift[:, None, :] > windows).any(axis=2).sum(axis=1)
     return level

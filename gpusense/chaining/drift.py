@@ -1,4 +1,4 @@
-"""Drift between the poses of two scans: covariances of relative poses in a pose graph."""
+"""Compute the drift between scans: covariances of relative poses in a pose graph."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool]
 
-# Most poses whose joint covariance is kept; in a longer graph each represents the poses up to the next one. At most
-# this share are sides of steps whose variance is this many times the usual one, so that breaks of the chain are
-# represented.
+# Most poses with a kept joint covariance; in a longer graph each represents the poses up to the next. Largest share of
+# sides of loose steps, to represent breaks of the chain, and their variance in multiples of the usual one.
 _ANCHORS, _BREAKS, _LOOSE = 300, 0.4, 10.0
 # Length that converts heading to position variance [m].
 _LEVER = 3.0
-# Poses of a stretch that is eliminated at once, and stretches that are joined for the next elimination.
+# Poses per eliminated stretch, and stretches joined for the next elimination.
 _STRETCH, _JOINED = 32, 16
 # Damping [1/m^2, 1/rad^2]; its inverse is the variance along a direction that no link observes.
 DAMPING = 1e-6
@@ -29,15 +28,14 @@ DAMPING = 1e-6
 class Drift:
     """Covariances of relative poses of a solved pose graph.
 
-    In a graph with more poses than are kept, all remaining poses are eliminated from its local links. Its closures
-    become links between kept poses, widened by the covariance of the steps in between, so the time is linear in the
-    number of poses for any number of closures.
+    In a larger graph, all other poses are eliminated from the local links. Closures become links between kept poses,
+    widened by the covariance of the steps in between; the time is linear in the number of poses for any number of
+    closures.
 
     Args:
         solution: The poses and links.
-        most: Most poses whose joint covariance is kept, at least 3; any other pose takes the covariance of the nearest
-            kept pose before it.
-        anchors: (A,) numbers of the kept poses, ascending from 0, in place of a choice of ``most``.
+        most: Most kept poses, at least 3; any other pose takes the covariance of the last kept pose before it.
+        anchors: (A,) numbers of the kept poses, ascending from 0, instead of choosing ``most``.
 
     Attributes:
         anchors: (A,) numbers of the kept poses, ascending.
@@ -88,7 +86,7 @@ def _spread_of_steps(solution: Solution) -> Floats:
 
 
 def _anchors_of(spread: Floats, most: int) -> Integers:
-    """Return the poses whose joint covariance is kept: evenly spaced ones, and both sides of the loosest steps."""
+    """Return the poses to keep: evenly spaced ones, and both sides of the loosest steps."""
     count = len(spread) + 1
     variance = spread[:, 0, 0] + spread[:, 1, 1] + _LEVER**2 * spread[:, 2, 2]
     loose = np.flatnonzero(variance > _LOOSE * np.median(variance))
@@ -101,8 +99,8 @@ def _anchors_of(spread: Floats, most: int) -> Integers:
 def _reduced(matrix: Any, rows: Integers) -> Floats:
     """Eliminate all but some rows of sparse information, by Schur's complement, and return the information of these.
 
-    Poses are linked to poses near them in the chain. So stretches of it are eliminated at once, as dense matrices, but
-    for poses with links to a later stretch; then longer stretches of what remains.
+    Links join nearby poses of the chain. Stretches are therefore eliminated as dense matrices, except poses with links
+    to a later stretch; longer stretches of the rest follow.
     """
     from scipy import sparse
 
@@ -120,7 +118,7 @@ def _reduced(matrix: Any, rows: Integers) -> Floats:
 
 
 def _without_stretches(matrix: Any, kept: Flags, stretch: Integers) -> tuple[Any, Flags]:
-    """Eliminate rows of sparse information whose links to later stretches, if any, are to kept rows.
+    """Eliminate rows of sparse information that link later stretches only at kept rows.
 
     Args:
         matrix: (M, M) information.
@@ -173,8 +171,8 @@ def _ranks(groups: Integers) -> Integers:
 def _inverse(matrix: Floats) -> Floats:
     """Return the inverse of a symmetric positive definite matrix (M, M), from its lower triangle.
 
-    Cholesky's factor takes three eighths of the operations of a general inverse. Rounding may leave a matrix with
-    hardly any information indefinite, which then takes the general one.
+    Cholesky's factor takes three eighths of the operations of a general inverse. Rounding may make a matrix with
+    hardly any information indefinite; it takes the general inverse.
     """
     from scipy.linalg import lapack
 
@@ -191,9 +189,9 @@ def _inverse(matrix: Floats) -> Floats:
 def _add_closures(whole: Floats, poses: Floats, closures: Links, anchors: Integers, spread: Floats) -> None:
     """Add closures to the information (A, 3, A, 3) of kept poses.
 
-    Small motions are expressed as motions of a frame at the origin that is fixed to the scan, so a link has the same
-    information between any scans of a rigid body. The covariance of the steps from the kept poses to the scans, as if
-    these had no further links, is added to the closure's.
+    Small motions are expressed as motions of a frame at the origin fixed to the scan, so that a link has the same
+    information between any scans of a rigid body. The closure's covariance is widened by the steps from the kept poses
+    to the scans, as if these had no further links.
     """
     steps = np.arange(len(spread))
     _, two = pose_jacobians(poses, steps, steps + 1)
@@ -219,7 +217,7 @@ def _add_closures(whole: Floats, poses: Floats, closures: Links, anchors: Intege
 
 
 def _fixed(poses: Floats) -> Floats:
-    """Return the derivatives (L, 3, 3) of poses by the motion of a frame at the origin to which they are fixed."""
+    """Return the derivatives (L, 3, 3) of poses by the motion of their frame at the origin."""
     result = np.tile(np.eye(3), (len(poses), 1, 1))
     result[:, 0, 2], result[:, 1, 2] = -poses[:, 1], poses[:, 0]
     return result

@@ -1,8 +1,8 @@
-"""Normal equations of a pose graph: sparse symmetric matrices of 3 x 3 blocks whose places are found once.
+"""Assemble the normal equations of a pose graph: sparse symmetric matrices of 3 x 3 blocks in a fixed layout.
 
 Let d lead from a link's first to its second pose in the world, and let W be its information in the world: the link adds
-W to the diagonal block of the second pose, T' W T to the first pose's, and -T' W between both. T turns a small motion
-of the first pose into a motion of the second one: it is the identity but for a lever -d_y, d_x of headings.
+W to the diagonal block of the second pose, T' W T to the first pose's, and -T' W between both. T converts a small
+motion of the first pose to a motion of the second: the identity with a lever -d_y, d_x of headings.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Columns that are factored at once: fewer than SuperLU's default, since few columns of a pose graph are alike.
+# Columns per panel, fewer than SuperLU's default, since few columns of a pose graph are alike.
 _PANEL = 4
 
 
@@ -24,10 +24,10 @@ class Equations:
 
     Args:
         count: Number N of poses.
-        first: (L,) poses in whose frames the links' poses are.
-        second: (L,) poses that are linked to these.
-        fixed: The pose that is kept; it has no rows and columns.
-        ordered: True if rows and columns are in an order with little fill; else in the poses' order.
+        first: (L,) poses that are frames of the links' poses.
+        second: (L,) poses linked to them.
+        fixed: The fixed pose, without rows and columns.
+        ordered: True for an order of rows and columns with little fill, else the poses' order.
 
     Attributes:
         rows: (N - 1,) the free pose of each row of blocks.
@@ -47,7 +47,7 @@ class Equations:
     def _slots(self, place: Integers) -> tuple[Integers, Integers, Integers]:
         """Return rows and columns of the blocks, column by column, and the number of each of the links' four blocks.
 
-        Blocks of the fixed pose have the number after the last one.
+        Blocks of the fixed pose get the number after the last.
         """
         one, two, size = place[self.first], place[self.second], len(self.rows)
         row, column = np.concatenate([one, two, one, two]), np.concatenate([one, two, two, one])

@@ -1,9 +1,9 @@
-"""Match successive scans from the odometry or from rest, and doubtful ones again from neighbouring motions.
+"""Match successive scans from the odometry or from rest, and retry doubtful matches from neighbouring motions.
 
-Rest is a poor guess for a robot that moves far between scans without odometry: along a corridor, where scans look alike
-everywhere, the match then stays at its guess. So doubtful matches, and matches whose motion differs from their
-neighbours', are also tried from constant motion. The match with the highest ``p_right`` is taken, which falls with the
-distance from the guess.
+Rest is a poor guess for a robot that moves far between scans without odometry: along a corridor, where scans look
+alike everywhere, the match stays at its guess. Doubtful matches, and motions unlike their neighbours, are therefore
+also tried from constant motion. The match with the highest ``p_right``, which falls with the distance from the guess,
+is taken.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Flags = NDArray[np.bool]
 
 # Half widths of a second search after a failed one [m, rad].
 _WIDE = (2.0, math.pi)
-# A match is beyond doubt from this p_right, and motions that differ by more than this are unlike [m, rad].
+# Least p_right of a match beyond doubt; least difference of unlike motions [m, rad].
 _BEYOND, _UNLIKE, _UNLIKE_TURN = 0.9, 0.25, 0.1
 # Most rounds of constant motion, each from the good motions of the previous one.
 _ROUNDS = 4
@@ -65,7 +65,7 @@ def matched_by_motion(
         found: L matches of successive scans, from rest.
         first: (L,) indices.
         second: (L,) indices.
-        last: (3,) motion before the first pair; None where it is not known.
+        last: (3,) motion before the first pair, or None.
 
     Returns:
         The matches, and (L, 3) offsets to a second possible motion; NaN without one.
@@ -116,12 +116,12 @@ def weakened(information: Floats, offset: Floats) -> Floats:
 def motions_around(motion: Floats, good: Flags, last: Floats | None) -> tuple[Floats, Floats, Floats]:
     """Return the last good motion before each, the next good motion, and their mean, each (L, 3).
 
-    A side without a good motion takes the opposite side's; if both lack one, rest.
+    A side without a good motion takes the other side's, or rest.
 
     Args:
         motion: (L, 3) motions.
         good: (L,) whether each motion is good.
-        last: (3,) motion before the first one; None where it is not known.
+        last: (3,) motion before the first one, or None.
     """
     motion = np.concatenate([np.zeros((1, 3)) if last is None else last[None], motion])
     near, rows = np.flatnonzero(np.append(last is not None, good)), np.arange(1, len(motion))
@@ -147,7 +147,7 @@ def _tried(
 
 
 def _is_better(found: ScanMatch, rows: Integers, again: ScanMatch) -> Flags:
-    """Return whether new matches of some pairs are usable where the previous ones are not, or have a higher p_right."""
+    """Return whether new matches of some pairs become usable, or have a higher p_right."""
     usable, before = again.usable, found.usable[rows]
     better: Flags = (usable & ~before) | ((usable == before) & (again.p_right > found.p_right[rows]))
     return better

@@ -1,7 +1,7 @@
-"""The front end of a chain matches successive scans, and each scan to the key scans around it.
+"""Match successive scans, and each scan to the key scans around it, as the front end of a chain.
 
-Scans are processed in groups of few launches each: every scan is matched to the previous one, every key scan to several
-key scans before it, and every scan between to the key scans on both sides. Time and memory grow linearly.
+Scans are processed in groups with few launches each: every scan is matched to the previous one, every key scan to
+several preceding key scans, and every scan between to the key scans on both sides. Time and memory grow linearly.
 """
 
 from __future__ import annotations
@@ -26,25 +26,24 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool]
 
-# Number of preceding key scans to which a key scan is matched.
+# Number of preceding key scans to match with a key scan.
 LOCAL = 4
 # Least p_right of a failed match that is still a better guess than constant motion.
 _LIKELY = 0.1
-# Least p_right of a match that bridges failed matches, and most failed matches in a row that it bridges.
+# Least p_right of a bridging match, and most consecutive failed matches under it.
 _BRIDGE, _GAP = 0.8, 5
-# A match is beyond doubt from this p_right, or with this many further matches over its step.
+# Least p_right of a match beyond doubt, or number of further matches over its step.
 _BEYOND, _CONFIRMED = 0.9, 2
-# Odometry agrees with a match within this much [m, rad], and this share of the motion.
+# Largest difference of agreeing odometry [m, rad], plus this share of the motion.
 _AGREES, _AGREES_SHARE = 0.1, 0.15
-# Readings differ if they are apart by more than this [m] and this share; scans are unlike if more than this share of
-# their readings differs.
+# Least difference of differing readings [m] and as a share; least share of differing readings in unlike scans.
 _DIFFERENCE, _DIFFERENCE_SHARE, _UNLIKE = 0.15, 0.1, 0.3
-# A direction counts as a turn if its heading component exceeds this.
+# Least heading component of a direction that is a turn.
 _TURNING = 0.5
 
 
 class Front:
-    """Matches the scans of a log group by group.
+    """Matcher of a log's scans, group by group.
 
     Args:
         readings: (S, K) readings [m].
@@ -55,13 +54,13 @@ class Front:
 
     Attributes:
         jumps: (S,) whether the time jumps before a scan.
-        nodes: (M,) indices of the matched scans, before which the robot has moved.
+        nodes: (M,) indices of the matched scans; the robot has moved before each.
         steps: Motions from each node to the next.
         keys: Numbers of the nodes that are key scans.
-        p_right: Probabilities of the matches of steps; 0 where none is usable.
-        lost: Numbers of directions that these matches leave open.
-        rivalled: A second motion explains the scans of a step about equally well.
-        bridged: A step without a match is taken from a match that spans it.
+        p_right: Probabilities of the steps' matches; 0 without a usable match.
+        lost: Numbers of open directions of these matches.
+        rivalled: True if a second motion explains the scans of a step about equally well.
+        bridged: True for a step without a match, taken from a spanning match.
         spanned: Whether a match spans an unmatched step together with its neighbours.
         unseen: (L, 3, 3) projections of steps onto their open directions.
         links: The links between nodes.
@@ -120,10 +119,10 @@ class Front:
 
     @property
     def weak(self) -> Flags:
-        """Tell for each of the M - 1 steps whether it may be a break of the chain.
+        """Mask (M - 1,) of steps that may be breaks of the chain.
 
-        A step is weak if its own scans do not match, or if its match is not beyond doubt and neither the odometry nor
-        two further matches confirm it; after a jump of time it must be beyond doubt and confirmed by matches.
+        A step is weak if its scans do not match, or if its match is doubtful and neither odometry nor two further
+        matches confirm it; after a jump of time it must be beyond doubt and confirmed by matches.
         """
         sure, confirmed = self.p_right >= _BEYOND, self.confirmations() >= _CONFIRMED
         jumped = self.jumps[self.nodes[1 : self.done]]
@@ -146,7 +145,7 @@ class Front:
         trial = copy.copy(self)
         trial.keys, trial._parts = list(self.keys), list(self._parts)
         found = trial._match_group()
-        # A single call, which no signal divides.
+        # A single call, indivisible by signals.
         self.__dict__.update(trial.__dict__)
         return found
 
@@ -229,7 +228,7 @@ class Front:
             self.spanned[steps] = True
 
     def _matched_over(self, first: Integers, second: Integers, rows: Integers) -> tuple[Integers, Floats, Floats]:
-        """Add links of good matches over failed steps, and return their rows, poses and p_right."""
+        """Add links of good matches over failed steps; return their rows, poses and p_right."""
         if not len(rows):
             return rows, np.zeros((0, 3)), np.zeros(0)
         nodes = self.nodes[first], self.nodes[second]
@@ -257,7 +256,7 @@ class Front:
         """Return projections (L, 3, 3) of motions onto the directions that matches do not observe."""
         lost = found.eigenvalues == 0
         if self._odometry is None:
-            # A turn need not continue.
+            # A turn may end.
             lost &= np.abs(found.directions[:, :, 2]) < _TURNING
         directions = found.directions * lost[:, :, None]
         scale = np.stack([np.ones(len(lost)), np.ones(len(lost)), found.lever], axis=1)
@@ -303,9 +302,9 @@ class Front:
 
 
 def moved_scans(odometry: Floats | None, readings: Floats, step: tuple[float, float]) -> Integers:
-    """Return the indices of scans before which the robot has moved since the previously chosen scan.
+    """Return the indices of scans after motion since the previously chosen scan.
 
-    It has moved if the odometer has moved by a step, or if the readings differ although the odometer rests.
+    The robot has moved if the odometer has moved by a step, or if the readings differ although the odometer rests.
     """
     if odometry is None or step == (0.0, 0.0):
         return np.arange(len(readings))
@@ -320,7 +319,7 @@ def moved_scans(odometry: Floats | None, readings: Floats, step: tuple[float, fl
 
 
 def _are_unlike(one: Floats, two: Floats) -> bool:
-    """Return whether more readings of two scans differ than would at rest."""
+    """Return whether more readings of two scans differ than at rest."""
     with np.errstate(invalid="ignore"):
         both = np.isfinite(one) & np.isfinite(two)
         differ = np.abs(one - two) > np.maximum(_DIFFERENCE, _DIFFERENCE_SHARE * one)

@@ -2,13 +2,12 @@
 
 The cost is the sum over links of c^2 log(1 + s / c^2), Cauchy's kernel of the squared distance s = r' I r of a link's
 residual r in deviations (I is its information). Reweighted Gauss-Newton steps, damped as by Levenberg, minimise it; the
-normal equations are sparse and are factored by SuperLU. Poses are relative to a fixed pose. Information may be 0 in
-some directions of some or even all links: an undetermined direction keeps its initial value.
+normal equations are sparse and are factored by SuperLU. Poses are relative to a fixed pose. Information may be 0 along
+directions of some or all links: an undetermined direction keeps its initial value.
 
-A step changes the poses in the world. Where asked for, it changes these or the motions from pose to pose, whichever
-costs less: both are equal at first, but the first is right for a loose pose among firm ones, the second for a long
-chain that turns. Damping is then per pose [1/m^2, 1/rad^2], so a few loose poses in curved valleys of the cost do not
-hold up all others.
+A step changes the poses in the world or, with ``settle``, the motions from pose to pose if that costs less. Both are
+equal to first order, but the former suits a loose pose among firm ones, the latter a long chain that turns. Damping is
+then per pose [1/m^2, 1/rad^2], so that a few loose poses in curved valleys of the cost do not delay all others.
 """
 
 from __future__ import annotations
@@ -31,11 +30,10 @@ KERNEL = 3.0
 # Most iterations, the step that ends them [m, rad], and the first, least and largest damping.
 _ITERATIONS, _SMALL = 50, 1e-6
 _DAMPING, _LEAST, _MOST = 1e-6, 1e-9, 1e6
-# After a step that is taken, damping falls by this factor, or by the second one if damping is per pose.
+# Factor of falling damping after an accepted step, in general and per pose.
 _RELAXED, _RELAXED_APART = 10.0, 3.0
-# After a step that fails, damping rises from at least this value, or from at least the second one if damping is per
-# pose. It rises at links whose cost rises by this share of the largest rise, after a second failure by its square, and
-# after this many everywhere.
+# After a failed step, least value of rising damping, in general and per pose. It rises at links that rise in cost by
+# this share of the largest rise, after a second failure by its square, and after this many failures everywhere.
 _FAILED, _FAILED_APART, _RISE, _FAILS = 1e-4, 1e-2, 0.01, 3
 
 
@@ -60,16 +58,16 @@ def solve(
     poses: Floats, links: Links, *, fixed: int = 0, kernel: float = KERNEL, least: float = 1e-7, settle: bool = False,
     equations: Equations | None = None,
 ) -> Solution:  # fmt: skip
-    """Return the poses near initial ones that agree best with links.
+    """Return the poses near initial ones that best agree with links.
 
     Args:
         poses: (N, 3) poses to begin with [m, m, rad].
         links: Links between them; their weights are ignored.
-        fixed: Index of the pose that is kept.
+        fixed: Index of the fixed pose.
         kernel: Scale of Cauchy's kernel [deviations]; infinity for plain least squares.
-        least: Relative gain of the cost below which the iterations end.
-        settle: Steps may also change motions, and damping is per pose: more work for each step, for fewer steps.
-        equations: Ordered equations of these poses and links, if there are any from an earlier call.
+        least: Least relative gain of the cost per iteration.
+        settle: True to also change motions, with damping per pose: fewer but costlier steps.
+        equations: Ordered equations of these poses and links from an earlier call, or None.
     """
     at, damping, fails = np.array(poses, np.float64), np.full(len(poses), _DAMPING), 0
     residual = links.residuals(at)
@@ -107,15 +105,15 @@ def solve(
 
 
 def _raised(rise: Floats, links: Links, count: int, fails: int) -> Flags:
-    """Return the poses (N,) whose damping rises after a step that failed.
+    """Return the poses (N,) with rising damping after a failed step.
 
-    These are the poses of the links whose cost rises most, and their neighbours; after further failures more of them.
+    These are the poses of the links with the largest rise in cost and their neighbours, more after further failures.
 
     Args:
         rise: (L,) rises of the links' costs.
         links: The links.
         count: Number of poses.
-        fails: Number of steps that failed in a row.
+        fails: Number of consecutive failed steps.
     """
     near = np.full(count, fails >= _FAILS)
     some = rise > _RISE**fails * rise.max()
@@ -133,9 +131,9 @@ def _moved(poses: Floats, step: Floats) -> Floats:
 
 
 def _moved_along(poses: Floats, step: Floats, fixed: int) -> Floats:
-    """Return poses (N, 3) whose motions from pose to pose change as a step (N, 3) in the world changes them at first.
+    """Return poses (N, 3) after changing the motions from pose to pose like a step (N, 3) in the world to first order.
 
-    The ends of a long chain turn about its beginning, on circles that a step in the world leaves.
+    The ends of a long chain turn about its beginning on circles; a step in the world leaves them.
     """
     before, after = pose_jacobians(poses, np.arange(len(poses) - 1), np.arange(1, len(poses)))
     change = np.einsum("lij,lj->li", before, step[:-1]) + np.einsum("lij,lj->li", after, step[1:])

@@ -1,8 +1,8 @@
-"""Joint trajectory of a robot with several scanners: the scans of all front ends in the order of the log.
+"""Join the scans of several scanners' front ends, in the order of the log, in one trajectory.
 
-Scans of each scanner are matched among themselves. The robot's pose at scans of further scanners between them is
-interpolated in time. So key scans are coupled with the preceding and following scans of further scanners, by odometry
-or by this interpolation.
+Scans of each scanner are matched among themselves, and the robot's pose at other scanners' scans in between is
+interpolated in time. Key scans are coupled with the preceding and following scans of other scanners by odometry or by
+this interpolation.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Flags = NDArray[np.bool]
 
 # Deviations of a pose between scans of two scanners: by mounts and clocks [m, rad], and a share of the motion.
 _MOUNTS, _MOUNTS_TURN, _SHARE = 0.01, 0.01, 0.1
-# Constant motion continues over intervals at most this many times as long.
+# Largest ratio of intervals for continuing constant motion.
 _LONGER = 3.0
 # The share between key scans.
 _KEY_SHARE = 0.02
@@ -41,17 +41,17 @@ class Joint:
         fronts: The front ends.
         rows: Indices in the log of the scans of each front end.
         times: (S,) times of the poses at the scans of the log [s]; None: evenly.
-        scans: Number of scans of the log that are used.
+        scans: Number of used scans of the log.
 
     Attributes:
         nodes: (M,) indices of the matched scans in the log, ascending.
-        of: For each front end the numbers of its nodes among all nodes.
+        of: Numbers of each front end's nodes among all nodes.
         owner: (M,) index of the front end of each node.
         keys: (K,) numbers of nodes that are key scans.
         failed: (M - 1,) whether no scanner determines the motion from a node to the next.
-        open: (M - 1,) whether the scanners that determine it leave a direction open.
-        contested: (M - 1,) whether a second motion explains their scans equally well.
-        poses: (M, 3) poses by the matches that determine each motion best, chained from the first one.
+        open: (M - 1,) whether the scanners that determine the motion leave a direction open.
+        contested: (M - 1,) whether a second motion explains the scans equally well.
+        poses: (M, 3) poses by the best match of each motion, chained from the first one.
     """
 
     def __init__(self, fronts: Sequence[Front], rows: Sequence[Integers], times: Floats | None, scans: int) -> None:
@@ -73,7 +73,7 @@ class Joint:
         return list(zip(self.fronts, self.of, strict=True))
 
     def renumbered(self, links: Links, index: int) -> Links:
-        """Renumber links of a front end to the nodes of all front ends; links beyond the last node are left out."""
+        """Renumber links of a front end to the nodes of all front ends, without links beyond the last node."""
         count = len(self.of[index])
         return links[(links.first < count) & (links.second < count)].renumbered(self.of[index])
 
@@ -89,7 +89,7 @@ class Joint:
 
     @property
     def weak(self) -> Flags:
-        """Tell for each of the M - 1 motions between nodes whether it may be a break of the chain by every scanner."""
+        """Mask (M - 1,) of motions between nodes that may be breaks of the chain by every scanner."""
         weak = np.ones(len(self.failed), bool)
         for front, of in self._each():
             step, inside = _steps_of(of, len(self.nodes))
@@ -113,7 +113,7 @@ class Joint:
         return ranks
 
     def confirmations(self) -> Integers:
-        """Count the matches (M - 1,) that determine the motion from a node to the next, without the first one."""
+        """Count the additional matches (M - 1,) that determine the motion from a node to the next."""
         total = np.count_nonzero(self._trust > 0, axis=0) - 1
         for front, of in self._each():
             step, inside = _steps_of(of, len(self.nodes))
@@ -183,9 +183,9 @@ class Joint:
         return chained(np.zeros(3), moved)
 
     def pairs(self) -> tuple[Integers, Integers]:
-        """Pair nodes with the preceding and following nodes of further scanners; return earlier and later ones (L,).
+        """Pair nodes with the preceding and following nodes of other scanners; return earlier and later ones (L,).
 
-        The nodes are key scans, and scans whose matches to their predecessors leave directions open.
+        The nodes are key scans, and scans with open directions in the matches to their predecessors.
         """
         count, pairs = len(self.nodes), []
         before, after = np.full((len(self.fronts), count), -1), np.full((len(self.fronts), count), -1)
@@ -206,7 +206,7 @@ class Joint:
         return both[0], both[1]
 
     def couplings(self, reported: Floats | None, motion: OdometryMotion | None) -> Links:
-        """Return links between key scans and scans of further scanners.
+        """Return links between key scans and scans of other scanners.
 
         Args:
             reported: (M, 3) poses of the odometer at the nodes, or None.
@@ -252,6 +252,6 @@ def _below(keys: Sequence[int], count: int) -> Integers:
 
 
 def _steps_of(of: Integers, count: int) -> tuple[Integers, Flags]:
-    """Return the step (M - 1,) of a front end that contains each motion between all nodes, and whether there is one."""
+    """Return the step (M - 1,) of a front end that contains each motion between all nodes, and whether it exists."""
     step = np.searchsorted(of, np.arange(max(count - 1, 0)), "right") - 1
     return step, (step >= 0) & (step < len(of) - 1)

@@ -21,7 +21,7 @@ KINDS = {
     COUPLING: "scans of two scanners of the robot, by the motion between them",
     CLOSURE: "scans of a place that was seen again, matched",
 }
-"""The meaning of each kind of a link."""
+"""Meaning of each kind of link."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,13 +29,13 @@ class Links:
     """L links between scans.
 
     Attributes:
-        first: (L,) indices of the scans in whose frames poses are.
+        first: (L,) indices of the scans that are frames of reference.
         second: (L,) indices of the scans at these poses.
         pose: (L, 3) poses of the second scans in the frames of the first ones [m, m, rad].
         information: (L, 3, 3) inverse covariances, 0 along directions that are not observed.
         p_right: (L,) probabilities that the poses are right; NaN for odometry and constant motion.
         kind: (L,) kinds, see :data:`gpusense.chaining.links.KINDS`.
-        weight: (L,) factors of the information in the solution: near 0 for links that all remaining ones contradict.
+        weight: (L,) factors of the information in the solution: near 0 for links that all others contradict.
 
     Example:
         >>> import numpy as np
@@ -67,7 +67,7 @@ class Links:
 
     @classmethod
     def joined(cls, parts: Sequence[Links]) -> Links:
-        """Return the links of several parts as one, in their order."""
+        """Join the links of several parts in order."""
         if not parts:
             return cls.of(MATCH, [], [], np.zeros((0, 3)), np.zeros((0, 3, 3)))
         return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
@@ -80,7 +80,7 @@ class Links:
         return Links(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
 
     def renumbered(self, numbers: Integers) -> Links:
-        """Return the links with the scans' indices looked up in ``numbers``."""
+        """Return the links with scans renumbered by ``numbers``."""
         return replace(self, first=numbers[self.first], second=numbers[self.second])
 
     def residuals(self, poses: Floats) -> Floats:
@@ -99,7 +99,7 @@ class Links:
 
 
 def chained(first: Floats, steps: Floats) -> Floats:
-    """Return (S + 1, 3) poses: the first one, then one after each step.
+    """Return (S + 1, 3) poses: the first, then a pose after each step.
 
     Args:
         first: (3,) pose.

@@ -1,4 +1,4 @@
-"""Match scans of a log by their indices, for one scanner or several scanners of a robot."""
+"""Match scans of a log by index, for one or several scanners of a robot."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ Integers = NDArray[np.int64]
 GROUP, GUIDED_GROUP = 256, 1024
 """Scans of a group without and with odometry; an interrupt keeps the matches of finished groups."""
 BATCH = 1024
-"""Most pairs of one call."""
-# Least p_right of a match that is used.
+"""Most pairs per call."""
+# Least p_right of a used match.
 SURE = 0.5
-# Deviation of a match along a direction that only starts on both sides determine [m]: 0.2 m after the temperature.
+# Deviation of a match along a direction determined only by starts on both sides [m]: 0.2 m after the temperature.
 _HELD = 0.04
 # Share of pairs that counts as constraining such a direction.
 _LITTLE = 1e-6
-# Half widths of a search where other matches determine the relative pose [m, rad].
+# Half widths of a search if other matches determine the relative pose [m, rad].
 NEAR = (0.5, 0.3)
 
 
@@ -46,7 +46,7 @@ class Found(NamedTuple):
 
 
 class Matcher:
-    """Matches scans of one scanner.
+    """Matcher of a scanner's scans.
 
     Args:
         readings: (S, K) readings [m].
@@ -81,7 +81,7 @@ class Matcher:
         )  # fmt: skip
 
     def observed(self, first: Integers, second: Integers, found: ScanMatch) -> ScanMatch:
-        """Return the matches, with information along lost directions where starts on both sides return to them.
+        """Return the matches, with information along lost directions if starts on both sides return to them.
 
         Args:
             first: (L,) indices.
@@ -107,9 +107,9 @@ class Matcher:
     def across(
         self, first: Integers, other: Matcher, second: Integers, guess: Floats, window: tuple[float, float] | None
     ) -> Found:
-        """Return the robot's poses at scans of a second scanner with equal bearings, relative to those at these.
+        """Return the robot's poses at scans of a second scanner with equal bearings, relative to this scanner's.
 
-        Both are matched as scans of one scanner in the middle of a robot, so that matched poses are scanner poses.
+        Both are matched as scans of a scanner in the middle of a robot, so that matched poses are scanner poses.
         """
         one, two = (np.array(matcher.scanner.mount) for matcher in (self, other))
         plain = Scanner(
@@ -156,7 +156,7 @@ class Matcher:
 
 
 class TeamMatcher:
-    """Matches scans of several scanners of a robot.
+    """Matcher of scans of several scanners of a robot.
 
     Args:
         matchers: The matcher of each scanner.
@@ -170,12 +170,12 @@ class TeamMatcher:
         self._alike = np.array([[np.array_equal(one, two) for two in bearings] for one in bearings])
 
     def can_match(self, first: Integers, second: Integers) -> NDArray[np.bool]:
-        """Return whether scans can be matched: if they are from one scanner, or from scanners with equal bearings."""
+        """Return whether scans can be matched: from one scanner, or from scanners with equal bearings."""
         result: NDArray[np.bool] = self._alike[self._sensor[first], self._sensor[second]]
         return result
 
     def match(self, first: Integers, second: Integers, guess: Floats, window: tuple[float, float]) -> Found:
-        """Return the poses at second scans relative to those at first scans, for pairs that can be matched."""
+        """Return the poses at second scans relative to first scans, for pairs that can be matched."""
         pairs = self._sensor[first] * len(self._matchers) + self._sensor[second]
         parts, order = [], []
         for pair in np.unique(pairs):

@@ -1,4 +1,4 @@
-"""Motion between scans by odometry or by constant motion, with information."""
+"""Compute motion between scans, with information, by odometry or constant motion."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from gpusense.world.deskew import part_of_arc
 
 Floats = NDArray[np.float64]
 
-# Least deviations of a motion by odometry [m, rad], since each direction needs a finite information.
+# Least deviations of a motion by odometry [m, rad], for finite information.
 _LEAST = (1e-3, 5e-4)
-# Most steps to which the noise of an odometer is fitted.
+# Most steps in a fit of an odometer's noise.
 _MOST_STEPS = 1000
 # Deviations of constant motion: a share of the motion, and an amount per scan [m, rad].
 _SHARE, _RESTLESS, _RESTLESS_TURN = 0.5, 0.02, 0.02
@@ -48,7 +48,7 @@ def odometry_links(motion: OdometryMotion, before: Floats, after: Floats) -> tup
 
 
 def fitted_motion(odometry: Floats, poses: Floats, joined: NDArray[np.bool]) -> OdometryMotion:
-    """Fit the noise of an odometer to matched poses; return the default where too little is known.
+    """Fit the noise of an odometer to matched poses; return the default without enough data.
 
     Args:
         odometry: (M, 3) poses of the odometer at key scans.
@@ -74,7 +74,7 @@ def constant_motion_deviation(steps: Floats) -> Floats:
 
 
 def scan_motions(steps: Floats, times: Floats, duration: float) -> Floats:
-    """Return the motions (S, 3) during scans, by the mean velocity before and after each.
+    """Return the motions (S, 3) during scans by the mean velocity before and after each.
 
     Args:
         steps: (S - 1, 3) motions from scan to scan.

@@ -1,4 +1,4 @@
-"""Options of a chain of scans, and the checks of its arguments."""
+"""Define the options of a chain of scans, and check its arguments."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gpusense.localization.motion import OdometryMotion
 
 Floats = NDArray[np.float64]
 
-# A time gap longer than this many usual steps, and longer than this [s], is a jump.
+# Least time gap of a jump, in usual steps and [s].
 _JUMP_STEPS, _JUMP = 10.0, 2.0
 # Longest time from the first beam of a scan to the last one [s].
 _LONGEST = 3600.0
@@ -26,11 +26,11 @@ class ChainOptions:
     """Options of a chain.
 
     Attributes:
-        step: Motion by odometry below which a scan is not matched [m, rad].
-        key_step: Motion after which a scan becomes a key scan [m, rad].
+        step: Least motion by odometry of a matched scan [m, rad].
+        key_step: Motion between key scans [m, rad].
         duration: Time from the first beam of a scan to the last one [s].
         motion: Noise of the odometry; None to fit it to the matches.
-        close_loops: Search for places that are seen again.
+        close_loops: Whether to search for revisited places.
         backend: The device.
         precision: Precision of the matches.
     """
@@ -74,7 +74,7 @@ def check_durations(duration: object, scanners: int, timed: bool) -> tuple[float
 
 
 def jumps_of(times: Floats | None, scans: int) -> NDArray[np.bool]:
-    """Return (S,) whether the time from the scan before is much longer than usual; False for the first one."""
+    """Return the mask (S,) of scans after a much longer time than usual; False for the first one."""
     jumps = np.zeros(scans, bool)
     if times is None or scans < 3:
         return jumps

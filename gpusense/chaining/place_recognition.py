@@ -1,4 +1,4 @@
-"""Find pairs of key scans that may show the same place because their end points share cells of the plane."""
+"""Find pairs of key scans that may show the same place: their end points share cells of the plane."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from gpusense.world.sensor_scans import SensorScans
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Least share of a scan's cells that a second scan must share.
+# Least share of common cells of a scan.
 _SHARE = 0.3
-# Key scans whose shares are computed at once.
+# Key scans per pass.
 _ROWS = 512
-# Most cells of a plane for which a table is kept.
+# Most cells of a plane with a table.
 _DENSE = 1 << 22
-# Points farther than this many rms ranges are left out, since they say little about a place.
+# Largest distance of useful points [rms ranges]; farther points hardly characterise a place.
 _FAR = 2.0
-# Passages per direction through a place with which later ones are compared, the directions, key scans of a scanner
+# Passages per direction through a place to compare with later ones, number of directions, key scans of a scanner
 # between two passages, and most key scans of a passage.
 _PASSAGES, _WAYS, _AWAY, _LONG = 4, 4, 16, 64
-# Most first scans for each second one, and the share of cells that counts as large.
+# Most first scans per second one, and least large share of cells.
 _PAIRS, _LARGE = 8, 0.6
 
 
@@ -53,8 +53,8 @@ def overlaps(
 ) -> tuple[Integers, Integers, Floats]:
     """Return pairs of key scans that share many cells, the best of each passage.
 
-    From successive key scans of a scanner that share cells with a second one, take the scan with the largest share.
-    Earlier scans come from the first passages through each place, so their number does not grow with further passages.
+    Successive key scans of a scanner that share cells with a second one yield the scan with the largest share. Earlier
+    scans come only from the first passages through each place, so that their number does not grow.
 
     Args:
         places: End points of each key scan in the robot's frame.
@@ -88,13 +88,13 @@ def overlaps(
 
 
 def _cells_of(places: list[Floats], poses: Floats, cell: float) -> tuple[Integers, Integers]:
-    """Return the key scans (C,) and the numbers (C,) of the cells that contain their points, each pair once."""
+    """Return the distinct pairs of key scans (C,) and numbers (C,) of the cells of their points."""
     sizes = [len(points) for points in places]
     owner = np.repeat(np.arange(len(places)), sizes)
     px, py, c, s = np.repeat([poses[:, 0], poses[:, 1], np.cos(poses[:, 2]), np.sin(poses[:, 2])], sizes, axis=1)
     x, y = np.concatenate(places).T
     cells = np.floor(np.stack([px + c * x - s * y, py + s * x + c * y]) / cell).astype(np.int64)
-    # Neighbouring points mostly share a cell, so little is left to sort.
+    # Neighbouring points mostly share a cell, which leaves little to sort.
     new = np.append(True, (np.diff(owner) != 0) | (np.diff(cells) != 0).any(axis=0))[: len(owner)]
     owner, number = owner[new], _numbered(cells[:, new].T)
     count = int(number.max(initial=0)) + 1
@@ -121,14 +121,15 @@ def _numbered(cells: Integers) -> Integers:
 def _first_passages(table: Any, poses: Floats, sequence: tuple[Integers, Integers]) -> Integers:
     """Return the key scans of the first passages, by a scanner in a direction, through enough of their cells.
 
-    A new passage of a cell begins after several key scans that do not show it, or after many in a row that do.
+    A new passage of a cell begins after several key scans that do not show the cell, or after many consecutive ones
+    that do.
     """
     scanners, ranks = sequence
     ways = scanners * _WAYS + np.floor(poses[:, 2] / (2 * np.pi) * _WAYS + 0.5).astype(np.int64) % _WAYS
     early = []
     cells = table.shape[1]
     each = np.diff(table.indptr)
-    # A number for each cell and way of passing it.
+    # A number for each cell and direction of passage.
     whole = table.indices + np.repeat(ways * cells, each)
     size = (int(ways.max(initial=0)) + 1) * cells
     passed, begun, until = np.zeros(size, np.int64), np.full(size, -_LONG - 1, np.int64), np.full(size, -1, np.int64)
@@ -155,7 +156,7 @@ def _most_alike(first: Integers, second: Integers, share: Floats, poses: Floats)
 def _best_of_passages(
     first: Integers, second: Integers, share: Floats, sequence: tuple[Integers, Integers]
 ) -> tuple[Integers, Integers, Floats]:
-    """Return the best pair of each run of successive first scans of a scanner with the same second one."""
+    """Return the best pair in each run of successive first scans of a scanner with the same second one."""
     if not len(first):
         return first, second, share
     scanner, rank = (values[first] for values in sequence)

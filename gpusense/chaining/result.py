@@ -1,4 +1,4 @@
-"""The trajectory of a chain of scans, with its links, closures and doubts."""
+"""Result of a chain of scans: trajectory, links, closures and doubts."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ REASONS = {
     "unconfirmed": "an unsure match, or without odometry a single one, determines the motion: nothing confirms it",
     "jump": "the time jumps, and the robot may be anywhere after it",
 }
-"""The meaning of each doubt."""
+"""Meaning of each doubt."""
 
 
 class Doubt(NamedTuple):
-    """A stretch of the trajectory that is doubtful.
+    """Doubtful stretch of the trajectory.
 
     Attributes:
         first: Index of the scan before the first doubtful motion.
@@ -41,25 +41,25 @@ class Doubt(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ScanChain:
-    """The trajectory of S scans, from :func:`gpusense.chain_scans`.
+    """Trajectory of S scans, from :func:`gpusense.chain_scans`.
 
     Attributes:
-        poses: (S, 3) poses of the robot at the first listed beam of each scan [m, m, rad]; the first is the odometry's,
-            or (0, 0, 0) without odometry.
-        covariance: (S, 3, 3) covariances given the first pose [m^2, m rad, rad^2]; very large along directions that
-            nothing determines.
-        links: The links of the pose graph between scans, with their weights in the solution; closures are among them.
+        poses: (S, 3) poses of the robot at the first listed beam of each scan [m, m, rad]; the first comes from the
+            odometry, or is (0, 0, 0).
+        covariance: (S, 3, 3) covariances given the first pose [m^2, m rad, rad^2]; very large along undetermined
+            directions.
+        links: Links of the pose graph between scans, including closures, with their weights in the solution.
         keys: (K,) indices of the key scans.
-        motion: The noise of the odometry, as passed or fitted to the matches; None without odometry.
+        motion: Noise of the odometry, passed or fitted to the matches; None without odometry.
         motions: (S, 3) motion of the robot from the first listed beam of each scan to the last one, or None if scans
             are instantaneous.
-        duration: Time from the first listed beam to the last one that was used [s]; negative where beams are listed in
-            reverse: see :attr:`later`. A tuple for several scanners.
+        duration: Used time from the first listed beam to the last one [s]; negative for beams in reverse order: see
+            :attr:`later`. A tuple for several scanners.
         sensor: (S,) index of the scanner of each scan.
         corrections: (C,) distances [m] that closures moved second scans in the frames of first scans.
-        doubts: Stretches that are doubtful.
-        matched: Number of scans that were matched; during all remaining ones the robot stood still by its odometry.
-        searched: Number of pairs of key scans that were matched in the search for places that are seen again.
+        doubts: Doubtful stretches.
+        matched: Number of matched scans; at all others the robot stood still by its odometry.
+        searched: Number of matched pairs of key scans in the search for revisited places.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -99,7 +99,7 @@ class ScanChain:
 
     @property
     def later(self) -> Floats:
-        """Time [s] from each scan to its pose, (S,); the scan's duration if beams are listed in reverse, else 0."""
+        """Time [s] from each scan to its pose, (S,): the scan's duration for beams in reverse order, else 0."""
         result: Floats = np.maximum(-np.atleast_1d(np.array(self.duration, np.float64)), 0.0)[self.sensor]
         return result
 
@@ -135,7 +135,7 @@ class ScanChain:
 
 
 def doubts_of(joint: Joint, alone: bool) -> tuple[Doubt, ...]:
-    """Return the stretches that are doubtful."""
+    """Return the doubtful stretches."""
     failed, open_, nodes = joint.failed, joint.open & alone, joint.nodes
     contested = joint.contested & ~failed & ~open_
     single = (joint.confirmations() == 0) & alone | joint.weak

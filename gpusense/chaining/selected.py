@@ -1,10 +1,10 @@
-"""Covariances of all poses of a pose graph: the diagonal blocks of the inverse of its sparse normal equations.
+"""Compute covariances of all poses of a pose graph: diagonal blocks of the inverse of its sparse normal equations.
 
 The matrix of 3 x 3 blocks is eliminated front by front along the elimination tree (Duff and Reid 1983): successive
-columns with equal rows at once, and fronts of equal shape whose children are done together. The blocks of the inverse
-within each front follow from its parent's blocks, from the root down (Takahashi et al. 1973): with L the columns below
-pivots D, and Z the inverse, Z_sj = -Z_ss L and Z_jj = D^-1 + L' Z_ss L. No further blocks are computed, so time and
-memory equal the elimination's.
+columns with equal rows at once, and fronts of equal shape with finished children together. The blocks of the inverse
+within each front follow from its parent's blocks, from the root down (Takahashi et al. 1973): for L the columns below
+pivots D, and Z the inverse, Z_sj = -Z_ss L and Z_jj = D^-1 + L' Z_ss L. Only these blocks are computed: time and memory
+equal the elimination's.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def _order(blocks: Any, count: int) -> Integers:
 
 
 def _parts_of(blocks: Any, order: Integers) -> list[tuple[int, int, Integers]]:
-    """Return runs of steps of the elimination, each with its first and its end, and the rows below that all share."""
+    """Return runs of elimination steps, each with its first step, its end, and the common rows below."""
     count = len(order)
     place = np.empty(count, np.int64)
     place[order] = np.arange(count)
@@ -108,10 +108,10 @@ def _parts_of(blocks: Any, order: Integers) -> list[tuple[int, int, Integers]]:
 
 
 class Tree:
-    """The elimination tree of parts; parts of equal shape whose children are done are eliminated at once, as a group.
+    """Elimination tree of parts; parts of equal shape with finished children are eliminated as a group.
 
     Args:
-        parts: For each part its first and its end step, and the rows below that its steps share.
+        parts: First and end step of each part, and the common rows below.
         count: Number of steps.
 
     Attributes:
@@ -122,7 +122,7 @@ class Tree:
         home: (N,) part of each step.
         groups: Parts of each group, children first.
         number: (P,) number of each part in its group.
-        last_used: For each group the groups that none but it and groups after it need on the way up.
+        last_used: For each group, the groups needed only by it and by later groups on the way up.
     """
 
     def __init__(self, parts: list[tuple[int, int, Integers]], count: int) -> None:
@@ -153,14 +153,14 @@ class Tree:
         self.last_used = [np.flatnonzero(first == group).tolist() for group in range(len(first))]
 
     def place(self, part: Integers, row: Integers) -> Integers:
-        """Return the places of rows in the fronts of parts: its own steps, then the rows below."""
+        """Return the positions of rows in the fronts of parts: the part's steps, then the rows below."""
         within = np.searchsorted(self._keys, part * self._count + row) - self._start[part] + self.size[part]
         step = row - self.begin[part]
         places: Integers = np.where(step < self.size[part], step, within)
         return places
 
     def parents(self, which: Integers) -> list[tuple[int, Integers, Integers]]:
-        """Return for each group of parents of a group's parts: its number, its parts' children, and their places.
+        """Return, for each group of parents of a group's parts, its number, its parts' children, and their positions.
 
         Places (C, R) locate the scalar rows below in the fronts of the parents.
         """
@@ -171,7 +171,7 @@ class Tree:
 
 
 def _eliminated(blocks: Any, order: Integers, tree: Tree, damping: float) -> tuple[list[Floats], list[Floats]]:
-    """Return for each group of the tree the factors L and the inverses of the pivots of its parts."""
+    """Return the factors L and inverse pivots of the parts, for each group of the tree."""
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
     step, row = place[np.repeat(np.arange(len(order)), np.diff(blocks.indptr))], place[blocks.indices]

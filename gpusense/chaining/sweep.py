@@ -1,7 +1,7 @@
-"""Determine the order in which beams are measured: as listed, in reverse, or all at once.
+"""Determine the order of beams in time: as listed, in reverse, or all at once.
 
-Drivers of lasers that turn clockwise list their beams in reverse, and some report wrong times. Scans during which the
-robot turns decide: corrected for its motion by the right order they agree best.
+Drivers of clockwise lasers list their beams in reverse, and some report wrong times. Scans of a turning robot decide:
+corrected for the motion by the right order they agree best.
 """
 
 from __future__ import annotations
@@ -15,20 +15,19 @@ from gpusense.chaining.motion import relative, scan_motions
 
 Floats = NDArray[np.float64]
 
-# Most scans that are inspected; scans between the two of a pair; most pairs; least turn during a scan that counts as
-# evidence [rad].
+# Most inspected scans; scans between the two of a pair; most pairs; least informative turn during a scan [rad].
 _SCANS, _LAG, _PAIRS, _TURN = 2000, 5, 120, 0.01
-# An order other than the listed one must raise the mean score by this much.
+# Least gain in mean score for an order other than the listed one.
 _CLEAR = 0.003
 
 
 def signed_duration(matcher: Matcher, times: Floats, duration: float) -> float:
-    """Return the time from the first listed beam to the last one: negative in reverse order, 0 for all at once.
+    """Return the time from the first listed beam to the last: negative in reverse order, 0 for all at once.
 
     Args:
         matcher: Matches scans without correction for motion.
         times: (S,) times of the scans [s].
-        duration: The time in the listed order [s], returned where the scans do not decide.
+        duration: The time in the listed order [s], returned if the scans do not decide.
     """
     count = min(len(times), _SCANS)
     if count <= _LAG + 1:

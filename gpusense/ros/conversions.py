@@ -1,6 +1,6 @@
-"""Conversions between ROS messages and NumPy: messages are read by their fields, and written as plain mappings.
+"""Convert between ROS messages and NumPy, without ROS.
 
-Nothing here imports ROS. ``fill`` copies a mapping into a message.
+Messages are read by field, and written as plain mappings; ``fill`` copies a mapping into a message.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ def pose_matrix(pose: Pose) -> np.ndarray:
 
 
 def compose(first: Pose, second: Pose) -> Pose:
-    """Return the pose ``second``, given in the frame of ``first``, in the frame of the latter's parent."""
+    """Return the pose ``second`` in the frame ``first``, relative to the parent of ``first``."""
     c, s = math.cos(first[2]), math.sin(first[2])
     x, y = first[0] + c * second[0] - s * second[1], first[1] + s * second[0] + c * second[1]
     return x, y, math.remainder(first[2] + second[2], 2 * math.pi)
 
 
 def inverse(pose: Pose) -> Pose:
-    """Return the pose of the parent's frame in the pose's own."""
+    """Return the pose of the parent in the frame of ``pose``."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     return -c * pose[0] - s * pose[1], s * pose[0] - c * pose[1], -pose[2]
 
@@ -55,7 +55,7 @@ def map_to_odometry(in_map: Pose, in_odometry: Pose) -> Pose:
 
 
 def moved_enough(before: Pose, after: Pose, least: tuple[float, float]) -> bool:
-    """Return whether the robot moved by ``least`` (m along x or y, rad), as nav2_amcl decides to update its filter."""
+    """Return whether the robot moved by ``least`` (m along x or y, rad), nav2_amcl's condition for an update."""
     turn = abs(math.remainder(after[2] - before[2], 2 * math.pi))
     return abs(after[0] - before[0]) > least[0] or abs(after[1] - before[1]) > least[0] or turn > least[1]
 
@@ -97,7 +97,7 @@ def start_of(message: Any, frame: str) -> tuple[Pose, np.ndarray]:
 
     Args:
         message: The pose.
-        frame: Frame in which it must be given.
+        frame: Required frame of the pose.
     """
     named = str(field("message", message, "header.frame_id")).lstrip("/")
     if named != frame.lstrip("/"):
@@ -123,8 +123,8 @@ def laser_scan(
     Args:
         message: The scan.
         laser: (4, 4) pose of the laser on the robot's base. If it is upside down, the beams run clockwise.
-        limits: Narrow the message's ``range_min`` and ``range_max``, as in nav2_amcl, or replace them where they are no
-            such limits [m]; None for the message's values.
+        limits: Narrow the message's ``range_min`` and ``range_max``, as in nav2_amcl, or replace invalid ones [m];
+            None for the message's values.
     """
     mount, upside_down, _ = planar_mount(laser)
     names = ("angle_min", "angle_increment", "range_min", "range_max", "ranges")

@@ -1,4 +1,4 @@
-"""Fields of diagnostic_msgs/DiagnosticStatus, without ROS."""
+"""Make the fields of diagnostic_msgs/DiagnosticStatus, without ROS."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def status_fields(
         level: OK, WARN, ERROR or STALE.
         message: One line for people.
         values: Values by their names.
-        node: Name of the node with its namespace, which tells robots apart.
+        node: Name of the node with its namespace, to distinguish robots.
     """
     pairs = [{"key": key, "value": value} for key, value in values.items()]
     return {"name": f"{node}: {name}", "hardware_id": node, "level": level, "message": message, "values": pairs}

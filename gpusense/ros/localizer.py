@@ -1,4 +1,4 @@
-"""The localiser behind the node, without ROS: map, scans and odometry in; estimate, cloud and transform out."""
+"""Localise without ROS, behind the node: from map, scans and odometry to estimate, cloud and transform."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from gpusense.world.messages import spread_readings
 from gpusense.world.scanner import Scanner
 
 PLACES = 1440
-"""Beams of the scanner of scans whose beams vary."""
+"""Beams of the common scanner for varying beams."""
 # Time without a scan after which diagnostics are stale [s].
 _PATIENCE = 5.0
-# Bearings that differ by less than this share of a step, and mounts that differ by less [m, rad], are the same.
+# Least difference of distinct bearings as a share of a step, and of distinct mounts [m, rad].
 _SAME, _SAME_MOUNT = 0.05, 1e-3
 # Standard deviations of a first pose, as in nav2_amcl [m, m, rad].
 _START = (0.5, 0.5, math.pi / 12)
 
 
 class Localizer:
-    """A particle filter that is made as soon as map, scanner and first pose are known.
+    """Particle filter that starts as soon as map, scanner and first pose are known.
 
     Args:
         options: Options of nav2_amcl, see ``gpusense.compat.from_nav2``.
@@ -37,9 +37,9 @@ class Localizer:
         clock: Returns the time [s].
 
     Attributes:
-        estimate: Estimate of the last scan that counted; None before one, and after a new start.
-        problem: Why the last scan could not be used; None where it could.
-        counted: Number of scans that counted.
+        estimate: Estimate of the last used scan; None before it and after a new start.
+        problem: Reason why the last scan was unusable, or None.
+        counted: Number of used scans.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Localizer:
             self.start_at(options.initial_pose, np.asarray(covariance))
 
     def warm_up(self) -> None:
-        """Open the device, and compile what scans need, on the map or a made-up room."""
+        """Open the device, and compile the code for scans on the map or a made-up room."""
         cells = np.zeros((80, 80), np.int8)
         cells[[0, -1]] = cells[:, [0, -1]] = 100
         grid = OccupancyGrid(cells, 0.1) if self.grid is None else self.grid
@@ -91,7 +91,7 @@ class Localizer:
         self._taken = self._clock()
 
     def set_map(self, grid: OccupancyGrid) -> None:
-        """Take a map; a filter goes on around its last estimate."""
+        """Take a map; a filter continues around its last estimate."""
         before, self.grid = self.grid, grid
         if self.filter is None:
             return
@@ -107,21 +107,21 @@ class Localizer:
         self.start_again()
 
     def start_anywhere(self) -> None:
-        """Begin all over the map, as nav2_amcl's ``reinitialize_global_localization`` does."""
+        """Begin all over the map, like nav2_amcl's ``reinitialize_global_localization``."""
         self._start = None
         self.start_again()
 
     def start_again(self) -> None:
-        """Begin as the last time: around a pose, or all over the map."""
+        """Repeat the last start: around a pose, or all over the map."""
         self._last = self.estimate = None
         if self.filter is not None:
             self._initialize()
 
     def update(self, message: Any, odometry: Pose, laser: np.ndarray) -> bool:
-        """Take a sensor_msgs/LaserScan; return whether it counted.
+        """Take a sensor_msgs/LaserScan; return whether it was used.
 
-        As in nav2_amcl, a scan counts if there is a map and the robot has moved enough since the last one that did. One
-        that breaks a rule does not count, and ``problem`` says why.
+        As in nav2_amcl, a scan is used if a map exists and the robot has moved enough since the last used scan. An
+        invalid scan is not used, and ``problem`` states the reason.
 
         Args:
             message: The scan.
@@ -148,7 +148,7 @@ class Localizer:
         return True
 
     def map_to_odometry(self) -> Pose:
-        """Return the pose of the odometry frame in the map, by the last scan that counted."""
+        """Return the pose of the odometry frame in the map, by the last used scan."""
         if self._last is None:
             raise ValueError("no scan counted since the start")
         x, y, yaw = (float(value) for value in self.estimate.pose)
@@ -162,8 +162,8 @@ class Localizer:
         """Return the fields of diagnostic_msgs/DiagnosticStatus.
 
         Args:
-            counts: Numbers of scans by what became of them.
-            reason: Why the last scan had no transforms, or why there is no map.
+            counts: Numbers of scans by outcome.
+            reason: Reason for missing transforms of the last scan, or for a missing map.
             node: Name of the node with its namespace.
         """
         values = {"scans that counted": str(self.counted)} | {f"scans {key}": str(n) for key, n in counts.items()}
@@ -181,18 +181,17 @@ class Localizer:
             "verdict": found.verdict, "p_lost": f"{found.p_lost:.4f}", "explained": f"{found.explained:.3f}",
             "particles": str(found.particles), "effective sample size": f"{found.effective_sample_size:.0f}",
         }  # fmt: skip
-        # The search for a cause takes milliseconds, so it is made once for an estimate.
+        # The search for a cause takes milliseconds: do it once per estimate.
         if found.verdict != "tracking" and not self._cause:
             self._cause = self.filter.diagnose().text
         text = ": ".join(filter(None, (found.verdict, self._cause)))
         return status_fields("filter", LEVELS[found.verdict], text, values, node)
 
     def _readings(self, fields: Mapping[str, Any], scanner: Scanner) -> np.ndarray:
-        """Return the readings for the filter's scanner, as in logs; make the filter where there is none for it.
+        """Return the readings for the filter's scanner, as in logs; make the filter if it is missing.
 
-        The first scan's geometry is the scanner. After a scan of another geometry, all scans are spread on common
-        bearings, so that varying beams need only a second model. Readings of 0 are missing, and the limits of each scan
-        are kept.
+        The first scan's geometry is the scanner. After a scan of another geometry, all scans move to common bearings,
+        so that varying beams need only a second model. Readings of 0 are missing, and each scan keeps its limits.
         """
         if self._scanner is None or self.filter is None:
             self._spread = False
@@ -228,7 +227,7 @@ class Localizer:
 
 
 def alike(first: Scanner, second: Scanner) -> bool:
-    """Return whether the beams of two scanners have the same bearings, but for rounding, and the same mount."""
+    """Return whether two scanners have the same bearings, up to rounding, and the same mount."""
     if first.count != second.count or not np.allclose(first.mount, second.mount, rtol=0, atol=_SAME_MOUNT):
         return False
     step = abs(float(first.bearings[1] - first.bearings[0])) if first.count > 1 else 1.0

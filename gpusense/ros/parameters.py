@@ -15,9 +15,9 @@ OWN: dict[str, Any] = {
     "mount": [], "scan_patience": 5.0, "restart_after_jump": False, "seed": 0,
     "initial_pose.x": 0.0, "initial_pose.y": 0.0, "initial_pose.yaw": 0.0,
 }  # fmt: skip
-"""Parameters that nav2_amcl does not have, with their defaults."""
+"""Parameters beyond nav2_amcl's, with defaults."""
 
-# Parameters that are read, but change nothing.
+# Parameters without effect.
 _IDLE = ("max_beams", "pf_err", "pf_z", "resample_interval")
 # Parameters of every node of ROS 2.
 _ROS = ("use_sim_time", "qos_overrides", "start_type_description_service")
@@ -32,8 +32,8 @@ def options_of(values: Mapping[str, Any]) -> tuple[Nav2Options, tuple[str, ...]]
     """Return the options, and the names of parameters that have no effect.
 
     Args:
-        values: Parameters of the node by dotted names. Where ``parameters`` names a file, it replaces those of
-            nav2_amcl, save for a first pose.
+        values: Parameters of the node by dotted names. A file named by ``parameters`` replaces nav2_amcl's parameters,
+            except a first pose.
     """
     _check_own(values)
     first = {name: value for name, value in values.items() if name.startswith("initial_pose.")}
@@ -66,7 +66,7 @@ def _check_own(values: Mapping[str, Any]) -> None:
 
 
 def mount_of(value: Any) -> tuple[float, float, float] | None:
-    """Return the pose (x, y, yaw) of the laser on the robot; None where transforms give it."""
+    """Return the pose (x, y, yaw) of the laser on the robot; None to use transforms."""
     if not len(value):
         return None
     x, y, yaw = checks.array("mount", list(value), (3,)).tolist()

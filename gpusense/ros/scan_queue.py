@@ -1,7 +1,7 @@
-"""The message filter of the node, without ROS: scans wait until the transforms at their stamps are known.
+"""Filter messages without ROS: scans wait until the transforms at their stamps are known.
 
-tf2_ros has a message filter for C++ alone. A scan often arrives before the odometry of its time does, so a look-up at
-once would lose it.
+tf2_ros has a message filter only for C++. A scan often arrives before the odometry of its time, so an immediate
+look-up would lose it.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from typing import Any
 from gpusense.logs.transform_buffer import BACK, TransformError
 
 MOST = 500
-"""Most scans that wait."""
+"""Most waiting scans."""
 
 
 class ScanQueue:
-    """Scans in their order, each of which waits for its transforms.
+    """Queue of scans that wait for their transforms.
 
     Args:
         look_up: Returns the transforms of a scan, or raises ``TransformError``.
         deliver: Takes a scan and its transforms.
-        patience: Longest wait of a scan, without the time in which others are delivered [s].
-        most: Most scans that wait; one more drops the oldest.
+        patience: Longest wait of a scan, without the delivery of others [s].
+        most: Most waiting scans; a further one drops the oldest.
         clock: Returns the time [s].
 
     Attributes:
-        dropped: Number of scans that were not delivered.
-        reason: Why the last of them was not; None where there is none.
+        dropped: Number of dropped scans.
+        reason: Reason for the last drop, or None.
     """
 
     def __init__(
@@ -52,12 +52,12 @@ class ScanQueue:
         return len(self._waiting)
 
     def add(self, scan: Any, stamp: float) -> None:
-        """Take a scan, and deliver what is ready.
+        """Add a scan, and deliver ready scans.
 
         Args:
             scan: The scan.
-            stamp: Its time [s]. Scans that are later by more than 2 s are dropped: a recording starts again, or their
-                stamps were wrong.
+            stamp: Its time [s]. Waiting scans that are later by more than 2 s are dropped: a recording has restarted,
+                or their stamps were wrong.
         """
         later = [each for each in self._waiting if each[1] > stamp + BACK]
         for each in later:
@@ -70,7 +70,7 @@ class ScanQueue:
             self._drop(f"more than {self.most} scans wait for their transforms")
 
     def check(self) -> None:
-        """Deliver scans whose transforms are known, oldest first, and drop those that waited too long.
+        """Deliver scans with known transforms, oldest first, and drop scans that waited too long.
 
         Transforms arrive in the order of time. Scans before a ready one are older than every known transform, and
         never become ready. After a scan that must wait, all others must wait.
@@ -99,7 +99,7 @@ class ScanQueue:
             self._busy += self._clock() - begin
 
     def clear(self) -> None:
-        """Forget the scans that wait, as when the node is deactivated."""
+        """Drop all waiting scans, for a deactivated node."""
         self._waiting.clear()
 
     def _idle(self) -> float:

@@ -1,6 +1,6 @@
-"""The monitor behind the watching node, without ROS: map, scans and poses in; diagnostics out.
+"""Judge a localiser without ROS, behind the watching node: from map, scans and poses to diagnostics.
 
-nav2_amcl stamps a pose with the time of the scan that it comes from, so the two are paired by their times.
+nav2_amcl stamps a pose with its scan's time, so both are paired by time.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.messages import stamp_of
 from gpusense.world.scanner import Scanner
 
-# Scans that wait for their pose.
+# Most scans that wait for their pose.
 _KEPT = 40
-# Poses whose most frequent cause is reported.
+# Number of last poses for the most frequent cause.
 _CAUSES = 7
 
 
 class Watcher:
-    """A verdict on the poses of another localiser.
+    """Verdict on another localiser's poses.
 
     Args:
         backend: The device.
@@ -37,7 +37,7 @@ class Watcher:
         range_max: Largest ``range_max`` of scans [m].
 
     Attributes:
-        problem: Why the last scan could not be used; None where it could.
+        problem: Reason why the last scan was unusable, or None.
     """
 
     def __init__(
@@ -61,11 +61,11 @@ class Watcher:
         self._judged = -math.inf
 
     def set_map(self, grid: OccupancyGrid) -> None:
-        """Take a map; what was known of the pose is forgotten."""
+        """Take a map, and forget the scans so far."""
         self._grid, self._monitor = grid, None
 
     def reset(self) -> None:
-        """Forget the scans so far, as after an initial pose."""
+        """Forget the scans so far, for example after an initial pose."""
         self._verdict = None
         self._causes.clear()
         if self._monitor is not None:
@@ -74,7 +74,7 @@ class Watcher:
     def add_scan(self, message: Any, laser: np.ndarray) -> None:
         """Take a sensor_msgs/LaserScan, and the (4, 4) pose of its laser on the robot.
 
-        A scan that breaks a rule is left out, and ``problem`` says why.
+        An invalid scan is ignored, and ``problem`` states the reason.
         """
         try:
             scanner, fields = laser_scan(message, laser, (None, self.range_max))
@@ -108,7 +108,7 @@ class Watcher:
             now: Time [s].
             node: Name of the node with its namespace.
         """
-        # The clock goes back when a recording starts again.
+        # A restarted recording turns the clock back.
         if self._verdict is None or abs(now - self._judged) > self.patience:
             return status_fields("localisation", STALE, "no pose with a scan of its time", {}, node)
         found, likely = self._verdict, self._likely()
@@ -119,14 +119,14 @@ class Watcher:
         return status_fields("localisation", LEVELS[found.verdict], f"{found.verdict}{evidence}", values, node)
 
     def _likely(self) -> Diagnosis | None:
-        """Return the newest diagnosis of the cause that the last poses had most often."""
+        """Return the newest diagnosis of the last poses' most frequent cause."""
         if not self._causes:
             return None
         ((cause, _),) = Counter(each.cause for each in self._causes).most_common(1)
         return next(each for each in reversed(self._causes) if each.cause == cause)
 
     def _monitor_of(self, grid: OccupancyGrid, scanner: Scanner) -> PoseMonitor:
-        """Return the monitor of a scanner; what it remembers stays where the scanner changes."""
+        """Return the monitor of a scanner; its memory survives a change of scanners."""
         if self._monitor is None or scanner != self._scanner:
             before = self._monitor
             self._monitor = PoseMonitor(LikelihoodFieldModel(grid, scanner, backend=self.backend))

@@ -1,1 +1,1 @@
-"""Sweeps: many independent jobs over processes, devices and machines, and one filter over several devices."""
+"""Run many independent jobs over processes, devices and machines."""

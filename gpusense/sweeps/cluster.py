@@ -149,7 +149,7 @@ class DaskExecutor(Executor):
 
     @property
     def window(self) -> int:
-        """Number of jobs to submit at once: jobs that wait at a Dask worker would count as started when it ends."""
+        """Number of jobs to submit at once: jobs waiting at a Dask worker would count as started at its end."""
         return max(self.slots, 1)
 
     @property
@@ -209,7 +209,7 @@ class DaskExecutor(Executor):
         """Queue a function for the next free worker; if the worker ends, the future raises :class:`WorkerDied`."""
         import cloudpickle
 
-        # Another machine may not be able to import the function.
+        # Another machine may lack the function's module.
         payload, future = bytes(cloudpickle.dumps((fn, args, kwargs))), Future[Any]()
         with self._lock:
             if self._lost:
@@ -272,7 +272,7 @@ class DaskExecutor(Executor):
         self.terminate()
 
     def _leave(self) -> None:
-        # A client without a scheduler would log that it no longer reconnects.
+        # A client without a scheduler would log its failed reconnection.
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         if self._client is not None and self.alive:
             # Workers end the processes of this executor; workers that do not answer are not awaited.

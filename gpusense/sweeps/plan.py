@@ -25,8 +25,8 @@ def read_plan(path: str | os.PathLike[str]) -> tuple[Job, ...]:
     """Read the jobs of a plan.
 
     The file has ``task``, ``options`` of all jobs, and ``axes``. An axis is a list of values of the option or field of
-    its name, or a mapping from labels to mappings of several; ``seed`` may be the number of seeds, from 0. The last
-    axis changes fastest. A plan cannot name code to execute, since its task belongs to the package.
+    its name, or a mapping from labels to several options; ``seed`` may be the number of seeds, from 0. The last axis
+    changes fastest. A plan cannot name code to execute, since its task belongs to the package.
 
     Args:
         path: A YAML file of plain values.

@@ -1,7 +1,7 @@
 """Run one call at a time in a process; watch, end and replace it.
 
-Each process has a ``concurrent.futures.ProcessPoolExecutor`` to itself, so that its end is charged to its call alone.
-All executors run their jobs in such processes; with Dask they are children of the Dask workers.
+Each process has a separate ``concurrent.futures.ProcessPoolExecutor``, so that its end fails only its call. All
+executors run their jobs in such processes; with Dask they are children of the Dask workers.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from typing import Any
 
 from gpusense.sweeps.worker import DEVICE, error_text, receive
 
-# Processes in a row that may end before they take a call.
+# Most consecutive processes that end before taking a call.
 _STARTS = 3
-# Seconds between two checks of a process, and seconds in which it ends after it was killed.
+# Interval between checks of a process, and time for it to end after a kill [s].
 _LOOK, _GRACE = 0.25, 10.0
 # Threads of the libraries of linear algebra: jobs run side by side, and threads that wait for small matrices take turns
 # at the processors of other jobs. Dask starts its workers so.
 _SINGLE = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 _STARTING = threading.Lock()
-# The system ends workers before the process that has started them when memory is short.
+# If memory is short, the system ends workers before their parent.
 _EXPENDABLE = "500"
 
 
@@ -38,7 +38,7 @@ class WorkerDied(BrokenExecutor):
     """A worker ended while it ran a job.
 
     Args:
-        how: Way in which it ended, such as "by SIGSEGV" or "with exit code 3".
+        how: Kind of the end, such as "by SIGSEGV" or "with exit code 3".
         outside: Whether the cause may lie outside the job: a signal of another process, or the loss of a machine.
 
     Example:
@@ -117,7 +117,7 @@ class Worker:
         Args:
             payload: Pickle of a function, its arguments and its keyword arguments.
             seconds: Longest time of the call; None for no limit.
-            wanted: Tells whether anything still waits for the answer; otherwise the process is ended.
+            wanted: Returns whether the answer is still awaited; otherwise the process is ended.
 
         Raises:
             BrokenExecutor: processes end before they take a call, or the worker was closed.
@@ -134,7 +134,7 @@ class Worker:
             while not answer.done():
                 wait([answer], _LOOK if end is None else min(_LOOK, max(end - time.monotonic(), 0)))
                 if process.exitcode is not None:
-                    # Processes that the call has started may hold its pipes open: the pool would not see its end.
+                    # Child processes of the call may hold its pipes open and hide its end from the pool.
                     self._ended()
                     wait([answer], _GRACE)
                     break
@@ -176,7 +176,7 @@ class Worker:
         if pool is not None:
             pool.shutdown(wait=False, cancel_futures=True)
         end = time.monotonic() + _GRACE
-        # The thread of the pool may fetch the exit code first, and store it a moment later.
+        # The pool's thread may fetch the exit code first and store it later.
         while process is not None and process.exitcode is None and time.monotonic() < end:
             time.sleep(0.002)
         if self._closed:
@@ -219,7 +219,7 @@ def deafen() -> None:
     if sys.platform != "win32":
         from multiprocessing import resource_tracker
 
-        # Started later, it would unblock the signal.
+        # A later start would unblock the signal.
         resource_tracker.ensure_running()
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
 

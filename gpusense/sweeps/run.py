@@ -18,9 +18,9 @@ from gpusense.sweeps.process import JobTimeout, WorkerDied
 from gpusense.sweeps.table import DONE, FAILED, Row, Table
 from gpusense.sweeps.worker import Outcome, error_text, work
 
-# Jobs that are queued for each slot of an executor, so that it never idles.
+# Queued jobs per slot of an executor, to keep it busy.
 _QUEUED = 2
-# Seconds for results that are on their way when a sweep is interrupted.
+# Time for results in transit when a sweep is interrupted [s].
 _ARRIVE = 0.5
 
 
@@ -36,7 +36,7 @@ class Sweep:
         table: The table's CSV file.
         jobs: Jobs of the sweep.
         done: Number of jobs that ran and succeeded.
-        failed: Number of jobs that ran and failed; their rows have the error.
+        failed: Number of jobs that ran and failed; their rows state the error.
         skipped: Number of jobs whose rows were already in the table.
         repeated: Number of starts that ended with their worker and were repeated.
 
@@ -195,7 +195,7 @@ class Starts:
                 ended = self._ended(future)
                 if ended is not None:
                     yield ended
-                # Remove it only now, so that the job is kept if writing its row was interrupted.
+                # Remove the future last, to keep the job if writing its row was interrupted.
                 del self._running[future]
 
     def left(self) -> Iterator[Ended]:

@@ -1,4 +1,4 @@
-"""Cache of maps, logs, and models with their compiled kernels, which a sweep's worker keeps between jobs."""
+"""Cache maps, logs, and models with compiled kernels between jobs of a sweep's worker."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from gpusense.logs import Scan
     from gpusense.world.grid import OccupancyGrid
 
-# Most objects of each kind that are kept: maps, logs, models.
+# Most cached objects of each kind: maps, logs, models.
 _KEPT = 4
-# Largest log that is sent [bytes]; larger logs need a shared file system.
+# Largest log to send [bytes]; larger logs need a shared file system.
 _LARGEST = 1 << 30
 
 
@@ -30,7 +30,7 @@ class Store:
 
     Attributes:
         device: Selection string of the worker's device.
-        reads: Number of maps and logs that were read and of models that were made.
+        reads: Number of maps and logs read, and of models made.
     """
 
     def __init__(self, root: str | Path, device: str = "auto") -> None:
@@ -43,7 +43,7 @@ class Store:
         return f"Store({str(self._root)!r}, device={self.device!r}, {counts or 'empty'})"
 
     def receive(self, sent: Mapping[str, Any]) -> None:
-        """Use sent maps, and files of logs, in place of the files under the root."""
+        """Use sent maps, and files of logs, instead of the files under the root."""
         self._sent.update(sent)
 
     def path(self, name: str) -> Path:
@@ -78,7 +78,7 @@ class Store:
         return self.keep("logs", key, lambda: with_poses(chosen_scans(path, topic=topic, **chosen), path))
 
     def keep(self, kind: str, key: Hashable, make: Callable[[], Any]) -> Any:
-        """Return an object of a kind, made if it is not kept."""
+        """Return a cached object of a kind, or make it."""
         kept = self._kept.setdefault(kind, OrderedDict())
         if key not in kept:
             kept[key] = make()
@@ -89,7 +89,7 @@ class Store:
         return kept[key]
 
 
-# Scans from which parameters are learned: every 20th.
+# Scans for learning parameters: every 20th.
 TRAINING = {"every": 20, "offset": 0, "limit": None}
 _ALL = {"every": 1, "offset": 0, "limit": None}
 

@@ -132,7 +132,7 @@ class Table:
 
 
 def row_of(job: Job, outcome: Outcome, attempts: int) -> Row:
-    """Return the cells of a job's row by the names of their columns."""
+    """Return the cells of a job's row by column."""
     fields: dict[str, Any] = {
         "key": job.key, "status": FAILED if outcome.error else DONE, "task": job.task, "map": job.map, "log": job.log,
         "model": job.model, "seed": job.seed,
@@ -157,7 +157,7 @@ def read_table(path: str | os.PathLike[str]) -> dict[str, list[Any]]:
         path: A CSV or Parquet file of a sweep.
 
     Returns:
-        The columns by name: numbers, booleans and strings; None where a job has no value. The last row of a job counts.
+        The columns by name: numbers, booleans and strings; None without a value. The last row of a job counts.
 
     Raises:
         FileNotFoundError: the file is missing.

@@ -34,7 +34,7 @@ class Task(NamedTuple):
     """A task.
 
     Attributes:
-        run: Runs a job with the worker's store, and returns the columns of its row.
+        run: Runs a job with the worker's store, and returns the columns of the row.
         options: Names of the task's options, without the model's.
         error: Column that a plot shows against run time.
     """
@@ -104,7 +104,7 @@ def localize(job: Job, store: Store) -> Values:
     track = Track()
     for _ in follow(pf, steps, track):
         pass
-    # The median leaves out the first step, which compiles.
+    # The median excludes the first step, which compiles.
     return {**summary(track), "ms_step": float(1000 * np.median(np.sum(track.seconds, axis=1)))}
 
 

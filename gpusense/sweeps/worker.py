@@ -42,7 +42,7 @@ class Outcome(NamedTuple):
     device: str
 
 
-# A worker runs one job at a time, since its device and its store serve only one.
+# A worker runs one job at a time, since device and store serve only one.
 _LOCK = threading.Lock()
 # Stores by root, device and sweep, since files may change between sweeps.
 _STORES: dict[tuple[str, str, str], Store] = {}

@@ -98,7 +98,7 @@ class Worlds:
         MemoryError: The device does not hold the worlds; the message says how many fit.
 
     Example:
-        >>> import numpy as np, gpusense as gs
+        >>> import gpusense as gs, numpy as np
         >>> cells = np.zeros((2, 1, 8), np.int8)
         >>> cells[0, 0, 5] = cells[1, 0, 7] = 100
         >>> worlds = gs.Worlds(cells, resolution=0.5, backend="numpy")
@@ -298,7 +298,7 @@ class Worlds:
             TypeError, ValueError: An argument breaks a rule above, or a pose is not finite.
 
         Example:
-            >>> import numpy as np, gpusense as gs
+            >>> import gpusense as gs, numpy as np
             >>> cells = np.zeros((1, 4, 4), np.int8)
             >>> cells[0, 0, 3] = 100
             >>> worlds = gs.Worlds(cells, resolution=1.0, backend="numpy")

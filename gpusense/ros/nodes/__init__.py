@@ -1,1 +1,1 @@
-"""Nodes for ROS 2, which import rclpy."""
+"""Nodes for ROS 2; they import rclpy."""

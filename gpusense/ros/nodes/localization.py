@@ -1,4 +1,4 @@
-"""The node: scan, odometry and map in; pose, particle cloud and the transform from map to odometry out.
+"""Localise from scans, odometry and a map, and publish pose, particle cloud and transform from map to odometry.
 
 It is a lifecycle node with the topics, frames and parameters of nav2_amcl.
 """
@@ -39,11 +39,11 @@ try:
 except ImportError:
     Particle, ParticleCloud = None, None
 
-# Time between two looks at how long scans wait [s].
+# Interval between checks of waiting scans [s].
 _LOOK = 0.1
 # Scans that wait in the middleware while the node is busy.
 _DEPTH = 50
-# A step of publication numbers beyond which another publisher is likely.
+# Step of publication numbers that suggests another publisher.
 _GAP = 10_000
 
 
@@ -80,13 +80,13 @@ class LocalizationNode(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Begin to localise."""
+        """Start localising."""
         self.active = True
         self.localizer.begin()
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop to localise; the filter is kept."""
+        """Stop localising, and keep the filter."""
         self.active = False
         self.queue.clear()
         return super().on_deactivate(state)
@@ -104,7 +104,7 @@ class LocalizationNode(LifecycleNode):
         return result
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Free all, so that the node can be configured anew."""
+        """Free everything, so that the node can be reconfigured."""
         self._release()
         return TransitionCallbackReturn.SUCCESS
 
@@ -129,7 +129,7 @@ class LocalizationNode(LifecycleNode):
         self._publish()
 
     def _listen(self, values: dict[str, Any]) -> None:
-        """Create subscriptions, the service and timers, and keep how each is destroyed."""
+        """Create subscriptions, the service and timers, and record their destructors."""
         frames = self.options.frames[1:]
         self.transforms = Transforms(
             self, self.guard, frames, values["odom_topic"], mount_of(values["mount"]), self.check_waiting
@@ -149,14 +149,14 @@ class LocalizationNode(LifecycleNode):
         anywhere = "reinitialize_global_localization"
         service = self.create_service(Empty, anywhere, self.guard.around(anywhere, self.on_reinitialize))
         self._made.append((self.destroy_service, service))
-        # Scans wait by the wall's clock, as simulated time may stand.
+        # Scans wait by wall clock, since simulated time may stop.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         for period, name, work in ((_LOOK, "scans", self.check_waiting), (1.0, "status", self.publish_diagnostics)):
             timer = self.create_timer(period, self.guard.around(name, work), clock=steady)
             self._made.append((self.destroy_timer, timer))
 
     def _publish(self) -> None:
-        """Create publishers, and keep how each is destroyed."""
+        """Create publishers, and record their destructors."""
         add = self.create_lifecycle_publisher
         self.pose = add(PoseWithCovarianceStamped, "amcl_pose", latched())
         self.cloud = add(ParticleCloud or PoseArray, "particle_cloud", qos_profile_sensor_data)
@@ -178,11 +178,11 @@ class LocalizationNode(LifecycleNode):
     # ------------------------------------------------------------------------------------------------------ callbacks
 
     def on_map(self, message: MapMessage) -> None:
-        """Take a map; the one before stays if this one is bad."""
+        """Take a map; a bad one leaves the previous map."""
         self.localizer.set_map(OccupancyGrid.from_message(message))
 
     def on_map_quality(self, event: Any) -> None:
-        """Say why a publisher's map does not come."""
+        """Report why a publisher's map does not arrive."""
         self.map_reason = (
             f"a publisher of {self.options.topics[0]} does not keep its map for late subscribers (its durability must "
             "be transient local)"
@@ -200,7 +200,7 @@ class LocalizationNode(LifecycleNode):
         return response
 
     def on_scan(self, message: LaserScan, info: Any) -> None:
-        """Take a scan; it waits for its transforms."""
+        """Queue a scan until its transforms are known."""
         number, before = info["publication_sequence_number"], self.number
         self.number = number
         if not self.active:
@@ -212,7 +212,7 @@ class LocalizationNode(LifecycleNode):
         self._report_dropped()
 
     def check_waiting(self) -> None:
-        """Look whether the transforms of scans that wait have come."""
+        """Check whether the transforms of waiting scans have arrived."""
         if self.active and len(self.queue):
             self.queue.check()
             self._report_dropped()
@@ -275,7 +275,7 @@ class LocalizationNode(LifecycleNode):
         self.broadcaster.publish(TFMessage(transforms=[sent]))
 
     def publish_diagnostics(self) -> None:
-        """Publish how the filter fares."""
+        """Publish the diagnostics of the filter."""
         if not self.active:
             return
         counts = {

@@ -1,4 +1,4 @@
-"""The watching node: scans, map and the poses of any localiser in; diagnostics out.
+"""Watch a localiser as a node: read scans, map and the localiser's poses; publish diagnostics.
 
 It needs no filter of gpusense: ``amcl_pose`` may come from nav2_amcl, or from any node that stamps its pose with the
 time of the scan.
@@ -56,7 +56,7 @@ class WatchingNode(Node):
         self.create_timer(1.0, self.guard.around("status", self.publish))
 
     def on_map(self, message: MapMessage) -> None:
-        """Take a map; the one before stays if this one is bad."""
+        """Take a map; a bad one leaves the previous map."""
         self.watcher.set_map(OccupancyGrid.from_message(message))
 
     def on_initial_pose(self, message: Any) -> None:
@@ -64,7 +64,7 @@ class WatchingNode(Node):
         self.watcher.reset()
 
     def on_scan(self, message: LaserScan) -> None:
-        """Keep a scan until its pose comes."""
+        """Keep a scan until its pose arrives."""
         try:
             laser = self.transforms.laser(message.header.frame_id)
         except TransformError as error:

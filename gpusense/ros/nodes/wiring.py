@@ -1,4 +1,4 @@
-"""Pieces of ROS that both nodes use: guards around callbacks, transforms, messages, and the life of a process."""
+"""Parts of ROS for both nodes: guards around callbacks, transforms, messages, and process lifetime."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ try:
 except ImportError:
     TFMessage = None
 
-# Time for which moving transforms are kept, as in tf2 [s].
+# Time to keep moving transforms, as in tf2 [s].
 _CACHE = 10.0
-# Least time between two lines about the same subject in the log [s].
+# Least time between log lines about a subject [s].
 _QUIET = 2.0
 
 
 def latched() -> QoSProfile:
-    """Return the quality of service of topics whose last message newcomers get."""
+    """Return the quality of service of topics that send their last message to newcomers."""
     return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
 
 
 def unreliable(depth: int) -> QoSProfile:
-    """Return the quality of service of sensors, with a longer queue than theirs."""
+    """Return the quality of service of sensors, with a longer queue."""
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -61,13 +61,13 @@ def diagnostic_array(fields: dict[str, Any], stamp: Any) -> DiagnosticArray:
 
 
 class Guard:
-    """Lets a callback fail without ending the node: the error is logged, and kept for diagnostics.
+    """Guard that lets a callback fail without ending the node; errors are logged and kept for diagnostics.
 
     Args:
         log: Logger of the node.
 
     Attributes:
-        troubles: The error of each subject whose last callback failed.
+        troubles: Error of each subject with a failed last callback.
     """
 
     def __init__(self, log: Any) -> None:
@@ -80,7 +80,7 @@ class Guard:
 
         Args:
             subject: Name of the topic, or of the work, in messages.
-            callback: The callback. A service's response is returned where it fails.
+            callback: The callback. A failing service returns its response.
         """
 
         @functools.wraps(callback)
@@ -96,7 +96,7 @@ class Guard:
         return run
 
     def report(self, subject: str, error: Exception) -> None:
-        """Log an error once, and at most one error of a subject in 2 s."""
+        """Log an error once, and at most one error per subject in 2 s."""
         text = described(error)
         self.troubles[subject] = text
         before, since = self._logged.get(subject, ("", -_QUIET))
@@ -179,11 +179,11 @@ def run(make: Callable[[], Any], args: Sequence[str] | None = None) -> int:
     """Run a node until it is interrupted or terminated.
 
     Args:
-        make: Makes the node; its method ``start``, if it has one, returns whether the node can go on.
+        make: Makes the node; its optional method ``start`` returns whether the node can continue.
         args: Arguments of the command line, with ``--ros-args``; ``sys.argv`` by default.
 
     Returns:
-        The exit code: 0, or 1 where the node could not start.
+        The exit code: 0, or 1 if the node could not start.
     """
     node = None
     try:
@@ -206,5 +206,5 @@ def run(make: Callable[[], Any], args: Sequence[str] | None = None) -> int:
 
 
 def described(error: Exception) -> str:
-    """Return an error's text, with its type where the user did not cause it."""
+    """Return an error's text, with its type unless the user caused it."""
     return str(error) if isinstance(error, (OSError, TypeError, ValueError)) else f"{type(error).__name__}: {error}"

@@ -11,7 +11,7 @@ from gpusense.localization.recovery import Recovery
 from gpusense.localization.spread import share_off, share_off_of, spread_of
 from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import Verdict
-from gpusense.localization.words import word_of
+from gpusense.localization.words import verdict_label
 
 # Most particles for counting the spread; a normal density approximates larger narrow clouds.
 _MOST_LOOKED_AT = 100_000
@@ -43,7 +43,7 @@ def estimate_of(tracker: Tracker, verdict: Verdict, recovery: Recovery, method: 
         share = 1 - (1 - share) * (1 - recovery.rival.probability(pose))
     wrong = verdict.wrong
     p_lost, spread = wrong + (1 - wrong) * share, spread_of(covariance)
-    word = word_of(p_lost, wrong, wide=spread.wide, apart=spread.apart)
+    word = verdict_label(p_lost, wrong, wide=spread.wide, apart=spread.apart)
     temperature = tracker.sensors[0].temperature(tracker.options.temperature)
     widening = WIDENING if verdict.informed and verdict.state.corrections else 1.0
     return Estimate(

@@ -15,8 +15,8 @@ from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.diagnosis import Diagnosis, diagnose
 from gpusense.localization.estimates import Estimate
 from gpusense.localization.filter_cloud import FilterCloud
-from gpusense.localization.filter_parts import FilterParts
-from gpusense.localization.journal import Whole, settled, whole
+from gpusense.localization.filter_core import FilterCore
+from gpusense.localization.journal import Transactional, atomic, consistent
 from gpusense.localization.motion import MotionModel, OdometryMotion, SampledMotion
 from gpusense.localization.sensors import grid_of, sensors_of
 from gpusense.localization.state import FilterState, check_state, constructor_options, model_names
@@ -24,7 +24,7 @@ from gpusense.localization.tracker import Tracker
 from gpusense.world.grid import OccupancyGrid
 
 
-class ParticleFilter(Whole):
+class ParticleFilter(Transactional):
     """Monte Carlo localisation: particles move with the odometry, and sensors weigh them.
 
     All state is on the device of the models. Random numbers depend only on seed, step and particle: a seed yields the
@@ -96,7 +96,7 @@ class ParticleFilter(Whole):
             raise ValueError("recovery: 'augmented' needs a model with a map, got none")
         self._begin_journals()
         self._cloud = FilterCloud(self._sensors, self.options.most, residual=self.options.resampling == "residual")
-        self._parts = FilterParts(self._sensors, self.options, self._cloud)
+        self._parts = FilterCore(self._sensors, self.options, self._cloud)
 
     def _keep(self) -> None:
         self._parts.keep()
@@ -121,7 +121,7 @@ class ParticleFilter(Whole):
 
     # ---- starts
 
-    @whole
+    @atomic
     def initialize(self, *, mean: AnyArray, covariance: AnyArray, particles: int | None = None) -> None:
         """Draw particles from a normal density.
 
@@ -138,7 +138,7 @@ class ParticleFilter(Whole):
         """
         self._parts.start_around(mean, covariance, particles)
 
-    @whole
+    @atomic
     def initialize_uniform(self, *, bounds: AnyArray | None = None, particles: int | None = None) -> None:
         """Draw particles uniformly over the free cells of the map, with any heading.
 
@@ -153,7 +153,7 @@ class ParticleFilter(Whole):
         """
         self._parts.start_anywhere(bounds, particles)
 
-    @whole
+    @atomic
     def initialize_from(self, likelihood: Any, *, particles: int | None = None) -> None:
         """Draw particles from a likelihood over poses.
 
@@ -179,7 +179,7 @@ class ParticleFilter(Whole):
 
     # ---- steps
 
-    @settled
+    @consistent
     def predict(self, *motion: Any) -> None:
         """Move the particles by the odometry before and after the step, or by other arguments of the motion model.
 
@@ -198,21 +198,21 @@ class ParticleFilter(Whole):
         else:
             self._follow(sampled)
 
-    @whole
+    @atomic
     def _follow(self, motion: SampledMotion) -> None:
         self._parts.follow(motion)
 
-    @settled
+    @consistent
     def flush(self) -> None:
         """Run the motion of the last ``predict`` now instead of at the next correction or result."""
         if self._parts.tracker.progress.motion is not None:
             self._move()
 
-    @whole
+    @atomic
     def _move(self) -> None:
         self._parts.tracker.move()
 
-    @whole
+    @atomic
     def correct(self, readings: Any) -> None:
         """Weigh the particles by readings, and resample where the effective sample size is low.
 
@@ -233,7 +233,7 @@ class ParticleFilter(Whole):
         self._parts.check_started()
         self._parts.correct(readings)
 
-    @whole
+    @atomic
     def reset(self) -> None:
         """Replace half of the particles by poses that make the last readings likely (sensor resetting).
 
@@ -254,12 +254,12 @@ class ParticleFilter(Whole):
         return self._backend.info
 
     @property
-    @settled
+    @consistent
     def count(self) -> int:
         """Number of particles of the next step."""
         return self._cloud.count
 
-    @settled
+    @consistent
     def estimate(self, method: str = "mean") -> Estimate:
         """Return the pose of the robot without changing the filter: corrections judge the pose.
 
@@ -275,7 +275,7 @@ class ParticleFilter(Whole):
         parts = self._parts
         return estimate_of(self._moved(), parts.verdict, parts.recovery, method)
 
-    @settled
+    @consistent
     def diagnose(self, *, search: bool = True) -> Diagnosis:
         """Return the evidence of the last readings at the estimate, and the likely cause of a contradiction.
 
@@ -290,7 +290,7 @@ class ParticleFilter(Whole):
         search = search and grid_of(self._sensors) is not None
         return diagnose(self._sensors, self._parts.last, pose, self._parts.tracker.random_poses if search else None)
 
-    @settled
+    @consistent
     def mean_and_covariance(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the weighted mean (3,) and the covariance (3, 3), without the verdict of :meth:`estimate`."""
         return self._moved().mean_and_covariance()
@@ -301,13 +301,13 @@ class ParticleFilter(Whole):
         return tuple(sensor.model for sensor in self._sensors)
 
     @property
-    @settled
+    @consistent
     def temperatures(self) -> tuple[float, ...]:
         """Present temperature of each model."""
         return tuple(sensor.temperature(self.options.temperature) for sensor in self._sensors)
 
     @property
-    @settled
+    @consistent
     def gain(self) -> float:
         """Mean gain of predicting recent features over chance [nats]; below 1 the filter is lost.
 
@@ -339,30 +339,30 @@ class ParticleFilter(Whole):
             raise ValueError("models: must have a map, got none with one")
         return grid
 
-    @settled
+    @consistent
     def host_particles(self) -> np.ndarray:
         """Return a copy of the (N, 3) poses after the last step in host memory."""
         return self._moved().host_particles()
 
-    @settled
+    @consistent
     def host_weights(self) -> np.ndarray:
         """Return a copy of the (N,) normalised weights in host memory."""
         return self._moved().host_weights()
 
     @property
-    @settled
+    @consistent
     def particles(self) -> Any:
         """(N, 3) poses after the last step: on a GPU an array of the device, for use in place by other libraries."""
         return self._cloud.particles(self._moved().shown)
 
     @property
-    @settled
+    @consistent
     def weights(self) -> Any:
         """(N,) normalised weights: on a GPU an array of the device."""
         return self._cloud.shares(self._moved().shown)
 
     @property
-    @settled
+    @consistent
     def moments(self) -> Any:
         """(9,) mean x, y, theta and covariance xx, xy, xt, yy, yt, tt: on a GPU an array of the device."""
         return self._cloud.moments(self._moved().shown)
@@ -373,13 +373,13 @@ class ParticleFilter(Whole):
 
     # ---- state
 
-    @settled
+    @consistent
     def state(self) -> FilterState:
         """Return a copy of the filter's state without models and device, see :class:`FilterState`."""
         self.flush()
         return FilterState(*self._kind(), *self._parts.state())
 
-    @whole
+    @atomic
     def restore(self, state: FilterState) -> None:
         """Restore the state of a filter with the same options and models, and continue with the same bits.
 

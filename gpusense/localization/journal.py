@@ -125,13 +125,13 @@ class Journal:
             (container.update if type(container) is dict else container.extend)(items)
 
 
-class Whole:
+class Transactional:
     """Base class of objects with atomic calls, serialised over threads."""
 
     _journal: Journal | None = None
 
     def _begin_journals(self) -> None:
-        """Prepare the object for :func:`whole` calls."""
+        """Prepare the object for :func:`atomic` calls."""
         self._calls = threading.RLock()
 
     def _keep(self) -> None:
@@ -148,10 +148,10 @@ class Whole:
             self._journal = None
 
 
-W = TypeVar("W", bound=Whole)
+W = TypeVar("W", bound=Transactional)
 
 
-def whole(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P], R]:
+def atomic(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P], R]:
     """Make a method atomic: if it raises, the object's state is unchanged."""
 
     @functools.wraps(method)
@@ -177,8 +177,8 @@ def whole(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P],
     return call
 
 
-def settled(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P], R]:
-    """Settle the state before a method that changes state only through :func:`whole` methods."""
+def consistent(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P], R]:
+    """Settle the state before a method that changes state only through :func:`atomic` methods."""
 
     @functools.wraps(method)
     def call(self: W, /, *args: P.args, **kwargs: P.kwargs) -> R:

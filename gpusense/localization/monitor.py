@@ -17,7 +17,7 @@ from gpusense.localization.scoring import readings_of
 from gpusense.localization.sensors import sensors_of
 from gpusense.localization.spread import share_off, spread_of
 from gpusense.localization.verdict import Verdict, VerdictState
-from gpusense.localization.words import LOST, Word, word_of
+from gpusense.localization.words import LOST, Word, verdict_label
 from gpusense.world.scanner import float64_readings
 
 # Number of poses drawn from a covariance for predicting features.
@@ -143,7 +143,7 @@ class PoseMonitor:
         self._pose, self._last = place, readings
         wrong = self._verdict.wrong
         p_lost, beyond = wrong + (1 - wrong) * share_off(spread), spread_of(spread)
-        word = word_of(p_lost, wrong, wide=beyond.wide, apart=beyond.apart)
+        word = verdict_label(p_lost, wrong, wide=beyond.wide, apart=beyond.apart)
         return PoseVerdict(p_lost, word, explained, None if covariance is None else spread, WIDENING)
 
     @property

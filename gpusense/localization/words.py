@@ -10,7 +10,7 @@ WORDS: tuple[Word, ...] = ("tracking", "uncertain", "lost")
 LOST, TRACKING = 0.5, 0.1
 
 
-def word_of(p_lost: float, wrong: float, *, wide: bool, apart: bool) -> Word:
+def verdict_label(p_lost: float, wrong: float, *, wide: bool, apart: bool) -> Word:
     """Return the word for the probability of being lost.
 
     Args:

@@ -15,7 +15,7 @@ from gpusense.evaluation.tolerances import differing
 from gpusense.interface.constants import BLOCK_TERMS, MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
 from gpusense.interface.structs import Frame, ReadingRules, Window
 from gpusense.models.scan.classed import class_scans
-from gpusense.models.scan.rules import Rules, choose_beams
+from gpusense.models.scan.rules import BeamSelection, choose_beams
 from gpusense.reference.scan import is_chosen
 from gpusense.world.frames import frame_of, ray_vectors, split
 from gpusense.world.scanner import Reading
@@ -76,7 +76,7 @@ def test_readings_are_placed_as_the_host_prepares_them(
         nearest = float((np.float32 if single else np.float64)(NEAREST))
         for ranges, chosen in itertools.product(scans(np.float32 if single else np.float64, count), (0, 7, 16, count)):
             chosen = min(chosen, count)
-            rules = Rules(scanner, vectors, z_max, chosen, True, max_depends=kind == MAX_PLACED)
+            rules = BeamSelection(scanner, vectors, z_max, chosen, True, max_depends=kind == MAX_PLACED)
             scan = class_scans(ranges[None], rules)
             flags = scene_flags(precision, *(["END_POINTS"] if end_points else []))
             numbers = (chosen, chosen, kind, 1, nearest, np.log(z_max) if z_max else 0.0, np.inf)
@@ -106,7 +106,7 @@ def test_readings_that_keep_their_places(device: Backend) -> None:
     (_, ranges, *_), count = scans(np.float32, 53), 53
     scanner = gs.Scanner(np.linspace(-3, 3, count), RANGE, NEAREST, cone=0.2, cone_rays=3)
     vectors = ray_vectors(scanner.ray_bearings, scanner.mount)
-    scan = class_scans(ranges[None], Rules(scanner, vectors[:, 1], 0.1, None, False))
+    scan = class_scans(ranges[None], BeamSelection(scanner, vectors[:, 1], 0.1, None, False))
     top = np.float32(4.0)
     numbers = (count, count, MAX_PLACED, 1, float(np.float32(NEAREST)), 0.0, float(top))
     found = placed(device, frozenset({"ALL_READINGS"}), ranges, vectors, *numbers)

@@ -16,7 +16,7 @@ from gpusense.localization.map_judge import MapJudge
 from gpusense.localization.passages import passages
 from gpusense.localization.ratio import LIMITS, explained_of_scan, ratio_of_scan
 from gpusense.localization.spread import share_off, share_off_of
-from gpusense.localization.words import word_of
+from gpusense.localization.words import verdict_label
 
 STILL = np.zeros((3, 3))
 
@@ -252,7 +252,7 @@ def test_the_share_of_a_spread_is_that_of_drawn_poses():
 
 def test_words():
     def word(p_lost, wrong, wide=False, apart=False):
-        return word_of(p_lost, wrong, wide=wide, apart=apart)
+        return verdict_label(p_lost, wrong, wide=wide, apart=apart)
 
     assert word(0.02, 0.02) == "tracking" and word(0.3, 0.3) == "uncertain" and word(0.7, 0.7) == "lost"
     # A wide cloud is never tracking; contradicted by scans it is lost, unless it covers several places.

@@ -20,9 +20,9 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, flags_of, launch
 from gpusense.interface.plan import ORDINARY_HEADINGS, Omission, Plan
 from gpusense.models.arguments import real_dtype
+from gpusense.models.chunking import Piece, chunk_of, finish, run_pieces
 from gpusense.models.pickled import Pickled
 from gpusense.models.poses import Part, Poses, pose_status
-from gpusense.models.run import Piece, chunk_of, finish, run_pieces
 from gpusense.reference import relative
 
 Programmer = Callable[[Poses, Part, Buffer], Program]

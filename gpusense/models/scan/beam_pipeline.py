@@ -19,7 +19,7 @@ from gpusense.models.scan.cones import Cones
 from gpusense.models.scan.map_caster import MapCaster
 from gpusense.models.scan.mixture import Mixture
 from gpusense.models.scan.pipeline import ScanLaunch, ScanPipeline, Tiles
-from gpusense.models.scan.readings import Readings, Sensing
+from gpusense.models.scan.readings import ReadingLayout, Readings
 from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.tiles import all_within, stranded, sum_launch, tiles_of
 from gpusense.world.frames import ray_vectors
@@ -96,10 +96,10 @@ class BeamPipeline(ScanPipeline):
             (scans.scans, scans.most_rays, scans.most_readings, len(scans.rays), len(scans.readings)),
         )  # fmt: skip
 
-    def sensing(self) -> Sensing:
+    def sensing(self) -> ReadingLayout:
         rules = self.rules
         vectors = rules.vectors[:, None] if self.cones.rays == 1 else self.cone_vectors
-        return Sensing(
+        return ReadingLayout(
             self.scanner, rules.beams, vectors, rules.z_max, end_points=False, max_depends=rules.max_depends,
             possible=self.setting.possible, specialize=self.specialize, top=self._top, guard_scale=0.0, real=self.real,
         )  # fmt: skip

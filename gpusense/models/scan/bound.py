@@ -20,8 +20,8 @@ from gpusense.backends.results import Result
 from gpusense.backends.workspace import POSE_STATUS, Workspace
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.launches import Program
+from gpusense.models.chunking import chunk_of, finish
 from gpusense.models.poses import Poses
-from gpusense.models.run import chunk_of, finish
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.readings import Readings, device_readings
 from gpusense.world.windows import Corners

@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.models.scan.rules import Rules
+from gpusense.models.scan.rules import BeamSelection
 from gpusense.world.scanner import Scanner, classify_ranges
 
 
-class LeftOut(NamedTuple):
+class OmittedReadings(NamedTuple):
     """Readings of a scan that are not evaluated at every pose; they are counted when asked for.
 
     Attributes:
@@ -81,7 +81,7 @@ class ClassedScans:
 
     def __init__(
         self, columns: np.ndarray, readings: np.ndarray, vectors: np.ndarray, rays: np.ndarray, first: np.ndarray,
-        ray_counts: np.ndarray, counts: np.ndarray, constants: np.ndarray, left_out: LeftOut,
+        ray_counts: np.ndarray, counts: np.ndarray, constants: np.ndarray, left_out: OmittedReadings,
     ) -> None:  # fmt: skip
         self.columns, self.readings, self.vectors, self.rays, self.first = columns, readings, vectors, rays, first
         self.ray_counts, self.counts, self.constants, self.left_out = ray_counts, counts, constants, left_out
@@ -125,7 +125,7 @@ def check_ranges(ranges: object, scanner: Scanner) -> np.ndarray:
     return checks.array("ranges", readings, shape=shape, finite=False, dtype=None)
 
 
-def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
+def class_scans(ranges: np.ndarray, rules: BeamSelection) -> ClassedScans:
     """Class, choose and group the readings of (S, K) scans, S > 0."""
     if rules.first_scans.left:
         rules.first_scans.look_at("ranges", ranges, rules.map_size)
@@ -160,17 +160,17 @@ def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
             constants += _numbers_of(constant) * rules.log_max
     scans = ClassedScans(
         columns, values, vectors, vectors, np.arange(len(columns) + 1, dtype=np.int32), counts, counts, constants,
-        LeftOut(hit[-1], far[-1], used[-1], used_max[-1], constant[-1], rules.z_max > 0),
+        OmittedReadings(hit[-1], far[-1], used[-1], used_max[-1], constant[-1], rules.z_max > 0),
     )  # fmt: skip
     return scans if rules.separate else _separated(scans, rules.ray_of)
 
 
-def _of_complete_scan(ranges: np.ndarray, classes: tuple[np.ndarray, np.ndarray], rules: Rules) -> ClassedScans:
+def _of_complete_scan(ranges: np.ndarray, classes: tuple[np.ndarray, np.ndarray], rules: BeamSelection) -> ClassedScans:
     """Return the chosen readings of a single scan in which every reading is a range."""
     (used, columns, vectors), (first, count, constants) = rules.of_complete_scan, rules.sizes_of_complete_scan
     hit, far = classes[0][0], classes[1][0]
     values = ranges[0] if rules.choice.every else ranges[0].take(columns)
-    left_out = LeftOut(hit, far, used, far, far, rules.z_max > 0)
+    left_out = OmittedReadings(hit, far, used, far, far, rules.z_max > 0)
     scans = ClassedScans(
         columns, values.astype(np.float64), vectors, vectors, first, count, count, constants, left_out
     )  # fmt: skip

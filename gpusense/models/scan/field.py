@@ -15,7 +15,7 @@ from gpusense._util.typing import AnyArray, Compat, Precision, Space
 from gpusense.backends import Selection
 from gpusense.interface.plan import Note, Omission, SceneNotes, component_notes, launch_omissions, precision_notes
 from gpusense.interface.terms import HIGH_PEAK
-from gpusense.models.run import finish
+from gpusense.models.chunking import finish
 from gpusense.models.scan.differentiable import Differentiable
 from gpusense.models.scan.field_gradient import gradients, in_world
 from gpusense.models.scan.field_pipeline import FieldPipeline

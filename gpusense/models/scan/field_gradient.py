@@ -10,7 +10,7 @@ from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import launch
 from gpusense.interface.signatures.rows import LANES
 from gpusense.interface.structs import ScanBatch, Score
-from gpusense.models.run import Piece, chunk_of, run_pieces
+from gpusense.models.chunking import Piece, chunk_of, run_pieces
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.readings import Readings, placing_launches

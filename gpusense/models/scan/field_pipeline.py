@@ -17,7 +17,7 @@ from gpusense.interface.structs import FieldTerms, Score, packed
 from gpusense.models.poses import PlacedPoses
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.pipeline import ScanLaunch, ScanPipeline, Tiles
-from gpusense.models.scan.readings import Readings, Sensing
+from gpusense.models.scan.readings import ReadingLayout, Readings
 from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.tiles import ENOUGH_SHORT, all_within, spread_of, sum_launch
 from gpusense.tables.field import RING, FieldTable
@@ -153,9 +153,9 @@ class FieldPipeline(ScanPipeline):
         padded[np.arange(padded.shape[1]) < scans.counts[:, None]] = lengths
         return padded.reshape(scans.scans, blocks, BLOCK_TERMS).max(axis=2)
 
-    def sensing(self) -> Sensing:
+    def sensing(self) -> ReadingLayout:
         rules = self.rules
-        return Sensing(
+        return ReadingLayout(
             self.scanner, rules.beams, rules.vectors[:, None], rules.z_max, end_points=True, max_depends=False,
             possible=self.setting.possible, specialize=self.specialize, top=math.inf, guard_scale=self.guard,
             real=self.real,

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from gpusense._util import checks
+from gpusense.models.chunking import finish_all
 from gpusense.models.poses import Poses
-from gpusense.models.run import finish_all
 from gpusense.models.scan.model import ScanModel
 from gpusense.models.scan.request import make_request
 

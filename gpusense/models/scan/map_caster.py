@@ -18,8 +18,8 @@ from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.structs import RangeScale
+from gpusense.models.chunking import Piece, chunk_of, finish, run_pieces
 from gpusense.models.poses import Frame, PlacedPoses, Poses, place
-from gpusense.models.run import Piece, chunk_of, finish, run_pieces
 from gpusense.models.scan.cones import LASER, Cones
 from gpusense.models.scan.sampling import Drawing
 from gpusense.models.scan.tiles import all_within, order_of, tiles_of

@@ -19,15 +19,15 @@ from gpusense.backends import Backend, BackendInfo, Selection, get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.plan import Plan, SceneNotes
 from gpusense.models.arguments import check_scene, map_words, real_dtype
+from gpusense.models.chunking import finish
 from gpusense.models.pickled import Pickled
 from gpusense.models.poses import Poses
-from gpusense.models.run import finish
 from gpusense.models.scan.differentiable import Differentiable, is_recorded, log_likelihood_of
 from gpusense.models.scan.explain import plan_of_call
 from gpusense.models.scan.pipeline import ScanPipeline
-from gpusense.models.scan.repeated import RepeatedScoring
+from gpusense.models.scan.repeated import ResidentCall
 from gpusense.models.scan.request import Request, make_request
-from gpusense.models.scan.rules import Beams, ModelContext, Rules, check_beams
+from gpusense.models.scan.rules import Beams, BeamSelection, ModelContext, check_beams
 from gpusense.models.scan.scoring import LastCall, run
 from gpusense.peers.weights import Peer, choose
 from gpusense.tables.worlds import Worlds
@@ -37,7 +37,7 @@ from gpusense.world.scanner import Scanner
 
 if TYPE_CHECKING:
     from gpusense.models.scan.bound import BoundCall
-    from gpusense.models.scan.packed_call import ShortCalls
+    from gpusense.models.scan.packed_call import PackedCallCache
 
 
 class ScanModel(Pickled):
@@ -76,7 +76,7 @@ class ScanModel(Pickled):
         checks.boolean("specialize", specialize)
         self._selection = backend
         device = get_backend(backend)
-        rules = Rules(
+        rules = BeamSelection(
             scanner, ray_vectors(scanner.bearings, scanner.mount), 0.0 if weights.is_peer else z_max, self.beams,
             specialize, max_is_range=weights.is_peer, max_depends=max_depends,
             map_size=math.hypot(grid.width, grid.height),
@@ -91,18 +91,18 @@ class ScanModel(Pickled):
         self._last_call = LastCall()
 
     @functools.cached_property
-    def _short(self) -> ShortCalls | None:
+    def _short(self) -> PackedCallCache | None:
         """Calls of few particles that repeat a size; None if the model has none."""
         if not self.backend.replays or self._worlds is not None:
             return None
-        from gpusense.models.scan.packed_call import ShortCalls
+        from gpusense.models.scan.packed_call import PackedCallCache
 
-        return ShortCalls.of(self._pipeline)
+        return PackedCallCache.of(self._pipeline)
 
     @functools.cached_property
-    def _repeated(self) -> RepeatedScoring:
+    def _repeated(self) -> ResidentCall:
         """Scans of poses that stay in place."""
-        return RepeatedScoring(self._pipeline, self._workspace, self._last_call)
+        return ResidentCall(self._pipeline, self._workspace, self._last_call)
 
     @property
     def _last(self) -> LastCall:

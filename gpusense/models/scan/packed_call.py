@@ -221,7 +221,7 @@ class _There:
             self._backend.copy(self._result[0], target, self._result[1])
 
 
-class ShortCalls:
+class PackedCallCache:
     """Ordinary calls of a model that repeat a size of few particles.
 
     Results have the bits of ordinary calls; a call for which this is not certain is left to the ordinary path.
@@ -243,12 +243,12 @@ class ShortCalls:
         self._lock = threading.Lock()
 
     @staticmethod
-    def of(pipeline: ScanPipeline) -> ShortCalls | None:
+    def of(pipeline: ScanPipeline) -> PackedCallCache | None:
         """Return the short calls of a model; None if its device or its options exclude them."""
         if not pipeline.backend.replays or host_task(pipeline) or pipeline.grid.cells.size > _MOST_CELLS:
             return None
         certain = pipeline.specialize and pipeline.rules.separate and pipeline.setting.possible
-        return ShortCalls(pipeline) if certain else None
+        return PackedCallCache(pipeline) if certain else None
 
     def score(self, poses: Any, ranges: Any, out: Any, *, per_beam: bool) -> np.ndarray | None:
         """Score poses by the readings of a scan; None if the ordinary call must do it.

@@ -17,10 +17,10 @@ from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.launches import Program
 from gpusense.interface.structs import ScanBatch, Score
+from gpusense.models.chunking import Piece, chunk_of
 from gpusense.models.poses import Frame, Part, PlacedPoses, Poses, place
-from gpusense.models.run import Piece, chunk_of
 from gpusense.models.scan.classed import ClassedScans, class_scans
-from gpusense.models.scan.readings import Readings, Sensing, placing_launches
+from gpusense.models.scan.readings import ReadingLayout, Readings, placing_launches
 from gpusense.models.scan.request import Request
 from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.tiles import Order, Parts, order_of
@@ -115,7 +115,7 @@ class ScanPipeline(ABC):
         """Copy the readings of scans to the device."""
 
     @abstractmethod
-    def sensing(self) -> Sensing:
+    def sensing(self) -> ReadingLayout:
         """Return the rules for readings that are on the device."""
 
     @abstractmethod

@@ -73,7 +73,7 @@ class Placing:
 
 
 @dataclass(frozen=True)
-class Sensing:
+class ReadingLayout:
     """Rules for readings that are on the device.
 
     Attributes:
@@ -131,7 +131,7 @@ class Sensing:
 
 
 def device_readings(
-    sensing: Sensing, ranges: Buffer, dtype: np.dtype, limits: np.dtype, space: Workspace
+    sensing: ReadingLayout, ranges: Buffer, dtype: np.dtype, limits: np.dtype, space: Workspace
 ) -> tuple[Placing, dict[str, Buffer]]:
     """Allocate places for readings that are on the device, and describe the launch that fills them.
 

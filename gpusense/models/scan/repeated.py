@@ -15,8 +15,8 @@ from gpusense.backends.base import Buffer
 from gpusense.backends.programs import ChangingProgram, RepeatedPrograms
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.launches import flags_of
+from gpusense.models.chunking import chunk_of
 from gpusense.models.poses import PlacedPoses, Poses
-from gpusense.models.run import chunk_of
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.request import FLOATS, Request
 from gpusense.models.scan.scoring import LastCall
@@ -59,7 +59,7 @@ class _Placed(NamedTuple):
     flags: frozenset[str]
 
 
-class RepeatedScoring:
+class ResidentCall:
     """Starts scans of poses that were scored before.
 
     Args:

@@ -70,7 +70,7 @@ class BeamChoice:
 
 
 @dataclass(frozen=True)
-class Rules:
+class BeamSelection:
     """Rules that class, thin and group readings.
 
     Attributes:
@@ -170,7 +170,7 @@ class ModelContext:
 
     backend: Backend
     real: np.dtype
-    rules: Rules
+    rules: BeamSelection
     weights: Likelihood
     cubes: bool
     temperature: float

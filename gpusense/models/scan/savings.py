@@ -10,7 +10,7 @@ import numpy as np
 from gpusense.backends import Backend
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.plan import Plan
-from gpusense.models.run import finish
+from gpusense.models.chunking import finish
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.request import Request

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense.backends.workspace import Workspace
+from gpusense.models.chunking import Piece, chunk_of, run_pieces
 from gpusense.models.poses import Frame, Part, place
-from gpusense.models.run import Piece, chunk_of, run_pieces
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.readings import Readings

@@ -16,8 +16,8 @@ from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
 from gpusense.models import run
 from gpusense.models.scan import pipeline
-from gpusense.models.scan.classed import ClassedScans, LeftOut, _join, class_scans
-from gpusense.models.scan.rules import Rules
+from gpusense.models.scan.classed import ClassedScans, OmittedReadings, _join, class_scans
+from gpusense.models.scan.rules import BeamSelection
 
 BEAMS, RANGE = 37, 5.0
 RNG = np.random.default_rng(5)
@@ -232,7 +232,7 @@ def test_other_numbers_and_lists_as_poses():
 def test_a_batch_is_its_scans_one_after_the_other(options, near):
     scanner = gs.Scanner(BEARINGS, RANGE, near)
     vectors = np.stack([np.cos(BEARINGS), np.sin(BEARINGS)], axis=1)
-    rules = Rules(scanner, vectors, options.get("z_max", 0.05), options.get("beams"), True)
+    rules = BeamSelection(scanner, vectors, options.get("z_max", 0.05), options.get("beams"), True)
     for z in (scans_of(), scans_of().astype(np.float32), scans_of()[:1], scans_of()[3:5]):
         alone = [class_scans(scan[None], rules) for scan in z]
         for batch in (class_scans(z, rules), _join(alone)):
@@ -250,5 +250,7 @@ def test_groups_of_scans():
     """Scans with no rays, as many rays as readings, or fewer."""
     rays, counts = np.array([5, 4, 9, 0, 0, 3, 3, 3, 2, 2, 0]), np.array([5, 4, 9, 0, 0, 3, 3, 3, 7, 4, 0])
     whole = np.zeros(counts.sum())
-    scans = ClassedScans(whole, whole, whole, whole, whole, rays, counts, whole, LeftOut(*[whole > 0] * 5, False))
+    scans = ClassedScans(
+        whole, whole, whole, whole, whole, rays, counts, whole, OmittedReadings(*[whole > 0] * 5, False)
+    )
     assert [*scans.groups()] == [(0, 3), (3, 4), (4, 5), (5, 8), (8, 10), (10, 11)]

@@ -16,13 +16,13 @@ from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
 from gpusense.models import run
 from gpusense.models.scan import model as model_module
-from gpusense.models.scan.packed_call import ShortCalls
+from gpusense.models.scan.packed_call import PackedCallCache
 
 
 @pytest.fixture(autouse=True)
 def no_short_calls(monkeypatch):
     """Keep repeated calls ordinary; test_bound_host.py tests the other ones."""
-    monkeypatch.setattr(ShortCalls, "of", staticmethod(lambda pipeline: None))
+    monkeypatch.setattr(PackedCallCache, "of", staticmethod(lambda pipeline: None))
 
 
 # ---- processors: memory of host and device

@@ -23,7 +23,7 @@ from gpusense.localization.tracker import Tracker, is_together
 from gpusense.localization.verdict import Verdict
 
 
-class FilterParts:
+class FilterCore:
     """Particles, the verdict on their pose, and recovery from a wrong pose.
 
     Args:

@@ -10,6 +10,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 from error_vs_time.page import interactive
 from make_figures import write_pages as write_figures
 from reference_pages import write_pages
@@ -36,6 +37,9 @@ exclude_patterns = ["**/.*", "site", "docs/tour/GALLERY_HEADER.rst"]
 suppress_warnings = ["myst.header", "config.cache"]
 
 myst_heading_anchors = 4
+# Formulas between dollar signs become MathML, which browsers typeset without a script.
+myst_enable_extensions = ["dollarmath"]
+html_math_renderer = "mathml"
 # Notebooks have no outputs in the checkout; each runs here, in a separate folder.
 nb_execution_mode = "force"
 nb_execution_in_temp = True
@@ -92,13 +96,25 @@ def show_colons(app: Any, what: str, name: str, obj: Any, options: Any, lines: l
     lines[:] = [line.replace(COLON, ":") for line in lines]
 
 
+# Files of the checkout that the site shows as a page: links to them work in both.
+SHOWN = {"GALLERY_HEADER.rst": "docs/lectures/index.html", "__init__.pyi": "docs/api/index.html"}
+
+
 def open_figures(app: Any, doctree: nodes.document) -> None:
-    """Let links to files of ``docs/front`` open them: they belong to the root of the site, and are no downloads."""
+    """Let links to files of ``docs/front``, to figures and to ``SHOWN`` open pages of the site: they are no downloads."""
     root = "../" * app.env.docname.count("/")
     for node in list(doctree.findall(addnodes.download_reference)):
-        _, front, path = node["reftarget"].partition("front/")
-        if front:
+        file = node["reftarget"]
+        _, front, path = file.partition("front/")
+        path = SHOWN.get(Path(file).name, path if front else f"figures/{Path(file).name}")
+        if front or Path(file).name in SHOWN or file.startswith("figures/"):
             node.replace_self(nodes.reference("", "", *node.children, refuri=f"{root}{path}"))
+
+
+def write_formula(translator: Any, node: nodes.Element, block: bool) -> None:
+    """Write a formula as MathML."""
+    translator.body.append(tex2mathml(node.astext(), as_block=block))
+    raise nodes.SkipNode
 
 
 def setup(app: Any) -> None:
@@ -107,6 +123,11 @@ def setup(app: Any) -> None:
     figures = ROOT / "docs" / "front" / "figures"
     write_figures(figures)
     (figures / "error-vs-time.html").write_text(interactive(), encoding="utf-8")
+    app.add_html_math_renderer(
+        "mathml",
+        (lambda translator, node: write_formula(translator, node, False), None),
+        (lambda translator, node: write_formula(translator, node, True), None),
+    )
     app.connect("source-read", mark_reports)
     # Before and after napoleon reads docstrings.
     app.connect("autodoc-process-docstring", hide_colons, priority=100)

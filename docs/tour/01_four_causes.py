@@ -3,9 +3,9 @@ A reading has four causes
 =========================
 
 The map says that the wall is at z*. The sensor may report the wall (*hit*), somebody in front of it (*short*),
-nothing at all (*max*) or anything (*rand*). The density of a reading is their mixture (book section 6.3.1)::
+nothing at all (*max*) or anything (*rand*). The density of a reading is their mixture (book section 6.3.1):
 
-    p(z | z*) = z_hit p_hit + z_short p_short + z_max p_max + z_rand p_rand
+.. math:: p(z \\mid z^*) = z_{hit}\\, p_{hit} + z_{short}\\, p_{short} + z_{max}\\, p_{max} + z_{rand}\\, p_{rand}
 
 ``gs.BeamParameters`` has the weights, the deviation of hits and the rate of short readings. **Try:**
 ``sigma_hit=0.5``, or a wall at 1 m; `with sliders <../../figures/beam.html>`__ in the browser.

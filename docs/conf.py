@@ -101,13 +101,12 @@ SHOWN = {"GALLERY_HEADER.rst": "docs/lectures/index.html", "__init__.pyi": "docs
 
 
 def open_figures(app: Any, doctree: nodes.document) -> None:
-    """Let links to files of ``docs/front``, to figures and to ``SHOWN`` open pages of the site: they are no downloads."""
+    """Let links to files of ``docs/front`` and to ``SHOWN`` open pages of the site instead of downloads."""
     root = "../" * app.env.docname.count("/")
     for node in list(doctree.findall(addnodes.download_reference)):
-        file = node["reftarget"]
-        _, front, path = file.partition("front/")
-        path = SHOWN.get(Path(file).name, path if front else f"figures/{Path(file).name}")
-        if front or Path(file).name in SHOWN or file.startswith("figures/"):
+        path = node["reftarget"].partition("front/")[2]
+        path = SHOWN.get(Path(node["reftarget"]).name, path)
+        if path:
             node.replace_self(nodes.reference("", "", *node.children, refuri=f"{root}{path}"))
 
 

@@ -24,6 +24,19 @@ TITLES = {
     "evaluation": "Judged trajectories",
     "backends": "Devices",
 }
+# The ten names that most programs use, with their meanings.
+FIRST = {
+    "read_map": "a map of map_server or slam_toolbox",
+    "read_log": "scans and odometry of a bag or a CARMEN log",
+    "OccupancyGrid": "a map from an array",
+    "Scanner": "a laser or a ring of sonars",
+    "BeamModel": "log p(z | x, m) by expected ranges",
+    "LikelihoodFieldModel": "log p(z | x, m) by distances to obstacles",
+    "ParticleFilter": "a pose with a verdict, scan by scan",
+    "match_scan": "the motion between two scans, or a pose on a map",
+    "build_map": "a map from scans with poses",
+    "fit_beam_parameters": "the parameters of a sensor",
+}
 # Public modules, by their titles.
 MODULES = {
     "casters": "Casters: gs.casters",
@@ -75,8 +88,10 @@ def write_pages(folder: Path) -> None:
         names = sorted(importlib.import_module(f"gpusense.{module}").__all__)
         pages[module] = page(MODULES.get(module, f"gs.{module}"), f"gpusense.{module}", names)
     listed = "\n".join(f"   {name}" for name in pages)
-    intro = "Every public name, with shapes, units, errors and an example."
-    pages["index"] = f"Reference\n=========\n\n{intro}\n\n.. toctree::\n\n{listed}\n"
+    intro = "Begin with these ten; the pages below list every public name, with shapes, units, errors and an example."
+    roles = {name: "class" if inspect.isclass(getattr(gpusense, name)) else "func" for name in FIRST}
+    first = "\n".join(f"- :{roles[name]}:`gpusense.{name}`: {meaning}" for name, meaning in FIRST.items())
+    pages["index"] = f"Reference\n=========\n\n{intro}\n\n{first}\n\n.. toctree::\n\n{listed}\n"
     folder.mkdir(exist_ok=True)
     for name, text in pages.items():
         file = folder / f"{name}.rst"

@@ -3,9 +3,9 @@ The likelihood field
 ====================
 
 The likelihood field asks how far the end of each reading is from the nearest obstacle (book section 6.4), and needs
-no rays::
+no rays; Z is the largest range:
 
-    p(z | x, m) = z_hit N(d; 0, sigma) + z_rand / z_max
+.. math:: p(z \\mid x, m) = z_{hit}\\, N(d; 0, \\sigma^2) + z_{rand} / Z
 
 The distances are computed once for a map, exactly. Left: the map with a scan at its true pose. Right: the field with
 the end points of the scan, at the true pose and at one that is off by 0.5 m and 10 degrees. **Try:**

@@ -103,7 +103,8 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track
     if result["verdict"] == "tracking" and result["evidence"] is not None:
         print_fact("but", result["evidence"]["text"])
     print_fact("last pose", f"{_pose(track.poses[-1])}; deviations {_deviations(deviations)}")
-    print_fact("scans", f"{result['scans']}, {sum(result[f'ms_{part}'] for part in _PARTS):.2g} ms each")
+    milliseconds = float(f"{sum(result[f'ms_{part}'] for part in _PARTS):.2g}")
+    print_fact("scans", f"{result['scans']}, {milliseconds:g} ms each")
     if result["scans"] > 1 and not result["odometry_moves"]:
         print_fact("odometry", "does not move: absent, unreadable, at other times than the scans, or the robot stands")
     if result["references_repeat_odometry"]:
@@ -172,15 +173,16 @@ def _verdict(result: dict[str, Any], deviations: list[float]) -> str:
     evidence = result["evidence"]["text"]
     if result["verdict"] == "lost":
         return f"{verdict}: {evidence}"
-    return f"{verdict}: {_doubt(deviations)}; {evidence}"
+    doubt = _doubt(deviations, result["evidence"]["cause"] == "none")
+    return f"{verdict}: {doubt}; {evidence}" if doubt else f"{verdict}: {evidence}"
 
 
-def _doubt(deviations: list[float]) -> str:
-    """Return the reason why a pose is uncertain: wide particles, or scans that other places also explain."""
+def _doubt(deviations: list[float], agrees: bool) -> str:
+    """Return the reason why a pose is uncertain beside its evidence: wide particles, or places that look alike."""
     position, heading = max(deviations[:2]), deviations[2]
     if position > WIDE or heading > WIDE_TURN:
         return f"the particles lie {position:.1f} m and {math.degrees(heading):.0f} degrees apart"
-    return "the particles lie together, but the scans so far fit other places as well, or too few agree; drive on"
+    return "the scans so far fit other places as well: drive on" if agrees else ""
 
 
 def _draw(path: Path, pf: ParticleFilter, track: Track) -> None:

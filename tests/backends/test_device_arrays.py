@@ -14,7 +14,7 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
-from gpusense.models import run
+from gpusense.models import chunking
 
 BEAMS, COUNT, RANGE = 21, 300, 5.0
 RNG = np.random.default_rng(12)
@@ -125,7 +125,7 @@ def test_scans_that_share_launches_on_the_device(kind, real, warp_as_gpu, warp_c
 def test_in_pieces_on_the_device(method, warp_as_gpu, monkeypatch):
     call, _ = call_of(method, warp_as_gpu)
     expected = call(POSES)
-    monkeypatch.setattr(run, "CHUNK", 77)
+    monkeypatch.setattr(chunking, "CHUNK", 77)
     assert differing(call(to_device(POSES)).numpy(), expected) == 0
 
 
@@ -169,7 +169,7 @@ def test_a_pose_that_is_not_finite_is_reported_after_memory_ran_out(warp_as_gpu,
     poses = np.tile(POSES, (6, 1))
     model.log_likelihood(to_device(poses), SCAN)
     poses[3, 0] = np.nan
-    monkeypatch.setattr(run, "CHUNK", 600)
+    monkeypatch.setattr(chunking, "CHUNK", 600)
     before, calls = Workspace.empty, []
 
     def empty(self, name, count, dtype, *, zero=False):

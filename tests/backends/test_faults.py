@@ -17,7 +17,7 @@ from support.full_device import full_device
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.interface import sources
-from gpusense.models import run
+from gpusense.models import chunking
 
 
 def room() -> tuple[gs.OccupancyGrid, gs.Scanner, np.ndarray, np.ndarray]:
@@ -243,14 +243,14 @@ def test_a_long_batch_can_be_interrupted_and_the_model_still_works(backend, tmp_
 
 def test_work_on_a_processor_is_cut_into_pieces_that_can_be_interrupted():
     device = get_backend("numpy")
-    assert run.chunk_of(device, 360) == run.CHUNK_WORK // 360 // 256 * 256
-    assert run.chunk_of(device, 1 << 17) == run.CHUNK_WORK >> 17 == 128
-    assert run.chunk_of(device, 1 << 30) == 1
-    assert run.chunk_of(device, 4, 8) <= run.CHUNK_BYTES // 32
+    assert chunking.chunk_of(device, 360) == chunking.CHUNK_WORK // 360 // 256 * 256
+    assert chunking.chunk_of(device, 1 << 17) == chunking.CHUNK_WORK >> 17 == 128
+    assert chunking.chunk_of(device, 1 << 30) == 1
+    assert chunking.chunk_of(device, 4, 8) <= chunking.CHUNK_BYTES // 32
 
 
 @pytest.mark.parametrize("memory", [4 << 30, 64 << 30])
 def test_results_of_a_gpu_are_cut_by_its_memory(memory):
     device = SimpleNamespace(info=SimpleNamespace(kind="gpu", memory=memory))
-    most = max(run.CHUNK_BYTES, memory // 32)
-    assert run.chunk_of(device, 4096, 4) == most // (4096 * 4) // 256 * 256
+    most = max(chunking.CHUNK_BYTES, memory // 32)
+    assert chunking.chunk_of(device, 4096, 4) == most // (4096 * 4) // 256 * 256

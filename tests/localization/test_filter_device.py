@@ -9,7 +9,7 @@ import pytest
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.models import run as pieces
+from gpusense.models import chunking as pieces
 
 GRID = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
 SCANNER = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.1, count=60, range_max=10.0)

@@ -14,7 +14,7 @@ from support.scan_calls import BEAM, BEAMS, COUNT, FIELD, GRID, MODELS, NEAR, SC
 import gpusense as gs
 from gpusense.backends import get_backend, proof, selection
 from gpusense.evaluation.tolerances import differing
-from gpusense.models import run
+from gpusense.models import chunking
 
 METHODS = ("log_likelihood", "field", "expected_ranges", "cast", "cones", "absolute", "landmarks")
 
@@ -80,7 +80,7 @@ def test_several_scans(kind, share, queue, there, monkeypatch):
 
 def test_pieces_of_calls(queue, there, monkeypatch):
     """Pieces become multiples of 256 particles where the device could not begin a sub-buffer."""
-    monkeypatch.setattr(run, "CHUNK", 300)
+    monkeypatch.setattr(chunking, "CHUNK", 300)
     poses = cloud(3, 1000)
     for kind in MODELS:
         model = kind(GRID, SCANNER, backend=queue)
@@ -91,7 +91,7 @@ def test_pieces_of_calls(queue, there, monkeypatch):
 @pytest.mark.parametrize("kind", MODELS)
 def test_pieces_with_which_the_device_cannot_begin(kind, as_gpu, queue, there, monkeypatch):
     """Such pieces are written elsewhere and copied; bound calls copy nothing and use larger pieces."""
-    monkeypatch.setattr(run, "CHUNK", 49)
+    monkeypatch.setattr(chunking, "CHUNK", 49)
     poses = cloud(3, 300).astype(np.float32)
     model, caster = kind(GRID, NEAR, backend=queue, precision="float64"), gs.RayCaster(GRID, 5.0, backend=queue)
     heading = gs.HeadingModel(backend=queue)

@@ -13,7 +13,7 @@ from support.frameworks import each_framework, framework
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing
-from gpusense.models import run
+from gpusense.models import chunking
 
 INF = float("inf")
 IMPOSSIBLE = {
@@ -101,7 +101,7 @@ def test_poses_on_the_device_stay_there(name, warp_as_gpu, warp_copies, monkeypa
     with pytest.raises(ValueError, match=r"^poses: must be finite, got a pose on the device that is not$"):
         call(to_device(bad))
     assert call(to_device(np.empty((0, 3)))).shape == (0,)
-    monkeypatch.setattr(run, "CHUNK", 23)
+    monkeypatch.setattr(chunking, "CHUNK", 23)
     assert differing(call(to_device(POSES)).numpy(), expected) == 0
 
 

@@ -9,7 +9,7 @@ from support import landmark_scenes as scenes
 from support.selection import on_every_backend
 
 import gpusense as gs
-from gpusense.models import run
+from gpusense.models import chunking
 from gpusense.models.landmark.features import check_features
 from gpusense.world.landmarks import make_buckets
 
@@ -201,7 +201,7 @@ def test_pieces_have_the_same_bits(backend, monkeypatch):
     for options in (dict(), dict(association="sum"), dict(association="joint", negative=True)):
         model = gs.LandmarkModel(landmarks, backend=backend, **options)
         whole = model.log_likelihood(poses, features[:, :2]), *model.associate(poses, features[:, :2])
-        monkeypatch.setattr(run, "CHUNK", 30)
+        monkeypatch.setattr(chunking, "CHUNK", 30)
         parts = model.log_likelihood(poses, features[:, :2]), *model.associate(poses, features[:, :2])
         monkeypatch.undo()
         for a, b in zip(whole, parts, strict=True):

@@ -25,7 +25,7 @@ from support.paths import ROOT
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.models import run
+from gpusense.models import chunking
 from gpusense.models.point.bumper import sample_outline
 
 # -------------------------------------------------------------------------------------------------------- bumper
@@ -158,7 +158,7 @@ def test_batches_order_and_repetition_change_no_bit(backend: str, precision: str
     poses = poses_around(GRID)
     order = np.random.default_rng(0).permutation(len(poses))
     whole = {name: m.log_likelihood(poses, *z) for name, (m, z) in models(backend, precision).items()}
-    monkeypatch.setattr(run, "CHUNK", 7)
+    monkeypatch.setattr(chunking, "CHUNK", 7)
     for name, (model, measured) in models(backend, precision).items():
         out = np.empty(len(poses), precision)
         assert model.log_likelihood(poses, *measured, out=out) is out

@@ -15,7 +15,7 @@ from support.selection import BACKENDS
 import gpusense as gs
 from gpusense.evaluation.tolerances import TOLERANCES, differing
 from gpusense.interface.launches import flags_of
-from gpusense.models import run
+from gpusense.models import chunking
 from gpusense.models.scan import tiles
 
 
@@ -99,7 +99,7 @@ def test_out_and_pieces_and_no_particles(batching, monkeypatch):
     model = BEAM(GRID, NEAR, backend=batching[0])
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
     expected = model.log_likelihood(poses, ranges.numpy()).numpy()
-    monkeypatch.setattr(run, "CHUNK", 77)
+    monkeypatch.setattr(chunking, "CHUNK", 77)
     out = to_device(np.full(COUNT, 7, np.float32))
     call = model.bind(Array(poses), Array(ranges), out=out)
     for _ in range(3):

@@ -123,9 +123,9 @@ def test_a_refusal_shows_in_calls_of_numpy_arrays(batching, monkeypatch):
 
 def test_a_call_in_many_pieces(batching, monkeypatch):
     """A recording of any length is one graph; with copies around it, it counts as one step."""
-    from gpusense.models import run
+    from gpusense.models import chunking
 
-    monkeypatch.setattr(run, "CHUNK", 7)
+    monkeypatch.setattr(chunking, "CHUNK", 7)
     call = bound(batching[0])
     call()
     call()

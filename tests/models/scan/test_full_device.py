@@ -11,7 +11,7 @@ from support.model_world import BEARINGS, KINDS, RANGE, cloud, make, parts_of_ki
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.backends.proxy import Proxy
-from gpusense.models import run
+from gpusense.models import chunking
 from gpusense.tables.reachable import ReachableMap
 
 
@@ -69,7 +69,7 @@ def test_a_table_that_does_not_fit_is_reported_at_once(kind, backend, monkeypatc
     """Fewer particles need the same table, so it is tried once; the message is the device's."""
     grid, z = room(), scan()
     poses = cloud(grid, 3000)
-    monkeypatch.setattr(run, "SMALLEST_CHUNK", 1)
+    monkeypatch.setattr(chunking, "SMALLEST_CHUNK", 1)
 
     def score(device: Any) -> Any:
         if kind == "caster":

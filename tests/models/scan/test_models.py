@@ -10,7 +10,7 @@ from support.model_world import BEARINGS, KINDS, NAN, RANGE, cloud, make, parts_
 
 import gpusense as gs
 from gpusense.backends.workspace import Workspace
-from gpusense.models import run
+from gpusense.models import chunking
 
 
 @pytest.mark.sampled(0.5)
@@ -20,7 +20,7 @@ def test_batches_do_not_matter(kind, chunk, backend, monkeypatch):
     grid, poses, z = room(), cloud(room(), 150), scan()
     log_p, parts = make(kind, grid, backend).log_likelihood(poses, z, per_beam=True)
     ranges = gs.RayCaster(grid, RANGE, backend=backend).cast(poses, BEARINGS)
-    monkeypatch.setattr(run, "CHUNK", chunk)
+    monkeypatch.setattr(chunking, "CHUNK", chunk)
     model = make(kind, grid, backend)
     again, each = model.log_likelihood(poses, z, per_beam=True)
     same_bits(log_p, again)

@@ -14,7 +14,7 @@ from gpusense.backends import get_backend
 from gpusense.backends.proxy import Proxy
 from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
-from gpusense.models import run
+from gpusense.models import chunking
 from gpusense.models.scan import pipeline
 from gpusense.models.scan.classed import ClassedScans, OmittedReadings, _join, class_scans
 from gpusense.models.scan.rules import BeamSelection
@@ -155,7 +155,7 @@ def test_scans_with_readings_share_one_set_of_launches(kind, gpu, as_gpu, monkey
     model.log_likelihood(poses[5:], z[5:])
     launches(1)
     # Launches of at most 150 particles, three scans each.
-    monkeypatch.setattr(run, "CHUNK", 150)
+    monkeypatch.setattr(chunking, "CHUNK", 150)
     assert_as_one_by_one(model, poses, z)
     device.launches.clear()
     model.log_likelihood(poses[5:], z[5:])

@@ -14,7 +14,7 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
-from gpusense.models import run
+from gpusense.models import chunking
 from gpusense.models.scan import model as model_module
 from gpusense.models.scan.packed_call import PackedCallCache
 
@@ -147,7 +147,7 @@ def test_graphs_with_arrays_on_the_device(kind, batching, monkeypatch):
 def test_scans_and_pieces_are_batched_in_their_order(batching, monkeypatch):
     """Pieces reuse buffers, so that a wrong order would change results."""
     device, started = batching
-    monkeypatch.setattr(run, "CHUNK", 77)
+    monkeypatch.setattr(chunking, "CHUNK", 77)
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=device)
     poses, scans = np.stack([cloud(1), cloud(2)]), np.stack([scan(1), scan(2)])
     expected = plainly(device, monkeypatch, lambda: model.log_likelihood(poses, scans))

@@ -9,7 +9,7 @@ from support.selection import on_every_backend
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing
 from gpusense.interface.constants import BLOCK_TERMS
-from gpusense.models import run
+from gpusense.models import chunking
 from gpusense.models.scan import tiles
 
 BEAMS, COUNT, RANGE = 21, 300, 5.0
@@ -172,7 +172,7 @@ def test_out_spares_the_host_an_array_but_changes_no_copy(gpu, as_gpu, monkeypat
 @pytest.mark.parametrize("gpu", [False, True])
 def test_calls_in_pieces_allocate_nothing_either(gpu, as_gpu, monkeypatch):
     device = as_gpu(gpu)
-    monkeypatch.setattr(run, "CHUNK", 128)
+    monkeypatch.setattr(chunking, "CHUNK", 128)
     watch = Watch(device, monkeypatch)
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=device)
     # Each piece has all corners of the box.

@@ -16,7 +16,7 @@ from support.selection import on_every_backend
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan
-from gpusense.models import run
+from gpusense.models import chunking
 from gpusense.models.scan import tiles
 from gpusense.tables.casters import CASTERS
 
@@ -197,9 +197,9 @@ def test_in_pieces(chunk, ordered, as_gpu, monkeypatch):
         return [*(model.log_likelihood(poses, z) for model in models), *parts, caster.cast(poses, scanner.bearings)]
 
     whole = results()
-    monkeypatch.setattr(run, "CHUNK_SHARE", 1 << 62)
+    monkeypatch.setattr(chunking, "CHUNK_SHARE", 1 << 62)
     for size in (16, 33, 117):
-        monkeypatch.setattr(run, chunk, size if chunk == "CHUNK" else size * BEAMS * 4)
+        monkeypatch.setattr(chunking, chunk, size if chunk == "CHUNK" else size * BEAMS * 4)
         for found, right in zip(results(), whole, strict=True):
             assert differing(found, right) == 0
 

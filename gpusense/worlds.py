@@ -25,7 +25,7 @@ __all__ = [
 # Modules of the package ``evaluation``.
 _HOME = dict.fromkeys(__all__, "worlds") | {
     "SimulatedRun": "simulation.run", "building": "buildings", "change_world": "simulation.changes",
-    "named_world": "named_worlds", "simulate_run": "simulation.run", "write_run": "simulation.files",
+    "named_world": "buildings", "simulate_run": "simulation.run", "write_run": "simulation.files",
 }  # fmt: skip
 
 

@@ -99,8 +99,7 @@ class Worlds:
 
     Example:
         >>> import gpusense as gs, numpy as np
-        >>> cells = np.zeros((2, 1, 8), np.int8)
-        >>> cells[0, 0, 5] = cells[1, 0, 7] = 100
+        >>> cells = 100 * np.eye(8, dtype=np.int8)[[5, 7], None]
         >>> worlds = gs.Worlds(cells, resolution=0.5, backend="numpy")
         >>> worlds
         Worlds(2 of 1 x 8 cells, resolution=0.5, backend='numpy', 1.2e-04 MB)

@@ -14,10 +14,10 @@ from gpusense.localization.assessment import estimate_of
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.diagnosis import Diagnosis, diagnose
 from gpusense.localization.estimates import Estimate
-from gpusense.localization.filter_cloud import FilterCloud
 from gpusense.localization.filter_core import FilterCore
 from gpusense.localization.journal import Transactional, atomic, consistent
 from gpusense.localization.motion import MotionModel, OdometryMotion, SampledMotion
+from gpusense.localization.scoring import FilterCloud
 from gpusense.localization.sensors import grid_of, sensors_of
 from gpusense.localization.state import FilterState, check_state, constructor_options, model_names
 from gpusense.localization.tracker import Tracker

@@ -11,12 +11,11 @@ from gpusense._util.typing import AnyArray
 from gpusense.localization import skipping, starts
 from gpusense.localization.cloud_state import Contents
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.filter_cloud import FilterCloud
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.options import Options
 from gpusense.localization.pose_algebra import compose_poses
 from gpusense.localization.recovery import Recovery
-from gpusense.localization.scoring import readings_of
+from gpusense.localization.scoring import FilterCloud, readings_of
 from gpusense.localization.sensors import Sensor, grid_of
 from gpusense.localization.state import memory_of, remember
 from gpusense.localization.tracker import Tracker, is_together

@@ -7,10 +7,10 @@ from typing import Any, ClassVar
 
 from gpusense.localization import starts
 from gpusense.localization.cloud_state import SensorReadings
-from gpusense.localization.filter_cloud import FilterCloud
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.rival import COMPARISONS, PARTICLES, PRIOR, Rival, evidence_of
 from gpusense.localization.rival_search import can_search
+from gpusense.localization.scoring import FilterCloud
 from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import Verdict
 

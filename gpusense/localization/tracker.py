@@ -17,10 +17,10 @@ from gpusense.localization.adaptive import kld_count
 from gpusense.localization.cloud_state import Contents, SensorReadings, Step
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.estimates import covariance_of, sample_size_of
-from gpusense.localization.filter_cloud import FilterCloud
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import STILL, SampledMotion
 from gpusense.localization.options import Options, settings_of_step
+from gpusense.localization.scoring import FilterCloud
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.skipping import TOGETHER
 

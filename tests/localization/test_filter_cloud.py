@@ -11,9 +11,9 @@ from support.tracking_scene import field, scans
 from gpusense.backends import get_backend
 from gpusense.interface.constants import FAST, SLOW, SLOW_RATE, STRAIGHT
 from gpusense.localization.cloud_state import Contents, Step
-from gpusense.localization.filter_cloud import FilterCloud
 from gpusense.localization.motion import STILL, OdometryMotion
 from gpusense.localization.options import checked, settings_of_step
+from gpusense.localization.scoring import FilterCloud
 from gpusense.localization.sensors import Sensor
 
 COUNT = 100

@@ -25,7 +25,7 @@ MOST_FIELD, MOST_BEAMS, MOST_CAST, MOST_MATCH, MOST_STEP, MOST_BOUND = 81, 87, 8
 # Most stays of a call in rooms of the package; successive calls in a room are one stay.
 MOST_STAYS = 22
 # Most files of the package in a call.
-FILES_FIELD, FILES_BEAMS, FILES_CAST, FILES_MATCH, FILES_STEP = 19, 22, 19, 26, 37
+FILES_FIELD, FILES_BEAMS, FILES_CAST, FILES_MATCH, FILES_STEP = 19, 22, 19, 26, 36
 
 
 @pytest.fixture(autouse=True)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from gpusense.commands.output import degrees, length, print_fact, print_files, print_json, print_result
 from gpusense.commands.scans import scan_times
+from gpusense.commands.stretches import print_stretches, stretch_rows
 from gpusense.evaluation.machine import machine, machine_line
 from gpusense.localization.spread import WIDE, WIDE_TURN
 
@@ -44,10 +45,11 @@ def report(
     Returns:
         The results of :func:`gpusense.evaluation.tracking.summary`.
     """
-    from gpusense.evaluation.tracking import summary
+    from gpusense.evaluation.judging import stretches_of_track
+    from gpusense.evaluation.tracking import RISK, summary
     from gpusense.evaluation.trajectory_files import write_tum
 
-    result = summary(track)
+    result, stretches = summary(track), stretches_of_track(track)
     found = _diagnosis(pf, track, tracking=result["verdict"] == "tracking")
     result["evidence"] = None if found is None else asdict(found) | {"text": found.text}
     first = 0 if args.tum_from == "start" else len(track.poses) if track.converged is None else track.converged
@@ -63,9 +65,12 @@ def report(
         poses = [[step.index, *pose.tolist()] for step, pose in zip(track.steps, track.poses, strict=True)]
         document = {"options": options, "filter": repr(pf), "summary": result, "scans_chosen": chosen}
         times = [step.scan.time for step in track.steps]
-        print_json(document | {"poses": poses, "times": times, "machine": machine()})
+        document |= {"poses": poses, "times": times, "stretches": stretch_rows(stretches), "risk": RISK}
+        print_json(document | {"machine": machine()})
         return result
     _print(pf, result, chosen, track)
+    if len(stretches) > 1:
+        print_stretches(stretches, track.steps[0].scan.time, RISK)
     print_files(args.plot, *recorders, args.tum)
     if args.tum is not None and first:
         print_fact("", f"without the first {first} of {len(track.poses)} scans, before the verdict is 'tracking'; "

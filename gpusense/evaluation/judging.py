@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 from gpusense.evaluation.posed_scans import NEAR
+from gpusense.evaluation.tracking import RISK, Track
 from gpusense.evaluation.trajectory_files import nearest_index, poses_at
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.diagnosis import Diagnosis
 from gpusense.localization.monitor import PoseMonitor
-from gpusense.localization.protection import protection_level
+from gpusense.localization.protection import check_risk
 from gpusense.localization.spread import FAR
 from gpusense.localization.words import WORDS, Word
 from gpusense.logs import Scan
@@ -144,7 +145,7 @@ class Judgement:
 class TrajectoryJudge:
     """Judges a trajectory, scan by scan."""
 
-    def __init__(self, models: ScanModel | list[ScanModel], *, risk: float = 0.05, searches: int = 5) -> None:
+    def __init__(self, models: ScanModel | list[ScanModel], *, risk: float = RISK, searches: int = 5) -> None:
         """Begin; the arguments are those of :func:`judge_trajectory`."""
         each = list(models) if isinstance(models, (list, tuple)) else [models]
         for model in each:
@@ -152,9 +153,7 @@ class TrajectoryJudge:
                 raise TypeError(f"models: must be a model of scans or a list of them, got {checks.show(model)}")
         self._models: dict[Scanner, ScanModel] = {model.scanner: model for model in each}
         self._searches = checks.integer("searches", searches, low=0)
-        # This checks the risk.
-        protection_level(risk, 0.0, None, 1.0)
-        self._risk = float(risk)
+        self._risk = check_risk(risk)
         self._monitor = PoseMonitor(each)
         self._locators: dict[Scanner, LikelihoodFieldModel] = {}
         self._judged: list[tuple[int, Scan, Floats, Any]] = []
@@ -236,7 +235,7 @@ def judge_trajectory(
     *,
     times: AnyArray | None = None,
     covariances: AnyArray | None = None,
-    risk: float = 0.05,
+    risk: float = RISK,
     searches: int = 5,
 ) -> Judgement:
     """Judge the poses of any localiser by the scans of a recording.
@@ -343,3 +342,10 @@ def stretches_of(
                     float(np.median(radii[part])), float(np.isfinite(radii[part]).mean()), poses[last])
         )  # fmt: skip
     return stretches
+
+
+def stretches_of_track(track: Track) -> list[Stretch]:
+    """Return the stretches of a filter's track."""
+    times = np.array([step.scan.time for step in track.steps])
+    columns = (np.array(values, np.float64) for values in (track.p_lost, track.explained, track.radii))
+    return stretches_of(times, np.array(track.poses).reshape(-1, 3), track.verdicts, *columns)

@@ -20,6 +20,8 @@ from gpusense.localization.words import WORDS, Word
 Floats = NDArray[np.float64]
 # Largest errors of the next scans of a converged track [m, rad].
 CONVERGED, CONVERGED_TURN, CONVERGED_SCANS = 1.0, math.radians(20), 5
+RISK = 0.05
+"""Probability that an error exceeds the reported radius, by default."""
 # Most scans that give the verdict at the end.
 _TAIL = 10
 # Deviations of a tracking start: x, y [m] and heading [rad].
@@ -43,6 +45,7 @@ class Track:
         p_lost: Probabilities that the estimates are off by more than 1 m or 0.5 rad.
         verdicts: "tracking", "uncertain" or "lost" for each estimate.
         explained: Shares of beams that the estimates explain; NaN for a scan without beams.
+        radii: Radii that errors exceed with at most the probability ``RISK`` [m].
         temperatures: Temperatures.
         seconds: Seconds of each step: predict, score, resample, estimate.
     """
@@ -55,6 +58,7 @@ class Track:
     p_lost: list[float] = field(default_factory=list)
     verdicts: list[Word] = field(default_factory=list)
     explained: list[float] = field(default_factory=list)
+    radii: list[float] = field(default_factory=list)
     temperatures: list[float] = field(default_factory=list)
     seconds: list[tuple[float, float, float, float]] = field(default_factory=list)
 
@@ -146,6 +150,7 @@ def follow(pf: ParticleFilter, steps: Iterable[Step], track: Track) -> Iterable[
         track.p_lost.append(found.p_lost)
         track.verdicts.append(found.verdict)
         track.explained.append(found.explained)
+        track.radii.append(found.protection_level(RISK))
         track.temperatures.append(found.temperature)
         track.seconds.append((float(predict), scoring, float(correct) - scoring, float(estimate)))
         track.steps.append(step)

@@ -65,6 +65,19 @@ class Distances(NamedTuple):
         return float(self.distance[min(k, len(self.distance) - 1)])
 
 
+def check_risk(risk: float) -> float:
+    """Return a risk that the calibration supports.
+
+    Raises:
+        TypeError, ValueError: It breaks its rule.
+    """
+    risk = checks.real("risk", risk, high=1.0)
+    if risk < LEAST_RISK:
+        rule = f"must be at least {LEAST_RISK}, the least risk that the calibration on logs supports"
+        raise ValueError(f"risk: {rule}, got {checks.show(risk)}")
+    return risk
+
+
 def protection_level(
     risk: float, p_lost: float, covariance: Floats | None, widening: float, distances: Distances | None = None
 ) -> float:
@@ -81,10 +94,7 @@ def protection_level(
     Raises:
         TypeError, ValueError: ``risk`` breaks its rule.
     """
-    risk = checks.real("risk", risk, high=1.0)
-    if risk < LEAST_RISK:
-        rule = f"must be at least {LEAST_RISK}, the least risk that the calibration on logs supports"
-        raise ValueError(f"risk: {rule}, got {checks.show(risk)}")
+    risk = check_risk(risk)
     if risk == 1:
         return 0.0
     if not p_lost <= risk:

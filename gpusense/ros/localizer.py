@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from gpusense.evaluation.tracking import RISK
 from gpusense.localization.nav2 import Nav2Options
 from gpusense.logs.records import Pose
 from gpusense.ros.conversions import host_array, laser_scan, map_to_odometry, moved_enough
-from gpusense.ros.diagnostics import ERROR, LEVELS, STALE, WARN, status_fields
+from gpusense.ros.diagnostics import ERROR, LEVELS, STALE, WARN, radius_text, status_fields
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.messages import spread_readings
 from gpusense.world.scanner import Scanner
@@ -34,6 +35,7 @@ class Localizer:
         options: Options of nav2_amcl, see ``gpusense.compat.from_nav2``.
         backend: The device.
         seed: Seed of the filter.
+        risk: Probability that the error of the position exceeds the published radius.
         clock: Returns the time [s].
 
     Attributes:
@@ -48,10 +50,11 @@ class Localizer:
         *,
         backend: str = "auto",
         seed: int = 0,
+        risk: float = RISK,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.options, self._clock = options, clock
-        self.backend, self.seed = backend, seed
+        self.backend, self.seed, self.risk = backend, seed, risk
         self.grid: OccupancyGrid | None = None
         self.filter: Any = None
         self._scanner: Scanner | None = None
@@ -180,6 +183,7 @@ class Localizer:
         values |= {
             "verdict": found.verdict, "p_lost": f"{found.p_lost:.4f}", "explained": f"{found.explained:.3f}",
             "particles": str(found.particles), "effective sample size": f"{found.effective_sample_size:.0f}",
+            "radius": radius_text(found.protection_level(self.risk)), "risk": f"{self.risk:g}",
         }  # fmt: skip
         # The search for a cause takes milliseconds: do it once per estimate.
         if found.verdict != "tracking" and not self._cause:

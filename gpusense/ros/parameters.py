@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from gpusense._util import checks
+from gpusense.evaluation.tracking import RISK
 from gpusense.localization.nav2 import DEFAULTS, Nav2Options, from_nav2
+from gpusense.localization.protection import check_risk
 
 OWN: dict[str, Any] = {
     "parameters": "", "node": "", "backend": "auto", "autostart_node": False, "map_file": "", "odom_topic": "",
-    "mount": [], "scan_patience": 5.0, "restart_after_jump": False, "seed": 0,
+    "mount": [], "scan_patience": 5.0, "restart_after_jump": False, "seed": 0, "risk": RISK,
     "initial_pose.x": 0.0, "initial_pose.y": 0.0, "initial_pose.yaw": 0.0,
 }  # fmt: skip
 """Parameters beyond nav2_amcl's, with defaults."""
@@ -59,6 +61,7 @@ def _check_own(values: Mapping[str, Any]) -> None:
             raise TypeError(f"{name}: must be {type(default).__name__}, got {checks.show(value)}")
     checks.real("scan_patience", values["scan_patience"], above=0)
     checks.integer("seed", values["seed"], low=0)
+    check_risk(values["risk"])
     mount_of(values["mount"])
     for name in ("parameters", "map_file"):
         if values[name]:
@@ -75,7 +78,7 @@ def mount_of(value: Any) -> tuple[float, float, float] | None:
 
 WATCH: dict[str, Any] = {
     "backend": "auto", "base_frame": "base_footprint", "global_frame_id": "map", "laser_max_range": 100.0,
-    "map_file": "", "mount": [], "patience": 10.0, "tolerance": 0.05,
+    "map_file": "", "mount": [], "patience": 10.0, "risk": RISK, "tolerance": 0.05,
 }  # fmt: skip
 """Parameters of the watching node, with their defaults."""
 
@@ -84,4 +87,5 @@ def check_watch(values: Mapping[str, Any]) -> None:
     """Check the parameters of the watching node."""
     for name in ("laser_max_range", "patience", "tolerance"):
         checks.real(name, values[name], above=0)
+    check_risk(values["risk"])
     mount_of(values["mount"])

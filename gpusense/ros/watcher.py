@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from gpusense.evaluation.tracking import RISK
 from gpusense.localization.diagnosis import Diagnosis
 from gpusense.localization.monitor import PoseMonitor, PoseVerdict
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.ros.conversions import laser_scan, start_of
-from gpusense.ros.diagnostics import LEVELS, STALE, status_fields
+from gpusense.ros.diagnostics import LEVELS, STALE, radius_text, status_fields
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.messages import stamp_of
 from gpusense.world.scanner import Scanner
@@ -35,6 +36,7 @@ class Watcher:
         patience: Time without a judged pose after which the verdict is stale [s].
         frame: Frame of the poses and the map.
         range_max: Largest ``range_max`` of scans [m].
+        risk: Probability that the error of the position exceeds the published radius.
 
     Attributes:
         problem: Reason why the last scan was unusable, or None.
@@ -48,9 +50,10 @@ class Watcher:
         patience: float = 10.0,
         frame: str = "map",
         range_max: float = 100.0,
+        risk: float = RISK,
     ) -> None:
         self.backend, self.tolerance, self.patience, self.frame = backend, tolerance, patience, frame
-        self.range_max = range_max
+        self.range_max, self.risk = range_max, risk
         self.problem: str | None = None
         self._grid: OccupancyGrid | None = None
         self._monitor: PoseMonitor | None = None
@@ -113,7 +116,10 @@ class Watcher:
             return status_fields("localisation", STALE, "no pose with a scan of its time", {}, node)
         found, likely = self._verdict, self._likely()
         evidence = "" if likely is None else f": {likely.text}"
-        values = {"p_lost": f"{found.p_lost:.4f}", "verdict": found.verdict, "explained": f"{found.explained:.3f}"}
+        values = {
+            "p_lost": f"{found.p_lost:.4f}", "verdict": found.verdict, "explained": f"{found.explained:.3f}",
+            "radius": radius_text(found.protection_level(self.risk)), "risk": f"{self.risk:g}",
+        }  # fmt: skip
         if likely is not None:
             values["cause"] = likely.cause
         return status_fields("localisation", LEVELS[found.verdict], f"{found.verdict}{evidence}", values, node)

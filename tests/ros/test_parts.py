@@ -164,6 +164,8 @@ def test_the_localizer_localises() -> None:
         message.ranges = caster.cast([truth], bearings)[0]
         assert own.update(message, (0.1 * k * math.cos(0.25), -0.1 * k * math.sin(0.25), 0.0), np.eye(4))
     assert np.hypot(*(np.asarray(own.estimate.pose)[:2] - truth[:2])) < 0.1
+    values = {each["key"]: each["value"] for each in own.status({})["values"]}
+    assert values["radius"] == f"{own.estimate.protection_level(0.05):.3f}" and values["risk"] == "0.05"
 
 
 # ------------------------------------------------------------------------------------------------- the watching node
@@ -198,7 +200,10 @@ def test_the_watcher_publishes_the_verdict() -> None:
         assert step(1.0 + k, truth + np.array([0.1 * k, 0.0, 0.0]), truth + np.array([0.1 * k, 0.0, 0.0]))
     status = own.status(5.5)
     assert status["level"] == 0 and status["message"] == "tracking"
-    assert status["values"][0]["key"] == "p_lost" and float(status["values"][0]["value"]) < 0.05
+    values = {each["key"]: each["value"] for each in status["values"]}
+    assert float(values["p_lost"]) < 0.05 and values["verdict"] == "tracking"
+    # Deviations of 5 cm at a risk of 5 %, widened.
+    assert 0.1 < float(values["radius"]) < 0.4 and values["risk"] == "0.05"
     assert own.status(30.0)["level"] == 3
     # A wide pose, and one on the other side of the wall.
     assert step(6.0, truth, truth, deviation=0.8) and own.status(6.0)["level"] == 1
@@ -208,6 +213,7 @@ def test_the_watcher_publishes_the_verdict() -> None:
         assert step(7.0 + k, truth + np.array([0.1 * k, 0.0, 0.0]), truth + np.array([1.8 + 0.1 * k, 1.5, 2.0]))
     status = own.status(15.0)
     assert status["level"] == 2 and status["message"].startswith("lost: ") and "likely cause" in status["message"]
+    assert {"key": "radius", "value": "inf"} in status["values"]
     # No scan of this time, and a scan that breaks a rule.
     assert not own.add_pose(pose_message(20.0, truth))
     own.add_scan(stamped(21.0, **(vars(scan_of(48)) | {"angle_increment": 0.0})), np.eye(4))
@@ -226,7 +232,7 @@ def moved_to(frame: str, time: float, pose: Any) -> Any:
 
 def test_the_watcher_reports_the_cause_of_most_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     own, causes = watcher.Watcher(backend="numpy"), iter(["map", "map", "start", "map", "start", "start", "start"])
-    verdict = SimpleNamespace(verdict="lost", p_lost=0.9, explained=0.1)
+    verdict = gs.PoseVerdict(0.9, "lost", 0.1)
     monitor = SimpleNamespace(update=lambda *_: verdict, diagnose=lambda: cause_of(next(causes)))
     monkeypatch.setattr(own, "_monitor_of", lambda *_: monitor)
     own.set_map(grid())
@@ -328,8 +334,9 @@ def test_parameters_by_the_names_of_nav2() -> None:
 
 
 @pytest.mark.parametrize("change, text", [
-    ({"mount": [1.0]}, "mount"), ({"scan_patience": 0}, "scan_patience"), ({"backend": 3}, "backend"),
-    ({"z_hit": -1.0}, "z_hit"), ({"map_file": "no.yaml"}, "no.yaml"), ({"laser_model_type": "x"}, "laser_model_type"),
+    ({"mount": [1.0]}, "mount"), ({"scan_patience": 0}, "scan_patience"), ({"risk": 0.001}, "risk"),
+    ({"backend": 3}, "backend"), ({"z_hit": -1.0}, "z_hit"), ({"map_file": "no.yaml"}, "no.yaml"),
+    ({"laser_model_type": "x"}, "laser_model_type"),
 ])  # fmt: skip
 def test_parameters_that_break_a_rule(change: dict[str, Any], text: str) -> None:
     with pytest.raises((TypeError, ValueError, OSError), match=text):

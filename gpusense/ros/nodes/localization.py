@@ -112,7 +112,7 @@ class LocalizationNode(LifecycleNode):
         self.options, without = options_of(values)
         if without:
             self.get_logger().warning(f"parameters without effect: {', '.join(without)}")
-        self.localizer = Localizer(self.options, backend=values["backend"], seed=values["seed"])
+        self.localizer = Localizer(self.options, backend=values["backend"], seed=values["seed"], risk=values["risk"])
         if values["map_file"]:
             self.localizer.set_map(read_map(values["map_file"]))
         begin = time.perf_counter()

@@ -38,7 +38,7 @@ class WatchingNode(Node):
         self.guard = Guard(self.get_logger())
         self.watcher = Watcher(
             backend=values["backend"], tolerance=values["tolerance"], patience=values["patience"],
-            frame=values["global_frame_id"], range_max=values["laser_max_range"],
+            frame=values["global_frame_id"], range_max=values["laser_max_range"], risk=values["risk"],
         )  # fmt: skip
         self.transforms = Transforms(self, self.guard, ("odom", values["base_frame"]), "", mount_of(values["mount"]))
         self.diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)

@@ -1,7 +1,7 @@
 """Judge the trajectories of compiled nav2_amcl and Beluga on nine logs with known losses: found, missed, false.
 
 NAV2, BELUGA and BELUGA_INCLUDE name the copies, see ``bench/speed/filters.py``. Each program follows a part of each log
-with its node's defaults from around the true pose: as recorded, and carried away after a half, while the odometry
+with its node's sensor model from around the true pose: as recorded, and carried away after a half, while the odometry
 stands still. A loss is a run of at least five scans that are off by more than 1 m or 0.5 rad by the reference. It is
 found if a judged pose says "lost" within it, after ``LATE`` scans at most, or at its end if that is earlier. A false
 stretch says "lost" without such a scan in it or in the ``LATE`` scans before it.
@@ -32,10 +32,12 @@ import gpusense as gs
 from gpusense._util.progress import progress
 from gpusense.commands import cli
 from gpusense.evaluation.tracking import START
+from gpusense.localization.defaults import DEFAULTS
 
 LOGS = ("intel", "csail", "aces", "belgioioso", "fhw", "seattle", "fr079", "jarvis-nav350", "olin")
-# Defaults of the programs: model; z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, max_distance; odometry noise.
-MODEL, PARAMETERS, ALPHA = "field", (0.5, 0.05, 0.05, 0.5, 0.2, 0.1, 2.0), (0.2,) * 4
+# Defaults of the programs: model; z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, max_distance. Their default
+# noise of the odometry, 0.2, loses the robot where scans are metres apart.
+MODEL, PARAMETERS, ALPHA = "field", (0.5, 0.05, 0.05, 0.5, 0.2, 0.1, 2.0), DEFAULTS.alpha
 CASES = ("as recorded", "carried away")
 # Least scans of a loss; scans until it must be found, and after its end until the verdict must recover.
 LEAST, LATE, FAR, FAR_TURN = 5, 20, 1.0, 0.5
@@ -46,8 +48,8 @@ COLUMNS = (
 
 
 def follow(weigher, chosen, scanner, events, particles, seed):
-    """Return the (S, 3) poses of a program, whose scanner has no mount, so that it follows the laser."""
-    mount = np.array(scanner.mount)
+    """Return the (S, 3) poses of a program, whose scanner has no mount, so that it follows the place of the laser."""
+    mount = np.array([*scanner.mount[:2], 0.0])
     start = gs.compose_poses(events[0].truth, mount)
     follower, poses = Follower(weigher, particles, start, START, ALPHA, seed), []
     for event in events:
@@ -135,7 +137,7 @@ def study(args):
                 recording = runs.load(log)
                 grid, scanner = recording.places[0]
                 chosen = np.linspace(0, scanner.count - 1, args.beams).round().astype(int)
-                thin = gs.Scanner(scanner.bearings[chosen], scanner.range_max, scanner.range_min)
+                thin = gs.Scanner(scanner.bearings[chosen] + scanner.mount[2], scanner.range_max, scanner.range_min)
                 weigher = Weigher(compiled, grid, thin, PARAMETERS, MODEL)
                 models = recordings.field(args.backend)(grid, scanner)
                 for case, repeat in [(case, k) for case in CASES for k in range(args.repeats)]:
@@ -153,7 +155,7 @@ def study(args):
         "### Programs", table(COLUMNS, rows), "### Logs", table(("program", "log", *COLUMNS[2:]), per_log),
     ])  # fmt: skip
     publish(__file__, args, text, dict(results=results, settings=dict(scans=args.scans, particles=args.particles)),
-            "Defaults of the programs' nodes, likelihood field.")  # fmt: skip
+            "Likelihood fields of the programs' nodes, odometry noise 0.02.")  # fmt: skip
 
 
 def times(args):

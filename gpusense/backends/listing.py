@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from gpusense.backends import proof, registry
+from gpusense.backends import helpers, proof, registry
 from gpusense.backends.base import Backend
 from gpusense.backends.info import BackendInfo
 from gpusense.backends.library import Library
@@ -74,6 +74,8 @@ def devices(*, anew: bool = False) -> Devices:
         >>> [device.selection for device in gs.devices() if device.backend == "numpy"]
         ['numpy']
     """
+    if not anew:
+        _prove_together()
     return Devices(device for entry in ENTRIES for device in _devices_of(entry, anew=anew))
 
 
@@ -123,6 +125,30 @@ def _devices_of(entry: Entry, *, anew: bool) -> list[Device]:
         return absent
     rows = [(info, verdict_on(info, handle, library, anew=anew)) for info, handle in _listed(library)[0]]
     return [*(_device(info, library, verdict) for info, verdict in rows), *absent]
+
+
+def _prove_together() -> None:
+    """Prove the devices of several backends at once: a child compiles on one processor."""
+    # Libraries are loaded here, not by the threads.
+    waiting = [entry for entry in ENTRIES if _awaits_child(_absence(entry)[0])]
+    if len(waiting) < 2 or helpers.threads() < 2:
+        return
+    from concurrent.futures import ThreadPoolExecutor
+
+    with ThreadPoolExecutor(min(len(waiting), helpers.threads()), helpers.HELPERS) as threads:
+        # An error recurs when the calling thread lists the devices.
+        for entry in waiting:
+            threads.submit(_devices_of, entry, anew=False)
+
+
+def _awaits_child(library: Library | None) -> bool:
+    """Return whether a device of a library has no verdict yet."""
+    if library is None:
+        return False
+    return any(
+        BY_NAME[info.backend].compiles and not library.is_simulator(info) and not library.trouble(handle)
+        and proof.awaits_child(info) for info, handle in _listed(library)[0]
+    )  # fmt: skip
 
 
 def _absence(entry: Entry, *, anew: bool = False) -> tuple[Library | None, list[Device]]:

@@ -69,7 +69,9 @@ class DeviceCheck:
     passing: bool = False
 
 
-_lock = threading.RLock()
+_lock = threading.Lock()
+# A lock for each verdict, so that several devices are proved at once.
+_locks: dict[str, threading.RLock] = {}
 _known: dict[str, DeviceCheck] = {}
 
 
@@ -95,6 +97,8 @@ def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> D
         return trust(info)
     key, obstacle = _key(info), probe_process.obstacle()
     with _lock:
+        lock = _locks.setdefault(key, threading.RLock())
+    with lock:
         if anew and not obstacle:
             _known.pop(key, None)
             discard_entry(key)
@@ -111,6 +115,14 @@ def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> D
                 notices.warn(summary(info, verdict))
         _known[key] = verdict
         return verdict
+
+
+def awaits_child(info: BackendInfo) -> bool:
+    """Return whether a verdict on a device takes a child."""
+    if probe_process.is_off() or probe_process.obstacle():
+        return False
+    key = _key(info)
+    return key not in _known and _load(key) is None
 
 
 def _hangs_first(key: str, verdict: DeviceCheck) -> bool:

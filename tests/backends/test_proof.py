@@ -7,13 +7,14 @@ import json
 import os
 import subprocess
 import sys
+import threading
 
 import pytest
 from support import fake_driver
 
 import gpusense as gs
 from gpusense._util import files
-from gpusense.backends import BackendInfo, get_backend, probe_process, proof, selection
+from gpusense.backends import BackendInfo, get_backend, helpers, probe_process, proof, selection
 from gpusense.backends.probe_process import Outcome
 from gpusense.backends.proof import FLOAT64, SCALAR, VECTORS, DeviceCheck, verdict_on
 
@@ -418,3 +419,23 @@ def test_a_variable_that_names_nothing_is_an_error_that_names_it(monkeypatch):
     with pytest.raises(ValueError, match=r"GPUSENSE_BACKEND: backend: must be 'auto'.* got 'vulkan'"):
         gs.backends.get_backend("auto")
     assert gs.backends.get_backend("numpy").info.backend == "numpy"
+
+
+def test_devices_of_several_backends_are_proved_at_once(needs, monkeypatch):
+    """Each thread waits in its first proof until the other one has begun."""
+    needs("opencl")
+    needs("warp")
+    monkeypatch.setattr(proof, "awaits_child", lambda info: True)
+    monkeypatch.setattr(helpers, "threads", lambda: 2)
+    both, met = threading.Barrier(2, timeout=60), set()
+
+    def verdict(info, *, setup=None, anew=False):
+        thread = threading.current_thread()
+        if thread is not threading.main_thread() and thread not in met:
+            met.add(thread)
+            both.wait()
+        return proof.trust(info)
+
+    monkeypatch.setattr(proof, "verdict_on", verdict)
+    found = gs.devices()
+    assert len(met) == 2 and {"opencl", "warp"} <= {one.backend for one in found if one.available}

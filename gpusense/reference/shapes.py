@@ -56,7 +56,7 @@ def meet_box(
     dx: np.ndarray, dy: np.ndarray, x: np.ndarray, y: np.ndarray, cosine: np.ndarray, sine: np.ndarray,
     half_length: np.ndarray, half_width: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Return the same of boxes, whose directions have cosines and sines."""
+    """Return the same for boxes with these cosines and sines of their yaws."""
     real = dx.dtype.type
     u, v = cosine * dx + sine * dy, cosine * dy - sine * dx
     p, q = -(cosine * x + sine * y), -(cosine * y - sine * x)

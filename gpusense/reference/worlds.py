@@ -1,8 +1,8 @@
 """Many worlds in one table: their cells, obstacles and tables, moving shapes, and poses placed in them.
 
 Worlds of one size are made together. Their rows are interleaved: line i is row i / worlds of world i % worlds.
-``place`` has the first cell of each in tables with a ring of two cells. ``frames`` has 8 numbers for each world: x and
-y of its origin, cosine and sine of its yaw, rows, columns, its first cell, and one that is not used.
+``place`` holds each world's first cell in tables with a ring of two cells. ``frames`` holds 8 numbers for each world:
+x and y of its origin, cosine and sine of its yaw, rows, columns, its first cell, and one that is not used.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def fill_worlds(
     flags: frozenset[str], squared: np.ndarray, density: np.ndarray, place: np.ndarray, table: np.ndarray, rows: int,
     cols: int, worlds: int, margin: int, cap: int, beyond: float,
 ) -> None:  # fmt: skip
-    """Fill the tables of likelihood fields of worlds from squared distances, whose map has a margin."""
+    """Fill the likelihood fields of worlds from squared distances, which include a margin."""
     height, width = rows + 2 * margin, cols + 2 * margin
     known = density[np.minimum(squared[: height * worlds * width].reshape(height, worlds, width), cap)]
     ring = RING - margin
@@ -61,7 +61,7 @@ def fill_worlds(
 
 
 def frame_in(frames: np.ndarray, index: int, frame: structs.Frame) -> structs.Frame:
-    """Return the frame of a world; the scanner's position and the resolution are those of all worlds."""
+    """Return the frame of a world; all worlds share the scanner's position and the resolution."""
     x, y, cosine, sine = frames[index * FRAME_NUMBERS : index * FRAME_NUMBERS + 4].tolist()
     return frame._replace(origin_x=x, origin_y=y, yaw_cos=cosine, yaw_sin=sine)
 

@@ -60,7 +60,7 @@ def _by_lines(backend: Backend, obstacles: np.ndarray, squared: Buffer, most: in
 
 
 def squared_of_stack(backend: Backend, space: Workspace, occupied: Buffer, rows: int, cols: int, worlds: int) -> Buffer:
-    """Start computing the squared distances of several maps of one size, whose rows are interleaved [cells^2].
+    """Start computing squared distances [cells^2] in several maps of one size with interleaved rows.
 
     Args:
         backend: The device.

@@ -147,7 +147,7 @@ def _make(
     Args:
         backend: The device.
         space: Memory of runs and stacks.
-        marked: Obstacles of a band of rows, whose lines are interleaved: bytes on a processor, else bits.
+        marked: Obstacles of a band of rows, with the worlds' lines interleaved: bytes on a processor, else bits.
         place: First cell of each world in tables with a ring.
         rectangles: The planes.
         planes: How they are stored.
@@ -159,7 +159,7 @@ def _make(
     begin, end = columns
     runs = space.empty("runs", 2 * band * cols * worlds, _BYTE)
     if backend.info.kind == "cpu":
-        # Columns do not depend on each other, so those of all worlds are columns of one map.
+        # Columns are independent, so the columns of all worlds form one map.
         first, last = (begin, end) if worlds == 1 else (0, cols * worlds)
         strips, height = -(-(last - first) // 64), min(bottom - top + RECTANGLE_REACH, rows)
         columns_kernel = backend.compile("free_columns", _NO_FLAGS)

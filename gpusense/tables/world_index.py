@@ -21,11 +21,11 @@ _ON_DEVICE = ("int32", "int64")
 
 
 class WorldIndex:
-    """The world of each pose, and the shape that it does not see.
+    """The world of each pose, and the shape that the pose does not see.
 
     Args:
         worlds: The worlds.
-        world: (N,) indices, or one for all poses; None with a single world.
+        world: (N,) indices of worlds, or one for all poses; None with a single world.
         ignore: (N,) indices of shapes, -1 for none, or one for all poses; None ignores none.
         count: N.
         backend: The device.

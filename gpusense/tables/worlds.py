@@ -278,16 +278,16 @@ class Worlds:
     def collides(
         self, poses: Any, radius: float, *, world: Any = None, ignore: Any = None, unknown: Space = "free"
     ) -> Any:
-        """Tell which discs about poses meet an obstacle or a moving shape.
+        """Return which discs around poses touch an obstacle or a moving shape.
 
-        The squares of occupied cells and the shapes are met exactly, to the rounding of float32 in cells. Space outside
-        a world is free.
+        Contact with the squares of occupied cells and with shapes is exact, up to float32 rounding in cells. Space
+        outside a world is free.
 
         Args:
             poses: (N, 3) poses (x, y, theta) in the world [m, m, rad], an array as ``RayCaster.cast`` takes it.
             radius: Radius of the discs [m], >= 0.
-            world: (N,) indices of the poses' worlds, or one for all; it may be left out where there is a single world.
-            ignore: (N,) indices of the shapes that poses do not meet, or one for all; -1 for none.
+            world: (N,) indices of the poses' worlds, or one for all; optional with a single world.
+            ignore: (N,) index of the shape that each disc ignores, or one for all; -1 for none.
             unknown: Treatment of unknown cells: ``"free"`` or ``"occupied"``.
 
         Returns:

@@ -31,7 +31,7 @@ real2 meet_disc(const real dx, const real dy, const real x, const real y, const 
     return (real2)((square >= 0) & (far >= 0) ? t : (real)INFINITY, near > 0 ? cosine : (real)1);
 }
 
-// Return the same of a box, whose direction has a cosine and sine.
+// Return the same for a box with this cosine and sine of its yaw.
 real2 meet_box(const real dx, const real dy, const real x, const real y, const real cosine, const real sine,
                const real half_length, const real half_width) {
     const real u = cosine * dx + sine * dy, v = cosine * dy - sine * dx;

@@ -1,7 +1,7 @@
 // Many worlds in one table: their cells, obstacles and tables, moving shapes, and poses placed in them. Worlds of one
-// size are made together. Their rows are interleaved: line i is row i / worlds of world i % worlds. place has the first
-// cell of each in tables with a ring of two cells. frames has 8 numbers for each world: x and y of its origin, cosine
-// and sine of its yaw, rows, columns, its first cell, and one that is not used.
+// size are made together. Their rows are interleaved: line i is row i / worlds of world i % worlds. place holds each
+// world's first cell in tables with a ring of two cells. frames holds 8 numbers for each world: x and y of its origin,
+// cosine and sine of its yaw, rows, columns, its first cell, and one that is not used.
 // requires: placement shapes
 
 // Cells above this one are unknown.
@@ -38,8 +38,7 @@ kernel void mark_obstacles(ARGUMENTS) {
     bits[(long)line * words + word] = (int)marked;
 }
 
-// Fill the tables of likelihood fields of worlds from squared distances, whose map has a margin. One work-item takes a
-// cell.
+// Fill the likelihood fields of worlds from squared distances, which include a margin. One work-item takes a cell.
 kernel void fill_worlds(ARGUMENTS) {
     const int col = get_global_id(0), line = get_global_id(1), width = cols + 2 * RING;
     if (col >= width || line >= (rows + 2 * RING) * worlds) return;
@@ -50,7 +49,7 @@ kernel void fill_worlds(ARGUMENTS) {
     table[place[w] + (long)row * width + col] = inside ? density[min(squared[at], cap)] : beyond;
 }
 
-// Return the frame of a world; the scanner's position and the resolution are those of all worlds.
+// Return the frame of a world; all worlds share the scanner's position and the resolution.
 Frame frame_in(global const double *frames, const int index, const Frame frame) {
     global const double *numbers = frames + (long)index * FRAME_NUMBERS;
     Frame moved = frame;

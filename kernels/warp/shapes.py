@@ -65,7 +65,7 @@ def functions(flags):
     def meet_box(
         dx: real, dy: real, x: real, y: real, cosine: real, sine: real, half_length: real, half_width: real
     ):  # fmt: skip
-        """Return the same of a box, whose direction has a cosine and sine."""
+        """Return the same for a box with this cosine and sine of its yaw."""
         u = cosine * dx + sine * dy
         v = cosine * dy - sine * dx
         p = -(cosine * x + sine * y)

@@ -77,7 +77,7 @@ def make(name, flags):
 
     @kernel(flags)
     def fill_worlds(squared, density, place, table, rows, cols, worlds, margin, cap, beyond):
-        """Fill the tables of likelihood fields of worlds from squared distances, whose map has a margin.
+        """Fill the likelihood fields of worlds from squared distances, which include a margin.
 
         One work-item takes a cell.
         """
@@ -97,7 +97,7 @@ def make(name, flags):
 
     @wp.func
     def frame_in(frames: wp.array(dtype=wp.float64), index: wp.int32, frame: types.Frame):
-        """Return the frame of a world; the scanner's position and the resolution are those of all worlds."""
+        """Return the frame of a world; all worlds share the scanner's position and the resolution."""
         first = index * FRAME_NUMBERS
         moved = types.Frame()
         moved.origin_x = frames[first]

@@ -51,7 +51,7 @@ report = {name: [module.__name__, module.__file__] for name, module in modules.i
 print(json.dumps({"modules": report, "library": warp.__file__}))
 """
 
-# A Warp kernel whose parts lie in two files, so that Warp must find the source of both.
+# A Warp kernel in two files, so that Warp must find the source of both.
 PROBE_PART = """
 import warp as wp
 

@@ -16,7 +16,7 @@ ORIGINS = [(0.0, 0.0, 0.0), (-3.0, 1.0, 0.7), (2.0, 2.0, -2.0)]
 
 
 def wall_free(backend: str, **options: Any) -> gs.Worlds:
-    """Return three worlds without walls, with origins of their own."""
+    """Return three worlds without walls, each with another origin."""
     return gs.Worlds(np.zeros((3, 120, 120), np.int8), 0.1, ORIGINS, backend=backend, **options)
 
 

@@ -127,7 +127,7 @@ class _StagedCall(BoundCall):
         }
         limits = None if "ranges" in there else self._ranges.dtype
         self._packed = PackedCall(host.pipeline, lock, count, limits, **there)
-        # Arrays of the host, whose numbers every call copies.
+        # Host arrays: every call copies their numbers.
         self._copied = [None if name in there else array for name, array in (
             ("poses", self._poses), ("ranges", self._ranges), ("out", self.out))]  # fmt: skip
         self._lock = threading.Lock()

@@ -180,9 +180,9 @@ class RayCaster(Pickled):
                 without a copy, and ranges are arrays of the same library; see ``BeamModel.log_likelihood``.
             bearings: (K,) directions relative to the heading [rad].
             world: (N,) indices of the poses' worlds, or one for all poses, of a caster of :class:`Worlds`; on the
-                device int32 or int64. It may be left out where there is a single world.
-            ignore: (N,) indices of the shapes that poses do not see, or one for all; -1 for none. A robot that is one
-                of the shapes does not see itself.
+                device int32 or int64. Optional with a single world.
+            ignore: (N,) indices of the shapes that poses do not see, or one for all; -1 for none. A robot that
+                is itself a shape passes its index.
             out: The array for the ranges: (N, K) in the caster's precision, C-contiguous, in the memory of the poses.
 
         Returns:

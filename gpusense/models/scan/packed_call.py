@@ -102,7 +102,7 @@ class PackedCall:
         corners: Corners of the box of the first poses; None for the table of the whole map.
         poses: (N, 3) poses on the device, used in place; None for poses of the host.
         ranges: (K,) readings on the device, used in place; None for readings of the host.
-        out: (N,) array on the device for the log-likelihoods; None for one of the host.
+        out: (N,) array on the device for the log-likelihoods; None for a host array.
 
     Attributes:
         arrays: The poses and the readings of the last call.
@@ -182,7 +182,7 @@ class _There:
         backend: The device.
         count: Number of poses.
         readings: Number of readings.
-        kinds: Types of poses and of readings on the device; None for those of the host.
+        kinds: Types of poses and of readings on the device; None for host arrays.
         real: Type of the result.
     """
 

@@ -32,7 +32,7 @@ class Request(NamedTuple):
         parts: (S, N, K) log-likelihoods of the readings; (S, N, 0) where they are not requested.
         per_beam: True if they are requested, of a scanner with beams.
         before: Called once readings are on the device; it starts the launches that write the poses.
-        own_scans: True if each of (N, 3) poses has a scan of its own.
+        own_scans: True if each of (N, 3) poses has a separate scan.
     """
 
     ranges: np.ndarray

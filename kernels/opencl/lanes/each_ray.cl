@@ -1,4 +1,4 @@
-// Cast rays of LANES beams of a pose one by one, by any caster, also from origins outside the grid.
+// Cast the rays of LANES beams of a pose one by one, by any caster; origins may lie outside the grid.
 // requires: caster lanes/types
 
 // Return the distances in cells to the first occupied cells, limits where none is nearer.

@@ -117,6 +117,7 @@ def test_a_job_of_a_client_that_has_gone_does_not_hold_its_worker(cluster, execu
     other.terminate()
 
 
+@pytest.mark.long
 def test_a_cluster_without_workers_ends_the_sweep(tmp_path, caplog):
     jobs = made("ending", 4, tmp_path, end2="hang")
     with Cluster(tmp_path, [PLAIN]) as cluster:
@@ -202,6 +203,7 @@ def strictly_verified(ca, certificate):
     return subprocess.run(call, capture_output=True, check=False).returncode == 0
 
 
+@pytest.mark.long
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="needs the command openssl")
 def test_certificates_of_the_page_are_valid(tmp_path):
     (commands,) = (
@@ -222,6 +224,7 @@ def test_a_cluster_of_this_machine_may_use_tls(tmp_path):
         assert executor.submit(abs, -3).result(timeout=60) == 3
 
 
+@pytest.mark.long
 def test_a_watch_that_fails_ends_the_calls():
     with gs.sweep.DaskExecutor(timeout=60) as executor:
         running = executor.submit(time.sleep, 600)

@@ -214,6 +214,7 @@ def test_the_command_sends_maps_and_logs_to_a_cluster(folder, cluster, tmp_path,
     assert set(gs.sweep.read_table(table)["device"]) == {"numpy"}
 
 
+@pytest.mark.long
 def test_an_executor_that_is_shut_down_is_lost(tmp_path):
     executor = ProcessExecutor(1)
     executor.shutdown()

@@ -16,6 +16,7 @@ from gpusense.commands.cli import main
 from gpusense.evaluation import selftest, stiff
 from gpusense.evaluation.replay import Recorder, replay
 from gpusense.evaluation.tolerances import TOLERANCES, beam_tolerance, differing, per_beam, per_scan, scan_tolerance
+from gpusense.interface.signatures import KERNELS
 from gpusense.interface.structs import Score
 from gpusense.models.scan import tiles
 from gpusense.reference import beam, distance, echo, mixture, order, ranges, sums
@@ -216,9 +217,14 @@ def test_json_lists_every_comparison(capsys):
     assert all(check["tolerance"]["reason"] for check in document["checks"])
 
 
+def named(kernel, arguments):
+    """Return the arguments of a kernel's reference by name."""
+    return dict(zip([argument.name for argument in KERNELS[kernel].arguments], arguments[1:], strict=True))
+
+
 def shift_ranges(*arguments):
     reference_cast_ranges(*arguments)
-    found = arguments[5]
+    found = named("cast_ranges", arguments)["ranges"]
     found[17] = np.nextafter(found[17], found.dtype.type(100))
 
 
@@ -229,13 +235,13 @@ def add_to_squares(*arguments):
 
 def add_to_scan(*arguments):
     score_beams(*arguments)
-    arguments[13][3] += 0.01
+    named("score_beams", arguments)["log_p"][3] += 0.01
 
 
 def add_to_beam(*arguments):
     score_beams(*arguments)
     if "PER_BEAM" in arguments[0]:
-        arguments[15][7] += np.float32(1e-4)
+        named("score_beams", arguments)["parts"][7] += np.float32(1e-4)
 
 
 def densities_of_another_mixture(flags, z, expected, terms):
@@ -243,10 +249,11 @@ def densities_of_another_mixture(flags, z, expected, terms):
     return np.where(z < 1, found + 1e-3, found).astype(found.dtype) if found.dtype == np.float32 else found
 
 
-def add_without_parts(flags, *arguments):
-    score_beams(flags, *arguments)
-    if "PER_BEAM" not in flags:
-        arguments[13][:] = np.nextafter(arguments[13], np.inf)
+def add_without_parts(*arguments):
+    score_beams(*arguments)
+    if "PER_BEAM" not in arguments[0]:
+        log_p = named("score_beams", arguments)["log_p"]
+        log_p[:] = np.nextafter(log_p, np.inf)
 
 
 def parameters_of_another_angle(terms, edges, kinds, cosine):
@@ -256,7 +263,7 @@ def parameters_of_another_angle(terms, edges, kinds, cosine):
 def turn_an_angle(*arguments):
     cast_echoes(*arguments)
     if "INCIDENCE" in arguments[0]:
-        arguments[7][21] += 1e-3
+        named("cast_echoes", arguments)["incidence"][21] += 1e-3
 
 
 incidence_terms, cast_echoes = echo.incidence_terms, echo.cast_echoes

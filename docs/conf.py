@@ -97,7 +97,7 @@ def show_colons(app: Any, what: str, name: str, obj: Any, options: Any, lines: l
 
 
 # Files of the checkout that the site shows as a page: links to them work in both.
-SHOWN = {"GALLERY_HEADER.rst": "docs/lectures/index.html", "__init__.pyi": "docs/api/index.html"}
+SHOWN = {"01_four_causes.py": "docs/lectures/index.html", "__init__.pyi": "docs/api/index.html"}
 
 
 def open_figures(app: Any, doctree: nodes.document) -> None:

@@ -6,6 +6,13 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from gpusense.world.parameters import LikelihoodFieldParameters
+
+_TRACKING = LikelihoodFieldParameters.tracking()
+_FIELD = MappingProxyType(
+    {name: getattr(_TRACKING, name) for name in ("z_hit", "z_max", "z_rand", "sigma_hit", "interpolation")}
+)
+
 
 class Defaults(NamedTuple):
     """Options of a particle filter; ``docs/localization.md`` describes the measurements behind them.
@@ -57,9 +64,7 @@ class Defaults(NamedTuple):
     recovery: str = "sensor"
     temperature: str = "auto"
     calibrations: int = 60
-    field: Mapping[str, Any] = MappingProxyType(
-        dict(z_hit=0.7, z_max=0.0, z_rand=0.3, sigma_hit=0.07, interpolation="bilinear")
-    )
+    field: Mapping[str, Any] = _FIELD
     alpha: tuple[float, float, float, float] = (0.02, 0.02, 0.02, 0.02)
     reverse: float = 0.02
     least: tuple[float, float] = (0.01, 0.005)

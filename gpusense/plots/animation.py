@@ -74,7 +74,7 @@ class Animation:
         self._robot.set_data(*pose[:2, None])
         # Before convergence the mean of particles that lie apart is no pose of the robot.
         self._robot.set_fillstyle("none" if track.converged is None else "full")
-        self._robot.set_alpha(0.4 if track.converged is None else 1.0)
+        self._robot.set_alpha(0.5 if track.converged is None else 1.0)
         if track.references is not None:
             self._truth.set_data(*track.references[:, :2].T)
         title = f"scan {step.index}: {verdict.upper()} (p_lost {track.p_lost[-1]:.2g})"

@@ -235,6 +235,20 @@ class LikelihoodFieldParameters(_HitParameters):
         checks.choice("interpolation", self.interpolation, ("nearest", "bilinear"))
         self._check_hit()
 
+    @classmethod
+    def tracking(cls) -> Self:
+        """Return the parameters of ``gpusense localize``, which follow a pose more exactly than the default.
+
+        The default is that of AMCL: wide, so that searches without a guess find the pose. With 2000 particles on
+        recorded bags and logs the median error falls from 23, 22 and 43 mm to 16, 21 and 40 mm.
+
+        Example:
+            >>> import gpusense as gs
+            >>> gs.LikelihoodFieldParameters.tracking().sigma_hit
+            0.07
+        """
+        return cls(z_hit=0.7, z_max=0.0, z_rand=0.3, sigma_hit=0.07, interpolation="bilinear")
+
 
 @dataclass(frozen=True)
 class LandmarkParameters(_Parameters):

@@ -312,3 +312,20 @@ def test_hits_of_a_student_are_fitted_written_and_read(capsys, recorded, tmp_pat
 def test_hits_of_a_student_are_fitted_by_incidence(capsys, recorded):
     code, out, _ = run(capsys, *of_log(recorded), "--every", 3, "--hit", "student", "--incidence", 2)
     assert code == 0 and out.count("hit_dof") >= 2
+
+
+@pytest.mark.parametrize(
+    "share, bias, verdict", [(0.02, 0.0, "FITTED"), (0.17, 0.05, "FITTED"), (0.6, 0.0, "DOUBTFUL")]
+)
+def test_unexplained_readings_and_an_offset_are_judged(capsys, tmp_path, share, bias, verdict):
+    """Few unexplained readings need no word, many name where to look, most make the fit doubtful."""
+    random = np.random.default_rng(1)
+    expected = random.uniform(2.0, 7.0, 2000)
+    z = expected + bias + random.normal(0.0, 0.02, 2000)
+    wild = random.random(2000) < share
+    z[wild] = random.uniform(0.0, RANGE, wild.sum())
+    (tmp_path / "pairs.csv").write_text("\n".join(f"{a!r},{b!r}" for a, b in np.stack([z, expected], 1).tolist()))
+    text = run(capsys, "--pairs", tmp_path / "pairs.csv", "--range-max", RANGE)[1]
+    assert text.startswith(f"{verdict}: ")
+    assert ("\nmany " in text) == (0.11 < share < 0.25) and ("\ndoubt " in text) == (share > 0.25)
+    assert ("ranges are 5 cm too long" in text and "--range-bias" in text) == (bias > 0)

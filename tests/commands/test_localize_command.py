@@ -292,3 +292,22 @@ def test_a_run_is_animated(place, tmp_path, capsys, monkeypatch):
     assert cli.main(call(place, "--animate", str(path))) == 0
     with Image.open(path) as movie:
         assert movie.n_frames == 4
+
+
+def test_python_localizes_as_the_command_does(place, capsys):
+    """The filter that the page builds from defaults has the options and the poses of the command's filter."""
+    arguments = call(place, "--start", "3", "1.5", "0.2", "--json")
+    assert cli.main(arguments) == 0
+    report = json.loads(capsys.readouterr().out)
+    scans = list(gs.read_log(place / "run.log", range_max=20.0))
+    parameters = gs.LikelihoodFieldParameters.tracking()
+    model = gs.LikelihoodFieldModel(
+        gs.read_map(place / "map.yaml"), scans[0].scanner, parameters, backend="numpy", beams=60
+    )
+    pf = gs.ParticleFilter(model, particles=300, seed=0)
+    pf.initialize(mean=(3, 1.5, 0.2), covariance=np.diag([0.25, 0.25, 0.0676]))
+    for before, scan in zip([None, *scans], scans, strict=False):
+        if before is not None:
+            pf.predict(before.odometry, scan.odometry)
+        pf.correct(scan.ranges)
+    np.testing.assert_allclose(pf.estimate().pose, report["poses"][-1][1:], atol=1e-9)

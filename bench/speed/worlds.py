@@ -1,4 +1,4 @@
-"""Measure rays in many worlds at once beside one map, moving shapes, and worlds that are replaced.
+"""Compare rays in many worlds at once with rays in one map; measure moving shapes and replaced worlds.
 
     python bench/speed/worlds.py --backend opencl --worlds 64,1024
     python bench/speed/worlds.py --backend warp:cuda:0 --worlds 256,1024,4096,8192 --shapes 64

@@ -174,16 +174,16 @@ def adopt_poses(
     return adopted.buffer, math.prod(adopted.shape) // 3, adopted.dtype == np.float32, adopted.owner
 
 
-def adopt_readings(array: object, backend: Backend, beams: int, *, in_place: bool) -> Adopted:
-    """Return (K,) ranges on the device.
+def adopt_readings(array: object, backend: Backend, shape: tuple[int, ...], *, in_place: bool) -> Adopted:
+    """Return ranges of a shape on the device.
 
     Raises:
         TypeError: Not float32 or float64, or not on the backend's device.
         ValueError: Another shape, not C-contiguous, or misaligned where no copy may be made.
     """
     adopted = _adopt(array, backend, "ranges", in_place=in_place)
-    if adopted.shape != (beams,):
-        raise ValueError(f"ranges: shape must be ({beams},), got {shape_text(adopted.shape)}")
+    if adopted.shape != shape:
+        raise ValueError(f"ranges: shape must be {shape_text(shape)}, got {shape_text(adopted.shape)}")
     _check_numbers(adopted, "ranges")
     return adopted
 

@@ -192,7 +192,7 @@ def _replay_field(launch: Launch, values: dict[str, Any], shift: tuple[float, fl
     count, readings = values["particles"], values["readings"]
     parts = np.empty(count * readings)
     low = values.get("pose_low", np.zeros((count, 4))) + np.array([*shift, 0.0, 0.0])
-    single_scan = {"start": None, "constant_terms": None}
+    single_scan = {"start": None, "constant_terms": None, "world": np.zeros((0, 2), np.int32), "shapes": None}
     arguments = {**values, **single_scan, "pose_low": low, "log_p": np.empty(count), "parts": parts}
     flags = launch.flags | {"FLOAT64", "PER_BEAM", "TWO_PART_POINTS"}
     field_kernels.score_field(flags, *(arguments[argument.name] for argument in KERNELS["score_field"].arguments))

@@ -100,3 +100,30 @@ def place_inputs(
     """Put poses and readings in their places; the first ``head`` work-items of a device are for readings."""
     place_reading(flags, ranges, beam, vector, point, point_low, reading, guard, constant_term, frame.resolution, rules)
     place_poses(flags, poses, pose_cell, pose, pose_low, pose_status, frame, window, particles)  # fmt: skip
+
+
+def placed_value(flags: frozenset[str], z: np.ndarray, rules: structs.ReadingRules) -> np.ndarray:
+    """Return readings as ranges, infinity for max readings that count, else nan."""
+    far = is_max(z, rules.farthest) & (rules.max_readings != MAX_LEFT_OUT)
+    return np.where(is_hit(z, rules.nearest, rules.farthest), z, np.where(far, np.inf, np.nan))
+
+
+def place_scans(
+    flags: frozenset[str], ranges: np.ndarray, beam: np.ndarray, vector: np.ndarray, point: np.ndarray,
+    point_low: np.ndarray, reading: np.ndarray, guard: np.ndarray, scans: int, head: int, blocks: int,
+    resolution: float, rules: structs.ReadingRules,
+) -> None:  # fmt: skip
+    """Place the readings of scans of one particle each, all of them."""
+    z = ranges[: scans * head].reshape(scans, head)[:, beam[: rules.beams]].astype(np.float64)
+    value = placed_value(flags, z, rules)
+    vectors = vector[: 2 * rules.each * rules.beams].reshape(rules.beams, rules.each, 2)
+    for scan in range(scans):
+        places = slice(scan * rules.beams, (scan + 1) * rules.beams)
+        if "END_POINTS" in flags:
+            fill_end_point(
+                value[scan], vectors, point[places], point_low[places], guard[scan * blocks : (scan + 1) * blocks],
+                resolution, rules,
+            )  # fmt: skip
+        else:
+            rays = slice(places.start * rules.each, places.stop * rules.each)
+            fill_rays(value[scan], vectors, point[rays], reading[places], rules)

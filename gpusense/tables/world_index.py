@@ -44,6 +44,14 @@ class WorldIndex:
         self._world = _indices("world", world, count, backend, len(worlds))
         self._ignore = None if ignore is None else _indices("ignore", ignore, count, backend, None)
 
+    def resident(self, backend: Backend) -> WorldIndex:
+        """Return the same indices on the device, for calls that repeat them."""
+        for name in ("_world", "_ignore"):
+            value = getattr(self, name)
+            if isinstance(value, np.ndarray):
+                setattr(self, name, backend.view(backend.upload(value), value.shape, value.dtype))
+        return self
+
     def buffers(self, backend: Backend, space: Workspace, part: tuple[int, int]) -> InWorlds:
         """Return the indices of some poses on the device."""
         worlds, crowd = self.worlds, self.worlds.crowd.crowd

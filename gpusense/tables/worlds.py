@@ -102,7 +102,7 @@ class Worlds:
         >>> cells = 100 * np.eye(8, dtype=np.int8)[[5, 7], None]
         >>> worlds = gs.Worlds(cells, resolution=0.5, backend="numpy")
         >>> worlds
-        Worlds(2 of 1 x 8 cells, resolution=0.5, backend='numpy', 1.2e-04 MB)
+        Worlds(2 of 1 x 8 cells, resolution=0.5, backend='numpy', 1.02 kB, 1 bytes a cell)
         >>> caster = gs.RayCaster(worlds, range_max=5.0, backend="numpy")
         >>> caster.cast([(0.25, 0.25, 0.0), (0.25, 0.25, 0.0)], [0.0], world=[0, 1]).tolist()
         [[2.25], [3.25]]
@@ -208,11 +208,11 @@ class Worlds:
         rows, cols = self.shape
         size = f"{rows} x {cols}" if (self._sizes == self._sizes[0]).all() else f"up to {rows} x {cols}"
         shapes = "" if self.shapes.worlds is None else f", shapes={self.shapes}"
-        megabytes = self.nbytes / 1e6
-        text = f"{megabytes:.1f}" if megabytes >= 1 else f"{megabytes:.1e}"
+        power = min(max(len(str(self.nbytes)) - 1, 0) // 3, 3)
+        memory = f"{self.nbytes / 1000**power:.3g} {('bytes', 'kB', 'MB', 'GB')[power]}"
         return (
             f"Worlds({len(self)} of {size} cells, resolution={self._resolution}{shapes}, "
-            f"backend={self.device.selection!r}, {text} MB)"
+            f"backend={self.device.selection!r}, {memory}, {self.nbytes / self._total:g} bytes a cell)"
         )
 
     def grid(self, index: int) -> OccupancyGrid:
@@ -249,7 +249,7 @@ class Worlds:
                 one.version += 1
 
     def replace(self, index: ArrayLike, cells: Any) -> None:
-        """Replace the cells of some worlds, whose tables are made again on the device.
+        """Replace the cells of some worlds, and make their tables again on the device.
 
         Args:
             index: (I,) indices of the worlds.

@@ -196,3 +196,37 @@ kernel void place_inputs(ARGUMENTS) {
     if (item - head >= particles) return;
     place_pose(item - head, poses, pose_cell, pose, pose_low, pose_status, frame, window);
 }
+
+// Return reading k of a scan of ``head`` readings as a range, infinity for a max reading that counts, else nan.
+double placed_value(const int k, global const measured *ranges, global const int *beam, const ReadingRules rules) {
+    const double z = ranges[beam[k]];
+    const int counts = rules.max_readings != MAX_LEFT_OUT && is_max(z, rules.farthest);
+    return is_hit(z, rules.nearest, rules.farthest) ? z : counts ? INFINITY : NAN;
+}
+
+// Place the readings of scans of one particle each, all of them. One work-item takes a reading.
+kernel void place_scans(ARGUMENTS) {
+    const int item = get_global_id(0), scan = item / rules.beams, k = item % rules.beams;
+    if (scan >= scans) return;
+    global const measured *own = ranges + (long)scan * head;
+    const double value = placed_value(k, own, beam, rules);
+    global const double *vectors = vector + 2 * (long)k * rules.each;
+    const double2 first = (double2)(vectors[0], vectors[1]);
+#if END_POINTS
+    const double cells = value / resolution, length = isfinite(cells) ? cells : 0;
+    const double x = first.x * length, y = first.y * length;
+    const real2 high = (real2)((real)x, (real)y);
+    point[item] = isfinite(cells) ? high : (real2)((real)cells);
+    point_low[item] = (real2)((real)(x - high.x), (real)(y - high.y));
+    if (k % BLOCK_TERMS == 0) {
+        double longest = 0;
+        for (int i = k; i < k + BLOCK_TERMS && i < rules.beams; ++i) {
+            const double other = placed_value(i, own, beam, rules);
+            longest = isfinite(other) && other > longest ? other : longest;
+        }
+        guard[scan * blocks + k / BLOCK_TERMS] = (real)(rules.guard_scale * (longest / resolution + 2));
+    }
+#else
+    fill_rays(item, value, first, vectors, point, reading, rules.each, rules.top);
+#endif
+}

@@ -177,7 +177,7 @@ def make(name, flags):
             # a third of the time. It would not in a function, with points read as vec2, or a maximum in place of a
             # count.
             lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
-            start_cell = table_origin(origin, window.cols)
+            start_cell = table_origin(origin, seen.cols)
             sure = rounding_margin(guard)
             cells = block_cells()
             while k < size:
@@ -188,18 +188,18 @@ def make(name, flags):
                 while i < width:
                     near, off = rounded_cell(lowered, point_at(point, first + i))
                     doubtful += int(off > sure)
-                    cells[i] = table_cell(near, start_cell, window)
+                    cells[i] = table_cell(near, start_cell, seen)
                     i += 1
                 if doubtful > 0:
                     i = int(0)
                     while i < width:
                         exact = end_point(sensor_pose, sensor_low, point[first + i], point_low[first + i], ZERO, guard)
-                        cells[i] = field_cell(origin.x + exact.cell.x, origin.y + exact.cell.y, window)
+                        cells[i] = field_cell(origin.x + exact.cell.x, origin.y + exact.cell.y, seen)
                         i += 1
                 block = ZERO
                 i = int(0)
                 while i < width:
-                    term = table[cells[i]]
+                    term = field[cells[i]]
                     if PER_BEAM:
                         parts[n * readings + k + i] = term
                     block += term

@@ -165,9 +165,10 @@ def field_readers(struct):
 @functools.cache
 def behind(dtype):
     """Make a function of (array, count) that returns the array without its first ``count`` numbers."""
-    native = {wp.uint16: "wp::uint16", wp.float32: "wp::float32", wp.float64: "wp::float64"}.get(dtype)
-    if native is None:
+    if hasattr(dtype, "_wp_scalar_type_"):
         native = f"wp::vec_t<{dtype._length_}, {_C_TYPES[dtype._wp_scalar_type_]}>"
+    else:
+        native = f"wp::{dtype.__name__}"
 
     @wp.func_native(f"wp::array_t<{native}> rest = values; rest.data += count; return rest;")
     def rest_of(values: wp.array(dtype=dtype), count: wp.int64) -> wp.array(dtype=dtype): ...

@@ -278,4 +278,55 @@ def make(name, flags):
                 item, ranges, beam, vector, point, point_low, reading, guard, constant_term, frame.resolution, rules
             )
 
+    # Return reading k of a scan of ``head`` readings as a range, infinity for a max reading that counts, else nan.
+    @wp.func
+    def placed_value(
+        k: wp.int32, before: wp.int32, ranges: wp.array(dtype=measured), beam: wp.array(dtype=wp.int32),
+        rules: ReadingRules,
+    ):  # fmt: skip
+        z = wp.float64(ranges[before + beam[k]])
+        value = wp.float64(MISSING)
+        if is_hit(z, rules.nearest, rules.farthest):
+            value = z
+        elif rules.max_readings != MAX_LEFT_OUT and is_max(z, rules.farthest):
+            value = wp.float64(FAR)
+        return value
+
+    # Place the readings of scans of one particle each, all of them. One work-item takes a reading.
+    @kernel(flags)
+    def place_scans(
+        ranges, beam, vector, point, point_low, reading, guard, scans, head, blocks, resolution, rules
+    ):  # fmt: skip
+        item = work_item(wp.tid())
+        scan = item // rules.beams
+        if scan >= scans:
+            return
+        k = item % rules.beams
+        value = placed_value(k, scan * head, ranges, beam, rules)
+        source = 2 * k * rules.each
+        first = wp.vec2d(vector[source], vector[source + 1])
+        if END_POINTS:
+            cells = value / resolution
+            length = ZERO
+            if wp.isfinite(cells):
+                length = cells
+            high = vec2(real(first.x * length), real(first.y * length))
+            point_low[item] = vec2(
+                real(first.x * length - wp.float64(high.x)), real(first.y * length - wp.float64(high.y))
+            )
+            if not wp.isfinite(cells):
+                high = vec2(real(cells), real(cells))
+            point[item] = high
+            if k % BLOCK_TERMS == 0:
+                longest = wp.float64(0.0)
+                for i in range(k, wp.min(k + BLOCK_TERMS, rules.beams)):
+                    other = placed_value(i, scan * head, ranges, beam, rules)
+                    if wp.isfinite(other):
+                        longest = wp.max(longest, other)
+                guard[scan * blocks + k // BLOCK_TERMS] = real(
+                    rules.guard_scale * (longest / resolution + wp.float64(2.0))
+                )
+        else:
+            fill_rays(item, value, first, vector, source, point, reading, rules.each, rules.top)
+
     return locals()[name]

@@ -41,6 +41,13 @@ KERNELS: dict[str, Kernel] = {
         "out real2 point [places * each]", "out real2 point_low [places]", "out real reading [places]",
         "out real guard [blocks]", "out real constant_term [1]", *_FRAME, "int head", "ReadingRules rules",
     ),
+    "place_scans": kernel(
+        "scan", "item", "measured ranges [scans * head]", "int beam [rules.beams]",
+        "double vector [2 * rules.each * rules.beams]", "out real2 point [scans * rules.beams * rules.each]",
+        "out real2 point_low [scans * rules.beams]", "out real reading [scans * rules.beams]",
+        "out real guard [scans * blocks]", "int scans", "int head", "int blocks", "double resolution",
+        "ReadingRules rules",
+    ),
     "cast_ranges": kernel(
         "ranges", "ray particle", *_CAST, *POSES, "real2 ray [rays]", "out real ranges [particles * rays]", WINDOW,
         "int particles", "int rays", *_CASTING, in_lanes=True, lanes_group=8,

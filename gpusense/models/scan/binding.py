@@ -20,6 +20,8 @@ from gpusense.models.scan.bound import BoundCall, DeviceCall
 from gpusense.models.scan.packed_call import LARGEST, PackedCall, fits, host_task
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.tiles import LEAST_ORDERED
+from gpusense.tables.world_index import WorldIndex
+from gpusense.tables.worlds import Worlds
 
 # Largest map for which a short call makes the whole table [cells].
 _MOST_CELLS = 1 << 22
@@ -38,11 +40,7 @@ def bind(
         ranges: (K,) readings.
         out: The array for the log-likelihoods, or None.
     """
-    for name, array in (("poses", poses), ("ranges", ranges)):
-        if not (isinstance(array, np.ndarray) or hasattr(array, "__dlpack__") or arrays.on_device(array)):
-            raise TypeError(f"{name}: must be an array, whose numbers every call reads anew, got {checks.show(array)}")
-        if type(array).__module__.startswith("jax"):
-            raise TypeError(f"{name}: must be an array whose numbers can change, got one of JAX, where none do")
+    _check_bound(poses, ranges)
     in_host = [name for name, array in (("poses", poses), ("ranges", ranges)) if not arrays.on_device(array)]
     obstacle = host_task(pipeline)
     if not in_host and not obstacle and pipeline.backend.info.kind == "gpu":
@@ -58,6 +56,68 @@ def bind(
             # The ordinary call needs only a part of the map's table.
             host.reason = "the table of the whole map does not fit the device"
     return host
+
+
+def bind_worlds(
+    pipeline: ScanPipeline, lock: threading.Lock, score: Callable[..., Any], worlds: Worlds, poses: Any, ranges: Any,
+    world: Any, ignore: Any, out: Any,
+) -> BoundCall:  # fmt: skip
+    """Bind arrays of robots in many worlds; see ``ScanModel.bind``.
+
+    Args:
+        pipeline: The stages of the model.
+        lock: Held while the model's buffers are in use.
+        score: ``log_likelihood`` of the model.
+        worlds: The worlds.
+        poses: (N, 3) poses.
+        ranges: (K,) or (N, K) readings.
+        world: (N,) indices of worlds, or one for all.
+        ignore: (N,) indices of shapes, one for all, or None.
+        out: The array for the log-likelihoods, or None.
+    """
+    _check_bound(poses, ranges)
+    backend, rules = pipeline.backend, pipeline.rules
+    there = arrays.on_device(poses) and arrays.on_device(ranges)
+    if not there or backend.info.kind != "gpu":
+        return _WorldsCall(score, poses, ranges, world, ignore, out)
+    if len(ranges.shape) == 2 and not (rules.choice.every and rules.separate and pipeline.setting.possible):
+        # Scans whose beams are chosen by their readings, or share rays, are prepared by the host.
+        return _WorldsCall(score, poses, ranges, world, ignore, out)
+    count = int(poses.shape[0])
+    inside = WorldIndex(worlds, world, ignore, count, backend).resident(backend)
+    return DeviceCall(pipeline, lock, poses, ranges, out, inside=inside)
+
+
+def _check_bound(poses: Any, ranges: Any) -> None:
+    """Refuse poses and ranges that are not arrays, or that cannot change."""
+    for name, array in (("poses", poses), ("ranges", ranges)):
+        if not (isinstance(array, np.ndarray) or hasattr(array, "__dlpack__") or arrays.on_device(array)):
+            raise TypeError(f"{name}: must be an array, whose numbers every call reads anew, got {checks.show(array)}")
+        if type(array).__module__.startswith("jax"):
+            raise TypeError(f"{name}: must be an array whose numbers can change, got one of JAX, where none do")
+
+
+class _WorldsCall(BoundCall):
+    """An ordinary call of ``log_likelihood`` of a model of worlds."""
+
+    waits = True
+
+    def __init__(self, score: Callable[..., Any], poses: Any, ranges: Any, world: Any, ignore: Any, out: Any) -> None:
+        self._score, self._arrays = score, (poses, ranges)
+        self._options = dict(world=world, ignore=ignore)
+        # The first call checks the arguments, and makes the result.
+        self.out = score(poses, ranges, out=out, **self._options)
+
+    def __call__(self, stream: Any = None) -> Any:
+        if stream is not None:
+            raise TypeError(f"stream: must be None for a call that waits, got {checks.show(stream)}")
+        return self._score(*self._arrays, out=self.out, **self._options)
+
+    def explain(self) -> str:
+        return "the ordinary call: poses or ranges are in host memory, or the host prepares the scans"
+
+    def check(self) -> None:
+        """See BoundCall.check."""
 
 
 class _HostCall(BoundCall):
@@ -78,7 +138,7 @@ class _HostCall(BoundCall):
         else:
             count = _shape_of("poses", poses, ("N", 3))[0]
         if arrays.on_device(ranges):
-            arrays.adopt_readings(ranges, backend, beams, in_place=False)
+            arrays.adopt_readings(ranges, backend, (beams,), in_place=False)
         else:
             _shape_of("ranges", ranges, (beams,))
         self.out = Result(poses, out, (count,), real, backend, on_device=on_device).user_array()

@@ -23,7 +23,8 @@ from gpusense.interface.launches import Program
 from gpusense.models.chunking import chunk_of, finish
 from gpusense.models.poses import Poses
 from gpusense.models.scan.pipeline import ScanPipeline
-from gpusense.models.scan.readings import Readings, device_readings
+from gpusense.models.scan.readings import Readings, device_readings, device_scans
+from gpusense.tables.world_index import WorldIndex
 from gpusense.world.windows import Corners
 
 _INT = np.dtype(np.int32)
@@ -92,6 +93,7 @@ class DeviceCall(BoundCall):
         status: A shared buffer for the non-finite flag, which its owner inspects; None for a private one.
         limits: The type to which the scanner's limits are rounded; None for the type of the ranges.
         corners: Corners of the box of the poses, where their owner knows them: the map's table may be cropped then.
+        inside: The worlds of the poses, on the device; None in a single map. Ranges may then be (N, K).
     """
 
     waits = False
@@ -106,13 +108,18 @@ class DeviceCall(BoundCall):
         status: Buffer | None = None,
         limits: np.dtype | None = None,
         corners: Corners | None = None,
+        inside: WorldIndex | None = None,
     ) -> None:
         backend, real = pipeline.backend, pipeline.real
         self._pipeline, self._lock = pipeline, lock
         self._poses = Poses(poses, backend, in_place=True)
         self._poses.hull = corners
         count = self._poses.count
-        adopted = arrays.adopt_readings(ranges, backend, pipeline.scanner.count, in_place=True)
+        self._poses.inside = inside
+        own_scans = inside is not None and len(ranges.shape) == 2
+        beams = pipeline.scanner.count
+        shape = (count, beams) if own_scans else (beams,)
+        adopted = arrays.adopt_readings(ranges, backend, shape, in_place=True)
         result = Result(poses, out, (count,), real, backend, on_device=True)
         self._log_p, self.out = result.flat, result.user_array()
         # Owners of the memory that calls read and write.
@@ -121,7 +128,11 @@ class DeviceCall(BoundCall):
         self._space = Workspace(backend)
         if status is not None:
             self._space.share(POSE_STATUS[0], status, 2, _INT)
-        self._readings = self._placed_readings(adopted, adopted.dtype if limits is None else limits)
+        self._first: Program = ()
+        if own_scans:
+            self._readings = self._placed_scans(adopted, count)
+        else:
+            self._readings = self._placed_readings(adopted, adopted.dtype if limits is None else limits)
         # Pieces begin where parts of buffers can.
         whole = max(backend.alignment // _INT.itemsize, 1)
         rays = self._readings.readings * pipeline.rays_each
@@ -177,6 +188,37 @@ class DeviceCall(BoundCall):
             constants_there=sensing.constants_there, placing=placing,
         )  # fmt: skip
 
+    def _placed_scans(self, adopted: Adopted, count: int) -> Readings:
+        """Return a scan of each pose as the kernel ``place_scans`` places them."""
+        pipeline, space = self._pipeline, self._space
+        sensing = pipeline.sensing()
+        placing, filled = device_scans(
+            sensing, adopted.buffer, adopted.dtype, count, pipeline.map.grid.resolution, space
+        )
+        self._first, places = (placing,), len(sensing.columns)
+        starts = space.upload("start", np.arange(count + 1, dtype=_INT) * _INT.type(places))
+        each = -(-places // BLOCK_TERMS) if sensing.end_points else places
+        constants = np.full(count, pipeline.setting.constant_term, pipeline.real)
+        return Readings(
+            count, places, places, frozenset({"ALL_READINGS", "SCANS"}),
+            pipeline.place_arguments(filled) | {"start": starts},
+            dict(counts=space.upload("counts", np.full(count, each, _INT)),
+                 constant_terms=space.upload("constants", constants)),
+            0.0,
+        )  # fmt: skip
+
+    def _piece_of(self, begin: int, end: int) -> Readings:
+        """Return the readings of some poses."""
+        readings, part = self._readings, self._pipeline.backend.part
+        if readings.scans == 1 or (begin, end) == (0, readings.scans):
+            return readings
+        arguments = readings.arguments | {"start": part(readings.arguments["start"], begin, end - begin + 1, _INT)}
+        if self._pipeline.end_points:
+            blocks = -(-readings.readings // BLOCK_TERMS)
+            guard = part(arguments["guard"], begin * blocks, (end - begin) * blocks, self._pipeline.real)
+            arguments["guard"] = guard
+        return readings._replace(scans=end - begin, arguments=arguments)
+
     def _wait(self) -> None:
         for _, program in self._programs.items():
             program.recording.wait()
@@ -207,14 +249,15 @@ class DeviceCall(BoundCall):
 
     def _program(self) -> Program:
         """Return all launches of a call."""
-        pipeline, count, readings = self._pipeline, self._poses.count, self._readings
-        program: Program = ()
+        pipeline, count = self._pipeline, self._poses.count
+        program = self._first
         for begin in range(0, count, self._chunk):
             part = (begin, min(begin + self._chunk, count))
+            readings = self._piece_of(*part)
+            # Readings stay where the first piece has placed them.
+            readings = readings if begin == 0 else readings._replace(placing=None)
             placed, state = pipeline.place(self._poses, part, self._space)
             log_p = pipeline.backend.part(self._log_p, begin, part[1] - begin, pipeline.real)
             scoring = pipeline.scoring(readings, placed, state.table, log_p, self._space, ordered=False)
             program += pipeline.program(scoring)
-            # Readings stay where the first piece has placed them.
-            readings = readings._replace(placing=None)
         return program

@@ -170,6 +170,8 @@ class FieldPipeline(ScanPipeline):
         return spread_of(particles, -(-readings.readings // BLOCK_TERMS), ENOUGH_SHORT)
 
     def conditions(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None) -> frozenset[str]:
+        if self.log_table and "SHAPES" in placed.world_flags:
+            raise ValueError("shapes: must be assigned before a likelihood field is bound, got the first ones later")
         if placed.inside is not None and not self.quick:
             return placed.world_flags
         inside = tiles is not None and self.quick and all_within(placed, readings.reach, RING)

@@ -314,7 +314,7 @@ class ScanModel(Pickled):
         """Return the calls that differentiate log-likelihoods; None for a model without a gradient."""
         return None
 
-    def bind(self, poses: Any, ranges: Any, *, out: Any = None) -> BoundCall:
+    def bind(self, poses: Any, ranges: Any, *, world: Any = None, ignore: Any = None, out: Any = None) -> BoundCall:
         """Bind arrays that stay in place to a call of ``log_likelihood``, for filters that repeat it.
 
         Each call reads the present contents of the arrays, and writes ``out``. Where poses and ranges are on the
@@ -329,7 +329,10 @@ class ScanModel(Pickled):
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array as ``log_likelihood`` takes it.
-            ranges: (K,) readings [m]; on the device float32 or float64 and C-contiguous.
+            ranges: (K,) readings [m]; on the device float32 or float64 and C-contiguous. Of a model of worlds also
+                (N, K), a scan of each robot.
+            world: As in ``log_likelihood``; an array on the device is read anew by every call.
+            ignore: The same.
             out: (N,) array for the log-likelihoods, as ``log_likelihood`` takes it.
 
         Raises:
@@ -338,9 +341,15 @@ class ScanModel(Pickled):
             MemoryError: The device cannot hold the map's table, or the buffers of a call.
         """
         # Imported on use, since few programs bind calls.
-        from gpusense.models.scan.binding import bind
+        from gpusense.models.scan.binding import bind, bind_worlds
 
-        return bind(self._pipeline, self._lock, self.log_likelihood, poses, ranges, out)
+        score = self.log_likelihood
+        if self._worlds is not None:
+            return bind_worlds(self._pipeline, self._lock, score, self._worlds, poses, ranges, world, ignore, out)
+        for name, value in (("world", world), ("ignore", ignore)):
+            if value is not None:
+                raise ValueError(f"{name}: must be None for a model of a single map, got {checks.show(value)}")
+        return bind(self._pipeline, self._lock, score, poses, ranges, out)
 
     def explain(self, *, measure: bool = False) -> str:
         """Report the parts that this scene leaves out, keeps, and could leave out, each with the reason.

@@ -308,7 +308,7 @@ class PackedCallCache:
                 kind = single if is_single else _DOUBLE
             if not kinds[1]:
                 return (kind, None, ranges.dtype), (buffer, None), (owner,)
-            adopted = arrays.adopt_readings(ranges, backend, self._pipeline.scanner.count, in_place=False)
+            adopted = arrays.adopt_readings(ranges, backend, (self._pipeline.scanner.count,), in_place=False)
         except (TypeError, ValueError):
             return None
         return (kind, adopted.dtype, adopted.dtype), (buffer, adopted.buffer), (owner, adopted)

@@ -12,7 +12,7 @@ from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import BLOCK_TERMS, MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
 from gpusense.interface.flags import flags_if
-from gpusense.interface.launches import Program, launch
+from gpusense.interface.launches import Launch, Program, launch
 from gpusense.interface.structs import ReadingRules
 from gpusense.models.poses import PlacedPoses
 from gpusense.models.scan.rules import BeamChoice, Beams
@@ -172,9 +172,55 @@ def device_readings(
     return Placing(flags, arguments), filled
 
 
+def device_scans(
+    sensing: ReadingLayout, ranges: Buffer, dtype: np.dtype, scans: int, resolution: float, space: Workspace
+) -> tuple[Launch, dict[str, Buffer]]:
+    """Allocate places for a scan of each particle on the device, and return the launch that fills them.
+
+    Every reading has a place; a missing one adds nothing.
+
+    Args:
+        sensing: The rules for readings.
+        ranges: (S, K) readings.
+        dtype: Their type.
+        scans: S.
+        resolution: Side of a cell [m].
+        space: Holds the places.
+
+    Returns:
+        The launch, and the buffers that it fills by name.
+    """
+    real, columns, each = sensing.real, sensing.columns, sensing.vectors.shape[1]
+    count, blocks, end_points = len(columns), -(-len(columns) // BLOCK_TERMS), sensing.end_points
+    filled = dict(
+        point=space.empty("point", 2 * scans * count * each, real),
+        point_low=space.empty("point_low", 2 * scans * count if end_points else 2, real),
+        reading=space.empty("reading", 1 if end_points else scans * count, real),
+        guard=space.empty("guard", scans * blocks if end_points else 1, real),
+    )
+    flags = flags_if(END_POINTS=end_points, FLOAT64=real == np.float64, RANGES_FLOAT32=dtype == np.float32)
+    nearest, farthest = range_limits(dtype, sensing.scanner.range_min, sensing.scanner.range_max)
+    rules = ReadingRules(
+        nearest, farthest, 0.0, sensing.top, sensing.guard_scale, count, each, count, count,
+        MAX_LEFT_OUT if sensing.z_max <= 0 else MAX_PLACED, 1,
+    )  # fmt: skip
+    beam, vector = space.upload("beam", columns.astype(_INT)), space.upload("vector", sensing.vectors[columns])
+    placing = launch(
+        "place_scans", flags, (scans * count,), ranges=ranges, beam=beam, vector=vector, **filled, scans=scans,
+        head=sensing.scanner.count, blocks=blocks, resolution=resolution, rules=rules,
+    )  # fmt: skip
+    return placing, filled
+
+
 def placing_launches(placed: PlacedPoses, placing: Placing | None) -> Program:
     """Return the launch that places poses, and readings along with them."""
     if placing is None:
         return placed.launches()
+    if placed.inside is not None:
+        # Poses are placed in their worlds by a launch of their own.
+        head = placing.arguments["head"]
+        given = placed._replace(inside=None).arguments() | {"particles": 0}
+        readings = launch("place_inputs", placed.flags | placing.flags, (head,), **given, **placing.arguments)
+        return (readings, *placed.launches())
     size = (placing.arguments["head"] + placed.count,)
     return (launch("place_inputs", placed.flags | placing.flags, size, **placed.arguments(), **placing.arguments),)

@@ -1,4 +1,5 @@
 // Likelihood field of LANES particles at once: score_field of field.cl.
+// Lanes share a table, so the scalar body scores particles in several of them (WORLDS).
 // requires: lanes/field_term
 
 // Particles of a work-item, in vectors. They share each block of beams: while a robot is tracked, its end points fall

@@ -64,7 +64,7 @@ def correlation(left: Floats, right: Floats) -> float:
 
 
 def largest_gap(left: Array, right: Array) -> float:
-    """Return the largest lead in the right scores between two particles that the left scores rank the other way."""
+    """Return the largest lead in the right scores between two particles that the left scores rank in reverse."""
     order = np.lexsort((-right, -left))
     b = right[order].astype(np.float64)
     lowest = np.minimum.accumulate(b)

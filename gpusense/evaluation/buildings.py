@@ -27,8 +27,8 @@ _WALL = 4  # cells
 def building(seed: int = 0, size: tuple[float, float] = (30.0, 20.0), resolution: float = 0.05) -> OccupancyGrid:
     """Generate a floor of an office building.
 
-    It has a corridor, rooms with doors on both sides, a hall with pillars, and furniture. Cells outside the walls and
-    in rooms with shut doors are unknown. The corridor's western end is open.
+    It contains a corridor, rooms with doors on both sides, a hall with pillars, and furniture. Cells outside the walls
+    and in rooms with shut doors are unknown. The corridor's western end is open.
 
     Args:
         seed: Seed of the random numbers: the same seed generates the same building.

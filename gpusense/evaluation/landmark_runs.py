@@ -32,7 +32,7 @@ _WINDOW = 5.0
 
 @dataclass(frozen=True)
 class DriftingOdometry:
-    """Odometry motion model with a random walk in addition, whose variance grows with time.
+    """Odometry motion model plus a random walk: its variance grows with time.
 
     The scans of such runs come at irregular times, and an odometer's heading drifts even without a turn. ``predict``
     takes the odometry before and after the step, and its duration [s].

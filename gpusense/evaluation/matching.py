@@ -151,7 +151,7 @@ def joined(parts: list[LogMatches]) -> LogMatches:
 
 
 def summary(matches: LogMatches) -> dict[str, object]:
-    """Return counts of statuses, and medians and 95th percentiles of errors, which are None without logged poses."""
+    """Return counts of statuses, and medians and 95th percentiles of errors (None without logged poses)."""
     names, counts = np.unique(matches.match.status, return_counts=True)
     result: dict[str, object] = {
         "matches": len(matches.match),

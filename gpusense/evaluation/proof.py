@@ -1,6 +1,6 @@
 """Prove a device: compute a small scene with each family of kernels and compare with NumPy.
 
-The scene is an ordinary one, so the kernels that the proof compiles are those of the first call with a scan.
+The scene is ordinary, so the proof compiles the kernels of the first call with a scan.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _TIMED_SECONDS = 0.05
 
 
 class Scene:
-    """A room with pillars and an unknown corner, a scan, and poses, some of which lie in walls."""
+    """A room with pillars and an unknown corner, a scan, and poses, some of them in walls."""
 
     def __init__(self) -> None:
         random = np.random.default_rng(0)
@@ -76,7 +76,7 @@ def prove(job: dict[str, Any], report: Report) -> None:
 
 
 def _tables(scene: Scene, device: Backend, numpy: Backend) -> str:
-    """Compare distance transforms, whose kernels have no lanes."""
+    """Compare distance transforms; their kernels have no lanes."""
     for cells in scene.obstacles:
         distances = [distance_transform(cells, squared=True, backend=backend) for backend in (device, numpy)]
         if wrong := _difference(TOLERANCES["distance transform"], *distances):

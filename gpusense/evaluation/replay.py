@@ -2,7 +2,7 @@
 
 :class:`Recorder` is a backend that keeps the arguments and results of every scoring launch; :func:`replay` evaluates
 the float64 reference kernels on these arguments. The comparison thus excludes the rounding of the inputs, and ray
-casting, whose results are compared bit by bit elsewhere.
+casting: its bits are compared elsewhere.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def replay(launch: Launch, like: np.ndarray | None = None) -> tuple[np.ndarray, 
 
 
 def _as_float64(value: Any) -> Any:
-    """Return real numbers, including those of a struct, in float64, and other values unchanged."""
+    """Return real numbers, also in a struct, in float64, and other values unchanged."""
     if isinstance(value, tuple):
         made: type[Any] = type(value)
         return made(*map(_as_float64, value))

@@ -216,7 +216,7 @@ def per_scan(parts: ArrayLike, dtype: DTypeLike, *, fixed: float = 0.0, temperat
     """Return the largest error of a scan's log-likelihood that follows from its beams' bounds and from the summation.
 
     BLOCK_TERMS terms are added plainly, with an error of (BLOCK_TERMS - 1) / 2 eps of the sum of their magnitudes.
-    Blocks are added with compensation, whose relative error is the square of a plain sum's. The final sum and its
+    Blocks are added with compensation; its relative error is the square of a plain sum's. The final sum and its
     product with the temperature round once each. float64 has a separate, wider rule.
 
     Args:

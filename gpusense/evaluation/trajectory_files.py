@@ -33,7 +33,7 @@ def write_tum(path: Path, times: Iterable[float], poses: Iterable[Floats], *, in
         path: The file.
         times: Times [s].
         poses: Poses (x, y [m], theta), as many.
-        indices: Whether the times are indices of scans, which a comment then states.
+        indices: Whether the times are indices of scans; a comment in the file then states it.
     """
 
     def write(stream: BinaryIO) -> None:

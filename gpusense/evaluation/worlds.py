@@ -88,7 +88,7 @@ def cloud_uniform(grid: OccupancyGrid, n: int, rng: Rng) -> Floats:
 
 
 def cloud_around(pose: ArrayLike, n: int, sigma_xy: float, sigma_theta: float, rng: Rng) -> Floats:
-    """Draw poses from a normal distribution around one pose, as in tracking; some may lie in walls.
+    """Draw poses from a normal distribution around one pose, as in tracking; some may be in walls.
 
     Args:
         pose: (3,) x, y and theta in the world [m, m, rad].

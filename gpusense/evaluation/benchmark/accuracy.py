@@ -165,7 +165,7 @@ def errors(
         problem: ``"ranges"``, ``"beam"`` or ``"field"``.
         ranges: (M, K) the candidate's ranges [m], or None.
         log_p: (M,) the candidate's log-likelihoods; if None, the float64 mixture computes them from the ranges.
-        temperature: Factor that makes the log-likelihoods comparable with those of all beams: n for every n-th beam.
+        temperature: Factor that makes the log-likelihoods comparable with all beams': n for every n-th beam.
 
     Returns:
         Errors by kind: ``"ranges"`` if ranges are passed, ``"log_p"``, ``"posterior"``, ``"tempered"``, the posterior
@@ -194,7 +194,7 @@ def errors(
 
 
 def fine_errors(truth: Truth, problem: str, log_p: NDArray[np.floating], temperature: float = 1.0) -> dict[str, float]:
-    """Compare log-likelihoods on the fine grid of poses with the true posterior there, which is not tempered.
+    """Compare log-likelihoods on the fine grid of poses with the true, untempered posterior there.
 
     Args:
         truth: The exact results.

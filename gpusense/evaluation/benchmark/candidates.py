@@ -45,7 +45,7 @@ class Candidate:
         precision: Precision of an outside candidate, for the report.
         outside: Version and threads of an outside candidate; empty for this package's candidates.
         missing: Reason why it cannot run here; such a candidate is listed and not measured.
-        temperature: Factor that makes its log-likelihoods comparable with those of all beams: n for every n-th beam.
+        temperature: Factor that makes its log-likelihoods comparable with all beams': n for every n-th beam.
         code: The Python expression that makes it, for readers of the report.
         whole: Whether its table is of the whole map, and so the same for all clouds.
         table_rays: Number of rays that build the table of a scene's map; None for tables built without rays.

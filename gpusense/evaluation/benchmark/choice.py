@@ -3,7 +3,7 @@
 A method is judged over all scenes and clouds of a report together, by its largest error and the geometric mean of its
 times. A run of another day should choose the same, so no difference that noise makes decides: methods within ``ALIKE``
 of the fastest count as equally fast and those within ``CLOSE`` of the least error as equally exact, and of equal ones
-:attr:`Entry.preference` decides, in which nothing is measured. An error must keep its limit for other seeds as well.
+:attr:`Entry.preference` decides, in which nothing is measured. An error must also keep its limit for other seeds.
 
 Still a method near one of these factors is within it on one day and not on the next. So an earlier choice may stand: it
 is kept until another method is better by more than what noise of both days makes, the square of the factor.
@@ -27,7 +27,7 @@ ROUNDING = 1e-6
 
 @dataclass(frozen=True)
 class Measure:
-    """A kind of error by which a method is chosen.
+    """A kind of error that decides between methods.
 
     Attributes:
         kind, name: Place of the error in a point.

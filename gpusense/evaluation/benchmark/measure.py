@@ -199,7 +199,7 @@ def measure(
         seconds: Longest time of the timed calls, of which there are at least three, and of the launches alone [s].
         slow_to_make: Duration of a first call above which no second runner is made [s]; None: ``SLOW_TO_MAKE``.
         earlier: A runner of another cloud, if there is one, is measured instead of a new one. Otherwise it receives a
-            runner that took longer than ``slow_to_make``. None: every cloud has runners of its own.
+            runner that took longer than ``slow_to_make``. None: each cloud gets new runners.
     """
     limit = SLOW_TO_MAKE if slow_to_make is None else slow_to_make
     meter = None if backend is None else Meter(backend)

@@ -32,7 +32,7 @@ MODEL_MEASURES["likelihood field"] = MODEL_MEASURES["beam model"]
 
 @dataclass(frozen=True)
 class Case:
-    """A method in one scene: a map with one of its clouds.
+    """A method in one scene: a map with a cloud.
 
     Attributes:
         name: Names of map and cloud.
@@ -95,7 +95,7 @@ class Row:
         return f"{text} ({self.maps})" if self.maps else text
 
     def entry(self, measure: str) -> Entry:
-        """Return the row as an entry to choose from, by one of its measures."""
+        """Return the row as an entry to choose from, by a measure."""
         return Entry(
             self.device, self.method, self.setting, self.precision, self.errors[measure], self.seconds, self.code,
             self.exact, self.doubt,
@@ -128,12 +128,12 @@ def titles_of(
 ) -> dict[str, str]:
     """Return a title for each device of some points, by selection string; equal titles are extended by device names.
 
-    Other implementations, whose selection string is ``"outside"``, have the title of the first processor.
+    Other implementations (selection string ``"outside"``) have the title of the first processor.
 
     Args:
         points: The points of a report.
         machine: Machine of the report.
-        devices: Devices of the report, whose drivers and targets distinguish the OpenCL runtimes of one processor.
+        devices: Devices of the report; drivers and targets distinguish the OpenCL runtimes of one processor.
     """
     drivers = {device["selection"]: (device["driver"], device.get("target", "")) for device in devices}
     first: dict[str, Mapping[str, Any]] = {}
@@ -170,7 +170,7 @@ def seconds_of(point: Mapping[str, Any]) -> float | None:
 def model_rows(report: Mapping[str, Any]) -> list[Row]:
     """Return the rows of a report of ``gpusense bench``, for each map and for all together.
 
-    A method that failed in a scene has neither a row for it nor one for all maps. A scene where every method was left
+    A method that failed in a scene has no row for the scene and none for all maps. A scene where every method was left
     out, such as one after the deadline of a quick run, does not count.
     """
     titles, origin = titles_of(report["points"], report["machine"], report.get("devices", ())), origin_of(report)

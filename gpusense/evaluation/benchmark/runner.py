@@ -23,7 +23,7 @@ FINE_CLOUD = "tracking"
 
 # Default number of particles of a call: enough to fill the device.
 PARTICLES = {"gpu": 4096, "cpu": 1024}
-# Divisor of that number for the NumPy reference, which is slower.
+# Divisor of that number for the slower NumPy reference.
 NUMPY_SHARE = 8
 
 
@@ -49,7 +49,7 @@ class Plan:
         build_limit: Longest time to build a table [s]; a point above it is left out.
         deadline: Measuring time, without compiling, after which no further point begins [s].
         slow_to_make: Duration of a first call above which building includes compiling [s], and tables of the whole map
-            are built for the first cloud of a scene alone; None: all clouds have tables of their own, see ``measure``.
+            are built for the first cloud of a scene alone; None: each cloud builds its tables, see ``measure``.
     """
 
     sources: Sequence[MapSource]
@@ -67,7 +67,7 @@ class Plan:
     slow_to_make: float | None = None
 
     def particles_on(self, backend: Backend | None) -> int:
-        """Return N of a timed call on a device; None stands for an outside candidate."""
+        """Return N of a timed call on a device; None means an outside candidate."""
         kind = "cpu" if backend is None else backend.info.kind
         count = PARTICLES[kind] if self.particles is None else self.particles
         numpy = backend is not None and backend.info.backend == "numpy"

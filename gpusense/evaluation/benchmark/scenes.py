@@ -210,7 +210,7 @@ def _cloud_in_free_space(grid: OccupancyGrid, pose: Floats, n: int, rng: np.rand
 
 
 def is_free(grid: OccupancyGrid, poses: Floats) -> NDArray[np.bool]:
-    """Return (N,) whether each of (N, 3) poses lies in a free cell."""
+    """Return (N,) whether each of (N, 3) poses is in a free cell."""
     col, row = np.floor(grid.world_to_cells(poses[:, :2])).astype(np.int64).T
     rows, cols = grid.shape
     inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)

@@ -32,8 +32,8 @@ def change_world(
 ) -> OccupancyGrid:
     """Return the world at a later time than its map.
 
-    Walls and furniture are cut into pieces of 1 m. The shares are of the surface: the occupied cells beside a free
-    one.
+    Walls and furniture are cut into pieces of 1 m. The shares are of the surface: the occupied cells next to a
+    free one.
 
     Args:
         grid: The map.
@@ -45,7 +45,7 @@ def change_world(
         clearance: Distance from these positions that stays free [m].
 
     Returns:
-        A grid of the same geometry, whose cells are 0, 100 or unchanged.
+        A grid of the same geometry with cells 0, 100 or unchanged.
 
     Raises:
         TypeError, ValueError: an argument has the wrong type or breaks its rule.

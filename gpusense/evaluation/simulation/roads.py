@@ -20,7 +20,7 @@ class Roads:
     """Shortest paths between random places of one connected part of the free space.
 
     Args:
-        grid: The map, whose frame the paths are in.
+        grid: The map; paths are in its frame.
         free: (H, W) cells where the robot may be.
         clearance: Least distance of a path from every other cell, and from the grid's edge [m].
         rng: Random generator, which chooses a part with probability proportional to the number of its nodes.

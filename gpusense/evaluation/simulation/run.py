@@ -279,7 +279,7 @@ def draw_odometry(
 ) -> Floats:
     """Return the odometer's poses along true poses; the first one is 0.
 
-    Noise has the model's deviations at the true motion. The odometer has the model's systematic errors, which the model
+    The deviations of the noise follow from the true motion. The odometer has the systematic errors that the model
     corrects.
 
     Args:

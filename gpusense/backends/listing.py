@@ -15,18 +15,18 @@ from gpusense.backends.registry import BY_NAME, ENTRIES, Entry
 
 @dataclass(frozen=True)
 class Device:
-    """A device of this machine, or one that it could have.
+    """A device of this machine, or an absent one with the reason.
 
     Attributes:
-        backend: The name of its backend: ``"numpy"``, ``"opencl"``, ``"warp"`` or another name of the registry.
-        name: The name of the device, or of the absent part.
+        backend: The name of the backend: ``"numpy"``, ``"opencl"``, ``"warp"`` or another name of the registry.
+        name: The name of the device, or of the missing component.
         kind: ``"cpu"``, ``"gpu"`` or ``"simulator"``.
         available: Whether a model can run on it.
         reason: Why not, with the remedy; or why only some kernels can run. Empty if it is fully available.
-        selection: The value of ``backend=``; empty where it is absent.
+        selection: The value for ``backend=``; empty for an absent device.
         driver: The name and version of the compiler's driver; empty where kernels are not compiled.
         lanes: Particles or beams that one work-item computes at once; 1 leaves that to the compiler.
-        target: The processor for which the driver compiles; empty where it is not known.
+        target: The processor for which the driver compiles; empty if unknown.
         float64: Whether models with ``precision="float64"`` can run on it.
 
     Example:
@@ -67,7 +67,7 @@ def devices(*, anew: bool = False) -> Devices:
     A new device is proved first, which takes some seconds; see :mod:`gpusense.backends.proof`.
 
     Args:
-        anew: Load all drivers and prove all devices again, for changes that are not part of the verdicts' keys.
+        anew: Load all drivers and prove all devices again, after a change that the verdicts' keys do not cover.
 
     Example:
         >>> import gpusense as gs

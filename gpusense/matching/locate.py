@@ -87,12 +87,12 @@ def locate_scan(
         model: A likelihood field; its beams, parameters and device are used.
         ranges: (K,) readings [m], or (S, K) for a joint search of S scans.
         resolution: Distance between neighbouring positions [m], > 0; rounded to whole cells, at least one.
-        angle: Angle between neighbouring headings [rad], up to a right angle; lowered to the next that divides
-            a right angle.
+        angle: Angle between neighbouring headings [rad], up to a right angle; rounded down to a divisor of a right
+            angle.
         positions: ``"free"``: the robot's position must be in a free cell; ``"all"``: anywhere on the map.
         modes: Largest number of modes.
         min_probability: Least ``p_right`` of a pose that counts as found, from 0 to 1.
-        refine: Whether ``pose`` may lie between the poses of the grid, up to two steps from the likeliest of them.
+        refine: True to refine ``pose`` between the poses of the grid, up to two steps from the likeliest one.
 
     Returns:
         The pose; for S scans, a tuple of S.

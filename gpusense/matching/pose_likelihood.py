@@ -58,7 +58,7 @@ class PoseLikelihood:
         return self.step * self.grid.resolution
 
     def poses(self, row: ArrayLike, col: ArrayLike, heading: ArrayLike) -> Floats:
-        """Return (M, 3) poses in the world of M indices of rows, columns and headings [m, m, rad]."""
+        """Return the (M, 3) poses in the world [m, m, rad] at M indices of rows, columns and headings."""
         rows, cols = self.cells.shape[:2]
         sized = ("row", row, rows), ("col", col, cols), ("heading", heading, len(self.headings))
         found = checks.broadcast({name: checks.indices(name, value, size) for name, value, size in sized})

@@ -46,7 +46,7 @@ class LineModel(FeatureModel):
         mount: Pose (x, y, yaw) of the features' frame on the robot [m, m, rad]; ``extract_features`` returns lines in
             the robot's frame.
         temperature: In (0, 1]: multiplies the sum over lines.
-        specialize: False leaves nothing out, for the same numbers at lower speed.
+        specialize: False to run every part of the kernels, with the same results at lower speed.
 
     Raises:
         TypeError: An argument is of the wrong kind.
@@ -131,9 +131,9 @@ class LineModel(FeatureModel):
     ) -> np.ndarray:
         """Draw lines from p(f | x, m) at each pose, on the host in float64; see ``BeamModel.sample``.
 
-        Unless ``correspondence`` is passed, every wall that is seen from its side, with a part within range_max, gives
-        a line with probability p_detect. Walls hide nothing. With ``correspondence``, each wall in it gives a line for
-        certain. A line is a false positive, uniform in angle and distance, with probability z_false.
+        Without ``correspondence``, every wall that faces the sensor, with a part within range_max, yields a line with
+        probability p_detect. Walls hide nothing. With ``correspondence``, each listed wall yields a line. A line is a
+        false positive, uniform in angle and distance, with probability z_false.
 
         Args:
             poses: (N, 3) or (S, N, 3) robot poses in the world [m, m, rad].

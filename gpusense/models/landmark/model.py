@@ -53,7 +53,7 @@ class LandmarkModel(FeatureModel):
         negative: Whether landmarks in view without a feature add ``log(1 - p_detect)`` each; not with ``"sum"``.
         mount: The sensor's pose (x, y, yaw) on the robot [m, m, rad].
         temperature: In (0, 1]: multiplies the sum over features. 1 is the book's plain product.
-        specialize: False leaves nothing out, for the same numbers at lower speed.
+        specialize: False to run every part of the kernels, with the same results at lower speed.
 
     Raises:
         TypeError: An argument is of the wrong kind.
@@ -140,10 +140,10 @@ class LandmarkModel(FeatureModel):
     ) -> np.ndarray:
         """Draw features from p(f | x, m) at each pose, on the host in float64; see ``BeamModel.sample``.
 
-        Unless ``correspondence`` is passed, each landmark within range_max and the field of view is detected with
-        probability p_detect. With it, each landmark in it gives a feature for certain. A feature is a false positive,
-        uniform within the sensor's limits, with probability z_false. Given their correspondence, features have the
-        density of ``log_likelihood``.
+        Without ``correspondence``, each landmark within range_max and the field of view is detected with probability
+        p_detect. With it, each listed landmark yields a feature. A feature is a false positive, uniform within the
+        sensor's limits, with probability z_false. Given their correspondence, features have the density of
+        ``log_likelihood``.
 
         Args:
             poses: (N, 3) or (S, N, 3) robot poses in the world [m, m, rad].

@@ -34,8 +34,8 @@ _WIDEST_SUM = 1.5
 class PositionModel(PointModel):
     """log p(z | x) of a position fix, as of a satellite receiver.
 
-    ``z_hit N(z; antenna, covariance) + z_rand / area`` for a fix within the region; outside it the second part is
-    missing.
+    The density is ``z_hit N(z; antenna, covariance) + z_rand / area`` within the region, and only the first part
+    outside.
 
     Args:
         parameters: Covariance, weights, region and the antenna's mount.
@@ -199,7 +199,8 @@ class PositionModel(PointModel):
 class HeadingModel(PointModel):
     """log p(z | x) of a heading, as of a compass.
 
-    ``z_hit p_hit(z - theta - offset) + z_rand / (2 pi)`` with a wrapped normal or a von Mises density p_hit.
+    The density is ``z_hit p_hit(z - theta - offset) + z_rand / (2 pi)``; p_hit is a wrapped normal or von Mises
+    density.
 
     Args:
         parameters: Kind, deviation or concentration, weights and offset.

@@ -48,7 +48,7 @@ class BeamModel(ScanModel):
             range_max, with one look-up per beam, max readings included.
         incidence: Parameters by angle of incidence, in place of ``parameters``; see ``RayCaster.incidence`` for the
             angle. A beam without a hit has ``no_surface``, or the parameters of the first bin. If ``z_max`` differs
-            between bins, max readings depend on the pose, and are impossible where it is 0. Needs an exact caster.
+            between bins, max readings depend on the pose, and are impossible where it is 0. Requires an exact caster.
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
         caster: The method for expected ranges: ``"exact"`` (the default), another name of ``RayCaster.methods()``, or
@@ -57,12 +57,12 @@ class BeamModel(ScanModel):
             log p is tabulated, at least range_max / 8192, as racing particle filters do.
         unknown: Treatment of unknown cells: ``"free"`` (the default) or ``"occupied"``.
         outside: Treatment of space outside the grid: ``"free"`` (the default) or ``"occupied"``.
-        temperature: In (0, 1]: multiplies the sum over beams: the plain sum is overconfident because beams are not
-            independent. 1 is the book's plain product.
+        temperature: In (0, 1]: multiplies the sum over beams. The plain sum is overconfident, because beams are not
+            independent; 1 is the book's plain product.
         beams: None, the number of informative beams to use, evenly chosen, or the indices of the beams to use.
         compat: None; or ``"amcl"`` or ``"beluga"`` for the weights of these programs, with their defaults for
             parameters, caster, unknown and outside; or an object with their options, see ``gpusense.compat``.
-        specialize: False leaves nothing out, for the same numbers at lower speed.
+        specialize: False to run every part of the kernels, with the same results at lower speed.
 
     Raises:
         TypeError: An argument is of the wrong kind.

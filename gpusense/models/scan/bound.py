@@ -31,7 +31,7 @@ _INT = np.dtype(np.int32)
 
 
 class BoundCall(ABC):
-    """A call of ``log_likelihood`` with arrays that stay in place, as ``bind`` of a model returns.
+    """A call of ``log_likelihood`` on arrays that stay in place, made by ``bind`` of a model.
 
     Attributes:
         out: (N,) log-likelihoods, in the memory and of the library of the poses; every call writes them.

@@ -33,9 +33,9 @@ from gpusense.world.scanner import Scanner
 class LikelihoodFieldModel(ScanModel):
     """log p(z | x, m) of a scan by the distance of its end points to the nearest obstacle.
 
-    Each hit has the density ``z_hit N(d; 0, sigma_hit) + z_rand / range_max``; d is capped at ``max_distance``, also
-    its value outside the grid. Max readings add ``log z_max`` where z_max > 0 and are left out otherwise (book table
-    6.3).
+    Each hit has the density ``z_hit N(d; 0, sigma_hit) + z_rand / range_max``; d is capped at ``max_distance``, and
+    has this value outside the grid. Max readings add ``log z_max`` where z_max > 0 and are left out otherwise (book
+    table 6.3).
 
     Args:
         grid: The map.
@@ -49,7 +49,7 @@ class LikelihoodFieldModel(ScanModel):
         beams: None, the number of informative beams to use, evenly chosen, or the indices of the beams to use.
         compat: None; or ``"amcl"`` or ``"beluga"`` for the weights of these programs, with their default
             parameters; or their options, see ``gpusense.compat``.
-        specialize: False leaves nothing out, for the same numbers at lower speed.
+        specialize: False to run every part of the kernels, with the same results at lower speed.
 
     Raises:
         TypeError: An argument is of the wrong kind.
@@ -162,7 +162,7 @@ class LikelihoodFieldModel(ScanModel):
     def update_map(self, cells: ArrayLike, region: Sequence[int]) -> None:
         """Replace cells of the map; a model made with the changed grid would give the same results.
 
-        Only distances within ``max_distance`` of a changed obstacle are computed again.
+        Distances are recomputed only within ``max_distance`` of a changed obstacle.
 
         Args:
             cells: (h, w) integers as ``OccupancyGrid.cells``: occupancy in per cent, or -1 for unknown.

@@ -14,7 +14,7 @@ from gpusense.models.scan.request import make_request
 
 
 def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out: Any = None) -> list[Any]:
-    """Return log p(z | x, m) of several beam models and likelihood fields, as ``log_likelihood`` of each.
+    """Return log p(z | x, m) of several beam models and likelihood fields in one call.
 
     All models enqueue their launches, and the call waits for the device once. Models may differ in everything but the
     device: maps (of floors or robots), scanners, parameters, precision. A model may occur several times.
@@ -24,7 +24,7 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
         poses: As for ``log_likelihood``, (N, 3) or (S, N, 3): one array for all models, or a list or tuple with an
             array per model.
         ranges: (K,) or (S, K) readings: one array for all models, or a list or tuple with an array per model.
-        out: None, or a list or tuple of an array for each model's result, or None, as in ``log_likelihood``.
+        out: None, or a list or tuple with an array or None for each model's result, as in ``log_likelihood``.
 
     Returns:
         A list of the results of ``log_likelihood`` of each model, with the same bits: (N,) or (S, N).

@@ -41,9 +41,11 @@ MODEL, PARAMETERS, ALPHA = "field", (0.5, 0.05, 0.05, 0.5, 0.2, 0.1, 2.0), DEFAU
 CASES = ("as recorded", "carried away")
 # Least scans of a loss; scans until it must be found, and after its end until the verdict must recover.
 LEAST, LATE, FAR, FAR_TURN = 5, 20, 1.0, 0.5
+# Errors of poses that are certainly right [m, rad].
+NEAR, NEAR_TURN = 0.3, 0.15
 COLUMNS = (
     "program", "case", "runs", "scans", "losses", "found", "missed", "median delay [scans]", "false stretches",
-    "said lost of right scans [%]", "not said tracking of wrong scans [%]", "place within 1 m",
+    "right scans", "said lost [%]", "scans within 0.3 m", "said lost [%]", "not said tracking of wrong scans [%]", "place within 1 m",
 )  # fmt: skip
 
 
@@ -94,6 +96,7 @@ def one_run(recording, models, weigher, chosen, case, args, rng):
     off = np.array([recordings.errors(pose, event.truth) for pose, event in zip(poses, events, strict=True)])
     wrong = (off[:, 0] > FAR) | (off[:, 1] > FAR_TURN)
     losses, delays, false = rate(found, wrong)
+    near = (off[:, 0] < NEAR) & (off[:, 1] < NEAR_TURN)
     lost, sure = (np.array([one == word for one in found.verdicts]) for word in ("lost", "tracking"))
     places = []
     for stretch in found.stretches:
@@ -102,7 +105,8 @@ def one_run(recording, models, weigher, chosen, case, args, rng):
             places.append(bool(np.hypot(*(stretch.place.pose - events[row].truth)[:2]) < FAR))
     return dict(
         log=recording.name, case=case, scans=len(events), losses=len(losses), delays=delays, false=false,
-        right=int((~wrong).sum()), right_lost=int((lost & ~wrong).sum()), wrong=int(wrong.sum()),
+        right=int((~wrong).sum()), right_lost=int((lost & ~wrong).sum()), near=int(near.sum()), near_lost=int((lost & near).sum()),
+        wrong=int(wrong.sum()),
         wrong_doubted=int((~sure & wrong).sum()), places=places,
     )  # fmt: skip
 
@@ -111,13 +115,14 @@ def row_of(name, case, chosen):
     """Return a row of the table."""
     delays = [delay for one in chosen for delay in one["delays"]]
     found = [delay for delay in delays if delay is not None]
-    total = {key: sum(one[key] for one in chosen) for key in ("scans", "false", "right", "right_lost", "wrong",
+    total = {key: sum(one[key] for one in chosen) for key in ("scans", "false", "right", "right_lost", "near", "near_lost", "wrong",
                                                               "wrong_doubted")}  # fmt: skip
     places = [place for one in chosen for place in one["places"]]
     return (
         name, case, len(chosen), total["scans"], len(delays), len(found), len(delays) - len(found),
         f"{np.median(found):g}" if found else "-", total["false"],
-        f"{100 * total['right_lost'] / max(total['right'], 1):.2f}",
+        total["right"], f"{100 * total['right_lost'] / max(total['right'], 1):.2f}",
+        total["near"], f"{100 * total['near_lost'] / max(total['near'], 1):.2f}",
         f"{100 * total['wrong_doubted'] / total['wrong']:.1f}" if total["wrong"] else "-",
         f"{sum(places)} of {len(places)}",
     )  # fmt: skip
@@ -195,7 +200,7 @@ def main() -> None:
     parser = make_parser(__doc__, backend="opencl", seed=False)
     parser.add_argument("--times", action="store_true", help="measure the time of the command instead")
     parser.add_argument("--logs", nargs="+", default=list(LOGS), choices=LOGS)
-    parser.add_argument("--particles", type=int, default=1000)
+    parser.add_argument("--particles", type=int, default=2000)
     parser.add_argument("--beams", type=int, default=60, help="beams that the programs use")
     parser.add_argument("--scans", type=int, default=120, help="scans of a run")
     parser.add_argument("--repeats", type=int, default=1, help="runs of each case, or of the command")

@@ -45,7 +45,8 @@ LEAST, LATE, FAR, FAR_TURN = 5, 20, 1.0, 0.5
 NEAR, NEAR_TURN = 0.3, 0.15
 COLUMNS = (
     "program", "case", "runs", "scans", "losses", "found", "missed", "median delay [scans]", "false stretches",
-    "right scans", "said lost [%]", "scans within 0.3 m", "said lost [%]", "not said tracking of wrong scans [%]", "place within 1 m",
+    "right scans", "said lost [%]", "scans within 0.3 m", "said lost [%]",
+    "not said tracking of wrong scans [%]", "place within 1 m",
 )  # fmt: skip
 
 
@@ -105,7 +106,8 @@ def one_run(recording, models, weigher, chosen, case, args, rng):
             places.append(bool(np.hypot(*(stretch.place.pose - events[row].truth)[:2]) < FAR))
     return dict(
         log=recording.name, case=case, scans=len(events), losses=len(losses), delays=delays, false=false,
-        right=int((~wrong).sum()), right_lost=int((lost & ~wrong).sum()), near=int(near.sum()), near_lost=int((lost & near).sum()),
+        right=int((~wrong).sum()), right_lost=int((lost & ~wrong).sum()),
+        near=int(near.sum()), near_lost=int((lost & near).sum()),
         wrong=int(wrong.sum()),
         wrong_doubted=int((~sure & wrong).sum()), places=places,
     )  # fmt: skip
@@ -115,8 +117,8 @@ def row_of(name, case, chosen):
     """Return a row of the table."""
     delays = [delay for one in chosen for delay in one["delays"]]
     found = [delay for delay in delays if delay is not None]
-    total = {key: sum(one[key] for one in chosen) for key in ("scans", "false", "right", "right_lost", "near", "near_lost", "wrong",
-                                                              "wrong_doubted")}  # fmt: skip
+    keys = ("scans", "false", "right", "right_lost", "near", "near_lost", "wrong", "wrong_doubted")
+    total = {key: sum(one[key] for one in chosen) for key in keys}
     places = [place for one in chosen for place in one["places"]]
     return (
         name, case, len(chosen), total["scans"], len(delays), len(found), len(delays) - len(found),

@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
         with progress(len(posed.scans)) as step:
             for one in posed.scans:
                 step(f"scan {one.index}")
-                judge.add(one.index, one.scan, one.pose, one.covariance)
+                judge.add(one.index, one.scan, one.pose, one.covariance, one.odometry)
     except KeyboardInterrupt:
         if judge.count:
             report(args, grid, judge.result(len(steps)), posed, truth)

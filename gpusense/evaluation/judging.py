@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +18,11 @@ from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.diagnosis import Diagnosis
 from gpusense.localization.monitor import PoseMonitor
 from gpusense.localization.protection import check_risk
+from gpusense.localization.run_causes import diagnose_run
+from gpusense.localization.scan_motion import Moment
 from gpusense.localization.spread import FAR
 from gpusense.localization.words import WORDS, Word
-from gpusense.logs import Scan
+from gpusense.logs import Pose, Scan
 from gpusense.matching.locate import locate_scan
 from gpusense.matching.location import Location
 from gpusense.models.scan.field import LikelihoodFieldModel
@@ -32,6 +33,12 @@ from gpusense.world.scanner import Scanner
 Floats = NDArray[np.float64]
 # A stretch ends where no pose is judged for this time [s], and for this multiple of the median time between them.
 _GAP, _GAP_STEPS = 2.0, 5.0
+# Lost stretches, the longest ones, whose scans are searched in sequence for the cause.
+_DIAGNOSED = 3
+# Largest difference between copies of a position [m].
+_SAME = 1e-3
+# Evidence of the beams of a scan in a diagnosis.
+_BEAMS = ("agree", "through", "short", "place", "inside", "off")
 # Steps of the search for the place of a scan [m, rad].
 _RESOLUTION, _ANGLE = 0.1, math.radians(3)
 
@@ -156,59 +163,87 @@ class TrajectoryJudge:
         self._risk = check_risk(risk)
         self._monitor = PoseMonitor(each)
         self._locators: dict[Scanner, LikelihoodFieldModel] = {}
-        self._judged: list[tuple[int, Scan, Floats, Any]] = []
+        self._judged: list[tuple[int, Scan, Moment, tuple[float, Word, float, float]]] = []
 
     @property
     def count(self) -> int:
         """Number of judged poses."""
         return len(self._judged)
 
-    def add(self, index: int, scan: Scan, pose: AnyArray, covariance: AnyArray | None = None) -> Word:
-        """Judge the pose (3,) of a scan; return the verdict."""
+    def add(
+        self, index: int, scan: Scan, pose: AnyArray, covariance: AnyArray | None = None, odometry: Pose | None = None
+    ) -> Word:
+        """Judge the pose (3,) of a scan; return the verdict. The odometry of the scan is the default."""
         model = self._models.get(scan.scanner)
         if model is None:
             raise ValueError(f"scans: every scanner must have a model, got none for that of scan {index}")
         verdict = self._monitor.update(pose, {model: scan.ranges}, covariance)
         radius = verdict.protection_level(self._risk)
         place = np.array(pose, np.float64)
-        self._judged.append((index, scan, place, (verdict.p_lost, verdict.verdict, verdict.explained, radius)))
+        sensor = list(self._models).index(scan.scanner)
+        moment = Moment(scan.ranges, place, odometry or scan.odometry, scan.time, sensor)
+        self._judged.append((index, scan, moment, (verdict.p_lost, verdict.verdict, verdict.explained, radius)))
         return verdict.verdict
 
     def result(self, scans: int) -> Judgement:
         """Return the judgement of the poses so far, of ``scans`` scans."""
         index, times = [one[0] for one in self._judged], np.array([one[1].time for one in self._judged])
-        poses = np.array([one[2] for one in self._judged]).reshape(-1, 3)
+        poses = np.array([one[2].pose for one in self._judged]).reshape(-1, 3)
         p_lost, verdicts, explained, radii = zip(*(one[3] for one in self._judged), strict=True)
         columns = [np.array(column, np.float64) for column in (p_lost, explained, radii)]
         stretches = stretches_of(times, poses, verdicts, *columns)
-        explained_stretches = tuple(one if one.verdict == "tracking" else self._explained(one) for one in stretches)
+        lost = sorted((one for one in stretches if one.verdict == "lost"), key=lambda one: one.first - one.last)
+        searched = {one.first for one in lost[:_DIAGNOSED]}
+        explained_stretches = tuple(
+            one if one.verdict == "tracking" else self._explained(one, of_run=one.first in searched)
+            for one in stretches
+        )
         return Judgement(
             scans, np.array(index, np.int64), times, poses, columns[0], tuple(verdicts), columns[1], columns[2],
             self._risk, explained_stretches,
         )  # fmt: skip
 
-    def _explained(self, stretch: Stretch) -> Stretch:
-        """Return a stretch with its likely cause, and where the robot more likely was if it is lost."""
+    def _explained(self, stretch: Stretch, *, of_run: bool) -> Stretch:
+        """Return a stretch with its likely cause, and where the robot more likely was if it is lost.
+
+        Args:
+            stretch: A stretch that is not tracking.
+            of_run: Whether the scans of the stretch are searched for its cause in sequence, which takes seconds.
+        """
         count = min(self._searches, stretch.last - stretch.first + 1)
         if not count:
             return stretch
         rows = np.unique(np.linspace(stretch.first, stretch.last, count).round().astype(int))
         found: list[Stretch] = []
         for row in rows:
-            _, scan, pose, _ = self._judged[row]
+            _, scan, moment, _ = self._judged[row]
             place = self._locate(scan) if stretch.verdict == "lost" else None
-            found.append(replace(stretch, pose=pose, place=place, diagnosis=self._diagnose(scan, pose)))
-        causes = [one.diagnosis.cause for one in found if one.diagnosis is not None]
-        usual = max(causes, key=causes.count)
-        # The search that is surest tells the place; the diagnosis there may have another cause than most.
+            found.append(replace(stretch, pose=moment.pose, place=place, diagnosis=self._diagnose(scan, moment.pose)))
+        # The surest search decides.
         best = max(found, key=lambda one: -1.0 if one.place is None else one.place.p_right)
+        assert best.diagnosis is not None
+        if of_run and len(rows) > 1:
+            run = self._diagnose_run(stretch)
+            if run.cause not in ("none", "unknown"):
+                # The last scans of a stretch may be right again: show the beams of the searched scan.
+                beams = {name: getattr(best.diagnosis, name) for name in _BEAMS}
+                return replace(best, diagnosis=replace(run, **beams))
         if best.place is not None and best.place.found and best.off > FAR:
             x, y, theta = best.place.pose.tolist()
-            assert best.diagnosis is not None
             return replace(best, diagnosis=replace(best.diagnosis, elsewhere=(x, y, theta), cause="start"))
-        if best.diagnosis is not None and best.diagnosis.cause != usual:
-            best = replace(best, diagnosis=next(d for d in (one.diagnosis for one in found) if d and d.cause == usual))
-        return best
+        diagnoses = [one.diagnosis for one in found if one.diagnosis is not None]
+        causes = [one.cause for one in diagnoses]
+        usual = max(causes, key=causes.count)
+        return replace(best, diagnosis=next(one for one in diagnoses if one.cause == usual))
+
+    def _diagnose_run(self, stretch: Stretch) -> Diagnosis:
+        """Return the likely cause by the scans of a stretch in sequence."""
+        moments = [one[2] for one in self._judged[stretch.first : stretch.last + 1]]
+        odometry, poses = (np.array([getattr(one, name) for one in moments]) for name in ("odometry", "pose"))
+        # A log without odometry has the same pose throughout; a topic with the judged poses is no odometry.
+        if not np.ptp(odometry, axis=0).any() or np.abs((odometry - poses)[:, :2]).max() < _SAME:
+            moments = [one._replace(odometry=None) for one in moments]
+        return diagnose_run(list(self._models.values()), moments)
 
     def _diagnose(self, scan: Scan, pose: Floats) -> Diagnosis:
         model = self._models[scan.scanner]

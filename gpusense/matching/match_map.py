@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util import checks
 from gpusense._util.angles import wrapped
 from gpusense._util.html import card
-from gpusense.backends import Selection, get_backend
+from gpusense.backends import Backend, Selection, get_backend
 from gpusense.matching.align import Alignment
 from gpusense.matching.score_tables import TOP, ScoreTables, field_scores
 from gpusense.matching.search import Found, PoseGrid, Search
@@ -140,11 +141,37 @@ def match_map(
     device = get_backend(backend)
     local = _Local(local_grid, grid.resolution)
     searched = _whole(grid, turn, local_grid.origin[2]) if guess is None else _around(grid, local, guess, window, turn)
-    levels = min(_LEVELS, int(math.log2(max(min(searched.height, searched.width) / 4, 1))))
-    search = Search(ScoreTables(device, _scores(grid, backend=backend), levels=levels))
     slack = math.ceil(_DEPTH * TOP * len(local.points))
-    found = search.find([local.points], searched, slack=slack, images=[local.images])
+    with _LOCK:
+        search = _search_of(grid, device)
+        levels = min(search.tables.levels, _levels_of(searched.height, searched.width))
+        # None lets the search choose, which has all levels.
+        level = None if levels == search.tables.levels else levels
+        found = search.find([local.points], searched, slack=slack, level=level, images=[local.images])
     return _result(local_grid, local, grid, searched, found, least)
+
+
+_LOCK = threading.Lock()
+# Searches in the last global maps; each keeps its map alive, so that no later map has the same id.
+_KEPT: dict[tuple[int, int], tuple[OccupancyGrid, Search]] = {}
+_MOST_KEPT = 2
+
+
+def _levels_of(height: int, width: int) -> int:
+    """Return the levels of branch and bound over positions."""
+    return min(_LEVELS, int(math.log2(max(min(height, width) / 4, 1))))
+
+
+def _search_of(grid: OccupancyGrid, device: Backend) -> Search:
+    """Return the search in a global map; tables of the last maps are kept."""
+    key = id(grid), id(device)
+    kept = _KEPT.pop(key, None)
+    if kept is None:
+        kept = grid, Search(ScoreTables(device, _scores(grid, backend=device), levels=_levels_of(*grid.shape)))
+    _KEPT[key] = kept
+    while len(_KEPT) > _MOST_KEPT:
+        del _KEPT[next(iter(_KEPT))]
+    return kept[1]
 
 
 class _Local:
@@ -176,7 +203,7 @@ def _thinned(index: np.ndarray, most: int) -> np.ndarray:
     return index if len(index) <= most else index[np.arange(most) * len(index) // most]
 
 
-def _scores(grid: OccupancyGrid, *, backend: Selection) -> np.ndarray:
+def _scores(grid: OccupancyGrid, *, backend: Backend) -> np.ndarray:
     """Return (2, H, W) scores of occupied and of free cells of a local map in the global one."""
     field = field_scores(distance_transform(grid.occupied, backend=backend), _SIGMA, _CAP)
     free = np.where(grid.free, TOP, np.where(grid.occupied, 0, TOP // 2)).astype(np.uint8)

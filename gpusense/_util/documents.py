@@ -1,9 +1,8 @@
-"""Read YAML and JSON documents within bounds, without executing their contents."""
+"""Read YAML documents within bounds, without executing their contents."""
 
 from __future__ import annotations
 
 import functools
-import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 
 from gpusense._util import checks
 
-_LARGEST_YAML_BYTES, _LARGEST_JSON_BYTES = 1 << 20, 1 << 28
+_LARGEST_YAML_BYTES = 1 << 20
 DEEPEST = 100
 """Largest depth of nested lists and mappings."""
 MOST_REPEATED = 100_000
@@ -153,21 +152,6 @@ def _problem(error: Exception) -> str:
         if text := getattr(error, name, None):
             return " ".join(str(text).split())
     return str(error) if type(error) is ValueError and str(error) else type(error).__name__
-
-
-def read_json(file: Path, kind: str) -> Any:
-    """Read a JSON file.
-
-    Args:
-        file: The file.
-        kind: Description of the file for messages, with an article, such as ``"a report of gpusense bench"``.
-    """
-    text = _bounded(checks.existing_file(file), _LARGEST_JSON_BYTES, kind)
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        problem = error if isinstance(error, json.JSONDecodeError) else type(error).__name__
-        raise ValueError(f"{file}: must be {kind}, got no JSON ({problem})") from None
 
 
 def _bounded(file: Path, most: int, kind: str) -> bytes:

@@ -96,11 +96,6 @@ def end_places(points: np.ndarray, headings: np.ndarray, start: np.ndarray) -> n
     return np.stack([start[0] + (cos * x - sin * y), start[1] + (sin * x + cos * y)], axis=-1)
 
 
-def end_cells(points: np.ndarray, headings: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return (A, K, 2) int32 columns and rows of the end points; see :func:`end_places`."""
-    return np.floor(end_places(points, headings, start)).astype(np.int32)
-
-
 def distinct_poses(poses: np.ndarray, count: int, radius: float, angle: float, first: int = 0) -> list[int]:
     """Return the indices of the best pose, and of poses that are far from all better ones.
 

@@ -1,8 +1,8 @@
 """Confusion table of the likely cause: simulated runs with one cause each.
 
 A filter at its defaults tracks each run from the true start, with a map, a laser and an odometry that have the cause.
-Without its recovery it follows the runs in which the robot is carried away, so that it stays lost. Poses among people,
-and on a map that was moved since, are the true ones with an error of a few centimetres, as of another localiser.
+In runs in which the robot is carried away the filter has no recovery, so that it stays lost. Poses among people, and on
+a map that was moved since, are true poses with an error of a few centimetres, like those of another localiser.
 
     python bench/studies/causes.py --runs 20 --output causes
 """

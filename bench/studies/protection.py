@@ -2,8 +2,9 @@
 
 The factor that widens the spread is chosen on the logs ``verdict_runs.TUNING``, and the table shows the logs of
 ``HELD_OUT`` and simulated buildings, on which it was not chosen. Whole logs are tracked; other runs are carried away
-once. Scans of a run are dependent, so limits of shares are those of a bootstrap that draws blocks of scans, and of
-Clopper and Pearson for the number of blocks. A shard writes its runs to a file; ``--join`` makes the page of all.
+once. Scans of a run are dependent, so a limit of a share comes from a bootstrap that draws blocks of scans, or from the
+interval of Clopper and Pearson for the number of blocks if that is larger. A shard writes its runs to a file;
+``--join`` makes the page of all.
 
     python bench/studies/protection.py --shard 1/2 --seeds 2 --raw shard_1.npz
     python bench/studies/protection.py --join shard_*.npz --output protection

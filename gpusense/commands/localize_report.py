@@ -82,7 +82,7 @@ def report(
 
 def _diagnosis(pf: ParticleFilter, track: Track, *, tracking: bool) -> Diagnosis | None:
     """Return the evidence of a run; for a run that tracks, only if its odometry, mount or times are wrong."""
-    from gpusense.localization.run_causes import diagnose_run
+    from gpusense.localization.run_causes import CAUSES_OF_RUNS, diagnose_run
     from gpusense.localization.scan_motion import Moment
 
     moments = [
@@ -91,7 +91,7 @@ def _diagnosis(pf: ParticleFilter, track: Track, *, tracking: bool) -> Diagnosis
     ]
     found = diagnose_run(pf.models, moments, search=not tracking)
     if tracking:
-        return found if found.cause in ("odometry", "mount", "time") else None
+        return found if found.cause in CAUSES_OF_RUNS else None
     # The last scan alone may show more: people, a far turned mount.
     return pf.diagnose() if found.cause in ("none", "unknown") else found
 

@@ -55,8 +55,8 @@ class Diagnosis:
             it) and "time" (the scans fit the odometry of another time).
         motion: How the motion between the scans of a run compares with the odometry, in words.
         moved: (x, y, theta) displacement of the places on the map from the poses, at their centre; None without one.
-        scale: True lengths by those of the map; 1 if they agree.
-        delay: Time by which the odometry that fits a scan is later than the scan [s]; 0 if the times agree.
+        scale: Ratio of true lengths to lengths on the map; 1 if they agree.
+        delay: Time of the fitting odometry less the time of the scan [s]; 0 if they agree.
 
     Example:
         >>> import gpusense as gs

@@ -135,8 +135,16 @@ class RivalSearch:
                 return self.likely(sensor, float64_readings(on_host, scanner))
         return np.empty((0, 3))
 
-    def likely(self, sensor: Sensor, ranges: np.ndarray) -> np.ndarray:
-        """Return the likeliest poses (M, 3) of a scan (K,) on the whole map, by all beams and by the longer half."""
+    def likely(self, sensor: Sensor, ranges: np.ndarray, *, quick: bool = False) -> np.ndarray:
+        """Return the likeliest poses (M, 3) of a scan (K,) on the whole map, by all beams and by the longer half.
+
+        Args:
+            sensor: The sensor of the scan.
+            ranges: (K,) readings [m].
+            quick: Whether to search by all beams alone.
+        """
+        if quick:
+            return likely_poses(self.field_of(sensor), ranges, _CANDIDATES)
         scanner = sensor.model.scanner
         returned = classify_ranges(ranges, scanner.range_min, scanner.range_max)[0]
         longer = np.where(ranges < np.median(ranges[returned]), np.nan, ranges) if returned.any() else ranges

@@ -2,8 +2,9 @@
 
 Evidence is of three kinds. The motion between scans contradicts the odometry, or not
 (:mod:`gpusense.localization.scan_motion`). A few scans in a row, with their relative poses by matching, fit somewhere
-on the map: as they are; as a laser upside down would see it; or with another scale of the map. And their places agree
-with the judged poses, or are all moved from them in the same way. :func:`likely_cause` decides by this evidence alone.
+on the map: unchanged, in the order of a laser that is upside down, or with another scale of the map. And their places
+agree with the judged poses, or are all moved from them in the same way. :func:`likely_cause` decides by this evidence
+alone.
 """
 
 from __future__ import annotations
@@ -30,17 +31,20 @@ from gpusense.world.scanner import float64_readings
 
 Floats = NDArray[np.float64]
 
+CAUSES_OF_RUNS = ("odometry", "time", "mount", "scale", "moved")
+"""Causes that one scan does not show."""
+
 # Windows whose places are searched; candidates that all scans weigh, and that are refined; poses around each.
 _PLACES, _WEIGHED, _REFINED, _AROUND, _REACH = 5, 20, 5, 64, (0.1, 0.1, 0.05)
-# Scans of a window that are searched at each scale.
-_QUICK = 3
+# Scans of a window that are searched at each scale, and their candidates.
+_QUICK, _FEWER = 3, (8, 2)
 # Least shares of the beams of a window that agree at its place: of beams that meet walls, and of all informative ones.
 _AGREE, _AGREE_OF_ALL = 0.92, 0.5
 # Scales of the map that are tried.
-_SCALES = tuple(float(scale) for scale in (0.5, *np.geomspace(1 / 1.4, 1.4, 24), 2.0))
+_SCALES = tuple(float(scale) for scale in (0.5, *np.geomspace(1 / 1.4, 1.4, 18), 2.0))
 # Least share of windows that fit where a hypothesis holds, and where it holds throughout; largest where it does not.
 _MOST, _ALMOST_ALL, _FEW = 0.6, 0.75, 0.4
-# Share of short beams above which people or furniture are meant; drift of the odometry, as a share of its way [rad/m].
+# Least share of short beams that names people or furniture; drift of the odometry, as a share of its way [rad/m].
 _CROWD, _DRIFT = 0.2, 0.1
 # Largest distance between a place and the judged pose that agree [m, rad], and between common displacements.
 _SAME, _SAME_TURN = 0.5, 0.2
@@ -70,14 +74,14 @@ class RunEvidence(NamedTuple):
         motion: Agreement of the scans' motion with the odometry.
         windows: Number of windows that were judged.
         at_poses: Share of them that fit at the judged poses.
-        at_last: Whether the last window does.
+        at_last: True if the last window fits there.
         short: Share of the beams of windows that end in free space, among those that fit.
         as_is: Share of windows that fit somewhere on the map.
         mirrored: Share that fits somewhere as a laser upside down sees it.
         scaled: Share that fits somewhere on a map of another scale.
-        scale: That scale: true lengths by those of the map.
+        scale: This scale: the ratio of true lengths to lengths on the map.
         moved: Common displacement of the places from the judged poses, in the map; None without one.
-        last: Place of the last window, if it fits as it is.
+        last: Place of the last window, if it fits.
     """
 
     motion: ScanMotion
@@ -99,13 +103,13 @@ def diagnose_run(models: Any, moments: Sequence[Moment], *, search: bool = True)
     Args:
         models: The model of the scans, or several of one device.
         moments: Scans with the judged poses, and with odometry and times where they are known, in order of time.
-        search: Whether to search places on the map; otherwise the odometry alone is judged, and a map is not blamed.
+        search: True to search places on the map; False to judge the odometry alone.
     """
     sensors = sensors_of(models)
     scanning = [one for one in moments if sensors[one.sensor].calibrates]
     if not scanning:
         return Diagnosis(0, 0, 0)
-    # The laser of most scans stands for all.
+    # Only the laser with the most scans is used.
     numbers = [one.sensor for one in scanning]
     index = max(set(numbers), key=lambda number: (numbers.count(number), -number))
     chosen = [one for one in scanning if one.sensor == index]
@@ -202,8 +206,7 @@ class _Places:
         if known.as_is >= _MOST and not motion.mirrored:
             return known
         steady = steady or motion.mirrored
-        flipped = [self.place(window, mirrored=True) for window in windows]
-        known = known._replace(mirrored=float(self._consistent(windows, flipped, steady=steady).mean()))
+        known = known._replace(mirrored=self._share(windows, steady=steady, mirrored=True))
         if max(known.as_is, known.mirrored) >= _MOST:
             return known
         scaled, scale = self._scale(windows, steady=steady)
@@ -221,13 +224,13 @@ class _Places:
     def _consistent(
         self, windows: list[Window], places: list[Place], *, steady: bool, scale: float = 1.0
     ) -> NDArray[np.bool_]:
-        """Return which places fit, and have another one that fits at the distance of the odometry.
+        """Return which places fit together with a second place at the distance of the odometry.
 
         Args:
             windows: The windows.
             places: Their places.
-            steady: Whether the odometry is right; without it every place that fits counts.
-            scale: True lengths by those of the map.
+            steady: True if the odometry is right; False to count every place that fits.
+            scale: Ratio of true lengths to lengths on the map.
         """
         fits = np.array([one.fits for one in places])
         odometry = [self._moments[window.moments[0]].odometry for window in windows]
@@ -246,14 +249,25 @@ class _Places:
         """Return the share of windows that fit with the best scale of the map, and this scale."""
         tried = windows[len(windows) // 2]
         places = [self.place(tried, scale=scale, quick=True) for scale in _SCALES]
-        scale = _SCALES[max(range(len(_SCALES)), key=lambda k: (places[k].fits, places[k].share))]
-        found = [self.place(window, scale=scale) for window in windows]
-        return float(self._consistent(windows, found, steady=steady, scale=scale).mean()), scale
+        best = max(range(len(_SCALES)), key=lambda k: (places[k].fits, places[k].share))
+        if not places[best].fits:
+            return 0.0, 1.0
+        scale = _SCALES[best]
+        return self._share(windows, steady=steady, scale=scale), scale
+
+    def _share(self, windows: list[Window], *, steady: bool, mirrored: bool = False, scale: float = 1.0) -> float:
+        """Return the share of windows that fit with a hypothesis; the search ends where it cannot hold any more."""
+        found: list[Place] = []
+        for window in windows:
+            found.append(self.place(window, mirrored=mirrored, scale=scale))
+            if sum(not one.fits for one in found) > (1 - _MOST) * len(windows):
+                return sum(one.fits for one in found) / len(windows)
+        return float(self._consistent(windows, found, steady=steady, scale=scale).mean())
 
     def _displacement(
         self, windows: list[Window], places: list[Place], fits: NDArray[np.bool_]
     ) -> tuple[float, float, float] | None:
-        """Return the motion of the map by which all places that fit come from the judged poses; None without one."""
+        """Return the common motion from the judged poses to the places that fit; None without one."""
         if fits.sum() < 3 or not fits[0]:
             return None
         before = np.array([self._pose(window) for window in windows])[fits]
@@ -281,7 +295,7 @@ class _Places:
         Args:
             window: The window.
             mirrored: Whether to take the laser as upside down.
-            scale: True lengths by those of the map.
+            scale: Ratio of true lengths to lengths on the map.
             quick: Whether to search a few scans of it, for few candidates.
         """
         scans, relative = self._seen(window, mirrored, scale)
@@ -292,10 +306,11 @@ class _Places:
         poses = np.vstack([
             compose_poses(found, invert_poses(relative[k]))
             for k in ends
-            if len(found := self._search.likely(self._sensor, scans[k]))
+            if len(found := self._search.likely(self._sensor, scans[k], quick=quick))
         ] or [np.empty((0, 3))])  # fmt: skip
         # Among people a field prefers places with many walls, so beams through walls count first.
-        for number, count in ((1, _WEIGHED), (len(scans), 2 if quick else _REFINED)):
+        weighed, refined = _FEWER if quick else (_WEIGHED, _REFINED)
+        for number, count in ((1, weighed), (len(scans), refined)):
             ratios = np.array([self._ratio(scans[:number], relative, pose) for pose in poses])
             poses = poses[np.argsort(ratios, kind="stable")[:count]]
         if not len(poses):

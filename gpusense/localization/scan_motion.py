@@ -26,12 +26,16 @@ Floats = NDArray[np.float64]
 # Most windows, and scans of one. Scans of a window are this far apart [m, rad], or that many scans.
 WINDOWS, LENGTH = 16, 6
 _WAY, _TURN, _MOST_SKIPPED = 0.15, 0.15, 5
+# Motion up to which odometry and pose stand [m, rad].
+_REST = 0.01
 # Deviations of the odometry [m, rad]: constant, share of a motion, turn by a metre, and metres by a turn, which a laser
 # makes that is not where the mount has it.
 _CONSTANT, _PART, _TURN_OF_WAY, _LEVER = (0.02, 0.01), 0.2, 0.1, 0.15
 # Largest squared residual of a pair in the mean from which the odometry contradicts the scans, and that mean; largest
 # median residual of a hypothesis that explains them, its least gain [nats], and the least variance of its residuals.
 _LARGEST, _CONTRADICTS, _EXPLAINS, _GAIN, _LEAST_VARIANCE = 30.0, 4.0, 6.0, 25.0, 0.05
+# Squared residual of a pair that contradicts the odometry, and least share of such pairs if the odometry is wrong.
+_APART, _MANY = 9.0, 0.15
 # Squared residual of a pair that a hypothesis does not explain; largest share of such pairs that stays so, and largest
 # further share of all pairs, for other mounts and for other times, which a random odometry resembles.
 _FAR, _STAYS_FAR, _MOST_FAR = 16.0, 0.34, {"mount": 0.12, "time": 0.05}
@@ -88,8 +92,8 @@ class ScanMotion(NamedTuple):
         way: Median distance between the two motions [m].
         turn: Median turn between them [rad].
         turned: Turn of the mount that explains the odometry [rad].
-        mirrored: Whether a laser that is upside down explains it.
-        delay: Delay of the scans' times against the odometry that explains it [s], or in scans if times are unknown.
+        mirrored: True if a laser that is upside down explains it.
+        delay: Time of the fitting odometry less the time of its scan [s]; 0 if the times of scans are unknown.
     """
 
     pairs: int
@@ -179,7 +183,9 @@ def _windows(moments: Sequence[Moment]) -> list[list[int]]:
     kept, turns = [0] if moments else [], [0.0]
     for k in range(1, len(moments)):
         way, turn = _moved(moments[kept[-1]], moments[k])
-        if k - kept[-1] >= _MOST_SKIPPED or way >= _WAY or turn >= _TURN:
+        # The robot may move although an odometry and a pose that depends on it stand.
+        rests = way < _REST and turn < _REST
+        if rests or k - kept[-1] >= _MOST_SKIPPED or way >= _WAY or turn >= _TURN:
             kept.append(k)
             turns.append(turn)
     count = (len(kept) - 1) // (LENGTH - 1)
@@ -193,7 +199,7 @@ def _windows(moments: Sequence[Moment]) -> list[list[int]]:
 
 
 def _moved(before: Moment, after: Moment) -> tuple[float, float]:
-    """Return distance [m] and turn [rad] by which odometry or pose have moved, whichever is larger."""
+    """Return the larger distance [m] and the larger turn [rad] of odometry and pose."""
     motions = [motion_between(after.pose, before.pose)]
     if before.odometry is not None and after.odometry is not None:
         motions.append(motion_between(after.odometry, before.odometry))
@@ -219,9 +225,9 @@ class _Compared:
         odometry = np.array([np.asarray(one.odometry, np.float64) for one in moments])
         odometry[:, 2] = np.unwrap(odometry[:, 2])
         times = np.array([one.time for one in moments], np.float64)
-        known = np.isfinite(times).all() and (np.diff(times) > 0).all()
-        self.odometry, self.times = odometry, times if known else np.arange(len(moments), dtype=np.float64)
-        self.period = float(np.median(np.diff(self.times)))
+        known = bool(np.isfinite(times).all() and (np.diff(times) > 0).all())
+        self.odometry, self.times = odometry, times
+        self.period = float(np.median(np.diff(times))) if known else math.nan
         self.motion = pose_difference(odometry[first], odometry[second])
         # The smaller motion of both, so that a wrong odometry does not explain itself by its noise.
         way = np.minimum(np.hypot(*self.motion[:, :2].T), np.hypot(*found[:, :2].T))
@@ -255,17 +261,20 @@ def _judged(compared: _Compared, scanner: Scanner) -> ScanMotion:
     plain = compared.residuals(compared.motion)
     d = compared.found - compared.motion
     way, turn = float(np.median(np.hypot(*d[:, :2].T))), float(np.median(np.abs(wrap_angle(d[:, 2]))))
-    contradicts = np.minimum(plain, _LARGEST).mean() > _CONTRADICTS
+    # A robot that is carried, or an odometry that jumps once, contradicts in few pairs.
+    many = np.count_nonzero(plain > _APART) >= max(_LEAST_PAIRS, _MANY * len(plain))
+    contradicts = many and np.minimum(plain, _LARGEST).mean() > _CONTRADICTS
     seen = ScanMotion(0, len(d), [], "odometry" if contradicts else "none", way, turn)
     options: list[tuple[Floats, ScanMotion]] = []
     for motion, flipped in ((compared.motion, False), (mirrored_motion(compared.motion, scanner), True)):
         turned, residuals = _best(_TURNS, [compared.residuals(_turned(motion, scanner, one)) for one in _TURNS])
         if abs(turned) >= _LEAST_TURNED or flipped:
             options.append((residuals, seen._replace(cause="mount", turned=turned, mirrored=flipped)))
-    delays = compared.period * np.arange(-4 * _MOST_DELAY, 4 * _MOST_DELAY + 1) / 4
-    delay, residuals = _best(delays, [compared.residuals(compared.delayed(one)) for one in delays])
-    if abs(delay) >= _LEAST_DELAY * compared.period:
-        options.append((residuals, seen._replace(cause="time", delay=delay)))
+    if not math.isnan(compared.period):
+        delays = compared.period * np.arange(-4 * _MOST_DELAY, 4 * _MOST_DELAY + 1) / 4
+        delay, residuals = _best(delays, [compared.residuals(compared.delayed(one)) for one in delays])
+        if abs(delay) >= _LEAST_DELAY * compared.period:
+            options.append((residuals, seen._replace(cause="time", delay=delay)))
     gains = [_gain(plain, residuals, _MOST_FAR[option.cause]) for residuals, option in options]
     if not options or max(gains) < _GAIN:
         return seen
@@ -299,5 +308,5 @@ def _turned(motion: Floats, scanner: Scanner, angle: float) -> Floats:
 
 
 def _conjugate(motion: Floats, frame: Floats) -> Floats:
-    """Return motions (..., 3) as they are in a frame that moves with the robot."""
+    """Return motions (..., 3) of a frame that moves with the robot."""
     return compose_poses(invert_poses(frame), compose_poses(motion, frame))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -11,6 +12,8 @@ import numpy as np
 
 from gpusense.evaluation.tracking import RISK
 from gpusense.localization.nav2 import Nav2Options
+from gpusense.localization.run_causes import CAUSES_OF_RUNS, diagnose_run
+from gpusense.localization.scan_motion import Moment
 from gpusense.logs.records import Pose
 from gpusense.ros.conversions import host_array, laser_scan, map_to_odometry, moved_enough
 from gpusense.ros.diagnostics import ERROR, LEVELS, STALE, WARN, radius_text, status_fields
@@ -22,6 +25,8 @@ PLACES = 1440
 """Beams of the common scanner for varying beams."""
 # Time without a scan after which diagnostics are stale [s].
 _PATIENCE = 5.0
+# Scans that the likely cause is looked for in.
+_HISTORY = 150
 # Least difference of distinct bearings as a share of a step, and of distinct mounts [m, rad].
 _SAME, _SAME_MOUNT = 0.05, 1e-3
 # Standard deviations of a first pose, as in nav2_amcl [m, m, rad].
@@ -62,6 +67,7 @@ class Localizer:
         self.estimate: Any = None
         self.counted = 0
         self._cause = ""
+        self._history: deque[Moment] = deque(maxlen=_HISTORY)
         self._taken = clock()
         self.problem: str | None = None
         self._last: Pose | None = None
@@ -117,6 +123,7 @@ class Localizer:
     def start_again(self) -> None:
         """Repeat the last start: around a pose, or all over the map."""
         self._last = self.estimate = None
+        self._history.clear()
         if self.filter is not None:
             self._initialize()
 
@@ -147,6 +154,7 @@ class Localizer:
             self.filter.predict(np.array(self._last), np.array(odometry))
         self.filter.correct(ranges)
         self._last, self.estimate = odometry, self.filter.estimate()
+        self._history.append(Moment(ranges, self.estimate.pose, odometry, self._taken))
         self.counted, self._cause = self.counted + 1, ""
         return True
 
@@ -187,7 +195,8 @@ class Localizer:
         }  # fmt: skip
         # The search for a cause takes milliseconds: do it once per estimate.
         if found.verdict != "tracking" and not self._cause:
-            self._cause = self.filter.diagnose().text
+            run = diagnose_run(self.filter.models, self._history, search=False)
+            self._cause = (run if run.cause in CAUSES_OF_RUNS else self.filter.diagnose()).text
         text = ": ".join(filter(None, (found.verdict, self._cause)))
         return status_fields("filter", LEVELS[found.verdict], text, values, node)
 
@@ -214,6 +223,7 @@ class Localizer:
 
     def _make(self, scanner: Scanner | None) -> None:
         assert self.grid is not None and scanner is not None
+        self._history.clear()
         model = self.options.make_model(self.grid, scanner, backend=self.backend)
         before, self.filter = self.filter, self.options.make_filter(model, seed=self.seed)
         self._scanner = scanner

@@ -65,6 +65,7 @@ sphinx_gallery_conf = {
     "show_memory": False,
     "show_signature": False,
     "download_all_examples": False,
+    "thumbnail_size": (600, 420),
     "abort_on_example_error": True,
     "write_computation_times": False,
 }
@@ -72,6 +73,8 @@ sphinx_gallery_conf = {
 html_theme = "furo"
 html_title = f"gpusense {version}"
 html_extra_path = ["front"]
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 html_copy_source = False
 
 

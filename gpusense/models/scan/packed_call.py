@@ -37,6 +37,8 @@ _FLOATS = (np.dtype(np.float32), _DOUBLE)
 _Adoption: TypeAlias = tuple[
     tuple[np.dtype | None, np.dtype | None, np.dtype], tuple[Buffer | None, Buffer | None], tuple[Any, ...]
 ]
+# Poses and readings of the host.
+_HOST, _NO_BUFFERS = (False, False), (None, None)
 # Alignment of arrays that are copied as one [bytes], enough for every device.
 _ALIGNED = 1024
 # Number of sizes of short calls that are kept; ordinary calls of a size before the first short one; largest map that
@@ -175,6 +177,12 @@ class PackedCall:
         return self._device.explain()
 
 
+@functools.cache
+def _no_adoption(limits: np.dtype) -> _Adoption:
+    """Return the adoption of host arrays with readings of a type."""
+    return (None, None, limits), _NO_BUFFERS, ()
+
+
 class _There:
     """Arrays on the device that ordinary calls copy to the places of a recorded program, as each call has other arrays.
 
@@ -267,7 +275,7 @@ class PackedCallCache:
         kinds = self._kinds(poses, ranges)
         if kinds is None or not is_short(count, size) or not fits(count, size) or not self._takes(count, out, kinds):
             return None
-        there = self._adopted(poses, ranges, kinds)
+        there = _no_adoption(ranges.dtype) if kinds is _HOST else self._adopted(poses, ranges, kinds)
         if there is None or not self._repeats((count, *there[0])):
             return None
         corners = None if kinds[0] else self._corners(poses)
@@ -284,6 +292,8 @@ class PackedCallCache:
 
     def _kinds(self, poses: Any, ranges: Any) -> tuple[bool, bool] | None:
         """Return whether poses and readings are on the device; None for arrays that the ordinary call must read."""
+        if type(poses) is np.ndarray and type(ranges) is np.ndarray:
+            return _HOST if poses.dtype in _FLOATS and ranges.dtype in _FLOATS else None
         kinds = []
         for array in (poses, ranges):
             if type(array) is np.ndarray:
@@ -317,8 +327,12 @@ class PackedCallCache:
         """Score poses; None where one of them is not finite."""
         pipeline, backend = self._pipeline, self._pipeline.backend
         kinds, buffers, _ = there
-        result = Result(poses, out, (count,), pipeline.real, backend, on_device=kinds[0] is not None)
         kept = self._calls.get((count, *kinds))
+        if kept is not None and buffers == _NO_BUFFERS:
+            # Host arrays take the shortest path: each further call costs a hundredth of the launches.
+            written = np.empty(count, pipeline.real) if out is None else out
+            return self._delivered(kept[0], ranges, written) if kept[0].score(poses, ranges, written, corners) else None
+        result = Result(poses, out, (count,), pipeline.real, backend, on_device=kinds[0] is not None)
         if kept is None:
             places = _There(backend, count, pipeline.scanner.count, kinds[:2], pipeline.real)
             call = PackedCall(pipeline, self._lock, count, kinds[2], corners, **places.given)
@@ -329,10 +343,14 @@ class PackedCallCache:
         flat = None if kinds[0] is not None else result.flat
         if not call.score(host[0], host[1], flat, corners, functools.partial(places.deliver, result.flat)):
             return None
-        self.last = call
-        if pipeline.rules.first_scans.left:
-            pipeline.rules.first_scans.look_at("ranges", ranges[None], pipeline.rules.map_size)
-        return result.user_array()
+        return self._delivered(call, ranges, result.user_array())
+
+    def _delivered(self, call: PackedCall, ranges: Any, result: Any) -> Any:
+        """Note a call that has succeeded, and return its result."""
+        self.last, rules = call, self._pipeline.rules
+        if rules.first_scans.left:
+            rules.first_scans.look_at("ranges", ranges[None], rules.map_size)
+        return result
 
     def _takes(self, count: int, out: Any, kinds: tuple[bool, bool]) -> bool:
         """Return whether results can be written."""

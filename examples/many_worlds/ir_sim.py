@@ -1,10 +1,10 @@
-"""Cast the lidars of ir-sim's robots with gpusense, beside ir-sim's own.
+"""Cast the lidars of ir-sim's robots with gpusense, and compare with ir-sim's ranges.
 
     pip install ir-sim
     python examples/many_worlds/ir_sim.py [--robots 20] [--obstacles 30]
 
 ``shapes_of`` turns the objects of a scene into moving shapes: the outlines of all objects become segments, as ir-sim
-itself sees them. A robot does not see itself: its own segments lie in a world of their own, so each robot has a world.
+itself sees them. A robot does not see itself, so each robot has a separate world without its outline.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import gpusense as gs
 
 
 def shapes_of(env: Any) -> gs.Shapes:
-    """Return the outlines of all objects, for each robot those of the others."""
+    """Return the outlines of all objects other than the robot itself, for each robot."""
     outlines = []
     for thing in env.objects:
         outline = np.array(getattr(thing.geometry, "exterior", thing.geometry).coords)

@@ -26,7 +26,7 @@ EXTENT = SIDE * RESOLUTION
 
 
 class Navigation(gymnasium.vector.VectorEnv):
-    """Robots among moving obstacles, one in each room."""
+    """Drive one robot in each room among moving obstacles."""
 
     metadata: ClassVar = {"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}
 

@@ -183,7 +183,7 @@ def _verdict(result: dict[str, Any], deviations: list[float]) -> str:
 
 
 def _doubt(deviations: list[float], agrees: bool) -> str:
-    """Return the reason why a pose is uncertain beside its evidence: wide particles, or places that look alike."""
+    """Return why a pose is uncertain despite its evidence: wide particles, or places that look alike."""
     position, heading = max(deviations[:2]), deviations[2]
     if position > WIDE or heading > WIDE_TURN:
         return f"the particles lie {position:.1f} m and {math.degrees(heading):.0f} degrees apart"

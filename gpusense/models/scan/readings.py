@@ -217,7 +217,7 @@ def placing_launches(placed: PlacedPoses, placing: Placing | None) -> Program:
     if placing is None:
         return placed.launches()
     if placed.inside is not None:
-        # Poses are placed in their worlds by a launch of their own.
+        # A separate launch places poses in their worlds.
         head = placing.arguments["head"]
         given = placed._replace(inside=None).arguments() | {"particles": 0}
         readings = launch("place_inputs", placed.flags | placing.flags, (head,), **given, **placing.arguments)

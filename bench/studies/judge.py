@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import contextlib
 import io
-import os
+import shutil
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -169,31 +170,36 @@ def times(args):
     """Measure ``gpusense judge`` on two bags: times of a recording, of the process's clock, and of its processors."""
     data, rows = recordings.data(), []
     truth = np.loadtxt(data / "olin_mac_bag" / "derived_reference.csv", delimiter=",", skiprows=1)
-    file = Path(os.environ.get("TMPDIR", "/tmp")) / f"judge-{os.getpid()}.tum"
+    folder = Path(tempfile.mkdtemp())
     half = np.sin(truth[:, 3] / 2), np.cos(truth[:, 3] / 2)
-    np.savetxt(file, np.column_stack([truth[:, :3], *np.zeros((3, len(truth))), *half]), fmt="%.6f")
+    rows_of = np.column_stack([truth[:, :3], *np.zeros((3, len(truth))), *half])
+    np.savetxt(folder / "right.tum", rows_of, fmt="%.6f")
+    third = len(truth) // 3
+    rows_of[third : 2 * third, 1:3] += 2.0
+    np.savetxt(folder / "wrong.tum", rows_of, fmt="%.6f")
     jarvis, olin = data / "jarvis_lab", data / "olin_mac_bag"
+    bag = ["--map", olin / "mac_1st_floor_9_23.yaml", "--log", olin / "macfirst_floor_take_2", "--range-max", "12"]
     cases = {
         "jarvis, ROS 1 bag, 1440 beams": ["--map", jarvis / "jarvis_nav350_from_complex_03cm.yaml", "--log",
                                           jarvis / "jarvis_complex_path_fast.bag", "--topic",
                                           "/driver_laser_navigation/laser_scan", "--poses", "/pose_ground_truth"],
-        "olin, ROS 2 bag, 720 beams": ["--map", olin / "mac_1st_floor_9_23.yaml", "--log",
-                                       olin / "macfirst_floor_take_2", "--range-max", "12", "--poses", file],
+        "olin, ROS 2 bag, 720 beams": [*bag, "--poses", folder / "right.tum"],
+        "olin, a third of the poses 2.8 m off": [*bag, "--poses", folder / "wrong.tum"],
     }  # fmt: skip
+    table_of = folder / "judged.csv"
     for name, arguments in cases.items():
         found = []
         for _ in range(args.repeats):
             out, begin, used = io.StringIO(), time.perf_counter(), time.process_time()
             with contextlib.redirect_stdout(out):
-                cli.main(["judge", *map(str, arguments), "--backend", args.backend, "--csv", str(file) + ".csv"])
+                cli.main(["judge", *map(str, arguments), "--backend", args.backend, "--csv", str(table_of)])
             found.append((time.perf_counter() - begin, time.process_time() - used))
-        recorded = np.loadtxt(str(file) + ".csv", delimiter=",", skiprows=1, usecols=1)
+        recorded = np.loadtxt(table_of, delimiter=",", skiprows=1, usecols=1)
         wall, used = np.min(found, axis=0)
         length = float(np.ptp(recorded))
         rows.append((name, len(recorded), f"{length:.1f}", f"{wall:.1f}", f"{used:.1f}", f"{length / wall:.1f}",
                      out.getvalue().splitlines()[0]))  # fmt: skip
-    for path in (file, Path(f"{file}.csv")):
-        path.unlink()
+    shutil.rmtree(folder)
     columns = ("recording", "scans", "length [s]", "judged in [s]", "processor time [s]", "times real time", "verdict")
     publish(__file__, args, table(columns, rows), dict(rows=rows), "The best of the repetitions, files included.")
 

@@ -57,7 +57,9 @@ def judgement_figure(
     axes = figure.subplot_mosaic(rows, width_ratios=(1.6, 1.0))
     _draw_track(axes["map"], grid, found)
     axes["map"].set_title(
-        "LOST" if found.lost else "RIGHT", color=VERDICTS["lost" if found.lost else "tracking"], loc="left"
+        f"LOST for {found.duration('lost'):.1f} of {found.duration():.1f} s" if found.lost else "RIGHT",
+        color=VERDICTS["lost" if found.lost else "tracking"],
+        loc="left",
     )
     time = found.times - found.times[0]
     ax = axes["p_lost"]

@@ -42,12 +42,7 @@ def on_device(array: object) -> bool:
 
 
 def to_host(array: object, name: str = "poses") -> object:
-    """Return a NumPy view of an array of another library in host memory; return other objects unchanged.
-
-    Raises:
-        TypeError: A tensor whose gradients are recorded.
-        ValueError: A masked value.
-    """
+    """Return a NumPy view of an array of another library in host memory; return other objects unchanged."""
     if isinstance(array, (np.ndarray, list, tuple)):
         return masks.unmasked(name, array)
     if not hasattr(array, "__dlpack__"):
@@ -89,10 +84,6 @@ def host_poses(array: object, name: str, scans: int | None = None, *, single: bo
         name: Their name in messages.
         scans: S; None without scans.
         single: Whether (N, 3) poses in float32 remain float32 numbers.
-
-    Raises:
-        TypeError: Not numbers.
-        ValueError: Another shape.
     """
     read = array if type(array) is np.ndarray else to_host(array, name)
     shape = ("N", 3) if scans is None else (scans, "N", 3)
@@ -102,11 +93,7 @@ def host_poses(array: object, name: str, scans: int | None = None, *, single: bo
 
 
 def refuse_poses(poses: np.ndarray, name: str, scans: int | None = None) -> None:
-    """Raise the error of poses in host memory that are not finite.
-
-    Raises:
-        ValueError: Always; the message names the first bad value.
-    """
+    """Raise the error of poses in host memory that are not finite."""
     shape = ("N", 3) if scans is None else (scans, "N", 3)
     checks.array(name, poses if scans is None else poses.reshape(scans, -1, 3), shape)
 
@@ -159,10 +146,6 @@ def adopt_poses(
 
     Returns:
         A flat buffer, the number of all poses, whether they are float32, and the owner of the memory.
-
-    Raises:
-        TypeError: Not float32 or float64, or not on the backend's device.
-        ValueError: Another shape, not C-contiguous, or misaligned where no copy may be made.
     """
     adopted = _adopt(array, backend, name, in_place=in_place)
     if not backend.info.float64:
@@ -175,12 +158,7 @@ def adopt_poses(
 
 
 def adopt_readings(array: object, backend: Backend, shape: tuple[int, ...], *, in_place: bool) -> Adopted:
-    """Return ranges of a shape on the device.
-
-    Raises:
-        TypeError: Not float32 or float64, or not on the backend's device.
-        ValueError: Another shape, not C-contiguous, or misaligned where no copy may be made.
-    """
+    """Return ranges of a shape on the device."""
     adopted = _adopt(array, backend, "ranges", in_place=in_place)
     if adopted.shape != shape:
         raise ValueError(f"ranges: shape must be {shape_text(shape)}, got {shape_text(adopted.shape)}")
@@ -189,12 +167,7 @@ def adopt_readings(array: object, backend: Backend, shape: tuple[int, ...], *, i
 
 
 def adopt_numbers(array: object, backend: Backend, name: str) -> Adopted:
-    """Return a C-contiguous array of float32 or float64 numbers on the device.
-
-    Raises:
-        TypeError: Other numbers, or an array on another device.
-        ValueError: Not C-contiguous.
-    """
+    """Return a C-contiguous array of float32 or float64 numbers on the device."""
     adopted = _adopt(array, backend, name)
     _check_numbers(adopted, name)
     return adopted
@@ -208,10 +181,6 @@ def adopt_integers(array: object, backend: Backend, name: str, kinds: tuple[str,
         backend: The device.
         name: The array's name in messages.
         kinds: Names of the types that it may have.
-
-    Raises:
-        TypeError: Integers of another type, or an array on another device.
-        ValueError: Not C-contiguous.
     """
     adopted = _adopt(array, backend, name)
     if adopted.dtype.name not in kinds:
@@ -256,12 +225,7 @@ def like(poses: object, result: np.ndarray) -> Any:
 
 
 def check_out(out: object, shape: tuple[int, ...], real: np.dtype, backend: Backend, *, device_poses: bool) -> Any:
-    """Return the memory of ``out=``: a NumPy array, or a flat buffer on the device; None where ``out`` is None.
-
-    Raises:
-        TypeError: Not an array of the precision in the memory where the poses are.
-        ValueError: Another shape, not C-contiguous, or read-only.
-    """
+    """Return the memory of ``out=``: a NumPy array, or a flat buffer on the device; None where ``out`` is None."""
     if out is None:
         return None
     if on_device(out) != device_poses:

@@ -340,9 +340,6 @@ def errors_of(found: Judgement, times: Floats, poses: Floats) -> Floats:
         found: The judgement.
         times: (T,) increasing times of the trajectory [s].
         poses: (T, 3) its poses.
-
-    Raises:
-        ValueError: No pose has a time of the trajectory.
     """
     none = (math.nan,) * 3
     true = np.array([pose or none for pose in poses_at(found.times.tolist(), times, poses, name="--truth")])

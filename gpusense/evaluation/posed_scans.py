@@ -63,9 +63,6 @@ def posed_scans(
         source: A TUM trajectory as a path, or a topic of a bag as for :func:`gpusense.logs.bag_poses.read_poses`. None
             takes the likeliest poses of a bag, and the logged poses of another log.
         map_frame: Frame of the map among transforms.
-
-    Raises:
-        ValueError: no scan has a pose, or the source is absent or not unique.
     """
     times = [step.scan.time for step in steps]
     form = format_of(log)

@@ -105,9 +105,6 @@ def poses_at(
         poses: (T, 3) its poses.
         near: Largest time from a scan to a single pose near it [s].
         name: Name of the trajectory in errors.
-
-    Raises:
-        ValueError: no scan has a time of the trajectory.
     """
     found = [_pose_at(time, times, poses, near) for time in scans]
     if not any(found):

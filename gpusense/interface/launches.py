@@ -58,9 +58,6 @@ def launch(kernel: str, flags: Iterable[str], size: tuple[int, ...], /, **argume
         flags: Flags of its code.
         size: Work-items along each axis.
         **arguments: All arguments of the row, each a buffer, an integer, a real number or a struct.
-
-    Raises:
-        TypeError: An argument is missing, unknown or of the wrong type; the message names it.
     """
     row = _ROWS.get(kernel) or _row(kernel)
     if len(arguments) != len(row.names):

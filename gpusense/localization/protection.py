@@ -66,11 +66,7 @@ class Distances(NamedTuple):
 
 
 def check_risk(risk: float) -> float:
-    """Return a risk that the calibration supports.
-
-    Raises:
-        TypeError, ValueError: It breaks its rule.
-    """
+    """Return a risk that the calibration supports."""
     risk = checks.real("risk", risk, high=1.0)
     if risk < LEAST_RISK:
         rule = f"must be at least {LEAST_RISK}, the least risk that the calibration on logs supports"
@@ -90,9 +86,6 @@ def protection_level(
             most 1 m.
         widening: Factor of the spread.
         distances: Distances of the particles from the pose; None if the covariance describes them.
-
-    Raises:
-        TypeError, ValueError: ``risk`` breaks its rule.
     """
     risk = check_risk(risk)
     if risk == 1:

@@ -45,10 +45,6 @@ class Sensor:
         calibrates: Whether temperature="auto" learns from this sensor.
         ambiguous: True if its likelihood may have several peaks among concentrated particles, for example exchangeable
             landmarks.
-
-    Raises:
-        TypeError: another object.
-        ValueError: the model has a temperature other than 1.
     """
 
     MEMORY, PARTS = ("_correlation", "_seen", "_learned"), ()

@@ -148,9 +148,6 @@ class BeamCorrelation:
             axes: (3, 3) steps between the poses; their products are the covariance of the pose.
             directions: (K,) directions of beams in the world [rad], for comparing consecutive scans.
             follows: Whether the scan directly follows the previous one.
-
-        Raises:
-            TypeError, ValueError: arrays of other shapes.
         """
         values = checks.array("parts", parts, (7, "K"), finite=False)
         steps = checks.array("axes", axes, (3, 3))
@@ -228,9 +225,6 @@ class BeamCorrelation:
 
         Args:
             beams: Used beams of a scan.
-
-        Raises:
-            TypeError, ValueError: not a number of beams.
         """
         count = checks.integer("beams", beams, low=0)
         if self.scans < _LEAST_SCANS or not self._sums[1] > 0:

@@ -52,9 +52,6 @@ def read_poses(path: Path, times: Floats, *, topic: str | None = None, map_frame
             the transforms from ``map_frame`` to the robot's base, or the only topic of poses.
         map_frame: Frame of the map.
 
-    Raises:
-        ValueError: The bag has no such poses, or the user must choose a topic.
-
     Warns:
         UserWarning: Messages are skipped, are not level, or have another frame than the map's.
     """
@@ -119,11 +116,7 @@ def _of_topic(path: Path, kind: str, topic: str, map_frame: str) -> PoseTrack:
 
 
 def _covariance(message: object) -> Floats | None:
-    """Return the (3, 3) covariance of x, y and yaw; None for zeros, which mean "unknown".
-
-    Raises:
-        ValueError: It is not finite.
-    """
+    """Return the (3, 3) covariance of x, y and yaw; None for zeros, which mean "unknown"."""
     full = np.asarray(field("message", message, "pose.covariance"), np.float64).reshape(6, 6)
     part = full[np.ix_((0, 1, 5), (0, 1, 5))]
     if not np.isfinite(part).all() or (part.diagonal() < 0).any():

@@ -20,12 +20,7 @@ _MOST_CELLS_PER_RANGE = 1 << 20
 
 
 def check_scene(grid: object, range_max: float) -> OccupancyGrid | Worlds:
-    """Return the map, after a check of its cells against the range.
-
-    Raises:
-        TypeError: Neither an OccupancyGrid nor Worlds.
-        ValueError: More than 1 048 576 cells per range_max.
-    """
+    """Return the map, after a check of its cells against the range."""
     checked = grid if isinstance(grid, Worlds) else checks.instance("grid", grid, OccupancyGrid)
     look_at_scene(range_max, math.hypot(checked.width, checked.height))
     cells = range_max / checked.resolution
@@ -44,11 +39,7 @@ def map_words(grid: OccupancyGrid | Worlds) -> str:
 
 
 def real_dtype(precision: str, backend: Backend) -> np.dtype:
-    """Return the NumPy dtype of a precision on a device.
-
-    Raises:
-        TypeError, ValueError: An unknown precision, or float64 on a device without it.
-    """
+    """Return the NumPy dtype of a precision on a device."""
     dtype = np.dtype(checks.choice("precision", precision, ("float32", "float64")))
     if dtype == np.float64 and not backend.info.float64:
         raise ValueError(f"precision: must be 'float32' on {backend.info.name}, which has no float64, got 'float64'")
@@ -61,9 +52,6 @@ def check_absent(where: str, **options: object) -> None:
     Args:
         where: When they must be, in words of the message.
         **options: Their values.
-
-    Raises:
-        ValueError: An option is set.
     """
     for name, value in options.items():
         if value is not None:
@@ -71,11 +59,7 @@ def check_absent(where: str, **options: object) -> None:
 
 
 def check_discrete(model: SensorTable, scanner: Scanner, compat: object, sensor_table: object) -> None:
-    """Refuse options that contradict a discrete model.
-
-    Raises:
-        ValueError: The scanner has another range_max, or an option of the mixture is set.
-    """
+    """Refuse options that contradict a discrete model."""
     check_absent("with a DiscreteBeamModel", compat=compat, sensor_table=sensor_table)
     if isinstance(scanner, Scanner) and scanner.range_max != model.range_max:
         rule = f"must have the scanner's range_max = {scanner.range_max}"

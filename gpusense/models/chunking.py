@@ -109,11 +109,7 @@ def _halved(piece: Piece) -> int:
 
 
 def finish(space: Workspace, on_device: bool, name: str = "poses") -> None:
-    """Wait for a call to end.
-
-    Raises:
-        ValueError: A device pose of the call was not finite.
-    """
+    """Wait for a call to end."""
     if on_device:
         finish_all([(space, True)], name)
     else:
@@ -126,9 +122,6 @@ def finish_all(spaces: Sequence[tuple[Workspace, bool]], name: str = "poses") ->
     Args:
         spaces: Each workspace, and whether it had device poses.
         name: Name of the poses in messages.
-
-    Raises:
-        ValueError: A device pose of the call was not finite.
     """
     flag, dtype = POSE_STATUS
     states = [np.zeros(2, dtype) for _ in spaces]

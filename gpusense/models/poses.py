@@ -53,10 +53,6 @@ class Poses:
 
     Attributes:
         hull: Corners of the box of poses on the device, if their owner knows them; they affect only the table.
-
-    Raises:
-        TypeError: Not numbers, or an array that this device cannot read.
-        ValueError: Another shape, or, of arrays that are not on the device, a value that is not finite.
     """
 
     hull: Corners | None = None
@@ -96,9 +92,6 @@ class Poses:
             part: The first of them and the one after the last.
             backend: The device, which bounds them where they are many.
             space: Holds them there; None where no launch follows.
-
-        Raises:
-            ValueError: A value is not finite.
         """
         if self.host is None:
             return None

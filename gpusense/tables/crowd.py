@@ -103,11 +103,7 @@ class CrowdTable:
         return self._shapes
 
     def assign(self, shapes: Shapes) -> None:
-        """Replace all shapes; buffers stay where the numbers of shapes are unchanged.
-
-        Raises:
-            TypeError, ValueError: Not shapes of these worlds, or arrays on another device.
-        """
+        """Replace all shapes; buffers stay where the numbers of shapes are unchanged."""
         checks.instance("shapes", shapes, Shapes)
         if shapes.worlds not in (None, self._worlds):
             raise ValueError(f"shapes: must be of {self._worlds} worlds, got {shapes.worlds}")

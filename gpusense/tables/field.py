@@ -91,11 +91,7 @@ class FieldTable:
         return table
 
     def of_worlds(self, worlds: Worlds, unknown: str) -> Buffer:
-        """Return the tables of all worlds, made on the device; models of the same parameters share them.
-
-        Raises:
-            ValueError: Squared distances up to ``max_distance`` have too many values.
-        """
+        """Return the tables of all worlds, made on the device; models of the same parameters share them."""
         margin = self._margin
 
         def fill(stack: Stack, table: Buffer) -> None:

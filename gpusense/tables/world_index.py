@@ -29,10 +29,6 @@ class WorldIndex:
         ignore: (N,) indices of shapes, -1 for none, or one for all poses; None ignores none.
         count: N.
         backend: The device.
-
-    Raises:
-        TypeError: Not integers, or on the device neither int32 nor int64.
-        ValueError: A wrong shape, or an index in host memory of no world.
     """
 
     def __init__(self, worlds: Worlds, world: Any, ignore: Any, count: int, backend: Backend) -> None:
@@ -92,11 +88,7 @@ class InWorlds(NamedTuple):
 
 
 def index_of(grid: OccupancyGrid | Worlds, world: Any, ignore: Any, count: int, backend: Backend) -> WorldIndex | None:
-    """Return the worlds of poses; None for a single map.
-
-    Raises:
-        ValueError: A world or a shape is named for a single map.
-    """
+    """Return the worlds of poses; None for a single map."""
     if isinstance(grid, Worlds):
         return WorldIndex(grid, world, ignore, count, backend)
     for name, value in (("world", world), ("ignore", ignore)):
@@ -106,11 +98,7 @@ def index_of(grid: OccupancyGrid | Worlds, world: Any, ignore: Any, count: int, 
 
 
 def check_worlds(worlds: Worlds, backend: Backend) -> Worlds:
-    """Return worlds after a check of their device.
-
-    Raises:
-        ValueError: They are on another device than the model.
-    """
+    """Return worlds after a check of their device."""
     if worlds.backend is not backend:
         here, there = backend.info.selection, worlds.device.selection
         raise ValueError(f"grid: must be Worlds on the model's device {here!r}, got backend={there!r}; "
@@ -119,11 +107,7 @@ def check_worlds(worlds: Worlds, backend: Backend) -> Worlds:
 
 
 def check_no_worlds(grid: object, compat: object) -> None:
-    """Refuse peers' formulas in worlds.
-
-    Raises:
-        ValueError: ``compat`` is set for a model of worlds.
-    """
+    """Refuse peers' formulas in worlds."""
     if isinstance(grid, Worlds) and compat is not None:
         raise ValueError(f"compat: must be None in Worlds, got {checks.show(compat)}")
 

@@ -510,11 +510,7 @@ class WorldMap:
         """Return None: worlds are prepared as a whole."""
 
     def update(self, cells: object, place: object) -> OccupancyGrid:
-        """Refuse a change of cells.
-
-        Raises:
-            ValueError: Always.
-        """
+        """Refuse a change of cells."""
         raise ValueError("grid: must be a single map for update_map, got Worlds; worlds.replace(index, cells) does it")
 
 

@@ -65,10 +65,6 @@ def density_of(parameters: object, default: BeamParameters, incidence: object, *
         default: The mixture without ``parameters``.
         incidence: Parameters by angle of incidence, or None.
         **options: Options that must be None with ``incidence``.
-
-    Raises:
-        TypeError: An argument is of the wrong kind.
-        ValueError: Several densities, or conflicting options, are given.
     """
     table = parameters if isinstance(parameters, SensorTable) else None
     # A table of a sensor replaces the mixture.

@@ -61,10 +61,6 @@ class BoundCall(ABC):
 
         Returns:
             ``out``; if ``waits`` is False, the device may not have written it yet.
-
-        Raises:
-            TypeError: Not a stream, or a stream for a call that waits.
-            TypeError, ValueError: For a call that waits, the errors of ``log_likelihood``.
         """
 
     @abstractmethod

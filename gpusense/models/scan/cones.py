@@ -45,11 +45,7 @@ class Cones:
 
 
 def cones_of(scanner: Scanner, method: Caster, *, incidence: bool) -> Cones:
-    """Return the cones of a scanner; ``incidence`` says whether its model depends on angles of incidence.
-
-    Raises:
-        ValueError: Angles of incidence matter, and the caster is not exact.
-    """
+    """Return the cones of a scanner; ``incidence`` says whether its model depends on angles of incidence."""
     critical = scanner.critical_incidence
     least = 0.0 if critical is None or critical >= math.pi / 2 else max(math.cos(critical), 0.0)
     if critical is not None and not method.exact:
@@ -61,11 +57,7 @@ def cones_of(scanner: Scanner, method: Caster, *, incidence: bool) -> Cones:
 
 
 def require_exact(argument: str, method: Caster) -> None:
-    """Refuse casters that do not find the cell in which a ray ends.
-
-    Raises:
-        ValueError: The caster is not exact.
-    """
+    """Refuse casters that do not find the cell in which a ray ends."""
     if not method.exact:
         raise ValueError(f"{argument}: must be an exact one where angles of incidence matter, got {method.name!r}")
 

@@ -37,12 +37,7 @@ def is_recorded(poses: object) -> bool:
 
 
 def log_likelihood_of(poses: Any, ranges: object, calls: Differentiable) -> Any:
-    """Return the log-likelihoods of recorded poses as an operation of their library.
-
-    Raises:
-        TypeError: JAX also traces the ranges.
-        ValueError: Poses of another shape.
-    """
+    """Return the log-likelihoods of recorded poses as an operation of their library."""
     checks.check_values("ranges", ranges)
     if type(poses).__module__.partition(".")[0] == "torch":
         return _torch_log_likelihood(sys.modules["torch"], poses, calls)

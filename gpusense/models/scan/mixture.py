@@ -69,10 +69,6 @@ def mixture_on_device(
         width: Width of the bins in which the mixture is tabulated [m]; None evaluates it.
         compat: The program whose weights are reproduced, or None.
         specialize: False leaves nothing out.
-
-    Raises:
-        ValueError: A number is beyond what the precision can hold.
-        TypeError, ValueError: A width that is not a number, too small or more than range_max.
     """
     mixtures, cosines = density.mixtures, density.cosines
     if compat is not None:
@@ -92,11 +88,7 @@ def mixture_on_device(
 def mixture_of(
     kinds: Sequence[BeamParameters], range_max: float, real: np.dtype, *, specialize: bool, max_depends: bool
 ) -> tuple[frozenset[str], MixtureTerms, np.ndarray]:
-    """Return flags of the components, their numbers for each bin of incidence, and the tables of masses of hits.
-
-    Raises:
-        ValueError: A number is beyond what the precision can hold.
-    """
+    """Return flags of the components, their numbers for each bin of incidence, and the tables of masses of hits."""
     hit, short, rand = (max(getattr(p, name) for p in kinds) > 0 for name in ("z_hit", "z_short", "z_rand"))
     # If no range is possible at any angle, a component must evaluate to -inf.
     rand |= max_depends and not (hit or short)
@@ -120,11 +112,7 @@ def mixture_of(
 
 
 def learning_terms(p: BeamParameters, range_max: float, real: np.dtype) -> tuple[MixtureTerms, np.ndarray]:
-    """Return the numbers of the kernel file ``learning``, and the table of masses of hits.
-
-    Raises:
-        ValueError: A number is beyond what the precision can hold.
-    """
+    """Return the numbers of the kernel file ``learning``, and the table of masses of hits."""
     return _terms(p, range_max, real, False, None, 0), mass_tables([shape_of(p)], real)[1]
 
 
@@ -145,11 +133,7 @@ def _common_flags(kinds: Sequence[BeamParameters]) -> frozenset[str]:
 def peer_mixture(
     p: BeamParameters, range_max: float, real: np.dtype, *, amcl: bool
 ) -> tuple[frozenset[str], MixtureTerms]:
-    """Return flags and numbers of the kernel file ``compat``.
-
-    Raises:
-        ValueError: A number is beyond what the precision can hold.
-    """
+    """Return flags and numbers of the kernel file ``compat``."""
     if p.range_bias or p.sigma_growth:
         raise ValueError(f"parameters: range_bias and sigma_growth must be 0 with compat, got {p}")
     flags = frozenset({"HIT", "SHORT", "RAND", "LINEAR", "CUBES"}) | flags_if(AMCL=amcl)
@@ -163,11 +147,7 @@ def peer_mixture(
 
 
 def tabulated(p: BeamParameters, width: float, range_max: float, real: np.dtype) -> np.ndarray:
-    """Return log p in bins of readings and expected ranges, both with a last bin for range_max.
-
-    Raises:
-        TypeError, ValueError: A width that is not a number, too small or more than range_max.
-    """
+    """Return log p in bins of readings and expected ranges, both with a last bin for range_max."""
     from gpusense.models.scan.densities import log_mixture  # loads SciPy
 
     width = checks.real("sensor_table", width, low=range_max / _MOST_BINS, high=range_max)

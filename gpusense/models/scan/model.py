@@ -251,11 +251,6 @@ class ScanModel(Pickled):
             each max reading. ``per_beam`` adds (N, K) or (S, N, K) parts; left-out readings have 0. With ``compat`` the
             logarithm of a particle's weight, and the cubes or logarithms that it sums.
 
-        Raises:
-            TypeError: An argument does not hold real numbers, or is on a device that the backend cannot read.
-            ValueError: A wrong shape, or a pose that is not finite; the message names it.
-            MemoryError: The device cannot hold the map's table, or even a few particles.
-
         Warns:
             PlausibilityWarning: In the first calls of a scanner, negative readings, or readings in millimetres.
         """
@@ -289,9 +284,6 @@ class ScanModel(Pickled):
             ranges: (K,) readings [m].
             out: (N,) array on the device for the log-likelihoods.
             before: Function called before poses are read, to start the launches that write them.
-
-        Raises:
-            TypeError, ValueError, MemoryError: See ``log_likelihood``.
         """
         with self._lock, self._workspace:
             if self._repeated.start(poses, ranges, out, before):
@@ -302,11 +294,7 @@ class ScanModel(Pickled):
             self._repeated.remember(poses, out, request)
 
     def finish_scoring(self) -> None:
-        """Wait for calls that ``start_scoring`` has begun.
-
-        Raises:
-            ValueError: A pose was not finite.
-        """
+        """Wait for calls that ``start_scoring`` has begun."""
         with self._lock:
             finish(self._workspace, on_device=True)
 
@@ -334,11 +322,6 @@ class ScanModel(Pickled):
             world: As in ``log_likelihood``; an array on the device is read anew by every call.
             ignore: The same.
             out: (N,) array for the log-likelihoods, as ``log_likelihood`` takes it.
-
-        Raises:
-            TypeError: Not an array, an immutable one, or one on a device that the backend cannot read.
-            ValueError: A wrong shape.
-            MemoryError: The device cannot hold the map's table, or the buffers of a call.
         """
         # Imported on use, since few programs bind calls.
         from gpusense.models.scan.binding import bind, bind_worlds
@@ -365,9 +348,6 @@ class ScanModel(Pickled):
         Returns:
             A title, the flags of the code, a line ``- part  reason; saves ...`` for each part that is left out, and
             lines of the sections ``kept:`` (``+ part  reason``) and ``could go:`` (``? part  reason``).
-
-        Raises:
-            RuntimeError: ``measure`` before any call with a reading that depends on the pose.
         """
         return str(self.plan(measure=measure))
 
@@ -379,9 +359,6 @@ class ScanModel(Pickled):
 
         Returns:
             The title, the flags of the code, and the parts that are left out, kept, and could go.
-
-        Raises:
-            RuntimeError: As :meth:`explain`.
         """
         plan = plan_of_call(self._notes(), self._setting, self._last)
         if not checks.boolean("measure", measure):
@@ -408,12 +385,7 @@ class ScanModel(Pickled):
         """Return the report's title, and the parts that are left out, kept, and removable."""
 
     def prepare(self, poses: AnyArray) -> None:
-        """Make the map's table for a cloud of (N, 3) poses now, instead of in the first ``log_likelihood``.
-
-        Raises:
-            TypeError, ValueError: Poses that are not (N, 3) finite numbers.
-            MemoryError: The device cannot hold the table.
-        """
+        """Make the map's table for a cloud of (N, 3) poses now, instead of in the first ``log_likelihood``."""
         checked = Poses(poses, self._setting.backend)
         if checked.count:
             with self._lock:

@@ -146,9 +146,6 @@ class PackedCall:
 
         Returns:
             False where a pose is not finite; nothing is written on the host then.
-
-        Raises:
-            MemoryError: The device cannot hold the map's table.
         """
         backend, inputs, outputs = self._backend, self._inputs, self._outputs
         log_p, status = outputs.views

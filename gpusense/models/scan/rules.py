@@ -179,12 +179,7 @@ class ModelContext:
 
 
 def check_beams(beams: Beams, count: int) -> Beams:
-    """Validate ``beams=`` for a scanner of ``count`` beams.
-
-    Raises:
-        ValueError: A number below 0, or an index outside the scan.
-        TypeError: Not an integer or a list of them.
-    """
+    """Validate ``beams=`` for a scanner of ``count`` beams."""
     if beams is None:
         return None
     if isinstance(beams, (int, np.integer)):

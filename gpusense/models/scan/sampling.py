@@ -107,11 +107,7 @@ class Drawing:
 def drawing_of(
     density: BeamDensity, range_max: float, real: np.dtype, *, seed: object, step: object, per_scan: int
 ) -> Drawing:
-    """Return the numbers from which a model draws.
-
-    Raises:
-        TypeError, ValueError: A seed or a step that is not an integer, or beyond its limits.
-    """
+    """Return the numbers from which a model draws."""
     key = checks.integer("seed", seed, low=0, high=MOST_SEED)
     first = checks.integer("step", step, low=0, high=MOST_STEP)
     mixtures, table = density.mixtures, density.table
@@ -147,11 +143,7 @@ def chances_of(table: SensorTable) -> np.ndarray:
 
 
 def poses_to_draw_at(poses: Any, backend: Backend) -> tuple[Poses, tuple[int, ...]]:
-    """Return checked (N, 3) or (S, N, 3) poses, and their shape without the last axis.
-
-    Raises:
-        TypeError, ValueError: Not numbers, another shape, or a pose that is not finite.
-    """
+    """Return checked (N, 3) or (S, N, 3) poses, and their shape without the last axis."""
     if arrays.on_device(poses):
         shape = tuple(poses.shape)
         return Poses(poses, backend, scans=shape[0] if len(shape) == 3 else None), shape[:-1]

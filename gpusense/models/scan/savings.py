@@ -37,9 +37,6 @@ def measured_savings(
 
     Returns:
         Median differences [s] of a call with a part and one without it, by the names of the parts.
-
-    Raises:
-        RuntimeError: Before any call with a reading that depends on the pose.
     """
     scan = last.scan
     if scan is None or not len(scan.readings) or not last.flags:

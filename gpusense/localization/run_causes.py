@@ -247,13 +247,12 @@ class _Places:
 
     def _scale(self, windows: list[Window], *, steady: bool) -> tuple[float, float]:
         """Return the share of windows that fit with the best scale of the map, and this scale."""
-        tried = windows[len(windows) // 2]
-        places = [self.place(tried, scale=scale, quick=True) for scale in _SCALES]
-        best = max(range(len(_SCALES)), key=lambda k: (places[k].fits, places[k].share))
-        if not places[best].fits:
-            return 0.0, 1.0
-        scale = _SCALES[best]
-        return self._share(windows, steady=steady, scale=scale), scale
+        for tried in (windows[len(windows) // 2], windows[len(windows) // 4]):
+            places = [self.place(tried, scale=scale, quick=True) for scale in _SCALES]
+            best = max(range(len(_SCALES)), key=lambda k: (places[k].fits, places[k].share))
+            if places[best].fits:
+                return self._share(windows, steady=steady, scale=_SCALES[best]), _SCALES[best]
+        return 0.0, 1.0
 
     def _share(self, windows: list[Window], *, steady: bool, mirrored: bool = False, scale: float = 1.0) -> float:
         """Return the share of windows that fit with a hypothesis; the search ends where it cannot hold any more."""

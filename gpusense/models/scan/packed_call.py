@@ -241,7 +241,7 @@ class PackedCallCache:
     def __init__(self, pipeline: ScanPipeline) -> None:
         self._pipeline = pipeline
         self.last: PackedCall | None = None
-        self._calls = ProgramCache[tuple[PackedCall, _There]](_MOST_SIZES)
+        self._calls = ProgramCache[tuple[PackedCall, _There | None]](_MOST_SIZES)
         # Number of calls by size so far.
         self._seen = ProgramCache[int](_MOST_SIZES)
         # A private lock, since the scoring thread holds the model's lock.
@@ -265,6 +265,8 @@ class PackedCallCache:
             per_beam: True if the log-likelihoods of the readings are requested.
         """
         self.last = None
+        if type(poses) is np.ndarray and type(ranges) is np.ndarray:
+            return None if per_beam else self._score_host(poses, ranges, out)
         pipeline, size = self._pipeline, self._pipeline.scanner.count
         if per_beam or getattr(ranges, "shape", None) != (size,):
             return None
@@ -286,6 +288,34 @@ class PackedCallCache:
             # The buffers of both kinds of calls may not fit the device at once.
             self._calls.clear()
             return None
+
+    def _score_host(self, poses: np.ndarray, ranges: np.ndarray, out: Any) -> np.ndarray | None:
+        """Score poses and readings of the host; a call takes so little time that each check counts."""
+        pipeline, count = self._pipeline, len(poses) if poses.ndim else 0
+        size = pipeline.scanner.count
+        if poses.shape != (count, 3) or ranges.shape != (size,) or not is_short(count, size) or not fits(count, size):
+            return None
+        if poses.dtype not in _FLOATS or ranges.dtype not in _FLOATS or not self._takes(count, out, (False, False)):
+            return None
+        key = (count, None, None, ranges.dtype)
+        corners = self._corners(poses) if self._repeats(key) else None
+        if corners is None or (pipeline.setting.temperature < 1 and not self._has_range(ranges)):
+            return None
+        result = np.empty(count, pipeline.real) if out is None else out
+        try:
+            kept = self._calls.get(key)
+            if kept is None:
+                kept = PackedCall(pipeline, self._lock, count, ranges.dtype, corners), None
+                self._calls.keep(key, kept)
+            kept[0].score(poses, ranges, result, corners)
+        except MemoryError:
+            # The buffers of both kinds of calls may not fit the device at once.
+            self._calls.clear()
+            return None
+        self.last = kept[0]
+        if pipeline.rules.first_scans.left:
+            pipeline.rules.first_scans.look_at("ranges", ranges[None], pipeline.rules.map_size)
+        return result
 
     def _kinds(self, poses: Any, ranges: Any) -> tuple[bool, bool] | None:
         """Return whether poses and readings are on the device; None for arrays that the ordinary call must read."""
@@ -334,7 +364,9 @@ class PackedCallCache:
             places = _There(backend, count, pipeline.scanner.count, kinds[:2], pipeline.real)
             call = PackedCall(pipeline, self._lock, count, kinds[2], corners, **places.given)
             kept = self._calls.keep((count, *kinds), (call, places))
-        call, places = kept
+        call, there_now = kept
+        assert there_now is not None
+        places = there_now
         places.take(*buffers)
         host = [None if buffer is not None else array for array, buffer in zip((poses, ranges), buffers, strict=True)]
         flat = None if kinds[0] is not None else result.flat

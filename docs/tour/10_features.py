@@ -24,6 +24,6 @@ print({kind: len(features[kind]) for kind in ("line", "corner", "door", "hallway
 
 figure, ax = plt.subplots(figsize=(8, 6), layout="constrained")
 gs.plots.draw_features(ax, features, ranges, scanner)
-ax.set_title(f"{np.isfinite(ranges).sum()} end points, {len(features)} features")
+ax.set_title(f"{(ranges < scanner.range_max).sum()} end points, {len(features)} features")
 gs.plots.add_legend(ax, 6)
 plt.show()

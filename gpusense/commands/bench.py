@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from gpusense._util.files import check_writable, write_whole
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import BACKEND_HELP, add_json, open_backends, positive_number, whole_number
-from gpusense.commands.output import print_json, print_table
+from gpusense.commands.output import print_json, print_result, print_table
 from gpusense.evaluation.benchmark.choice import Wish, choices, parse_error, parse_time
 from gpusense.evaluation.machine import machine, machine_line
 
@@ -225,7 +225,7 @@ def _print(report: Mapping[str, Any], wish: Wish, folder: Path | None) -> None:
     points = report["points"]
     found = list(choices(points, wish))
     for choice in found:
-        print(choice.answer)
+        print_result(choice.answer)
     for backend in dict.fromkeys(choice.backend for choice in found):
         rows = [row for choice in found if choice.backend == backend for row in choice.rows]
         print(f"\nbest methods on {backend}")

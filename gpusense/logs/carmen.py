@@ -101,7 +101,13 @@ def _messages(path: Path, lines: Iterator[tuple[int, bytes]]) -> Iterator[tuple[
                 any_message = True
                 yield f"{path}:{number}", fields
     if not any_message:
-        raise ValueError(f"{path}: must hold laser or ODOM messages of CARMEN, got none in {number} lines")
+        found = f"got none in {number} lines{_other_use(path)}"
+        raise ValueError(f"{path}: must hold laser or ODOM messages of CARMEN, {found}")
+
+
+def _other_use(path: Path) -> str:
+    """Return the option to which a file belongs that is no log; empty if its name does not tell."""
+    return "; a map is passed by --map or read by gs.read_map" if path.suffix in (".yaml", ".yml", ".pgm") else ""
 
 
 def _old_laser(where: str, fields: Sequence[bytes]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

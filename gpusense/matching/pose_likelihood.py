@@ -103,7 +103,8 @@ class PoseLikelihood:
             angle: Least difference of heading of modes that are near each other [rad].
 
         Returns:
-            (M, 3) poses [m, m, rad] and (M,) log-likelihoods, the best first. Impossible poses are left out.
+            (M, 3) poses [m, m, rad], headings in (-pi, pi], and (M,) log-likelihoods, the best first. Impossible poses
+            are left out.
         """
         checks.integer("count", count, low=1)
         near, turn = checks.real("radius", radius, low=0), checks.real("angle", angle, low=0)
@@ -126,7 +127,7 @@ class PoseLikelihood:
             around = np.flatnonzero(distant[heading] <= turn)
             left[i[inside, None], j[inside, None], around] = -np.inf
         found = np.array(poses).reshape(-1, 3)
-        found[:, 2] = wrapped(found[:, 2])
+        found[:, 2] = -wrapped(-found[:, 2])
         return found, np.array(log_p)
 
     def __repr__(self) -> str:
@@ -246,7 +247,7 @@ def refine_modes(
         chosen = values.argmax(axis=1)
         poses = tried.reshape(len(poses), -1, 3)[np.arange(len(poses)), chosen]
         log_p = values.max(axis=1)
-    poses[:, 2] = wrapped(poses[:, 2])
+    poses[:, 2] = -wrapped(-poses[:, 2])
     kept: list[int] = []
     for k in np.argsort(-log_p, kind="stable").tolist():
         off = poses[kept] - poses[k]

@@ -311,3 +311,11 @@ def test_python_localizes_as_the_command_does(place, capsys):
             pf.predict(before.odometry, scan.odometry)
         pf.correct(scan.ranges)
     np.testing.assert_allclose(pf.estimate().pose, report["poses"][-1][1:], atol=1e-9)
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".yml"])
+def test_a_map_in_place_of_a_log_names_the_option(place, capsys, tmp_path, suffix):
+    path = tmp_path / f"map{suffix}"
+    path.write_text((place / "map.yaml").read_text())
+    message = error_of(["localize", "--map", str(place / "map.yaml"), "--log", str(path)], capsys)
+    assert message.startswith(f"{path}: must hold laser") and message.endswith("passed by --map or read by gs.read_map")

@@ -160,3 +160,10 @@ def test_modes_are_refined_between_positions_and_headings(headings):
     assert (np.diff(log_p) <= 0).all() and len(poses) <= 3
     apart = np.hypot(*(poses[1:] - poses[0])[:, :2].T), np.abs(wrapped(poses[1:, 2] - poses[0, 2]))
     assert ((apart[0] > 0.5) | (apart[1] > 0.26)).all()
+
+
+def test_headings_of_modes_are_in_the_usual_interval():
+    """A robot that looks back has the heading pi, not -pi."""
+    model = gs.LikelihoodFieldModel(gs.OccupancyGrid([[100, 0, 0]], 1.0), gs.Scanner([0.0], 9.0), backend="numpy")
+    poses, _ = gs.pose_likelihood(model, [1.9], resolution=1.0, headings=4).modes(1)
+    assert poses[0, 2] == np.pi

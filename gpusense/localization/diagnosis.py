@@ -50,8 +50,8 @@ class Diagnosis:
         mirrored: Whether the readings seem to be in the opposite order.
         cause: Likely cause: "none" (nothing contradicts the pose), "people" (some beams are short, none long), "start"
             (the robot is elsewhere on this map), "mount" (the scanner has another mount), "map" (no place of the map
-            explains the scan) or "unknown". By the scans of a run also "moved" (all places are moved from the poses in
-            the same way), "scale" (the map has another resolution), "odometry" (scans that match one another contradict
+            explains the scan) or "unknown". From the scans of a run also "moved" (all places are displaced from the
+            poses by the same motion), "scale" (the map has another resolution), "odometry" (matched scans contradict
             it) and "time" (the scans fit the odometry of another time).
         motion: How the motion between the scans of a run compares with the odometry, in words.
         moved: (x, y, theta) displacement of the places on the map from the poses, at their centre; None without one.

@@ -1,10 +1,10 @@
-"""Compare the motion between scans with the odometry: wrong wheels, mounts and clocks show there, without a map.
+"""Compare the motion between scans with the odometry, to find wrong wheels, mounts and clocks without a map.
 
-Scans are matched with one another. Where they agree, their motion is known to millimetres, and it must be the motion
-of the odometry, as the laser sees it. With o the motion of the robot and M the mount, a laser moves by M^-1 o M. So a
-laser that is turned on the robot sees the motion go another way; one that is upside down sees the robot turn the other
-way; and a clock that is wrong pairs each scan with the odometry of another time. Each is a hypothesis with the
-odometry of the log, and the residuals of its best parameter decide. If none is good, the odometry is wrong.
+Scans are matched with one another. Matches give their motion to a few millimetres, and it must equal the odometry's
+motion as seen by the laser: M^-1 o M for the robot's motion o and the mount M. A laser turned on the robot sees motion
+in another direction. A laser mounted upside down sees opposite turns. A wrong clock pairs each scan with the odometry
+of another time. Each is a hypothesis; the residuals at its best parameter decide. If no hypothesis fits, the odometry
+is wrong.
 """
 
 from __future__ import annotations

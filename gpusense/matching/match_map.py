@@ -145,7 +145,7 @@ def match_map(
     with _LOCK:
         search = _search_of(grid, device)
         levels = min(search.tables.levels, _levels_of(searched.height, searched.width))
-        # None lets the search choose, which has all levels.
+        # With all levels available, the search chooses.
         level = None if levels == search.tables.levels else levels
         found = search.find([local.points], searched, slack=slack, level=level, images=[local.images])
     return _result(local_grid, local, grid, searched, found, least)

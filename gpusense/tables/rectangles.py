@@ -61,7 +61,7 @@ class Planes:
         return 4 * self.sectors * self.lines(rows) * (cols + 2)
 
 
-def planes_of(backend: Backend, rows: int, cols: int, all_cells: int = 0) -> Planes:
+def planes_of(backend: Backend, rows: int, cols: int) -> Planes:
     """Return the planes of a map on a device.
 
     GPUs gain most from sectors, since a warp waits for its slowest ray. Memory limits rays once planes exceed a GPU's
@@ -72,7 +72,7 @@ def planes_of(backend: Backend, rows: int, cols: int, all_cells: int = 0) -> Pla
     sectors = 1 if backend.info.backend == "numpy" else 4 if gpu and cells <= _FOUR_SECTORS else 2
     while sectors > 1 and (
         4 * sectors * (rows + ROWS + 2) * (cols + 4) >= 1 << 31
-        or 8 * sectors * max((rows + ROWS + 2) * (cols + 4), all_cells) > backend.info.max_buffer
+        or 8 * sectors * (rows + ROWS + 2) * (cols + 4) > backend.info.max_buffer
     ):
         sectors //= 2
     return Planes(sectors, ROWS if gpu and cells > _CACHED else 1)
@@ -115,8 +115,10 @@ def rectangles_of_worlds(worlds: Worlds, unknown: str) -> tuple[Table, frozenset
     """Return the planes of empty rectangles of all worlds, which models share, and their flags."""
     backend = worlds.backend
     rows, cols = worlds.shape
-    planes = planes_of(backend, rows, cols, worlds.cells)
-    planes = Planes(planes.sectors)
+    sectors = planes_of(backend, rows, cols).sectors
+    while sectors > 1 and 8 * sectors * worlds.cells > worlds.largest_table:
+        sectors //= 2
+    planes = Planes(sectors)
 
     def fill(stack: Stack, table: Buffer) -> None:
         occupied, bits = worlds.marked(stack, unknown)

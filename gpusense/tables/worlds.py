@@ -372,6 +372,12 @@ class Worlds:
             self._tables[key] = table
         return self._tables[key]
 
+    @property
+    def largest_table(self) -> int:
+        """Largest size of a table of all worlds [bytes]."""
+        numbers = 8 * _MOST_CELLS if self.device.backend == "warp" else self.device.max_buffer
+        return min(self.device.max_buffer, numbers)
+
     def allocate(self, each: int, dtype: np.dtype) -> Buffer:
         """Return a buffer for ``each`` numbers of each cell of all worlds.
 
@@ -380,7 +386,7 @@ class Worlds:
         """
         info, size = self.backend.info, self._total * each * dtype.itemsize
         try:
-            if 0 < info.max_buffer < size:
+            if size > self.largest_table:
                 raise MemoryError
             count = self._total * each
             if count <= _MOST_CELLS or info.backend != "warp":
@@ -389,7 +395,7 @@ class Worlds:
             whole = self.backend.empty(-(-size // 8), np.dtype(np.float64), zero=True)
             return self.backend.part(whole, 0, _MOST_CELLS, dtype)
         except MemoryError as error:
-            room = info.max_buffer if 0 < info.max_buffer < size else info.memory // 2
+            room = self.largest_table if size > self.largest_table else info.memory // 2
             ends = np.cumsum(np.append(self._place[1:], self._total) - self._place, dtype=np.int64)
             fit = int(np.searchsorted(ends * each * dtype.itemsize, room, side="right"))
             raise MemoryError(

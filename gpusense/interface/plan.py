@@ -130,6 +130,10 @@ def launch_omissions(code: frozenset[str], least_ordered: tuple[int, int] | None
             and models that never do.
     """
     omissions = [ORDINARY_HEADINGS] if code and "HUGE_HEADINGS" not in code else []
+    if code and "WORLDS" not in code:
+        omissions.append(Omission("other worlds", "the model has a single map", "the map of each particle"))
+    elif code and "SHAPES" not in code:
+        omissions.append(Omission("moving shapes", "no world has shapes", "an intersection of each ray and shape"))
     if "ROUNDED_CELLS" in code:
         omissions.append(
             Omission(

@@ -133,6 +133,8 @@ def place_shapes(
             cosine, sine = cos_sin(np.where(none, 0.0, rows[:, 2]))
             if here.yaw_sin != 0:
                 cosine, sine = cosine * here.yaw_cos + sine * here.yaw_sin, sine * here.yaw_cos - cosine * here.yaw_sin
+            # The radius of a circle around the box, with a margin for rounding.
+            placed[:, 6] = np.hypot(sizes[:, 0], sizes[:, 1]) / here.resolution / 2 * 1.00001 + 0.001
             placed[:, 2], placed[:, 3], placed[:, 4:6] = cosine, sine, sizes / here.resolution / 2
         if sizes is not None:
             none |= (sizes < 0).any(axis=1)

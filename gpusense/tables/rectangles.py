@@ -61,14 +61,14 @@ class Planes:
         return 4 * self.sectors * self.lines(rows) * (cols + 2)
 
 
-def planes_of(backend: Backend, rows: int, cols: int) -> Planes:
+def planes_of(backend: Backend, rows: int, cols: int, all_cells: int = 0) -> Planes:
     """Return the planes of a map on a device.
 
     GPUs gain most from sectors, since a warp waits for its slowest ray. Memory limits rays once planes exceed a GPU's
     caches, and groups of rows halve the reads; on larger maps four sectors are no faster than two and take twice the
     memory. Kernels index the cells of all planes in 32 bits, which limits the sectors.
     """
-    gpu, cells = backend.info.kind == "gpu", rows * cols
+    gpu, cells = backend.info.kind == "gpu", max(rows * cols, all_cells)
     sectors = 1 if backend.info.backend == "numpy" else 4 if gpu and cells <= _FOUR_SECTORS else 2
     while sectors > 1 and (
         4 * sectors * (rows + ROWS + 2) * (cols + 4) >= 1 << 31
@@ -100,7 +100,7 @@ def empty_rectangles(
     end = min(right + RECTANGLE_REACH, cols)
     near = obstacles[first : bottom + RECTANGLE_REACH]
     band = len(near)
-    space, place = Workspace(backend), backend.upload(np.zeros(1, _INT))
+    space, place = Workspace(backend), backend.empty(1, _INT, zero=True)
     changed_part = (rows, cols, planes.sectors, first, band, top, left, bottom, right)
     if backend.info.kind == "cpu":
         marked = backend.upload(as_bytes(near))
@@ -115,10 +115,11 @@ def rectangles_of_worlds(worlds: Worlds, unknown: str) -> tuple[Table, frozenset
     """Return the planes of empty rectangles of all worlds, which models share, and their flags."""
     backend = worlds.backend
     rows, cols = worlds.shape
-    sectors = planes_of(backend, rows, cols).sectors
+    chosen = planes_of(backend, rows, cols, worlds.cells)
+    sectors = chosen.sectors
     while sectors > 1 and 8 * sectors * worlds.cells > worlds.largest_table:
         sectors //= 2
-    planes = Planes(sectors)
+    planes = Planes(sectors, chosen.group)
 
     def fill(stack: Stack, table: Buffer) -> None:
         occupied, bits = worlds.marked(stack, unknown)

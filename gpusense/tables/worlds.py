@@ -130,7 +130,10 @@ class Worlds:
         self._origins = _checked_origins(origin, count)
         # Parts of buffers begin at multiples of some bytes.
         whole = max(_WHOLE, self.backend.alignment)
-        padded = -(-(self._sizes[:, 0] + 2 * RING) * (self._sizes[:, 1] + 2 * RING) // whole) * whole
+        rows, cols = self._sizes.T
+        # Planes of rectangles have whole groups of 8 rows on GPUs.
+        padded = np.maximum((rows + 2 * RING) * (cols + 2 * RING), (rows + 9) // 8 * 8 * (cols + 2))
+        padded = -(-padded // whole) * whole
         self._total = int(padded.sum())
         if self._total > _MOST_CELLS:
             raise MemoryError(

@@ -1,6 +1,6 @@
 // Moving shapes of a world: discs, boxes and segments, in cells of its grid. A disc has 4 numbers: centre and radius,
-// and one that is not used. A box has 8: centre, cosine and sine of its direction, half its length and width, and two
-// that are not used. A segment has 4: its ends. A shape whose numbers are NaN is met by no ray. WORLDS: world has two
+// and one that is not used. A box has 8: centre, cosine and sine of its direction, half its length and width,
+// radius around it, and one not used. A segment has 4: its ends. A shape whose numbers are NaN is met by no ray. WORLDS: world has two
 // pairs of numbers for each particle: the first cell of its world among all worlds and the world's size, rows times
 // 2^16 plus columns; the world's index and the index of the shape that it does not see.
 // requires: ray
@@ -76,17 +76,21 @@ real2 nearest_shape(global const real *shapes, global const int2 *world, const C
     int i = 0;
     for (; i < crowd.discs; ++i, one += DISC) {
         const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
+        if (!(fabs(direction.x * y - direction.y * x) <= one[2])) continue;
         const real2 met = meet_disc(direction.x, direction.y, x, y, one[2]);
         if (met.x < nearest.x && i != seen.y) nearest = met;
     }
     for (; i < crowd.discs + crowd.boxes; ++i, one += BOX) {
         const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
+        if (!(fabs(direction.x * y - direction.y * x) <= one[6])) continue;
         const real2 met = meet_box(direction.x, direction.y, x, y, one[2], one[3], one[4], one[5]);
         if (met.x < nearest.x && i != seen.y) nearest = met;
     }
     for (; i < crowd.discs + crowd.boxes + crowd.segments; ++i, one += SEGMENT) {
         const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
         const real end_x = (one[2] - cell.x) - pose.x, end_y = (one[3] - cell.y) - pose.y;
+        const real aside = direction.x * y - direction.y * x, end_aside = direction.x * end_y - direction.y * end_x;
+        if ((aside > 0 && end_aside > 0) || (aside < 0 && end_aside < 0)) continue;
         const real2 met = meet_segment(direction.x, direction.y, x, y, end_x, end_y);
         if (met.x < nearest.x && i != seen.y) nearest = met;
     }

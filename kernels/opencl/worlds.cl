@@ -128,7 +128,9 @@ kernel void place_shapes(ARGUMENTS) {
         to[3] = (real)turned.y;
         to[4] = (real)(length / here.resolution / 2);
         to[5] = (real)(from[4] / here.resolution / 2);
-        to[6] = to[7] = 0;
+        // The radius of a circle around the box, with a margin for rounding.
+        to[6] = (real)(sqrt(length * length + (double)from[4] * from[4]) / here.resolution / 2 * 1.00001 + 0.001);
+        to[7] = 0;
     }
 }
 

@@ -136,7 +136,10 @@ def reader(dtype, count=1):
         ]
         numbers = ", ".join(f"part{k}.{name}" for k in range(length // width) for name in "xyzw"[:width])
         whole = f"wp::vec_t<{length}, {one}>({numbers})"
-        numbers = ", ".join(f"values.data[i + {k // per_element}].c[{k % per_element}]" for k in range(length))
+        inside = "" if per_element == 1 else ".c[{}]"
+        numbers = ", ".join(
+            f"values.data[i + {k // per_element}]{inside.format(k % per_element)}" for k in range(length)
+        )
         single = f"wp::vec_t<{length}, {one}>({numbers})"
     lines = ["#if defined(__CUDA_ARCH__)", *loads, f"return {whole};", "#else", f"return {single};", "#endif", ""]
     result = dtype if count == 1 else wp.types.vector(length=length, dtype=scalar)

@@ -1,10 +1,10 @@
 """Moving shapes of a world: discs, boxes and segments, in cells of its grid.
 
 A disc has 4 numbers: centre and radius, and one that is not used. A box has 8: centre, cosine and sine of its
-direction, half its length and width, and two that are not used. A segment has 4: its ends. A shape whose numbers are
-NaN is met by no ray. WORLDS: world has two pairs of numbers for each particle: the first cell of its world among all
-worlds and the world's size, rows times 2^16 plus columns; the world's index and the index of the shape that it does not
-see.
+direction, half its length and width, radius around it, and one not used. A segment has 4: its ends. A shape whose
+numbers are NaN is met by no ray. WORLDS: world has two pairs of numbers for each particle: the first cell of its world
+among all worlds and the world's size, rows times 2^16 plus columns; the world's index and the index of the shape that
+it does not see.
 """
 
 import functools
@@ -42,7 +42,7 @@ def functions(flags):
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     ray_direction = ray_file.functions(flags).ray_direction
-    number_at = reader(real)
+    number_at, four_at = reader(real), reader(real, 4)
     ZERO, ONE, TWO, MINUS_ONE = real(0.0), real(1.0), real(2.0), real(-1.0)
     TINY, NEVER, ALWAYS, UNKNOWN = real(1e-30), real(math.inf), real(-math.inf), real(math.nan)
 
@@ -121,23 +121,29 @@ def functions(flags):
         nearest = vec2(t, TWO)
         i = int(0)
         while i < crowd.discs + crowd.boxes + crowd.segments:
-            x = (number_at(shapes, one) - real(cell.x)) - pose.x
-            y = (number_at(shapes, one + 1) - real(cell.y)) - pose.y
-            a = number_at(shapes, one + 2)
-            b = number_at(shapes, one + 3)
+            four = four_at(shapes, one)
+            x = (four[0] - real(cell.x)) - pose.x
+            y = (four[1] - real(cell.y)) - pose.y
+            a = four[2]
+            b = four[3]
+            aside = wp.abs(direction.x * y - direction.y * x)
             met = vec2(NEVER, TWO)
             if i < crowd.discs:
-                met = meet_disc(direction.x, direction.y, x, y, a)
+                if aside <= a:
+                    met = meet_disc(direction.x, direction.y, x, y, a)
                 one += DISC
             elif i < crowd.discs + crowd.boxes:
-                met = meet_box(
-                    direction.x, direction.y, x, y, a, b, number_at(shapes, one + 4), number_at(shapes, one + 5)
-                )
+                rest = four_at(shapes, one + 4)
+                if aside <= rest[2]:
+                    met = meet_box(direction.x, direction.y, x, y, a, b, rest[0], rest[1])
                 one += BOX
             else:
                 end_x = (a - real(cell.x)) - pose.x
                 end_y = (b - real(cell.y)) - pose.y
-                met = meet_segment(direction.x, direction.y, x, y, end_x, end_y)
+                before = direction.x * y - direction.y * x
+                behind = direction.x * end_y - direction.y * end_x
+                if not ((before > ZERO and behind > ZERO) or (before < ZERO and behind < ZERO)):
+                    met = meet_segment(direction.x, direction.y, x, y, end_x, end_y)
                 one += SEGMENT
             if met.x < nearest.x and i != seen.y:
                 nearest = met

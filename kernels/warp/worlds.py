@@ -201,7 +201,10 @@ def make(name, flags):
             shapes[to + 3] = real(sine)
             shapes[to + 4] = real(length / here.resolution / TWO)
             shapes[to + 5] = real(wp.float64(raw[at + 4]) / here.resolution / TWO)
-            shapes[to + 6] = NUMBER_ZERO
+            # The radius of a circle around the box, with a margin for rounding.
+            width = wp.float64(raw[at + 4])
+            around = wp.sqrt(length * length + width * width) / here.resolution / TWO
+            shapes[to + 6] = real(around * wp.float64(1.00001) + wp.float64(0.001))
             shapes[to + 7] = NUMBER_ZERO
 
     @kernel(flags)

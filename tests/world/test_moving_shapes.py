@@ -123,6 +123,24 @@ def test_all_backends_have_the_same_ranges(backend: str) -> None:
     assert np.abs(found[1] - found[0]).max() <= 2e-6
 
 
+def test_gpus_have_the_same_ranges(as_gpu: Any, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their planes have groups of rows where worlds have very many cells."""
+    rng = np.random.default_rng(3)
+    cells = (rng.random((3, 70, 90)) < 0.01).astype(np.int8) * np.int8(100)
+    shapes, index = some_shapes(rng), rng.integers(0, 3, 40)
+    poses = np.column_stack([rng.uniform(-2, 8, (40, 2)), rng.uniform(-9, 9, 40)])
+    alone = gs.Worlds(cells, 0.1, ORIGINS, backend="numpy")
+    alone.shapes = shapes
+    wanted = gs.RayCaster(alone, RANGE, backend="numpy").cast(poses, BEARINGS, world=index)
+    monkeypatch.setattr("gpusense.tables.rectangles._CACHED", 1)
+    device = as_gpu()
+    worlds = gs.Worlds(cells, 0.1, ORIGINS, backend=device)
+    worlds.shapes = shapes
+    caster = gs.RayCaster(worlds, RANGE, backend=device)
+    assert np.abs(caster.cast(poses, BEARINGS, world=index) - wanted).max() <= 2e-6
+    assert "ROW_GROUPS" in caster._caster.flags
+
+
 CASES = [
     (dict(discs=[[[3.0, 1.0, 1.0]]]), 3.0, "a disc that the ray grazes"),
     (dict(discs=[[[1.0, 0.0, 2.0]]]), 0.0, "inside a disc"),

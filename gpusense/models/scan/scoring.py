@@ -100,11 +100,13 @@ class _Scorer:
         with space.result("log_p", request.result.flat, piece.begin, piece.count, pipeline.real) as log_p:
             scoring = pipeline.scoring(readings, placed, state.table, log_p, space, per_beam=request.per_beam)
             key = (scoring.flags, placed.key, readings.key)
+            changing = dict(pipeline.numbers(scoring), poses=placed.source, log_p=log_p)
+            if placed.inside is not None:
+                changing |= placed.changing()
             # As late as possible: a processor's threads are then awake for the launches that follow.
             self._begin()
             flags = space.run(
-                key, dict(pipeline.numbers(scoring), poses=placed.source, log_p=log_p, **placed.changing()),
-                lambda: pipeline.program(scoring), version=state.version,
+                key, changing, lambda: pipeline.program(scoring), version=state.version,
             )  # fmt: skip
         self._last.kernels = pipeline.kernel_names[scoring.tiles is not None]
         # Poses are placed in lanes, whatever kernel scores them.

@@ -64,4 +64,4 @@ def _spread_about(tracker: Tracker, pose: np.ndarray, about: np.ndarray) -> tupl
     if spread_of(about).narrow or tracker.shown > _MOST_LOOKED_AT:
         return share_off(about), None
     poses, weights = tracker.host_particles(), tracker.cloud.host_weights(tracker.shown)
-    return share_off_of(poses, weights, pose), Distances.of(poses, weights, pose)
+    return share_off_of(poses, weights, pose), Distances(poses, weights, pose)

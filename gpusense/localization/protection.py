@@ -11,8 +11,8 @@ Errors of filters have longer tails than the particles, so the spread is multipl
 
 from __future__ import annotations
 
+import functools
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,36 +33,33 @@ _COSINES = np.cos((np.arange(_PARTS) + 0.5) * (math.pi / 2 / _PARTS)) ** 2
 _STEPS = 60
 
 
-class Distances(NamedTuple):
-    """Distances of particles from a pose.
+class Distances:
+    """Distances of particles from a pose, sorted when a radius is first asked for: a filter's step has no use for them.
 
-    Attributes:
-        distance: (N,) distances [m], increasing.
-        beyond: (N,) share of the particles that is farther than each distance.
+    Args:
+        poses: (N, 3) particles.
+        weights: (N,) weights >= 0, not necessarily normalised.
+        pose: (3,) pose.
     """
 
-    distance: Floats
-    beyond: Floats
+    def __init__(self, poses: Floats, weights: Floats, pose: Floats) -> None:
+        self._particles = poses, weights, pose
 
-    @classmethod
-    def of(cls, poses: Floats, weights: Floats, pose: Floats) -> Distances:
-        """Return the distances of weighted particles.
-
-        Args:
-            poses: (N, 3) particles.
-            weights: (N,) weights >= 0, not necessarily normalised.
-            pose: (3,) pose.
-        """
+    @functools.cached_property
+    def _sorted(self) -> tuple[Floats, Floats]:
+        """Distances (N,) [m], increasing, and the share of the particles that is farther than each."""
+        poses, weights, pose = self._particles
         distance = np.hypot(poses[:, 0] - pose[0], poses[:, 1] - pose[1])
         order = np.argsort(distance, kind="stable")
         sums = np.cumsum(weights[order])
-        return cls(distance[order], 1 - sums / sums[-1])
+        return distance[order], 1 - sums / sums[-1]
 
     def radius(self, beyond: float) -> float:
         """Return the least distance exceeded by at most a share of the particles."""
+        distance, farther = self._sorted
         # Sums of many weights are 1 up to rounding.
-        k = int(np.searchsorted(-self.beyond, -beyond - 1e-12))
-        return float(self.distance[min(k, len(self.distance) - 1)])
+        k = int(np.searchsorted(-farther, -beyond - 1e-12))
+        return float(distance[min(k, len(distance) - 1)])
 
 
 def check_risk(risk: float) -> float:

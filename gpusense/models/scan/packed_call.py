@@ -38,7 +38,6 @@ _Adoption: TypeAlias = tuple[
     tuple[np.dtype | None, np.dtype | None, np.dtype], tuple[Buffer | None, Buffer | None], tuple[Any, ...]
 ]
 # Poses and readings of the host.
-_HOST, _NO_BUFFERS = (False, False), (None, None)
 # Alignment of arrays that are copied as one [bytes], enough for every device.
 _ALIGNED = 1024
 # Number of sizes of short calls that are kept; ordinary calls of a size before the first short one; largest map that
@@ -175,11 +174,6 @@ class PackedCall:
 
 
 @functools.cache
-def _no_adoption(limits: np.dtype) -> _Adoption:
-    """Return the adoption of host arrays with readings of a type."""
-    return (None, None, limits), _NO_BUFFERS, ()
-
-
 class _There:
     """Arrays on the device that ordinary calls copy to the places of a recorded program, as each call has other arrays.
 
@@ -274,7 +268,7 @@ class PackedCallCache:
         kinds = self._kinds(poses, ranges)
         if kinds is None or not is_short(count, size) or not fits(count, size) or not self._takes(count, out, kinds):
             return None
-        there = _no_adoption(ranges.dtype) if kinds is _HOST else self._adopted(poses, ranges, kinds)
+        there = self._adopted(poses, ranges, kinds)
         if there is None or not self._repeats((count, *there[0])):
             return None
         corners = None if kinds[0] else self._corners(poses)
@@ -312,15 +306,10 @@ class PackedCallCache:
             # The buffers of both kinds of calls may not fit the device at once.
             self._calls.clear()
             return None
-        self.last = kept[0]
-        if pipeline.rules.first_scans.left:
-            pipeline.rules.first_scans.look_at("ranges", ranges[None], pipeline.rules.map_size)
-        return result
+        return self._delivered(kept[0], ranges, result)
 
     def _kinds(self, poses: Any, ranges: Any) -> tuple[bool, bool] | None:
         """Return whether poses and readings are on the device; None for arrays that the ordinary call must read."""
-        if type(poses) is np.ndarray and type(ranges) is np.ndarray:
-            return _HOST if poses.dtype in _FLOATS and ranges.dtype in _FLOATS else None
         kinds = []
         for array in (poses, ranges):
             if type(array) is np.ndarray:
@@ -355,10 +344,6 @@ class PackedCallCache:
         pipeline, backend = self._pipeline, self._pipeline.backend
         kinds, buffers, _ = there
         kept = self._calls.get((count, *kinds))
-        if kept is not None and buffers == _NO_BUFFERS:
-            # Host arrays take the shortest path: each further call costs a hundredth of the launches.
-            written = np.empty(count, pipeline.real) if out is None else out
-            return self._delivered(kept[0], ranges, written) if kept[0].score(poses, ranges, written, corners) else None
         result = Result(poses, out, (count,), pipeline.real, backend, on_device=kinds[0] is not None)
         if kept is None:
             places = _There(backend, count, pipeline.scanner.count, kinds[:2], pipeline.real)

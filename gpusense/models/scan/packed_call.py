@@ -37,7 +37,6 @@ _FLOATS = (np.dtype(np.float32), _DOUBLE)
 _Adoption: TypeAlias = tuple[
     tuple[np.dtype | None, np.dtype | None, np.dtype], tuple[Buffer | None, Buffer | None], tuple[Any, ...]
 ]
-# Poses and readings of the host.
 # Alignment of arrays that are copied as one [bytes], enough for every device.
 _ALIGNED = 1024
 # Number of sizes of short calls that are kept; ordinary calls of a size before the first short one; largest map that
@@ -173,7 +172,6 @@ class PackedCall:
         return self._device.explain()
 
 
-@functools.cache
 class _There:
     """Arrays on the device that ordinary calls copy to the places of a recorded program, as each call has other arrays.
 

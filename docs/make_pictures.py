@@ -20,7 +20,7 @@ WIDTH, COLOURS = 1100, 128
 TARGET = Path(__file__).parent / "img" / "demo.png"
 MOVIE = TARGET.with_name("run.gif")
 COMMANDS = (
-    "simulate --world office:1 --map-out map.yaml --log-out run.bag --scans 100",
+    "simulate --world office:3 --map-out map.yaml --log-out run.bag --scans 100",
     f"localize --map map.yaml --log run.bag --global --animate {MOVIE}",
 )
 

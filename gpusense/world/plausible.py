@@ -15,6 +15,8 @@ from gpusense._util.notices import warn_user
 
 # A heading or bearing beyond a turn, with a margin for float32 rounding [rad].
 _TURN = 2 * math.pi * (1 + 1e-6)
+# Headings in degrees are at most two turns.
+_DEGREES = 720.0
 # Larger cells suggest that a map is in other units [m].
 _LARGEST_CELL = 1.0
 # Range beyond any robot's scanner, and range that is doubtful in a much smaller map [m].
@@ -72,6 +74,19 @@ def look_at_heading(name: str, heading: float) -> None:
         _notice(
             f"{name}: has a heading of {heading:.6g} rad, more than a turn: is it in degrees? Radians are meant "
             "(math.radians converts)"
+        )
+
+
+def look_at_poses(name: str, poses: NDArray[np.floating]) -> None:
+    """Warn of headings that spread like degrees: over more than four turns, and none beyond 720."""
+    headings = poses[..., 2]
+    if not headings.size or headings.dtype.kind not in "fiu":
+        return
+    low, high = float(headings.min()), float(headings.max())
+    if high - low > 4 * _TURN and max(-low, high) <= _DEGREES:
+        _notice(
+            f"{name}: have headings over more than four turns: are they in degrees? Radians are meant (numpy.radians "
+            "converts)"
         )
 
 

@@ -193,10 +193,11 @@ def test_replay_casts_on_the_device_that_scored(scene):
 
 @pytest.mark.slow
 def test_all_backends_present_agree(capsys):
-    code, out, err = run(capsys)
+    code, out, err = run(capsys, "-v")
     assert err == ""
     assert code == 0, out
-    assert "none breached" in out
+    assert out.startswith("PASSED: all ")
+    out = " ".join(out.split())
     for device in gs.devices():
         assert (device.selection if device.available else device.reason) in out or device.kind == "simulator"
 
@@ -339,7 +340,7 @@ def test_an_absent_backend_is_an_error_only_when_named(capsys):
     code, out, err = run(capsys, "--backend", "warp:cuda:99")
     assert (code, out) == (2, "")
     assert err.count("\n") == 1
-    assert run(capsys, "--backend", "cuda")[0] == 2
+    assert run(capsys, "--backend", "vulkan")[0] == 2
 
 
 def test_a_single_backend_is_held_against_numpy():

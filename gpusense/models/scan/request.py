@@ -15,6 +15,7 @@ from gpusense.models.scan.classed import check_ranges
 from gpusense.models.scan.rules import ModelContext
 from gpusense.tables.world_index import WorldIndex
 from gpusense.tables.worlds import Worlds
+from gpusense.world.plausible import look_at_poses
 
 FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
 # Poses that several models share, checked once, by the number of scans.
@@ -87,6 +88,8 @@ def make_request(
         ignore: (N,) indices of the shapes that poses do not see.
     """
     backend, real, scanner = setting.backend, setting.real, setting.rules.scanner
+    if scanner._first_scans.left and type(poses) is np.ndarray and poses.shape[-1:] == (3,):
+        look_at_poses("poses", poses)
     beams = scanner.count
     if type(ranges) is np.ndarray and ranges.shape == (beams,) and ranges.dtype in FLOATS:
         readings: np.ndarray = ranges

@@ -38,7 +38,11 @@ from gpusense.localization.defaults import DEFAULTS
 LOGS = ("intel", "csail", "aces", "belgioioso", "fhw", "seattle", "fr079", "jarvis-nav350", "olin")
 # Defaults of the programs: model; z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, max_distance. Their default
 # noise of the odometry, 0.2, loses the robot where scans are metres apart.
-MODEL, PARAMETERS, ALPHA = "field", (0.5, 0.05, 0.05, 0.5, 0.2, 0.1, 2.0), DEFAULTS.alpha
+MODELS = {
+    "default": ("field", (0.5, 0.05, 0.05, 0.5, 0.2, 0.1, 2.0)),
+    "product": ("field, prob", (0.7, 0.0, 0.0, 0.3, 0.07, 0.1, 2.0)),
+}
+ALPHA = DEFAULTS.alpha
 CASES = ("as recorded", "carried away")
 # Least scans of a loss; scans until it must be found, and after its end until the verdict must recover.
 LEAST, LATE, FAR, FAR_TURN = 5, 20, 1.0, 0.5
@@ -134,6 +138,7 @@ def row_of(name, case, chosen):
 def study(args):
     """Run all programs on all logs."""
     results, rows = [], []
+    model, parameters = MODELS[args.model]
     for number, (name, (_, package, _)) in enumerate(PEERS.items()):
         compiled, version, missing = load(name)
         if compiled is None:
@@ -146,7 +151,7 @@ def study(args):
                 grid, scanner = recording.places[0]
                 chosen = np.linspace(0, scanner.count - 1, args.beams).round().astype(int)
                 thin = gs.Scanner(scanner.bearings[chosen] + scanner.mount[2], scanner.range_max, scanner.range_min)
-                weigher = Weigher(compiled, grid, thin, PARAMETERS, MODEL)
+                weigher = Weigher(compiled, grid, thin, parameters, model)
                 models = recordings.field(args.backend)(grid, scanner)
                 for case, repeat in [(case, k) for case in CASES for k in range(args.repeats)]:
                     rng = np.random.default_rng((number, place, CASES.index(case), repeat))
@@ -163,7 +168,7 @@ def study(args):
         "### Programs", table(COLUMNS, rows), "### Logs", table(("program", "log", *COLUMNS[2:]), per_log),
     ])  # fmt: skip
     publish(__file__, args, text, dict(results=results, settings=dict(scans=args.scans, particles=args.particles)),
-            "Likelihood fields of the programs' nodes, odometry noise 0.02.")  # fmt: skip
+            f"The programs' field model: {args.model}; odometry noise 0.02.")  # fmt: skip
 
 
 def times(args):
@@ -208,6 +213,9 @@ def main() -> None:
     parser = make_parser(__doc__, backend="opencl", seed=False)
     parser.add_argument("--times", action="store_true", help="measure the time of the command instead")
     parser.add_argument("--logs", nargs="+", default=list(LOGS), choices=LOGS)
+    parser.add_argument(
+        "--model", default="default", choices=MODELS, help="the nodes' default, or a product of densities"
+    )
     parser.add_argument("--particles", type=int, default=2000)
     parser.add_argument("--beams", type=int, default=60, help="beams that the programs use")
     parser.add_argument("--scans", type=int, default=120, help="scans of a run")

@@ -33,8 +33,8 @@ from gpusense.world.scanner import Scanner
 Floats = NDArray[np.float64]
 # A stretch ends where no pose is judged for this time [s], and for this multiple of the median time between them.
 _GAP, _GAP_STEPS = 2.0, 5.0
-# Lost stretches, the longest ones, whose scans are searched in sequence for the cause.
-_DIAGNOSED = 3
+# Stretches that are searched, lost ones and then the longest; of these, whose scans are diagnosed in sequence.
+_SEARCHED, _DIAGNOSED = 12, 3
 # Largest difference between copies of a position [m].
 _SAME = 1e-3
 # Evidence of the beams of a scan in a diagnosis.
@@ -59,7 +59,7 @@ class Stretch:
         promised: Share of the poses with a finite radius.
         pose: (3,) pose at the scan that was searched, else the last pose [m, m, rad].
         place: The likeliest place of the scan at ``pose``; None without a search.
-        diagnosis: Evidence at ``pose`` and the likely cause; None for "tracking".
+        diagnosis: Evidence at ``pose`` and the likely cause; None for "tracking", and without a search.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -192,15 +192,15 @@ class TrajectoryJudge:
         p_lost, verdicts, explained, radii = zip(*(one[3] for one in self._judged), strict=True)
         columns = [np.array(column, np.float64) for column in (p_lost, explained, radii)]
         stretches = stretches_of(times, poses, verdicts, *columns)
-        lost = sorted((one for one in stretches if one.verdict == "lost"), key=lambda one: one.first - one.last)
-        searched = {one.first for one in lost[:_DIAGNOSED]}
-        explained_stretches = tuple(
-            one if one.verdict == "tracking" else self._explained(one, of_run=one.first in searched)
-            for one in stretches
-        )
+        doubted = [one for one in stretches if one.verdict != "tracking"]
+        worst = sorted(doubted, key=lambda one: (one.verdict != "lost", one.first - one.last))[:_SEARCHED]
+        explained_stretches = {
+            one.first: self._explained(one, of_run=one.verdict == "lost" and k < _DIAGNOSED)
+            for k, one in enumerate(worst)
+        }
         return Judgement(
             scans, np.array(index, np.int64), times, poses, columns[0], tuple(verdicts), columns[1], columns[2],
-            self._risk, explained_stretches,
+            self._risk, tuple(explained_stretches.get(one.first, one) for one in stretches),
         )  # fmt: skip
 
     def _explained(self, stretch: Stretch, *, of_run: bool) -> Stretch:
@@ -361,7 +361,8 @@ def stretches_of(
     """
     steps = np.diff(times)
     longest = max(_GAP, _GAP_STEPS * float(np.median(steps))) if len(steps) else _GAP
-    gap = np.append(steps > longest, True)
+    # A clock that goes back ends a stretch as well.
+    gap = np.append((steps > longest) | (steps < 0), True)
     ends = [k for k in range(len(times)) if gap[k] or verdicts[k + 1] != verdicts[k]]
     stretches = []
     for first, last in zip([0, *(k + 1 for k in ends)], ends, strict=False):

@@ -90,6 +90,12 @@ def test_a_scanner_must_have_a_model(model):
         gs.judge_trajectory("a model", scans(), truth())
 
 
+def test_a_clock_that_goes_back_ends_a_stretch():
+    times, column = np.array([5.0, 6.0, 1.0, 2.0]), np.zeros(4)
+    found = stretches_of(times, np.zeros((4, 3)), ("tracking",) * 4, column, column, column)
+    assert [(one.start, one.end) for one in found] == [(5.0, 6.0), (1.0, 2.0)]
+
+
 def test_stretches_end_at_verdicts_and_gaps():
     times = np.array([0.0, 1.0, 2.0, 3.0, 20.0, 21.0])
     words = ("tracking", "tracking", "lost", "lost", "lost", "tracking")

@@ -12,7 +12,8 @@ from gpusense.interface.launches import launch
 from gpusense.peers.weights import OVERLAID, Beluga, Peer
 from gpusense.tables.cells import check_size
 from gpusense.tables.distances import NO_OBSTACLE, squared_distances, squared_of_stack
-from gpusense.tables.worlds import Stack, Table, Worlds
+from gpusense.tables.world_stack import Stack, Table
+from gpusense.tables.worlds import Worlds
 from gpusense.world.field_density import FieldDensity
 from gpusense.world.likelihood import Likelihood
 from gpusense.world.parameters import LikelihoodFieldParameters

@@ -20,7 +20,8 @@ from gpusense._util import checks
 from gpusense._util.typing import Space
 from gpusense.backends.base import Buffer
 from gpusense.tables.outlines import REACH, SPANS, Outlines
-from gpusense.tables.worlds import Stack, Table, Worlds
+from gpusense.tables.world_stack import Stack, Table
+from gpusense.tables.worlds import Worlds
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.windows import Window, whole
 

@@ -13,7 +13,8 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.tables.cells import as_bytes, check_size, packed
-from gpusense.tables.worlds import Stack, Table, Worlds
+from gpusense.tables.world_stack import Stack, Table
+from gpusense.tables.worlds import Worlds
 from gpusense.world.windows import Window
 
 _INT = np.dtype(np.int32)

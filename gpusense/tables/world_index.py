@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -12,12 +12,28 @@ from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.flags import flags_if
 from gpusense.interface.structs import Crowd
-from gpusense.tables.crowd import NO_CROWD
-from gpusense.tables.worlds import Worlds
-from gpusense.world.grid import OccupancyGrid
+from gpusense.tables.crowd import NO_CROWD, CrowdTable
 
 _INT = np.dtype(np.int32)
 _ON_DEVICE = ("int32", "int64")
+
+
+class ManyWorlds(Protocol):
+    """The worlds, as this module uses them."""
+
+    backend: Backend
+    space: Workspace
+    store: Buffer
+    frames: Buffer
+    crowd: CrowdTable
+    threshold: int
+    uniform: bool
+
+    @property
+    def resolution(self) -> float:
+        """Side of a cell [m]."""
+
+    def __len__(self) -> int: ...
 
 
 class WorldIndex:
@@ -31,7 +47,7 @@ class WorldIndex:
         backend: The device.
     """
 
-    def __init__(self, worlds: Worlds, world: Any, ignore: Any, count: int, backend: Backend) -> None:
+    def __init__(self, worlds: ManyWorlds, world: Any, ignore: Any, count: int, backend: Backend) -> None:
         self.worlds = worlds
         if world is None:
             if len(worlds) > 1:
@@ -70,7 +86,7 @@ class InWorlds(NamedTuple):
         wide_ignore: The same of each index of a shape.
     """
 
-    worlds: Worlds
+    worlds: ManyWorlds
     index: Buffer
     ignore: Buffer
     wide: int
@@ -85,31 +101,6 @@ class InWorlds(NamedTuple):
     def flags(self) -> frozenset[str]:
         """Flags of kernels that cast rays of these poses."""
         return flags_if(WORLDS=True, SHAPES=self.crowd.stride > 0)
-
-
-def index_of(grid: OccupancyGrid | Worlds, world: Any, ignore: Any, count: int, backend: Backend) -> WorldIndex | None:
-    """Return the worlds of poses; None for a single map."""
-    if isinstance(grid, Worlds):
-        return WorldIndex(grid, world, ignore, count, backend)
-    for name, value in (("world", world), ("ignore", ignore)):
-        if value is not None:
-            raise ValueError(f"{name}: must be None for a model of a single map, got {checks.show(value)}")
-    return None
-
-
-def check_worlds(worlds: Worlds, backend: Backend) -> Worlds:
-    """Return worlds after a check of their device."""
-    if worlds.backend is not backend:
-        here, there = backend.info.selection, worlds.device.selection
-        raise ValueError(f"grid: must be Worlds on the model's device {here!r}, got backend={there!r}; "
-                         f"pass backend={there!r}, or make the worlds on {here!r}")  # fmt: skip
-    return worlds
-
-
-def check_no_worlds(grid: object, compat: object) -> None:
-    """Refuse peers' formulas in worlds."""
-    if isinstance(grid, Worlds) and compat is not None:
-        raise ValueError(f"compat: must be None in Worlds, got {checks.show(compat)}")
 
 
 def no_worlds(space: Workspace, real: np.dtype) -> dict[str, Any]:

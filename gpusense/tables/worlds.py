@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import weakref
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Hashable, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,17 +14,13 @@ from gpusense._util.typing import Space
 from gpusense.backends import Backend, BackendInfo, Selection, arrays, get_backend
 from gpusense.backends.base import Adopted, Buffer
 from gpusense.backends.workspace import Workspace
-from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import launch
-from gpusense.interface.structs import Frame
+from gpusense.tables.collisions import collisions
 from gpusense.tables.crowd import CrowdTable, Shapes
-from gpusense.world.frames import frame_of
+from gpusense.tables.world_cells import checked_cells, checked_origins, frames_of, of_grids
+from gpusense.tables.world_stack import Stack, Table
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.grid_frame import check_resolution
-from gpusense.world.windows import LONGEST_SIDE, Window
-
-if TYPE_CHECKING:
-    from gpusense.tables.world_index import InWorlds
 
 _INT, _BYTE = np.dtype(np.int32), np.dtype(np.uint8)
 _NO_FLAGS: frozenset[str] = frozenset()
@@ -37,43 +32,6 @@ _MOST_CELLS = (1 << 31) - 1
 _WHOLE = 512
 # Cells of worlds that are made at once, by kind of device: they bound the memory besides the tables.
 _TOGETHER = {"cpu": 1 << 22, "gpu": 1 << 26}
-
-
-class Stack(NamedTuple):
-    """Some worlds of one size whose tables are made together.
-
-    Attributes:
-        indices: (W,) indices of the worlds.
-        rows: Rows of each.
-        cols: Columns of each.
-        place: First cell of each in tables with a ring, on the device.
-        space: Memory besides the tables.
-    """
-
-    indices: np.ndarray
-    rows: int
-    cols: int
-    place: Buffer
-    space: Workspace
-
-    @property
-    def worlds(self) -> int:
-        """W."""
-        return len(self.indices)
-
-
-class Table(NamedTuple):
-    """A table of all worlds.
-
-    Attributes:
-        buffer: The table.
-        size: Its size [bytes].
-        fill: Function that fills the parts of a stack of worlds.
-    """
-
-    buffer: Buffer
-    size: int
-    fill: Callable[[Stack, Buffer], None]
 
 
 class Worlds:
@@ -120,14 +78,14 @@ class Worlds:
         self.backend: Backend = get_backend(backend)
         grids = cells if isinstance(cells, (list, tuple)) and any(isinstance(c, OccupancyGrid) for c in cells) else None
         if grids is not None:
-            resolution, origin, occupied_threshold = _of_grids(grids, resolution, origin, occupied_threshold)
+            resolution, origin, occupied_threshold = of_grids(grids, resolution, origin, occupied_threshold)
             cells = [grid.cells for grid in grids]
         self._resolution = check_resolution(0.05 if resolution is None else resolution)
         threshold = 65 if occupied_threshold is None else occupied_threshold
-        self._threshold = checks.integer("occupied_threshold", threshold, low=1, high=100)
-        given, self._sizes = _checked_cells(cells, self.backend, "cells")
+        self.threshold = checks.integer("occupied_threshold", threshold, low=1, high=100)
+        given, self._sizes = checked_cells(cells, self.backend, "cells")
         count = len(self._sizes)
-        self._origins = _checked_origins(origin, count)
+        self._origins = checked_origins(origin, count)
         # Parts of buffers begin at multiples of some bytes.
         whole = max(_WHOLE, self.backend.alignment)
         rows, cols = self._sizes.T
@@ -141,11 +99,11 @@ class Worlds:
                 f"{int(np.searchsorted(np.cumsum(padded), _MOST_CELLS, side='right'))} of {count} worlds fit"
             )
         self._place = np.append(0, np.cumsum(padded)[:-1]).astype(np.int32)
-        self._space = Workspace(self.backend)
+        self.space = Workspace(self.backend)
         self._tables: dict[Hashable, Table] = {}
-        self._maps: weakref.WeakSet[WorldMap] = weakref.WeakSet()
-        self._store = self.allocate(1, _BYTE)
-        self.frames = self.backend.upload(self._frames())
+        self._maps: weakref.WeakSet[Any] = weakref.WeakSet()
+        self.store = self.allocate(1, _BYTE)
+        self.frames = self.backend.upload(frames_of(self._origins, self._resolution, self._sizes, self._place))
         self.crowd = CrowdTable(self.backend, self.frames, self._resolution, count)
         self._put(np.arange(count), given)
         sizes = self._sizes
@@ -227,9 +185,9 @@ class Worlds:
         number = checks.integer("index", index, low=0, high=len(self) - 1)
         (rows, cols), first = self._sizes[number].tolist(), int(self._place[number])
         cells = np.empty(rows * cols, np.int8)
-        self.backend.download(self.backend.part(self._store, first, rows * cols, _BYTE), cells.view(_BYTE))
+        self.backend.download(self.backend.part(self.store, first, rows * cols, _BYTE), cells.view(_BYTE))
         return OccupancyGrid(
-            cells.reshape(rows, cols), self._resolution, self._origins[number], occupied_threshold=self._threshold
+            cells.reshape(rows, cols), self._resolution, self._origins[number], occupied_threshold=self.threshold
         )
 
     def obstacles(self, index: int, unknown: str) -> np.ndarray:
@@ -267,7 +225,7 @@ class Worlds:
             raise ValueError(f"index: every world must occur once, got {checks.show(read)}")
         if not len(which):
             return
-        given, sizes = _checked_cells(cells, self.backend, "cells")
+        given, sizes = checked_cells(cells, self.backend, "cells")
         if len(sizes) != len(which) or (sizes != self._sizes[which]).any():
             wanted, found = self._sizes[which].tolist(), sizes.tolist()
             raise ValueError(f"cells: sizes must be those of the worlds, {wanted[:3]} ..., got {found[:3]} ...")
@@ -276,7 +234,7 @@ class Worlds:
             for table in self._tables.values():
                 table.fill(stack, table.buffer)
         self.backend.synchronize()
-        self._space.wait()
+        self.space.wait()
 
     def collides(
         self, poses: Any, radius: float, *, world: Any = None, ignore: Any = None, unknown: Space = "free"
@@ -307,52 +265,7 @@ class Worlds:
             >>> worlds.collides([(2.2, 0.5, 0.0), (2.7, 0.5, 0.0)], radius=0.5).tolist()
             [False, True]
         """
-        from gpusense.tables.world_index import WorldIndex
-
-        cells = checks.real("radius", radius, low=0) / self._resolution
-        checks.choice("unknown", unknown, ("free", "occupied"))
-        backend, single, there = self.backend, False, arrays.on_device(poses)
-        if there:
-            buffer, count, single, _ = arrays.adopt_poses(poses, backend, "poses")
-        else:
-            host = checks.array("poses", arrays.host_poses(poses, "poses"), ("N", 3))
-            buffer, count = backend.upload(host), len(host)
-        inside = WorldIndex(self, world, ignore, count, backend).buffers(backend, self._space, (0, count))
-        hit = backend.blank(count, _BYTE) if there else backend.empty(count, _BYTE)
-        if count:
-            self._collide(buffer, count, single, inside, hit, cells, int(unknown == "occupied"))
-        if there:
-            return arrays.lent(poses, backend, hit, (count,), _BYTE)
-        return backend.download(hit, np.empty(count, np.uint8)).view(bool)
-
-    def _collide(
-        self, poses: Buffer, count: int, single: bool, inside: InWorlds, hit: Buffer, radius: float, unknown: int
-    ) -> None:
-        """Place poses, and tell which discs about them, with a radius in cells, meet anything."""
-        space, real = self._space, np.dtype(np.float32)
-        cell, pose = space.empty("cell", 2 * count, _INT), space.empty("pose", 4 * count, real)
-        world, status = space.empty("placed", 4 * count, _INT), self.backend.upload(np.zeros(2, _INT))
-        frame = Frame(0.0, 0.0, self._resolution, 0.0, 0.0, 1.0, 0.0)
-        flags = inside.flags | flags_if(POSES_FLOAT32=single, HUGE_HEADINGS=True)
-        self.backend.run((
-            launch(
-                "place_in_worlds", flags, (count,), poses=poses, index=inside.index, ignore=inside.ignore,
-                frames=self.frames, pose_cell=cell, pose=pose, pose_low=space.empty("low", 4, real), world=world,
-                pose_status=status, frame=frame, particles=count, worlds=len(self), wide=inside.wide,
-                wide_ignore=inside.wide_ignore,
-            ),
-            launch(
-                "find_collisions", inside.flags, (count,), store=self._store, world=world,
-                shapes=self.crowd.table(real), pose_cell=cell, pose=pose, hit=hit, particles=count, radius=radius,
-                crowd=inside.crowd, threshold=self._threshold, unknown=unknown,
-            ),
-        ))  # fmt: skip
-        state = self.backend.download(status, np.zeros(2, _INT))
-        space.wait()
-        if state[0] > 1:
-            raise ValueError("world: every index must be one of the worlds, got an index on the device that is not")
-        if state[0]:
-            raise ValueError("poses: must be finite, got a pose on the device that is not")
+        return collisions(self, poses, radius, world, ignore, unknown)
 
     # ---- tables
 
@@ -371,7 +284,7 @@ class Worlds:
             for stack in self.stacks(np.arange(len(self))):
                 table.fill(stack, table.buffer)
                 self.backend.synchronize()
-            self._space.release()
+            self.space.release()
             self._tables[key] = table
         return self._tables[key]
 
@@ -415,7 +328,7 @@ class Worlds:
             for first in range(0, len(members), each):
                 part = members[first : first + each]
                 place = self.backend.upload(self._place[part])
-                yield Stack(part, rows, cols, place, self._space)
+                yield Stack(part, rows, cols, place, self.space)
 
     def marked(self, stack: Stack, unknown: str, margin: int = 0) -> tuple[Buffer, Buffer]:
         """Return the obstacles of a stack as bytes and as bits, with a margin of obstacles around each world."""
@@ -424,9 +337,9 @@ class Worlds:
         occupied = stack.space.empty("occupied", lines * cols, _BYTE)
         bits = stack.space.empty("bits", lines * words, _INT)
         self._run(
-            "mark_obstacles", (words, lines), store=self._store, place=stack.place, occupied=occupied, bits=bits,
+            "mark_obstacles", (words, lines), store=self.store, place=stack.place, occupied=occupied, bits=bits,
             rows=stack.rows, cols=stack.cols, worlds=stack.worlds, words=words, margin=margin,
-            threshold=self._threshold, unknown=int(unknown == "occupied"),
+            threshold=self.threshold, unknown=int(unknown == "occupied"),
         )  # fmt: skip
         return occupied, bits
 
@@ -435,7 +348,7 @@ class Worlds:
         first = int(self._place[index]) * each
         self.backend.upload(numbers.reshape(-1), self.backend.part(table, first, numbers.size, numbers.dtype))
 
-    def watch(self, one: WorldMap) -> None:
+    def watch(self, one: Any) -> None:
         """Tell a model's map when the shapes get other numbers."""
         self._maps.add(one)
 
@@ -457,129 +370,10 @@ class Worlds:
                 cells = self.backend.upload(np.ascontiguousarray(given[first : first + step]).view(_BYTE))
             place = self.backend.upload(self._place[part])
             self._run(
-                "put_cells", (count, len(part)), cells=cells, place=place, store=self._store, count=count,
+                "put_cells", (count, len(part)), cells=cells, place=place, store=self.store, count=count,
                 worlds=len(part),
             )  # fmt: skip
             self.backend.synchronize()
 
     def _run(self, kernel: str, size: tuple[int, ...], **arguments: Any) -> None:
         self.backend.run((launch(kernel, _NO_FLAGS, size, **arguments),))
-
-    def _frames(self) -> np.ndarray:
-        """Return the frames of all worlds; see the kernel file ``worlds``."""
-        frames = np.zeros((len(self), 8))
-        known: dict[Any, Any] = {}
-        for number, origin in enumerate(self._origins):
-            if origin not in known:
-                known[origin] = frame_of(_Corner(origin, self._resolution, (1, 1)), (0.0, 0.0, 0.0))
-            frame = known[origin]
-            frames[number, :4] = frame.origin_x, frame.origin_y, frame.yaw_cos, frame.yaw_sin
-        frames[:, 4:6], frames[:, 6] = self._sizes, self._place
-        return frames
-
-
-class _Corner(NamedTuple):
-    """The corner of a world, as ``frame_of`` takes it."""
-
-    origin: tuple[float, float, float]
-    resolution: float
-    shape: tuple[int, int]
-
-
-class WorldMap:
-    """The table of all worlds for a model, in place of a map's reachable window.
-
-    Args:
-        worlds: The worlds.
-        make: Function that returns the table.
-
-    Attributes:
-        grid: The worlds.
-        window: A window of the size of the largest world.
-        table: The table; None before it is made.
-    """
-
-    def __init__(self, worlds: Worlds, make: Callable[[], Buffer]) -> None:
-        self.grid, self._make, self.version, self.preparations = worlds, make, 0, 0
-        self.table: Buffer = None
-        self.window = Window(0, 0, *worlds.shape)
-        worlds.watch(self)
-
-    def ensure(self, corners: object) -> WorldMap:
-        """Return the map with its table."""
-        if self.table is None:
-            self.table = self._make()
-            self.preparations, self.version = 1, self.version + 1
-        return self
-
-    def drop(self) -> None:
-        """Keep the table: it belongs to the worlds."""
-
-    def omission(self, bytes_per_cell: float) -> None:
-        """Return None: worlds are prepared as a whole."""
-
-    def update(self, cells: object, place: object) -> OccupancyGrid:
-        """Refuse a change of cells."""
-        raise ValueError("grid: must be a single map for update_map, got Worlds; worlds.replace(index, cells) does it")
-
-
-def _of_grids(
-    grids: Sequence[Any], resolution: float | None, origin: Any, threshold: int | None
-) -> tuple[float, Any, int]:
-    """Return the resolution, the origins and the threshold of a list of grids."""
-    for number, grid in enumerate(grids):
-        checks.instance(f"cells[{number}]", grid, OccupancyGrid)
-    sides = sorted({grid.resolution for grid in grids} | ({resolution} if resolution is not None else set()))
-    if len(sides) > 1:
-        raise ValueError(f"resolution: must be the same for all worlds, got {sides}")
-    thresholds = sorted({grid.occupied_threshold for grid in grids} | ({threshold} if threshold is not None else set()))
-    if len(thresholds) > 1:
-        raise ValueError(f"occupied_threshold: must be the same for all worlds, got {thresholds}")
-    return sides[0], [grid.origin for grid in grids] if origin is None else origin, thresholds[0]
-
-
-def _checked_cells(cells: Any, backend: Backend, name: str) -> tuple[Any, np.ndarray]:
-    """Return cells after checking them, and the (M, 2) sizes of the worlds.
-
-    Returns:
-        (M, H, W) int8 in host memory, an array on the device, or a list of (H, W) int8 of several sizes.
-    """
-    if arrays.on_device(cells):
-        adopted = arrays.adopt_integers(cells, backend, name, ("int8",))
-        shape = adopted.shape
-        if len(shape) != 3 or math.prod(shape) == 0:
-            raise ValueError(f"{name}: shape must be (M, H, W) with a cell at least, got {checks.shape_text(shape)}")
-        _check_side(name, shape[1:])
-        return adopted, np.tile(shape[1:], (shape[0], 1))
-    if isinstance(cells, (list, tuple)) and len(cells):
-        each = [OccupancyGrid(arrays.to_host(one, f"{name}[{number}]"), 1.0).cells for number, one in enumerate(cells)]  # type: ignore[arg-type]
-        for one in each:
-            _check_side(name, one.shape)
-        sizes = np.array([one.shape for one in each])
-        return (np.stack(each) if (sizes == sizes[0]).all() else each), sizes
-    values = checks.as_array(name, arrays.to_host(cells, name))
-    if values.ndim != 3 or values.size == 0:
-        raise ValueError(f"{name}: shape must be (M, H, W) with a cell at least, got {checks.shape_text(values.shape)}")
-    _check_side(name, values.shape[1:])
-    flat = OccupancyGrid(values.reshape(-1, values.shape[2]), 1.0).cells
-    return flat.reshape(values.shape), np.tile(values.shape[1:], (len(values), 1))
-
-
-def _check_side(name: str, shape: tuple[int, ...]) -> None:
-    """Refuse worlds with sides that distances in 32 bits do not allow."""
-    if max(shape) > LONGEST_SIDE:
-        size = f"{shape[0]} x {shape[1]}"
-        raise ValueError(f"{name}: a world must have at most {LONGEST_SIDE} rows and columns, got {size}")
-
-
-def _checked_origins(origin: Any, count: int) -> list[tuple[float, float, float]]:
-    """Return the pose of each world's corner."""
-    from gpusense.world.grid_frame import check_origin
-
-    if origin is None:
-        return [(0.0, 0.0, 0.0)] * count
-    values = checks.as_array("origin", origin)
-    if values.ndim == 2:
-        poses = checks.array("origin", values, (count, 3))
-        return [check_origin(pose) for pose in poses]
-    return [check_origin(values)] * count

@@ -32,7 +32,8 @@ METHODS = {
     "BeamModel.start_scoring", "LikelihoodFieldModel.start_scoring", "LikelihoodFieldModel.sample",
     "PoseLikelihood.plot", "RayCaster.save_table", "OdometryMotion.sampled", "OdometryMotion.sampled_turns",
     "OmniMotion.sampled", "VelocityMotion.sampled", "ScanMatch.changed", "ScanMatch.joined", "ScanMatch.moved",
-    "ScanMatch.ordered", "ScanMatch.replaced", "PoseMonitor.restore",
+    "ScanMatch.ordered", "ScanMatch.replaced", "PoseMonitor.restore", "Shapes.counts", "Worlds.allocate",
+    "Worlds.marked", "Worlds.obstacles", "Worlds.put", "Worlds.stacks", "Worlds.table", "Worlds.watch",
 }  # fmt: skip
 FUNCTIONS = {"devices"}
 # Calls whose results have NaN for what is unknown: errors of parameters, missing readings, shares of no evidence.

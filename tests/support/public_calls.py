@@ -135,6 +135,18 @@ def _add_data(s: SimpleNamespace, add: Any, made: Any) -> None:
     add("surface_normals", lambda: gs.surface_normals, grid=s.grid, unknown="free", outside="free")
 
 
+def _add_worlds(s: SimpleNamespace, add: Any, made: Any) -> None:
+    """Add many worlds, and their moving shapes."""
+    cells, index = np.stack([s.grid.cells] * 2), np.zeros(len(s.poses), int)
+    worlds = lambda: gs.Worlds(cells, 0.1, backend=BACKEND)  # noqa: E731
+    made(gs.Worlds, cells=cells, resolution=0.1, origin=(0.0, 0.0, 0.0), backend=BACKEND, occupied_threshold=65)
+    made(gs.Shapes, discs=np.ones((2, 1, 3)), boxes=np.ones((2, 1, 5)), segments=np.ones((2, 1, 4)))
+    add("Worlds.grid", lambda: worlds().grid, index=1)
+    add("Worlds.replace", lambda: worlds().replace, index=np.array([1]), cells=cells[:1])
+    add("Worlds.collides", lambda: worlds().collides, poses=s.poses, radius=0.2, world=index, ignore=None,
+        unknown="free")  # fmt: skip
+
+
 def _add_models(s: SimpleNamespace, add: Any, made: Any) -> None:
     """Add measurement models, the ray caster and their parameters."""
     p, plain = functools.partial(_parameters, add, made), dict(backend=BACKEND, precision="float32")
@@ -164,17 +176,17 @@ def _add_models(s: SimpleNamespace, add: Any, made: Any) -> None:
     for kind in (gs.BeamModel, gs.LikelihoodFieldModel):
         make = functools.partial(_method, kind, (s.grid, s.scanner))
         name, drawn = kind.__name__, dict(seed=0, step=0, out=None)
-        score = dict(poses=s.poses, ranges=s.scan)
-        add(f"{name}.log_likelihood", make("log_likelihood"), **score, per_beam=False, out=None)
-        add(f"{name}.bind", make("bind"), **score, out=None)
+        score, worlds = dict(poses=s.poses, ranges=s.scan), dict(world=None, ignore=None)
+        add(f"{name}.log_likelihood", make("log_likelihood"), **score, **worlds, per_beam=False, out=None)
+        add(f"{name}.bind", make("bind"), **score, **worlds, out=None)
         add(f"{name}.explain", make("explain"), measure=False)
         add(f"{name}.plan", make("plan"), measure=False)
         add(f"{name}.prepare", make("prepare"), poses=s.poses)
         add(f"{name}.update_map", make("update_map"), cells=np.zeros((2, 2), np.int8), region=(1, 1))
         if kind is gs.BeamModel:
             for method in ("expected_ranges", "incidence"):
-                add(f"{name}.{method}", make(method), poses=s.poses, out=None)
-            add(f"{name}.sample", make("sample"), poses=s.poses, **drawn)
+                add(f"{name}.{method}", make(method), poses=s.poses, **worlds, out=None)
+            add(f"{name}.sample", make("sample"), poses=s.poses, **worlds, **drawn)
         else:
             add(
                 f"{name}.gradient",
@@ -184,7 +196,9 @@ def _add_models(s: SimpleNamespace, add: Any, made: Any) -> None:
     made(gs.RayCaster, grid=s.grid, range_max=6.0, caster="exact", method=None, unknown="free", outside="free", **plain)
     cast = functools.partial(_method, gs.RayCaster, (s.grid, 6.0))
     for method in ("cast", "incidence"):
-        add(f"RayCaster.{method}", cast(method), poses=s.poses, bearings=s.scanner.bearings, out=None)
+        add(f"RayCaster.{method}", cast(method), poses=s.poses, bearings=s.scanner.bearings, world=None, ignore=None,
+            out=None)  # fmt: skip
+    _add_worlds(s, add, made)
     add("RayCaster.prepare", cast("prepare"), poses=s.poses)
     add("RayCaster.update_map", cast("update_map"), cells=np.zeros((2, 2), np.int8), region=(1, 1))
     add("log_likelihoods", lambda: gs.log_likelihoods, models=[gs.BeamModel(s.grid, s.scanner, backend=BACKEND)],

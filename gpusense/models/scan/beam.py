@@ -26,7 +26,7 @@ from gpusense.models.scan.sampling import drawing_of, poses_to_draw_at
 from gpusense.peers.weights import Peer, check_weights, choose
 from gpusense.tables import casters
 from gpusense.tables.casters import Caster
-from gpusense.tables.world_index import check_no_worlds, index_of
+from gpusense.tables.world_map import check_no_worlds, index_of
 from gpusense.tables.worlds import Worlds
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.likelihood import Likelihood

@@ -23,7 +23,7 @@ from gpusense.models.scan.model import ScanModel
 from gpusense.models.scan.request import make_request
 from gpusense.models.scan.rules import Beams
 from gpusense.peers.weights import Peer, check_weights, choose
-from gpusense.tables.world_index import check_no_worlds
+from gpusense.tables.world_map import check_no_worlds
 from gpusense.tables.worlds import Worlds
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import LikelihoodFieldParameters

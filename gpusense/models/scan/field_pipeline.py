@@ -22,8 +22,8 @@ from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.tiles import ENOUGH_SHORT, all_within, spread_of, sum_launch
 from gpusense.tables.field import RING, FieldTable
 from gpusense.tables.reachable import ReachableMap
-from gpusense.tables.world_index import check_worlds
-from gpusense.tables.worlds import WorldMap, Worlds
+from gpusense.tables.world_map import WorldMap, check_worlds
+from gpusense.tables.worlds import Worlds
 from gpusense.world.field_density import FieldDensity
 from gpusense.world.frames import split
 from gpusense.world.grid import OccupancyGrid

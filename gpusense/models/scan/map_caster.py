@@ -28,8 +28,8 @@ from gpusense.tables.caster_base import Caster, CasterInput
 from gpusense.tables.lookup_files import describe, write_lookup
 from gpusense.tables.reachable import MapState, ObstaclesOf, ReachableMap, TableMemoryError, obstacles_of
 from gpusense.tables.rectangles import rectangles_of_worlds
-from gpusense.tables.world_index import check_worlds, index_of
-from gpusense.tables.worlds import WorldMap, Worlds
+from gpusense.tables.world_map import WorldMap, check_worlds, index_of
+from gpusense.tables.worlds import Worlds
 from gpusense.world.frames import Mount
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.windows import Window

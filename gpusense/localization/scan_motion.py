@@ -195,8 +195,8 @@ def _windows(moments: Sequence[Moment], most: int) -> list[list[int]]:
     evenly = np.linspace(0, count - 1, min(most // 2, count)).astype(int)
     turned = np.array([sum(turns[start + 1 : start + LENGTH]) for start in starts])
     turned[evenly] = -1.0
-    most = np.argsort(-turned, kind="stable")[: max(min(most, count) - len(evenly), 0)]
-    return [kept[starts[k] : starts[k] + LENGTH] for k in sorted({*evenly.tolist(), *most.tolist()})]
+    turning = np.argsort(-turned, kind="stable")[: max(min(most, count) - len(evenly), 0)]
+    return [kept[starts[k] : starts[k] + LENGTH] for k in sorted({*evenly.tolist(), *turning.tolist()})]
 
 
 def _moved(before: Moment, after: Moment) -> tuple[float, float]:

@@ -246,6 +246,7 @@ def test_blocks_of_fields_of_every_kind(name: str, names: tuple[str, ...], real:
     assert_near(found, expected.astype(np.float64), bound)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "names",
     [(), ("ROUNDED_CELLS",), ("ROUNDED_CELLS", "ALL_READINGS")],

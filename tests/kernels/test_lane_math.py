@@ -101,6 +101,7 @@ def in_either(request):
     return request.getfixturevalue("evaluate" if request.param == "opencl" else "evaluate_warp")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_errors_in_ulps(function, in_either):
     numbers, exact = FUNCTIONS[function]

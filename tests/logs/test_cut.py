@@ -107,6 +107,7 @@ def bag(folder: Path, kind: str) -> tuple[Path, Path]:
     return path, path if path.is_file() else next(one for one in path.iterdir() if one.suffix in (".mcap", ".db3"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap"])
 @pytest.mark.parametrize("share", [0.3, 0.7, 0.999])
 def test_a_bag_is_read_up_to_its_cut(tmp_path, needs_ros, kind, share):

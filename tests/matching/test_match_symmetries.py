@@ -43,6 +43,7 @@ def assert_near(one: np.ndarray, two: np.ndarray, most: float = 1e-6) -> None:
     np.testing.assert_allclose(gs.wrap_angle(one[:, 2] - two[:, 2]), 0, atol=most)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["auto", "icp", "gauss_newton", "correlative"])
 @pytest.mark.parametrize("noise", ["auto", 0.02])
 def test_matches_turn_and_mirror_with_scans(method, noise):

@@ -7,8 +7,8 @@ from support.pages import commands, is_ours, parsed, run_page, visible
 from support.paths import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-# Pages whose blocks take several seconds.
-DEAR = ("getting-started", "localization", "logs", "sweeps")
+# Pages whose blocks take seconds.
+DEAR = ("getting-started", "landmarks", "learning", "localization", "logs", "matching", "speed", "sweeps")
 
 
 def name_of(page):

@@ -153,6 +153,7 @@ def test_scored_ranges_are_the_beam_models():
     np.testing.assert_allclose(found, model.log_likelihood(poses, readings), rtol=1e-11)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("selection", ["opencl", "warp"])
 def test_truth_is_the_numpy_reference(selection, needs):
     """The device for the truth computes the values of float64 NumPy."""

@@ -137,6 +137,7 @@ def test_beams_that_hit_nothing_may_need_a_cause_that_walls_do_not() -> None:
     assert fit.parameters.no_surface.z_max == pytest.approx(20 / 50, rel=1e-6) and fit.converged
 
 
+@pytest.mark.long
 @pytest.mark.sampled(1, without="warp:cpu")
 def test_a_model_gives_readings_the_likelihood_of_their_fit(backend: str) -> None:
     cells = np.zeros((60, 80), np.int8)

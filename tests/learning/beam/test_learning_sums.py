@@ -78,6 +78,7 @@ def exact_objective(z: list[float], expected: list[float], prior: Prior | None, 
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "prior"), [*((name, None) for name in POINTS), ("truncated", PRIOR)], ids=[*POINTS, "with a prior"]
 )

@@ -77,6 +77,7 @@ def test_features_against_mpmath(backend, name, precision, how):
     assert (np.abs(log_p[possible].astype(np.float64) - total) <= TOLERANCES["landmark"].value * eps * size).all()
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.4)
 @on_every_backend(
     on_warp=lambda name, precision: (name, precision) == ("everything", "float32"),

@@ -96,6 +96,7 @@ def test_known_landmarks_without_features_and_without_landmarks(backend):
     assert model.associate(np.zeros((0, 3)), features)[0].shape == (0, len(features))
 
 
+@pytest.mark.long
 def test_false_positives_and_impossible_features(backend):
     landmarks, _, poses, features, _ = scenes.make("ordinary")
     only = gs.LandmarkModel(landmarks, gs.LandmarkParameters(z_detect=0, z_false=1), backend=backend)
@@ -124,6 +125,7 @@ def test_joint_association_is_exclusive_where_the_nearest_is_not(backend):
     assert nearest.tolist() == [[0, 0]] and joint.tolist() == [[0, 1]]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("association", "precision"), [("nearest", "float32"), ("joint", "float64")])
 def test_negative_information_by_counting(association, precision, backend):
     rng = np.random.default_rng(2)
@@ -196,6 +198,7 @@ def test_coincident_landmarks_are_the_first_of_them(backend):
     assert which.tolist() == [list(scenes.SEEN)]
 
 
+@pytest.mark.long
 def test_pieces_have_the_same_bits(backend, monkeypatch):
     landmarks, poses, features = forest(40, 30.0)
     for options in (dict(), dict(association="sum"), dict(association="joint", negative=True)):

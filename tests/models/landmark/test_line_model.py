@@ -62,6 +62,7 @@ def test_lines_as_the_caller_gave_them(name):
     assert_within(model.associate(poses, features)[1], expected, "float32")
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.5)
 @on_every_backend(on_warp=lambda precision: precision == "float32", precision=PRECISIONS)
 def test_joint_association_tries_all(backend, precision):

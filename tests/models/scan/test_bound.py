@@ -57,6 +57,7 @@ def test_bound_calls_that_add_up_strands(batching, monkeypatch):
     assert differing(*found) == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", MODELS)
 def test_bearings_that_repeat_are_cast_one_by_one(kind, batching):
     """The ordinary call sorts beams by ray, so the sums have another order."""

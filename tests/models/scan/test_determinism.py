@@ -120,6 +120,7 @@ def test_in_a_fresh_process(needs):
     assert done.stdout == "".join(map(hashes, backends)), done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.5)
 def test_any_batches(call):
     whole = call(cloud())

@@ -108,6 +108,7 @@ def test_tables_have_the_digits_of_their_precision(dof):
     )
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.25)
 @pytest.mark.parametrize("real", ["float32", "float64"])
 def test_models_have_the_density_on_every_backend(real, backend):
@@ -131,6 +132,7 @@ def test_models_have_the_density_on_every_backend(real, backend):
         assert np.isfinite(log_p).all()
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("real", ["float32", "float64"])
 def test_fields_and_their_gradients_on_every_backend(real, backend):

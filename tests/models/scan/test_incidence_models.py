@@ -67,6 +67,7 @@ def test_every_beam_has_the_parameters_of_its_angle(no_surface, backend):
         assert (" and for none" in model.explain()) == (no_surface is not None)
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.4)
 @on_every_backend(
     on_warp=lambda weights: weights != (1, 0, 0, 0), weights=[(0.7, 0.1, 0.1, 0.1), (1, 0, 0, 0), (0.5, 0.5, 0, 0)]

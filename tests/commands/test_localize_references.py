@@ -127,8 +127,11 @@ def test_the_verdict_names_the_share_that_decides(place, capsys, tmp_path):
     arguments = call(place, "--start", "3", "1.5", "3", "--json")
     arguments[arguments.index("--log") + 1] = str(tmp_path / "carried.log")
     code = cli.main(arguments)
-    found = json.loads(capsys.readouterr().out)["summary"]
+    document = json.loads(capsys.readouterr().out)
+    found = document["summary"]
     assert code == 1 and found["lost"] and found["explained_at_end"] < 0.8
+    words = [one["verdict"] for one in document["stretches"]]
+    assert words[0] == "tracking" and words[-1] == "lost" and document["stretches"][-1]["radius"] is None
 
 
 def test_a_log_whose_odometry_does_not_move_is_named(place, capsys, tmp_path):

@@ -26,6 +26,8 @@ PATTERN = "error_vs_time_*_{}.json"
 # Folders whose changes make a report old, and the number of commits to them after which it must not be published.
 FOLDERS = ("kernels", "gpusense/models", "gpusense/tables", "gpusense/backends")
 LIMIT = 100
+# Subjects of commits that change docstrings and comments only: they do not count.
+WORDS_ONLY = "docstring|comments|sentences|error sections"
 TASK_MEASURES = {"median": "median error", "p95": "95 % error", "max": "largest error"}
 UNITS = {"%": "relative"}
 DISCRETE = "gs.DiscreteBeamModel(gs.BeamParameters(), range_max=scanner.range_max)"
@@ -87,10 +89,11 @@ def has_history(root: Path = ROOT) -> bool:
 
 @cache
 def _commits_since(commit: str, folders: tuple[str, ...], root: Path) -> float:
-    """Count the later commits to folders; infinite where HEAD does not descend from the commit."""
+    """Count the later commits to folders that change code; infinite where HEAD does not descend from the commit."""
     try:
         git("merge-base", "--is-ancestor", commit, "HEAD", root=root)
-        return int(git("rev-list", "--count", f"{commit}..HEAD", "--", *folders, root=root))
+        words = ("-i", "-E", "--invert-grep", f"--grep={WORDS_ONLY}")
+        return int(git("rev-list", "--count", *words, f"{commit}..HEAD", "--", *folders, root=root))
     except subprocess.CalledProcessError:
         return math.inf
 

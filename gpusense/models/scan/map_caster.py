@@ -22,7 +22,7 @@ from gpusense.models.chunking import Piece, chunk_of, finish, run_pieces
 from gpusense.models.poses import Frame, PlacedPoses, Poses, place
 from gpusense.models.scan.cones import LASER, Cones
 from gpusense.models.scan.sampling import Drawing
-from gpusense.models.scan.tiles import all_within, order_of, tiles_of
+from gpusense.models.scan.tiles import Order, all_within, order_of, tiles_of
 from gpusense.tables import casters
 from gpusense.tables.caster_base import Caster, CasterInput
 from gpusense.tables.lookup_files import describe, write_lookup
@@ -272,18 +272,21 @@ class MapCaster:
         normals = self.normals(state.window, cones.flags)
         changing = dict(poses=placed.source, ranges=ranges, incidence=incidence, normals=normals)
         changing |= placed.changing()
+        gpu = self.backend.info.kind == "gpu" and "CONES" not in flags
+        # Each run uploads the order's initial bounds.
+        order = order_of(self._workspace, placed, rays, self.real) if gpu else None
         self._workspace.run(
             (flags, placed.key, rays, cones), changing,
-            lambda: (*placed.launches(), *self._program(placed, state.table, ray, rays, cones, flags, changing)),
+            lambda: (*placed.launches(), *self._program(placed, state.table, ray, rays, cones, flags, changing, order)),
             version=state.version,
         )  # fmt: skip
 
     def _program(
         self, placed: PlacedPoses, table: Buffer, ray: Buffer, rays: int, cones: Cones, flags: frozenset[str],
-        results: dict[str, Buffer],
+        results: dict[str, Buffer], order: Order | None,
     ) -> Program:  # fmt: skip
         """Return the launches that cast the rays of placed poses."""
-        space, count, ranges = self._workspace, placed.count, results["ranges"]
+        count, ranges = placed.count, results["ranges"]
         common = dict(
             map_table=table, pose_cell=placed.cell, pose=placed.pose, ray=ray, window=placed.frame.window,
             particles=count, rays=rays, caster=self.method.struct(), scale=self.scale, ranges=ranges,
@@ -294,7 +297,6 @@ class MapCaster:
             return (launch("cast_echoes", flags, (rays, count), **common, **heard),)
         flags -= {"COSINES"}
         if self.backend.info.kind == "gpu":
-            order = order_of(space, placed, rays, self.real)
             flags |= flags_if(ORDERED=order is not None)
             items, spread = tiles_of(count, rays)
             places = placed.cell if order is None else order.order

@@ -110,11 +110,11 @@ def trials(machine, monkeypatch):
 
     def run_text(arguments, job, variables):
         loaded.append(named(variables) if "OCL_ICD_VENDORS" in variables else "all")
-        return drivers.child.Outcome([], failures.pop(0))
+        return drivers.probe_process.Outcome([], failures.pop(0))
 
     monkeypatch.setenv("GPUSENSE_PROOF", "on")
     monkeypatch.setattr(drivers, "_loader", lambda: "libOpenCL.so")
-    monkeypatch.setattr(drivers.child, "run_text", run_text)
+    monkeypatch.setattr(drivers.probe_process, "run_text", run_text)
     return failures, loaded
 
 

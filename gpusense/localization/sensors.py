@@ -21,6 +21,7 @@ from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.point.base import PointModel
 from gpusense.models.scan.bound import DeviceCall
 from gpusense.models.scan.model import ScanModel
+from gpusense.tables.world_map import check_one_map
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import float64_readings
 
@@ -195,6 +196,8 @@ def sensors_of(models: Any) -> list[Sensor]:
         raise ValueError(f"models: must be 1 to {_MOST_SENSORS} measurement models, got {len(chosen)}")
     if len({id(model) for model in chosen}) < len(chosen):
         raise ValueError("models: must be different ones, since readings are found by their model, got one twice")
+    for model in chosen:
+        check_one_map("models", model)
     sensors = [model if isinstance(model, Sensor) else Sensor(model) for model in chosen]
     backend = sensors[0].backend
     if any(sensor.backend is not backend for sensor in sensors):

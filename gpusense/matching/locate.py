@@ -19,6 +19,7 @@ from gpusense.matching.refine_on_field import climb
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.models.scan.rules import BeamChoice
+from gpusense.tables.world_map import check_one_map
 from gpusense.world.frames import ray_vectors
 from gpusense.world.scanner import Reading, classify, float64_readings
 
@@ -110,6 +111,7 @@ def locate_scan(
         ('ambiguous', 22528, 1.0)
     """
     checks.instance("model", model, LikelihoodFieldModel)
+    check_one_map("model", model)
     if model.compat is not None:
         raise ValueError(
             f"model: must have compat=None, since weights of peers are no likelihood, got {model.compat!r}"

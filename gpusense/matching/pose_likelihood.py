@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util import checks, pictures
 from gpusense._util.angles import wrapped
 from gpusense.models.scan.model import ScanModel
+from gpusense.tables.world_map import check_one_map
 from gpusense.world.grid import OccupancyGrid
 
 Floats = NDArray[np.float64]
@@ -201,6 +202,7 @@ def prepare_tiles(
     """Return the result, empty so far, and an iterator that fills it tile by tile and yields the share that is done."""
     if not isinstance(model, ScanModel):
         raise TypeError(f"model: must be a BeamModel or LikelihoodFieldModel, got {checks.show(model)}")
+    check_one_map("model", model)
     grid = model.grid
     step = max(round(checks.real("resolution", resolution, above=0, high=checks.FARTHEST) / grid.resolution), 1)
     count = checks.integer("headings", headings, low=1)

@@ -16,6 +16,11 @@ from gpusense.world.grid_frame import check_origin
 from gpusense.world.windows import LONGEST_SIDE
 
 
+def are_grids(cells: Any) -> bool:
+    """Tell whether cells are a list with a grid."""
+    return isinstance(cells, (list, tuple)) and any(isinstance(one, OccupancyGrid) for one in cells)
+
+
 def of_grids(
     grids: Sequence[Any], resolution: float | None, origin: Any, threshold: int | None
 ) -> tuple[float, Any, int]:

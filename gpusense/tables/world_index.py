@@ -116,6 +116,8 @@ def _indices(name: str, value: Any, count: int, backend: Backend, worlds: int | 
             raise ValueError(f"{name}: shape must be ({count},), got {checks.shape_text(adopted.shape)}")
         return adopted
     read = checks.as_array(name, arrays.to_host(value, name))
+    if isinstance(value, (list, tuple)) and not value:
+        read = read.astype(int)
     if read.dtype.kind not in "iu":
         cure = "numpy.flatnonzero(mask)" if read.dtype.kind == "b" else f"{name}.astype(int)"
         raise TypeError(f"{name}: must hold integers, got dtype {read.dtype}; pass {cure}")
@@ -124,6 +126,8 @@ def _indices(name: str, value: Any, count: int, backend: Backend, worlds: int | 
         raise ValueError(f"{name}: shape must be ({count},), got {checks.shape_text(read.shape)}")
     if worlds is not None:
         checks.indices(name, np.atleast_1d(read), worlds)
+    # No shape has a number that 32 bits do not hold.
+    read = np.maximum(np.minimum(read, np.iinfo(_INT).max).astype(np.int64), -1)
     return np.ascontiguousarray(np.broadcast_to(read, (count,)), _INT)
 
 

@@ -74,3 +74,9 @@ def check_no_worlds(grid: object, compat: object) -> None:
     """Refuse peers' formulas in worlds."""
     if isinstance(grid, Worlds) and compat is not None:
         raise ValueError(f"compat: must be None in Worlds, got {checks.show(compat)}")
+
+
+def check_one_map(name: str, model: Any) -> None:
+    """Refuse a model of worlds where a single map is needed."""
+    if isinstance(getattr(model, "grid", None), Worlds):
+        raise ValueError(f"{name}: must be of a single map, got one of {model.grid!r}; take worlds.grid(index)")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Hashable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from gpusense.backends.workspace import Workspace
 from gpusense.interface.launches import launch
 from gpusense.tables.collisions import collisions
 from gpusense.tables.crowd import CrowdTable, Shapes
-from gpusense.tables.world_cells import checked_cells, checked_origins, frames_of, of_grids
+from gpusense.tables.world_cells import are_grids, checked_cells, checked_origins, frames_of, of_grids
 from gpusense.tables.world_stack import Stack, Table
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.grid_frame import check_resolution
@@ -76,10 +77,10 @@ class Worlds:
         occupied_threshold: int | None = None,
     ) -> None:
         self.backend: Backend = get_backend(backend)
-        grids = cells if isinstance(cells, (list, tuple)) and any(isinstance(c, OccupancyGrid) for c in cells) else None
-        if grids is not None:
-            resolution, origin, occupied_threshold = of_grids(grids, resolution, origin, occupied_threshold)
-            cells = [grid.cells for grid in grids]
+        self._asked = backend if isinstance(backend, str) else self.backend.info.selection
+        if are_grids(cells):
+            resolution, origin, occupied_threshold = of_grids(cells, resolution, origin, occupied_threshold)
+            cells = [grid.cells for grid in cells]
         self._resolution = check_resolution(0.05 if resolution is None else resolution)
         threshold = 65 if occupied_threshold is None else occupied_threshold
         self.threshold = checks.integer("occupied_threshold", threshold, low=1, high=100)
@@ -176,6 +177,15 @@ class Worlds:
             f"backend={self.device.selection!r}, {memory}, {self.nbytes / self._total:g} bytes a cell)"
         )
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Copies and pickles call the constructor: buffers of a device do not travel.
+        cells = [self.grid(number).cells for number in range(len(self))]
+        make = partial(Worlds, backend=self._asked, occupied_threshold=self.threshold)
+        return make, (cells, self._resolution, self.origins), self.shapes
+
+    def __setstate__(self, shapes: Shapes) -> None:
+        self.shapes = shapes
+
     def grid(self, index: int) -> OccupancyGrid:
         """Return one world as a map in host memory.
 
@@ -214,7 +224,8 @@ class Worlds:
 
         Args:
             index: (I,) indices of the worlds.
-            cells: Their cells, as for the constructor, of the sizes that they had.
+            cells: Their cells, as for the constructor, of the sizes that they had; of grids, their resolution, origin
+                and threshold must be those of the worlds.
 
         Raises:
             TypeError, ValueError: An argument breaks a rule, or an index occurs twice; nothing has changed.
@@ -225,10 +236,18 @@ class Worlds:
             raise ValueError(f"index: every world must occur once, got {checks.show(read)}")
         if not len(which):
             return
+        grids = cells if are_grids(cells) else ()
+        if grids:
+            of_grids(grids, self._resolution, None, self.threshold)
+            cells = [grid.cells for grid in grids]
         given, sizes = checked_cells(cells, self.backend, "cells")
         if len(sizes) != len(which) or (sizes != self._sizes[which]).any():
             wanted, found = self._sizes[which].tolist(), sizes.tolist()
             raise ValueError(f"cells: sizes must be those of the worlds, {wanted[:3]} ..., got {found[:3]} ...")
+        for number, grid in enumerate(grids):
+            origin = self._origins[which[number]]
+            if grid.origin != origin:
+                raise ValueError(f"cells[{number}]: origin must be {origin}, got {grid.origin}")
         self._put(which, given)
         for stack in self.stacks(which):
             for table in self._tables.values():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from typing import Any
 
 import numpy as np
@@ -199,3 +201,51 @@ def test_worlds_that_do_not_fit_say_how_many_do(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(device, "info", dataclasses.replace(device.info, max_buffer=1100))
     with pytest.raises(MemoryError, match=r"^cells: must fit into the memory of .*: 2 of 10 worlds of 1 bytes a cell"):
         gs.Worlds(np.zeros((10, 16, 16), np.int8), backend=device)
+
+
+def test_copies_and_pickles_have_the_same_cells_and_shapes(grids: list[gs.OccupancyGrid], backend: str) -> None:
+    worlds = gs.Worlds(grids, backend=backend)
+    worlds.shapes = gs.Shapes(discs=np.tile([1.0, 2.0, 0.4], (len(grids), 1, 1)))
+    caster = gs.RayCaster(worlds, RANGE, backend=backend)
+    poses, index = np.array([(1.0, 1.0, 0.3)] * len(grids)), np.arange(len(grids))
+    wanted = caster.cast(poses, BEARINGS, world=index)
+    for made in (pickle.loads(pickle.dumps(worlds)), copy.copy(worlds), copy.deepcopy(worlds)):
+        assert [made.grid(k) for k in range(len(made))] == [worlds.grid(k) for k in range(len(worlds))]
+        same_bits(gs.RayCaster(made, RANGE, backend=backend).cast(poses, BEARINGS, world=index), wanted)
+    same_bits(pickle.loads(pickle.dumps(caster)).cast(poses, BEARINGS, world=index), wanted)
+
+
+def test_grids_replace_grids_of_the_same_frame() -> None:
+    worlds = gs.Worlds(CELLS, 0.1, (1.0, 2.0, 0.0), backend="numpy")
+    full = gs.OccupancyGrid(CELLS[0] + 100, 0.1, (1.0, 2.0, 0.0))
+    worlds.replace([1], [full])
+    assert worlds.grid(1) == full
+    assert (worlds.grid(0).cells == 0).all()
+    for other, words in (
+        (gs.OccupancyGrid(CELLS[0], 0.2, (1.0, 2.0, 0.0)), "^resolution: must be the same"),
+        (gs.OccupancyGrid(CELLS[0], 0.1), r"^cells\[0\]: origin must be"),
+        (gs.OccupancyGrid(CELLS[0], 0.1, (1.0, 2.0, 0.0), occupied_threshold=50), "^occupied_threshold: must be"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            worlds.replace([1], [other])
+    assert worlds.grid(1) == full
+
+
+def test_large_indices_of_shapes_ignore_none_and_empty_lists_are_indices() -> None:
+    worlds = gs.Worlds(CELLS, 1.0, backend="numpy")
+    worlds.shapes = gs.Shapes(discs=np.tile([1.0, 1.0, 0.5], (2, 1, 1)))
+    assert not worlds.collides([(1.0, 1.0, 0.0)], 0.1, world=0, ignore=0).any()
+    for none in (-1, 1, 1 << 32, -(1 << 32), np.uint64(1 << 63)):
+        assert worlds.collides([(1.0, 1.0, 0.0)], 0.1, world=0, ignore=none).all()
+    assert worlds.collides(np.empty((0, 3)), 0.1, world=[]).shape == (0,)
+
+
+def test_functions_of_a_single_map_refuse_worlds() -> None:
+    model = gs.LikelihoodFieldModel(gs.Worlds(CELLS, backend="numpy"), gs.Scanner([0.0], range_max=2.0),
+                                    backend="numpy")  # fmt: skip
+    for call in (
+        lambda: gs.locate_scan(model, [1.0]), lambda: gs.pose_likelihood(model, [1.0]), lambda: gs.PoseMonitor(model),
+        lambda: gs.ParticleFilter(model),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=r"^models?: must be of a single map"):
+            call()

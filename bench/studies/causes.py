@@ -133,12 +133,16 @@ def main() -> None:
     parser.add_argument("--particles", type=int, default=1000)
     parser.add_argument("--causes", nargs="+", default=list(CAUSES), choices=CAUSES)
     parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=math.inf, help="after which a cause starts no more runs")
     args = parse(parser)
-    jobs = [(cause, args.first + k, args) for cause in args.causes for k in range(args.runs)]
-    every = list(recordings.results(diagnosed, jobs, args.processes))
     rows, result = [], {}
     for cause in args.causes:
-        found = [one for job, one in zip(jobs, every, strict=True) if job[0] == cause]
+        found, begin = [], time.perf_counter()
+        for k in range(0, args.runs, args.processes):
+            if found and time.perf_counter() - begin > args.seconds:
+                break
+            jobs = [(cause, args.first + each, args) for each in range(k, min(k + args.processes, args.runs))]
+            found += recordings.results(diagnosed, jobs, args.processes)
         counts = Counter(name for name, _, _ in found)
         right = counts[cause]
         ms = float(np.median([ms for _, ms, _ in found]))

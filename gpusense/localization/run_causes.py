@@ -42,6 +42,8 @@ _QUICK, _FEWER = 3, (8, 2)
 _AGREE, _AGREE_OF_ALL = 0.92, 0.5
 # Scales of the map that are tried.
 _SCALES = tuple(float(scale) for scale in (0.5, *np.geomspace(1 / 1.4, 1.4, 18), 2.0))
+# Scales that all windows judge after one window's search; least scale, or its inverse, against a map that partly fits.
+_BEST_SCALES, _LEAST_SCALE = 3, 1.08
 # Least share of windows that fit where a hypothesis holds, and where it holds throughout; largest where it does not.
 _MOST, _ALMOST_ALL, _FEW = 0.6, 0.75, 0.4
 # Least share of short beams that names people or furniture; drift of the odometry, as a share of its way [rad/m].
@@ -138,11 +140,11 @@ def likely_cause(beams: Diagnosis, evidence: RunEvidence, *, search: bool = True
             return replace(found, cause="mount", turned=motion.turned)
         if not search or evidence.mirrored >= max(_MOST, evidence.as_is):
             return flipped
+    if search and evidence.scaled >= _MOST and evidence.scaled > evidence.as_is:
+        return replace(found, cause="scale", scale=evidence.scale)
     if search and evidence.as_is < _MOST:
         if evidence.mirrored >= _MOST:
             return flipped
-        if evidence.scaled >= _MOST:
-            return replace(found, cause="scale", scale=evidence.scale)
         fitting = max(evidence.as_is, evidence.mirrored, evidence.scaled)
         return replace(found, cause="map" if evidence.windows and fitting <= _FEW else "unknown")
     if motion.cause == "time":
@@ -203,14 +205,14 @@ class _Places:
             x, y, theta = (float(value) for value in found[-1].pose)
             known = known._replace(last=(x, y, theta))
         known = known._replace(moved=self._displacement(windows, found, fits))
+        # A few windows also fit a map of another scale, so a map that others do not fit competes with all scales.
         if known.as_is >= _MOST and not motion.mirrored:
-            return known
+            return self._scaled(windows, known, steady=True) if steady and known.as_is < 1 else known
         steady = steady or motion.mirrored
         known = known._replace(mirrored=self._share(windows, steady=steady, mirrored=True))
         if max(known.as_is, known.mirrored) >= _MOST:
             return known
-        scaled, scale = self._scale(windows, steady=steady)
-        return known._replace(scaled=scaled, scale=scale)
+        return self._scaled(windows, known, steady=steady)
 
     def _chosen(self, windows: list[Window]) -> list[Window]:
         """Return the windows that are judged: the first, the last, and long ones between them."""
@@ -245,14 +247,20 @@ class _Places:
         near &= fits[:, None] & fits[None] & ~np.eye(len(fits), dtype=bool)
         return np.asarray(near.any(axis=1))
 
-    def _scale(self, windows: list[Window], *, steady: bool) -> tuple[float, float]:
-        """Return the share of windows that fit with the best scale of the map, and this scale."""
+    def _scaled(self, windows: list[Window], known: RunEvidence, *, steady: bool) -> RunEvidence:
+        """Return the evidence with the scale of the map that most windows fit."""
         for tried in (windows[len(windows) // 2], windows[len(windows) // 4]):
-            places = [self.place(tried, scale=scale, quick=True) for scale in _SCALES]
-            best = max(range(len(_SCALES)), key=lambda k: (places[k].fits, places[k].share))
-            if places[best].fits:
-                return self._share(windows, steady=steady, scale=_SCALES[best]), _SCALES[best]
-        return 0.0, 1.0
+            places = {scale: self.place(tried, scale=scale, quick=True) for scale in _SCALES}
+            fitting = [scale for scale in _SCALES if places[scale].fits]
+            if known.as_is >= _MOST:
+                fitting = [scale for scale in fitting if max(scale, 1 / scale) >= _LEAST_SCALE]
+            for scale in sorted(fitting, key=lambda scale: -places[scale].share)[:_BEST_SCALES]:
+                share = self._share(windows, steady=steady, scale=scale)
+                if share > known.scaled:
+                    known = known._replace(scaled=share, scale=scale)
+                if known.scaled >= _ALMOST_ALL:
+                    return known
+        return known
 
     def _share(self, windows: list[Window], *, steady: bool, mirrored: bool = False, scale: float = 1.0) -> float:
         """Return the share of windows that fit with a hypothesis; the search ends where it cannot hold any more."""

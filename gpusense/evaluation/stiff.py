@@ -117,7 +117,10 @@ def density_grid(backend: Selection, precision: str) -> Densities:
     world = structs.Window(0, 0, *obstacles.shape), count, 1
     casting = structs.Caster(0, 0.0, 0.0), structs.RangeScale(RANGE_MAX, 1.0, RANGE_MAX), structs.Crowd(0, 0, 0, 0, 0.0)
     none, laser = device.empty(2, real), (structs.MixtureTables(1, 0, 0.0), structs.Cone(1, 0.0))
-    device.compile("cast_ranges", wide)((1, count), rectangles, none, none, cells, pose, ray, ranges, *world, *casting)
+    no_worlds = device.upload(np.zeros((1, 2), np.int32))
+    device.compile("cast_ranges", wide)(
+        (1, count), rectangles, no_worlds, none, cells, pose, ray, ranges, *world, *casting,
+    )  # fmt: skip
     expected = device.download(ranges, np.empty(count, real))
 
     # Warp compiles each set of flags for seconds, so its kernel is unspecialised and compiled once.
@@ -134,7 +137,7 @@ def density_grid(backend: Selection, precision: str) -> Densities:
         mixture = model._pipeline.mixture
         # Rays that are shared do not end behind a reading.
         device.compile("score_beams", flags | (mixture.flags - {"STOPS"}))(
-            (count,), rectangles, none, none, none, cells, pose, ray, first, device.upload(z),
+            (count,), rectangles, no_worlds, none, none, cells, pose, ray, first, device.upload(z),
             device.upload(np.stack(mixture.terms, axis=1)), device.upload(mixture.masses), none, none, first, none,
             device.empty(count, real), parts, *world, len(z), *laser, *casting, structs.Score(0.0, 1.0),
             structs.ScanBatch(1, 0),

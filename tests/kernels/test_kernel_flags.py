@@ -43,7 +43,7 @@ TRACES = [
     ("place_poses", "POSES_FLOAT32", (), r"\bfloat coordinate\b", r"array_t<wp::float32>"),
     ("place_poses", "HUGE_HEADINGS", (), r"\breduce_huge\(", r"reduce_huge_\d+\("),
     ("place_inputs", "RANGES_FLOAT32", (), r"\bfloat measured\b", r"array_t<wp::float32> var_ranges"),
-    ("place_inputs", "SOME_BEAMS", (), r"\branges\[beam\[k\]", r"address\(var_beam\b"),
+    ("place_inputs", "SOME_BEAMS", (), r"return ranges\[beam\[k\]\]", r"address\(var_beam\b"),
     ("place_inputs", "POSES_FLOAT32", (), r"\bfloat coordinate\b", r"array_t<wp::float32> var_poses"),
     ("place_inputs", "END_POINTS", (), r"\bguard_scale \*", r"array_store\(var_guard\b"),
     ("cast_ranges", "SECTORS_2", (), r"define SECTORS 2$", r"var_speed_y > var_speed_x"),

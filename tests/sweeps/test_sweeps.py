@@ -210,7 +210,7 @@ def test_the_command_sends_maps_and_logs_to_a_cluster(folder, cluster, tmp_path,
     table = tmp_path / "t.csv"
     assert cli.main(["sweep", str(folder / "plan.yaml"), "--table", str(table), "--dask", cluster.address]) == 0
     out, err = capsys.readouterr()
-    assert "2 jobs: 2 done" in out and f"Dask at {cluster.address}, 2 slots" in err
+    assert "DONE: 2 of 2 jobs" in out and f"Dask at {cluster.address}, 2 slots" in err
     assert set(gs.sweep.read_table(table)["device"]) == {"numpy"}
 
 

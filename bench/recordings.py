@@ -157,6 +157,8 @@ def makers(kind, backend, beams):
     """Return a maker of models of a kind: ``make(grid, scanner)``."""
     if kind == "field":
         return field(backend, beams=beams)
+    if kind == "wide":
+        return lambda grid, scanner: gs.LikelihoodFieldModel(grid, scanner, backend=backend, beams=beams)
     parameters = gs.BeamParameters(**BEAM)
 
     def make(grid, scanner):

@@ -9,12 +9,11 @@
   the share of returned features that exist. Median errors follow, the mean squared error over the covariance per degree
   of freedom (NEES; 1 is right) without errors beyond 99.9 % of chi squared, and the share of those.
 - ``chance``: poles in scans of independent ranges, which have no shape.
-- ``ransac``: lines by scikit-image's RANSAC, one after another, beside gpusense's.
+- ``ransac``: lines by gpusense and by scikit-image's RANSAC, one after another.
 - ``real``: the share of features of recorded scans that are found again from another place, and their distances in
-  standard deviations. Reference poses are inexact: their deviations are taken as 3 cm and 0.01 rad (jarvis 1 cm
-  and 0.004 rad).
-- ``localisation``: a filter with points (corners, doors and poles), with lines, and with both, on a map made of the
-  other half of the scans, beside the same filter with the likelihood field.
+  standard deviations. The assumed deviations of the reference poses are 3 cm and 0.01 rad (jarvis 1 cm and 0.004 rad).
+- ``localisation``: a filter with points (corners, doors and poles), with lines, with both, and with the likelihood
+  field. The other half of the scans makes the map.
 - ``rates``: scans of 1080 beams a second.
 """
 

@@ -112,7 +112,7 @@ def measure_starts(args):
 def main() -> None:
     parser = make_parser(__doc__, backend="opencl", seed=False)
     parser.add_argument("--logs", nargs="+", default=list(recordings.NAMES), choices=(*recordings.NAMES, "wean"))
-    parser.add_argument("--models", nargs="+", default=["field"], choices=("field", "beam", "discrete"))
+    parser.add_argument("--models", nargs="+", default=["field"], choices=("field", "wide", "beam", "discrete"))
     parser.add_argument("--particles", nargs="+", type=int, default=[500, 5000])
     parser.add_argument("--beams", type=int, help="thin each scan evenly to this many beams")
     parser.add_argument("--seeds", type=int, default=3)

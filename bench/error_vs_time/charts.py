@@ -134,7 +134,7 @@ def _panel(chart: Chart, groups: Sequence[str], scales: tuple[tuple[int, int], t
 
 
 def _names(best: Sequence[Mark], x, y, end: float) -> list[str]:
-    """Label at most four marks of the front, except where a label would cover another one."""
+    """Label at most four marks of the front; skip labels that would overlap."""
     last = len(best) - 1
     best = [best[k] for k in sorted({round(last * k / (LABELS - 1)) for k in range(LABELS)})] if best else []
     placed: list[tuple[float, float, float]] = []

@@ -88,6 +88,23 @@ def test_landmarks(name, side, in_lanes, compiled_lanes):
             assert_alike(wide, one, len(FEATURES))
 
 
+@pytest.mark.parametrize("field", [2.0, 4.5])
+@pytest.mark.parametrize("way", [1, LANES, "warp", "numpy"])
+def test_fields_of_view_end_at_their_edges(way, field, needs, request):
+    """Landmarks lie closely inside and outside of both edges of the view, and of its range."""
+    inside = np.arange(40) % 3 > 0
+    angle = (field / 2 + np.where(inside, -1e-4, 1e-4)) * np.where(np.arange(40) % 2, 1, -1)
+    distance = np.linspace(3, 9, 40)
+    distance[:5] = 10 * np.where(inside[:5], 1 - 1e-5, 1 + 1e-5)
+    angle[:5] = 0.3
+    xy = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    p = gs.LandmarkParameters(field_of_view=field, range_max=10.0, p_detect=0.7)
+    backend = request.getfixturevalue("in_lanes")(way) if isinstance(way, int) else needs(way)
+    model = gs.LandmarkModel(gs.LandmarkMap(xy), p, negative=True, backend=backend)
+    found = model.log_likelihood(np.zeros((3, 3)), [])
+    np.testing.assert_allclose(found, inside.sum() * math.log(0.3), rtol=1e-6)
+
+
 @pytest.mark.long
 def test_unseen_landmarks_have_the_bits_of_one(in_lanes):
     """If no feature can be a landmark, log p depends only on the number of unseen landmarks."""

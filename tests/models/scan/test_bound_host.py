@@ -102,6 +102,24 @@ def test_limits_are_rounded_as_readings_are(kind, real, batching):
     assert type(call) is binding._StagedCall and differing(call(), model.log_likelihood(poses, ranges)) == 0
 
 
+@pytest.mark.parametrize("kind", MODELS)
+def test_recordings_are_kept_by_size_and_type(kind, batching):
+    """Sizes, types of readings and places of arrays take turns; readings lie between limits of both types."""
+    parameters = {BEAM: gs.BeamParameters(), FIELD: gs.LikelihoodFieldParameters(0.7, 0.2, 0.1)}[kind]
+    model, plain = (kind(GRID, ROUNDED, parameters, backend=batching[0]) for _ in range(2))
+    plain._short = None
+    single = np.resize(BESIDE, BEAMS).astype(np.float32)
+    calls = [(count, real, there) for count in (COUNT, 40) for real in (single, single.astype(np.float64))
+             for there in (False, True)]  # fmt: skip
+    assert differing(plain.log_likelihood(cloud(1), single), plain.log_likelihood(cloud(1), single.astype(float))) > 0
+    for turn in range(4):
+        for count, ranges, there in calls:
+            poses = to_device(cloud(turn, count)) if there else cloud(turn, count)
+            found, expected = (one.log_likelihood(poses, ranges) for one in (model, plain))
+            assert differing(*(one.numpy() if there else one for one in (found, expected))) == 0
+            assert (model._short.last is not None) == (turn > 1)
+
+
 def test_calls_that_are_not_short_take_the_ordinary_path(batching, monkeypatch):
     device, _ = batching
     model = FIELD(GRID, NEAR, backend=device)
@@ -171,6 +189,7 @@ def test_arrays_on_the_device_repeat_a_recording(case, batching):
             host[0][3, 1] = 1.0
             found, expected = (one.log_likelihood(to_device(host[0]), ranges) for one in (model, plain))
             assert differing(found.numpy(), expected.numpy()) == 0
+            assert (model._short is not None and model._short.last is not None) == recorded
     with pytest.raises(TypeError, match="must hold float32 or float64"):
         model.log_likelihood(to_device(np.zeros((COUNT, 3), np.int32)), scan[:beams])
 

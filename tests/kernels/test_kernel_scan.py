@@ -101,6 +101,34 @@ def test_readings_are_placed_as_the_host_prepares_them(
                 assert found["guard"][block] == real.type(GUARD * (longest + 2))
 
 
+@pytest.mark.parametrize(("precision", "single"), [(np.float32, True), (np.float32, False), (np.float64, False)])
+@pytest.mark.parametrize(("end_points", "each"), [(True, 1), (False, 3)], ids=["end points", "rays"])
+def test_a_scan_of_each_robot_is_placed_like_a_single_one(
+    end_points: bool, each: int, precision: type, single: bool, device: Backend
+) -> None:
+    count, top, real = 53, float(np.float32(4.0)), np.float32 if single else np.float64
+    given, blocks = np.stack(scans(real, count)), -(-count // BLOCK_TERMS)
+    vectors = np.random.default_rng(6).uniform(-1, 1, (count, each, 2))
+    # Beams of the model among others.
+    beam, among = 1 + 2 * np.arange(count, dtype=np.int32), np.insert(given, np.arange(count), real(1.5), axis=1)
+    flags = scene_flags(precision, *(["END_POINTS"] if end_points else []))
+    shapes = {"point": 2 * each * count, "point_low": 2 * count, "reading": count, "guard": blocks}
+    for kind in (MAX_LEFT_OUT, MAX_PLACED):
+        rules = ReadingRules(float(real(NEAREST)), RANGE, 0.0, top, GUARD, count, each, count, count, kind, 1)
+        reference, found = on_both(
+            device, "place_scans", flags | (frozenset({"RANGES_FLOAT32"}) if single else frozenset()), (given.size,),
+            among, beam, vectors, *(np.full(len(given) * size, 77, precision) for size in shapes.values()), len(given),
+            among.shape[1], blocks, RESOLUTION, rules,
+        )  # fmt: skip
+        for scan, ranges in enumerate(given):
+            numbers = (count, count, kind, 1, rules.nearest, 0.0, top)
+            alone = placed(device, flags | {"ALL_READINGS"}, ranges, vectors, *numbers)
+            for name, size in shapes.items():
+                for placing in (reference, found):
+                    part = placing[name].reshape(len(given), size)[scan]
+                    assert differing(part, alone[name][:size]) == 0, (name, scan, kind)
+
+
 def test_readings_that_keep_their_places(device: Backend) -> None:
     """ALL_READINGS keeps readings in place; a table's ranges stay below its last bin, cones have several vectors."""
     (_, ranges, *_), count = scans(np.float32, 53), 53

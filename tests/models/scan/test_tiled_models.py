@@ -17,7 +17,7 @@ from support.selection import on_every_backend
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan
 from gpusense.models import chunking
-from gpusense.models.scan import tiles
+from gpusense.models.scan import map_caster, tiles
 from gpusense.tables.casters import CASTERS
 
 RANGE, BEAMS, COUNT = 5.0, 53, 150
@@ -166,6 +166,24 @@ def test_casters(method, kind, ordered, as_gpu):
         for gpu in (True, False)
     ]  # fmt: skip
     assert differing(*found) == 0
+
+
+def test_each_cast_orders_its_own_cloud(as_gpu, monkeypatch):
+    """A repeated program bounds the headings of the last cloud alone, however wide clouds before it were."""
+    device, orders = as_gpu(), []
+    monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
+    monkeypatch.setattr(map_caster, "order_of", lambda *a: orders.append(tiles.order_of(*a)) or orders[-1])
+    grid, scanner, _ = world()
+    wide = poses_of("inside")
+    narrow = wide * (1, 1, 0.01)
+
+    def bounds(*clouds: np.ndarray) -> list[int]:
+        caster = gs.RayCaster(grid, RANGE, backend=device)
+        for cloud in clouds:
+            caster.cast(cloud, scanner.bearings)
+        return device.download(orders[-1].bounds, np.empty(7, np.int32)).tolist()
+
+    assert bounds(wide) != bounds(narrow) == bounds(narrow, wide, narrow, wide, narrow)
 
 
 @pytest.mark.sampled(0.3)

@@ -1,17 +1,20 @@
-"""Measure a step of the particle filter: predict, score, normalise, resample, estimate.
+"""Time one step of the particle filter: predict, score, normalise, resample and estimate.
 
-Where a step is one recorded program, replays in a row show its time on the device, with and without the estimate.
+A step that is one recorded program is also replayed many times in a row, with and without the estimate. This gives its
+time on the device.
 
-The scene is a generated building with the cloud of a tracked robot. One stage is the plain filter; the default is up to
-four stages, of which a step on a processor takes those that the cloud needs. Steps of three filters run in turns:
-without recovery and verdict, with the verdict and ``estimate``, and the default filter, also with recovery.
+The scene is a generated building, in which the particles track a robot. A filter with one stage is the plain filter.
+The default filter has up to four stages, and on a processor a step runs only as many as its particles need. Three
+filters take turns. The first has neither recovery nor verdict, the second has the verdict and ``estimate``, and the
+third is the default, which can also recover.
 
-``--histogram STEPS`` measures instead the default filter as it is called (``predict``, ``correct``, ``estimate``) on a
-simulated run whose robot moves: quantiles of the steps after the first 100, since a control loop lives by its slowest
-step, and a histogram by ratios to the median.
+``--histogram STEPS`` instead times ``predict``, ``correct`` and ``estimate`` of the default filter while a simulated
+robot moves. It prints quantiles of the steps after the first 100, since the slowest step limits a control loop, and a
+histogram of step times relative to the median.
 
-``--peers`` measures instead, in turns on one simulated run, the default filter with its estimate and those filters of
-nav2_amcl and Beluga that filters.py can compile. Their field has the same parameters, its densities multiplied.
+``--peers`` instead compares the default filter, with its estimate, to the filters of nav2_amcl and Beluga that
+filters.py can compile. The filters take turns on one simulated run. All likelihood fields have the same parameters, and
+the peers multiply the densities of a scan.
 """
 
 from __future__ import annotations

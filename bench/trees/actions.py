@@ -142,7 +142,7 @@ def expect(case: Case) -> Outcome:
 
 
 def score_large(case: Case) -> Outcome:
-    """Score the number of particles from which GPUs sort them; skip other devices, which are too slow."""
+    """Score enough particles on a GPU for it to sort them; score fewer on slower devices."""
     rays = max(case.world.scanner.count, 1)
     if not case.device.gpu or "slow" in case.config or rays < 64:
         yield from score(case)

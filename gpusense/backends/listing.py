@@ -1,4 +1,4 @@
-"""The devices of this machine with the verdicts on them, and the backends that are absent with the remedies."""
+"""List the devices of this machine, whether each can run models, and how to install missing backends."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from gpusense.backends.registry import BY_NAME, ENTRIES, Entry
 
 @dataclass(frozen=True)
 class Device:
-    """A device of this machine, or an absent one with the reason.
+    """A device that models can run on, or a missing one and the reason why they cannot.
 
     Attributes:
         backend: The name of the backend: ``"numpy"``, ``"opencl"``, ``"warp"`` or another name of the registry.
         name: The name of the device, or of the missing component.
         kind: ``"cpu"``, ``"gpu"`` or ``"simulator"``.
         available: Whether a model can run on it.
-        reason: Why not, with the remedy; or why only some kernels can run. Empty if it is fully available.
+        reason: Why models, or some kernels, cannot run on it, with the remedy. Empty if everything can run.
         selection: The value for ``backend=``; empty for an absent device.
         driver: The name and version of the compiler's driver; empty where kernels are not compiled.
         lanes: Particles or beams that one work-item computes at once; 1 leaves that to the compiler.

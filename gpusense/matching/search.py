@@ -241,7 +241,7 @@ class _Run:
         space, rows = self._space, self._grid.headings.size * self._height
         made = space.empty("blocks", 4 * room, _INT)
         limits = [space.upload(name, part.astype(np.int32)) for name, part in (("low", low), ("high", high))]
-        self._floor_there = low
+        self._low, self._floor_there = limits[0], low
         count, slot = self._counter()
         self._backend.compile("choose_blocks", _NO_FLAGS)(
             (rows,), self._bounds(), self._maxima, *limits, made, count, rows, self._height, self._width, self._turns,

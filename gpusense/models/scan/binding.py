@@ -17,14 +17,10 @@ from gpusense._util import checks, masks
 from gpusense.backends import arrays
 from gpusense.backends.results import Result
 from gpusense.models.scan.bound import BoundCall, DeviceCall
-from gpusense.models.scan.packed_call import LARGEST, PackedCall, fits, host_task
+from gpusense.models.scan.packed_call import LARGEST, MOST_CELLS, PackedCall, fits, host_task, is_short
 from gpusense.models.scan.pipeline import ScanPipeline
-from gpusense.models.scan.tiles import LEAST_ORDERED
 from gpusense.tables.world_index import WorldIndex
 from gpusense.tables.worlds import Worlds
-
-# Largest map for which a short call makes the whole table [cells].
-_MOST_CELLS = 1 << 22
 
 
 def bind(
@@ -165,9 +161,9 @@ class _HostCall(BoundCall):
             return "only NumPy arrays of float32 or float64 are copied with a recorded program"
         if not fits(len(poses), len(ranges)):
             return f"poses and ranges take more than {LARGEST >> 10} KiB"
-        if self.pipeline.grid.cells.size > _MOST_CELLS:
-            return f"the map has more than {_MOST_CELLS} cells"
-        if not 0 < len(poses) * len(ranges) < LEAST_ORDERED[0]:
+        if self.pipeline.grid.cells.size > MOST_CELLS:
+            return f"the map has more than {MOST_CELLS} cells"
+        if not is_short(len(poses), len(ranges)):
             return f"{len(poses)} poses times {len(ranges)} readings are no short call"
         return ""
 

@@ -31,6 +31,8 @@ from gpusense.world.windows import Corners
 
 # Largest size that is copied with the launches [bytes]; longer arrays take the ordinary call.
 LARGEST = 256 << 10
+# Largest map of which a short call makes the whole table [cells].
+MOST_CELLS = 1 << 22
 _DOUBLE, _INT = np.dtype(np.float64), np.dtype(np.int32)
 _FLOATS = (np.dtype(np.float32), _DOUBLE)
 # Types of poses and readings on the device (None on the host), type of the limits; buffers; owners of their memory.
@@ -39,9 +41,8 @@ _Adoption: TypeAlias = tuple[
 ]
 # Alignment of arrays that are copied as one [bytes], enough for every device.
 _ALIGNED = 1024
-# Number of sizes of short calls that are kept; ordinary calls of a size before the first short one; largest map that
-# may have two tables [cells].
-_MOST_SIZES, _BEFORE, _MOST_CELLS = 8, 2, 1 << 22
+# Number of sizes of short calls that are kept; ordinary calls of a size before the first short one.
+_MOST_SIZES, _BEFORE = 8, 2
 
 
 def fits(count: int, readings: int) -> bool:
@@ -242,7 +243,7 @@ class PackedCallCache:
     @staticmethod
     def of(pipeline: ScanPipeline) -> PackedCallCache | None:
         """Return the short calls of a model; None if its device or its options exclude them."""
-        if not pipeline.backend.replays or host_task(pipeline) or pipeline.grid.cells.size > _MOST_CELLS:
+        if not pipeline.backend.replays or host_task(pipeline) or pipeline.grid.cells.size > MOST_CELLS:
             return None
         certain = pipeline.specialize and pipeline.rules.separate and pipeline.setting.possible
         return PackedCallCache(pipeline) if certain else None

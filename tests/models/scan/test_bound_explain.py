@@ -155,7 +155,7 @@ def test_reasons_for_the_ordinary_call(batching, monkeypatch):
     assert ordinary(device, np.zeros((3, 3), int), mixed(1)) == floats
     assert ordinary(device, np.zeros((0, 3)), mixed(1)) == f"0 poses times {len(mixed(1))} readings are no short call"
     assert ordinary(device, np.zeros((20_000, 3)), mixed(1)) == "poses and ranges take more than 256 KiB"
-    monkeypatch.setattr(binding, "_MOST_CELLS", 10)
+    monkeypatch.setattr(binding, "MOST_CELLS", 10)
     assert ordinary(device, cloud(1), mixed(1)) == "the map has more than 10 cells"
 
 

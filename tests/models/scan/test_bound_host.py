@@ -128,7 +128,7 @@ def test_calls_that_are_not_short_take_the_ordinary_path(batching, monkeypatch):
         call = model.bind(poses, ranges)
         assert type(call) is binding._HostCall
         assert differing(np.asarray(call()), model.log_likelihood(poses, ranges)) == 0
-    for module, name, value in ((binding, "_MOST_CELLS", 10), (packed_call, "DeviceCall", refuse_memory)):
+    for module, name, value in ((binding, "MOST_CELLS", 10), (packed_call, "DeviceCall", refuse_memory)):
         with monkeypatch.context() as patch:
             patch.setattr(module, name, value)
             assert type(model.bind(cloud(1), mixed(1))) is binding._HostCall

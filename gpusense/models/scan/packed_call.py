@@ -345,12 +345,11 @@ class PackedCallCache:
         kept = self._calls.get((count, *kinds))
         result = Result(poses, out, (count,), pipeline.real, backend, on_device=kinds[0] is not None)
         if kept is None:
-            places = _There(backend, count, pipeline.scanner.count, kinds[:2], pipeline.real)
-            call = PackedCall(pipeline, self._lock, count, kinds[2], corners, **places.given)
-            kept = self._calls.keep((count, *kinds), (call, places))
-        call, there_now = kept
-        assert there_now is not None
-        places = there_now
+            made = _There(backend, count, pipeline.scanner.count, kinds[:2], pipeline.real)
+            packed = PackedCall(pipeline, self._lock, count, kinds[2], corners, **made.given)
+            kept = self._calls.keep((count, *kinds), (packed, made))
+        call, places = kept
+        assert places is not None
         places.take(*buffers)
         host = [None if buffer is not None else array for array, buffer in zip((poses, ranges), buffers, strict=True)]
         flat = None if kinds[0] is not None else result.flat

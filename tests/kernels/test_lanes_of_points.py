@@ -105,6 +105,26 @@ def test_fields_of_view_end_at_their_edges(way, field, needs, request):
     np.testing.assert_allclose(found, inside.sum() * math.log(0.3), rtol=1e-6)
 
 
+@pytest.mark.parametrize("field", [2.0, 5.5])
+@pytest.mark.parametrize("way", [1, LANES, "warp", "numpy"])
+def test_bearings_have_their_mass_in_the_field_of_view(way, field, needs, request):
+    """The field divides a density by the normal's mass in it, which is integrated here."""
+    backend, sigma = request.getfixturevalue("in_lanes")(way) if isinstance(way, int) else needs(way), 0.3
+    bearing = np.linspace(-field / 2, field / 2, 31)
+    poses = np.stack([0 * bearing, 0 * bearing, -bearing], axis=1)
+    found = []
+    for view in (None, field):
+        p = gs.LandmarkParameters(
+            sigma_bearing=sigma, range_max=10.0, z_detect=1.0, z_false=0.0, **({"field_of_view": view} if view else {})
+        )
+        model = gs.LandmarkModel(gs.LandmarkMap([[5.0, 0.0]]), p, backend=backend)
+        found.append(model.log_likelihood(poses, [(5.0, 0.2)], [0]))
+    steps = (np.arange(20_000) + 0.5) * (field / 20_000) - field / 2
+    error = (steps - bearing[:, None] + math.pi) % (2 * math.pi) - math.pi
+    mass = np.exp(-0.5 * (error / sigma) ** 2).sum(axis=1) * (field / 20_000) / (sigma * math.sqrt(2 * math.pi))
+    np.testing.assert_allclose(found[1] - found[0], -np.log(mass), atol=1e-4)
+
+
 @pytest.mark.long
 def test_unseen_landmarks_have_the_bits_of_one(in_lanes):
     """If no feature can be a landmark, log p depends only on the number of unseen landmarks."""

@@ -44,7 +44,7 @@ MODELS = {
 }
 ALPHA = DEFAULTS.alpha
 CASES = ("as recorded", "carried away")
-# Least scans of a loss; scans until it must be found, and after its end until the verdict must recover.
+# Least scans of a loss; most scans until it is found, and until the verdict recovers after it; wrong poses [m, rad].
 LEAST, LATE, FAR, FAR_TURN = 5, 20, 1.0, 0.5
 # Errors of poses that are certainly right [m, rad].
 NEAR, NEAR_TURN = 0.3, 0.15
@@ -56,7 +56,7 @@ COLUMNS = (
 
 
 def follow(weigher, chosen, scanner, events, particles, seed):
-    """Return the (S, 3) poses of a program, whose scanner has no mount, so that it follows the place of the laser."""
+    """Return the (S, 3) poses of a program. It follows the laser, since its scanner has no mount."""
     mount = np.array([*scanner.mount[:2], 0.0])
     start = gs.compose_poses(events[0].truth, mount)
     follower, poses = Follower(weigher, particles, start, START, ALPHA, seed), []

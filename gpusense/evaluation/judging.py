@@ -33,7 +33,7 @@ from gpusense.world.scanner import Scanner
 Floats = NDArray[np.float64]
 # A stretch ends where no pose is judged for this time [s], and for this multiple of the median time between them.
 _GAP, _GAP_STEPS = 2.0, 5.0
-# Stretches that are searched, lost ones and then the longest; of these, whose scans are diagnosed in sequence.
+# Most stretches to search, lost ones first and then the longest; most lost stretches to diagnose as a whole.
 _SEARCHED, _DIAGNOSED = 12, 3
 # Largest difference between copies of a position [m].
 _SAME = 1e-3
@@ -204,11 +204,11 @@ class TrajectoryJudge:
         )  # fmt: skip
 
     def _explained(self, stretch: Stretch, *, of_run: bool) -> Stretch:
-        """Return a stretch with its likely cause, and where the robot more likely was if it is lost.
+        """Return a stretch with its likely cause, and for a lost one with the likeliest place of the robot.
 
         Args:
             stretch: A stretch that is not tracking.
-            of_run: Whether the scans of the stretch are searched for its cause in sequence, which takes seconds.
+            of_run: Whether to diagnose all scans of the stretch in sequence, which takes seconds.
         """
         count = min(self._searches, stretch.last - stretch.first + 1)
         if not count:
@@ -361,7 +361,7 @@ def stretches_of(
     """
     steps = np.diff(times)
     longest = max(_GAP, _GAP_STEPS * float(np.median(steps))) if len(steps) else _GAP
-    # A clock that goes back ends a stretch as well.
+    # A stretch also ends where the clock goes back.
     gap = np.append((steps > longest) | (steps < 0), True)
     ends = [k for k in range(len(times)) if gap[k] or verdicts[k + 1] != verdicts[k]]
     stretches = []

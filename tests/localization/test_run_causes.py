@@ -135,3 +135,11 @@ def test_mixed_evidence_is_unknown() -> None:
     assert likely_cause(beams, RunEvidence(motion, 5, as_is=0.2)).cause == "map"
     assert likely_cause(beams, RunEvidence(motion, 5, as_is=0.8, last=(1.0, 2.0, 0.0))).cause == "start"
     assert likely_cause(beams, RunEvidence(motion, 5, as_is=0.8)).cause == "unknown"
+
+
+def test_a_scale_must_fit_more_windows_than_the_map_as_it_is() -> None:
+    motion, beams = ScanMotion(20, 20, [], "none", 0.01, 0.01), Diagnosis(10, 10, 0)
+    found = likely_cause(beams, RunEvidence(motion, 5, as_is=0.6, scaled=1.0, scale=0.9))
+    assert found.cause == "scale" and found.scale == 0.9
+    assert likely_cause(beams, RunEvidence(motion, 5, as_is=0.8, scaled=0.8, scale=0.9)).cause == "unknown"
+    assert likely_cause(beams, RunEvidence(motion, 5, as_is=0.2, scaled=0.4, scale=0.9)).cause == "map"

@@ -7,11 +7,15 @@ from __future__ import annotations
 
 import functools
 import math
+import time
+from pathlib import Path
 
 import numpy as np
 import recordings
+from common import command_line, part_of
 
 import gpusense as gs
+from gpusense._util.progress import progress
 from gpusense.evaluation.steps import read_steps
 from gpusense.localization.pose_algebra import compose_poses
 
@@ -171,3 +175,40 @@ def simulated(seed, *, scans=60, hidden=0.0, moved=0.0, glass=0.0, beams=180, ar
         backend="opencl", **changes,
     )  # fmt: skip
     return grid, scanner, recordings.simulated_events(run)
+
+
+def add_shards(parser, raw):
+    """Add the options of a study that runs in shards, whose runs lie in the file ``raw``."""
+    parser.add_argument("--shard", type=part_of, default=(1, 1), metavar="I/N")
+    parser.add_argument("--seconds", type=float, help="begin no more runs of the shard after this time")
+    parser.add_argument("--raw", type=Path, default=Path(raw), help="file of the shard's runs")
+    parser.add_argument("--join", type=Path, nargs="+", help="files of shards to report on")
+
+
+def run_shard(args, jobs, run, script):
+    """Run the jobs of a shard, and write their rows.
+
+    Args:
+        args: The options of ``add_shards``.
+        jobs: All jobs, each a tuple of plain values.
+        run: Function of a job that returns its rows and values to store with the job, or None to skip it.
+        script: The study, for its command line.
+    """
+    first, count = args.shard
+    chosen = jobs[first - 1 :: count]
+    kept, rows, begin = [], [], time.time()
+    with progress(len(chosen)) as step:
+        for job in chosen:
+            if args.seconds is not None and time.time() - begin > args.seconds:
+                break
+            step(f"{job[1]} {job[2]}")
+            made = run(job)
+            if made is None:
+                continue
+            found, more = made
+            rows.append(found)
+            kept.append(repr((*job, *more)))
+    lengths = np.array([len(one) for one in rows])
+    np.savez_compressed(args.raw, jobs=np.array(kept), lengths=lengths, rows=np.concatenate(rows).astype(np.float32),
+                        command=command_line(script))  # fmt: skip
+    print(f"{len(kept)} runs, {lengths.sum()} scans in {time.time() - begin:.0f} s: {args.raw}")

@@ -73,7 +73,7 @@ def spans(flags):
 
 
 def rate(found, wrong):
-    """Return losses, delays of found ones, number of false stretches, and whether each loss has its place."""
+    """Return the losses, their delays (None where missed), and the number of false stretches."""
     lost = np.array([word == "lost" for word in found.verdicts])
     losses = [(first, last) for first, last in spans(wrong) if last - first + 1 >= LEAST]
     delays, near = [], np.zeros(len(wrong), bool)

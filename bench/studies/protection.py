@@ -13,7 +13,6 @@ interval of Clopper and Pearson for the number of blocks if that is larger. A sh
 from __future__ import annotations
 
 import sys
-import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -22,10 +21,9 @@ import numpy as np
 import protection_report as report
 import recordings
 import verdict_runs as runs
-from common import command_line, make_parser, parse, part_of, publish
+from common import make_parser, parse, publish
 
 import gpusense as gs
-from gpusense._util.progress import progress
 
 WORDS = ("tracking", "uncertain", "lost")
 
@@ -76,27 +74,14 @@ def prepared(job, args):
     return None if events is None else (recording.places, events, jump)
 
 
-def run_shard(args):
-    """Run the jobs of a shard and write their rows."""
-    first, count = args.shard
-    chosen = jobs(args)[first - 1 :: count]
-    kept, rows, begin = [], [], time.time()
-    with progress(len(chosen)) as step:
-        for job in chosen:
-            if args.seconds is not None and time.time() - begin > args.seconds:
-                break
-            step(f"{job[1]} {job[2]}")
-            made = prepared(job, args)
-            if made is None:
-                continue
-            places, events, jump = made
-            options = dict(backend=args.backend, particles=args.particles, beams=args.beams, seed=job[-1])
-            rows.append(follow(places, events, **options))
-            kept.append(repr((*job, -1 if jump is None else jump)))
-    lengths = np.array([len(one) for one in rows])
-    np.savez_compressed(args.raw, jobs=np.array(kept), lengths=lengths, rows=np.concatenate(rows).astype(np.float32),
-                        command=command_line("bench/studies/protection.py"))  # fmt: skip
-    print(f"{len(kept)} runs, {lengths.sum()} scans in {time.time() - begin:.0f} s: {args.raw}")
+def run(job, args):
+    """Return the rows of a job and the index of its jump, or -1; None where a log has no such part."""
+    made = prepared(job, args)
+    if made is None:
+        return None
+    places, events, jump = made
+    options = dict(backend=args.backend, particles=args.particles, beams=args.beams, seed=job[-1])
+    return follow(places, events, **options), (-1 if jump is None else jump,)
 
 
 def main() -> None:
@@ -109,13 +94,10 @@ def main() -> None:
     parser.add_argument("--scans", type=int, default=120, help="scans of a simulated run, or one with a jump")
     parser.add_argument("--most", type=int, help="most scans of a log")
     parser.add_argument("--groups", nargs="+", default=list(report.GROUPS), choices=report.GROUPS)
-    parser.add_argument("--shard", type=part_of, default=(1, 1), metavar="I/N")
-    parser.add_argument("--seconds", type=float, help="begin no more runs of the shard after this time")
-    parser.add_argument("--raw", type=Path, default=Path("protection_shard.npz"), help="file of the shard's runs")
-    parser.add_argument("--join", type=Path, nargs="+", help="files of shards to report on")
+    runs.add_shards(parser, "protection_shard.npz")
     args = parse(parser)
     if args.join is None:
-        run_shard(args)
+        runs.run_shard(args, jobs(args), lambda job: run(job, args), "bench/studies/protection.py")
         return
     text, figures = report.page(args.join)
     publish(__file__, args, text, figures)

@@ -18,7 +18,6 @@ from __future__ import annotations
 import itertools
 import math
 import sys
-import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -26,11 +25,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 import recordings
 import verdict_runs as runs
-from common import command_line, make_parser, parse, part_of, publish
+from common import make_parser, parse, publish
 from verdict_report import page
 
 import gpusense as gs
-from gpusense._util.progress import progress
 
 SHARES = (0.0, 0.1, 0.3)
 CASES = ("own", "kidnapped", "wrong")
@@ -116,28 +114,15 @@ def _start(case, grid, events, rng):
     return None if rng.integers(2) else gs.worlds.free_pose(grid, rng, 0.2)
 
 
-def run_shard(args):
-    """Run the jobs of a shard and write their rows."""
-    first, count = args.shard
-    chosen = jobs(args)[first - 1 :: count][: args.limit]
-    kept, rows, begin = [], [], time.time()
-    with progress(len(chosen)) as step:
-        for job in chosen:
-            if args.seconds is not None and time.time() - begin > args.seconds:
-                break
-            step(f"{job[1]} {job[2]}")
-            made = prepared(job, args)
-            if made is None:
-                continue
-            places, events, start = made
-            particles = EVERYWHERE if start is None else args.particles
-            rows.append(follow(places, events, start, backend=args.backend, particles=particles, kind=args.model,
-                               beams=args.beams, seed=job[-1]))  # fmt: skip
-            kept.append(repr(job))
-    lengths = np.array([len(one) for one in rows])
-    np.savez_compressed(args.raw, jobs=np.array(kept), lengths=lengths, rows=np.concatenate(rows).astype(np.float32),
-                        command=command_line("bench/studies/verdict.py"))  # fmt: skip
-    print(f"{len(kept)} runs, {lengths.sum()} scans in {time.time() - begin:.0f} s: {args.raw}")
+def run(job, args):
+    """Return the rows of a job; None where a log has no such part."""
+    made = prepared(job, args)
+    if made is None:
+        return None
+    places, events, start = made
+    particles = EVERYWHERE if start is None else args.particles
+    return follow(places, events, start, backend=args.backend, particles=particles, kind=args.model, beams=args.beams,
+                  seed=job[-1]), ()  # fmt: skip
 
 
 def main() -> None:
@@ -149,14 +134,13 @@ def main() -> None:
     parser.add_argument("--maps", type=int, default=2, help="other maps of each log and setting")
     parser.add_argument("--simulated", type=int, default=300, help="simulated runs")
     parser.add_argument("--groups", nargs="+", default=list(GROUPS), choices=GROUPS)
-    parser.add_argument("--shard", type=part_of, default=(1, 1), metavar="I/N")
     parser.add_argument("--limit", type=int, help="most runs of the shard")
-    parser.add_argument("--seconds", type=float, help="begin no more runs of the shard after this time")
-    parser.add_argument("--raw", type=Path, default=Path("verdict_shard.npz"), help="file of the shard's runs")
-    parser.add_argument("--join", type=Path, nargs="+", help="files of shards to report on")
+    runs.add_shards(parser, "verdict_shard.npz")
     args = parse(parser)
     if args.join is None:
-        run_shard(args)
+        first, count = args.shard
+        chosen = jobs(args) if args.limit is None else jobs(args)[: first - 1 + count * args.limit]
+        runs.run_shard(args, chosen, lambda job: run(job, args), "bench/studies/verdict.py")
         return
     text, report = page(args.join)
     publish(__file__, args, text, report)

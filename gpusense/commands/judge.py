@@ -35,8 +35,8 @@ and 'uncertain' where they leave doubt. The radius is the distance that the erro
 the probability --risk. The whole map is searched for some of the scans of each lost stretch.
 
 --truth adds the integrity: a pose is available if its radius is at most --alert-limit. It is then misleading if its
-error exceeds the radius, and hazardously misleading if the error exceeds the alert limit. The time to alert is
-counted from the first scan with an error above the limit to the first radius above it.
+error exceeds the radius but not the alert limit, and hazardously misleading if it exceeds the alert limit. The time to
+alert is counted from the first scan with an error above the limit to the first radius above it.
 
 Ctrl-C ends the run with the results so far.
 

@@ -72,6 +72,9 @@ def headline(found: Judgement) -> str:
     total, right = found.duration(), found.duration("tracking")
     if not found.informed:
         return f"no verdict: no scan of {_seconds(total)} has a reading to judge by"
+    if len(found.times) == 1:
+        (verdict,) = found.verdicts
+        return f"{'right' if verdict == 'tracking' else verdict} at its only pose; p_lost {found.p_lost[0]:.2g}"
     lost = [one for one in found.stretches if one.verdict == "lost"]
     parts = [f"right for {_seconds(right, unit=False)} of {_seconds(total)}"]
     unsure = found.duration("uncertain")

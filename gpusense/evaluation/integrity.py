@@ -1,8 +1,9 @@
 """Integrity of a localiser with a known truth: did its radius bound the error, and did it alert in time?
 
 The classes come from the Stanford diagram. A pose is *available* if its radius is at most the alert limit. An
-available pose is *misleading* if its error exceeds the radius, and *hazardously misleading* if it exceeds the alert
-limit as well (Joerger and others, "Integrity monitoring of localization systems", *Sensors* 18(8), 2018, 2740).
+available pose is *misleading* if its error exceeds the radius but not the alert limit, and *hazardously misleading* if
+it exceeds the alert limit (Joerger and others, "Integrity monitoring of localization systems", *Sensors* 18(8), 2018,
+2740).
 """
 
 from __future__ import annotations

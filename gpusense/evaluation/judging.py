@@ -204,7 +204,7 @@ class TrajectoryJudge:
         )  # fmt: skip
 
     def _explained(self, stretch: Stretch, *, of_run: bool) -> Stretch:
-        """Return a stretch with its likely cause, and for a lost one with the likeliest place of the robot.
+        """Return a stretch with its likely cause and, if it is lost, the likeliest place.
 
         Args:
             stretch: A stretch that is not tracking.
@@ -279,7 +279,7 @@ def judge_trajectory(
     for the places of some scans of each lost stretch.
 
     Args:
-        models: A model of scans with the map, or a list of models on one device, one for each scanner.
+        models: The scan model, or a list of models on one device, one for each scanner.
         scans: S scans in the order of time.
         poses: (S, 3) poses of the robot at the scans [m, m, rad], NaN where unknown; or with ``times`` (T, 3) poses.
         times: (T,) increasing times of the poses [s], which are then interpolated at the scans: between poses at most

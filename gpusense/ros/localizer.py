@@ -18,7 +18,7 @@ from gpusense.logs.records import Pose
 from gpusense.ros.conversions import host_array, laser_scan, map_to_odometry, moved_enough
 from gpusense.ros.diagnostics import ERROR, LEVELS, STALE, WARN, radius_text, status_fields
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.messages import spread_readings
+from gpusense.world.messages import spread_readings, stamp_of
 from gpusense.world.scanner import Scanner
 
 PLACES = 1440
@@ -66,7 +66,8 @@ class Localizer:
         self._spread = False
         self.estimate: Any = None
         self.counted = 0
-        self._cause = ""
+        # Text of the likely cause of the last estimate; None before the search.
+        self._cause: str | None = None
         self._history: deque[Moment] = deque(maxlen=_HISTORY)
         self._taken = clock()
         self.problem: str | None = None
@@ -142,6 +143,7 @@ class Localizer:
             return False
         try:
             scanner, fields = laser_scan(message, laser, self.options.range_limits)
+            stamp = stamp_of("scan", message)
             self.problem = None
         except (TypeError, ValueError) as error:
             self.problem = str(error)
@@ -154,8 +156,8 @@ class Localizer:
             self.filter.predict(np.array(self._last), np.array(odometry))
         self.filter.correct(ranges)
         self._last, self.estimate = odometry, self.filter.estimate()
-        self._history.append(Moment(ranges, self.estimate.pose, odometry, self._taken))
-        self.counted, self._cause = self.counted + 1, ""
+        self._history.append(Moment(ranges, self.estimate.pose, odometry, stamp))
+        self.counted, self._cause = self.counted + 1, None
         return True
 
     def map_to_odometry(self) -> Pose:
@@ -194,7 +196,7 @@ class Localizer:
             "radius": radius_text(found.protection_level(self.risk)), "risk": f"{self.risk:g}",
         }  # fmt: skip
         # The search for a cause takes milliseconds: do it once per estimate.
-        if found.verdict != "tracking" and not self._cause:
+        if found.verdict != "tracking" and self._cause is None:
             run = diagnose_run(self.filter.models, self._history, search=False)
             self._cause = (run if run.cause in CAUSES_OF_RUNS else self.filter.diagnose()).text
         text = ": ".join(filter(None, (found.verdict, self._cause)))

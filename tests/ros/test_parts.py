@@ -68,9 +68,10 @@ class FakeFilter:
         return SimpleNamespace(pose=np.array([1.0, 2.0, 0.5]), covariance=np.eye(3))
 
 
-def scan_of(count: int) -> Any:
-    return SimpleNamespace(angle_min=-math.pi, angle_increment=2 * math.pi / count, range_min=0.1, range_max=8.0,
-                           ranges=np.full(count, 2.0))  # fmt: skip
+def scan_of(count: int, seconds: int = 0) -> Any:
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=seconds, nanosec=0))
+    return SimpleNamespace(header=header, angle_min=-math.pi, angle_increment=2 * math.pi / count, range_min=0.1,
+                           range_max=8.0, ranges=np.full(count, 2.0))  # fmt: skip
 
 
 def grid(wall: int = 0) -> gs.OccupancyGrid:
@@ -168,12 +169,36 @@ def test_the_localizer_localises() -> None:
     assert values["radius"] == f"{own.estimate.protection_level(0.05):.3f}" and values["risk"] == "0.05"
 
 
+def test_the_cause_comes_once_from_scans_at_their_stamps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scans of a recording that plays faster keep their stamps."""
+    seen = []
+
+    def diagnose(models: Any, moments: Any, *, search: bool) -> Any:
+        seen.append([one.time for one in moments])
+        return SimpleNamespace(cause="time", text="likely cause: wrong times")
+
+    monkeypatch.setattr(localizer, "diagnose_run", diagnose)
+    own = localizer.Localizer(from_nav2({"sigma_hit": 0.1}), backend="numpy", clock=lambda: 7.0)
+    own.set_map(grid())
+    own.start_at((1.0, 1.3, 0.2), np.diag([0.01, 0.01, 0.01]))
+    for k in range(3):
+        # The room has no walls that are 2 m away all around.
+        assert own.update(scan_of(60, 100 + 5 * k), (0.3 * k, 0.0, 0.0), np.eye(4))
+    assert own.estimate.verdict != "tracking"
+    for _ in range(2):
+        assert own.status({})["message"] == f"{own.estimate.verdict}: likely cause: wrong times"
+    assert seen == [[100.0, 105.0, 110.0]]
+    monkeypatch.setattr(localizer, "diagnose_run", lambda *_, **__: SimpleNamespace(cause="none", text="agree"))
+    assert own.update(scan_of(60, 115), (0.9, 0.0, 0.0), np.eye(4))
+    assert "wrong times" not in own.status({})["message"]
+
+
 # ------------------------------------------------------------------------------------------------- the watching node
 
 
 def stamped(time: float, frame: str = "map", **fields: Any) -> Any:
     stamp = SimpleNamespace(sec=int(time), nanosec=round((time - int(time)) * 1e9))
-    return SimpleNamespace(header=SimpleNamespace(stamp=stamp, frame_id=frame), **fields)
+    return SimpleNamespace(**fields | {"header": SimpleNamespace(stamp=stamp, frame_id=frame)})
 
 
 def pose_message(time: float, pose: Any, deviation: float = 0.05) -> Any:

@@ -18,6 +18,8 @@ from gpusense.reference.shapes import BOX, DISC, particles_of_worlds, shape_dist
 MOST_KNOWN = 127
 FRAME_NUMBERS = 8
 RING = 2
+# Largest number of a shape.
+LARGEST_SHAPE = 1e6
 
 
 def put_cells(
@@ -114,7 +116,7 @@ def place_shapes(
 ) -> None:  # fmt: skip
     """Place moving shapes of one kind, with 3 (discs), 5 (boxes) or 4 numbers (segments), in the cells of their worlds.
 
-    A shape with a number that is not finite, or with a negative size, is none.
+    A shape with a number that is not finite or beyond LARGEST_SHAPE, or with a negative size, is none.
     """
     every = raw.reshape(-1)[: worlds * count * numbers].reshape(worlds, count, numbers).astype(np.float64)
     each = BOX if numbers == 5 else DISC
@@ -123,7 +125,8 @@ def place_shapes(
         here, rows = frame_in(frames, w, frame), every[w]
         placed = np.zeros((count, each))
         placed[:, :2] = point_in(rows[:, :2], here)
-        none = ~np.isfinite(rows).all(axis=1)
+        none = ~(np.abs(rows) <= LARGEST_SHAPE).all(axis=1)
+        rows = np.where(none[:, None], 0.0, rows)
         sizes = {3: rows[:, 2:3], 5: rows[:, 3:5]}.get(numbers)
         if sizes is None:
             placed[:, 2:4] = point_in(rows[:, 2:4], here)

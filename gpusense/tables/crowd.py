@@ -27,8 +27,8 @@ class Shapes:
         boxes: (M, B, 5) x, y, theta, length along theta and width [m, m, rad, m, m].
         segments: (M, G, 4) x and y of both ends [m].
 
-    Arrays may be on the device of the worlds. A row with a number that is not finite, or with a negative size, is no
-    shape. Shapes are numbered from 0 in each world: discs, then boxes, then segments.
+    Arrays may be on the device of the worlds. A row with a number that is not finite or beyond 1e6, or with a negative
+    size, is no shape. Shapes are numbered from 0 in each world: discs, then boxes, then segments.
 
     Raises:
         TypeError, ValueError: An array in host memory does not hold real numbers, or has another shape.

@@ -1,8 +1,8 @@
 // Moving shapes of a world: discs, boxes and segments, in cells of its grid. A disc has 4 numbers: centre and radius,
 // and one that is not used. A box has 8: centre, cosine and sine of its direction, half its length and width,
-// radius around it, and one not used. A segment has 4: its ends. A shape whose numbers are NaN is met by no ray. WORLDS: world has two
-// pairs of numbers for each particle: the first cell of its world among all worlds and the world's size, rows times
-// 2^16 plus columns; the world's index and the index of the shape that it does not see.
+// radius around it, and one not used. A segment has 4: its ends. A shape whose numbers are NaN is met by no ray.
+// WORLDS: world has two pairs of numbers for each particle: the first cell of its world among all worlds and the
+// world's size, rows times 2^16 plus columns; the world's index and the index of the shape that it does not see.
 // requires: ray
 
 // Return the part of the grid that a particle's world fills.

@@ -8,6 +8,8 @@
 #define MOST_KNOWN 127
 #define FRAME_NUMBERS 8
 #define RING 2
+// Largest number of a shape.
+#define LARGEST_SHAPE 1e6
 
 // Copy the cells of some worlds to their places. One work-item takes a cell.
 kernel void put_cells(ARGUMENTS) {
@@ -93,7 +95,7 @@ double2 point_in(const double x, const double y, const Frame here) {
 }
 
 // Place moving shapes of one kind, with 3 (discs), 5 (boxes) or 4 numbers (segments), in the cells of their worlds. A
-// shape with a number that is not finite, or with a negative size, is none. One work-item takes a shape.
+// shape with a number that is not finite or beyond LARGEST_SHAPE, or with a negative size, is none. One work-item takes a shape.
 kernel void place_shapes(ARGUMENTS) {
     const int i = get_global_id(0), w = get_global_id(1);
     if (i >= count || w >= worlds) return;
@@ -101,10 +103,10 @@ kernel void place_shapes(ARGUMENTS) {
     const int each = numbers == 5 ? BOX : DISC;
     global real *to = shapes + (long)w * stride + begin + i * each;
     const Frame here = frame_in(frames, w, frame);
-    double sum = 0;
-    for (int k = 0; k < numbers; ++k) sum += (double)from[k] - (double)from[k];
+    bool none = false;
+    for (int k = 0; k < numbers; ++k) none |= !(fabs((double)from[k]) <= LARGEST_SHAPE);
     const double length = from[numbers == 3 ? 2 : 3];
-    if (!(sum == 0) || (numbers != 4 && length < 0) || (numbers == 5 && from[4] < 0)) {
+    if (none || (numbers != 4 && length < 0) || (numbers == 5 && from[4] < 0)) {
         for (int k = 0; k < each; ++k) to[k] = NAN;
         return;
     }

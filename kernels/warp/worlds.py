@@ -20,6 +20,8 @@ from .shapes import BOX, DISC, world_window
 MOST_KNOWN = wp.constant(127)
 FRAME_NUMBERS = wp.constant(8)
 RING = wp.constant(2)
+# Largest number of a shape.
+LARGEST_SHAPE = wp.constant(wp.float64(1e6))
 
 
 @kernel()
@@ -156,8 +158,8 @@ def make(name, flags):
     @kernel(flags)
     def place_shapes(raw, frames, shapes, frame, count, numbers, begin, stride, worlds):
         """Place moving shapes of one kind, with 3 (discs), 5 (boxes) or 4 numbers (segments), in the cells of their
-        worlds. A shape with a number that is not finite, or with a negative size, is none. One work-item takes a
-        shape.
+        worlds. A shape with a number that is not finite or beyond LARGEST_SHAPE, or with a negative size, is none. One
+        work-item takes a shape.
         """
         w, i = wp.tid()
         if i >= count or w >= worlds:
@@ -165,12 +167,11 @@ def make(name, flags):
         at = (w * count + i) * numbers
         to = w * stride + begin + i * wp.where(numbers == 5, BOX, DISC)
         here = frame_in(frames, w, frame)
-        total = wp.float64(0.0)
+        none = bool(False)
         for k in range(numbers):
-            value = wp.float64(raw[at + k])
-            total += value - value
+            if not (wp.abs(wp.float64(raw[at + k])) <= LARGEST_SHAPE):
+                none = bool(True)
         length = wp.float64(raw[at + wp.where(numbers == 3, 2, 3)])
-        none = not (total == ZERO)
         if numbers != 4 and length < ZERO:
             none = bool(True)
         if numbers == 5:

@@ -159,6 +159,10 @@ CASES = [
     (dict(segments=[[[-2.0, -1.0, -2.0, 1.0]]]), 5.0, "a segment behind"),
     (dict(segments=[[[2.0, 0.0, 2.0, 1.0]]]), 2.0, "the end of a segment"),
     (dict(segments=[[[math.nan, 0.0, 2.0, 1.0]]]), 5.0, "no segment"),
+    (dict(segments=[[[2.0, -1e5, 2.0, 1e5]]]), 2.0, "a long segment"),
+    (dict(segments=[[[2.0, -1e30, 3.0, 1e30]]]), 5.0, "a segment whose products overflow"),
+    (dict(boxes=[[[3.0, 0.0, 0.0, 1.0, 1e300]]]), 5.0, "a box too wide for float32"),
+    (dict(discs=[[[2e30, 0.0, 2e30]]]), 5.0, "a disc too large for float32"),
 ]
 
 

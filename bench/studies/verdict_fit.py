@@ -1,4 +1,4 @@
-"""Fit the log-likelihood ratio of a scan (``gpusense/localization/ratio.py``) to simulated runs of filters.
+"""Fit the log-likelihood ratio of a scan (``gpusense/localization/scan_evidence.py``) to simulated runs of filters.
 
 Each run has people, moved and new furniture, glass, another building or a jump at random, and 16 to 360 beams. The
 beams of each scan are judged at the estimate, unless its covariance is wide. A logistic regression with half of the
@@ -34,9 +34,18 @@ from scipy.optimize import minimize
 
 import gpusense as gs
 from gpusense._util.progress import progress
-from gpusense.localization.passages import counts_of, passages
-from gpusense.localization.ratio import BY_CHANCE, FARTHEST, FEW, HALF, IS_FOUND, NEAREST, OF_LEAD, ratio_of_scan
+from gpusense.localization.beam_consistency import beam_consistency, counts_of
 from gpusense.localization.rival_search import RivalSearch
+from gpusense.localization.scan_evidence import (
+    BY_CHANCE,
+    FARTHEST,
+    FEW,
+    HALF,
+    IS_FOUND,
+    NEAREST,
+    OF_LEAD,
+    ratio_of_scan,
+)
 from gpusense.localization.spread import is_wide
 
 EDGES = (-math.inf, -5, -4, -3, -2, -1, 0, 1, 2, 3, 4, math.inf)
@@ -76,7 +85,7 @@ def follow(seed, args):
         wrong = case == "wrong" or position > 1 or heading > 0.5
         if is_wide(covariance) or (not wrong and (position > 0.5 or heading > 0.25)):
             continue
-        found = passages(grid, scanner, pose, event.ranges, covariance)
+        found = beam_consistency(grid, scanner, pose, event.ranges, covariance)
         rows.append((wrong, *counts_of([found]), *pose[:2]))
         if k % SEARCHED == SEARCHED - 1:
             tracker = pf._parts.tracker
@@ -167,12 +176,12 @@ def fitted(each, compared):
     """
     rows = np.concatenate(each)
     wrong, (agree, close, through, short, nothing) = rows[:, 0] > 0, rows[:, 1:6].T
-    telling = agree + through + short
+    informative_count = agree + through + short
     features = [
         np.log((one + 0.5) / (other + 0.5))
-        for one, other in ((through, agree), (agree - close, close), (nothing, telling), (short, agree))
+        for one, other in ((through, agree), (agree - close, close), (nothing, informative_count), (short, agree))
     ]
-    weight = telling / (telling + FEW)
+    weight = informative_count / (informative_count + FEW)
     design = weight[:, None] * np.column_stack([np.ones(len(rows)), *features])
     chosen = regression(design[:, :4], wrong)
     with_short, through_only = regression(design, wrong), regression(design[:, :2], wrong)

@@ -199,9 +199,9 @@ def _check_numbers(adopted: Adopted, name: str) -> None:
         raise ValueError(f"{name}: must be C-contiguous on the device, got strides {adopted.strides}")
 
 
-def lent(poses: object, backend: Backend, buffer: Buffer, shape: tuple[int, ...], real: np.dtype) -> object:
+def wrapped(poses: object, backend: Backend, buffer: Buffer, shape: tuple[int, ...], real: np.dtype) -> object:
     """Return a result on the device as an array of the library of the poses."""
-    return _converted(poses, backend.lend(buffer, shape, real))
+    return _converted(poses, backend.wrap_external(buffer, shape, real))
 
 
 def _converted(poses: object, result: Any) -> object:

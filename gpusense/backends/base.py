@@ -182,17 +182,17 @@ class Backend(ABC):
 
         return Adopted(buffer, shape, dtype, tuple(strides), True, to_host, buffer)
 
-    def blank(self, count: int, dtype: np.dtype) -> Buffer:
-        """Allocate a buffer of ``count`` numbers, 0 included, that can be lent: not memory shared with the host."""
+    def empty_external(self, count: int, dtype: np.dtype) -> Buffer:
+        """Allocate a buffer of ``count`` numbers, 0 included, for an external array, in memory of the device alone."""
         return self.empty(count, dtype)
 
     def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
         """Start copying ``size`` bytes of a buffer from byte ``begin`` on into another, from byte ``to`` on."""
         raise TypeError(f"{self.info.selection} does not copy between buffers")
 
-    def lend(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
+    def wrap_external(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
         """Return a buffer as an array of the backend's library."""
-        raise TypeError(f"{self.info.selection} does not lend buffers")
+        raise TypeError(f"{self.info.selection} does not wrap buffers")
 
 
 class _ProgramRecording(Recording):

@@ -34,7 +34,7 @@ class Result:
         if out is not None:
             self.flat = arrays.check_out(out, shape, real, backend, device_poses=on_device)
         elif on_device:
-            self.flat = backend.blank(math.prod(shape), real)
+            self.flat = backend.empty_external(math.prod(shape), real)
         else:
             self.flat = backend.empty_result(shape, real)
         if not on_device:
@@ -45,6 +45,6 @@ class Result:
         if self._out is not None:
             return self._out
         if self._on_device:
-            return arrays.lent(self._poses, self._backend, self.flat, self._shape, self._real)
+            return arrays.wrapped(self._poses, self._backend, self.flat, self._shape, self._real)
         result = self.flat.reshape(self._shape)
         return result if type(self._poses) is np.ndarray else arrays.like(self._poses, result)

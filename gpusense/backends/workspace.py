@@ -38,7 +38,7 @@ class _Result:
         elif self._in_place:
             self._buffer = backend.part(target, first, count, dtype)
         else:
-            self._buffer = space.empty(f"{name} lent", count, dtype, lent=True)
+            self._buffer = space.empty(f"{name} external", count, dtype, external=True)
         self._bytes = count * dtype.itemsize
 
     def __enter__(self) -> Buffer:
@@ -146,7 +146,7 @@ class Workspace:
         """Return a number or struct unchanged, and a buffer by its address."""
         return value if value is None or isinstance(value, (int, float, tuple)) else self._backend.address(value)
 
-    def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False, lent: bool = False) -> Buffer:
+    def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False, external: bool = False) -> Buffer:
         """Return a buffer of at least ``count`` numbers; its old contents are lost."""
         capacity, buffer = self._buffers.get((name, dtype), (0, None))
         if buffer is None or capacity < count:
@@ -154,8 +154,8 @@ class Workspace:
             self._buffers.pop((name, dtype), None)
             capacity = max(count, capacity + capacity // 2, 1)
             buffer = None
-            if lent:
-                buffer = self._backend.blank(capacity, dtype)
+            if external:
+                buffer = self._backend.empty_external(capacity, dtype)
             else:
                 buffer = self._backend.empty(capacity, dtype, zero=zero)
             self._buffers[name, dtype] = (capacity, buffer)
@@ -212,7 +212,7 @@ class Workspace:
         return parts
 
     def result(self, name: str, target: np.ndarray | Buffer, first: int, count: int, dtype: np.dtype) -> _Result:
-        """Return a context with the buffer in which launches write ``count`` numbers of a flat array or lent buffer."""
+        """Return a context with the buffer in which launches write ``count`` numbers of a flat or external array."""
         return _Result(self, self._backend, name, target, first, count, dtype)
 
     def download(self, buffer: Buffer, out: np.ndarray) -> None:

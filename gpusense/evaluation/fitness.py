@@ -10,11 +10,11 @@ import numpy as np
 
 from gpusense.evaluation.agreement import Model
 from gpusense.evaluation.worlds import cloud_uniform
+from gpusense.localization.beam_consistency import BeamConsistency, beam_consistency
 from gpusense.localization.belief import Belief
 from gpusense.localization.diagnosis import Diagnosis, evidence_of
 from gpusense.localization.map_judge import MapJudge
-from gpusense.localization.passages import Passages, passages
-from gpusense.localization.ratio import explained_of_scan, ratio_of_scan
+from gpusense.localization.scan_evidence import explained_of_scan, ratio_of_scan
 from gpusense.localization.temperature import BeamCorrelation, learn_from_scan
 from gpusense.localization.words import LOST, TRACKING, Word
 from gpusense.logs import Scan
@@ -76,7 +76,7 @@ class FitnessOfLog:
         # The host judges beams for devices without float64.
         device = model.backend if model.backend.info.float64 else None
         self._belief, self._judge = Belief(), None if device is None else MapJudge(device, model.grid)
-        self._scans: list[Passages] = []
+        self._scans: list[BeamConsistency] = []
         self._shares: list[float] = []
         self._better: list[float] = []
         self._p_lost: list[float] = []
@@ -88,7 +88,7 @@ class FitnessOfLog:
         poses = np.vstack([pose[None], cloud_uniform(self._model.grid, _RANDOM, random)])
         log_p = self._model.log_likelihood(poses, scan.ranges)
         ranges = np.asarray(scan.ranges, np.float64)
-        found = passages(self._model.grid, scan.scanner, pose, ranges, judge=self._judge)
+        found = beam_consistency(self._model.grid, scan.scanner, pose, ranges, judge=self._judge)
         share, ratio, better = explained_of_scan([found]), ratio_of_scan([found]), math.nan
         # Readings that are equally likely or impossible everywhere are no evidence.
         if np.isfinite(log_p).any() and (log_p != log_p[0]).any():

@@ -244,7 +244,7 @@ class ReadingRules(NamedTuple):
     top: double
     guard_scale: double
     beams: int
-    each: int
+    rays_per_beam: int
     places: int
     chosen: int
     max_readings: int
@@ -298,12 +298,13 @@ class MatchRules(NamedTuple):
 
 
 class BeamRules(NamedTuple):
-    """Companions of a scan's rays in a part of the map, and rules for its readings; see the kernel file ``passages``.
+    """Companions of a scan's rays, and rules for its readings; see the kernel file ``beam_consistency``.
 
-    The part begins at the column ``left`` and the row ``top`` of the map. Companions start ``beside`` off the beam, or
-    at the position's deviation up to ``most_beside`` [m]. They diverge by ``apart``, or by the deviation of the
-    heading up to ``most_apart``, and by ``cone`` [rad]. Tolerances of readings are ``part`` of them, at least ``least``
-    and the deviation of the position; rays are walked up to ``limit`` [m]. Walls have the value ``occupied`` or more.
+    The kernel reads the part of the map from the column ``left`` and the row ``top`` on. Companions start ``beside``
+    off the beam, or at the position's deviation up to ``most_beside`` [m]. They diverge by ``apart``, or by the
+    deviation of the heading up to ``most_apart``, and by ``cone`` [rad]. Tolerances of readings are ``part`` of them,
+    at least ``least`` and the deviation of the position; rays are walked up to ``limit`` [m]. Walls have the value
+    ``occupied`` or more.
     """
 
     beside: double

@@ -28,9 +28,9 @@ and even perfect scans of a short log leave "wrong" at least a share ``ALIKE`` o
 A search, for example after a start anywhere, chooses a place because the scans agree with it. This agreement is no new
 evidence and counts as repeated from the previous scan. A contradiction counts in full.
 
-Comparisons of the pose with other places of the map (:func:`gpusense.localization.ratio.ratio_of_places`) form a
-second series of ratios. Given right or wrong, they count as independent of the scans' ratios, the offset of their fit.
-Their autocorrelation is the same.
+Comparisons of the pose with other places of the map (:func:`gpusense.localization.scan_evidence.ratio_of_places`) form
+a second series of ratios. Given right or wrong, they count as independent of the scans' ratios, the offset of their
+fit. Their autocorrelation is the same.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ class Belief(NamedTuple):
 
         Args:
             pose: The pose [m, m, rad].
-            ratio: Its ratio (:func:`gpusense.localization.ratio.ratio_of_places`); NaN for none.
+            ratio: Its ratio (:func:`gpusense.localization.scan_evidence.ratio_of_places`); NaN for none.
         """
         if math.isnan(ratio):
             return self

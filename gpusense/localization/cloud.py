@@ -18,7 +18,7 @@ from gpusense.interface.constants import ESTIMATE, LEFT, MOMENTS, SLOW_RATE, STA
 from gpusense.interface.launches import Program
 from gpusense.localization.cloud_state import Contents, Summary, deeper, is_starved, meaningful, summary_of
 from gpusense.localization.map_judge import JUDGED, MapJudge
-from gpusense.localization.particles import Particles, Places, Stage
+from gpusense.localization.particles import BufferSlots, Particles, Stage
 
 _DOUBLE = np.dtype(np.float64)
 _MOST_RECORDED, _MOST_STAGES = 64, 48
@@ -177,7 +177,7 @@ class Cloud(Particles):
             self._judges, self._prepared = self._prepared(), None
         return tuple([judge.version for judge in self._judges])
 
-    def _estimating(self, places: Places, count: int, second_pass: int) -> Program:
+    def _estimating(self, places: BufferSlots, count: int, second_pass: int) -> Program:
         """Return the launches of a pass of the estimate."""
         poses, weights = self.poses[places.shown], self.weights[places.weight]
         return self.sums.estimate(poses, weights, self.estimated, count, second_pass)
@@ -239,11 +239,11 @@ class Cloud(Particles):
         if self.backend.info.kind != "gpu":
             weights = self.host_weights(count)
             return weights / weights.sum()
-        return self.backend.lend(self.device_shares(count), (count,), _DOUBLE)
+        return self.backend.wrap_external(self.device_shares(count), (count,), _DOUBLE)
 
     def device_shares(self, count: int) -> Buffer:
         """Return a new buffer with the normalised weights of the shown particles."""
-        out, weight = self.backend.blank(count, _DOUBLE), self.weights[self.places.weight]
+        out, weight = self.backend.empty_external(count, _DOUBLE), self.weights[self.places.weight]
         program = self.sums.estimate(self.poses[self.places.shown], weight, self.estimated, count)
         program += self.sums.launch("normalize_weights", count, weight=weight, estimate=self.estimated, share=out,
                                     particles=count)  # fmt: skip
@@ -254,7 +254,11 @@ class Cloud(Particles):
         """Return mean and covariance of the shown particles: on a GPU an array of the device's library."""
         if self.backend.info.kind != "gpu":
             return self.estimate(count)[:MOMENTS]
-        out, poses, weight = self.backend.blank(ESTIMATE, _DOUBLE), self.poses[self.places.shown], self.places.weight
+        out, poses, weight = (
+            self.backend.empty_external(ESTIMATE, _DOUBLE),
+            self.poses[self.places.shown],
+            self.places.weight,
+        )
         for second_pass in (0, 1):
             # The second pass is correct for any headings.
             self.backend.run(self.sums.estimate(poses, self.weights[weight], out, count, second_pass))
@@ -335,4 +339,4 @@ class Cloud(Particles):
 
     def _lent(self, buffer: Buffer, shape: tuple[int, ...]) -> Any:
         """Return the head of a buffer as an array of the device's library."""
-        return self.backend.lend(self.backend.part(buffer, 0, math.prod(shape), _DOUBLE), shape, _DOUBLE)
+        return self.backend.wrap_external(self.backend.part(buffer, 0, math.prod(shape), _DOUBLE), shape, _DOUBLE)

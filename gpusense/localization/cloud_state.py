@@ -25,7 +25,7 @@ from gpusense.interface.constants import (
     STAGE,
     STATE,
 )
-from gpusense.localization.particles import Places
+from gpusense.localization.particles import BufferSlots
 from gpusense.reference.tempering import left_of
 
 # Lowest depth of a ladder: distances of a million deviations differ by 2^-39 on its last rung.
@@ -83,14 +83,14 @@ class Contents(NamedTuple):
         """Number of particles of the next step."""
         return len(self.poses if self.next_poses is None else self.next_poses)
 
-    def places_and_arrays(self, now: Places) -> tuple[Places, list[tuple[str, int, np.ndarray]]]:
+    def places_and_arrays(self, now: BufferSlots) -> tuple[BufferSlots, list[tuple[str, int, np.ndarray]]]:
         """Return buffers for these particles that keep present buffers intact, and the array for each buffer.
 
         Args:
             now: The buffers at the beginning of the call, to keep.
 
         Returns:
-            Places, and arrays by the name ("poses" or "weights") and index of their buffer.
+            Buffer slots, and arrays by the name ("poses" or "weights") and index of their buffer.
         """
         places = now.placed(now)
         if self.next_poses is None or self.next_weights is None:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense.interface.constants import AGREES, SHORT, THROUGH
-from gpusense.localization.passages import Passages
-from gpusense.localization.ratio import ratio_of_scan
+from gpusense.localization.beam_consistency import BeamConsistency
+from gpusense.localization.scan_evidence import ratio_of_scan
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.verdict import sightings
 
@@ -164,21 +164,21 @@ def diagnose(
     return replace(found, cause="map")
 
 
-def evidence_of(scans: Sequence[Passages]) -> Diagnosis:
+def evidence_of(scans: Sequence[BeamConsistency]) -> Diagnosis:
     """Return the evidence of judged beams, without a cause."""
     agree, through, short = (sum(one.count(kind) for one in scans) for kind in (AGREES, THROUGH, SHORT))
     inside, off = any(one.inside for one in scans), any(one.off for one in scans)
     return Diagnosis(agree, through, short, _place(scans), inside, off)
 
 
-def _fits(scans: Sequence[Passages]) -> bool:
+def _fits(scans: Sequence[BeamConsistency]) -> bool:
     """Return whether a pose explains scans: most beams that meet walls agree, and most informative beams."""
     agree, through, short = (sum(one.count(kind) for one in scans) for kind in (AGREES, THROUGH, SHORT))
     inside = any(one.inside or one.off for one in scans)
     return not inside and agree > _FITS * (agree + through) and agree > _FITS_OF_ALL * (agree + through + short)
 
 
-def _place(scans: Sequence[Passages]) -> tuple[float, float] | None:
+def _place(scans: Sequence[BeamConsistency]) -> tuple[float, float] | None:
     """Return the wall where most beams pass through; None without such beams."""
     walls = [one.wall[one.kind == THROUGH] for one in scans]
     points = np.concatenate(walls) if walls else np.zeros((0, 2))

@@ -19,7 +19,7 @@ from gpusense.interface.constants import MOMENTS
 from gpusense.interface.lanes import with_teams_flags
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import BeamRules, Frame
-from gpusense.reference.passages import STEP, judge_beams
+from gpusense.reference.beam_consistency import STEP, judge_beams
 from gpusense.world.frames import frame_of
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner, classify_ranges
@@ -122,7 +122,7 @@ class MapJudge:
         # First and last row and column of the cells on the device.
         self._part = (0, 0), (0, 0)
         self._cells: Buffer = None
-        self._setting: _Setting | None = None
+        self._context: _Setting | None = None
         # The estimate, then the scan.
         align = max(backend.alignment // _DOUBLE.itemsize, 1)
         begin = -(-MOMENTS // align) * align
@@ -225,10 +225,10 @@ class MapJudge:
 
     def _set(self, scanner: Scanner) -> _Setting:
         """Return the setting of a scanner in the present part of the map."""
-        if self._setting is None or self._setting.scanner is not scanner:
+        if self._context is None or self._context.scanner is not scanner:
             (top, _), (left, _) = self._part
-            self._setting = _setting_of(self.grid, scanner, (top, left))
-        return self._setting
+            self._context = _setting_of(self.grid, scanner, (top, left))
+        return self._context
 
     def _cover(self, setting: _Setting, pose: Floats) -> None:
         """Copy another part of the map if it lacks cells within reach of a pose."""
@@ -246,7 +246,7 @@ class MapJudge:
             self._part = (top, bottom), (left, right) = self._around(places, 1.5 * reach)
             part = np.ascontiguousarray(self.grid.cells[top:bottom, left:right])
             self._cells = self._space.upload("cells", part.reshape(-1).view(np.uint8))
-            self.version, self._setting = next(_VERSIONS), None
+            self.version, self._context = next(_VERSIONS), None
 
     def _around(self, places: tuple[float, float], reach: float) -> tuple[tuple[int, int], tuple[int, int]]:
         """Return rows and columns within a distance of a position [cells], at least a row and a column."""

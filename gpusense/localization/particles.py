@@ -23,7 +23,7 @@ from gpusense.localization.sums import Sums, weight_block
 _DOUBLE = np.dtype(np.float64)
 
 
-class Places(NamedTuple):
+class BufferSlots(NamedTuple):
     """Buffers of a filter's particles by index.
 
     Attributes:
@@ -40,18 +40,18 @@ class Places(NamedTuple):
     before: int = 1
     state: int = 0
 
-    def placed(self, kept: Places) -> Places:
+    def placed(self, kept: BufferSlots) -> BufferSlots:
         """Return buffers for new particles outside ``kept``."""
         poses, weights = kept.free()
-        return Places(poses, poses, weights + 1, weights + 1, 1 - kept.state)
+        return BufferSlots(poses, poses, weights + 1, weights + 1, 1 - kept.state)
 
-    def moved(self, kept: Places) -> Places:
+    def moved(self, kept: BufferSlots) -> BufferSlots:
         """Return the buffers after a motion without a correction; weights wait for the next correction."""
         poses = kept.free()[0]
         return self._replace(shown=poses, next=poses, weight=self.before)
 
     @functools.lru_cache(maxsize=64)  # noqa: B019 - plain values
-    def stages(self, kept: Places, most: int, drawn: int, kind: int, *, same: bool = False) -> list[Stage]:
+    def stages(self, kept: BufferSlots, most: int, drawn: int, kind: int, *, same: bool = False) -> list[Stage]:
         """Return the stages of a correction.
 
         Args:
@@ -114,9 +114,9 @@ class Stage(NamedTuple):
         return self.weight + 1
 
     @property
-    def places(self) -> Places:
+    def places(self) -> BufferSlots:
         """The buffers after the stage."""
-        return Places(self.source, self.source ^ 1, self.weight, self.weight + 1, self.state)
+        return BufferSlots(self.source, self.source ^ 1, self.weight, self.weight + 1, self.state)
 
 
 class Particles:
@@ -147,10 +147,10 @@ class Particles:
         self, backend: Backend, capacity: int, sensors: int, precision: np.dtype, *, residual: bool = False
     ) -> None:
         self.backend, self.capacity, self.precision, self._sensors = backend, capacity, precision, sensors
-        self.count, self.places, self.kept = capacity, Places(), Places()
+        self.count, self.places, self.kept = capacity, BufferSlots(), BufferSlots()
         self.block = weight_block(backend, capacity)
         # Other libraries get no memory that a processor shares with the host.
-        make = backend.blank if backend.info.kind == "gpu" else backend.empty
+        make = backend.empty_external if backend.info.kind == "gpu" else backend.empty
         self.poses = [make(3 * capacity, _DOUBLE) for _ in range(4)]
         self.weights = [make(capacity, _DOUBLE) for _ in range(4)]
         self.log_p = [make(capacity, precision) for _ in range(sensors)]
@@ -175,7 +175,7 @@ class Particles:
         """Number of blocks of particles."""
         return -(-self.count // self.block)
 
-    def set_particles(self, places: Places, count: int) -> None:
+    def set_particles(self, places: BufferSlots, count: int) -> None:
         """Set the buffers, the number of particles, and the number in a block of weights."""
         self.places, self.count, self.block = places, count, weight_block(self.backend, count)
 

@@ -31,8 +31,8 @@ from gpusense.localization.belief import correlation, motion_between, new_part
 from gpusense.localization.cloud_state import Contents, SensorReadings, Summary
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import SampledMotion
-from gpusense.localization.ratio import ratio_of_scan
 from gpusense.localization.rival_search import RivalSearch, are_apart, drawn
+from gpusense.localization.scan_evidence import ratio_of_scan
 from gpusense.localization.spread import FAR, FAR_TURN, deviations
 from gpusense.localization.tracker import Progress, Tracker
 from gpusense.localization.verdict import sightings

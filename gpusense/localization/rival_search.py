@@ -3,8 +3,8 @@
 Branch and bound searches the whole map for scans (:func:`gpusense.matching.likely.likely_poses`) without missing any
 place: once with all beams, and once with the longer half, since people shorten beams. People make the likelihood prefer
 places with many walls, so candidates are also weighed by the beams that meet walls
-(:mod:`gpusense.localization.ratio`). A better fit of the scan at another place than at the estimate is evidence for
-the verdict. For landmarks, and if the search finds nothing, poses are drawn at random.
+(:mod:`gpusense.localization.scan_evidence`). A better fit of the scan at another place than at the estimate is evidence
+for the verdict. For landmarks, and if the search finds nothing, poses are drawn at random.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gpusense.backends import arrays
 from gpusense.localization import starts
 from gpusense.localization.cloud_state import SensorReadings
 from gpusense.localization.pose_algebra import wrap_angle
-from gpusense.localization.ratio import ratio_of_places, ratio_of_scan
+from gpusense.localization.scan_evidence import ratio_of_places, ratio_of_scan
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.spread import FAR, FAR_TURN, deviations
 from gpusense.localization.verdict import sightings

@@ -21,8 +21,8 @@ from gpusense.interface.constants import AGREES, SHORT, THROUGH
 from gpusense.localization.belief import motion_between
 from gpusense.localization.diagnosis import Diagnosis, evidence_of
 from gpusense.localization.pose_algebra import compose_poses, invert_poses, pose_difference, wrap_angle
-from gpusense.localization.ratio import ratio_of_scan
 from gpusense.localization.rival_search import SPREAD_OF_POSE, RivalSearch
+from gpusense.localization.scan_evidence import ratio_of_scan
 from gpusense.localization.scan_motion import Moment, ScanMotion, Window, mirrored_motion, scan_motion
 from gpusense.localization.sensors import Sensor, sensors_of
 from gpusense.localization.spread import FAR, FAR_TURN

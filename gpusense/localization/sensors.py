@@ -166,7 +166,7 @@ class Sensor:
         ranges = reading[0]
         count = self.model.scanner.count
         if self._ranges is None:
-            self._ranges = self.backend.blank(count, _DOUBLE)
+            self._ranges = self.backend.empty_external(count, _DOUBLE)
         if arrays.on_device(ranges) and self.backend.reads(ranges):
             adopted = self.backend.adopt(ranges, "ranges")
             if adopted.dtype == _DOUBLE and adopted.shape == (count,) and adopted.contiguous:

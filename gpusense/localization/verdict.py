@@ -6,8 +6,8 @@ limits:
 
     p_lost = W + (1 - W) s.
 
-W comes from the scans (:mod:`gpusense.localization.ratio`), s from the spread. Models of positions or headings have no
-map and no evidence; W would only follow its prior and rates, and is omitted.
+W comes from the scans (:mod:`gpusense.localization.scan_evidence`), s from the spread. Models of positions or headings
+have no map and no evidence; W would only follow its prior and rates, and is omitted.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ import numpy as np
 
 from gpusense._util import masks
 from gpusense.backends import arrays
+from gpusense.localization.beam_consistency import BeamConsistency, beam_consistency
 from gpusense.localization.belief import Belief, motion_between
-from gpusense.localization.evidence import LEAST_GAIN, Evidence, Gains
+from gpusense.localization.landmark_gain import LEAST_GAIN, Evidence, Gains
 from gpusense.localization.motion import STILL, SampledMotion
-from gpusense.localization.passages import Passages, passages
-from gpusense.localization.ratio import evidence_of_scan, ratio_of_features
+from gpusense.localization.scan_evidence import evidence_of_scan, ratio_of_features
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.spread import Spread, is_wide, spread_of
 from gpusense.localization.words import TRACKING
@@ -267,7 +267,7 @@ class Verdict:
 
 def sightings(
     sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]], pose: np.ndarray, covariance: np.ndarray
-) -> list[Passages]:
+) -> list[BeamConsistency]:
     """Return the judged beams of all scans among readings."""
     result = []
     for index, reading in readings.items():
@@ -276,7 +276,7 @@ def sightings(
             grid, scanner = sensor.model.grid, sensor.model.scanner
             on_host = np.asarray(arrays.copied_to_host(reading[0], sensor.backend, "ranges"))
             ranges = float64_readings(on_host, scanner)
-            result.append(passages(grid, scanner, pose, ranges, covariance, sensor.judge()))
+            result.append(beam_consistency(grid, scanner, pose, ranges, covariance, sensor.judge()))
     return result
 
 

@@ -56,8 +56,8 @@ def fill_rays(
 ) -> None:
     """Fill places with readings, at most ``top``, and with the ``each`` vectors of their beams."""
     count = len(value)
-    point[: count * rules.each] = vectors.reshape(-1, 2)
-    point[count * rules.each : rules.places * rules.each] = (1, 0)
+    point[: count * rules.rays_per_beam] = vectors.reshape(-1, 2)
+    point[count * rules.rays_per_beam : rules.places * rules.rays_per_beam] = (1, 0)
     rounded = value.astype(reading.dtype)
     reading[:count] = np.where(np.isinf(rounded), rounded, np.minimum(rounded, rules.top))
     reading[count : rules.places] = np.nan
@@ -81,7 +81,7 @@ def place_reading(
     value = np.where(used & hit & bool(rules.possible), z, np.nan)
     value[used & far & (rules.max_readings == MAX_PLACED)] = np.inf
     column = np.arange(rules.beams) if "ALL_READINGS" in flags else np.flatnonzero(~np.isnan(value))
-    vectors = vector[: 2 * rules.each * rules.beams].reshape(rules.beams, rules.each, 2)[column]
+    vectors = vector[: 2 * rules.rays_per_beam * rules.beams].reshape(rules.beams, rules.rays_per_beam, 2)[column]
     if "END_POINTS" in flags:
         fill_end_point(value[column], vectors, point, point_low, guard, resolution, rules)
     else:
@@ -116,7 +116,7 @@ def place_scans(
     """Place the readings of scans of one particle each, all of them."""
     z = ranges[: scans * head].reshape(scans, head)[:, beam[: rules.beams]].astype(np.float64)
     value = placed_value(flags, z, rules)
-    vectors = vector[: 2 * rules.each * rules.beams].reshape(rules.beams, rules.each, 2)
+    vectors = vector[: 2 * rules.rays_per_beam * rules.beams].reshape(rules.beams, rules.rays_per_beam, 2)
     for scan in range(scans):
         places = slice(scan * rules.beams, (scan + 1) * rules.beams)
         if "END_POINTS" in flags:
@@ -125,5 +125,5 @@ def place_scans(
                 resolution, rules,
             )  # fmt: skip
         else:
-            rays = slice(places.start * rules.each, places.stop * rules.each)
+            rays = slice(places.start * rules.rays_per_beam, places.stop * rules.rays_per_beam)
             fill_rays(value[scan], vectors, point[rays], reading[places], rules)

@@ -30,11 +30,11 @@ def collisions(worlds: ManyWorlds, poses: Any, radius: object, world: Any, ignor
         host = checks.array("poses", arrays.host_poses(poses, "poses"), ("N", 3))
         buffer, count = backend.upload(host), len(host)
     inside = WorldIndex(worlds, world, ignore, count, backend).buffers(backend, worlds.space, (0, count))
-    hit = backend.blank(count, _BYTE) if there else backend.empty(count, _BYTE)
+    hit = backend.empty_external(count, _BYTE) if there else backend.empty(count, _BYTE)
     if count:
         _collide(worlds, buffer, count, inside, hit, cells, single=single, unknown=unknown == "occupied")
     if there:
-        return arrays.lent(poses, backend, hit, (count,), _BYTE)
+        return arrays.wrapped(poses, backend, hit, (count,), _BYTE)
     return backend.download(hit, np.empty(count, np.uint8)).view(bool)
 
 

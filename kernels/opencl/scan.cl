@@ -131,9 +131,9 @@ void fill_item(const int item, const int item_place, const int left_over, const 
         fill_end_point(item, NAN, (double2)(1, 0), 0, point, point_low, guard, resolution, rules.guard_scale);
 #else
     if (item_place < rules.places)
-        fill_rays(item_place, value, vector_of_item, vectors, point, reading, rules.each, rules.top);
+        fill_rays(item_place, value, vector_of_item, vectors, point, reading, rules.rays_per_beam, rules.top);
     if (left_over) {
-        for (int j = 0; j < rules.each; ++j) point[(long)item * rules.each + j] = (real2)(1, 0);
+        for (int j = 0; j < rules.rays_per_beam; ++j) point[(long)item * rules.rays_per_beam + j] = (real2)(1, 0);
         reading[item] = (real)NAN;
     }
 #endif
@@ -146,7 +146,7 @@ void place_reading(const int item, global const measured *ranges, global const i
                    global real2 *point, global real2 *point_low, global real *reading, global real *guard,
                    global real *constant_term, const double resolution, const ReadingRules rules) {
     // Values that are needed last are read first, so that nothing waits for them.
-    const long from = 2 * (long)min(item, rules.beams - 1) * rules.each;
+    const long from = 2 * (long)min(item, rules.beams - 1) * rules.rays_per_beam;
     const double item_reading = reading_of(item, ranges, beam, rules.beams);
     const double2 vector_of_item = item < rules.beams ? (double2)(vector[from], vector[from + 1]) : (double2)(1, 0);
     const int informative = count_informative(ranges, beam, rules);
@@ -210,7 +210,7 @@ kernel void place_scans(ARGUMENTS) {
     if (scan >= scans) return;
     global const measured *own = ranges + (long)scan * head;
     const double value = placed_value(k, own, beam, rules);
-    global const double *vectors = vector + 2 * (long)k * rules.each;
+    global const double *vectors = vector + 2 * (long)k * rules.rays_per_beam;
     const double2 first = (double2)(vectors[0], vectors[1]);
 #if END_POINTS
     const double cells = value / resolution, length = isfinite(cells) ? cells : 0;
@@ -227,6 +227,6 @@ kernel void place_scans(ARGUMENTS) {
         guard[scan * blocks + k / BLOCK_TERMS] = (real)(rules.guard_scale * (longest / resolution + 2));
     }
 #else
-    fill_rays(item, value, first, vectors, point, reading, rules.each, rules.top);
+    fill_rays(item, value, first, vectors, point, reading, rules.rays_per_beam, rules.top);
 #endif
 }

@@ -187,7 +187,7 @@ def make(name, flags):
                 ahead = wp.vec2d(wp.float64(1.0), wp.float64(0.0))
                 fill_end_point(item, wp.float64(MISSING), ahead, ZERO, point, point_low, guard, resolution, scale)
         else:
-            each = rules.each
+            each = rules.rays_per_beam
             if item_place < rules.places:
                 source = 2 * item * each
                 fill_rays(item_place, value, vector_of_item, vectors, source, point, reading, each, rules.top)
@@ -208,7 +208,7 @@ def make(name, flags):
         readings without a place, -inf if there is a range where none is possible.
         """
         # Values that are needed last are read first, so that nothing waits for them.
-        source = 2 * item * rules.each
+        source = 2 * item * rules.rays_per_beam
         item_reading = reading_of(item, ranges, beam, rules.beams)
         vector_of_item = wp.vec2d(wp.float64(1.0), wp.float64(0.0))
         if item < rules.beams:
@@ -303,7 +303,7 @@ def make(name, flags):
             return
         k = item % rules.beams
         value = placed_value(k, scan * head, ranges, beam, rules)
-        source = 2 * k * rules.each
+        source = 2 * k * rules.rays_per_beam
         first = wp.vec2d(vector[source], vector[source + 1])
         if END_POINTS:
             cells = value / resolution
@@ -327,6 +327,6 @@ def make(name, flags):
                     rules.guard_scale * (longest / resolution + wp.float64(2.0))
                 )
         else:
-            fill_rays(item, value, first, vector, source, point, reading, rules.each, rules.top)
+            fill_rays(item, value, first, vector, source, point, reading, rules.rays_per_beam, rules.top)
 
     return locals()[name]

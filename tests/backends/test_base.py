@@ -101,13 +101,13 @@ def test_abilities_that_a_backend_lacks():
     device.check_process()
     assert (device.in_batch, device.replays, device.reads(array), device.alignment) == (False, False, False, 1)
     assert device.address(array) == id(array) and device.calls == []
-    assert device.blank(2, INT).shape == (2,) and device.calls == [("empty", 2, False)]
+    assert device.empty_external(2, INT).shape == (2,) and device.calls == [("empty", 2, False)]
     with pytest.raises(TypeError, match="poses: must be in host memory for numpy, got an array on a device"):
         device.adopt(array, "poses")
     with pytest.raises(TypeError, match="numpy does not copy between buffers"):
         device.copy(array, array, 8)
-    with pytest.raises(TypeError, match="numpy does not lend buffers"):
-        device.lend(array, (3,), REAL)
+    with pytest.raises(TypeError, match="numpy does not wrap buffers"):
+        device.wrap_external(array, (3,), REAL)
 
 
 def public(kind: type) -> set[str]:
@@ -139,9 +139,9 @@ def test_a_proxy_defines_every_method():
         ("check_process", (), {}),
         ("reads", (1,), {}),
         ("adopt", (1, "poses"), {"in_place": True}),
-        ("blank", (1, 2), {}),
+        ("empty_external", (1, 2), {}),
         ("copy", (1, 2, 3), {"begin": 4, "to": 5}),
-        ("lend", (1, 2, 3), {}),
+        ("wrap_external", (1, 2, 3), {}),
     ],
 )
 def test_a_proxy_forwards_methods(name, arguments, options, monkeypatch):

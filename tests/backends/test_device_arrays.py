@@ -66,7 +66,7 @@ def test_out_on_the_device(method, warp_as_gpu, warp_copies):
 def test_copies_on_the_device(selection, needs):
     """Copy between any two places, after all earlier commands."""
     backend, real = get_backend(needs(selection)), np.dtype(np.float32)
-    source, target = backend.blank(8, real), backend.blank(6, real)
+    source, target = backend.empty_external(8, real), backend.empty_external(6, real)
     backend.upload(np.arange(8, dtype=real), source)
     backend.upload(np.full(6, 77, real), target)
     backend.copy(source, target, 12, begin=8, to=4)

@@ -11,10 +11,10 @@ import pytest
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.interface.constants import AGREES, NOTHING, SHORT, THROUGH, VANISHED
+from gpusense.localization.beam_consistency import beam_consistency
 from gpusense.localization.belief import ALIKE, ALIKE_LENGTH, FOUND, LENGTH, PER_METRE, PER_SCAN, STAYS, Belief
 from gpusense.localization.map_judge import MapJudge
-from gpusense.localization.passages import passages
-from gpusense.localization.ratio import LIMITS, explained_of_scan, ratio_of_scan
+from gpusense.localization.scan_evidence import LIMITS, explained_of_scan, ratio_of_scan
 from gpusense.localization.spread import share_off, share_off_of
 from gpusense.localization.words import verdict_label
 
@@ -39,7 +39,7 @@ def scan_at(pose, grid=GRID):
 
 
 def kinds(pose, ranges, grid=GRID, **options):
-    found = passages(grid, SCANNER, np.asarray(pose, float), np.asarray(ranges, float), **options)
+    found = beam_consistency(grid, SCANNER, np.asarray(pose, float), np.asarray(ranges, float), **options)
     return [found.count(kind) for kind in (AGREES, SHORT, THROUGH, VANISHED, NOTHING)]
 
 
@@ -70,12 +70,12 @@ def test_unknown_cells_and_what_is_off_the_map_tell_nothing():
     # The beams through the door and over the wall end in unknown cells.
     agree, short, through, _, nothing = kinds(POSE, ranges, open_world)
     assert short == through == 0 and nothing >= 2 and agree >= 20
-    off = passages(GRID, SCANNER, np.array([50.0, 0.0, 0.0]), ranges)
+    off = beam_consistency(GRID, SCANNER, np.array([50.0, 0.0, 0.0]), ranges)
     assert off.off and not off.inside and off.count(NOTHING) == len(off.kind)
-    inside = passages(house(), SCANNER, np.array([-0.3, 2.0, 0.0]), ranges)
+    inside = beam_consistency(house(), SCANNER, np.array([-0.3, 2.0, 0.0]), ranges)
     assert inside.off
     solid = gs.OccupancyGrid(np.full((40, 40), 100), 0.1)
-    assert passages(solid, SCANNER, np.array([2.0, 2.0, 0.0]), ranges).inside
+    assert beam_consistency(solid, SCANNER, np.array([2.0, 2.0, 0.0]), ranges).inside
 
 
 def test_a_diagonal_pair_of_walls_stops_a_beam():
@@ -86,7 +86,7 @@ def test_a_diagonal_pair_of_walls_stops_a_beam():
     for _ in range(20):
         pose = np.array([*rng.uniform(1.0, 2.0, 2), 0.0])
         scanner = gs.Scanner(rng.uniform(0.3, 1.2, 16), range_max=12.0)
-        found = passages(grid, scanner, pose, np.full(16, 6.0))
+        found = beam_consistency(grid, scanner, pose, np.full(16, 6.0))
         # A ray that leaves the map first meets no wall.
         assert found.count(THROUGH) == 16
 
@@ -115,8 +115,8 @@ def test_every_device_judges_beams_alike(backend, as_gpu, gpu):
             ranges = rng.choice([np.nan, np.inf, 0.0, *rng.uniform(0.0, 11.0, 9)], 64)
             spread = np.diag(np.square([0.1 * (k % 4), 0.07 * (k % 3), 0.05 * (k % 3)]))
             spread[0, 1] = spread[1, 0] = -0.5 * spread[0, 0] ** 0.5 * spread[1, 1] ** 0.5
-            host = passages(grid, scanner, pose, ranges * farthest / 12, spread)
-            device = passages(grid, scanner, pose, ranges * farthest / 12, spread, judge)
+            host = beam_consistency(grid, scanner, pose, ranges * farthest / 12, spread)
+            device = beam_consistency(grid, scanner, pose, ranges * farthest / 12, spread, judge)
             assert all(np.array_equal(*pair) for pair in zip(host, device, strict=True))
 
 
@@ -124,20 +124,20 @@ def test_a_scanner_has_its_mount():
     mount = (0.3, -0.1, 1.0)
     turned = gs.Scanner(SCANNER.bearings, range_max=12.0, mount=mount)
     base = gs.compose_poses(POSE, gs.invert_poses(np.array(mount)))
-    found = passages(GRID, turned, base, scan_at(POSE))
+    found = beam_consistency(GRID, turned, base, scan_at(POSE))
     assert found.count(AGREES) >= 29
 
 
 def test_the_ratio_ignores_short_beams_and_has_limits():
     right, hidden = scan_at(POSE), scan_at(POSE)
     hidden[20:40] = 0.6
-    one = ratio_of_scan([passages(GRID, SCANNER, POSE, right)])
-    two = ratio_of_scan([passages(GRID, SCANNER, POSE, hidden)])
+    one = ratio_of_scan([beam_consistency(GRID, SCANNER, POSE, right)])
+    two = ratio_of_scan([beam_consistency(GRID, SCANNER, POSE, hidden)])
     assert one == two == LIMITS[0]
-    elsewhere = ratio_of_scan([passages(GRID, SCANNER, POSE + np.array([3.5, 0.0, 0.0]), right)])
+    elsewhere = ratio_of_scan([beam_consistency(GRID, SCANNER, POSE + np.array([3.5, 0.0, 0.0]), right)])
     assert one + 3 < elsewhere <= LIMITS[1]
     assert math.isnan(ratio_of_scan([])) and math.isnan(explained_of_scan([]))
-    nothing = passages(GRID, SCANNER, POSE, np.full(64, np.nan))
+    nothing = beam_consistency(GRID, SCANNER, POSE, np.full(64, np.nan))
     assert math.isnan(ratio_of_scan([nothing])) and math.isnan(explained_of_scan([nothing]))
 
 

@@ -100,8 +100,8 @@ def adopted(array: Any, queue: cl.CommandQueue, selection: str, name: str, *, in
     return Adopted(buffer, tuple(map(int, array.shape)), array.dtype, tuple(array.strides), contiguous, to_host, array)
 
 
-def lent(buffer: cl.Buffer, queue: cl.CommandQueue, shape: tuple[int, ...], dtype: np.dtype) -> pyopencl.array.Array:
-    """See Backend.lend."""
+def wrapped(buffer: cl.Buffer, queue: cl.CommandQueue, shape: tuple[int, ...], dtype: np.dtype) -> pyopencl.array.Array:
+    """See Backend.wrap_external."""
     # Imported on use, since the import takes a while and NumPy arrays do not need it.
     import pyopencl.array
 

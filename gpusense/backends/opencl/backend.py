@@ -175,8 +175,8 @@ class OpenCLBackend(ProcessBound, Backend):
     def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
         return arrays.adopted(array, self._queue, self.info.selection, name, in_place=in_place)
 
-    def blank(self, count: int, dtype: np.dtype) -> Buffer:
-        """See Backend.blank; arrays of shared memory could not outlive the backend's launches."""
+    def empty_external(self, count: int, dtype: np.dtype) -> Buffer:
+        """See Backend.empty_external; arrays of shared memory could not outlive the backend's launches."""
         size = max(count, 1) * np.dtype(dtype).itemsize
         self._check_size(size)
         with driver_errors():
@@ -192,8 +192,8 @@ class OpenCLBackend(ProcessBound, Backend):
             else:
                 cl.enqueue_copy(self._queue, target, source, byte_count=size, src_offset=begin, dst_offset=to)
 
-    def lend(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
-        return arrays.lent(buffer, self._queue, shape, dtype)
+    def wrap_external(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
+        return arrays.wrapped(buffer, self._queue, shape, dtype)
 
     @property
     def replays(self) -> bool:

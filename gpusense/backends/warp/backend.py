@@ -144,7 +144,7 @@ class WarpBackend(ProcessBound, Backend):
         """See Backend.adopt; every array on the device can be used in place."""
         return adopted(array, self._device, name)
 
-    def blank(self, count: int, dtype: np.dtype) -> wp.array:
+    def empty_external(self, count: int, dtype: np.dtype) -> wp.array:
         return self.part(self.empty(count, dtype), 0, count, dtype)
 
     def copy(self, source: wp.array, target: wp.array, size: int, *, begin: int = 0, to: int = 0) -> None:
@@ -158,7 +158,7 @@ class WarpBackend(ProcessBound, Backend):
         from_size, to_size = (wp.types.type_size_in_bytes(array.dtype) for array in (source, target))
         wp.copy(target, source, dest_offset=to // to_size, src_offset=begin // from_size, count=size // from_size)
 
-    def lend(self, buffer: wp.array, shape: tuple[int, ...], dtype: np.dtype) -> wp.array:
+    def wrap_external(self, buffer: wp.array, shape: tuple[int, ...], dtype: np.dtype) -> wp.array:
         return buffer if buffer.shape == shape else buffer.reshape(shape)
 
     @property

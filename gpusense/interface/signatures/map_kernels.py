@@ -62,7 +62,7 @@ KERNELS: dict[str, Kernel] = {
         *_MAP, "int rays",
     ),
     "judge_beams": kernel(
-        "passages", "beam", "uchar cells [rows * cols]", "double estimate [9]", "double scan [2 * beams]",
+        "beam_consistency", "beam", "uchar cells [rows * cols]", "double estimate [9]", "double scan [2 * beams]",
         "out double judged [2 * beams]", "Frame frame", "BeamRules rules", *_MAP, "int beams", group=4, team=256,
     ),
 }  # fmt: skip

@@ -37,13 +37,15 @@ KERNELS: dict[str, Kernel] = {
         "int apart", "int items",
     ),
     "place_inputs": kernel(
-        "scan", "item", *_GIVEN, "measured ranges [scan]", "int beam [beams]", "double vector [2 * each * beams]",
-        "out real2 point [places * each]", "out real2 point_low [places]", "out real reading [places]",
+        "scan", "item", *_GIVEN, "measured ranges [scan]", "int beam [beams]",
+        "double vector [2 * rays_per_beam * beams]",
+        "out real2 point [places * rays_per_beam]", "out real2 point_low [places]", "out real reading [places]",
         "out real guard [blocks]", "out real constant_term [1]", *_FRAME, "int head", "ReadingRules rules",
     ),
     "place_scans": kernel(
         "scan", "item", "measured ranges [scans * head]", "int beam [rules.beams]",
-        "double vector [2 * rules.each * rules.beams]", "out real2 point [scans * rules.beams * rules.each]",
+        "double vector [2 * rules.rays_per_beam * rules.beams]",
+        "out real2 point [scans * rules.beams * rules.rays_per_beam]",
         "out real2 point_low [scans * rules.beams]", "out real reading [scans * rules.beams]",
         "out real guard [scans * blocks]", "int scans", "int head", "int blocks", "double resolution",
         "ReadingRules rules",

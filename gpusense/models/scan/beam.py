@@ -114,16 +114,16 @@ class BeamModel(ScanModel):
             z_max=density.z_max, max_depends=density.max_depends, constant_term=weights.constant_term,
             possible=density.possible,
         )  # fmt: skip
-        setting = self._setting
+        context = self._context
         self._density, self.sensor_table = density, sensor_table
         self._caster = MapCaster(
-            setting.backend, setting.real, grid, scanner.mount, scanner.range_max, method, unknown=self.unknown,
+            context.backend, context.real, grid, scanner.mount, scanner.range_max, method, unknown=self.unknown,
             outside=self.outside, crop=specialize, obstacles_of=weights.obstacles,
         )  # fmt: skip
         self._beam_pipeline = BeamPipeline(
-            setting, self._caster, cones_of(scanner, method, incidence=incidence is not None),
+            context, self._caster, cones_of(scanner, method, incidence=incidence is not None),
             mixture_on_device(
-                density, scanner.range_max, setting.real, width=sensor_table, compat=weights.name, specialize=specialize
+                density, scanner.range_max, context.real, width=sensor_table, compat=weights.name, specialize=specialize
             ),
             max_evaluated=density.max_depends and density.table is None,
         )  # fmt: skip
@@ -258,12 +258,12 @@ class BeamModel(ScanModel):
             >>> z.shape, bool(abs(np.median(z[:, 0]) - 1.8) < 0.05)
             ((1000, 2), True)
         """
-        if self._setting.weights.is_peer:
+        if self._context.weights.is_peer:
             raise ValueError(f"compat: must be None where readings are drawn, got {self.compat!r}, no density")
-        checked, shape = poses_to_draw_at(poses, self._setting.backend)
-        checked.inside = index_of(self._caster.grid, world, ignore, checked.count, self._setting.backend)
+        checked, shape = poses_to_draw_at(poses, self._context.backend)
+        checked.inside = index_of(self._caster.grid, world, ignore, checked.count, self._context.backend)
         drawing = drawing_of(
-            self._density, self.scanner.range_max, self._setting.real, seed=seed, step=step, per_scan=shape[-1]
+            self._density, self.scanner.range_max, self._context.real, seed=seed, step=step, per_scan=shape[-1]
         )
         pipeline, shape = self._beam_pipeline, (*shape, self.scanner.count)
         result = Result(poses, out, shape, pipeline.real, pipeline.backend, on_device=checked.on_device)

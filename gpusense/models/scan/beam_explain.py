@@ -42,7 +42,7 @@ def scene_notes(pipeline: BeamPipeline, last: LastCall, density: BeamDensity, we
         density: The density of the model.
         weights_note: Words of the title about weights of other programs.
     """
-    flags, real, weights = last.flags, pipeline.real.name, pipeline.setting.weights
+    flags, real, weights = last.flags, pipeline.real.name, pipeline.context.weights
     mixtures, discrete = density.mixtures, density.table is not None
     tabulated = discrete or pipeline.mixture.table is not None
     components = [(name, max(getattr(p, name) for p in mixtures), cost) for name, cost in _COSTS]

@@ -29,7 +29,7 @@ class BeamPipeline(ScanPipeline):
     """The stages of a beam model.
 
     Args:
-        setting: The device and the rules.
+        context: The device and the rules.
         caster: Casts expected ranges.
         cones: Cones of the sensor.
         mixture: The mixture.
@@ -40,9 +40,9 @@ class BeamPipeline(ScanPipeline):
     kernel_names = ("score_beams",), ("beam_tiles", "sum_parts")
 
     def __init__(
-        self, setting: ModelContext, caster: MapCaster, cones: Cones, mixture: Mixture, *, max_evaluated: bool
+        self, context: ModelContext, caster: MapCaster, cones: Cones, mixture: Mixture, *, max_evaluated: bool
     ) -> None:
-        super().__init__(setting)
+        super().__init__(context)
         self.caster, self.cones, self.mixture, self.map = caster, cones, mixture, caster.map
         self.rays_each = cones.rays
         # The rays of each beam, several for a cone.
@@ -73,26 +73,26 @@ class BeamPipeline(ScanPipeline):
 
     def upload(self, scans: ClassedScans, space: Workspace) -> Readings:
         """See ScanPipeline.upload; readings that share a ray are neighbours."""
-        vectors = scans.rays if self.cones.rays == 1 else self.cone_vectors[scans.columns[scans.first[:-1]]]
+        vectors = scans.rays if self.cones.rays == 1 else self.cone_vectors[scans.columns[scans.ray_offsets[:-1]]]
         values = scans.readings.astype(self.real)
         if self.mixture.cells:
             values = np.where(np.isfinite(scans.readings), np.minimum(values, self.real.type(self._top)), values)
         shared, several = scans.shared or not self.specialize, scans.scans > 1
         arrays = dict(ray=vectors.astype(self.real), reading=values)
         if several:
-            arrays["constant_terms"] = (scans.constants + self.setting.constant_term).astype(self.real)
+            arrays["constant_terms"] = (scans.constants + self.context.constant_term).astype(self.real)
         uploaded = dict(zip(arrays, space.upload_all("scan", list(arrays.values())), strict=True))
         start = counts = self.nothing
         if several:
             begins = np.append(0, np.cumsum(scans.ray_counts)).astype(np.int32)
             start, counts = space.upload_all("scans", [begins, scans.counts.astype(np.int32)])
         # Kernels read ``first`` only for shared rays; NumPy's kernel does for a single scan.
-        first = space.upload("first", scans.first) if shared and (several or scans.shared) else self._one_each
+        first = space.upload("first", scans.ray_offsets) if shared and (several or scans.shared) else self._one_each
         return Readings(
             scans.scans, scans.most_rays, scans.most_readings, flags_if(SHARED_RAYS=shared, SCANS=several),
             dict(ray=uploaded["ray"], reading=uploaded["reading"], first=first, start=start),
             dict(counts=counts, constant_terms=uploaded.get("constant_terms", self._terms)),
-            float(scans.constants[0]) + self.setting.constant_term,
+            float(scans.constants[0]) + self.context.constant_term,
             (scans.scans, scans.most_rays, scans.most_readings, len(scans.rays), len(scans.readings)),
         )  # fmt: skip
 
@@ -101,7 +101,7 @@ class BeamPipeline(ScanPipeline):
         vectors = rules.vectors[:, None] if self.cones.rays == 1 else self.cone_vectors
         return ReadingLayout(
             self.scanner, rules.beams, vectors, rules.z_max, end_points=False, max_depends=rules.max_depends,
-            possible=self.setting.possible, specialize=self.specialize, top=self._top, guard_scale=0.0, real=self.real,
+            possible=self.context.possible, specialize=self.specialize, top=self._top, guard_scale=0.0, real=self.real,
         )  # fmt: skip
 
     def place_arguments(self, filled: dict[str, Buffer]) -> dict[str, Buffer]:

@@ -76,7 +76,7 @@ def bind_worlds(
     there = arrays.on_device(poses) and arrays.on_device(ranges)
     if not there or backend.info.kind != "gpu":
         return _WorldsCall(score, poses, ranges, world, ignore, out)
-    if len(ranges.shape) == 2 and not (rules.choice.every and rules.separate and pipeline.setting.possible):
+    if len(ranges.shape) == 2 and not (rules.choice.every and rules.separate and pipeline.context.possible):
         # Scans whose beams are chosen by their readings, or share rays, are prepared by the host.
         return _WorldsCall(score, poses, ranges, world, ignore, out)
     count = int(poses.shape[0])

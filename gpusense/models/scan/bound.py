@@ -194,7 +194,7 @@ class DeviceCall(BoundCall):
         self._first, places = (placing,), len(sensing.columns)
         starts = space.upload("start", np.arange(count + 1, dtype=_INT) * _INT.type(places))
         each = -(-places // BLOCK_TERMS) if sensing.end_points else places
-        constants = np.full(count, pipeline.setting.constant_term, pipeline.real)
+        constants = np.full(count, pipeline.context.constant_term, pipeline.real)
         return Readings(
             count, places, places, frozenset({"ALL_READINGS", "SCANS"}),
             pipeline.place_arguments(filled) | {"start": starts},

@@ -64,7 +64,7 @@ class ClassedScans:
         readings: (M,) ranges in metres; NaN (missing) and inf (max) only where nothing is left out.
         vectors: (M, 2) float64 cosines and sines of their bearings.
         rays: (R, 2) the bearings that are cast.
-        first: (R + 1,) int32; readings of ray r are first[r] to first[r + 1] - 1.
+        ray_offsets: (R + 1,) int32; readings of ray r are ray_offsets[r] to ray_offsets[r + 1] - 1.
         ray_counts: (S,) rays of each scan.
         counts: (S,) readings of each scan.
         constants: (S,) constant terms: log-likelihoods of the readings that do not depend on the pose.
@@ -75,15 +75,21 @@ class ClassedScans:
     """
 
     __slots__ = (
-        "columns", "constants", "counts", "first", "left_out", "most_rays", "most_readings", "ray_counts", "rays",
+        "columns", "constants", "counts", "left_out", "most_rays", "most_readings", "ray_counts", "ray_offsets", "rays",
         "readings", "scans", "vectors",
     )  # fmt: skip
 
     def __init__(
-        self, columns: np.ndarray, readings: np.ndarray, vectors: np.ndarray, rays: np.ndarray, first: np.ndarray,
+        self, columns: np.ndarray, readings: np.ndarray, vectors: np.ndarray, rays: np.ndarray, ray_offsets: np.ndarray,
         ray_counts: np.ndarray, counts: np.ndarray, constants: np.ndarray, left_out: OmittedReadings,
     ) -> None:  # fmt: skip
-        self.columns, self.readings, self.vectors, self.rays, self.first = columns, readings, vectors, rays, first
+        self.columns, self.readings, self.vectors, self.rays, self.ray_offsets = (
+            columns,
+            readings,
+            vectors,
+            rays,
+            ray_offsets,
+        )
         self.ray_counts, self.counts, self.constants, self.left_out = ray_counts, counts, constants, left_out
         self.scans = len(counts)
         self.most_readings = len(readings) if self.scans == 1 else max(counts.tolist(), default=0)
@@ -99,7 +105,7 @@ class ClassedScans:
         if (begin, end) == (0, self.scans):
             return self
         rays = slice(int(self.ray_counts[:begin].sum()), int(self.ray_counts[:end].sum()))
-        first = self.first[rays.start : rays.stop + 1]
+        first = self.ray_offsets[rays.start : rays.stop + 1]
         chosen, scans = slice(first[0], first[-1]), slice(begin, end)
         return ClassedScans(
             self.columns[chosen], self.readings[chosen], self.vectors[chosen], self.rays[rays], first - first[0],
@@ -211,7 +217,7 @@ def _join(scans: Sequence[ClassedScans]) -> ClassedScans:
         np.concatenate([getattr(scan, name) for scan in scans]) for name in ("counts", "ray_counts", "constants")
     )
     before = np.cumsum(counts) - counts
-    firsts = [scan.first[:-1] + begin for scan, begin in zip(scans, before, strict=True)]
+    firsts = [scan.ray_offsets[:-1] + begin for scan, begin in zip(scans, before, strict=True)]
     first = np.append(np.concatenate(firsts), counts.sum()).astype(np.int32)
     columns, readings, vectors, rays = (
         np.concatenate([getattr(scan, name) for scan in scans]) for name in ("columns", "readings", "vectors", "rays")

@@ -93,7 +93,7 @@ class LikelihoodFieldModel(ScanModel):
             possible=self.parameters.z_hit > 0 or self.parameters.z_rand > 0,
         )  # fmt: skip
         self._field_pipeline = FieldPipeline(
-            self._setting, grid, self.parameters, unknown=self.unknown, outside=self.outside
+            self._context, grid, self.parameters, unknown=self.unknown, outside=self.outside
         )
 
     def _arguments(self) -> dict[str, Any]:
@@ -109,7 +109,7 @@ class LikelihoodFieldModel(ScanModel):
     def _with_shapes(self) -> FieldPipeline:
         """The stages of a model of worlds with moving shapes."""
         return FieldPipeline(
-            self._setting, self._field_pipeline.map.grid, self.parameters, unknown=self.unknown, outside=self.outside,
+            self._context, self._field_pipeline.map.grid, self.parameters, unknown=self.unknown, outside=self.outside,
             shapes=True,
         )  # fmt: skip
 
@@ -143,7 +143,7 @@ class LikelihoodFieldModel(ScanModel):
             )
         if self._worlds is not None:
             raise ValueError(f"grid: must be a single map for gradients, got {self._worlds}")
-        request = make_request(self._setting, poses, ranges)
+        request = make_request(self._context, poses, ranges)
         with self._lock, self._workspace:
             numbers = gradients(self._field_pipeline, request, self._workspace)
             finish(self._workspace, request.poses.on_device)

@@ -66,7 +66,7 @@ class _Gradient:
             start=arguments["start"], constant_terms=readings.sums["constant_terms"], gradient=numbers,
             window=placed.frame.window, particles=piece.count, readings=readings.readings,
             guard=pipeline.guard * readings.reach, mount_x=mount_x, mount_y=mount_y, resolution=resolution,
-            score=Score(readings.constant_term, pipeline.setting.temperature), batch=ScanBatch(per_scan, 0),
+            score=Score(readings.constant_term, pipeline.context.temperature), batch=ScanBatch(per_scan, 0),
         )  # fmt: skip
         backend.run((*placing_launches(placed, readings.placing), gradient))
         space.download(numbers, rows)

@@ -54,7 +54,7 @@ class FieldPipeline(ScanPipeline):
 
     def __init__(
         self,
-        setting: ModelContext,
+        context: ModelContext,
         grid: OccupancyGrid | Worlds,
         parameters: LikelihoodFieldParameters,
         *,
@@ -62,13 +62,13 @@ class FieldPipeline(ScanPipeline):
         outside: str,
         shapes: bool = False,
     ) -> None:
-        super().__init__(setting)
-        bilinear, weights = parameters.interpolation == "bilinear", setting.weights
+        super().__init__(context)
+        bilinear, weights = parameters.interpolation == "bilinear", context.weights
         # Distances to shapes are compared with those to walls.
         self.log_table = (self.specialize or weights.is_peer) and not bilinear and not shapes
         self.careful = self.real == np.float32
         self.quick = self.careful and self.log_table and self.specialize
-        self.components, terms = self._mixture(parameters, bilinear=bilinear, cubes=setting.cubes)
+        self.components, terms = self._mixture(parameters, bilinear=bilinear, cubes=context.cubes)
         self.terms = self.backend.upload(packed([terms], self.real))
         self.guard = _GUARD * float(np.finfo(self.real).eps)
         range_max = self.scanner.range_max
@@ -129,7 +129,7 @@ class FieldPipeline(ScanPipeline):
             arrays["guard"] = (self.guard * (longest + 2)).astype(self.real)
         several = scans.scans > 1
         if several:
-            arrays["constant_terms"] = (scans.constants + self.setting.constant_term).astype(self.real)
+            arrays["constant_terms"] = (scans.constants + self.context.constant_term).astype(self.real)
         uploaded = dict(zip(arrays, space.upload_all("points", list(arrays.values())), strict=True))
         start = counts = self.nothing
         if several:
@@ -140,7 +140,7 @@ class FieldPipeline(ScanPipeline):
             scans.scans, scans.most_rays, scans.most_readings, _SCANS if several else _NONE,
             dict(point=uploaded["point"], point_low=uploaded["point_low"], guard=uploaded.get("guard"), start=start),
             dict(counts=counts, constant_terms=uploaded.get("constant_terms", self.terms)),
-            float(scans.constants[0]) + self.setting.constant_term,
+            float(scans.constants[0]) + self.context.constant_term,
             (scans.scans, scans.most_readings, len(scans.readings)), lengths.item(lengths.argmax()) + 2,
         )  # fmt: skip
 
@@ -157,7 +157,7 @@ class FieldPipeline(ScanPipeline):
         rules = self.rules
         return ReadingLayout(
             self.scanner, rules.beams, rules.vectors[:, None], rules.z_max, end_points=True, max_depends=False,
-            possible=self.setting.possible, specialize=self.specialize, top=math.inf, guard_scale=self.guard,
+            possible=self.context.possible, specialize=self.specialize, top=math.inf, guard_scale=self.guard,
             real=self.real,
         )  # fmt: skip
 
@@ -191,7 +191,7 @@ class FieldPipeline(ScanPipeline):
     def numbers(self, scoring: ScanLaunch) -> dict[str, Any]:
         """See ScanPipeline.numbers; blocks of readings have a guard each on the device."""
         readings = scoring.readings
-        score = Score(readings.constant_term, self.setting.temperature)
+        score = Score(readings.constant_term, self.context.temperature)
         # Error bounds: products of rounded factors err by at most 3.12 eps of the longest, their sums by 1.5 eps.
         return dict(score=score, guard=self.guard * readings.reach) if scoring.tiles is None else dict(score=score)
 

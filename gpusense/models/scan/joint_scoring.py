@@ -54,7 +54,7 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
     for model, model_poses, model_ranges, model_out in zip(chosen, each_poses, each_ranges, each_out, strict=True):
         # Poses that several models share are checked once.
         shared = known.setdefault(id(model_poses), {})
-        requests.append(make_request(model._setting, model_poses, model_ranges, model_out, known=shared))
+        requests.append(make_request(model._context, model_poses, model_ranges, model_out, known=shared))
     # A fixed order of locks, so that two such calls cannot deadlock.
     different = sorted({id(model): model for model in chosen}.items())
     with contextlib.ExitStack() as stack:
@@ -80,7 +80,7 @@ def _checked(models: object) -> list[ScanModel]:
         if not isinstance(model, ScanModel):
             rule = "must be BeamModel or LikelihoodFieldModel objects"
             raise TypeError(f"models: {rule}, got {checks.show(model)} at index {i}")
-        if model._setting.backend is not models[0]._setting.backend:
+        if model._context.backend is not models[0]._context.backend:
             selections = f"{models[0].device.selection} and, at index {i}, {model.device.selection}"
             raise ValueError(f"models: must be of one device, got {selections}")
     return list(models)

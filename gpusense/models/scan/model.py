@@ -81,7 +81,7 @@ class ScanModel(Pickled):
             specialize, max_is_range=weights.is_peer, max_depends=max_depends,
             map_size=math.hypot(grid.width, grid.height),
         )  # fmt: skip
-        self._setting = ModelContext(
+        self._context = ModelContext(
             device, real_dtype(precision, device), rules, weights, cubes, self.temperature, constant_term,
             possible or cubes,
         )  # fmt: skip
@@ -110,7 +110,7 @@ class ScanModel(Pickled):
         call = None if self._short is None else self._short.last
         if call is not None:
             poses, ranges = (array.copy() if type(array) is np.ndarray else array for array in call.arrays)
-            request = make_request(self._setting, poses, ranges)
+            request = make_request(self._context, poses, ranges)
             with self._lock, self._workspace:
                 self._run(request)
                 finish(self._workspace, request.poses.on_device)
@@ -123,7 +123,7 @@ class ScanModel(Pickled):
         run(self._pipeline, request, self._workspace, self._last_call)
 
     def __repr__(self) -> str:
-        count, used = self.scanner.count, self._setting.rules.choice.most
+        count, used = self.scanner.count, self._context.rules.choice.most
         parts = [
             map_words(self.grid),
             f"beams={count}" if used == count else f"beams={used} of {count}",
@@ -134,7 +134,7 @@ class ScanModel(Pickled):
         return f"{type(self).__name__}({', '.join(parts)})"
 
     def _repr_html_(self) -> str:
-        count, used = self.scanner.count, self._setting.rules.choice.most
+        count, used = self.scanner.count, self._context.rules.choice.most
         options = (*self._options(), *(() if self.compat is None else (f"compat={self.compat!r}",)))
         rows = [
             ("map", map_words(self.grid)),
@@ -147,7 +147,7 @@ class ScanModel(Pickled):
     def _arguments(self) -> dict[str, Any]:
         """See Pickled; subclasses add their own."""
         names = ("grid", "scanner", "precision", "unknown", "outside", "temperature", "beams", "compat")
-        return {name: getattr(self, name) for name in names} | {"specialize": self._setting.rules.specialize}
+        return {name: getattr(self, name) for name in names} | {"specialize": self._context.rules.specialize}
 
     def _options(self) -> tuple[str, ...]:
         """Return the options that only this kind of model has, as ``repr`` shows them."""
@@ -166,17 +166,17 @@ class ScanModel(Pickled):
     @property
     def device(self) -> BackendInfo:
         """The device the model is compiled for."""
-        return self._setting.backend.info
+        return self._context.backend.info
 
     @property
     def backend(self) -> Backend:
         """The backend that holds the model's buffers."""
-        return self._setting.backend
+        return self._context.backend
 
     @property
     def used_beams(self) -> int:
         """Largest number of beams of a scan that the model evaluates."""
-        return self._setting.rules.choice.most
+        return self._context.rules.choice.most
 
     @property
     def table_version(self) -> int:
@@ -186,7 +186,7 @@ class ScanModel(Pickled):
     @property
     def precision(self) -> Precision:
         """``"float32"`` or ``"float64"``."""
-        return cast(Precision, self._setting.real.name)
+        return cast(Precision, self._context.real.name)
 
     @overload
     def log_likelihood(
@@ -266,7 +266,7 @@ class ScanModel(Pickled):
             if result is not None:
                 return result
         request = make_request(
-            self._setting, poses, ranges, out, per_beam=per_beam, worlds=self._worlds, world=world, ignore=ignore
+            self._context, poses, ranges, out, per_beam=per_beam, worlds=self._worlds, world=world, ignore=ignore
         )
         with self._lock, self._workspace:
             run(self._pipeline, request, self._workspace, self._last_call)
@@ -288,7 +288,7 @@ class ScanModel(Pickled):
         with self._lock, self._workspace:
             if self._repeated.start(poses, ranges, out, before):
                 return
-        request = make_request(self._setting, poses, ranges, out, before=before)
+        request = make_request(self._context, poses, ranges, out, before=before)
         with self._lock, self._workspace:
             self._run(request)
             self._repeated.remember(poses, out, request)
@@ -360,13 +360,13 @@ class ScanModel(Pickled):
         Returns:
             The title, the flags of the code, and the parts that are left out, kept, and could go.
         """
-        plan = plan_of_call(self._notes(), self._setting, self._last)
+        plan = plan_of_call(self._notes(), self._context, self._last)
         if not checks.boolean("measure", measure):
             return plan
         from gpusense.models.scan.savings import measured_savings
 
         with self._lock:
-            requests = functools.partial(make_request, self._setting)
+            requests = functools.partial(make_request, self._context)
             savings = measured_savings(requests, self._pipeline, self._last, plan, self.scanner.count)
         return dataclasses.replace(plan, measured=savings)
 
@@ -378,7 +378,7 @@ class ScanModel(Pickled):
         """
         from gpusense.models.scan.savings import sources_of
 
-        return sources_of(self._setting.backend, self._last)
+        return sources_of(self._context.backend, self._last)
 
     @abstractmethod
     def _notes(self) -> SceneNotes:
@@ -386,10 +386,10 @@ class ScanModel(Pickled):
 
     def prepare(self, poses: AnyArray) -> None:
         """Make the map's table for a cloud of (N, 3) poses now, instead of in the first ``log_likelihood``."""
-        checked = Poses(poses, self._setting.backend)
+        checked = Poses(poses, self._context.backend)
         if checked.count:
             with self._lock:
-                checked.ensure_table(self._pipeline.map, (0, checked.count), self._setting.backend)
+                checked.ensure_table(self._pipeline.map, (0, checked.count), self._context.backend)
 
     def _weights_note(self) -> str:
-        return "" if self.compat is None else f" with the weights of {self._setting.weights.name} (no likelihood)"
+        return "" if self.compat is None else f" with the weights of {self._context.weights.name} (no likelihood)"

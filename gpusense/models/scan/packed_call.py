@@ -57,7 +57,7 @@ def is_short(count: int, readings: int) -> bool:
 
 def host_task(pipeline: ScanPipeline) -> str:
     """Return the preparation that only the host can do, as a clause; empty where the device can do all of it."""
-    if pipeline.setting.weights.is_peer:
+    if pipeline.context.weights.is_peer:
         return "the host classes the readings for another program's weights"
     if not pipeline.backend.info.float64:
         return "the host places the poses, as the device has no float64"
@@ -80,7 +80,7 @@ class _Pack:
             begins.append(size)
             size += -(-count * dtype_of.itemsize // _ALIGNED) * _ALIGNED
         self.host = np.zeros(size // dtype.itemsize, dtype)
-        self.on_device = backend.upload(self.host, backend.blank(self.host.size, dtype))
+        self.on_device = backend.upload(self.host, backend.empty_external(self.host.size, dtype))
         numbers = self.host.view(np.uint8)
         self.views, self.parts = [], []
         for begin, (count, dtype_of) in zip(begins, arrays, strict=True):
@@ -124,9 +124,9 @@ class PackedCall:
             here if there is None else there for here, there in zip(self._copied, (poses, ranges), strict=True)
         )
         parts, (log_p, status) = self._inputs.parts, self._outputs.parts
-        poses = backend.lend(parts[0], (count, 3), _DOUBLE) if poses is None else poses
-        ranges = backend.lend(parts[1], (readings,), _DOUBLE) if ranges is None else ranges
-        out = backend.lend(log_p, (count,), real) if out is None else out
+        poses = backend.wrap_external(parts[0], (count, 3), _DOUBLE) if poses is None else poses
+        ranges = backend.wrap_external(parts[1], (readings,), _DOUBLE) if ranges is None else ranges
+        out = backend.wrap_external(log_p, (count,), real) if out is None else out
         self._device = DeviceCall(pipeline, lock, poses, ranges, out, status, limits, corners)
         self._space = Workspace(backend)
 
@@ -199,13 +199,13 @@ class _There:
             place = None
             if kind is not None:
                 size = math.prod(shape)
-                place = backend.blank(size, kind), size * kind.itemsize
-                self.given[name] = backend.lend(place[0], shape, kind)
+                place = backend.empty_external(size, kind), size * kind.itemsize
+                self.given[name] = backend.wrap_external(place[0], shape, kind)
             self._places.append(place)
         self._result = None
         if kinds[0] is not None:
-            self._result = backend.blank(count, real), count * real.itemsize
-            self.given["out"] = backend.lend(self._result[0], (count,), real)
+            self._result = backend.empty_external(count, real), count * real.itemsize
+            self.given["out"] = backend.wrap_external(self._result[0], (count,), real)
 
     def take(self, *buffers: Buffer | None) -> None:
         """Start copying poses and readings to their places."""
@@ -245,7 +245,7 @@ class PackedCallCache:
         """Return the short calls of a model; None if its device or its options exclude them."""
         if not pipeline.backend.replays or host_task(pipeline) or pipeline.grid.cells.size > MOST_CELLS:
             return None
-        certain = pipeline.specialize and pipeline.rules.separate and pipeline.setting.possible
+        certain = pipeline.specialize and pipeline.rules.separate and pipeline.context.possible
         return PackedCallCache(pipeline) if certain else None
 
     def score(self, poses: Any, ranges: Any, out: Any, *, per_beam: bool) -> np.ndarray | None:
@@ -273,7 +273,7 @@ class PackedCallCache:
         corners = None if kinds[0] else self._corners(poses)
         if not kinds[0] and corners is None:
             return None
-        if pipeline.setting.temperature < 1 and (kinds[1] or not self._has_range(ranges)):
+        if pipeline.context.temperature < 1 and (kinds[1] or not self._has_range(ranges)):
             return None
         try:
             return self._scored(poses, ranges, out, count, there, corners)
@@ -292,7 +292,7 @@ class PackedCallCache:
             return None
         key = (count, None, None, ranges.dtype)
         corners = self._corners(poses) if self._repeats(key) else None
-        if corners is None or (pipeline.setting.temperature < 1 and not self._has_range(ranges)):
+        if corners is None or (pipeline.context.temperature < 1 and not self._has_range(ranges)):
             return None
         result = np.empty(count, pipeline.real) if out is None else out
         try:

@@ -75,7 +75,7 @@ class ScanPipeline(ABC):
     """The stages of one scan model.
 
     Attributes:
-        setting: The device and the rules.
+        context: The device and the rules.
         nothing: A buffer for arguments that are not read.
         map: The map's table.
     """
@@ -91,12 +91,12 @@ class ScanPipeline(ABC):
     kernel_names: tuple[tuple[str, ...], tuple[str, ...]]
     map: ReachableMap
 
-    def __init__(self, setting: ModelContext) -> None:
-        self.setting = setting
-        self.backend, self.real, self.rules = setting.backend, setting.real, setting.rules
-        self.scanner, self.specialize = setting.rules.scanner, setting.rules.specialize
+    def __init__(self, context: ModelContext) -> None:
+        self.context = context
+        self.backend, self.real, self.rules = context.backend, context.real, context.rules
+        self.scanner, self.specialize = context.rules.scanner, context.rules.specialize
         self._mount = self.scanner.mount
-        self._converted = setting.weights.readings if setting.weights.is_peer else None
+        self._converted = context.weights.readings if context.weights.is_peer else None
         self.nothing = self.backend.upload(np.zeros(1, np.int32))
         # Flags, keyed by everything on which they depend.
         self._flags: dict[Hashable, frozenset[str]] = {}
@@ -140,7 +140,7 @@ class ScanPipeline(ABC):
 
     def numbers(self, scoring: ScanLaunch) -> dict[str, Any]:
         """Return the arguments of the launches that change from call to call."""
-        return dict(score=Score(scoring.readings.constant_term, self.setting.temperature))
+        return dict(score=Score(scoring.readings.constant_term, self.context.temperature))
 
     @abstractmethod
     def score_launches(self, scoring: ScanLaunch) -> Program:
@@ -168,7 +168,7 @@ class ScanPipeline(ABC):
 
     def _shares_launches(self, request: Request) -> bool:
         """Return whether several scans may be scored by one program."""
-        if request.scans < 2 or request.per_beam or not self.setting.possible:
+        if request.scans < 2 or request.per_beam or not self.context.possible:
             return False
         rays = max(self.scanner.count * self.rays_each, 1)
         most = min(TOGETHER[self.backend.info.kind] // rays, chunk_of(self.backend, rays, self.kept_bytes()))
@@ -189,10 +189,10 @@ class ScanPipeline(ABC):
     def value(self, scans: ClassedScans) -> float | None:
         """Return the log-likelihood of scans if it is the same at every pose, else None."""
         if not len(scans.readings):
-            setting = self.setting
-            constant = setting.weights.without_readings(scans.constants[0], setting.constant_term, cubes=setting.cubes)
-            return float(setting.temperature * constant)
-        if not self.setting.possible and np.isfinite(scans.readings).any():
+            context = self.context
+            constant = context.weights.without_readings(scans.constants[0], context.constant_term, cubes=context.cubes)
+            return float(context.temperature * constant)
+        if not self.context.possible and np.isfinite(scans.readings).any():
             return -np.inf
         return None
 

@@ -61,7 +61,7 @@ class Request(NamedTuple):
 
 
 def make_request(
-    setting: ModelContext,
+    context: ModelContext,
     poses: Any,
     ranges: Any,
     out: Any = None,
@@ -76,7 +76,7 @@ def make_request(
     """Check the arguments of a call.
 
     Args:
-        setting: The model's device, precision and scanner.
+        context: The model's device, precision and scanner.
         poses: (N, 3), or (S, N, 3).
         ranges: (K,), or (S, K).
         out: None, or the array for the result.
@@ -87,7 +87,7 @@ def make_request(
         world: (N,) indices of the poses' worlds.
         ignore: (N,) indices of the shapes that poses do not see.
     """
-    backend, real, scanner = setting.backend, setting.real, setting.rules.scanner
+    backend, real, scanner = context.backend, context.real, context.rules.scanner
     if scanner._first_scans.left and type(poses) is np.ndarray and poses.shape[-1:] == (3,):
         look_at_poses("poses", poses)
     beams = scanner.count

@@ -236,7 +236,7 @@ def test_backends_of_queues(queue):
     import pyopencl as cl
 
     device = get_backend(queue)
-    assert get_backend(queue) is device and FIELD(GRID, NEAR, backend=queue)._setting.backend is device
+    assert get_backend(queue) is device and FIELD(GRID, NEAR, backend=queue)._context.backend is device
     assert device.info == get_backend(device.info.selection).info
     other = cl.CommandQueue(queue.context)
     assert get_backend(other) is not device

@@ -115,7 +115,7 @@ def test_a_bound_call_of_numpy_arrays_copies_once_each_way(as_gpu, queue, copies
         call()
         copies.clear()
         with monkeypatch.context() as patch:
-            for name in ("compile", "empty", "blank"):
+            for name in ("compile", "empty", "empty_external"):
                 patch.setattr(as_gpu, name, None)
             call()
         (up, sent), (down, received) = copies

@@ -58,7 +58,7 @@ def test_ordinary_calls_that_repeat_a_size(case, batching):
     plain._short = None
     beams = model.scanner.count
     short = model._short is not None
-    assert short == (model._setting.rules.separate and model._setting.rules.specialize and model._setting.possible)
+    assert short == (model._context.rules.separate and model._context.rules.specialize and model._context.possible)
     for real in (np.float32, np.float64):
         out = np.zeros(COUNT, model.precision)
         for seed, scan in enumerate((*SCANS, *SCANS[:2])):

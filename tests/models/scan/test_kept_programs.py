@@ -77,6 +77,6 @@ def test_scans_of_poses_that_stay_in_place_have_the_bits_of_ordinary_calls(case,
         assert len(moved) == seed + 1
     # On processors the first scan, the list, and scans with a constant log-likelihood; on GPUs all.
     most = len(moved) if device.info.kind == "gpu" else 5
-    assert 2 <= len(ordinary) <= most or not model._setting.possible
+    assert 2 <= len(ordinary) <= most or not model._context.possible
     once.start_scoring(poses, scan, out=out)
     assert model.explain() == once.explain() and model.sources() == once.sources()

@@ -40,7 +40,7 @@ offset, on 71 further simulated runs and on the log robotdata4 of Wean Hall, wit
 BY_CHANCE and IS_FOUND were chosen on 246 more simulated runs, half of them with 30 % of the walls moved, and on the
 tuning half of the recorded logs. The 200 runs, with few doubtful right poses, yield 0.29, 1.6 and 0.0 for the three.
 
-Among landmarks the ratio comes from the prediction of features (:mod:`gpusense.localization.evidence`).
+Among landmarks the ratio comes from the prediction of features (:mod:`gpusense.localization.landmark_gain`).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from gpusense.localization.passages import Counts, Passages, counts_of
+from gpusense.localization.beam_consistency import BeamConsistency, Counts, counts_of
 
 BIAS, SLOPE, BLUNT, NOTHING, FEW = 3.34, 1.74, 0.48, 0.58, 4.0
 CAUTION, SOLID, UNKNOWN, LIMITS = 0.9, 2.0, 1.0, (-4.0, 5.0)
@@ -59,7 +59,7 @@ OF_LEAD, NEAREST, FARTHEST, BY_CHANCE, IS_FOUND, HALF = 0.44, -4.0, 8.0, 0.9, 1.
 _OF_GAIN, _LIMIT_OF_GAIN = 0.25, 3.0
 
 
-def ratio_of_scan(scans: Sequence[Passages]) -> float:
+def ratio_of_scan(scans: Sequence[BeamConsistency]) -> float:
     """Return the ratio of simultaneous scans; NaN without evidence.
 
     Args:
@@ -68,24 +68,26 @@ def ratio_of_scan(scans: Sequence[Passages]) -> float:
     return evidence_of_scan(scans)[0]
 
 
-def evidence_of_scan(scans: Sequence[Passages]) -> tuple[float, float]:
+def evidence_of_scan(scans: Sequence[BeamConsistency]) -> tuple[float, float]:
     """Return the results of :func:`ratio_of_scan` and :func:`explained_of_scan`."""
     if not scans:
         return math.nan, math.nan
     counts = counts_of(scans)
-    telling = counts.telling
-    return _ratio_of(counts, scans), counts.agree / telling if telling else math.nan
+    informative_count = counts.informative_count
+    return _ratio_of(counts, scans), counts.agree / informative_count if informative_count else math.nan
 
 
-def _ratio_of(counts: Counts, scans: Sequence[Passages]) -> float:
+def _ratio_of(counts: Counts, scans: Sequence[BeamConsistency]) -> float:
     """Return the ratio of scans with these counts."""
     place = SOLID * any(one.inside for one in scans) + UNKNOWN * any(one.off for one in scans)
-    telling = counts.telling
-    if not telling and not place:
+    informative_count = counts.informative_count
+    if not informative_count and not place:
         return math.nan
     ratio = BIAS - CAUTION + SLOPE * _odds(counts.through, counts.agree)
-    ratio += BLUNT * _odds(counts.agree - counts.close, counts.close) + NOTHING * _odds(counts.nothing, telling)
-    return min(max(telling / (telling + FEW) * ratio + place, LIMITS[0]), LIMITS[1])
+    ratio += BLUNT * _odds(counts.agree - counts.close, counts.close) + NOTHING * _odds(
+        counts.nothing, informative_count
+    )
+    return min(max(informative_count / (informative_count + FEW) * ratio + place, LIMITS[0]), LIMITS[1])
 
 
 def _odds(one: int, other: int) -> float:
@@ -93,7 +95,7 @@ def _odds(one: int, other: int) -> float:
     return math.log((one + 0.5) / (other + 0.5))
 
 
-def explained_of_scan(scans: Sequence[Passages]) -> float:
+def explained_of_scan(scans: Sequence[BeamConsistency]) -> float:
     """Return the agreeing share of the explainable beams; NaN without any."""
     return evidence_of_scan(scans)[1]
 

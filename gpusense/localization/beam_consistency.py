@@ -34,7 +34,7 @@ _CLOSE = 0.1
 _STILL = np.zeros((3, 3))
 
 
-class Passages(NamedTuple):
+class BeamConsistency(NamedTuple):
     """Judged beams of a scan.
 
     Attributes:
@@ -96,26 +96,26 @@ class Counts(NamedTuple):
     nothing: int
 
     @property
-    def telling(self) -> int:
+    def informative_count(self) -> int:
         """Number of beams that agree, pass through, or are short."""
         return self.agree + self.through + self.short
 
 
-def counts_of(scans: Sequence[Passages]) -> Counts:
+def counts_of(scans: Sequence[BeamConsistency]) -> Counts:
     """Return the counts of several scans."""
     kinds = [kind for one in scans for kind in one.kind.tolist()]
     close = sum(one.close for one in scans)
     return Counts(kinds.count(AGREES), close, kinds.count(THROUGH), kinds.count(SHORT), kinds.count(NOTHING))
 
 
-def passages(
+def beam_consistency(
     grid: OccupancyGrid,
     scanner: Scanner,
     pose: Floats,
     ranges: Floats,
     covariance: Floats = _STILL,
     judge: MapJudge | None = None,
-) -> Passages:
+) -> BeamConsistency:
     """Judge the beams of a scan.
 
     Args:
@@ -132,7 +132,7 @@ def passages(
     else:
         beams, judged = judge(scanner, pose, covariance, ranges)
     count = len(beams.bearing)
-    return Passages(
+    return BeamConsistency(
         judged[:count], judged[count:], *beams, *_origin_of(pose, scanner.mount), max(_CLOSE, grid.resolution),
         *_place_of(grid, pose),
     )  # fmt: skip

@@ -1,6 +1,7 @@
 """Classes of the beams of a scan at one pose: each beam is walked through the map with two companions.
 
-These start next to it and diverge. :mod:`gpusense.localization.passages` describes the classes. Steps are half a cell.
+These start next to it and diverge. :mod:`gpusense.localization.beam_consistency` describes the classes. Steps are half
+a cell.
 """
 
 from __future__ import annotations

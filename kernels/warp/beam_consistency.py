@@ -1,7 +1,7 @@
 """Classes of the beams of a scan at one pose: each beam is walked through the map with two companions.
 
-These start next to it and diverge. gpusense.localization.passages describes the classes. Steps are half a cell. With
-IN_TEAMS the work-items of a group share the steps of a walk, of which each takes some neighbours.
+These start next to it and diverge. gpusense.localization.beam_consistency describes the classes. Steps are half a cell.
+With IN_TEAMS the work-items of a group share the steps of a walk, of which each takes some neighbours.
 """
 
 import functools

@@ -1,6 +1,6 @@
 // Classes of the beams of a scan at one pose: each beam is walked through the map with two companions that start next
-// to it and diverge. gpusense.localization.passages describes the classes. Steps are half a cell. With IN_TEAMS the
-// work-items of a group share the steps of a walk, of which each takes some neighbours.
+// to it and diverge. gpusense.localization.beam_consistency describes the classes. Steps are half a cell. With IN_TEAMS
+// the work-items of a group share the steps of a walk, of which each takes some neighbours.
 // requires: heading
 
 // Values of unknown cells, and of places off the map, also unknown.

@@ -52,16 +52,7 @@ def real(
     below: float | None = None,
     high: float | None = None,
 ) -> float:
-    """Return ``value`` as a float after checking that it is a finite real number within limits.
-
-    Args:
-        name: Name of the argument.
-        value: The caller's value.
-        above: Exclusive lower limit.
-        low: Inclusive lower limit.
-        below: Exclusive upper limit.
-        high: Inclusive upper limit.
-    """
+    """Return ``value`` as a float after checking that it is finite and within limits, some of them exclusive."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise TypeError(f"{name}: must be a real number, got {show(value)}")
     try:
@@ -126,13 +117,7 @@ def or_default(name: str, value: object, kind: Callable[[], T]) -> T:
 
 
 def as_array(name: str, value: object, *, masked: bool = False) -> NDArray[Any]:
-    """Return ``numpy.asarray(value)`` of any dtype.
-
-    Args:
-        name: Name of the argument.
-        value: Anything that ``numpy.asarray`` accepts.
-        masked: Whether values may be masked; they become NaN, and integers become float64.
-    """
+    """Return ``numpy.asarray(value)`` of any dtype; masked values become NaN if allowed, and their integers float64."""
     if type(value) is np.ndarray:
         return value
     check_values(name, value)
@@ -154,16 +139,11 @@ def array(
     largest: float = math.inf,
     dtype: DTypeLike | None = np.float64,
 ) -> NDArray[Any]:
-    """Return ``value`` as an array of real numbers.
+    """Return ``value`` as an array of real numbers, copied only if its dtype changes.
 
-    Args:
-        name: Name of the argument.
-        value: Anything that ``numpy.asarray`` accepts; copied only if its dtype differs from ``dtype``.
-        shape: Required shape; an integer is an exact length, a letter any length. None skips this check.
-        finite: Whether to refuse NaN, infinities and masked values. Otherwise masked values are NaN.
-        largest: Largest magnitude of a finite value.
-        dtype: Dtype of the result. An integer dtype accepts integers only. None keeps a floating dtype (in the
-            machine's byte order) and converts integers to float64.
+    In ``shape`` an integer is an exact length, a letter any length. ``finite`` refuses NaN, infinities and masked
+    values, which otherwise become NaN. An integer ``dtype`` accepts integers only; None keeps a floating dtype (in the
+    machine's byte order) and converts integers to float64.
     """
     if type(value) is np.ndarray and value.dtype == _DOUBLE and (dtype is None or dtype is np.float64):
         # Fast path for most arguments: the other checks take five times as long.

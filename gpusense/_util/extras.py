@@ -13,15 +13,10 @@ from typing import NamedTuple
 
 
 class Requirement(NamedTuple):
-    """Library that gpusense imports late.
+    """Library that gpusense imports late."""
 
-    Attributes:
-        package: Name of its package for pip.
-        extra: Extra of gpusense that installs it; empty for a required dependency.
-    """
-
-    package: str
-    extra: str = ""
+    package: str  # name of its package for pip
+    extra: str = ""  # extra of gpusense that installs it; empty for a required dependency
 
 
 # Keyed by the imported module; a test compares the packages with pyproject.toml.
@@ -48,14 +43,9 @@ class MissingLibraryError(ImportError):
 
 
 def library(module: str, purpose: str) -> ModuleType:
-    """Import a module of a library.
+    """Import a module such as ``"pyarrow.parquet"`` of a library in ``REQUIREMENTS``, or raise MissingLibraryError.
 
-    Args:
-        module: The module, such as ``"pyarrow.parquet"``, of a library in ``REQUIREMENTS``.
-        purpose: Subject of the message, such as ``"a Parquet table"``.
-
-    Raises:
-        MissingLibraryError: The library is absent, or cannot be imported.
+    ``purpose`` is the subject of the message, such as ``"a Parquet table"``.
     """
     try:
         return importlib.import_module(module)

@@ -18,14 +18,9 @@ LONGEST = 2000
 def card(
     title: str, rows: Iterable[Sequence[object]], *, head: Sequence[str] = (), detail: str = "", picture: bytes = b""
 ) -> str:
-    """Return a table with a title.
+    """Return a table with a title, and perhaps a PNG next to it and text below it that opens on a click.
 
-    Args:
-        title: The title, usually the name of a class.
-        rows: Cells of each row, starting with its heading; floats have five digits.
-        head: Headings of the columns, if any.
-        detail: Text below the table that opens on a click.
-        picture: A PNG next to the table.
+    Rows start with their headings; floats have five digits.
     """
     parts = [f"<b>{_text(title)}</b>"]
     if picture:

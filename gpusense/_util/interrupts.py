@@ -17,11 +17,7 @@ HOOK = "report_unraisable"
 
 
 def undisturbed(work: Callable[[], object]) -> None:
-    """Run a destructor's work to its end, then raise any pending interrupt.
-
-    Args:
-        work: Repeatable function, such as a wait for a device.
-    """
+    """Run a destructor's repeatable work to its end, then raise any pending interrupt."""
     interrupt: KeyboardInterrupt | None = None
     while True:
         try:

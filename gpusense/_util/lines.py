@@ -20,10 +20,7 @@ _LINES = 1 << 22
 
 
 def numbered_lines(file: Path) -> Iterator[tuple[int, bytes]]:
-    """Read a file line by line; its first bytes decide whether it is compressed.
-
-    Yields:
-        The line's number, from 1 on, and the line with its end.
+    """Read a file line by line, numbered from 1 on; its first bytes decide whether it is compressed.
 
     A byte order mark is skipped. A truncated compressed file is read up to its end, with a warning.
     """
@@ -62,14 +59,10 @@ def _bounds(file: Path, compressed: bool) -> tuple[float, float]:
 
 
 def until_cut(file: Path, read: Callable[[Iterator[tuple[int, bytes]]], Iterator[T]]) -> Iterator[T]:
-    """Yield the records that a function reads from the lines of a file.
+    """Yield the records that ``read`` yields from the numbered lines of a file; it raises ValueError at a bad line.
 
     A last line without a line break that breaks the format was truncated by a killed recorder or an interrupted copy.
     It is skipped with a warning, unless it is the first record.
-
-    Args:
-        file: The file.
-        read: Function that yields the records of numbered lines, and raises ValueError at a line.
     """
     last, any_record = (0, b"\n"), False
 

@@ -20,13 +20,7 @@ def available() -> int | None:
 
 
 def check_room(name: str, needed: int, what: str) -> None:
-    """Refuse work that needs more than the free memory, before it begins.
-
-    Args:
-        name: Name of the file or argument.
-        needed: Memory [bytes].
-        what: Contents of the memory, such as ``"20000 x 20000 cells"``.
-    """
+    """Refuse work that needs more than the free memory [bytes], before it begins; ``what`` describes its contents."""
     room = available()
     if room is not None and needed > room:
         raise MemoryError(

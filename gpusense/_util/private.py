@@ -22,12 +22,7 @@ class UnsafeFolderError(PermissionError):
 
 
 def make_private(folder: Path) -> None:
-    """Make a folder and its missing parents, each private to this user, and check it.
-
-    Raises:
-        UnsafeFolderError: As for :func:`check_private`.
-        OSError: The folder cannot be made.
-    """
+    """Make a folder and its missing parents, each private to this user, and check it."""
     absent = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
     if absent and _HAS_OWNERS:
         _check_parents(absent[-1])
@@ -39,16 +34,7 @@ def make_private(folder: Path) -> None:
 
 
 def check_private(folder: Path) -> None:
-    """Check that only this user can change a folder's files or replace the folder.
-
-    Args:
-        folder: An absolute path without symbolic links above it, as ``os.path.realpath`` returns.
-
-    Raises:
-        UnsafeFolderError: The folder is no real directory, has another owner, is writable by other users, or can be
-            renamed by them.
-        OSError: The folder is absent.
-    """
+    """Check that only this user can change or replace a folder (a ``realpath``); else raise UnsafeFolderError."""
     status = os.lstat(folder)
     if not stat.S_ISDIR(status.st_mode):
         kind = "a symbolic link" if stat.S_ISLNK(status.st_mode) else "another kind of file"
@@ -116,13 +102,9 @@ def _is_group_of_one(group: int) -> bool:
 
 
 def read_regular(path: Path, most: int, *, touch: bool = False, head: int | None = None) -> bytes:
-    """Read a regular file of this user, and refuse any other file.
+    """Read a regular file of this user, at most ``most`` bytes, or its ``head``, and refuse any other file.
 
-    Args:
-        path: The file. Symbolic links are not followed, and a FIFO does not block.
-        most: Largest size of the file [bytes].
-        touch: Set the file's times to now, if possible.
-        head: Number of leading bytes to read; all by default.
+    Symbolic links are not followed, and a FIFO does not block. ``touch`` sets the file's times to now, if possible.
     """
     # Check the file type before, since opening some devices has side effects, and again for the opened file.
     _check_regular(os.lstat(path), path, most)

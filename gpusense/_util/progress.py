@@ -15,11 +15,7 @@ def is_terminal(stream: TextIO | None) -> bool:
 
 @contextlib.contextmanager
 def progress(total: int) -> Iterator[Callable[[str], None]]:
-    """Show a progress bar of ``total`` steps on standard error if that is a terminal.
-
-    Yields:
-        Function that starts the next step and shows its text.
-    """
+    """Show a progress bar on standard error if that is a terminal; yield a function that starts a step."""
     if not is_terminal(sys.stderr):
         yield lambda text: None
         return

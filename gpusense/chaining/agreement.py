@@ -36,10 +36,7 @@ _NONE = np.zeros(0, np.int64)
 def agreeing(matches: Links, poses: Floats, needed: Floats) -> Flags:
     """Return the mask (L,) of matches that enough other matches of the same passages support.
 
-    Args:
-        matches: Matches of places.
-        poses: (K, 3) poses of the key scans.
-        needed: (L,) necessary evidence of a match's group; 0: none.
+    ``needed`` (L,) is the necessary evidence of a match's group; 0: none.
     """
     if not len(matches):
         return np.zeros(0, bool)
@@ -56,17 +53,11 @@ def agreeing(matches: Links, poses: Floats, needed: Floats) -> Flags:
 
 
 class Groups(NamedTuple):
-    """Groups of matches that agree directly or through other matches.
+    """Groups of matches that agree directly or through other matches."""
 
-    Attributes:
-        group: (L,) group of each match; -1 if too few agree with it.
-        evidence: (G,) evidence of each group.
-        scans: (G,) number of different scans on the side with fewer.
-    """
-
-    group: Integers
-    evidence: Floats
-    scans: Integers
+    group: Integers  # (L,) group of each match; -1 if too few agree with it
+    evidence: Floats  # (G,) evidence of each group
+    scans: Integers  # (G,) number of different scans on the side with fewer
 
 
 def groups_of(matches: Links, poses: Floats) -> Groups:

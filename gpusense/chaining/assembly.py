@@ -44,14 +44,7 @@ def weighed(front: Front) -> Links:
 
 
 def links_of_odometry(front: Front, links: Links, reported: Floats, motion: OdometryMotion) -> Links:
-    """Return links of odometry: between successive key scans, and to scans that lack other links in a direction.
-
-    Args:
-        front: The matches.
-        links: Their links, as weighed.
-        reported: (M,) poses of the odometer at the nodes.
-        motion: Noise of the odometer.
-    """
+    """Return links of odometry: between successive key scans, and to scans that lack other links in a direction."""
     nodes = np.arange(1, front.done)
     keys = np.array(front.keys)
     wanted = _is_open(front.done, links) | np.isin(nodes, keys)
@@ -78,11 +71,7 @@ def fitted_odometry(front: Front, links: Links, reported: Floats) -> OdometryMot
 def constant_motion_links(poses: Floats, keys: NDArray[np.int64], jumped: Flags, links: Links) -> Links:
     """Return links of constant motion along directions that other links leave open; their errors accumulate.
 
-    Args:
-        poses: (M, 3) poses of the nodes.
-        keys: (K,) numbers of the key scans.
-        jumped: (M - 1,) whether the time jumps from a node to the next, and no match determines the motion.
-        links: All other links.
+    ``jumped`` (M - 1,) marks jumps of the time from a node to the next without a match.
     """
     second = np.arange(1, len(poses))[_is_open(len(poses), links)]
     first = keys[np.searchsorted(keys, second) - 1]

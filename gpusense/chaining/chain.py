@@ -305,12 +305,6 @@ class Chainer:
 
 
 def _carried(poses: Floats, keys: Integers, placed: Floats) -> Floats:
-    """Return poses moved with their preceding key scans.
-
-    Args:
-        poses: (N, 3) poses.
-        keys: (K,) indices of key scans, the first one 0.
-        placed: (K, 3) new poses of the key scans.
-    """
+    """Return (N, 3) poses moved with their preceding key scans to the (K, 3) placed ones."""
     place = np.searchsorted(keys, np.arange(len(poses)), "right") - 1
     return compose_poses(placed[place], pose_difference(poses[keys[place]], poses))

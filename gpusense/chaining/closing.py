@@ -60,37 +60,21 @@ _NONE = np.zeros(0, np.int64)
 
 @dataclass(eq=False)
 class Loops:
-    """Step-by-step loop closure in a graph of key scans.
-
-    Attributes:
-        matcher: Matches scans.
-        nodes: (K,) indices of the key scans.
-        sequence: (K,) scanners of the key scans, and (K,) their numbers among their scanner's scans.
-        places: End points of the key scans.
-        broken: (K,) number of breaks of the chain before each key scan; a closed break counts for its earlier side.
-        weak: (K,) number of breaks and weak steps of the chain before each key scan, likewise.
-        links: Links between key scans, without closures.
-        solution: The solution so far.
-        closures: Closures so far.
-        temperature: Factor of the information of matches.
-        apart: Key scans of a pair are at least this many apart.
-        matches: Sure matches of candidates so far.
-        searched: Number of matched candidates.
-    """
+    """Step-by-step loop closure in a graph of key scans."""
 
     matcher: TeamMatcher
-    nodes: Integers
-    sequence: tuple[Integers, Integers]
-    places: list[Floats]
-    broken: Integers
-    weak: Integers
-    links: Links
+    nodes: Integers  # (K,) indices of the key scans
+    sequence: tuple[Integers, Integers]  # (K,) scanners of the key scans, and (K,) their numbers among its scans
+    places: list[Floats]  # end points of the key scans
+    broken: Integers  # (K,) breaks of the chain before each key scan; a closed break counts for its earlier side
+    weak: Integers  # (K,) number of breaks and weak steps of the chain before each key scan, likewise
+    links: Links  # links between key scans, without closures
     solution: Solution
-    temperature: float
-    apart: int
-    closures: Links = field(default_factory=lambda: Links.joined([]))
-    matches: Links = field(default_factory=lambda: Links.joined([]))
-    searched: int = 0
+    temperature: float  # factor of the information of matches
+    apart: int  # key scans of a pair are at least this many apart
+    closures: Links = field(default_factory=lambda: Links.joined([]))  # closures so far
+    matches: Links = field(default_factory=lambda: Links.joined([]))  # sure matches of candidates so far
+    searched: int = 0  # number of matched candidates
     _drift_of: tuple[Solution, Drift] | None = None
     _overlaps_of: tuple[Solution, float, tuple[Integers, Integers, Floats]] | None = None
     # Matched pairs in ascending order of their numbers, the levels of their last searches, and their guesses.

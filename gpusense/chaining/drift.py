@@ -32,13 +32,8 @@ class Drift:
     widened by the covariance of the steps in between; the time is linear in the number of poses for any number of
     closures.
 
-    Args:
-        solution: The poses and links.
-        most: Most kept poses, at least 3; any other pose takes the covariance of the last kept pose before it.
-        anchors: (A,) numbers of the kept poses, ascending from 0, instead of choosing ``most``.
-
-    Attributes:
-        anchors: (A,) numbers of the kept poses, ascending.
+    ``anchors`` (A,) are the kept poses, ascending from 0, by default at most ``most``; any other pose takes the
+    covariance of the last kept pose before it.
     """
 
     def __init__(self, solution: Solution, most: int = _ANCHORS, anchors: Integers | None = None) -> None:
@@ -120,13 +115,8 @@ def _reduced(matrix: Any, rows: Integers) -> Floats:
 def _without_stretches(matrix: Any, kept: Flags, stretch: Integers) -> tuple[Any, Flags]:
     """Eliminate rows of sparse information that link later stretches only at kept rows.
 
-    Args:
-        matrix: (M, M) information.
-        kept: (M,) whether a row is kept.
-        stretch: (M,) ascending numbers of the stretches of the rows.
-
-    Returns:
-        The information of all other rows, and whether each row (M,) was eliminated.
+    ``stretch`` (M,) numbers the stretches of the rows in ascending order. Returns the information of all other rows,
+    and whether each row (M,) was eliminated.
     """
     from scipy import sparse
 

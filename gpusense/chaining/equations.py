@@ -20,17 +20,10 @@ _PANEL = 4
 
 
 class Equations:
-    """The normal equations of the free poses of a graph.
+    """The normal equations of the free poses of a graph with N poses; the fixed pose has no rows and columns.
 
-    Args:
-        count: Number N of poses.
-        first: (L,) poses that are frames of the links' poses.
-        second: (L,) poses linked to them.
-        fixed: The fixed pose, without rows and columns.
-        ordered: True for an order of rows and columns with little fill, else the poses' order.
-
-    Attributes:
-        rows: (N - 1,) the free pose of each row of blocks.
+    ``ordered`` chooses an order of rows and columns with little fill; ``rows`` (N - 1,) holds the free pose of each row
+    of blocks.
     """
 
     def __init__(self, count: int, first: Integers, second: Integers, fixed: int, *, ordered: bool = False) -> None:
@@ -74,13 +67,10 @@ class Equations:
         self._diagonal = np.flatnonzero(row == column)
 
     def at(self, poses: Floats, information: Floats, pull: Floats, damping: float | Floats = 0.0) -> tuple[Any, Floats]:
-        """Return the sparse matrix (3 N - 3, 3 N - 3) and the gradient (3 N - 3,) at poses.
+        """Return the sparse matrix (3 N - 3, 3 N - 3) and the gradient (3 N - 3,) at (N, 3) poses.
 
-        Args:
-            poses: (N, 3) poses.
-            information: (L, 3, 3) information of the links times their weights.
-            pull: (L, 3) its product with the residuals of the links.
-            damping: Added to the diagonal; a number, or a number per free pose.
+        ``information`` (L, 3, 3) includes the links' weights, ``pull`` (L, 3) is its product with the residuals, and
+        ``damping`` a number or one per free pose.
         """
         from scipy import sparse
 
@@ -102,15 +92,7 @@ class Equations:
 def _turned(
     poses: Floats, first: Integers, second: Integers, information: Floats, pull: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Return for L links, turned into the world: information (6, L) by rows, its product with residuals, and the way.
-
-    Args:
-        poses: (N, 3) poses.
-        first: (L,) first poses.
-        second: (L,) second poses.
-        information: (L, 3, 3) information in the frames of the first poses.
-        pull: (L, 3) its product with the residuals in these frames.
-    """
+    """Return, turned into the world: information (6, L) by rows, its product with residuals, and the way."""
     c, s = np.cos(poses[:, 2])[first], np.sin(poses[:, 2])[first]
     lever = (poses[second, :2] - poses[first, :2]).T
     a, b, e, d, f, h = information.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]].T

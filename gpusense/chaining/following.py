@@ -30,15 +30,7 @@ _ROUNDS = 4
 
 
 def matched_again(matcher: Matcher, found: ScanMatch, first: Integers, second: Integers, guess: Floats) -> ScanMatch:
-    """Retry failed matches from the motions before and after, and in a wide window, and return all matches.
-
-    Args:
-        matcher: Matches scans.
-        found: L matches of successive scans.
-        first: (L,) indices.
-        second: (L,) indices.
-        guess: (L, 3) guesses of the matches.
-    """
+    """Retry failed matches (L,) from the motions before and after, and in a wide window, and return all matches."""
     for attempt in ("before", "after", "wide"):
         good = found.usable & (found.p_right >= SURE)
         rows = np.flatnonzero(~good)
@@ -58,17 +50,10 @@ def matched_again(matcher: Matcher, found: ScanMatch, first: Integers, second: I
 def matched_by_motion(
     matcher: Matcher, found: ScanMatch, first: Integers, second: Integers, last: Floats | None
 ) -> tuple[ScanMatch, Floats]:
-    """Retry doubtful matches from neighbouring motions and from the usual motion, and return all matches.
+    """Retry doubtful matches from rest by neighbouring motions and by the usual motion.
 
-    Args:
-        matcher: Matches scans.
-        found: L matches of successive scans, from rest.
-        first: (L,) indices.
-        second: (L,) indices.
-        last: (3,) motion before the first pair, or None.
-
-    Returns:
-        The matches, and (L, 3) offsets to a second possible motion; NaN without one.
+    Returns all matches, and (L, 3) offsets to a second possible motion, NaN without one. ``last`` is the motion before
+    the first pair, or None.
     """
     seen = [found]
     for _ in range(_ROUNDS):
@@ -116,12 +101,7 @@ def weakened(information: Floats, offset: Floats) -> Floats:
 def motions_around(motion: Floats, good: Flags, last: Floats | None) -> tuple[Floats, Floats, Floats]:
     """Return the last good motion before each, the next good motion, and their mean, each (L, 3).
 
-    A side without a good motion takes the other side's, or rest.
-
-    Args:
-        motion: (L, 3) motions.
-        good: (L,) whether each motion is good.
-        last: (3,) motion before the first one, or None.
+    A side without a good motion takes the other side's, or rest. ``last`` is the motion before the first one, or None.
     """
     motion = np.concatenate([np.zeros((1, 3)) if last is None else last[None], motion])
     near, rows = np.flatnonzero(np.append(last is not None, good)), np.arange(1, len(motion))

@@ -39,17 +39,10 @@ _FAILED, _FAILED_APART, _RISE, _FAILS = 1e-4, 1e-2, 0.01, 3
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Poses of a pose graph.
+    """Poses of a pose graph."""
 
-    Attributes:
-        poses: (N, 3) poses; the fixed one is unchanged.
-        links: The links with their weights.
-        cost: The minimum.
-        iterations: Iterations.
-    """
-
-    poses: Floats
-    links: Links
+    poses: Floats  # (N, 3) poses; the fixed one is unchanged
+    links: Links  # the links with their weights
     cost: float
     iterations: int
 
@@ -58,16 +51,11 @@ def solve(
     poses: Floats, links: Links, *, fixed: int = 0, kernel: float = KERNEL, least: float = 1e-7, settle: bool = False,
     equations: Equations | None = None,
 ) -> Solution:  # fmt: skip
-    """Return the poses near initial ones that best agree with links.
+    """Return the poses near initial ones (N, 3) that best agree with links, ignoring their weights.
 
-    Args:
-        poses: (N, 3) poses to begin with [m, m, rad].
-        links: Links between them; their weights are ignored.
-        fixed: Index of the fixed pose.
-        kernel: Scale of Cauchy's kernel [deviations]; infinity for plain least squares.
-        least: Least relative gain of the cost per iteration.
-        settle: True to also change motions, with damping per pose: fewer but costlier steps.
-        equations: Ordered equations of these poses and links from an earlier call, or None.
+    ``kernel`` is the scale of Cauchy's kernel [deviations], infinite for plain least squares; ``least`` the least
+    relative gain of the cost per iteration. ``settle`` also changes motions, with damping per pose: fewer but costlier
+    steps.
     """
     at, damping, fails = np.array(poses, np.float64), np.full(len(poses), _DAMPING), 0
     residual = links.residuals(at)
@@ -107,13 +95,8 @@ def solve(
 def _raised(rise: Floats, links: Links, count: int, fails: int) -> Flags:
     """Return the poses (N,) with rising damping after a failed step.
 
-    These are the poses of the links with the largest rise in cost and their neighbours, more after further failures.
-
-    Args:
-        rise: (L,) rises of the links' costs.
-        links: The links.
-        count: Number of poses.
-        fails: Number of consecutive failed steps.
+    These are the poses of the links with the largest ``rise`` (L,) in cost and their neighbours, more after further
+    failures.
     """
     near = np.full(count, fails >= _FAILS)
     some = rise > _RISE**fails * rise.max()

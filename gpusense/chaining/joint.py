@@ -206,12 +206,7 @@ class Joint:
         return both[0], both[1]
 
     def couplings(self, reported: Floats | None, motion: OdometryMotion | None) -> Links:
-        """Return links between key scans and scans of other scanners.
-
-        Args:
-            reported: (M, 3) poses of the odometer at the nodes, or None.
-            motion: Noise of the odometer, or None.
-        """
+        """Return links between key scans and scans of other scanners."""
         if len(self.fronts) == 1:
             return Links.joined([])
         first, second = self.pairs()

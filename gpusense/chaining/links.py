@@ -28,15 +28,6 @@ KINDS = {
 class Links:
     """L links between scans.
 
-    Attributes:
-        first: (L,) indices of the scans that are frames of reference.
-        second: (L,) indices of the scans at these poses.
-        pose: (L, 3) poses of the second scans in the frames of the first ones [m, m, rad].
-        information: (L, 3, 3) inverse covariances, 0 along directions that are not observed.
-        p_right: (L,) probabilities that the poses are right; NaN for odometry and constant motion.
-        kind: (L,) kinds, see :data:`gpusense.chaining.links.KINDS`.
-        weight: (L,) factors of the information in the solution: near 0 for links that all others contradict.
-
     Example:
         >>> import numpy as np
         >>> from gpusense.chaining.links import Links
@@ -44,13 +35,13 @@ class Links:
         1
     """
 
-    first: Integers
-    second: Integers
-    pose: Floats
-    information: Floats
-    p_right: Floats
-    kind: NDArray[np.str_]
-    weight: Floats
+    first: Integers  # (L,) indices of the scans that are frames of reference
+    second: Integers  # (L,) indices of the scans at these poses
+    pose: Floats  # (L, 3) poses of the second scans in the frames of the first ones [m, m, rad]
+    information: Floats  # (L, 3, 3) inverse covariances, 0 along directions that are not observed
+    p_right: Floats  # (L,) probabilities that the poses are right; NaN for odometry and constant motion
+    kind: NDArray[np.str_]  # (L,) kinds, see :data:`gpusense.chaining.links.KINDS`
+    weight: Floats  # (L,) factors of the information in the solution: near 0 for links that all others contradict
 
     @classmethod
     def of(
@@ -99,12 +90,7 @@ class Links:
 
 
 def chained(first: Floats, steps: Floats) -> Floats:
-    """Return (S + 1, 3) poses: the first, then a pose after each step.
-
-    Args:
-        first: (3,) pose.
-        steps: (S, 3) poses in the frames of their predecessors.
-    """
+    """Return (S + 1, 3) poses: the first, then a pose after each of the (S, 3) steps."""
     heading = np.cumsum(np.append(first[2], steps[:, 2]))
     c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
     x = np.cumsum(np.append(first[0], c * steps[:, 0] - s * steps[:, 1]))

@@ -46,17 +46,9 @@ class Found(NamedTuple):
 
 
 class Matcher:
-    """Matcher of a scanner's scans.
+    """Matcher of a scanner's (S, K) readings [m].
 
-    Args:
-        readings: (S, K) readings [m].
-        scanner: Their scanner.
-        options: Device and precision.
-
-    Attributes:
-        readings: The readings.
-        scanner: The scanner.
-        motion: (S, 3) motions of the robot during the scans; None if scans are instantaneous.
+    ``motion`` (S, 3) holds the motions of the robot during the scans; None if scans are instantaneous.
     """
 
     def __init__(self, readings: Floats, scanner: Scanner, options: ChainOptions) -> None:
@@ -67,13 +59,9 @@ class Matcher:
     def match(
         self, first: Integers, second: Integers, guess: Floats, window: tuple[float, float] | None = None
     ) -> ScanMatch:
-        """Return the poses of second scans in the frames of first ones; at least one pair.
+        """Return the poses of L >= 1 second scans in the frames of first ones, from (L, 3) guesses.
 
-        Args:
-            first: (L,) indices.
-            second: (L,) indices.
-            guess: (L, 3) poses [m, m, rad].
-            window: Half widths of the search [m, rad]; None for the default of ``match_scan``.
+        ``window`` holds the half widths of the search [m, rad]; None for the default of ``match_scan``.
         """
         return match_log(
             self.readings, self.scanner, first, second, guess, self._noise, self._device, self._options.precision,
@@ -81,13 +69,7 @@ class Matcher:
         )  # fmt: skip
 
     def observed(self, first: Integers, second: Integers, found: ScanMatch) -> ScanMatch:
-        """Return the matches, with information along lost directions if starts on both sides return to them.
-
-        Args:
-            first: (L,) indices.
-            second: (L,) indices.
-            found: L matches.
-        """
+        """Return the matches, with information along lost directions if starts on both sides return to them."""
         rows = np.flatnonzero(found.usable & (found.p_right >= SURE) & (found.eigenvalues == 0).any(axis=1))
         if not len(rows):
             return found
@@ -158,10 +140,7 @@ class Matcher:
 class TeamMatcher:
     """Matcher of scans of several scanners of a robot.
 
-    Args:
-        matchers: The matcher of each scanner.
-        sensor: (S,) indices of the scanners of all scans.
-        place: (S,) indices of the scans among their scanners' scans.
+    ``sensor`` (S,) and ``place`` (S,) are the scanners of all scans, and their indices among their scanners' scans.
     """
 
     def __init__(self, matchers: Sequence[Matcher], sensor: Integers, place: Integers) -> None:

@@ -23,16 +23,7 @@ _SHARE, _RESTLESS, _RESTLESS_TURN = 0.5, 0.02, 0.02
 
 
 def odometry_links(motion: OdometryMotion, before: Floats, after: Floats) -> tuple[Floats, Floats]:
-    """Return the motions (L, 3) between poses of an odometer without its systematic errors, and their information.
-
-    Args:
-        motion: The noise.
-        before: (L, 3) poses of the odometer.
-        after: (L, 3) later poses.
-
-    Returns:
-        (L, 3) relative poses, and (L, 3, 3) inverse covariances.
-    """
+    """Return the motions (L, 3) between poses of an odometer without its systematic errors, and their information."""
     count = len(before)
     poses, covariances = np.zeros((count, 3)), np.zeros((count, 3, 3))
     for k in range(count):
@@ -48,12 +39,9 @@ def odometry_links(motion: OdometryMotion, before: Floats, after: Floats) -> tup
 
 
 def fitted_motion(odometry: Floats, poses: Floats, joined: NDArray[np.bool]) -> OdometryMotion:
-    """Fit the noise of an odometer to matched poses; return the default without enough data.
+    """Fit the noise of an odometer to matched poses (M, 3); return the default without enough data.
 
-    Args:
-        odometry: (M, 3) poses of the odometer at key scans.
-        poses: (M, 3) poses by matches.
-        joined: (M - 1,) whether a match determines the motion between successive key scans in all directions.
+    ``joined`` (M - 1,) marks motions between successive key scans that a match determines in all directions.
     """
     # Use the longest stretch without a gap.
     ends = np.flatnonzero(~np.concatenate([[False], joined, [False]]))
@@ -74,13 +62,7 @@ def constant_motion_deviation(steps: Floats) -> Floats:
 
 
 def scan_motions(steps: Floats, times: Floats, duration: float) -> Floats:
-    """Return the motions (S, 3) during scans by the mean velocity before and after each.
-
-    Args:
-        steps: (S - 1, 3) motions from scan to scan.
-        times: (S,) times of the scans [s].
-        duration: Time from the first to the last beam [s].
-    """
+    """Return the motions (S, 3) during scans of a duration [s] by the mean velocity before and after each."""
     gaps = np.diff(times)
     velocity = np.where(gaps[:, None] > 0, steps / np.where(gaps > 0, gaps, 1.0)[:, None], 0.0)
     if not len(velocity):

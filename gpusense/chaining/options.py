@@ -23,25 +23,15 @@ _LONGEST = 3600.0
 
 @dataclass(frozen=True)
 class ChainOptions:
-    """Options of a chain.
+    """Options of a chain."""
 
-    Attributes:
-        step: Least motion by odometry of a matched scan [m, rad].
-        key_step: Motion between key scans [m, rad].
-        duration: Time from the first beam of a scan to the last one [s].
-        motion: Noise of the odometry; None to fit it to the matches.
-        close_loops: Whether to search for revisited places.
-        backend: The device.
-        precision: Precision of the matches.
-    """
-
-    step: tuple[float, float]
-    key_step: tuple[float, float]
-    duration: float
-    motion: OdometryMotion | None
-    close_loops: bool
+    step: tuple[float, float]  # least motion by odometry of a matched scan [m, rad]
+    key_step: tuple[float, float]  # motion between key scans [m, rad]
+    duration: float  # time from the first beam of a scan to the last one [s]
+    motion: OdometryMotion | None  # noise of the odometry; None to fit it to the matches
+    close_loops: bool  # whether to search for revisited places
     backend: Selection = field(repr=False)
-    precision: Precision
+    precision: Precision  # precision of the matches
 
 
 def check_steps(name: str, value: object) -> tuple[float, float]:

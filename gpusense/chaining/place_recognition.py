@@ -51,20 +51,11 @@ def _place_points(points: ScanPoints, mount: tuple[float, float], scan: int) -> 
 def overlaps(
     places: list[Floats], poses: Floats, cell: float, apart: int, sequence: tuple[Integers, Integers]
 ) -> tuple[Integers, Integers, Floats]:
-    """Return pairs of key scans that share many cells, the best of each passage.
+    """Return pairs of key scans that share many cells, the best of each passage: (L,) first, second, and shares.
 
     Successive key scans of a scanner that share cells with a second one yield the scan with the largest share. Earlier
-    scans come only from the first passages through each place, so that their number does not grow.
-
-    Args:
-        places: End points of each key scan in the robot's frame.
-        poses: (K, 3) poses of the key scans.
-        cell: Side of a cell [m].
-        apart: Key scans of a pair are at least this many apart.
-        sequence: (K,) scanners of the key scans, and (K,) their numbers among their scanner's scans.
-
-    Returns:
-        (L,) first ones, (L,) second ones, and (L,) shares of common cells.
+    scans come only from the first passages through each place, so that their number does not grow. Key scans of a pair
+    are at least ``apart`` apart.
     """
     from scipy import sparse
 

@@ -26,17 +26,11 @@ REASONS = {
 
 
 class Doubt(NamedTuple):
-    """Doubtful stretch of the trajectory.
+    """Doubtful stretch of the trajectory."""
 
-    Attributes:
-        first: Index of the scan before the first doubtful motion.
-        last: Index of the scan after the last doubtful motion.
-        reason: One of :data:`gpusense.chaining.result.REASONS`.
-    """
-
-    first: int
-    last: int
-    reason: str
+    first: int  # index of the scan before the first doubtful motion
+    last: int  # index of the scan after the last doubtful motion
+    reason: str  # one of :data:`gpusense.chaining.result.REASONS`
 
 
 @dataclass(frozen=True, eq=False)

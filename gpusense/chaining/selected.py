@@ -35,12 +35,7 @@ def pose_covariances(solution: Solution) -> Floats:
 
 
 def inverse_blocks(matrix: Any, damping: float) -> Floats:
-    """Return the diagonal blocks (N, 3, 3) of the inverse of a sparse symmetric positive definite matrix.
-
-    Args:
-        matrix: (3 N, 3 N) sparse.
-        damping: Added to its diagonal.
-    """
+    """Return the diagonal blocks (N, 3, 3) of the inverse of a sparse positive definite matrix plus damping."""
     blocks = matrix.tobsr((3, 3))
     blocks.sort_indices()
     order = _order(blocks, blocks.shape[0] // 3)

@@ -24,10 +24,7 @@ _CLEAR = 0.003
 def signed_duration(matcher: Matcher, times: Floats, duration: float) -> float:
     """Return the time from the first listed beam to the last: negative in reverse order, 0 for all at once.
 
-    Args:
-        matcher: Matches scans without correction for motion.
-        times: (S,) times of the scans [s].
-        duration: The time in the listed order [s], returned if the scans do not decide.
+    Returns the duration in the listed order [s] if the scans do not decide.
     """
     count = min(len(times), _SCANS)
     if count <= _LAG + 1:

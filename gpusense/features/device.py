@@ -28,11 +28,9 @@ class ScanDevice:
         self._arrays = {"point": points.point.astype(real), "start": points.start, "noise": noise.astype(real)}
 
     def split(self, penalty: float, point: np.ndarray) -> np.ndarray:
-        """Return, for each point, the end of the segment that begins there, or -1.
+        """Return, for each point in splitting order, the end of the segment that begins there, or -1.
 
-        Args:
-            penalty: Least reduction of the cost for replacing a line by two.
-            point: (P, 4) points of the scans in splitting order, see ``ScanPoints``.
+        ``penalty`` is the least reduction of the cost for replacing a line by two.
         """
         points = self._sizes["points"]
         stop = np.empty(points, _INT)

@@ -30,21 +30,13 @@ _LEAF, _LEAST_TURN, _TOUCHING = (0.6, 1.25), math.radians(15), 0.12
 
 @dataclass(frozen=True)
 class _Gaps:
-    """Gaps between two segments of a scan.
+    """Gaps between two segments of a scan."""
 
-    Attributes:
-        before: (D,) segment before the gap.
-        after: (D,) segment after it.
-        wall: (D,) the segment on the wall, one of these two.
-        other: (D,) the other segment: a part of the wall, or a door leaf.
-        ends: (D, 4) positions of both jambs along the wall, and the distances between beams there [m].
-    """
-
-    before: np.ndarray
-    after: np.ndarray
-    wall: np.ndarray
-    other: np.ndarray
-    ends: np.ndarray
+    before: np.ndarray  # (D,) segment before the gap
+    after: np.ndarray  # (D,) segment after it
+    wall: np.ndarray  # (D,) the segment on the wall, one of these two
+    other: np.ndarray  # (D,) the other segment: a part of the wall, or a door leaf
+    ends: np.ndarray  # (D, 4) positions of both jambs along the wall, and the distances between beams there [m]
 
     def only(self, rows: np.ndarray) -> _Gaps:
         """Return some of the gaps."""

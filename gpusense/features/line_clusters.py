@@ -22,19 +22,12 @@ _PASSES = 4
 
 @dataclass
 class _Pieces:
-    """Pieces of lines in the world.
+    """Pieces of lines in the world."""
 
-    Attributes:
-        middle: (P, 2) middles [m].
-        theta: (P,) directions, the free side on the left [rad].
-        half: (P,) half lengths [m].
-        covariance: (P, 2, 2) of the offset to the left at the middle and of the direction.
-    """
-
-    middle: np.ndarray
-    theta: np.ndarray
-    half: np.ndarray
-    covariance: np.ndarray
+    middle: np.ndarray  # (P, 2) middles [m]
+    theta: np.ndarray  # (P,) directions, the free side on the left [rad]
+    half: np.ndarray  # (P,) half lengths [m]
+    covariance: np.ndarray  # (P, 2, 2) of the offset to the left at the middle and of the direction
 
 
 def lines_of(features: Features, poses: Floats, spread: Floats, least: int) -> FeatureMap:

@@ -184,23 +184,14 @@ def check_kinds(name: str, kinds: str | Sequence[str]) -> tuple[str, ...]:
 
 @dataclass
 class Found:
-    """Observed quantities of features of one kind.
+    """Observed quantities of features of one kind."""
 
-    Attributes:
-        scan: (F,) index of the scan.
-        pose: (F, 3) in the robot's frame.
-        observed: (F, M, 3) observed directions in x, y and theta, as orthonormal rows.
-        covariance: (F, M, M) covariances along the observed directions.
-        size: (F,) see ``Features``.
-        score: (F,) see ``Features``.
-    """
-
-    scan: np.ndarray
-    pose: np.ndarray
-    observed: np.ndarray
-    covariance: np.ndarray
-    size: np.ndarray
-    score: np.ndarray
+    scan: np.ndarray  # (F,) index of the scan
+    pose: np.ndarray  # (F, 3) in the robot's frame
+    observed: np.ndarray  # (F, M, 3) observed directions in x, y and theta, as orthonormal rows
+    covariance: np.ndarray  # (F, M, M) covariances along the observed directions
+    size: np.ndarray  # (F,) see ``Features``
+    score: np.ndarray  # (F,) see ``Features``
 
     def only(self, rows: np.ndarray) -> Found:
         """Return some of the features."""

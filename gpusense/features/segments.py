@@ -24,38 +24,21 @@ _NEIGHBOURS = 1.5
 
 @dataclass(frozen=True)
 class Segments:
-    """Segments of all scans by bearing, each with a line ``x cos(angle) + y sin(angle) = distance``.
+    """Segments of all scans by bearing, each with a line ``x cos(angle) + y sin(angle) = distance``."""
 
-    Attributes:
-        points: The points of all scans.
-        scan: (G,) the scan.
-        first: (G,) first point.
-        count: (G,) points.
-        angle: (G,) direction of the line's normal, away from the sensor [rad].
-        distance: (G,) distance of the line from the sensor [m], NaN without a line.
-        covariance: (G, 2, 2) of angle and distance.
-        cost: (G,) sum of squared deviations of ranges over their variance.
-        variance: (G,) variance of ranges, from the scan and from the segment's residuals [m^2].
-        ends: (G, 2) positions of the first and last point along the line, from the foot of the normal [m].
-        spacing: (G, 2) distances between neighbouring beams along the line at its ends [m].
-        successor: (G,) next segment of the scan, or -1; the first one follows the last one unless a gap separates
-            them.
-        apart: (G,) whether an object may be hidden in front of the successor.
-    """
-
-    points: ScanPoints
-    scan: np.ndarray
-    first: np.ndarray
-    count: np.ndarray
-    angle: np.ndarray
-    distance: np.ndarray
-    covariance: np.ndarray
-    cost: np.ndarray
-    variance: np.ndarray
-    ends: np.ndarray
-    spacing: np.ndarray
-    successor: np.ndarray
-    apart: np.ndarray
+    points: ScanPoints  # the points of all scans
+    scan: np.ndarray  # (G,) the scan
+    first: np.ndarray  # (G,) first point
+    count: np.ndarray  # (G,) points
+    angle: np.ndarray  # (G,) direction of the line's normal, away from the sensor [rad]
+    distance: np.ndarray  # (G,) distance of the line from the sensor [m], NaN without a line
+    covariance: np.ndarray  # (G, 2, 2) of angle and distance
+    cost: np.ndarray  # (G,) sum of squared deviations of ranges over their variance
+    variance: np.ndarray  # (G,) variance of ranges, from the scan and from the segment's residuals [m^2]
+    ends: np.ndarray  # (G, 2) positions of the first and last point along the line, from the foot of the normal [m]
+    spacing: np.ndarray  # (G, 2) distances between neighbouring beams along the line at its ends [m]
+    successor: np.ndarray  # (G,) next segment of the scan, or -1; the first follows the last without a gap
+    apart: np.ndarray  # (G,) whether an object may be hidden in front of the successor
 
     @property
     def step(self) -> float:
@@ -106,11 +89,8 @@ def _cut(points: ScanPoints, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     """Return where to cut scans open, from their readings only, so that segments turn and mirror with their scans.
 
     A scan is cut at its widest gap, or at the range that deviates most from its neighbours' prediction: an edge or a
-    corner.
-
-    Returns:
-        (S,) the first point after the cut; whether the cut is not at a gap; and whether to split against the sense of
-        bearings, where the sum of cubed steps of log ranges is negative.
+    corner. The results (S,) are the first point after the cut, whether the cut is not at a gap, and whether to split
+    against the sense of bearings, where the sum of cubed steps of log ranges is negative.
     """
     counts, total = points.counts, len(points.point)
     scan = np.repeat(np.arange(len(counts)), counts)
@@ -230,19 +210,12 @@ def _successors(
 
 @dataclass(frozen=True)
 class Beams:
-    """Beams of S scans, sorted by bearing.
+    """Beams of S scans, sorted by bearing."""
 
-    Attributes:
-        beam: (P,) beam of each point.
-        opens_after: (P,) whether the next beam has no return.
-        opens_before: (P,) whether the beam before has no return.
-        maxima: (S, K + 1) number of beams without a return before each beam.
-    """
-
-    beam: np.ndarray
-    opens_after: np.ndarray
-    opens_before: np.ndarray
-    maxima: np.ndarray
+    beam: np.ndarray  # (P,) beam of each point
+    opens_after: np.ndarray  # (P,) whether the next beam has no return
+    opens_before: np.ndarray  # (P,) whether the beam before has no return
+    maxima: np.ndarray  # (S, K + 1) number of beams without a return before each beam
 
     def without_return(self, scan: np.ndarray, last: np.ndarray, first: np.ndarray) -> np.ndarray:
         """Count the beams (P,) without a return between pairs of points of scans, in the direction of bearings."""

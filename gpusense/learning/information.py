@@ -14,14 +14,9 @@ _FLAT = 1e-10
 
 
 def scaled_axes(curve: Floats, least: float = 1e-300) -> tuple[Floats, Floats, Floats]:
-    """Return the eigenvalues and axes of a curvature in coordinates that scale its diagonal to 1.
+    """Return (m,) scales that bring the diagonal of an (m, m) curvature to 1, its ascending eigenvalues, and axes.
 
-    Args:
-        curve: (m, m) curvature.
-        least: Smaller elements of the diagonal count as this.
-
-    Returns:
-        (m,) scales of the coordinates, (m,) ascending eigenvalues, and (m, m) axes as columns.
+    Elements of the diagonal below ``least`` count as this.
     """
     scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(curve)), least))
     size, axes = np.linalg.eigh(curve * np.outer(scale, scale))
@@ -31,15 +26,9 @@ def scaled_axes(curve: Floats, least: float = 1e-300) -> tuple[Floats, Floats, F
 def newton_direction(
     gradient: Floats, second: Floats, places: NDArray[np.integer], least: float = 1e-300
 ) -> tuple[Floats, float]:
-    """Return the Newton step, uphill even if the function is not concave, and its predicted gain [nats].
+    """Return the (m,) Newton step, uphill even if the function is not concave, and its predicted gain [nats].
 
-    The gain is half the slope along the step.
-
-    Args:
-        gradient: (m,) derivatives of the log-likelihood.
-        second: (m, m) second derivatives.
-        places: Indices of the free coordinates; the step is 0 along the remaining ones.
-        least: As in :func:`scaled_axes`.
+    The gain is half the slope along the step. The step is 0 along coordinates outside ``places``.
     """
     step = np.zeros(len(gradient))
     if not len(places):
@@ -52,18 +41,10 @@ def newton_direction(
 
 
 def errors_of(curve: Floats, rows: Floats, scatter: Floats | None = None) -> Floats:
-    """Compute the standard errors of functions of the coordinates.
+    """Compute (p,) standard errors of functions with (p, m) derivatives ``rows``, infinite without information.
 
     The covariance of the coordinates is the inverse of the information H, or ``H^-1 S H^-1`` with the scatter S of the
     gradient over blocks (White 1982; Liang and Zeger 1986).
-
-    Args:
-        curve: (m, m) minus the second derivatives of the log-likelihood by the free coordinates.
-        rows: (p, m) derivatives of the functions by these coordinates.
-        scatter: (m, m) scatter of the gradient over blocks; None for independent readings.
-
-    Returns:
-        (p,) standard errors, infinite where the readings hold no information.
     """
     if not len(curve):
         return np.full(len(rows), math.nan)
@@ -87,15 +68,7 @@ def scatter_of(sums: Floats) -> Floats:
 
 
 def _error(row: Floats, size: Floats, known: NDArray[np.bool_], axes: Floats, scatter: Floats | None) -> float:
-    """Return the standard error of a parameter.
-
-    Args:
-        row: (m,) derivatives of the parameter along the axes.
-        size: (m,) eigenvalues of the scaled information.
-        known: (m,) mask of the axes with information.
-        axes: (m, m) axes as columns, in the coordinates.
-        scatter: (m, m) scatter of the gradient over blocks, or None.
-    """
+    """Return the error of a parameter from its (m,) derivatives along the (m, m) axes and the information there."""
     if scatter is None:
         return math.sqrt(float((row[known] ** 2 / size[known]).sum()))
     influence = axes[:, known] @ (row[known] / size[known])

@@ -44,25 +44,15 @@ def _limits(message: object) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Beams:
-    """Common beams of a laser's scans, in the laser's frame.
+    """Common beams of a laser's scans, in the laser's frame."""
 
-    Attributes:
-        first: Bearing of beam 0 [rad].
-        step: Step between beams [rad].
-        count: Number of beams.
-        range_min: Lower limit of ranges [m].
-        range_max: Upper limit of ranges [m].
-        overridden: Whether options replace the messages' range_min and range_max.
-        varied: Whether beams vary from scan to scan, so that the common beams cover a full turn.
-    """
-
-    first: float
-    step: float
-    count: int
-    range_min: float
-    range_max: float
-    overridden: tuple[bool, bool]
-    varied: bool
+    first: float  # bearing of beam 0 [rad]
+    step: float  # step between beams [rad]
+    count: int  # number of beams
+    range_min: float  # lower limit of ranges [m]
+    range_max: float  # upper limit of ranges [m]
+    overridden: tuple[bool, bool]  # whether options replace the messages' range_min and range_max
+    varied: bool  # whether beams vary from scan to scan, so that the common beams cover a full turn
 
     def scanner(self, mount: Pose, upside_down: bool) -> Scanner:
         """Return the scanner at a mount; bearings of an upside-down laser run clockwise."""
@@ -122,14 +112,8 @@ def _intensities(message: object, beams: int) -> NDArray[np.float32] | None:
 def shared_beams(place: str, found: Counter[Geometry], range_min: float | None, range_max: float | None) -> Beams:
     """Choose the beams of most scans of a laser, or beams of a full turn if they vary from scan to scan.
 
-    Args:
-        place: The bag and the topic, for messages.
-        found: Numbers of scans by geometry.
-        range_min: Replaces the messages' value [m]; None for the most frequent one.
-        range_max: Replaces the messages' value [m]; None for the most frequent one.
-
-    Warns:
-        UserWarning: Some scans have other beams or limits, or beams vary.
+    ``range_min`` and ``range_max`` replace the most frequent values of the messages [m]. Warns if some scans have other
+    beams or limits, or beams vary.
     """
     angles_of: Counter[Angles] = Counter()
     nearest: Counter[float] = Counter()

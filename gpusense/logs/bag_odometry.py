@@ -22,17 +22,11 @@ _APART = 1.0
 
 @dataclass
 class Times:
-    """Times of messages: stamps of headers, or the log's times if all stamps are 0.
+    """Times of messages: stamps of headers, or the log's times if all stamps are 0."""
 
-    Attributes:
-        stamps: Stamps [s].
-        clock: Times in the log [s].
-        from_zero: True if stamps of 0 are times although all stamps are 0.
-    """
-
-    stamps: list[float] = field(default_factory=list)
-    clock: list[float] = field(default_factory=list)
-    from_zero: bool = False
+    stamps: list[float] = field(default_factory=list)  # stamps [s]
+    clock: list[float] = field(default_factory=list)  # times in the log [s]
+    from_zero: bool = False  # True if stamps of 0 are times although all stamps are 0
 
     def add(self, stamp: float, clock: float) -> None:
         """Add the times of a message."""
@@ -50,23 +44,14 @@ class Times:
 
 @dataclass
 class Track:
-    """Poses of odometry.
+    """Poses of odometry."""
 
-    Attributes:
-        source: Topic or frame of the odometry; "" without one.
-        times: Times of the poses.
-        poses: Poses of the robot's base.
-        tilts: Tilts of the base [rad].
-        base: Frame of the robot's base; "" if unknown.
-        frame: Frame of the odometry.
-    """
-
-    source: str = ""
-    times: Times = field(default_factory=Times)
-    poses: list[Pose] = field(default_factory=list)
-    tilts: list[float] = field(default_factory=list)
-    base: str = ""
-    frame: str = ""
+    source: str = ""  # topic or frame of the odometry; "" without one
+    times: Times = field(default_factory=Times)  # times of the poses
+    poses: list[Pose] = field(default_factory=list)  # poses of the robot's base
+    tilts: list[float] = field(default_factory=list)  # tilts of the base [rad]
+    base: str = ""  # frame of the robot's base; "" if unknown
+    frame: str = ""  # frame of the odometry
 
     def add(self, stamp: float, clock: float, pose: Pose, tilt: float) -> None:
         """Add a pose."""
@@ -105,16 +90,7 @@ def chosen_track(
 ) -> Track:
     """Choose the messages of a topic as odometry, else the motion of the robot's base in an odometry frame.
 
-    Args:
-        place: The bag, for messages.
-        track: Odometry of the chosen topic; may be empty.
-        topics: Topics of odometry.
-        transforms: Transforms of the bag.
-        laser: Frame of the laser.
-        wanted: Topic or frame that the user requests.
-
-    Warns:
-        UserWarning: Several choices exist.
+    ``wanted`` is the topic or frame that the user requests. Warns if several choices exist.
     """
     parents = {link.parent for link in transforms.links()}
     frames = sorted(each for each in parents if "odom" in each.rpartition("/")[2])

@@ -27,33 +27,20 @@ _NOT_POSES = ("initial", "goal")
 
 @dataclass(frozen=True, eq=False)
 class PoseTrack:
-    """Poses of a localiser.
+    """Poses of a localiser."""
 
-    Attributes:
-        source: Topic of the messages, or the frames of the transforms.
-        times: (T,) increasing times [s].
-        poses: (T, 3) x, y, theta [m, m, rad], headings without jumps.
-        covariances: (T, 3, 3) covariances, NaN where a message states none; None if no message states any.
-    """
-
-    source: str
-    times: Floats
-    poses: Floats
-    covariances: Floats | None = None
+    source: str  # topic of the messages, or the frames of the transforms
+    times: Floats  # (T,) increasing times [s]
+    poses: Floats  # (T, 3) x, y, theta [m, m, rad], headings without jumps
+    covariances: Floats | None = None  # (T, 3, 3), NaN where a message states none; None if no message states any
 
 
 def read_poses(path: Path, times: Floats, *, topic: str | None = None, map_frame: str = "map") -> PoseTrack:
-    """Read the poses of a localiser.
+    """Read the poses of a localiser from a bag; transforms are looked up at (S,) times [s].
 
-    Args:
-        path: The bag.
-        times: (S,) times at which transforms are looked up [s].
-        topic: Topic of ``PoseWithCovarianceStamped``, ``PoseStamped`` or ``Odometry`` messages, or ``/tf``. None takes
-            the transforms from ``map_frame`` to the robot's base, or the only topic of poses.
-        map_frame: Frame of the map.
-
-    Warns:
-        UserWarning: Messages are skipped, are not level, or have another frame than the map's.
+    ``topic`` names ``PoseWithCovarianceStamped``, ``PoseStamped`` or ``Odometry`` messages, or ``/tf``. None takes the
+    transforms from ``map_frame`` to the robot's base, or the only topic of poses. Warns if messages are skipped, are
+    not level, or have another frame than the map's.
     """
     topics = topics_of(path)
     known = {name: kind for kind in _KINDS for name in topics.get(kind, [])}
@@ -125,11 +112,7 @@ def _covariance(message: object) -> Floats | None:
 
 
 def _of_transforms(path: Path, times: Floats, map_frame: str) -> PoseTrack:
-    """Look up the robot's base in the map's frame.
-
-    Raises:
-        TransformError: The base of the robot is not connected to the map, or never at these times.
-    """
+    """Look up the robot's base in the map's frame."""
     buffer, skipped = TransformBuffer(), 0
     for message in messages(path, {TRANSFORMS: None}):
         for each in message.fields.transforms:

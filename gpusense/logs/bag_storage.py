@@ -42,13 +42,7 @@ class Raw(NamedTuple):
 
 
 class Storage:
-    """A file of a bag.
-
-    Attributes:
-        counts: Number of messages by topic; 0 if unknown.
-        start: Time of the first message [ns].
-        cut: True if the file is cut off.
-    """
+    """A file of a bag: ``counts`` of messages by topic (0 if unknown), ``start`` [ns], and whether it is cut off."""
 
     def __init__(self, file: Path) -> None:
         self.file = file

@@ -21,24 +21,14 @@ from gpusense.world.messages import stamp_of
 
 @dataclass
 class Bag:
-    """Contents of a bag, except the readings of scans.
-
-    Attributes:
-        path: The bag.
-        topic: Topic of the scans.
-        lasers: Numbers of scans by geometry, for each laser frame.
-        unnamed: Frame of scans without a frame name.
-        times: Times of the scans.
-        track: Odometry.
-        transforms: Transforms between frames.
-    """
+    """Contents of a bag, except the readings of scans."""
 
     path: Path
-    topic: str
-    lasers: dict[str, Counter[Geometry]] = field(default_factory=dict)
-    unnamed: str = ""
-    times: Times = field(default_factory=Times)
-    track: Track = field(default_factory=Track)
+    topic: str  # topic of the scans
+    lasers: dict[str, Counter[Geometry]] = field(default_factory=dict)  # numbers of scans by frame and geometry
+    unnamed: str = ""  # frame of scans without a frame name
+    times: Times = field(default_factory=Times)  # times of the scans
+    track: Track = field(default_factory=Track)  # odometry
     transforms: TransformBuffer = field(default_factory=TransformBuffer)
 
 
@@ -65,8 +55,7 @@ class _Skipped:
 def survey(path: Path, topic: str | None, frame: str | None, odometry_from: str | None) -> Bag:
     """Read everything except readings; arguments as for :func:`gpusense.read_log`.
 
-    Warns:
-        UserWarning: Messages are skipped, a choice was made, or odometry is not level or does not overlap in time.
+    Warns if messages are skipped, a choice was made, or odometry is not level or does not overlap in time.
     """
     topics = topics_of(path)
     chosen = _scan_topic(path, topics, topic)

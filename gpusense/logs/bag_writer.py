@@ -25,17 +25,8 @@ _LASER, _BASE, _ODOM = "laser", "base_link", "odom"
 def write_bag(path: Path, scans: Iterable[Scan], *, first: bool) -> None:
     """Write scans on ``/scan``, odometry on ``/odom`` and ``/tf``, and the laser's mount on ``/tf_static``.
 
-    "No return" is written as infinity (REP-117). The frames are odom, base_link and laser.
-
-    Args:
-        path: The bag: a file for ROS 1, or a folder for ROS 2 (sqlite3), which must not exist.
-        scans: Scans with odometry; their poses are not written.
-        first: True for ROS 1.
-
-    Raises:
-        ValueError: the folder exists, or a scanner's bearings have uneven steps.
-        ImportError: the library rosbags is absent.
-        OSError: the bag cannot be written.
+    "No return" is written as infinity (REP-117). The frames are odom, base_link and laser. ROS 1 (``first``) writes a
+    file, ROS 2 (sqlite3) a folder, which must not exist.
     """
     check_bag(path, first=first)
     with naming(path), tempfile.TemporaryDirectory(prefix=".gpusense-", suffix=".new", dir=path.parent) as folder:

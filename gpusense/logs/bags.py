@@ -56,11 +56,9 @@ def topics_of(path: Path) -> dict[str, list[str]]:
 
 
 def messages(path: Path, wanted: Mapping[str, set[str] | None]) -> Iterator[Message]:
-    """Read messages in the bag's order; multi-echo scans become scans of the first echo.
+    """Read messages of the wanted topics of each type, None for all, in the bag's order.
 
-    Args:
-        path: The bag.
-        wanted: Requested topics of each message type; None for all topics.
+    Multi-echo scans become scans of the first echo.
     """
 
     def chosen(topic: Topic) -> bool:

@@ -87,11 +87,7 @@ def _records(
 
 
 def _messages(path: Path, lines: Iterator[tuple[int, bytes]]) -> Iterator[tuple[str, list[bytes]]]:
-    """Read all messages of known names.
-
-    Yields:
-        The message's place ``file:line``, and its fields, name included.
-    """
+    """Read all messages of known names: their places ``file:line``, and their fields, names included."""
     any_message = False
     number = 0
     for number, line in lines:

@@ -37,13 +37,10 @@ _ROBOT, _UNKNOWN = -1, -2
 def read_mrclam(
     folder: str | os.PathLike[str], robot: int, *, range_max: float | None = None, field_of_view: float | None = None
 ) -> LandmarkRun:
-    """Read the run of one robot.
+    """Read the run of one robot, N >= 1 of the files' names.
 
-    Args:
-        folder: Folder of the files.
-        robot: N of the files' names, >= 1.
-        range_max: Largest range of the sensor [m]; None is the next metre above the largest reading.
-        field_of_view: Field of view of the sensor [rad]; None is 2.1 times the largest bearing.
+    ``range_max`` [m] None is the next metre above the largest reading, ``field_of_view`` [rad] None 2.1 times the
+    largest bearing.
     """
     base = checks.path("folder", folder)
     robot = checks.integer("robot", robot, low=1)
@@ -84,13 +81,7 @@ def read_mrclam(
 
 
 def _landmarks_by_code(subjects: Integers, codes: Floats, lines: list[str]) -> dict[int, int]:
-    """Return the landmark of each barcode; _ROBOT for a robot's.
-
-    Args:
-        subjects: (M,) subject of each landmark.
-        codes: Rows of subject and barcode.
-        lines: Place of each row, for messages.
-    """
+    """Return the landmark of each barcode; _ROBOT for a robot's."""
     index = {int(subject): i for i, subject in enumerate(subjects)}
     known: dict[int, int] = {}
     for (subject, code), where in zip(codes, lines, strict=True):
@@ -101,14 +92,7 @@ def _landmarks_by_code(subjects: Integers, codes: Floats, lines: list[str]) -> d
 
 
 def dead_reckoning(velocities: Floats) -> Floats:
-    """Integrate velocities to poses.
-
-    Args:
-        velocities: (T, 3) times [s], forward velocities [m/s] and angular velocities [rad/s].
-
-    Returns:
-        (T, 4) times [s] and poses [m, m, rad], the first at the origin.
-    """
+    """Integrate (T, 3) times [s], forward and angular velocities to (T, 4) times and poses, the first at the origin."""
     seconds = np.diff(velocities[:, 0])
     heading = np.concatenate([[0.0], np.cumsum(velocities[:-1, 2] * seconds)])
     middle = (heading[:-1] + heading[1:]) / 2
@@ -130,16 +114,7 @@ def _file(path: Path) -> Path:
 
 
 def _table(path: Path, columns: tuple[str, ...], ordered: bool = False) -> tuple[Floats, list[str]]:
-    """Read the rows of a file.
-
-    Args:
-        path: The file.
-        columns: Names of the columns.
-        ordered: Whether the first column, time, must not decrease.
-
-    Returns:
-        The rows, and the place ``file:line`` of each.
-    """
+    """Read the rows of a file, and the place ``file:line`` of each; an ``ordered`` first column must not decrease."""
     file = checks.existing_file(_file(path))
     rows: list[list[float]] = []
     where: list[str] = []

@@ -22,23 +22,14 @@ from gpusense.world.scanner import Scanner
 
 @dataclass(frozen=True)
 class Format:
-    """A format of logs.
+    """A format of logs."""
 
-    Attributes:
-        name: Name of the format in messages, with an article.
-        module: The module whose function ``read(file, *, range_max, odometry, rear)`` yields its records.
-        magic: First bytes of its binary files; they take precedence over suffixes.
-        suffixes: Suffixes of its files without these bytes.
-        begins: First bytes of its text files.
-        topics: Whether ``read`` also takes the options of bags.
-    """
-
-    name: str
-    module: str
-    magic: tuple[bytes, ...] = ()
-    suffixes: tuple[str, ...] = ()
-    begins: tuple[bytes, ...] = ()
-    topics: bool = False
+    name: str  # name of the format in messages, with an article
+    module: str  # the module whose function ``read(file, *, range_max, odometry, rear)`` yields its records
+    magic: tuple[bytes, ...] = ()  # first bytes of its binary files; they take precedence over suffixes
+    suffixes: tuple[str, ...] = ()  # suffixes of its files without these bytes
+    begins: tuple[bytes, ...] = ()  # first bytes of its text files
+    topics: bool = False  # whether ``read`` also takes the options of bags
 
 
 BAG2 = Format("a ROS 2 bag", "gpusense.logs.ros", (MCAP, SQLITE, ZSTD), (".db3", ".mcap"), topics=True)
@@ -219,11 +210,8 @@ def read_laser(
 ) -> Iterator[Scan]:
     """Read the scans of one laser of a log.
 
-    Args:
-        path: The log, as for :func:`gpusense.read_log`.
-        topic: Topic of the laser in a ROS bag; ``"front"`` or ``"rear"`` for a CARMEN log. None for the laser that
-            ``read_log`` takes.
-        options: See :func:`gpusense.read_log`.
+    ``topic`` names it in a ROS bag, or is ``"front"`` or ``"rear"`` for a CARMEN log; None for the laser that
+    ``read_log`` takes.
     """
     form = format_of(checks.path("path", path))
     records = _records(form, path, topic, False, options)
@@ -235,16 +223,10 @@ def read_lasers(
     sensors: Sequence[str] = (),
     **options: Unpack[LogOptions],
 ) -> Iterator[tuple[int, Scan | Odometry]]:
-    """Read scans and odometry.
+    """Yield the index of a laser in ``sensors`` with its scan, or 0 with an odometry reading.
 
-    Args:
-        path: The log, as for :func:`gpusense.read_log`.
-        sensors: Topics of a ROS bag's lasers, with mounts from transforms; ``"front"`` or ``"rear"`` for a CARMEN log,
-            which states no mounts. None for the laser that ``read_log`` takes.
-        options: See :func:`gpusense.read_log`.
-
-    Yields:
-        The index of a laser in ``sensors`` with its scan, or 0 with an odometry reading.
+    ``sensors`` names topics of a ROS bag's lasers, with mounts from transforms, or ``"front"`` or ``"rear"`` for a
+    CARMEN log, which states no mounts. None is the laser that ``read_log`` takes.
     """
     for index, name in enumerate(sensors):
         if name in sensors[:index]:

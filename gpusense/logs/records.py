@@ -78,33 +78,19 @@ class Odometry:
 
 @dataclass(frozen=True, eq=False)
 class LandmarkRun:
-    """A run among landmarks: S scans with F features, in the order of time.
-
-    Attributes:
-        landmarks: The map.
-        labels: (M,) labels of the landmarks in the recording.
-        time: (S,) times of the scans [s].
-        odometry: (S, 3) poses by odometry, in the odometry frame [m, m, rad].
-        truth: (S, 3) logged poses in the world [m, m, rad].
-        features: (F, 2) ranges [m] and bearings [rad].
-        scan: (F,) scan of each feature, ascending.
-        ids: (F,) landmark of each feature according to the recording.
-        range_max: Largest range of the sensor [m].
-        field_of_view: Field of view of the sensor [rad].
-        left_out: Numbers of readings without a landmark of the map, by reason.
-    """
+    """A run among landmarks: S scans with F features, in the order of time."""
 
     landmarks: LandmarkMap
-    labels: Integers
-    time: Floats
-    odometry: Floats
-    truth: Floats
-    features: Floats
-    scan: Integers
-    ids: Integers
-    range_max: float
-    field_of_view: float
-    left_out: dict[str, int]
+    labels: Integers  # (M,) labels of the landmarks in the recording
+    time: Floats  # (S,) times of the scans [s]
+    odometry: Floats  # (S, 3) poses by odometry, in the odometry frame [m, m, rad]
+    truth: Floats  # (S, 3) logged poses in the world [m, m, rad]
+    features: Floats  # (F, 2) ranges [m] and bearings [rad]
+    scan: Integers  # (F,) scan of each feature, ascending
+    ids: Integers  # (F,) landmark of each feature according to the recording
+    range_max: float  # largest range of the sensor [m]
+    field_of_view: float  # field of view of the sensor [rad]
+    left_out: dict[str, int]  # numbers of readings without a landmark of the map, by reason
 
     @property
     def poses(self) -> Floats:

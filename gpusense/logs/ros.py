@@ -113,21 +113,13 @@ def _record(
 
 @dataclass
 class _Laser:
-    """A laser of a bag.
-
-    Attributes:
-        mount: Its mount.
-        upside_down: Whether its beams run clockwise.
-        tilt: Its largest tilt [rad].
-        moves: Largest distance [m] and turn [rad] between its mounts; None for a fixed laser.
-        at: Function that returns its pose on the base at a time; None for a fixed laser.
-    """
+    """A laser of a bag."""
 
     mount: Pose = (0.0, 0.0, 0.0)
-    upside_down: bool = False
-    tilt: float = 0.0
-    moves: tuple[float, float] | None = None
-    at: Callable[[float], Floats] | None = None
+    upside_down: bool = False  # whether its beams run clockwise
+    tilt: float = 0.0  # its largest tilt [rad]
+    moves: tuple[float, float] | None = None  # largest distance [m] and turn [rad] between its mounts, unless fixed
+    at: Callable[[float], Floats] | None = None  # its pose on the base at a time; None for a fixed laser
     beams: Beams = field(init=False)
     _scanners: dict[tuple[Pose, bool], Scanner] = field(default_factory=dict)
 
@@ -153,8 +145,7 @@ def _lasers(bag: Bag, given: Pose | None, range_min: float | None, range_max: fl
 def _mounted(bag: Bag, given: Pose | None) -> dict[str, _Laser]:
     """Return the lasers with their mounts, by their frames.
 
-    Warns:
-        UserWarning: A mount contradicts transforms, is not level, moves, is assumed, or serves several lasers.
+    Warns if a mount contradicts transforms, is not level, moves, is assumed, or serves several lasers.
     """
     bases = _bases(bag)
     found: dict[str, _Laser] = {}

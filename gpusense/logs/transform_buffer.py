@@ -30,11 +30,7 @@ Vector = tuple[float, ...]
 
 
 class TransformError(LookupError):
-    """A transform is unknown, or unknown at the requested time.
-
-    Attributes:
-        early: True if the time is later than all known transforms, so that waiting helps.
-    """
+    """A transform is unknown, or unknown at the requested time; if ``early``, waiting helps."""
 
     def __init__(self, text: str, early: bool = False) -> None:
         super().__init__(text)
@@ -45,24 +41,16 @@ class TransformError(LookupError):
 class Link:
     """Transform between a frame and its parent.
 
-    Attributes:
-        parent: The parent.
-        child: The frame.
-        static: Whether the transform holds at all times.
-        moved: True if a moving transform has changed.
-        times: Stamps in increasing order [s].
-        values: Translation [m] and quaternion at each stamp, in one row.
-        stray: Time and value of a single transform with a stamp that went back; dropped unless the next stamp follows
-            it.
+    A single transform whose stamp goes back is stray: it is dropped unless the next stamp follows it.
     """
 
     parent: str
     child: str
     static: bool = False
-    moved: bool = False
-    times: array[float] = field(default_factory=lambda: array("d"))
-    values: array[float] = field(default_factory=lambda: array("d"))
-    stray: tuple[float, Vector] | None = None
+    moved: bool = False  # True if a moving transform has changed
+    times: array[float] = field(default_factory=lambda: array("d"))  # stamps in increasing order [s]
+    values: array[float] = field(default_factory=lambda: array("d"))  # rows of translation [m] and quaternion, by stamp
+    stray: tuple[float, Vector] | None = None  # time and value
 
     def put(self, time: float, value: Vector, static: bool) -> None:
         """Add a transform in the order of time; a static one replaces the others."""
@@ -112,11 +100,9 @@ class Link:
 
 
 class TransformBuffer:
-    """Transforms between frames over time. A slash before a frame's name is ignored.
+    """Transforms between frames over ``cache`` seconds. A slash before a frame's name is ignored.
 
-    Args:
-        cache: Time to keep moving transforms [s]. If infinite, as for a log, a single stamp that goes back drops
-            nothing.
+    In an infinite cache, as for a log, a single stamp that goes back drops nothing.
     """
 
     def __init__(self, cache: float = math.inf) -> None:
@@ -124,12 +110,7 @@ class TransformBuffer:
         self._links: dict[tuple[str, str], Link] = {}
 
     def add(self, message: object, static: bool = False) -> bool:
-        """Add a ``geometry_msgs/TransformStamped``; return whether its stamp went back and dropped later transforms.
-
-        Args:
-            message: The transform, read by its fields.
-            static: Whether it holds at all times, as on ``/tf_static``.
-        """
+        """Add a ``geometry_msgs/TransformStamped``; return whether its stamp went back and dropped later transforms."""
         parent, child = (
             str(field_of("message", message, name)).lstrip("/") for name in ("header.frame_id", "child_frame_id")
         )
@@ -168,16 +149,7 @@ class TransformBuffer:
         yield from self._links.values()
 
     def look_up(self, target: str, source: str, time: float | None = None) -> NDArray[np.float64]:
-        """Return the (4, 4) pose of ``source`` in ``target``.
-
-        Args:
-            target: Frame of reference.
-            source: Frame to locate.
-            time: The time [s]; None for the latest time known to all links of the chain.
-
-        Raises:
-            TransformError: The frames are not connected, or not at this time.
-        """
+        """Return the (4, 4) pose of ``source`` in ``target``; None as time [s] is the latest known to all links."""
         target, source = target.lstrip("/"), source.lstrip("/")
         chain = self._chain(target, source, self._links.values())
         if time is None:
@@ -193,11 +165,7 @@ class TransformBuffer:
                 raise error from None
 
     def fixed(self, target: str, source: str) -> NDArray[np.float64]:
-        """Return the (4, 4) pose of ``source`` in ``target``, which must be constant.
-
-        Raises:
-            TransformError: The frames are not connected, or move in each other.
-        """
+        """Return the (4, 4) pose of ``source`` in ``target``, which must be constant."""
         target, source = target.lstrip("/"), source.lstrip("/")
         still = [link for link in self._links.values() if not link.moved]
         try:
@@ -208,11 +176,7 @@ class TransformBuffer:
         raise TransformError(f"the transform from {moving.parent} to {moving.child} changes")
 
     def history(self, target: str, source: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the (N,) times [s] and (N, 4, 4) poses of the motion of ``source`` in ``target``.
-
-        Raises:
-            TransformError: The frames are not connected.
-        """
+        """Return the (N,) times [s] and (N, 4, 4) poses of the motion of ``source`` in ``target``."""
         target, source = target.lstrip("/"), source.lstrip("/")
         chain = self._chain(target, source, self._links.values())
         moving = [link for link, _ in chain if not link.static]

@@ -33,11 +33,7 @@ def bands(shape: tuple[int, int], most: int) -> list[Window]:
 
 
 class BandCounts:
-    """Hits and misses of a band's cells on a device.
-
-    Attributes:
-        rays: Number of counted rays that end in the band, or in its rows outside the map.
-    """
+    """Hits and misses of a band's cells on a device; ``rays`` end in the band, or in its rows outside the map."""
 
     def __init__(self, backend: Backend, frame: GridFrame, shape: tuple[int, int], band: Window) -> None:
         self._backend, self._frame, self._shape, self._band = backend, frame, shape, band
@@ -77,11 +73,8 @@ class BandCounts:
     def occupancies(self, out: np.ndarray, model: tuple[float, float, float]) -> None:
         """Write the occupancies of the band into the (H, W) int8 cells of the map.
 
-        Cells without a ray keep their value.
-
-        Args:
-            out: The cells.
-            model: Occupancy of a cell after one hit and an even prior, after one miss, and before any ray.
+        Cells without a ray keep their value. ``model`` is the occupancy of a cell after one hit and an even prior,
+        after one miss, and before any ray.
         """
         flat = self._band.cut(out).reshape(-1)
         few = np.arange(_FEW, dtype=_INT)

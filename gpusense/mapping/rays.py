@@ -22,22 +22,13 @@ LONGEST_RAY = 1 << 19
 
 @dataclass(frozen=True)
 class Survey:
-    """Scans at known poses, and the rules for converting readings to rays.
+    """Scans at known poses, and the rules for converting readings to rays."""
 
-    Attributes:
-        data: The scans and their scanners.
-        poses: (S, 3) poses of the robot [m, m, rad].
-        range_limit: Longer readings clear cells up to ``range_limit`` and mark no obstacle [m]; each scanner's
-            range_max is an upper limit.
-        clear_max: True if max readings clear cells up to ``range_limit``; otherwise they have no effect.
-        motion: (S, 3) motions of the robot during the scans, see ``gpusense.world.deskew``; None at rest.
-    """
-
-    data: SensorScans
-    poses: np.ndarray
-    range_limit: float
-    clear_max: bool
-    motion: np.ndarray | None = None
+    data: SensorScans  # the scans and their scanners
+    poses: np.ndarray  # (S, 3) poses of the robot [m, m, rad]
+    range_limit: float  # longer readings clear cells up to it and mark no obstacle, at most range_max [m]
+    clear_max: bool  # True if max readings clear cells up to ``range_limit``; otherwise they have no effect
+    motion: np.ndarray | None = None  # (S, 3) motions of the robot during the scans; None at rest
 
     @property
     def readings(self) -> int:
@@ -61,21 +52,9 @@ class Survey:
 
 
 class RayEnds:
-    """Start and end in the world of each ray that carries information about the map.
+    """Start and end in the world of each ray that carries information about the map; options as in :class:`Survey`.
 
-    Args:
-        scans: (S, K) readings [m].
-        poses: (S, 3) poses of the robot [m, m, rad].
-        scanner: The scanner's geometry.
-        range_limit: See :class:`Survey`.
-        clear_max: See :class:`Survey`.
-        motion: See :class:`Survey`.
-
-    Attributes:
-        start: (R, 2) [m].
-        end: (R, 2) [m].
-        hit: (R,) whether an obstacle is at the end.
-        scan: (R,) index of the scan.
+    ``start`` and ``end`` are (R, 2) [m], ``hit`` (R,) marks obstacles at the end, ``scan`` (R,) is the scan's index.
     """
 
     def __init__(

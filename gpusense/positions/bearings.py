@@ -140,19 +140,11 @@ def _blur(problem: Problem) -> float:
 
 
 def _triple_blur(problem: Problem, triples: NDArray[np.intp], state: Floats | None = None) -> Floats:
-    """Return the rounding error of the clarity of triples, see :func:`three_bearings`.
-
-    Args:
-        problem: The measurements.
-        triples: (N, 3) beacons.
-        state: A pose, where rounded coordinates affect the direction to a near beacon most; None assumes a robot at
-            the beacons' distance from each other.
+    """Return the (N,) rounding errors of the clarity of triples, see :func:`three_bearings`.
 
     The error of an angle, times |m_i| cos(b_j - b_k), changes the terms m_i exp(-i b_i) sin(b_j - b_k). For beacons in
-    nearly one direction this exceeds the terms.
-
-    Returns:
-        (N,) errors.
+    nearly one direction this exceeds the terms. Rounded coordinates affect the direction to a near beacon most; None as
+    ``state`` assumes a robot at the beacons' distance from each other.
     """
     assert problem.bearings is not None
     points, bearings = problem.points[triples], problem.bearings[triples]

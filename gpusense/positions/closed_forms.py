@@ -34,19 +34,13 @@ def two_circles(
     d2)(a + d2) + d1^2) / 2a, and y is the height of the triangle, 2 area / a, with Kahan's area ("Miscalculating Area
     and Angles of a Needle-like Triangle", 2014), which subtracts only the sides.
 
-    Args:
-        first: (N,) centres of the first circles.
-        second: (N,) centres of the second circles.
-        d1: (N,) radii of the first circles, >= 0.
-        d2: (N,) radii of the second circles, >= 0.
-        share: Share of the gap between the circles that belongs to the first one, 0 to 1.
-        noise: Rounding error of the inputs' coordinates, a length.
+    ``share`` of a gap between circles belongs to the first one; ``noise`` is the rounding error of coordinates, a
+    length.
 
-    Returns:
-        (N, 2) points, beginning with the point to the left of the direction from ``first`` to ``second``; and (N,)
-        statuses: "two" (the circles intersect), "tangent", "disjoint", "contained" (one inside the other) or
-        "coincident" (one centre). For circles that do not intersect, both points are the nearest point on the line of
-        centres (least squares); NaN for one centre.
+    Returns (N, 2) points, beginning with the point to the left of the direction from ``first`` to ``second``; and (N,)
+    statuses: "two" (the circles intersect), "tangent", "disjoint", "contained" (one inside the other) or "coincident"
+    (one centre). For circles that do not intersect, both points are the nearest point on the line of centres (least
+    squares); NaN for one centre.
     """
     base = second - first
     a = np.abs(base)
@@ -76,19 +70,12 @@ def two_circles(
 
 
 def two_rays(first: Complexes, second: Complexes, angle1: Floats, angle2: Floats) -> tuple[Complexes, Floats, Floats]:
-    """Intersect pairs of lines of sight of known direction.
+    """Intersect pairs of lines of sight of known direction in the world [rad].
 
     With m_i - p = rho_i u_i, rho_1 = ((m1 - m2) x u2) / (u1 x u2) and rho_2 = ((m1 - m2) x u1) / (u1 x u2).
 
-    Args:
-        first: (N,) first beacons.
-        second: (N,) second beacons.
-        angle1: (N,) directions from the robot to the first beacons in the world [rad].
-        angle2: (N,) directions from the robot to the second beacons in the world [rad].
-
-    Returns:
-        (N,) points; (N, 2) distances of the beacons along the lines of sight, negative for a beacon behind the robot;
-        and (N,) sines of the angles between the lines. The point of parallel lines is inf or NaN.
+    Returns (N,) points; (N, 2) distances of the beacons along the lines of sight, negative for a beacon behind the
+    robot; and (N,) sines of the angles between the lines. The point of parallel lines is inf or NaN.
     """
     u1, u2 = np.exp(1j * angle1), np.exp(1j * angle2)
     sine = np.sin(angle2 - angle1)
@@ -101,7 +88,7 @@ def two_rays(first: Complexes, second: Complexes, angle1: Floats, angle2: Floats
 
 
 def three_bearings(beacons: Complexes, bearings: Floats) -> tuple[Complexes, Floats, Floats, Floats]:
-    """Compute position and heading from three bearings ("Bearings Only").
+    """Compute position and heading from (N, 3) bearings of beacons ("Bearings Only").
 
     (m_i - p) exp(-i (b_i + theta)) is real and positive. Let beacon 2 be the origin: the imaginary parts are three
     linear equations in exp(-i theta) and p exp(-i theta). Eliminating p leaves
@@ -113,13 +100,8 @@ def three_bearings(beacons: Complexes, bearings: Floats) -> tuple[Complexes, Flo
     Positioning", 2014) this form needs no special cases for beacons in line, or for a robot in line with two beacons. w
     = 0 on the circle through the beacons.
 
-    Args:
-        beacons: (N, 3) positions.
-        bearings: (N, 3) [rad].
-
-    Returns:
-        (N,) positions; (N,) headings; (N, 3) distances along the lines of sight, all > 0 for a valid pose; and (N,)
-        clarities: |w| relative to the sum of its terms' magnitudes, 0 if the bearings leave more than one pose.
+    Returns (N,) positions; (N,) headings; (N, 3) distances along the lines of sight, all > 0 for a valid pose; and (N,)
+    clarities: |w| relative to the sum of its terms' magnitudes, 0 if the bearings leave more than one pose.
     """
     terms = np.empty(beacons.shape, np.complex128)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):

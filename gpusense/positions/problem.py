@@ -44,33 +44,19 @@ STARTS = 300
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Measurements of M beacons of positive weight, and the unknowns: a position or a pose.
+    """Measurements of M beacons of positive weight, and the unknowns: a position or a pose."""
 
-    Attributes:
-        xy: (M, 2) beacons relative to ``origin`` [m].
-        origin: (2,) origin in the world [m]; it keeps all digits of UTM coordinates.
-        ranges: (M,) or None [m].
-        bearings: (M,) or None [rad].
-        heading: The known heading, or None [rad].
-        sigma_range: (M,) standard deviations [m].
-        sigma_bearing: (M,) standard deviations [rad].
-        weights: (M,) factors > 0 of the squared residuals.
-        loss: Name of one of LOSSES.
-        loss_scale: Residual at which the loss bends [sigma].
-        used: (M',) mask of the caller's beacons that are in ``xy``.
-    """
-
-    xy: Floats
-    origin: Floats
-    ranges: Floats | None
-    bearings: Floats | None
-    heading: float | None
-    sigma_range: Floats
-    sigma_bearing: Floats
-    weights: Floats
-    loss: str
-    loss_scale: float
-    used: NDArray[np.bool]
+    xy: Floats  # (M, 2) beacons relative to ``origin`` [m]
+    origin: Floats  # (2,) origin in the world [m]; it keeps all digits of UTM coordinates
+    ranges: Floats | None  # (M,) or None [m]
+    bearings: Floats | None  # (M,) or None [rad]
+    heading: float | None  # the known heading, or None [rad]
+    sigma_range: Floats  # (M,) standard deviations [m]
+    sigma_bearing: Floats  # (M,) standard deviations [rad]
+    weights: Floats  # (M,) factors > 0 of the squared residuals
+    loss: str  # name of one of LOSSES
+    loss_scale: float  # residual at which the loss bends [sigma]
+    used: NDArray[np.bool]  # (M',) mask of the caller's beacons that are in ``xy``
 
     @property
     def dimension(self) -> int:
@@ -172,12 +158,9 @@ class Problem:
         return gain @ gain.T, condition
 
     def fix(self, states: Sequence[Floats] | Floats, status: str, *, flat: bool = False) -> PositionFix:
-        """Make the result for solutions.
+        """Make the result for (S, d) solutions, the best first.
 
-        Args:
-            states: (S, d) solutions, the best first.
-            status: Status of the best; "unique" and the like become "singular" if the information matrix is.
-            flat: True if the information matrix is known to be singular, despite rounding.
+        A status of a definite solution becomes "singular" if the information matrix is, or is known to be (``flat``).
         """
         solutions = np.asarray(states, np.float64).reshape(-1, self.dimension)
         assert status in STATUSES

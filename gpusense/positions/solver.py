@@ -27,13 +27,9 @@ def distance(problem: Problem, states: Floats, state: Floats) -> Floats:
 
 
 def descend(problem: Problem, start: Floats, line: tuple[Floats, Floats] | None, step: float) -> Floats:
-    """Return the minimum that least squares (trust-region Gauss-Newton of SciPy) reaches from a start.
+    """Return the minimum that least squares (trust-region Gauss-Newton of SciPy) reaches from a (d,) state.
 
-    Args:
-        problem: The measurements.
-        start: (d,) state.
-        line: Point and direction (2,) of a line that constrains the position, or None.
-        step: Relative change of the cost and of the state at which the search stops.
+    ``line`` (point, direction) constrains the position; ``step`` is the relative change at which the search stops.
     """
     from scipy.optimize import least_squares
 
@@ -68,17 +64,10 @@ def descend(problem: Problem, start: Floats, line: tuple[Floats, Floats] | None,
 def minima(
     problem: Problem, starts: Sequence[Floats] | Floats, line: tuple[Floats, Floats] | None = None
 ) -> tuple[Floats, Floats]:
-    """Find different minima.
+    """Return (S, d) different minima with costs near the lowest, the lowest first, and their (S,) costs.
 
-    Args:
-        problem: The measurements.
-        starts: (N, d) states; non-finite states are ignored. The search follows the best states, each at least APART
-            from the previous ones.
-        line: See :func:`descend`.
-
-    Returns:
-        (S, d) minima with costs near the lowest, the lowest first, and their (S,) costs; S is 0 if no start is
-        finite.
+    Non-finite states of the (N, d) starts are ignored. The search follows the best states, each at least APART from the
+    previous ones.
     """
     pending = np.asarray(starts, np.float64).reshape(-1, problem.dimension)
     pending = pending[np.isfinite(pending).all(axis=1)]

@@ -93,12 +93,7 @@ def covariance_of(numbers: Any) -> np.ndarray:
 
 
 def start_of(message: Any, frame: str) -> tuple[Pose, np.ndarray]:
-    """Return the pose and the (3, 3) covariance of a geometry_msgs/PoseWithCovarianceStamped.
-
-    Args:
-        message: The pose.
-        frame: Required frame of the pose.
-    """
+    """Return the pose and the (3, 3) covariance of a PoseWithCovarianceStamped, which must be in ``frame``."""
     named = str(field("message", message, "header.frame_id")).lstrip("/")
     if named != frame.lstrip("/"):
         raise ValueError(f"message.header.frame_id: must be {frame!r}, got {named!r}")
@@ -120,11 +115,8 @@ def laser_scan(
 ) -> tuple[Scanner, dict[str, Any]]:
     """Return the scanner of a sensor_msgs/LaserScan, and the fields of its readings.
 
-    Args:
-        message: The scan.
-        laser: (4, 4) pose of the laser on the robot's base. If it is upside down, the beams run clockwise.
-        limits: Narrow the message's ``range_min`` and ``range_max``, as in nav2_amcl, or replace invalid ones [m];
-            None for the message's values.
+    Beams of an upside-down ``laser`` (4, 4) run clockwise. ``limits`` [m] narrow the message's ``range_min`` and
+    ``range_max``, as in nav2_amcl, or replace invalid ones.
     """
     mount, upside_down, _ = planar_mount(laser)
     names = ("angle_min", "angle_increment", "range_min", "range_max", "ranges")

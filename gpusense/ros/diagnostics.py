@@ -17,14 +17,6 @@ def radius_text(radius: float) -> str:
 def status_fields(
     name: str, level: int, message: str, values: Mapping[str, str], node: str = "gpusense"
 ) -> dict[str, Any]:
-    """Return the fields of diagnostic_msgs/DiagnosticStatus.
-
-    Args:
-        name: Subject of the status.
-        level: OK, WARN, ERROR or STALE.
-        message: One line for people.
-        values: Values by their names.
-        node: Name of the node with its namespace, to distinguish robots.
-    """
+    """Return the fields of diagnostic_msgs/DiagnosticStatus; ``node`` distinguishes robots."""
     pairs = [{"key": key, "value": value} for key, value in values.items()]
     return {"name": f"{node}: {name}", "hardware_id": node, "level": level, "message": message, "values": pairs}

@@ -36,17 +36,8 @@ _START = (0.5, 0.5, math.pi / 12)
 class Localizer:
     """Particle filter that starts as soon as map, scanner and first pose are known.
 
-    Args:
-        options: Options of nav2_amcl, see ``gpusense.compat.from_nav2``.
-        backend: The device.
-        seed: Seed of the filter.
-        risk: Probability that the error of the position exceeds the published radius.
-        clock: Returns the time [s].
-
-    Attributes:
-        estimate: Estimate of the last used scan; None before it and after a new start.
-        problem: Reason why the last scan was unusable, or None.
-        counted: Number of used scans.
+    ``risk`` is the probability that the error of the position exceeds the published radius. ``estimate`` belongs to the
+    last used scan, ``problem`` is the reason why the last scan was unusable, and ``counted`` the number of used scans.
     """
 
     def __init__(
@@ -129,15 +120,10 @@ class Localizer:
             self._initialize()
 
     def update(self, message: Any, odometry: Pose, laser: np.ndarray) -> bool:
-        """Take a sensor_msgs/LaserScan; return whether it was used.
+        """Take a LaserScan with the robot's odometry and the laser's (4, 4) pose; return whether it is used.
 
         As in nav2_amcl, a scan is used if a map exists and the robot has moved enough since the last used scan. An
         invalid scan is not used, and ``problem`` states the reason.
-
-        Args:
-            message: The scan.
-            odometry: Pose of the robot in the odometry frame.
-            laser: (4, 4) pose of the laser on the robot.
         """
         if self.grid is None:
             return False
@@ -172,13 +158,7 @@ class Localizer:
         return host_array(self.filter.particles), host_array(self.filter.weights)
 
     def status(self, counts: Mapping[str, int], reason: str | None = None, node: str = "gpusense") -> dict[str, Any]:
-        """Return the fields of diagnostic_msgs/DiagnosticStatus.
-
-        Args:
-            counts: Numbers of scans by outcome.
-            reason: Reason for missing transforms of the last scan, or for a missing map.
-            node: Name of the node with its namespace.
-        """
+        """Return the fields of diagnostic_msgs/DiagnosticStatus; ``reason`` explains missing transforms or map."""
         values = {"scans that counted": str(self.counted)} | {f"scans {key}": str(n) for key, n in counts.items()}
         why = "" if reason is None else f": {reason}"
         if self.grid is None:

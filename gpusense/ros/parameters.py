@@ -31,11 +31,9 @@ def defaults() -> dict[str, Any]:
 
 
 def options_of(values: Mapping[str, Any]) -> tuple[Nav2Options, tuple[str, ...]]:
-    """Return the options, and the names of parameters that have no effect.
+    """Return the options of parameters by dotted names, and the names of parameters that have no effect.
 
-    Args:
-        values: Parameters of the node by dotted names. A file named by ``parameters`` replaces nav2_amcl's parameters,
-            except a first pose.
+    A file named by ``parameters`` replaces nav2_amcl's parameters, except a first pose.
     """
     _check_own(values)
     first = {name: value for name, value in values.items() if name.startswith("initial_pose.")}

@@ -18,18 +18,9 @@ MOST = 500
 
 
 class ScanQueue:
-    """Queue of scans that wait for their transforms.
+    """Queue of scans that wait for their transforms, at most ``patience`` seconds without the delivery of others.
 
-    Args:
-        look_up: Returns the transforms of a scan, or raises ``TransformError``.
-        deliver: Takes a scan and its transforms.
-        patience: Longest wait of a scan, without the delivery of others [s].
-        most: Most waiting scans; a further one drops the oldest.
-        clock: Returns the time [s].
-
-    Attributes:
-        dropped: Number of dropped scans.
-        reason: Reason for the last drop, or None.
+    A scan beyond ``most`` drops the oldest. ``dropped`` counts these, and ``reason`` explains the last.
     """
 
     def __init__(
@@ -54,10 +45,8 @@ class ScanQueue:
     def add(self, scan: Any, stamp: float) -> None:
         """Add a scan, and deliver ready scans.
 
-        Args:
-            scan: The scan.
-            stamp: Its time [s]. Waiting scans that are later by more than 2 s are dropped: a recording has restarted,
-                or their stamps were wrong.
+        Waiting scans that are later by more than 2 s are dropped: a recording has restarted, or their stamps were
+        wrong.
         """
         later = [each for each in self._waiting if each[1] > stamp + BACK]
         for each in later:

@@ -28,18 +28,11 @@ _CAUSES = 7
 
 
 class Watcher:
-    """Verdict on another localiser's poses.
+    """Verdict on another localiser's poses in ``frame``, stale after ``patience`` seconds without a judged pose.
 
-    Args:
-        backend: The device.
-        tolerance: Largest difference of the times of a pose and its scan [s].
-        patience: Time without a judged pose after which the verdict is stale [s].
-        frame: Frame of the poses and the map.
-        range_max: Largest ``range_max`` of scans [m].
-        risk: Probability that the error of the position exceeds the published radius.
-
-    Attributes:
-        problem: Reason why the last scan was unusable, or None.
+    Times of a pose and its scan differ by at most ``tolerance`` [s], and ``range_max`` [m] limits scans. ``risk`` is
+    the probability that the error of the position exceeds the published radius, ``problem`` the reason why the last
+    scan was unusable.
     """
 
     def __init__(
@@ -105,12 +98,7 @@ class Watcher:
         return True
 
     def status(self, now: float, node: str = "gpusense") -> dict[str, Any]:
-        """Return the fields of diagnostic_msgs/DiagnosticStatus.
-
-        Args:
-            now: Time [s].
-            node: Name of the node with its namespace.
-        """
+        """Return the fields of diagnostic_msgs/DiagnosticStatus at a time [s]."""
         # A restarted recording turns the clock back.
         if self._verdict is None or abs(now - self._judged) > self.patience:
             return status_fields("localisation", STALE, "no pose with a scan of its time", {}, node)

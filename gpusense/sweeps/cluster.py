@@ -328,13 +328,7 @@ def _local_cluster(names: list[str], security: Any) -> Any:
 
 
 def security_of(authority: Path, certificate: Path, key: Path) -> Any:
-    """Return the TLS settings of a client, from files in PEM.
-
-    Args:
-        authority: Certificate of the authority that has signed the cluster's certificates.
-        certificate: Certificate of the client.
-        key: Private key of the client.
-    """
+    """Return the TLS settings of a client, from PEM files of the authority, the client and its private key."""
     return library("distributed", "a sweep on Dask").Security(
         tls_ca_file=str(authority), tls_client_cert=str(certificate), tls_client_key=str(key), require_encryption=True
     )

@@ -37,13 +37,7 @@ def leave(worker: str, executor: str) -> None:
 
 
 def answer(executor: str, payload: bytes, seconds: float | None) -> bytes:
-    """Run a call in a process of the present Dask worker, and return the pickle of its answer.
-
-    Args:
-        executor: Name of the executor.
-        payload: The call.
-        seconds: Longest time of the call; None for no limit.
-    """
+    """Run a call of at most ``seconds`` in a process of the present Dask worker; return the pickle of its answer."""
     import distributed
 
     dask_worker = distributed.get_worker()

@@ -92,11 +92,9 @@ class _Spawn(SpawnContext):
 
 
 class Worker:
-    """A process that starts on first use and again after its end.
+    """A process that starts on first use and again after its end; each keeps the sent maps and paths of logs.
 
-    Args:
-        device: Selection string of its device; empty leaves the device of the environment.
-        sent: Maps and paths of logs that each new process keeps.
+    An empty ``device`` leaves the device of the environment.
     """
 
     def __init__(self, device: str, sent: Mapping[str, Any] | None = None) -> None:
@@ -112,17 +110,10 @@ class Worker:
         return () if process is None or process.pid is None or process.exitcode is not None else (process.pid,)
 
     def call(self, payload: bytes, seconds: float | None = None, wanted: Callable[[], bool] = lambda: True) -> bytes:
-        """Run a call in the process, and return the pickle of its answer.
+        """Run a pickled call of at most ``seconds`` in the process, and return the pickle of its answer.
 
-        Args:
-            payload: Pickle of a function, its arguments and its keyword arguments.
-            seconds: Longest time of the call; None for no limit.
-            wanted: Returns whether the answer is still awaited; otherwise the process is ended.
-
-        Raises:
-            BrokenExecutor: processes end before they take a call, or the worker was closed.
-            JobTimeout: the call took too long; the process was ended.
-            WorkerDied: the process ended in the call.
+        The process is ended once ``wanted()`` is false. Raises BrokenExecutor if processes end before they take a call,
+        JobTimeout, and WorkerDied.
         """
         with self._calls:
             pool, process = self._started()

@@ -150,27 +150,15 @@ def _submitted(executor: Executor, job: Job, setting: tuple[str, ...]) -> Future
 
 
 class Ended(NamedTuple):
-    """A job that has ended.
-
-    Attributes:
-        job: The job.
-        outcome: Result of the job.
-        starts: Number of starts.
-    """
+    """A job that has ended."""
 
     job: Job
-    outcome: Outcome
-    starts: int
+    outcome: Outcome  # result of the job
+    starts: int  # number of starts
 
 
 class Starts:
-    """The jobs of a sweep as they pass through an executor.
-
-    Args:
-        jobs: The jobs.
-        submit: Starts a job, and returns the future of its outcome.
-        most: Most starts of a job.
-    """
+    """The jobs of a sweep as they pass through an executor; a job starts at most ``most`` times."""
 
     def __init__(self, jobs: Iterable[Job], submit: Callable[[Job], Future[Any]], most: int) -> None:
         self._submit, self._most = submit, most
@@ -180,11 +168,7 @@ class Starts:
         self._running: dict[Future[Any], tuple[Job, int]] = {}
 
     def ended(self, window: Callable[[], int]) -> Iterator[Ended]:
-        """Yield the jobs in the order in which they end.
-
-        Raises:
-            SweepLost: the executor has ended.
-        """
+        """Yield the jobs in the order in which they end; raise SweepLost if the executor has ended."""
         while self._waiting or self._suspects or self._running:
             limit = window()
             while self._waiting and len(self._running) < limit:

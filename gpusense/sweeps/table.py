@@ -30,22 +30,9 @@ _INTEGER = re.compile(r"[-+]?\d{1,18}")
 
 
 class Table:
-    """Rows of finished jobs in a CSV file.
+    """Rows of finished jobs in a CSV file, and a Parquet file of the same name if the path ends in ``.parquet``.
 
-    Args:
-        path: A ``.csv`` file; or a ``.parquet`` file, with a CSV file in the same folder.
-        resume: Whether the file may exist already.
-
-    Attributes:
-        path: The CSV file.
-        parquet: The Parquet file that :meth:`finish` writes, or None.
-        rows: The last row of each key, as texts.
-
-    Raises:
-        FileExistsError: the file exists, and ``resume`` is false.
-        ImportError: Parquet without pyarrow.
-        OSError: the folder is absent or not writable, or another sweep writes this table.
-        ValueError: the suffix is unknown, or the file is no table.
+    ``rows`` holds the last row of each key, as texts. Only ``resume`` accepts an existing file.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, resume: bool = False) -> None:

@@ -31,17 +31,11 @@ Values = Mapping[str, Any]
 
 
 class Task(NamedTuple):
-    """A task.
+    """A task."""
 
-    Attributes:
-        run: Runs a job with the worker's store, and returns the columns of the row.
-        options: Names of the task's options, without the model's.
-        error: Column that a plot shows against run time.
-    """
-
-    run: Callable[[Job, Store], Values]
-    options: tuple[str, ...]
-    error: str
+    run: Callable[[Job, Store], Values]  # runs a job with the worker's store, and returns the columns of the row
+    options: tuple[str, ...]  # names of the task's options, without the model's
+    error: str  # column that a plot shows against run time
 
 
 def model_of(job: Job, store: Store, scanner: Scanner, *, temperature: float = 1.0) -> Any:

@@ -21,25 +21,15 @@ _LONGEST = 400
 
 
 class Outcome(NamedTuple):
-    """The result of a job.
+    """The result of a job."""
 
-    Attributes:
-        values: Columns of its row by name; empty after a failure.
-        error: The error in one line; empty after success.
-        trace: Traceback of the error, for a log.
-        seconds: Time of the job [s].
-        cpu_seconds: Processor time of the worker's process during the job [s].
-        worker: Host and process of the worker.
-        device: Selection string of the device.
-    """
-
-    values: dict[str, Any]
-    error: str
-    trace: str
-    seconds: float
-    cpu_seconds: float
-    worker: str
-    device: str
+    values: dict[str, Any]  # columns of its row by name; empty after a failure
+    error: str  # the error in one line; empty after success
+    trace: str  # traceback of the error, for a log
+    seconds: float  # time of the job [s]
+    cpu_seconds: float  # processor time of the worker's process during the job [s]
+    worker: str  # host and process of the worker
+    device: str  # selection string of the device
 
 
 # A worker runs one job at a time, since device and store serve only one.
@@ -59,11 +49,7 @@ def receive(sent: Mapping[str, Any]) -> None:
 def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:
     """Run a job in this process; errors are part of the result.
 
-    Args:
-        job: The job.
-        root: Folder of its files.
-        device: Selection string of the device, for a worker without a chosen device.
-        sweep: Name of the sweep; files read for another sweep are read again.
+    ``device`` is for a worker without a chosen device. Files that were read for another sweep are read again.
     """
     chosen = os.environ.get(DEVICE) or device
     with _LOCK:

@@ -83,12 +83,7 @@ def block_gradients(problem: Problem, point: Point) -> tuple[Floats, NDArray[np.
 def _terms(z: Floats, expected: Floats, parts: Floats, point: Point, range_max: float) -> dict[int, Floats]:
     """Return the gradient of each hit's log p by coordinate, without the weights' normalisation.
 
-    Args:
-        z: (m,) readings [m].
-        expected: (m,) expected ranges [m].
-        parts: (m, 3) responsibilities of hit, short and rand.
-        point: The parameters.
-        range_max: Longest range [m].
+    ``parts`` holds the (m, 3) responsibilities of hit, short and rand for (m,) readings and expected ranges [m].
     """
     hit, short, rand = parts.T
     shape, mean = point.shape, np.clip(expected + point.bias, 0, range_max)

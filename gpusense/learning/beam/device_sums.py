@@ -30,25 +30,15 @@ _FLAGS = frozenset({"HIT", "SHORT", "RAND", "BIAS"})
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Pairs in one buffer on the device: ``blocks`` blocks of ``readings`` pairs, the last one padded with NaN.
+    """Pairs in one buffer on the device: ``blocks`` blocks of ``readings`` pairs, the last one padded with NaN."""
 
-    Attributes:
-        reading: Readings [m].
-        expected: Expected ranges [m].
-        count: Number of pairs.
-        blocks: Number of blocks.
-        readings: Pairs per block.
-        across: Stride from one block to the next.
-        along: Stride from one pair of a block to the next.
-    """
-
-    reading: Any
-    expected: Any
+    reading: Any  # readings [m]
+    expected: Any  # expected ranges [m]
     count: int
-    blocks: int
-    readings: int
-    across: int
-    along: int
+    blocks: int  # number of blocks
+    readings: int  # pairs per block
+    across: int  # stride from one block to the next
+    along: int  # stride from one pair of a block to the next
 
     @property
     def layout(self) -> tuple[int, int, int, int]:
@@ -57,17 +47,7 @@ class _Chunk:
 
 
 class DeviceSums:
-    """Pairs on a device, and sums over them.
-
-    Args:
-        backend: The device.
-        real: Precision of the kernels, float32 or float64.
-        pairs: Readings and expected ranges.
-
-    Attributes:
-        real: Precision of the kernels.
-        passes: Number of passes over the pairs so far.
-    """
+    """Pairs on a device, and sums over them; ``passes`` counts the passes so far."""
 
     def __init__(self, backend: Backend, real: np.dtype, pairs: Pairs) -> None:
         self._backend, self.real = backend, real
@@ -113,11 +93,7 @@ class DeviceSums:
         return self._backend.upload(packed([terms], self.real)), self._backend.upload(masses)
 
     def sums(self, point: Point, *, information: bool = False) -> NDArray[np.float64]:
-        """Sum over the hits, in a fixed order of addition.
-
-        Returns:
-            (13,) or, with second derivatives, (39,) float64.
-        """
+        """Sum over the hits in a fixed order: (13,) or, with second derivatives, (39,) float64."""
         width = _SUMS[information]
         flags = self._flags | point.shape.flags | flags_if(INFORMATION=information)
         total = np.zeros(width)

@@ -43,19 +43,12 @@ Watch = Callable[[int, Value], None]
 
 @dataclass
 class Climb:
-    """Result of a search.
-
-    Attributes:
-        value: Value at the end.
-        trace: Objectives at the start and after each iteration.
-        converged: Whether the search ended at an optimum.
-        notes: Remarks for the user.
-    """
+    """Result of a search."""
 
     value: Value
-    trace: list[float]
-    converged: bool
-    notes: list[str] = field(default_factory=list)
+    trace: list[float]  # objectives at the start and after each iteration
+    converged: bool  # whether the search ended at an optimum
+    notes: list[str] = field(default_factory=list)  # remarks for the user
 
 
 def climb_em(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
@@ -139,11 +132,7 @@ def _log_step(above: float, below: float, slope: float) -> float:
 
 
 def newton_step(problem: Problem, value: Value) -> tuple[Value, float]:
-    """Take a Newton step if it raises the objective.
-
-    Returns:
-        The new or the old value, and the gain [nats] that the quadratic model predicted.
-    """
+    """Take a Newton step if it raises the objective; also return the gain [nats] that the quadratic model predicted."""
     step, left = free_direction(problem, value)
     if left <= 0:
         return value, 0.0

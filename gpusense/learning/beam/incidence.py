@@ -43,14 +43,7 @@ class Binned:
     def fit_bins(
         self, pairs: Pairs, surface: NDArray[np.bool_], angles: NDArray[np.float64], edges: NDArray[np.float64]
     ) -> tuple[tuple[BeamFit, ...], tuple[int, ...]]:
-        """Fit each bin; return the fits and their numbers of readings.
-
-        Args:
-            pairs: All pairs.
-            surface: (n,) mask of readings with a surface.
-            angles: (n,) angles of incidence [rad].
-            edges: (B + 1,) edges of the bins [rad].
-        """
+        """Fit the bins between (B + 1,) edges of the (n,) angles [rad]; return fits and numbers of readings."""
         incidence_bin = np.digitize(angles, edges[1:-1])
         fits, counts = [], []
         for number in range(len(edges) - 1):

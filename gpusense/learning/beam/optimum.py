@@ -40,25 +40,17 @@ _SHARES = (1.0, 0.5, 0.2, 0.05)
 
 @dataclass
 class Search:
-    """Search for the highest maximum by one method.
-
-    Attributes:
-        problem: The problem.
-        method: The search from one start.
-        watch: Function called after each iteration.
-    """
+    """Search for the highest maximum by one method."""
 
     problem: Problem
-    method: Method
-    watch: Watch
+    method: Method  # the search from one start
+    watch: Watch  # function called after each iteration
 
     def from_readings(self, start: Point, more: list[Point], known: Point | None = None) -> Climb:
         """Search from the likeliest start, and from starts that exceed the result.
 
-        Args:
-            start: A start; starts of the same causes are chosen from the readings.
-            more: Further starts, each followed to its maximum.
-            known: Another start, possibly without some of these causes, or None.
+        Starts with the causes of ``start`` are chosen from the readings; each of ``more`` is followed to its maximum.
+        ``known`` may lack some of these causes.
         """
         values = [self.problem.value(point) for point in (start, known) if point is not None] + self._others(start)
         values = sorted(values, key=lambda value: -value.objective)
@@ -159,19 +151,12 @@ _WEIGHT, _FACTOR = 0.1, 1.5
 
 @dataclass(frozen=True)
 class Sample:
-    """Sample of hits for choosing starts.
+    """Sample of hits for choosing starts."""
 
-    Attributes:
-        reading: (m,) readings [m].
-        expected: (m,) expected ranges [m].
-        share: Share of max readings among all readings.
-        range_max: Longest range [m].
-    """
-
-    reading: Floats
-    expected: Floats
-    share: float
-    range_max: float
+    reading: Floats  # (m,) readings [m]
+    expected: Floats  # (m,) expected ranges [m]
+    share: float  # share of max readings among all readings
+    range_max: float  # longest range [m]
 
     @classmethod
     def of(cls, pairs: Pairs) -> Sample:
@@ -232,13 +217,10 @@ def _assume(sample: Sample, bounds: Bounds, causes: NDArray[np.bool_], bias: flo
 def short_runs(
     sample: Sample, starts: list[Point], bounds: Bounds, fit_bias: bool
 ) -> tuple[list[Point], NDArray[np.float64]]:
-    """Run a few steps of EM from each start on a sample.
+    """Run a few steps of EM from C starts on a sample; return the ends and their (C,) log-likelihoods.
 
     Steps of sigma_hit and of the offset are the book's, without truncation; the long run corrects them. lambda_short
-    takes one fixed-point step of the exact M-step.
-
-    Returns:
-        The ends, with weights of at least half a reading, and (C,) log-likelihoods of the sample.
+    takes one fixed-point step of the exact M-step. Weights at the ends are at least half a reading.
     """
     z, expected = sample.reading[:, None], sample.expected[:, None]
     weights = np.array([point.weights for point in starts])
@@ -268,14 +250,9 @@ def short_runs(
 
 
 def _next_rate(parts: Floats, z: Floats, expected: Floats, rate: Floats, bounds: Bounds) -> Floats:
-    """Return lambda_short at which the mean length of short readings equals the mean of the truncated exponentials.
+    """Return (C,) lambda_short at which the mean length of short readings equals the truncated exponentials' mean.
 
-    Args:
-        parts: (m, C) responsibilities of short readings.
-        z: (m, 1) readings [m].
-        expected: (m, 1) expected ranges [m].
-        rate: (C,) lambda_short [1/m]; kept where no reading is short.
-        bounds: Bounds of the shapes.
+    ``parts`` holds the (m, C) responsibilities of short readings; the rate stays where no reading is short.
     """
     lengths = (parts * z).sum(axis=0)
     likely = (parts * ShortDensity(rate).mean(expected)).sum(axis=0)

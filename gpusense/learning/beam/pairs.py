@@ -18,25 +18,15 @@ _SAMPLE = 20_000
 
 @dataclass(frozen=True)
 class Pairs:
-    """Readings and their expected ranges.
+    """Readings and their expected ranges."""
 
-    Attributes:
-        reading: (M,) readings of the hits, in the caller's precision [m].
-        expected: (M,) expected ranges of the hits, in [0, range_max] [m].
-        places: (M,) indices of the hits among all readings.
-        kinds: (n,) class of every reading.
-        range_max: Longest range [m].
-        quantum: Rounding step of the readings; 0 without one [m].
-        block: (n,) number of each reading's block, or None.
-    """
-
-    reading: NDArray[np.floating]
-    expected: NDArray[np.floating]
-    places: NDArray[np.intp]
-    kinds: NDArray[np.uint8]
-    range_max: float
-    quantum: float
-    block: NDArray[np.intp] | None = None
+    reading: NDArray[np.floating]  # (M,) readings of the hits, in the caller's precision [m]
+    expected: NDArray[np.floating]  # (M,) expected ranges of the hits, in [0, range_max] [m]
+    places: NDArray[np.intp]  # (M,) indices of the hits among all readings
+    kinds: NDArray[np.uint8]  # (n,) class of every reading
+    range_max: float  # longest range [m]
+    quantum: float  # rounding step of the readings; 0 without one [m]
+    block: NDArray[np.intp] | None = None  # (n,) number of each reading's block, or None
 
     @property
     def hits(self) -> int:

@@ -31,21 +31,13 @@ _SAMPLE = 100_000
 
 @dataclass(frozen=True)
 class Point:
-    """Parameters during a search.
+    """Parameters during a search."""
 
-    Attributes:
-        weights: (4,) z_hit, z_short, z_max, z_rand.
-        sigma: sigma_hit [m].
-        rate: lambda_short [1/m].
-        bias: Offset of correct ranges [m].
-        shape: Shape of the density of correct ranges, of scale sigma.
-    """
-
-    weights: Floats
-    sigma: float
-    rate: float
-    bias: float = 0.0
-    shape: HitShape = NORMAL
+    weights: Floats  # (4,) z_hit, z_short, z_max, z_rand
+    sigma: float  # sigma_hit [m]
+    rate: float  # lambda_short [1/m]
+    bias: float = 0.0  # offset of correct ranges [m]
+    shape: HitShape = NORMAL  # shape of the density of correct ranges, of scale sigma
 
     @classmethod
     def of(cls, parameters: BeamParameters) -> Point:
@@ -95,17 +87,11 @@ class Point:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of the shapes.
+    """Bounds of the shapes."""
 
-    Attributes:
-        sigma: Smallest and largest sigma_hit [m].
-        rate: Smallest and largest lambda_short [1/m].
-        bias: Largest magnitude of the offset of correct ranges [m].
-    """
-
-    sigma: tuple[float, float]
-    rate: tuple[float, float]
-    bias: float
+    sigma: tuple[float, float]  # smallest and largest sigma_hit [m]
+    rate: tuple[float, float]  # smallest and largest lambda_short [1/m]
+    bias: float  # largest magnitude of the offset of correct ranges [m]
 
     def hold(self, point: Point) -> Point:
         """Return the point with its shapes clamped to the bounds."""

@@ -56,20 +56,13 @@ class Prior:
     The prior is a Dirichlet density of the weights, the density of ``counts[0]`` readings distributed by their shape
     around the offset, and the density of ``counts[1]`` short readings of mean length 1 / rate. Normalisers of truncated
     densities count as 1.
-
-    Attributes:
-        counts: (4,) pseudo-readings of each cause.
-        sigma: Standard deviation, or scale, of the pseudo-hits [m].
-        rate: Rate of the short pseudo-readings [1/m].
-        bias: Offset of the pseudo-hits [m].
-        shape: Shape of the pseudo-hits.
     """
 
-    counts: Floats
-    sigma: float = 1.0
-    rate: float = 1.0
-    bias: float = 0.0
-    shape: HitShape = NORMAL
+    counts: Floats  # (4,) pseudo-readings of each cause
+    sigma: float = 1.0  # standard deviation, or scale, of the pseudo-hits [m]
+    rate: float = 1.0  # rate of the short pseudo-readings [1/m]
+    bias: float = 0.0  # offset of the pseudo-hits [m]
+    shape: HitShape = NORMAL  # shape of the pseudo-hits
 
     def value(self, point: Point) -> float:
         """Return the log density up to a constant."""
@@ -146,40 +139,19 @@ NO_PRIOR = Prior(np.zeros(4))
 
 @dataclass(frozen=True)
 class Value:
-    """Result of one pass over the pairs at a point.
-
-    Attributes:
-        point: The parameters.
-        log_likelihood: Log-likelihood of the readings without the prior.
-        objective: Log-likelihood plus log prior.
-        totals: (4,) readings that each cause accounts for, pseudo-readings included.
-        gradient: Derivatives of the objective by the coordinates; without ``hessian``, 0 by coordinates of the shape
-            of hits.
-        sums: The device's sums.
-        hessian: Second derivatives, or None.
-    """
+    """Result of one pass over the pairs at a point."""
 
     point: Point
-    log_likelihood: float
-    objective: float
-    totals: Floats
-    gradient: Floats
-    sums: Floats
-    hessian: Floats | None = None
+    log_likelihood: float  # log-likelihood of the readings without the prior
+    objective: float  # log-likelihood plus log prior
+    totals: Floats  # (4,) readings that each cause accounts for, pseudo-readings included
+    gradient: Floats  # derivatives of the objective; without ``hessian``, 0 by coordinates of the shape of hits
+    sums: Floats  # the device's sums
+    hessian: Floats | None = None  # second derivatives, or None
 
 
 class Problem:
-    """Objective of a search: readings, a prior and bounds.
-
-    Attributes:
-        device: Sums over the pairs.
-        pairs: The readings.
-        bounds: Bounds of the shapes.
-        prior: Pseudo-readings.
-        fit_bias: True if the offset of correct ranges is free.
-        readings: Number of readings that are not missing.
-        total: Number of these readings and of pseudo-readings.
-    """
+    """Objective of a search: readings, a prior and bounds; ``total`` counts the pseudo-readings too."""
 
     def __init__(self, device: DeviceSums, pairs: Pairs, bounds: Bounds, prior: Prior, fit_bias: bool) -> None:
         self.device, self.pairs, self.bounds, self.prior, self.fit_bias = device, pairs, bounds, prior, fit_bias

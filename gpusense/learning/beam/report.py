@@ -90,16 +90,11 @@ def _errors(problem: Problem, value: Value) -> tuple[dict[str, float], dict[str,
 
 
 def _standard_errors(problem: Problem, value: Value, scatter: Floats | None = None) -> dict[str, float]:
-    """Compute the standard error of each parameter by name.
+    """Compute the standard error of each parameter by name, from the scatter over blocks if there are any.
 
     The covariance is the inverse of minus the second derivatives by the free coordinates, transformed to the parameters
     by their derivatives. The error is NaN for a held parameter (0, at a bound, or of a cause without readings), and
     infinite if the readings hold no information about it.
-
-    Args:
-        problem: The problem.
-        value: The optimum, with second derivatives.
-        scatter: Scatter of the gradient over blocks, see ``blocks``; None for independent readings.
     """
     assert value.hessian is not None
     free = problem.free(value)

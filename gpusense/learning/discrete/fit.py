@@ -251,23 +251,14 @@ def _errors(information: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Counts:
-    """Counts of readings: ``counts[k]`` readings in step ``steps[k]`` with an obstacle expected in ``rows[k]``.
+    """Counts of readings: ``counts[k]`` readings in step ``steps[k]`` with an obstacle expected in ``rows[k]``."""
 
-    Attributes:
-        rows: (K,) steps of expected ranges.
-        steps: (K,) steps of readings.
-        counts: (K,) numbers of readings.
-        missing: Number of missing readings.
-        bins: Number of steps along the beam.
-        width: Width of a step [m].
-    """
-
-    rows: NDArray[np.int64]
-    steps: NDArray[np.int64]
-    counts: Floats
-    missing: int
-    bins: int
-    width: float
+    rows: NDArray[np.int64]  # (K,) steps of expected ranges
+    steps: NDArray[np.int64]  # (K,) steps of readings
+    counts: Floats  # (K,) numbers of readings
+    missing: int  # number of missing readings
+    bins: int  # number of steps along the beam
+    width: float  # width of a step [m]
 
     @property
     def total(self) -> float:

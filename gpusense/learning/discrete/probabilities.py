@@ -41,15 +41,10 @@ MOST_BINS = 4096
 
 
 def log_table(log_trigger: Floats, log_pass: Floats) -> Floats:
-    """Compute log P of every step and of no return from the causes' probabilities at a step that the beam has reached.
+    """Compute (rows, bins + 1) log P of every step, and of no return in the last column.
 
-    Args:
-        log_trigger: (causes, rows, bins) ``log h_k``.
-        log_pass: (causes, rows, bins) ``log(1 - h_k)``, a separate argument because ``log h_k`` does not determine it
-            exactly.
-
-    Returns:
-        (rows, bins + 1); the last column is the remainder.
+    ``log_trigger`` and ``log_pass`` (causes, rows, bins) are log h and log(1 - h) of the causes at a step that the beam
+    has reached; the former does not determine the latter exactly.
     """
     steps = log_pass.sum(axis=0)
     reached = np.concatenate([np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)], axis=1)
@@ -64,25 +59,12 @@ def separate_causes(
     bins: int, width: float, *, lambda_short: float, lambda_rand: float, p_detect: float, sigma_hit: float,
     rows: Integers, steps: Integers,
 ) -> Floats:  # fmt: skip
-    """Compute probabilities for independent causes; the first cause to trigger determines the reading.
+    """Compute log probabilities for independent causes; the first cause to trigger determines the reading.
 
     Unknown obstacles have a constant rate up to the step of the expected obstacle, random triggers a constant rate
     along the whole beam. The expected obstacle is detected with probability ``p_detect``, in a step distributed around
     its own by :func:`log_spread`. Its trigger probability at a step is this step's share of the remaining mass:
     detections at this step and later, and misses. The products over causes have closed forms.
-
-    Args:
-        bins: Steps along the beam.
-        width: Width of a step [m].
-        lambda_short: Rate of unknown obstacles [1/m].
-        lambda_rand: Rate of random triggers [1/m].
-        p_detect: Probability that the expected obstacle is detected if no cause triggers earlier.
-        sigma_hit: Standard deviation of the detected range [m]; 0 detects the obstacle in its step.
-        rows: Step of the expected obstacle, ``bins`` for none within range.
-        steps: Step of the reading, ``bins`` for no return.
-
-    Returns:
-        Natural logarithms of probabilities, in the broadcast shape of rows and steps.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         unknown, random = (np.log(-np.expm1(-rate * width)) for rate in (lambda_short, lambda_rand))
@@ -105,25 +87,11 @@ def shared_causes(
     bins: int, width: float, *, z_hit: float, z_short: float, z_max: float, z_rand: float, sigma_hit: float,
     lambda_short: float, rows: Integers,
 ) -> Floats:  # fmt: skip
-    """Compute the table whose causes have the shares of the beam model's mixture among the readings.
+    """Compute the (R, bins + 1) log table whose causes have the shares of the beam model's mixture among the readings.
 
     At step i cause k triggers with probability ``z_k m_ki / (mass of the mixture from step i on)``, where m_ki is the
     share of its component in that step. Two causes that trigger at the same step make one reading: the only difference
     from the mixture's integrals over the steps, which vanishes with their width.
-
-    Args:
-        bins: Steps along the beam.
-        width: Width of a step [m].
-        z_hit: Weight of a correct range.
-        z_short: Weight of an unexpected obstacle.
-        z_max: Weight of no return.
-        z_rand: Weight of a random reading.
-        sigma_hit: Standard deviation of a correct range [m].
-        lambda_short: Rate of unexpected obstacles [1/m].
-        rows: (R,) indices of the rows, 0 to ``bins``.
-
-    Returns:
-        (R, bins + 1) natural logarithms of probabilities.
     """
     total = math.fsum((z_hit, z_short, z_max, z_rand))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -168,15 +136,12 @@ def _log_difference(larger: Floats, smaller: Floats) -> Floats:
 
 
 def log_spread(bins: int, width: float, sigma: float) -> Floats:
-    """Return the log share of an obstacle's readings that fall d steps from its step, d = 0 to ``bins``.
+    """Return the (bins + 1,) log shares of an obstacle's readings that fall d = 0 to ``bins`` steps from its step.
 
     The obstacle is uniform in its step, readings are normal around it, and the beam has no ends. For s = width / sigma
     the share is ``s`` times the integral of ``(1 - |u|) phi((d + u) s)`` over [-1, 1], or the second difference ``(H(x
     - s) - 2 H(x) + H(x + s)) / s`` at x = d s of ``H(x) = phi(x) - x Q(x)``, where Q is the normal's upper tail. Small
     s use Gauss-Legendre quadrature, large s or x the difference; both keep 14 digits.
-
-    Returns:
-        (bins + 1,) natural logarithms.
     """
     d = np.arange(bins + 1.0)
     s = math.inf if sigma == 0 else width / sigma
@@ -232,10 +197,9 @@ def bins_of(ranges: NDArray[np.float64], range_max: float, bins: int) -> NDArray
 
 
 def check_pairs(ranges: object, expected: object, range_max: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Classify readings and expected ranges; range_max is rounded to their dtypes, as in ``classify``.
+    """Return float64 readings, NaN for missing and inf for no return, and expected ranges, inf for no obstacle.
 
-    Returns:
-        float64 readings, NaN for missing and inf for no return, and float64 expected ranges, inf for no obstacle.
+    range_max is rounded to their dtypes, as in ``classify``.
     """
     z = checks.array("ranges", ranges, finite=False, dtype=None)
     z_exp = checks.array("expected", expected, z.shape, finite=False, dtype=None)

@@ -80,9 +80,8 @@ def climb(
 ) -> tuple[Pairs, Value, list[float], bool]:
     """Climb until the remaining gain, estimated from the second derivatives, is at most ``tolerance`` nats.
 
-    Returns:
-        The pairs of relevant probability, the final value, the log-likelihoods at the start and after each iteration,
-        and whether the search converged.
+    Returns the pairs of relevant probability, the final value, the log-likelihoods at the start and after each
+    iteration, and whether the search converged.
     """
     value = evaluate(pairs, start)
     trace, newton = [value.log_likelihood], False
@@ -159,11 +158,7 @@ def free(pairs: Pairs, value: Value, bias: bool) -> Integers:
 
 
 def _newton_step(pairs: Pairs, value: Value, bias: bool) -> tuple[Value, float]:
-    """Take a Newton step if it raises the log-likelihood.
-
-    Returns:
-        The new or the old value, and the gain [nats] that the quadratic model predicted.
-    """
+    """Take a Newton step if it raises the log-likelihood; also return the predicted gain [nats]."""
     step, left = newton_direction(value.gradient, hessian(pairs, value.point), free(pairs, value, bias))
     if left <= 0:
         return value, 0.0

@@ -40,23 +40,14 @@ _FLAT = 1e-10
 
 @dataclass(frozen=True)
 class Sightings:
-    """Checked arguments of a fit: features with at least one measured part, and the poses of all scans.
+    """Checked arguments of a fit: features with at least one measured part, and the poses of all scans."""
 
-    Attributes:
-        sensors: (S, 3) poses of the sensor.
-        scan: (F,) index of each feature's pose.
-        features: (F, 3) range, bearing and signature; NaN for missing parts.
-        indices: (F,) indices of these features among the caller's.
-        total: Number of the caller's features.
-        pairs: The features with their possible landmarks.
-    """
-
-    sensors: Floats
-    scan: Integers
-    features: Floats
-    indices: Integers
-    total: int
-    pairs: Pairs
+    sensors: Floats  # (S, 3) poses of the sensor
+    scan: Integers  # (F,) index of each feature's pose
+    features: Floats  # (F, 3) range, bearing and signature; NaN for missing parts
+    indices: Integers  # (F,) indices of these features among the caller's
+    total: int  # number of the caller's features
+    pairs: Pairs  # the features with their possible landmarks
 
 
 def fit_landmark_parameters(

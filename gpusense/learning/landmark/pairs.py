@@ -30,17 +30,11 @@ _BLOCK = 1 << 20
 
 @dataclass(frozen=True)
 class Point:
-    """Parameters during a search.
+    """Parameters during a search."""
 
-    Attributes:
-        sigma: Standard deviations of range [m], bearing [rad] and signature.
-        z_detect: Weight of a feature that comes from a landmark.
-        bias: Offsets of range [m] and bearing [rad].
-    """
-
-    sigma: tuple[float, float, float]
-    z_detect: float
-    bias: tuple[float, float]
+    sigma: tuple[float, float, float]  # standard deviations of range [m], bearing [rad] and signature
+    z_detect: float  # weight of a feature that comes from a landmark
+    bias: tuple[float, float]  # offsets of range [m] and bearing [rad]
 
     def moved(self, step: Floats) -> Point:
         """Return the point after a step in log sigma, log odds of z_detect, and offsets."""
@@ -54,17 +48,11 @@ class Point:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of the sensor.
+    """Limits of the sensor."""
 
-    Attributes:
-        range_max: Largest range [m].
-        half_field: Half the field of view [rad].
-        span: Smallest and largest signature.
-    """
-
-    range_max: float
-    half_field: float
-    span: tuple[float, float]
+    range_max: float  # largest range [m]
+    half_field: float  # half the field of view [rad]
+    span: tuple[float, float]  # smallest and largest signature
 
     @property
     def full_circle(self) -> bool:
@@ -74,29 +62,17 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """P pairs in the order of their F features.
+    """P pairs in the order of their F features."""
 
-    Attributes:
-        feature: (P,) feature of each pair.
-        landmark: (P,) landmark of each pair.
-        prior: (P,) log probability of this landmark, given that the feature comes from a landmark.
-        residuals: (P, 3) residuals of range, bearing (in [-pi, pi]) and signature; NaN for missing parts.
-        means: (P, 3) expected range, bearing and signature.
-        in_view: (P,) whether the landmark is within the limits.
-        uniform: (F,) log density of a false positive.
-        present: True if at least one feature has a range, a bearing and a signature.
-        limits: Limits of the sensor.
-    """
-
-    feature: Integers
-    landmark: Integers
-    prior: Floats
-    residuals: Floats
-    means: Floats
-    in_view: NDArray[np.bool]
-    uniform: Floats
-    present: tuple[bool, bool, bool]
-    limits: Limits
+    feature: Integers  # (P,) feature of each pair
+    landmark: Integers  # (P,) landmark of each pair
+    prior: Floats  # (P,) log probability of this landmark, given that the feature comes from a landmark
+    residuals: Floats  # (P, 3) residuals of range, bearing (in [-pi, pi]) and signature; NaN for missing parts
+    means: Floats  # (P, 3) expected range, bearing and signature
+    in_view: NDArray[np.bool]  # (P,) whether the landmark is within the limits
+    uniform: Floats  # (F,) log density of a false positive
+    present: tuple[bool, bool, bool]  # True if at least one feature has a range, a bearing and a signature
+    limits: Limits  # limits of the sensor
 
     @property
     def measured(self) -> tuple[bool, bool, bool]:
@@ -112,21 +88,13 @@ class Pairs:
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """The log-likelihood at a point and its parts.
-
-    Attributes:
-        point: The parameters.
-        log_likelihood: Log-likelihood of all features.
-        gradient: (6,) derivatives by the steps of :meth:`Point.moved`.
-        responsibility: (P,) probability of each pair.
-        false: (F,) probability that each feature is a false positive.
-    """
+    """The log-likelihood at a point and its parts."""
 
     point: Point
-    log_likelihood: float
-    gradient: Floats
-    responsibility: Floats
-    false: Floats
+    log_likelihood: float  # log-likelihood of all features
+    gradient: Floats  # (6,) derivatives by the steps of :meth:`Point.moved`
+    responsibility: Floats  # (P,) probability of each pair
+    false: Floats  # (F,) probability that each feature is a false positive
 
 
 def sensor_poses(poses: Floats, mount: Mount) -> Floats:
@@ -165,15 +133,9 @@ def in_view(sensors: Floats, xy: Floats, limits: Limits) -> tuple[Integers, Inte
 def make_pairs(
     sensors: Floats, features: Floats, xy: Floats, signatures: Floats | None, known: Integers | None, limits: Limits
 ) -> Pairs:
-    """Pair features with their known landmarks, or with all landmarks in view.
+    """Pair (F, 3) features with their known (F,) landmarks, -1 for none, or else with all landmarks in view.
 
-    Args:
-        sensors: (F, 3) pose of the sensor for each feature.
-        features: (F, 3) range, bearing and signature; NaN for missing parts.
-        xy: (M, 2) landmarks.
-        signatures: (M,) signatures of the landmarks, or None.
-        known: (F,) landmark of each feature, -1 for none; None if unknown.
-        limits: Limits of the sensor.
+    Missing parts of features are NaN. ``sensors`` holds the (F, 3) poses of the sensor.
     """
     if known is None:
         feature, landmark = in_view(sensors, xy, limits)

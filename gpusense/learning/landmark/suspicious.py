@@ -121,14 +121,9 @@ def suspicious_landmarks(
 
 
 def _exchanges(judged: np.ndarray, count: np.ndarray, log_p: Floats, agree: Floats, least: float) -> list[Exchange]:
-    """Return disjoint exchanges, the largest gain first.
+    """Return disjoint exchanges among the judged landmarks, the largest gain first.
 
-    Args:
-        judged: Landmarks with enough features.
-        count: (M,) numbers of features.
-        log_p: (M, M) log-likelihood of the row's features at the column's position.
-        agree: (M, M) share of these features that agree.
-        least: Smallest gain [nats].
+    Rows of ``log_p`` and ``agree`` (M, M) are labels of features, columns positions.
     """
     candidates = []
     for place, j in enumerate(judged):

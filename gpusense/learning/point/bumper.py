@@ -141,10 +141,8 @@ def fit_bumper_parameters(
 def outline_gaps(model: BumperModel, poses: Floats) -> Floats:
     """Return the (F, B) gaps from each segment of the outline to the nearest obstacle, by the model [m].
 
-    Args:
-        model: A model with p_contact = 1 and p_false = 0: log p is log Phi(-gap / sigma) for a pressed bumper, else
-            log Phi(gap / sigma). The smaller of the two determines the gap precisely.
-        poses: (F, 3) robot poses.
+    If p_contact = 1 and p_false = 0, log p is log Phi(-gap / sigma) for a pressed bumper, else log Phi(gap / sigma).
+    The smaller of the two determines the gap precisely.
     """
     from scipy.special import ndtri_exp
 

@@ -25,17 +25,9 @@ _WIDEST_SUM, _WRAPS, _WAVES = 1.5, 3, 6
 def truncated(
     residual: Floats, mean: Floats, range_max: float, scale: float | Floats, shape: HitShape
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the log density of a hit, truncated to [0, range_max], and its derivatives.
+    """Return (n,) log densities of hits truncated to [0, range_max], and their derivatives by log scale and mean [1/m].
 
-    Args:
-        residual: (n,) range minus mean [m].
-        mean: (n,) mean before it is clamped to [0, range_max] [m].
-        range_max: Longest range [m].
-        scale: Standard deviation or scale, one or (n,) [m].
-        shape: Shape of the density.
-
-    Returns:
-        (n,) log density, its derivatives by log scale and by the mean [1/m].
+    ``residual`` is range minus mean [m], and ``mean`` not yet clamped to [0, range_max].
     """
     near = np.clip(mean, 0, range_max)
     u, x_0, x_1 = residual / scale, near / scale, (range_max - near) / scale
@@ -52,13 +44,7 @@ def by_shape(
 ) -> list[Floats]:
     """Return the derivatives of the log density of truncated hits by the coordinates of their shape, by differences.
 
-    Args:
-        u: (n,) distances from the mean, in scales.
-        near: (n,) distances of the mean from 0, in scales.
-        far: (n,) distances of range_max from the mean, in scales.
-        at: (P,) coordinates.
-        make: Function that makes the shape at coordinates.
-        limits: (P, 2) limits of the coordinates.
+    Distances in scales: ``u`` from the mean, ``near`` from 0 to the mean, ``far`` from the mean to range_max.
     """
     columns: list[Floats] = []
     for place, (low, high) in enumerate(limits):
@@ -72,12 +58,7 @@ def by_shape(
 
 
 def wrapped_normal(residual: Floats, sigma: float) -> tuple[Floats, Floats, Floats]:
-    """Return the log density of a wrapped normal, its derivatives by log sigma, and by the mean [1/rad].
-
-    Args:
-        residual: (n,) residuals in [-pi, pi] [rad].
-        sigma: Standard deviation before wrapping [rad].
-    """
+    """Return the log density of a wrapped normal at (n,) residuals, its derivatives by log sigma and mean [1/rad]."""
     if sigma > _WIDEST_SUM:
         n = np.arange(1, _WAVES + 1)
         wave = 2 * np.exp(-0.5 * np.minimum(n * sigma, 1e3) ** 2)
@@ -94,12 +75,7 @@ def wrapped_normal(residual: Floats, sigma: float) -> tuple[Floats, Floats, Floa
 
 
 def von_mises(residual: Floats, kappa: float) -> tuple[Floats, Floats, Floats]:
-    """Return the log density of a von Mises distribution, its derivatives by log kappa, and by the mean [1/rad].
-
-    Args:
-        residual: (n,) residuals [rad].
-        kappa: Concentration [1].
-    """
+    """Return the log density of a von Mises distribution, its derivatives by log kappa, and by the mean [1/rad]."""
     from scipy.special import i0e, i1e
 
     drop = 2 * np.sin(residual / 2) ** 2

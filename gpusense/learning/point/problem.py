@@ -104,13 +104,9 @@ class Problem(ABC):
 
 
 def mix(parts: list[tuple[float, Floats]]) -> tuple[Floats, Floats, list[Floats]]:
-    """Return the log of a weighted sum of densities, the shares, and the ratio of each density to the sum.
+    """Return the (n,) log of a weighted sum of c densities, their (c, n) shares, and their ratios to the sum.
 
-    Args:
-        parts: Weight and (n,) log density of each component.
-
-    Returns:
-        (n,) log p; (c, n) shares of p, which sum to 1; c ratios (n,) density / p, the derivatives by the weights.
+    The ratios are the derivatives by the weights.
     """
     logs = np.array([log for _, log in parts])
     with np.errstate(divide="ignore"):

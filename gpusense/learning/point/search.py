@@ -25,32 +25,17 @@ _FLAT, _NEGATIVE = 1e-10, 1e-7
 
 @dataclass(frozen=True)
 class Climb:
-    """End of a search.
+    """End of a search."""
 
-    Attributes:
-        theta: (k,) coordinates.
-        value: Log-likelihood.
-        trace: Log-likelihood at the start and after each iteration.
-        converged: True if the end is a maximum.
-        free: (k,) mask of the coordinates that are not held at a bound.
-    """
-
-    theta: Floats
-    value: float
-    trace: list[float]
-    converged: bool
-    free: NDArray[np.bool_]
+    theta: Floats  # (k,) coordinates
+    value: float  # log-likelihood
+    trace: list[float]  # log-likelihood at the start and after each iteration
+    converged: bool  # True if the end is a maximum
+    free: NDArray[np.bool_]  # (k,) mask of the coordinates that are not held at a bound
 
 
 def maximize(problem: Problem, max_iterations: int, tolerance: float, start: Floats | None = None) -> Climb:
-    """Search from the likeliest starts, and return the end with exchangeable parts in canonical order.
-
-    Args:
-        problem: The problem.
-        max_iterations: Largest number of iterations of a search.
-        tolerance: A search has converged once it expects to gain less than this [nats].
-        start: The only start; None takes the problem's starts.
-    """
+    """Search from the likeliest starts, and return the end with exchangeable parts in canonical order."""
     end = _best_end(problem, max_iterations, tolerance, start)
     theta = problem.ordered(end.theta)
     if np.array_equal(theta, end.theta):

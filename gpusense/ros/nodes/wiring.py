@@ -46,12 +46,7 @@ def unreliable(depth: int) -> QoSProfile:
 
 
 def diagnostic_array(fields: dict[str, Any], stamp: Any) -> DiagnosticArray:
-    """Return the message of one status.
-
-    Args:
-        fields: The fields of the status, see :func:`gpusense.ros.diagnostics.status_fields`.
-        stamp: builtin_interfaces/Time of the message.
-    """
+    """Return the message of one status."""
     status = DiagnosticStatus(name=fields["name"], hardware_id=fields["hardware_id"], message=fields["message"])
     status.level = bytes([fields["level"]])
     status.values = [KeyValue(**pair) for pair in fields["values"]]
@@ -61,14 +56,7 @@ def diagnostic_array(fields: dict[str, Any], stamp: Any) -> DiagnosticArray:
 
 
 class Guard:
-    """Guard that lets a callback fail without ending the node; errors are logged and kept for diagnostics.
-
-    Args:
-        log: Logger of the node.
-
-    Attributes:
-        troubles: Error of each subject with a failed last callback.
-    """
+    """Guard that lets a callback fail without ending the node; errors are logged, and kept in ``troubles``."""
 
     def __init__(self, log: Any) -> None:
         self.log = log
@@ -76,12 +64,7 @@ class Guard:
         self._logged: dict[str, tuple[str, float]] = {}
 
     def around(self, subject: str, callback: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a callback with a guard around it.
-
-        Args:
-            subject: Name of the topic, or of the work, in messages.
-            callback: The callback. A failing service returns its response.
-        """
+        """Return a callback with a guard around it; a failing service returns its response."""
 
         @functools.wraps(callback)
         def run(*arguments: Any) -> Any:
@@ -117,13 +100,8 @@ class Guard:
 class Transforms:
     """Transforms of the robot, from ``/tf``, or odometry from ``nav_msgs/Odometry`` and the mount from a parameter.
 
-    Args:
-        node: The node.
-        guard: Its guard.
-        frames: Frames of the odometry and the robot's base.
-        odometry: Topic of nav_msgs/Odometry; empty for transforms.
-        mount: Pose (x, y, yaw) of the laser on the robot; None for transforms.
-        arrived: Called after new transforms.
+    An empty topic ``odometry``, or None as ``mount`` (x, y, yaw), leaves it to ``/tf``. ``arrived`` is called after new
+    transforms.
     """
 
     def __init__(

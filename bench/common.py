@@ -47,15 +47,7 @@ THROUGH = "GPUSENSE_BENCH_THROUGH"
 def make_parser(
     doc: str | None, *, backend: str = "present", data: bool = False, seed: bool = True
 ) -> argparse.ArgumentParser:
-    """Make a parser with the options that the scripts share.
-
-    Args:
-        doc: The script's docstring, shown as its help.
-        backend: The default of ``--backend``: "present" for every device of the machine, "kernels" for every one but
-            NumPy, the selection string of a single device, "" for no such option.
-        data: Whether the script reads recorded data.
-        seed: Whether the script has ``--seed``.
-    """
+    """Make a parser with the options that the scripts share."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     if backend in ("present", "kernels"):
         which = "every device present" + (" but NumPy" if backend == "kernels" else "")
@@ -311,11 +303,7 @@ def differing_bits(one: Any, other: Any) -> int:
 def best(run: Callable[[], Any], repeats: int, longest: float, least: int = 1) -> tuple[float, float]:
     """Return the shortest and the median time of calls [s].
 
-    Args:
-        run: The call.
-        repeats: The number of calls.
-        longest: The most time of all calls together [s]; fewer calls are made where they would take longer.
-        least: The number of calls that are made in any case.
+    ``longest``: The most time of all calls together [s]; fewer calls are made where they would take longer.
     """
     times: list[float] = []
     while len(times) < repeats and (len(times) < least or sum(times) + times[-1] < longest):
@@ -343,11 +331,7 @@ class Way:
 def in_turns(ways: Sequence[Way], calls: int, turn: int = 1, seconds: float = 0.0) -> list[list[float]]:
     """Time ways in turns, so that ratios are valid on a busy machine.
 
-    Args:
-        ways: They take turns in this order.
-        calls: The least number of calls of each way.
-        turn: Calls of a turn. A turn of several calls begins with a call that is not counted.
-        seconds: The least time of all calls together [s].
+    ``seconds``: The least time of all calls together [s].
 
     Returns:
         Seconds of each call, for each way.
@@ -406,15 +390,7 @@ def machine(commit: str) -> dict[str, str]:
 
 
 def publish(script: str, arguments: argparse.Namespace, text: str, report: dict[str, Any], remark: str = "") -> None:
-    """Print a script's tables, then machine and command, and write them and the report to ``--output``.
-
-    Args:
-        script: The script's ``__file__``.
-        arguments: Those of :func:`parse`.
-        text: The tables.
-        report: The contents of the .json file, without machine and command.
-        remark: Sentences before the machine.
-    """
+    """Print a script's tables, then machine and command, and write them and the report to ``--output``."""
     command = command_line(Path(script).resolve().relative_to(ROOT).as_posix())
     if getattr(arguments, "data", None) is not None:
         # The path of the data means nothing on other machines.

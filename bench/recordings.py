@@ -270,13 +270,7 @@ _ONE_THREAD = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
 
 
 def results(function, jobs, processes=1):
-    """Yield ``function(*job)`` of each job, in their order; of several processes each has one thread.
-
-    Args:
-        function: A function of a module, for one process and for several.
-        jobs: Its arguments, plain data.
-        processes: Number of processes; 1 runs the jobs here, with all threads.
-    """
+    """Yield ``function(*job)`` of each job, in their order; of several processes each has one thread."""
     if processes == 1:
         yield from (function(*job) for job in jobs)
         return

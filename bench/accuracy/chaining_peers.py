@@ -30,10 +30,7 @@ _CONFIGURATION = "#define STDC_HEADERS 1\n" + "\n".join(
 def build(source: Path, gsl: Path | None, folder: Path, *, shared: bool = False) -> Path:
     """Compile ``peer_code/csm.c`` and return the program, or with ``shared`` a library of its functions.
 
-    Args:
-        source: A copy of CSM's repository.
-        gsl: The folder of GSL's ``include`` and ``lib``; None if the compiler finds them.
-        folder: The folder for the program.
+    ``gsl``: The folder of GSL's ``include`` and ``lib``; None if the compiler finds them.
     """
     root, program = source / "sm", folder / ("csm.so" if shared else "csm")
     files = [path for part in ("csm", "lib") for path in sorted((root / part).rglob("*.c"))]
@@ -54,12 +51,7 @@ def build(source: Path, gsl: Path | None, folder: Path, *, shared: bool = False)
 def steps(program: Path, ranges: np.ndarray, scanner: gs.Scanner, guess: np.ndarray, folder: Path) -> np.ndarray:
     """Match each scan to the one before, and return the motions of the robot (S - 1, 3); guesses where CSM fails.
 
-    Args:
-        program: The program that ``build`` made.
-        ranges: (S, K) readings [m].
-        scanner: Their scanner.
-        guess: (S - 1, 3) motions of the robot.
-        folder: A folder for its files.
+    ``ranges``: (S, K) readings [m]. ``guess``: (S - 1, 3) motions of the robot.
     """
     mount = np.array(scanner.mount)
     order = np.argsort(scanner.bearings)

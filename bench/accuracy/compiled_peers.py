@@ -51,15 +51,8 @@ class Compiled:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the weight of each pose, and the cells of the likelihood field: distances [m], or densities.
 
-        Args:
-            grid: The map.
-            scanner: The scanner, without a mount.
-            parameters: z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, max_distance.
-            model: A key of MODELS.
-            options: For Beluga, 1 for model_unknown_space and 2 for only_obstacle_boundaries.
-            poses: (N, 3) poses.
-            ranges: (K,) readings [m].
-            nearest: Index of the nearest obstacle of each cell, or -1; None for the peer's own distances.
+        ``poses``: (N, 3) poses. ``ranges``: (K,) readings [m]. ``nearest``: Index of the nearest obstacle of each cell,
+        or -1; None for the peer's own distances.
         """
         rows, cols = grid.shape
         weights, field = np.empty(len(poses)), np.zeros(grid.shape, np.float32)
@@ -179,11 +172,7 @@ class Follower:
 def build(name: str, source: Path, include: Sequence[Path], folder: Path) -> Compiled:
     """Compile a peer.
 
-    Args:
-        name: ``"amcl"`` or ``"beluga"``.
-        source: A copy of navigation2, or of Beluga.
-        include: Folders of headers: Sophus for Beluga, Eigen and range-v3 where the compiler does not find them.
-        folder: Place of the library.
+    ``name``: ``"amcl"`` or ``"beluga"``.
     """
     library = folder / f"{name}.so"
     if name == "amcl":

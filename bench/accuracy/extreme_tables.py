@@ -33,11 +33,7 @@ Row = dict[str, Any]
 
 
 def write_tables(page: Path, tables: dict[str, str]) -> None:
-    """Replace the text between the marks of a page.
-
-    Raises:
-        ValueError: A mark is missing.
-    """
+    """Replace the text between the marks of a page."""
     text = page.read_text(encoding="utf-8")
     for name, lines in tables.items():
         begin, end = f"<!-- made: {name} -->", "<!-- end -->"

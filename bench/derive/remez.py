@@ -20,12 +20,6 @@ def polynomial(powers: list, z: mp.mpf) -> mp.mpf:
 def remez(f: Function, weight: Function, grid: list[mp.mpf], count: int) -> list[mp.mpf]:
     """Find the polynomial with the smallest maximal weighted error at the points of a grid.
 
-    Args:
-        f: The function to approximate.
-        weight: Multiplies the error.
-        grid: Points in ascending order, dense at both ends.
-        count: The number of coefficients.
-
     Returns:
         The coefficients, lowest power first.
     """

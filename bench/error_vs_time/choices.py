@@ -89,14 +89,7 @@ def own(rows: Iterable[Row], need: str, device: str, scene: str = ALL) -> list[R
 
 
 def chosen(rows: Sequence[Row], wish: Wish, device: str, standing: str = "") -> tuple[Row | None, bool]:
-    """Return the method for a wish and whether it keeps the limit, else the nearest one; None without any.
-
-    Args:
-        rows: Rows of all devices.
-        wish: The wish.
-        device: Title of the device.
-        standing: Text of the answer of an earlier day, which stands until another one is clearly better.
-    """
+    """Return the method for a wish and whether it keeps the limit, else the nearest one; None without any."""
     able = [row for row in own(rows, wish.need, device) if wish.only(row) and not row.maps]
     if not able:
         return None, False

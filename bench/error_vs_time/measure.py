@@ -73,11 +73,7 @@ def plans_of(arguments: argparse.Namespace) -> tuple[list[Plan], dict[str, Any],
 def models(
     arguments: argparse.Namespace, stated: str, begin: float, old: dict[str, Any] | None = None
 ) -> Iterator[dict[str, Any]]:
-    """Measure the scenes that an old report lacks until the deadline; yield the report after each one.
-
-    Raises:
-        ValueError: The old report has other sizes or devices.
-    """
+    """Measure the scenes that an old report lacks until the deadline; yield the report after each one."""
     plans, given, absent = plans_of(arguments)
     outcome, command = Outcome([], []), command_line("bench/error_vs_time/measure.py")
     if old is not None:
@@ -113,11 +109,7 @@ def models(
 def tasks(
     arguments: argparse.Namespace, stated: str, begin: float, old: dict[str, Any] | None = None
 ) -> Iterator[dict[str, Any]]:
-    """Measure the needs that an old report lacks until the deadline; yield the report after each one.
-
-    Raises:
-        ValueError: The old report has other devices.
-    """
+    """Measure the needs that an old report lacks until the deadline; yield the report after each one."""
     devices, command = [get_backend(name) for name in arguments.backend], command_line("bench/error_vs_time/measure.py")
     rows: list[dict[str, Any]] = []
     if old is not None:
@@ -141,11 +133,7 @@ def same(old: object, new: object, what: str) -> None:
 
 
 def earlier(output: Path, kind: str, stated: str) -> dict[str, Any] | None:
-    """Return the report to extend, or None.
-
-    Raises:
-        ValueError: It is damaged, or of another commit or machine.
-    """
+    """Return the report to extend, or None."""
     file = output.with_name(f"{output.name}_{kind}.json")
     if not file.is_file():
         return None

@@ -190,12 +190,7 @@ def _written(standing: Standing) -> str:
 def files(folder: Path = RESULTS, last: Standing | None = None) -> dict[Path, str]:
     """Return all files of the page by their paths in the checkout.
 
-    Args:
-        folder: The folder of the reports.
-        last: Answers of the last page; None: those of standing.csv.
-
-    Raises:
-        ValueError: A report is damaged or of uncommitted changes, or there is none.
+    ``last``: Answers of the last page; None: those of standing.csv.
     """
     found = sources(folder)
     every = rows_of(found)

@@ -99,14 +99,7 @@ def _commits_since(commit: str, folders: tuple[str, ...], root: Path) -> float:
 
 
 def commit_trouble(commit: str, *, root: Path = ROOT, limit: int = LIMIT, folders: Sequence[str] = FOLDERS) -> str:
-    """Return why a report of a commit must not be published; empty if it may.
-
-    Args:
-        commit: The commit that the report states.
-        root: The checkout, with its history.
-        limit: Most commits to ``folders`` since then.
-        folders: The code that the report measures.
-    """
+    """Return why a report of a commit must not be published; empty if it may."""
     if not commit or commit.endswith("+"):
         return f"is of a checkout with uncommitted changes: {commit or 'no commit'}"
     since = _commits_since(commit, tuple(folders), root)
@@ -119,11 +112,7 @@ def commit_trouble(commit: str, *, root: Path = ROOT, limit: int = LIMIT, folder
 
 
 def sources(folder: Path = RESULTS) -> list[Source]:
-    """Read all reports of a folder, processors first.
-
-    Raises:
-        ValueError: A report is damaged, or of uncommitted changes, or two are of the same device.
-    """
+    """Read all reports of a folder, processors first."""
     found = []
     for kind in LISTS:
         for file in sorted(folder.glob(PATTERN.format(kind))):
@@ -179,11 +168,7 @@ def _json(value: Any) -> str:
 
 
 def read(file: Path, kind: str) -> dict[str, Any]:
-    """Read a report file.
-
-    Raises:
-        ValueError: The file is not a report of this kind.
-    """
+    """Read a report file."""
     return parsed(file.read_text(encoding="utf-8"), file.name, kind)
 
 

@@ -52,10 +52,7 @@ def thinned(scanner: gs.Scanner, beams: int) -> tuple[gs.Scanner, np.ndarray]:
 def rivals(run: Any, start: Sequence[float], settling: int) -> Iterator[Setting]:
     """Yield the settings of both programs; note the reasons of those that cannot run.
 
-    Args:
-        run: The drive: map, scans, odometry and true poses.
-        start: Standard deviations of the start around the true pose [m, m, rad].
-        settling: Number of scans at the beginning that do not count.
+    ``start``: Standard deviations of the start around the true pose [m, m, rad].
     """
     scanner, chosen = thinned(run.scanner, BEAMS)
     for name, (_, package, _) in PEERS.items():

@@ -25,12 +25,7 @@ SET, READ, CLAIM = b"\x31\xc9", b"\x0f\x01\xd0", b"\x6a\x07\x58"
 
 
 def copy_driver(folder: Path) -> Path:
-    """Copy PoCL's wheel without AVX-512, and return the file that names the driver.
-
-    Raises:
-        FileNotFoundError: there is no such wheel.
-        ValueError: its compiler does not ask in the known way.
-    """
+    """Copy PoCL's wheel without AVX-512, and return the file that names the driver."""
     for package in PACKAGES:
         spec = importlib.util.find_spec(package)
         if spec is None or not spec.submodule_search_locations:

@@ -31,11 +31,7 @@ MOST_OFF = 1e-3
 
 
 def measure(selection: str, poses: np.ndarray, ranges: np.ndarray, grid: Any, scanner: Any, options: Any) -> Any:
-    """Return seconds of a call, of its launches, and of all cores in a call.
-
-    Raises:
-        RuntimeError: the gradient is wrong.
-    """
+    """Return seconds of a call, of its launches, and of all cores in a call."""
     device, parameters = Recorder(get_backend(selection)), gs.LikelihoodFieldParameters(interpolation="bilinear")
     model = gs.LikelihoodFieldModel(grid, scanner, parameters, backend=device)  # type: ignore[arg-type]
     exact = gs.LikelihoodFieldModel(grid, scanner, parameters, backend="numpy", precision="float64")

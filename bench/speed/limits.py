@@ -193,11 +193,7 @@ def jobs(scene: Scene, device: Any, arguments: argparse.Namespace) -> Iterator[J
 
 
 def measure(device: Recorder, job: Job, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Measure one row.
-
-    Raises:
-        RuntimeError: ranges have other bits than NumPy's.
-    """
+    """Measure one row."""
     start = time.perf_counter()
     call = job.make(device, "float32")
     result = call(job.poses, job.out)

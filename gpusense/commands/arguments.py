@@ -77,8 +77,7 @@ def add_seed(parser: argparse.ArgumentParser) -> None:
 def open_backends(selections: Sequence[str] | None) -> tuple[list[Backend], list[str]]:
     """Open the backends of selection strings, or all devices present except simulators.
 
-    Args:
-        selections: Selection strings, or None.
+    ``selections``: Selection strings, or None.
 
     Returns:
         Distinct backends, and the errors of devices that no name selected.
@@ -178,8 +177,7 @@ def output_path(*suffixes: str) -> Output:
 
     The library that writes the file must be installed.
 
-    Args:
-        suffixes: Allowed suffixes, such as ``".png"``; none allows every suffix.
+    ``suffixes``: Allowed suffixes, such as ``".png"``; none allows every suffix.
     """
 
     def convert(text: str) -> Path:

@@ -111,11 +111,7 @@ class Parser(argparse.ArgumentParser):
                     )
 
     def group_options(self, first: Sequence[str]) -> None:
-        """Put the options that one needs first into a group of the help, and shorten the usage to required ones.
-
-        Args:
-            first: Destinations of these options.
-        """
+        """Put the options that one needs first into a group of the help, and shorten the usage to required ones."""
         options, group = self._optionals, self.add_argument_group("most used")
         actions = {action.dest: action for action in self._actions}
         for action in [actions[name] for name in first if actions[name] in options._group_actions]:
@@ -179,8 +175,7 @@ def _short_warnings() -> Iterator[None]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
-    Args:
-        argv: Arguments after the program's name; ``sys.argv[1:]`` by default.
+    ``argv``: Arguments after the program's name; ``sys.argv[1:]`` by default.
 
     Returns:
         The exit code: 0 success, 2 bad input, 130 interrupted, 143 terminated, 129 after a hang-up of the terminal,

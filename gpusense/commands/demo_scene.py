@@ -113,12 +113,6 @@ def score_scene(scene: Scene, name: str, backend: Backend, reference: np.ndarray
     """Time the first call, model included, and up to ``REPETITIONS`` steady calls within ``PATIENCE`` seconds.
 
     NumPy scores the poses ``scene.checked`` and the true pose.
-
-    Args:
-        scene: The scene.
-        name: ``BEAM`` or ``FIELD``.
-        backend: The backend.
-        reference: float64 log-likelihoods of the poses ``scene.checked``.
     """
     on_numpy = backend.info.backend == "numpy"
     poses = np.concatenate([scene.poses[:-1][scene.checked], scene.poses[-1:]]) if on_numpy else scene.poses

@@ -94,14 +94,7 @@ class PartialFit:
 
 
 def print_fit(result: FitResult, files: list[Path], *, verbose: bool, paired: bool) -> None:
-    """Print the verdict, the parameters with their errors, advice, and the written files.
-
-    Args:
-        result: The results.
-        files: The written files.
-        verbose: Whether to print all details.
-        paired: Whether the readings come from a file of pairs.
-    """
+    """Print the verdict, the parameters with their errors, advice, and the written files."""
     fit, p = result.fit, result.fit.parameters
     readings = fit.hits + fit.max_readings
     unexplained, doubtful = fit.outliers / readings if readings else 0.0, is_doubtful(fit)

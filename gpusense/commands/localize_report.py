@@ -35,13 +35,6 @@ def report(
 ) -> dict[str, Any]:
     """Write the files, and print the results of all scans, or of the scans before an interrupt.
 
-    Args:
-        args: Options of the command.
-        pf: The filter after the last scan.
-        track: Estimates of the scans so far.
-        chosen: Number of scans that the options choose.
-        recorders: Recorders of the run by their files.
-
     Returns:
         The results of :func:`gpusense.evaluation.tracking.summary`.
     """

@@ -70,12 +70,6 @@ def print_table(
     """Print a table by rich on a terminal, otherwise as plain text.
 
     On a narrow terminal, each row becomes a paragraph with one value per line.
-
-    Args:
-        columns: Names of the columns.
-        rows: Cells of each row.
-        right: Names of the columns that are right-aligned.
-        optional: Names of columns to omit on narrow terminals, in this order.
     """
     lines = table_lines(columns, rows, right=right)
     if not is_terminal(sys.stdout):
@@ -110,13 +104,7 @@ class TableStream:
     """
 
     def __init__(self, columns: Mapping[str, int], *, left: Sequence[str] = (), optional: Sequence[str] = ()) -> None:
-        """Choose the columns.
-
-        Args:
-            columns: Names and least widths of the columns.
-            left: Names of left-aligned columns.
-            optional: Names of columns to omit on narrow terminals, in this order.
-        """
+        """Choose the columns."""
         self._widths = {name: max(width, len(name)) for name, width in columns.items()}
         self._left = left
         for name in optional if is_terminal(sys.stdout) else ():

@@ -38,9 +38,7 @@ class Localization:
 def read_localization(path: Path, node: str | None = None) -> Localization:
     """Read the mappings ``beam_model`` and ``odometry_motion`` of a YAML file, or the parameters of nav2_amcl's node.
 
-    Args:
-        path: The file.
-        node: Name of the node in a file of nav2; None for its only amcl.
+    ``node``: Name of the node in a file of nav2; None for its only amcl.
     """
     from gpusense._util import checks
     from gpusense.localization.motion import OdometryMotion

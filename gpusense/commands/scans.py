@@ -30,11 +30,8 @@ OPTIONS = {
 def add_log(parser: argparse.ArgumentParser, what: str, *, required: bool = True, several: str | None = None) -> None:
     """Add ``--log``, and its laser: ``--topic`` and ``--mount``.
 
-    Args:
-        parser: The parser of a command.
-        what: Description of the log, with an article.
-        required: True if the option is required.
-        several: Description of the lasers' use, if the command takes several.
+    ``required``: True if the option is required. ``several``: Description of the lasers' use, if the command takes
+    several.
     """
     add = parser.add_argument
     add("--log", required=required, type=Path, metavar="FILE", help=f"{what}: {FORMATS}")
@@ -106,9 +103,7 @@ def options_named() -> Iterator[None]:
 def read_scans(args: argparse.Namespace, *, posed: bool = True) -> list[tuple[int, Scan]]:
     """Read the chosen scans of ``--log`` with their indices and poses.
 
-    Args:
-        args: Arguments of a command with the options of :func:`add_log` and :func:`add_reference`.
-        posed: True if each scan must have a pose.
+    ``posed``: True if each scan must have a pose.
     """
     from gpusense.evaluation.scoring import chosen_scans, with_one_scanner, with_poses
 

@@ -19,10 +19,7 @@ _MOST = 12
 def print_stretches(stretches: Sequence[Stretch], begin: float, risk: float) -> None:
     """Print the stretches in the order of time, the worst ones of many.
 
-    Args:
-        stretches: The stretches.
-        begin: Time of the first scan [s].
-        risk: Probability that an error exceeds the radius.
+    ``begin``: Time of the first scan [s].
     """
     order = {"lost": 0, "uncertain": 1, "tracking": 2}
     chosen = sorted(stretches, key=lambda one: (order[one.verdict], -one.duration))[:_MOST]

@@ -122,13 +122,7 @@ def _ratio_of_rank(better: float) -> float:
 
 
 def temperature_of_log(model: Model, scans: Sequence[tuple[int, Scan]], *, most: int = 100) -> float:
-    """Return the temperature of scans at their logged poses, as a filter with ``temperature="auto"`` learns it.
-
-    Args:
-        model: A model on the map, with temperature 1.
-        scans: Scans with poses, and their indices.
-        most: Most scans to learn from, taken from the beginning.
-    """
+    """Return the temperature of scans at their logged poses, as a filter with ``temperature="auto"`` learns it."""
     correlation = BeamCorrelation()
     for _, scan in scans[:most]:
         learn_from_scan(correlation, model, scan.ranges, np.array(scan.pose))

@@ -63,12 +63,7 @@ def peer_parameters() -> dict[str, BeamParameters]:
 
 
 def softened(fitted: BeamParameters, readings: int) -> BeamParameters:
-    """Return the parameters with half a reading added to each cause, so that no cause is impossible (Jeffreys' prior).
-
-    Args:
-        fitted: The fitted parameters.
-        readings: Number of readings that they were fitted to.
-    """
+    """Return the parameters with half a reading added to each cause (Jeffreys' prior), so that none is impossible."""
     values = fitted.to_dict()
     for name in ("z_hit", "z_short", "z_max", "z_rand"):
         values[name] = (values[name] * readings + 0.5) / (readings + 2)
@@ -88,11 +83,7 @@ def compare_held_out(
     parameters make a held-out reading impossible, a row of softened parameters follows, and gains refer to it. The fit
     by angles of incidence is a further row, softened in the same way; its gain is negative if it is better.
 
-    Args:
-        fitted: Parameters fitted without ``data``.
-        data: The held-out readings.
-        readings: Number of readings that the parameters were fitted to.
-        incidence: Fit by angles of incidence, or None; ``data`` then has angles.
+    ``incidence``: Fit by angles of incidence, or None; ``data`` then has angles.
     """
     known = data.kinds != Reading.MISSING
     if not known.any():

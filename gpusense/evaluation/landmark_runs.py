@@ -91,12 +91,9 @@ def run_motion(
 ) -> DriftingOdometry:
     """Return the motion noise of a run, with missing numbers taken from the run.
 
-    Args:
-        run: The run.
-        alpha: (4,) noise of the odometry; None for ``ALPHA``.
-        reverse: Probability of a reverse; None for 0.
-        drift: Random walks of translation and heading; None for ``DRIFT`` and the measured walk of the heading.
-        fit: Whether to learn ``alpha`` and ``reverse`` by :func:`fit_odometry_motion` if they are None.
+    ``alpha``: (4,) noise of the odometry; None for ``ALPHA``. ``reverse``: Probability of a reverse; None for 0.
+    ``drift``: Random walks of translation and heading; None for ``DRIFT`` and the measured walk of the heading.
+    ``fit``: Whether to learn ``alpha`` and ``reverse`` by :func:`fit_odometry_motion` if they are None.
     """
     if fit and (alpha is None or reverse is None):
         found = fit_odometry_motion(run.odometry, run.truth, systematic=False).motion
@@ -174,10 +171,7 @@ class Track:
 def fit_run(run: LandmarkRun, *, known: bool = True, bias: bool = False) -> LandmarkFit:
     """Fit the noise of a run's features at its logged poses.
 
-    Args:
-        run: The run.
-        known: Whether the fit uses the recorded landmark of each feature.
-        bias: Whether offsets of range and bearing are also fitted.
+    ``bias``: Whether offsets of range and bearing are also fitted.
     """
     return fit_landmark_parameters(
         run.truth, run.features, run.landmarks, correspondence=run.ids if known else None, scan=run.scan,
@@ -199,10 +193,7 @@ def usable(parameters: LandmarkParameters) -> LandmarkParameters:
 def association(run: LandmarkRun, model: LandmarkModel, poses: Floats | None = None) -> dict[str, float]:
     """Compare the likeliest landmark of each feature with the recorded one.
 
-    Args:
-        run: The run.
-        model: The model of the run's map.
-        poses: (S, 3) poses of the scans [m, m, rad]; None for the logged ones.
+    ``poses``: (S, 3) poses of the scans [m, m, rad]; None for the logged ones.
 
     Returns:
         Shares of features: right, none (classed as a false positive but recorded as a landmark) and wrong.
@@ -226,17 +217,7 @@ def localise(
     motion: DriftingOdometry | None = None,
     step: Callable[[str], None] | None = None,
 ) -> Track:
-    """Run :class:`ParticleFilter` along a run, from around its first logged pose (``START``).
-
-    Args:
-        run: The run.
-        model: Gives log p of a scan's features.
-        known: Whether the filter uses the recorded landmark of each feature.
-        particles: Number of particles.
-        seed: Seed of the random numbers.
-        motion: Noise of the odometry; by default :func:`run_motion` of the run.
-        step: Called with a text before each hundredth scan.
-    """
+    """Run :class:`ParticleFilter` along a run, from around its first logged pose (``START``)."""
     pf = ParticleFilter(model, motion=run_motion(run) if motion is None else motion, particles=particles, seed=seed)
     pf.initialize(mean=run.truth[0], covariance=np.diag([START**2, START**2, START_HEADING**2]))
     degenerate = 0

@@ -80,15 +80,9 @@ def match_log(
 ) -> Iterator[LogMatches]:
     """Match each scan of a log to its predecessor, or all scans to a map; yield the matches of each call.
 
-    Args:
-        scans: Indices and scans of one scanner.
-        grid: The map, or None.
-        guess: ``"odometry"``, ``"logged"`` or ``"identity"``; a map needs ``"logged"``.
-        method: See :func:`gpusense.match_scan`.
-        backend: The device.
-        spread: Largest change of a guess in x and in y [m] and in heading [rad], uniformly at random.
-        seed: Seed of these changes.
-        noise: Standard deviation of ranges [m]; None for the default of ``match_scan``.
+    ``grid``: The map, or None. ``guess``: ``"odometry"``, ``"logged"`` or ``"identity"``; a map needs ``"logged"``.
+    ``spread``: Largest change of a guess in x and in y [m] and in heading [rad], uniformly at random. ``noise``:
+    Standard deviation of ranges [m]; None for the default of ``match_scan``.
     """
     if grid is not None and guess != "logged":
         raise ValueError(f"--guess: must be 'logged' with --map, since odometry has another frame, got {guess!r}")
@@ -128,9 +122,7 @@ def trajectory(matches: LogMatches, first: Floats) -> Floats:
 
     A match that did not converge is replaced by its guess.
 
-    Args:
-        matches: Matches of a log.
-        first: (3,) pose of the first scan [m, m, rad]; not used for matches to a map.
+    ``first``: (3,) pose of the first scan [m, m, rad]; not used for matches to a map.
     """
     usable = matches.match.converged[:, None]
     steps = np.where(usable, matches.match.pose, matches.guess)

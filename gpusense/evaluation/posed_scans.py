@@ -57,12 +57,8 @@ def posed_scans(
 ) -> PosedScans:
     """Return the scans of a log that have a pose of a localiser.
 
-    Args:
-        log: The log.
-        steps: Its scans.
-        source: A TUM trajectory as a path, or a topic of a bag as for :func:`gpusense.logs.bag_poses.read_poses`. None
-            takes the likeliest poses of a bag, and the logged poses of another log.
-        map_frame: Frame of the map among transforms.
+    ``source``: A TUM trajectory as a path, or a topic of a bag as for :func:`gpusense.logs.bag_poses.read_poses`. None
+    takes the likeliest poses of a bag, and the logged poses of another log.
     """
     times = [step.scan.time for step in steps]
     form = format_of(log)

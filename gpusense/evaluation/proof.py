@@ -51,12 +51,7 @@ class Scene:
 
 
 def prove(job: dict[str, Any], report: Report) -> None:
-    """Run each family of kernels that a device has; stop at the first that computes wrong numbers.
-
-    Args:
-        job: ``info`` describes the device, with the lanes to try; ``setup`` prepares its library.
-        report: Called with the family that begins, with the first difference above its tolerance, and at the end.
-    """
+    """Run each family of kernels that a device has; stop at the first that computes wrong numbers."""
     info = info_of(job)
     if "setup" in job:
         set_up_child(info.backend, job["setup"])

@@ -52,11 +52,7 @@ class RangeData:
     range_min: float = 0.0
 
     def chosen(self, which: NDArray[np.bool]) -> RangeData:
-        """Return the readings that a mask selects.
-
-        Args:
-            which: (n,) the mask.
-        """
+        """Return the readings that a mask selects."""
         incidence = None if self.incidence is None else self.incidence[which]
         parts = self.ranges[which], self.expected[which], incidence, self.block[which]
         return RangeData(*parts, self.range_max, self.range_min)
@@ -86,14 +82,7 @@ def data_of_log(
 ) -> RangeData:
     """Cast the expected ranges of a log's readings at its logged poses.
 
-    Args:
-        grid: The map.
-        scans: Numbered scans of one scanner, each with a pose, as ``scoring.with_poses`` returns them.
-        backend: Device that casts the rays.
-        range_min: Readings below this are missing [m].
-        block: Scans per block.
-        incidence: Whether angles of incidence are computed too.
-        step: Called with a text before every 256 scans.
+    ``range_min``: Readings below this are missing [m].
     """
     block = checks.integer("block", block, low=1)
     model = BeamModel(grid, scans[0][1].scanner, backend=backend)
@@ -128,19 +117,8 @@ def data_of_pairs(
     The columns are the reading z, the expected range z* and, if present, the angle of incidence [rad]. A first line
     without numbers is a header. Empty lines and lines that begin with # are skipped.
 
-    Args:
-        path: The file, plain or compressed by gzip (.gz).
-        range_max: Readings of at least this are "no return" [m].
-        range_min: Readings below this are missing [m].
-        every: Stride: every ``every``-th pair is taken, starting at ``offset``.
-        offset: Index of the first pair.
-        limit: Largest number of pairs; None for all.
-        block: Neighbouring pairs per block.
-
-    Raises:
-        FileNotFoundError: the file is missing.
-        ValueError: A line breaks the format, or an expected range is impossible, and the message names it; or no pair
-            is chosen.
+    ``range_max``: Readings of at least this are "no return" [m]. ``range_min``: Readings below this are missing [m].
+    ``limit``: Largest number of pairs; None for all.
     """
     file = checks.existing_file(checks.path("pairs", path))
     range_max = checks.real("range_max", range_max, above=0)

@@ -125,9 +125,7 @@ def replay(launch: Launch, like: np.ndarray | None = None) -> tuple[np.ndarray, 
     replay takes the cell whose log-likelihood is nearer to ``like``. Bins of angles of incidence are treated in the
     same way.
 
-    Args:
-        launch: A recorded launch.
-        like: (particles, readings) log-likelihoods to resolve ties by; by default the launch's parts, if it has them.
+    ``like``: (particles, readings) log-likelihoods to resolve ties by; by default the launch's parts, if it has them.
 
     Returns:
         log p (particles,) and the beams' parts (particles, readings), both float64, in the order of the launch.

@@ -56,13 +56,7 @@ class ParticleSampler:
         checks.integer("seed", self.seed, low=0)
 
     def draw(self, index: int, pose: Pose, grid: OccupancyGrid) -> Floats:
-        """Draw (N, 3) particles of a scan: its pose, particles around it, particles over all free cells [m, m, rad].
-
-        Args:
-            index: Index of the scan in its log, which selects the random stream.
-            pose: The logged pose.
-            grid: The map.
-        """
+        """Draw (N, 3) particles of a scan: its pose, particles around it, particles over all free cells [m, m, rad]."""
         random = np.random.default_rng((self.seed, index))
         near = (self.particles - 1) // 2
         around = cloud_around(pose, near, self.sigma_position, self.sigma_heading, random)
@@ -125,12 +119,7 @@ class BackendScore:
 def score_scan(index: int, poses: Floats, log_p: Array, beams: int, seconds: float) -> ScanScore:
     """Rank the logged pose among a scan's particles and compute the weighted mean of the remaining particles.
 
-    Args:
-        index: Index of the scan in its log.
-        poses: (N, 3) particles; the first is the logged pose [m, m, rad].
-        log_p: (N,) log-likelihoods.
-        beams: Readings that were evaluated at every particle.
-        seconds: Time of the call.
+    ``poses``: (N, 3) particles; the first is the logged pose [m, m, rad]. ``log_p``: (N,) log-likelihoods.
     """
     better, equal = np.count_nonzero(log_p[1:] > log_p[0]), np.count_nonzero(log_p[1:] == log_p[0])
     others = len(log_p) - 1
@@ -189,13 +178,8 @@ def chosen_scans(
 ) -> list[tuple[int, Scan]]:
     """Read scans of a log with their indices: ``offset``, ``offset + every``, ..., at most ``limit`` scans.
 
-    Args:
-        path: The log.
-        every: Stride of the scans.
-        offset: Index of the first scan.
-        limit: Largest number of scans; None for all.
-        topic: The laser, see :func:`gpusense.logs.reader.read_laser`; None for the only or main laser.
-        options: See :func:`gpusense.read_log`.
+    ``limit``: Largest number of scans; None for all. ``topic``: The laser, see :func:`gpusense.logs.reader.read_laser`;
+    None for the only or main laser.
     """
     last = None if limit is None else offset + every * limit
     scans = read_laser(path, topic, **options)
@@ -269,14 +253,7 @@ def score_log(
     sampler: ParticleSampler,
     step: Callable[[str], None] = lambda text: None,
 ) -> tuple[list[BackendScore], list[Agreement]]:
-    """Score every scan with every model on the same particles, and compare the models in pairs.
-
-    Args:
-        models: The same model on one backend or several.
-        scans: Scans of the models' scanner, each with its index and its pose.
-        sampler: Draws the particles of a scan.
-        step: Called with a text before each scan.
-    """
+    """Score every scan with every model on the same particles, and compare the models in pairs."""
     scoring = LogScoring(models, sampler)
     for index, scan in scans:
         step(f"scan {index}")

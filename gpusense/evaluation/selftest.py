@@ -86,11 +86,7 @@ _REPEATS = 192
 
 
 def chosen_backends(selections: Sequence[str] = ()) -> list[Backend]:
-    """Open the backends of selection strings, each device once; ``"numpy"`` joins a single one.
-
-    Args:
-        selections: Selection strings; none selects every backend present except simulators.
-    """
+    """Open the backends of selection strings, each device once; ``"numpy"`` joins a single one."""
     names = list(selections) or [d.selection for d in devices() if d.available and d.kind != "simulator"]
     if len(names) == 1:
         names.insert(0, "numpy")
@@ -105,15 +101,7 @@ def run(
     sonar: bool = True,
     checks: list[Check] | None = None,
 ) -> list[Check]:
-    """Compare backends with the truth and in pairs.
-
-    Args:
-        backends: The backends.
-        scene: The scene; the built-in one by default.
-        step: Called with a backend's selection string before its turn.
-        sonar: Whether a ring of sonars is among the models; it needs the normals of the map.
-        checks: Receives the comparisons as they are made; a new list by default.
-    """
+    """Compare backends with the truth and in pairs."""
     scene, checks = scene or built_in_scene(), [] if checks is None else checks
     results: dict[str, Results] = {}
     for backend in backends:
@@ -129,11 +117,6 @@ def run(
 
 def evaluate_backend(backend: Backend, scene: Scene, *, sonar: bool = True) -> tuple[Results, list[Check]]:
     """Compute a scene on a backend, and compare the results with the truth on the backend's rounded inputs.
-
-    Args:
-        backend: The backend.
-        scene: The scene.
-        sonar: Whether a ring of sonars is among the models.
 
     Returns:
         Results by quantity, for comparison with other backends, and the comparisons with the truth.

@@ -56,13 +56,7 @@ def read_steps(
     Logs with corrected poses often repeat them as odometry, with wheel readings between the scans that start at the
     corrected pose of the previous scan. The odometry is then chained from these readings.
 
-    Args:
-        path: The log.
-        every: Stride of the scans of each laser.
-        offset: Index of the first scan of each laser.
-        limit: Largest number of scans; None for all. Nothing is read after the last one.
-        sensors: Lasers of the log: topics of a bag, front or rear of a CARMEN log; none for its only or main laser.
-        options: See :func:`gpusense.read_log`.
+    ``limit``: Largest number of scans; None for all. Nothing is read after the last one.
     """
     chained, last, between = np.zeros(3), None, None
     steps: list[Step] = []
@@ -118,10 +112,7 @@ def references_to_learn_from(steps: Sequence[Step]) -> tuple[list[Pose], list[Po
 def with_references(steps: Sequence[Step], times: Floats, poses: Floats) -> list[Step]:
     """Return steps with references from a trajectory at the times of the scans.
 
-    Args:
-        steps: Steps.
-        times: (T,) increasing times of the trajectory [s].
-        poses: (T, 3) its poses.
+    ``times``: (T,) increasing times of the trajectory [s]. ``poses``: (T, 3) its poses.
     """
     found = poses_at([step.scan.time for step in steps], times, poses)
     return [replace(step, reference=pose) for step, pose in zip(steps, found, strict=True)]

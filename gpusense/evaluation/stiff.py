@@ -242,9 +242,7 @@ def _truth(launch: Launch, parameters: Any) -> Floats:
 def run(backend: Selection, precision: str) -> list[Row]:
     """Run the whole catalogue on a backend.
 
-    Args:
-        backend: The backend.
-        precision: ``"float32"`` or ``"float64"``.
+    ``precision``: ``"float32"`` or ``"float64"``.
 
     Returns:
         The rows.

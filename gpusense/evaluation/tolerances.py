@@ -184,10 +184,6 @@ def scan_tolerance(dtype: DTypeLike, beams: int) -> Tolerance:
 
     In a scene where beams have |log p_k| in the thousands, float32 cannot represent the sum to 2e-3 nats;
     :func:`per_scan` bounds the error there.
-
-    Args:
-        dtype: The precision, float32 or float64.
-        beams: Number of beams.
     """
     if np.dtype(dtype) == np.float64:
         return TOLERANCES["float64 scan"]
@@ -198,10 +194,6 @@ def scan_tolerance(dtype: DTypeLike, beams: int) -> Tolerance:
 
 def per_beam(log_p: ArrayLike, dtype: DTypeLike) -> Floats:
     """Return the largest error allowed of each beam's log-likelihood.
-
-    Args:
-        log_p: Log-likelihoods of beams, of any shape.
-        dtype: The precision under test, float32 or float64.
 
     Returns:
         float64 of the same shape [nats]; 0 where log p is infinite, which must be exact.
@@ -218,12 +210,6 @@ def per_scan(parts: ArrayLike, dtype: DTypeLike, *, fixed: float = 0.0, temperat
     BLOCK_TERMS terms are added plainly, with an error of (BLOCK_TERMS - 1) / 2 eps of the sum of their magnitudes.
     Blocks are added with compensation; its relative error is the square of a plain sum's. The final sum and its
     product with the temperature round once each. float64 has a separate, wider rule.
-
-    Args:
-        parts: (..., K) log-likelihoods of the beams before the temperature.
-        dtype: The precision under test, float32 or float64.
-        fixed: Constant term of the readings that do not depend on the pose.
-        temperature: The factor of the sum.
 
     Returns:
         (...) float64 [nats]; 0 where a beam's log-likelihood is infinite.

@@ -106,12 +106,8 @@ def start(
 ) -> None:
     """Initialise a filter: everywhere, or around a pose, by default the first reference pose.
 
-    Args:
-        pf: The filter.
-        steps: Steps of the filter.
-        everywhere: Whether the filter starts anywhere on the map.
-        pose: The pose; None for the first reference pose.
-        covariance: (3, 3) covariance of the start; None for the usual one.
+    ``pose``: The pose; None for the first reference pose. ``covariance``: (3, 3) covariance of the start; None for the
+    usual one.
     """
     first = steps[0].reference if pose is None else pose
     if everywhere:
@@ -236,9 +232,8 @@ _NORMAL_95, _BINS = 1.96, 10
 def nees_of(differences: Floats, covariances: Floats) -> Floats:
     """Return the normalised estimation errors squared.
 
-    Args:
-        differences: (S, 3) estimates less true poses, headings wrapped.
-        covariances: (S, 3, 3) covariances of the estimates.
+    ``differences``: (S, 3) estimates less true poses, headings wrapped. ``covariances``: (S, 3, 3) covariances of the
+    estimates.
     """
     regular = covariances + 1e-12 * np.eye(3)
     solved = np.linalg.solve(regular, differences[:, :, None])[:, :, 0]
@@ -248,10 +243,7 @@ def nees_of(differences: Floats, covariances: Floats) -> Floats:
 def rank_of(particles: Floats, weights: Floats, truth: Floats) -> Floats:
     """Return the weights (3,) of the particles behind, to the right of and clockwise of the true pose, each 0 to 1.
 
-    Args:
-        particles: (N, 3) poses.
-        weights: (N,) weights, sum 1.
-        truth: (3,) the true pose.
+    ``particles``: (N, 3) poses. ``weights``: (N,) weights, sum 1. ``truth``: (3,) the true pose.
     """
     cosine, sine = math.cos(truth[2]), math.sin(truth[2])
     behind = np.zeros(3)
@@ -271,10 +263,8 @@ def coverage_report(differences: Floats, covariances: Floats, ranks: Floats) -> 
 
     Widths are medians of 95 % intervals, of the position in its least certain direction [m] and of the heading [rad].
 
-    Args:
-        differences: (S, 3) estimates less true poses, headings wrapped.
-        covariances: (S, 3, 3) covariances of the estimates.
-        ranks: (S, 3) ranks of the true poses.
+    ``differences``: (S, 3) estimates less true poses, headings wrapped. ``covariances``: (S, 3, 3) covariances of the
+    estimates. ``ranks``: (S, 3) ranks of the true poses.
     """
     squared = nees_of(differences, covariances)
     largest = np.maximum(np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1], 0)

@@ -29,11 +29,7 @@ _INDICES = "# indices of scans, not times"
 def write_tum(path: Path, times: Iterable[float], poses: Iterable[Floats], *, indices: bool = False) -> None:
     """Write poses as a TUM trajectory.
 
-    Args:
-        path: The file.
-        times: Times [s].
-        poses: Poses (x, y [m], theta), as many.
-        indices: Whether the times are indices of scans; a comment in the file then states it.
+    ``times``: Times [s]. ``poses``: Poses (x, y [m], theta), as many.
     """
 
     def write(stream: BinaryIO) -> None:
@@ -67,11 +63,6 @@ def read_tum(path: Path) -> tuple[Floats, Floats]:
     """Read a TUM trajectory: times (T,) [s] and poses (T, 3), with headings from the quaternions.
 
     Poses that are not finite are skipped, with one warning.
-
-    Raises:
-        ValueError: a line has not eight numbers, no pose is finite, a quaternion is 0, a coordinate exceeds 1e9 m, or
-            times do not increase.
-        FileNotFoundError: the file is missing.
     """
     every = np.array(list(until_cut(path, lambda lines: _rows(path, lines)))).reshape(-1, 8)
     rows = every[np.isfinite(every).all(axis=1)]
@@ -99,12 +90,8 @@ def poses_at(
 
     Between two poses of the trajectory that are at most half a second apart, poses are interpolated.
 
-    Args:
-        scans: Times of the scans [s], at least one.
-        times: (T,) increasing times of the trajectory [s].
-        poses: (T, 3) its poses.
-        near: Largest time from a scan to a single pose near it [s].
-        name: Name of the trajectory in errors.
+    ``scans``: Times of the scans [s], at least one. ``times``: (T,) increasing times of the trajectory [s]. ``poses``:
+    (T, 3) its poses. ``near``: Largest time from a scan to a single pose near it [s].
     """
     found = [_pose_at(time, times, poses, near) for time in scans]
     if not any(found):

@@ -21,11 +21,7 @@ def error_page(
     :func:`~gpusense.evaluation.benchmark.choice.choose`. The other view is the performance profile of Dolan and More
     (2002): the share of scenes that a method solves to a largest error within a factor of the best time.
 
-    Args:
-        rows: Rows of reports.
-        shown: Texts of the measures on the page, by need; None for all.
-        text: Line about the machine below the title.
-        back: Address of the page that explains the figure; empty for no link.
+    ``shown``: Texts of the measures on the page, by need; None for all.
     """
     origins = list(dict.fromkeys(row.origin for row in rows))
     order = sorted({_preference(row) for row in rows})

@@ -40,9 +40,7 @@ def distances_of(data: RangeData, count: int = 3) -> list[float]:
 def readings_figure(data: RangeData, distances: list[float]) -> Figure:
     """Draw readings against expected ranges, and raw readings around some expected ranges (book figure 6.5).
 
-    Args:
-        data: The readings.
-        distances: The expected ranges [m].
+    ``distances``: The expected ranges [m].
     """
     from matplotlib.colors import LogNorm
 
@@ -81,10 +79,7 @@ def readings_figure(data: RangeData, distances: list[float]) -> Figure:
 def density_figure(data: RangeData, parameters: BeamParameters, distances: list[float]) -> Figure:
     """Draw histograms of readings around some expected ranges, with the fitted density (book figure 6.6).
 
-    Args:
-        data: The readings.
-        parameters: The fitted parameters.
-        distances: The expected ranges [m].
+    ``distances``: The expected ranges [m].
     """
     figure = new_figure(5.0 * max(len(distances), 1), 4.2)
     axes = figure.subplots(1, max(len(distances), 1), squeeze=False)[0]
@@ -129,9 +124,7 @@ def _density_panel(ax: Axes, data: RangeData, parameters: BeamParameters, distan
 def trace_figure(trace: NDArray[np.float64], method: str) -> Figure:
     """Draw the log-likelihood after each iteration, and its distance from the highest value.
 
-    Args:
-        trace: (I,) log-likelihoods [nats].
-        method: Name of the method, for the title.
+    ``trace``: (I,) log-likelihoods [nats].
     """
     figure = new_figure(10.0, 3.8)
     left, right = figure.subplots(1, 2)

@@ -22,11 +22,7 @@ _LABELS = {
 
 
 def sweep_figure(columns: Mapping[str, Sequence[Any]]) -> Figure:
-    """Draw the jobs of a table; models have colours, values of a second axis have shapes.
-
-    Args:
-        columns: Columns of a table from :func:`gpusense.sweep.read_table`.
-    """
+    """Draw the jobs of a table; models have colours, values of a second axis have shapes."""
     tasks = [TASKS[task].error for task in dict.fromkeys(columns.get("task", ())) if task in TASKS]
     error = next((name for name in tasks if name in columns), None)
     if error is None:

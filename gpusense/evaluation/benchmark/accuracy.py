@@ -118,8 +118,7 @@ def temperature_of(log_p: Floats) -> float:
 
     With the plain product over beams nearly all weight lies on one particle, and its posterior hides most errors.
 
-    Args:
-        log_p: (M,) log-likelihoods, finite.
+    ``log_p``: (M,) log-likelihoods, finite.
     """
     return factor_for(log_p, SHARING * len(log_p), 1.0)
 
@@ -130,10 +129,7 @@ def factor_for(log_p: Floats, size: float, most: float = MOST_FACTOR) -> float:
     The effective sample size falls as the factor rises. Weights flatter than the exact ones, such as sums of cubes, are
     compared at the factor that makes the effective sample sizes equal.
 
-    Args:
-        log_p: (M,) log-likelihoods, finite.
-        size: Effective sample size, in [1, M].
-        most: Largest factor.
+    ``log_p``: (M,) log-likelihoods, finite. ``size``: Effective sample size, in [1, M].
     """
 
     def enough(factor: float) -> bool:
@@ -160,20 +156,13 @@ def errors(
 ) -> dict[str, dict[str, float]]:
     """Compute all errors of a point.
 
-    Args:
-        truth: The exact results.
-        problem: ``"ranges"``, ``"beam"`` or ``"field"``.
-        ranges: (M, K) the candidate's ranges [m], or None.
-        log_p: (M,) the candidate's log-likelihoods; if None, the float64 mixture computes them from the ranges.
-        temperature: Factor that makes the log-likelihoods comparable with all beams': n for every n-th beam.
+    ``problem``: ``"ranges"``, ``"beam"`` or ``"field"``. ``ranges``: (M, K) the candidate's ranges [m], or None.
+    ``log_p``: (M,) the candidate's log-likelihoods; if None, the float64 mixture computes them from the ranges.
 
     Returns:
         Errors by kind: ``"ranges"`` if ranges are passed, ``"log_p"``, ``"posterior"``, ``"tempered"``, the posterior
         at the temperature of ``Truth.temperatures``, and ``"comparable"``, the posterior at the temperature that gives
         the candidate the effective sample size of the exact tempered posterior.
-
-    Raises:
-        UnstableError: a value is not finite, or an array has the wrong shape.
     """
     scene, kinds = truth.scene, {}
     if ranges is not None:
@@ -196,14 +185,7 @@ def errors(
 def fine_errors(truth: Truth, problem: str, log_p: NDArray[np.floating], temperature: float = 1.0) -> dict[str, float]:
     """Compare log-likelihoods on the fine grid of poses with the true, untempered posterior there.
 
-    Args:
-        truth: The exact results.
-        problem: ``"beam"`` or ``"field"``.
-        log_p: The candidate's log-likelihoods of the poses of ``truth.fine(problem)``.
-        temperature: See :func:`errors`.
-
-    Raises:
-        UnstableError: a value is not finite, or the array has the wrong shape.
+    ``problem``: ``"beam"`` or ``"field"``.
     """
     fine = truth.fine(problem)
     return posterior_errors(temperature * _checked("log-likelihoods", log_p, fine.log_p), fine.log_p, fine.poses)
@@ -222,10 +204,8 @@ def _checked(quantity: str, computed: NDArray[np.floating], right: Floats) -> Fl
 def range_errors(computed: Floats, right: Floats, resolution: float) -> dict[str, float]:
     """Compute errors of ranges in cells: median, p95, p99, max, mean, and the shares wrong by more than 1 and 2 cells.
 
-    Args:
-        computed: The ranges [m].
-        right: The exact ranges, of the same shape [m].
-        resolution: The side of a cell [m].
+    ``computed``: The ranges [m]. ``right``: The exact ranges, of the same shape [m]. ``resolution``: The side of a cell
+    [m].
     """
     apart = np.abs(computed - right) / resolution
     if apart.size == 0:
@@ -250,10 +230,8 @@ def log_p_errors(computed: Floats, right: Floats) -> dict[str, float]:
 def posterior_errors(computed: Floats, right: Floats, poses: Floats) -> dict[str, float]:
     """Compare the normalised weights with the exact ones.
 
-    Args:
-        computed: (M,) log-likelihoods, finite; M > 0.
-        right: (M,) exact log-likelihoods, finite.
-        poses: (M, 3) the particles [m, m, rad].
+    ``computed``: (M,) log-likelihoods, finite; M > 0. ``right``: (M,) exact log-likelihoods, finite. ``poses``: (M, 3)
+    the particles [m, m, rad].
 
     Returns:
         ``kl``: the Kullback-Leibler divergence ``sum p log(p / q)`` of the computed weights q from the exact weights p
@@ -291,11 +269,7 @@ def score_ranges(
 ) -> Floats:
     """Score expected ranges with the beam model, in float64 on the host.
 
-    Args:
-        ranges: (M, K) expected ranges, clipped to [0, range_max] here [m].
-        readings: (K,) the scan.
-        scanner: The scanner.
-        parameters: The mixture, with ``z_rand`` > 0.
+    ``ranges``: (M, K) expected ranges, clipped to [0, range_max] here [m]. ``readings``: (K,) the scan.
 
     Returns:
         (M,) log-likelihoods; ``log z_max`` for each max reading where z_max > 0.

@@ -116,12 +116,7 @@ COMPAT = ("amcl", "beluga")
 
 
 def candidates(problems: Sequence[str], *, quick: bool = False) -> list[Candidate]:
-    """List this package's candidates for some problems, exact ones first.
-
-    Args:
-        problems: Problems, out of ``PROBLEMS``.
-        quick: Whether only a few values of each knob are listed.
-    """
+    """List this package's candidates for some problems, exact ones first."""
     listed = (*_of_casters(quick), *_of_models(quick))
     return [candidate for candidate in listed if candidate.problem in problems]
 

@@ -153,11 +153,7 @@ def entries(
     A method that failed, was left out or is not finite in any of them is not listed. A scene where every method was
     left out, such as one after the deadline of a quick run, does not count.
 
-    Args:
-        points: Points of a report.
-        problem: The problem.
-        measure: The measure of their errors.
-        backend: Selection string of the device, or ``"outside"``.
+    ``backend``: Selection string of the device, or ``"outside"``.
     """
     chosen = [point for point in points if point["problem"] == problem and point["backend"] == backend]
     places = {(point["scene"], point["cloud"]) for point in chosen if point["status"] != "left out"}
@@ -181,9 +177,6 @@ def entries(
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     """Find the points that no other point dominates, that is, is no larger in both and smaller in one.
-
-    Args:
-        points: (error, time) of each point.
 
     Returns:
         Indices of these points by rising error; of equal points the first.
@@ -211,12 +204,9 @@ def choose(
     With a largest error, the fastest method within both limits is chosen. With a longest time alone, the fastest of the
     most exact methods within it is chosen. Of equal ones the preferred one is chosen.
 
-    Args:
-        listed: Entries of one device and one measure.
-        error: The largest error; None without a limit.
-        seconds: The longest time [s]; None without a limit.
-        standing: The choice of an earlier day among ``listed``: it stands where its error and time keep the limits and
-            no method is better by more than the squares of ``ALIKE`` and ``CLOSE``. None: there is none.
+    ``error``: The largest error; None without a limit. ``seconds``: The longest time [s]; None without a limit.
+    ``standing``: The choice of an earlier day among ``listed``: it stands where its error and time keep the limits and
+    no method is better by more than the squares of ``ALIKE`` and ``CLOSE``. None: there is none.
 
     Returns:
         The entry; None if no entry is within the limits.
@@ -274,13 +264,7 @@ class Choice:
 
 
 def choices(points: Sequence[Mapping[str, Any]], wish: Wish) -> Iterator[Choice]:
-    """Yield the choice for each problem and device of a report.
-
-    Args:
-        points: Points of a report.
-        wish: The limits; a problem without a limit in its unit takes the limit of ``DEFAULTS``, or only the limit of
-            time.
-    """
+    """Yield the choice for each problem and device of a report."""
     for problem, backend in dict.fromkeys((point["problem"], point["backend"]) for point in points):
         measures = MEASURES[problem]
         unit = next((unit for unit in wish.errors if unit in measures), None)

@@ -42,9 +42,8 @@ def fine_posterior(score: Callable[[Floats], NDArray[np.floating]], pose: ArrayL
     The first grid is 0.6 m wide. While a standard deviation is below the grid's spacing, the next grid is narrower and
     lies around the mean.
 
-    Args:
-        score: Returns the log-likelihoods of (M, 3) poses, finite.
-        pose: (3,) pose at the middle of the first grid [m, m, rad].
+    ``score``: Returns the log-likelihoods of (M, 3) poses, finite. ``pose``: (3,) pose at the middle of the first grid
+    [m, m, rad].
     """
     middle, half = np.asarray(pose, np.float64), np.array(HALF)
     steps = np.linspace(-1.0, 1.0, SIDE)

@@ -191,15 +191,11 @@ def measure(
 ) -> tuple[Cost, Runner]:
     """Measure a candidate, and return its runner with built tables.
 
-    Args:
-        make: Makes a runner for a backend.
-        backend: The device; None for a candidate without a backend.
-        poses: (N, 3) particles of a call.
-        repeats: Most timed calls.
-        seconds: Longest time of the timed calls, of which there are at least three, and of the launches alone [s].
-        slow_to_make: Duration of a first call above which no second runner is made [s]; None: ``SLOW_TO_MAKE``.
-        earlier: A runner of another cloud, if there is one, is measured instead of a new one. Otherwise it receives a
-            runner that took longer than ``slow_to_make``. None: each cloud gets new runners.
+    ``backend``: The device; None for a candidate without a backend. ``poses``: (N, 3) particles of a call. ``seconds``:
+    Longest time of the timed calls, of which there are at least three, and of the launches alone [s]. ``slow_to_make``:
+    Duration of a first call above which no second runner is made [s]; None: ``SLOW_TO_MAKE``. ``earlier``: A runner of
+    another cloud, if there is one, is measured instead of a new one. Otherwise it receives a runner that took longer
+    than ``slow_to_make``. None: each cloud gets new runners.
     """
     limit = SLOW_TO_MAKE if slow_to_make is None else slow_to_make
     meter = None if backend is None else Meter(backend)
@@ -269,15 +265,7 @@ def series(
     seconds: float = float("inf"),
     used: list[float] | None = None,
 ) -> list[float]:
-    """Time calls after one warm-up; return their seconds, or the warm-up's if it takes more than ``LONG``.
-
-    Args:
-        run: The call.
-        repeats: Largest number of timed calls.
-        fewest: Least number of timed calls.
-        seconds: Total time after which no call beyond ``fewest`` begins.
-        used: Receives the processor's seconds of each call.
-    """
+    """Time calls after one warm-up; return their seconds, or the warm-up's if it takes more than ``LONG``."""
     used = [] if used is None else used
     warm = _seconds(run, used)
     if warm > LONG:

@@ -43,16 +43,7 @@ def document(
     absent: Sequence[str],
     command: str = "",
 ) -> dict[str, Any]:
-    """Build the report from plain values; non-finite numbers become None.
-
-    Args:
-        plan: The plan.
-        outcome: The measurements.
-        arguments: Arguments of the command.
-        machine: Description of the machine.
-        absent: Devices and candidates that are absent, with reasons.
-        command: The command line, files by their names.
-    """
+    """Build the report from plain values; non-finite numbers become None."""
     value = {
         "schema": SCHEMA,
         "date": time.strftime("%Y-%m-%d"),

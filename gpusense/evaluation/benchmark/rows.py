@@ -105,11 +105,7 @@ class Row:
 def title_of(point: Mapping[str, Any], machine: Mapping[str, Any], driver: str = "", target: str = "") -> str:
     """Name the device of a point: its library, and the processor with its cores or the GPU.
 
-    Args:
-        point: The point.
-        machine: The machine of its report.
-        driver: The device's driver, which distinguishes OpenCL runtimes.
-        target: The processor for which PoCL compiles; ``"haswell"`` has no AVX-512.
+    ``target``: The processor for which PoCL compiles; ``"haswell"`` has no AVX-512.
     """
     library = {"opencl": "OpenCL", "warp:cuda": "CUDA", "warp:cpu": "Warp"}
     if driver.startswith("Intel"):
@@ -129,11 +125,6 @@ def titles_of(
     """Return a title for each device of some points, by selection string; equal titles are extended by device names.
 
     Other implementations (selection string ``"outside"``) have the title of the first processor.
-
-    Args:
-        points: The points of a report.
-        machine: Machine of the report.
-        devices: Devices of the report; drivers and targets distinguish the OpenCL runtimes of one processor.
     """
     drivers = {device["selection"]: (device["driver"], device.get("target", "")) for device in devices}
     first: dict[str, Mapping[str, Any]] = {}

@@ -122,16 +122,7 @@ def steps(plan: Plan) -> int:
 
 
 def run(plan: Plan, step: Callable[[str], None] = lambda text: None, outcome: Outcome | None = None) -> Outcome:
-    """Measure all points of a plan.
-
-    Args:
-        plan: The plan.
-        step: Called with a text before each point.
-        outcome: Receives the scenes and points as they are measured; a new one by default.
-
-    Raises:
-        OSError, ValueError: a map cannot be read, or has no room for a robot.
-    """
+    """Measure all points of a plan."""
     device, spent = truth_device(), 0.0
     info = device.info
     note = "exact caster and models in float64; tests hold this device to the NumPy reference"
@@ -167,14 +158,6 @@ def point_of(
     plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "", earlier: list[Earlier] | None = None
 ) -> dict[str, Any]:
     """Measure one point; a failure becomes its status and reason.
-
-    Args:
-        plan: The plan.
-        job: Candidate, device and precision.
-        truth: The exact results of the cloud.
-        cloud: Name of the cloud.
-        reason: Reason to leave the point out; empty to measure it.
-        earlier: Runners of the scene's other clouds, see ``measure``.
 
     Returns:
         Plain values. ``status`` is ``"ok"``, ``"failed"`` after an exception, ``"unstable"`` for results that are not
@@ -245,13 +228,7 @@ def _left_out(
 ) -> str:
     """Return why a point is left out; empty if it is measured.
 
-    Args:
-        plan: The plan.
-        job: Candidate, device and precision.
-        scene: The scene.
-        paces: Rays per second of the exact caster, by device and precision.
-        built: Seconds that tables took to build in this scene, by device, precision and candidate.
-        spent: Measuring time so far [s].
+    ``spent``: Measuring time so far [s].
     """
     if job.candidate.missing:
         return job.candidate.missing

@@ -119,10 +119,7 @@ class Scene:
 def sources(names: Sequence[str] | None = None, maps: Sequence[Path] = (), *, quick: bool = False) -> list[MapSource]:
     """List the maps of a run.
 
-    Args:
-        names: Names of scenes; None for all available scenes, or for ``maps`` alone if there are some.
-        maps: map_server YAML files of further scenes, named by their stems.
-        quick: Whether generated maps are small, and recorded maps included only by name.
+    ``names``: Names of scenes; None for all available scenes, or for ``maps`` alone if there are some.
     """
     sizes = _QUICK_SIZES if quick else _SIZES
     known = {name: MapSource(name, f"generated, {w:g} x {h:g} m", None, (w, h)) for name, (w, h) in sizes.items()}
@@ -148,15 +145,7 @@ def sources(names: Sequence[str] | None = None, maps: Sequence[Path] = (), *, qu
 
 
 def make_scene(source: MapSource, device: Backend, *, beams: int, particles: int, seed: int) -> Scene:
-    """Make the scene of a map; it depends on these arguments alone.
-
-    Args:
-        source: The map.
-        device: Device that casts the beams of the scan, in its best precision.
-        beams: K of the scanner.
-        particles: N of each cloud.
-        seed: Seed of map, pose, scan and clouds.
-    """
+    """Make the scene of a map; it depends on these arguments alone."""
     grid = source.grid(seed)
     scanner = Scanner.uniform(
         angle_min=-math.pi, angle_increment=2 * math.pi / max(beams, 1), count=beams, range_max=RANGE_MAX
@@ -221,10 +210,7 @@ def is_free(grid: OccupancyGrid, poses: Floats) -> NDArray[np.bool]:
 def clutter(seed: int = 0, size: tuple[float, float] = (50.0, 50.0), resolution: float = 0.05) -> OccupancyGrid:
     """Generate a walled hall full of boxes: a few shelves, some crates, and many objects of at most 4 cells.
 
-    Args:
-        seed: Seed of the random numbers: the same seed generates the same hall.
-        size: (W, H) of the grid along x and y [m].
-        resolution: The side of a cell [m].
+    ``size``: (W, H) of the grid along x and y [m]. ``resolution``: The side of a cell [m].
 
     Returns:
         A grid with its origin at (0, 0, 0) whose cells are 0 (free) or 100 (occupied).

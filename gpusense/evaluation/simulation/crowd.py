@@ -68,10 +68,8 @@ class Crowd:
     def ranges(self, laser: Floats, bearings: Floats, expected: Floats) -> tuple[Floats, NDArray[np.bool]]:
         """Advance to the next scan; return its ranges with the people, and the beams that they hide.
 
-        Args:
-            laser: (3,) pose of the laser.
-            bearings: (K, R) directions of the rays of each beam relative to the laser [rad].
-            expected: (K,) ranges without people [m].
+        ``laser``: (3,) pose of the laser. ``bearings``: (K, R) directions of the rays of each beam relative to the
+        laser [rad]. ``expected``: (K,) ranges without people [m].
         """
         self._walk(laser)
         shorter = self._shortened(laser, bearings, expected)

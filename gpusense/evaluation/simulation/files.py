@@ -64,12 +64,7 @@ def kind_of(path: Path) -> str:
 
 
 def records_of(run: SimulatedRun, *, of_laser: bool = False) -> Iterator[Scan]:
-    """Yield the scans of a run as records of a log, with true poses.
-
-    Args:
-        run: The run.
-        of_laser: Whether poses and odometry refer to the laser, so that the scanner has no mount.
-    """
+    """Yield the scans of a run as records of a log, with true poses."""
     scanner, poses, odometry = run.scanner, run.poses, run.odometry
     if of_laser and any(scanner.mount):
         poses, odometry = (compose_poses(one, scanner.mount) for one in (poses, odometry))

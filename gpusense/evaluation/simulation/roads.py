@@ -128,12 +128,8 @@ def _graph_of(chosen: Bools, nodes: NDArray[np.intp]) -> object:
 def drive(corners: Floats, heading: float, step: float, turn: float, most: int) -> Floats:
     """Return the poses of a robot that turns on the spot at each corner and drives straight between corners.
 
-    Args:
-        corners: (P, 2) corners of the path, the first one the start [m].
-        heading: Heading at the start [rad].
-        step: Distance between two scans [m].
-        turn: Largest turn between two scans [rad].
-        most: Largest number of poses.
+    ``corners``: (P, 2) corners of the path, the first one the start [m]. ``heading``: Heading at the start [rad].
+    ``step``: Distance between two scans [m]. ``turn``: Largest turn between two scans [rad].
 
     Returns:
         (T, 3) poses after the start, at most ``most``.

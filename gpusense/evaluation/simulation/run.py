@@ -282,11 +282,8 @@ def draw_odometry(
     The deviations of the noise follow from the true motion. The odometer has the systematic errors that the model
     corrects.
 
-    Args:
-        poses: (T, 3) true poses.
-        motion: The noise.
-        rng: Random generator.
-        jumps: (T,) whether the robot was carried to a pose, without motion of its odometer.
+    ``poses``: (T, 3) true poses. ``jumps``: (T,) whether the robot was carried to a pose, without motion of its
+    odometer.
     """
     odometry = np.zeros_like(poses)
     systematic = motion.systematic if isinstance(motion, OdometryMotion) else (0.0, 0.0, 0.0)

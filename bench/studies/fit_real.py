@@ -32,6 +32,7 @@ from __future__ import annotations
 import argparse
 import csv
 import gzip
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -50,7 +51,6 @@ from gpusense.world.scanner import Reading
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from common import LOGS, make_parser, note, odd_scans, parse, publish, table
-from studies.sonar_field import recorded, ring_of
 
 SONARS = {"sonar1": (8.0, 0.0), "sonar2": (5.0, 0.3)}
 # In the scanner's name: range_max [m], the reading that means "no return" below range_min, x of the mount [m].
@@ -131,16 +131,46 @@ def laser(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeDa
 
 
 def ring(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeData, RangeData]:
-    """Read the odd frames of the sonar ring in the map of the even ones."""
-    place = recorded(data / "sonar_pioneer8", arguments.scans or 1 << 30)
+    """Read the odd frames of a Pioneer's eight sonars in the map of the even ones."""
+    folder = data / "sonar_pioneer8"
+    raw, pose = (np.loadtxt(folder / file) for file in ("measurement.txt", "poses.txt"))
+    poses = np.column_stack([pose[:, 1:3] / 1000, np.radians(pose[:, 3] / 10)])
+    z = np.where(raw[:, 1:] >= 5110, np.inf, raw[:, 1:] / 1000)
     cone = {"cone": np.radians(15), "cone_rays": 7} if name.endswith("cone") else {}
-    model = gs.BeamModel(place.grid, ring_of(place, **cone), backend=arguments.backend)
+    scanner = gs.Scanner(np.radians([-90, -37.5, -22.5, -7.5, 7.5, 22.5, 37.5, 90]), 5.11, 0.39, **cone)
+    grid = sonar_map(scanner, poses[::2], z[::2], width=math.radians(20))
+    model = gs.BeamModel(grid, scanner, backend=arguments.backend)
     halves = []
-    for poses, z in (place.tuning, place.scored):
-        expected = np.minimum(np.asarray(model.expected_ranges(poses), np.float64), place.ring.range_max)
-        block = np.repeat(np.arange(len(z)), z.shape[1])
-        halves.append(RangeData(z.ravel(), expected.ravel(), None, block, place.ring.range_max))
+    for first in (1, 3):
+        frames = slice(first, None if not arguments.scans else first + 4 * arguments.scans, 4)
+        ranges, expected = z[frames], np.asarray(model.expected_ranges(poses[frames]), np.float64)
+        block = np.repeat(np.arange(len(ranges)), ranges.shape[1])
+        clipped = np.minimum(expected, scanner.range_max).ravel()
+        halves.append(RangeData(ranges.ravel(), clipped, None, block, scanner.range_max))
     return halves[0], halves[1]
+
+
+def sonar_map(ring: gs.Scanner, poses: np.ndarray, z: np.ndarray, *, width: float) -> gs.OccupancyGrid:
+    """Map by log odds from cones: free before a reading, occupied at it, with less weight towards the cone's edges."""
+    side, reach = 0.05, ring.range_max
+    low, high = poses[:, :2].min(axis=0) - reach, poses[:, :2].max(axis=0) + reach
+    shape = np.ceil((high - low) / side).astype(int)[::-1]
+    odds, near = np.zeros(shape), int(reach / side) + 1
+    for pose, ranges in zip(poses, z, strict=True):
+        col, row = ((pose[:2] - low) / side).astype(int)
+        rows, cols = slice(max(row - near, 0), row + near), slice(max(col - near, 0), col + near)
+        y, x = np.mgrid[rows.start : min(rows.stop, shape[0]), cols.start : min(cols.stop, shape[1])]
+        dx, dy = low[0] + (x + 0.5) * side - pose[0], low[1] + (y + 0.5) * side - pose[1]
+        far, direction = np.hypot(dx, dy), np.arctan2(dy, dx) - pose[2]
+        for bearing, reading in zip(ring.bearings, ranges, strict=True):
+            if not np.isfinite(reading):
+                continue
+            off = np.abs((direction - bearing + math.pi) % (2 * math.pi) - math.pi) / (width / 2)
+            weight = np.where(off < 1, 1 - off * off, 0)
+            at = np.abs(far - reading) < 0.075
+            odds[rows, cols] += weight * np.where(at, 0.9, np.where(far < reading, -0.3, 0))
+    cells = np.where(odds > 0.7, 100, np.where(odds < -0.3, 0, -1))
+    return gs.OccupancyGrid(cells.astype(np.int8), side, (*low.tolist(), 0.0))
 
 
 Loader = Callable[[Path, str, argparse.Namespace], tuple[RangeData, RangeData]]
@@ -216,12 +246,7 @@ def by_incidence(
         half.ranges, half.expected, half.incidence, half.range_max, range_min=half.range_min, bins=bins, backend=backend
     )
     rest = rest.chosen(rest.kinds != gs.Reading.MISSING)
-    assert rest.incidence is not None and fit.parameters.no_surface is not None
-    place = np.digitize(rest.incidence, fit.parameters.edges[1:-1])
-    place[np.isnan(rest.incidence)] = bins
-    gain = -held_out.log_densities(parameters, rest)
-    for number, own in enumerate((*fit.parameters.parameters, fit.parameters.no_surface)):
-        gain[place == number] += held_out.log_densities(own, rest.chosen(place == number))
+    gain = held_out.incidence_log_densities(fit, rest) - held_out.log_densities(parameters, rest)
     _, block = np.unique(rest.block, return_inverse=True)
     mean, error = held_out.block_mean(gain, block)
     return {"fit": fit.to_dict(), "gain": finite(mean), "gain_error": finite(error)}

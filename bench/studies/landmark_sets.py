@@ -112,7 +112,7 @@ def _lego(data: Path) -> LandmarkRun:
     features, ids = np.concatenate(found), np.concatenate(ids)
     scan = np.repeat(np.arange(len(found)), [len(f) for f in found])
     return LandmarkRun(
-        gs.gs.LandmarkMap(xy), np.arange(len(xy)), scans[:, 0] / 1000, odometry, np.column_stack([position, headings]),
+        gs.LandmarkMap(xy), np.arange(len(xy)), scans[:, 0] / 1000, odometry, np.column_stack([position, headings]),
         features, scan, ids, 3.0, 2.1 * float(np.abs(features[:, 1]).max()), {},
     )  # fmt: skip
 

@@ -71,33 +71,3 @@ def test_groups_of_matches_are_judged_by_references(script: ModuleType) -> None:
     known[2] = np.nan
     groups = script.judged_groups(loops, known)
     assert sorted((g["compared"], g["right"]) for g in groups) == [(3, 3), (4, 0)]
-
-
-@pytest.mark.slow
-def test_growth_is_counted(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
-    arguments = ["--data", str(data_dir), "--log", "seattle", "--most", "1", "--backend", needs("opencl")]
-    (row,) = run_script("speed/chaining_growth.py", *arguments, output=tmp_path / "growth")["rows"]
-    assert row["scans"] == 241 and 200 < row["key_scans"] <= 241
-    assert row["closures"] <= row["searched"] < 8 * row["key_scans"]
-    assert row["launches"] > 50 and row["processor_s"] >= row["main_s"] > 0
-
-
-def test_the_mount_of_a_scanner_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(BENCH))
-    mount = importlib.import_module("accuracy.chaining_covariances")
-    logs = importlib.import_module("accuracy.chaining_logs")
-    t = np.linspace(0, 30, 200)
-    truth = np.stack([5 * np.sin(0.4 * t), 3 * np.sin(0.3 * t), 0.5 * np.sin(t)], axis=1)
-    scanner = gs.Scanner(np.radians(np.arange(-90.0, 91.0)), 30.0, mount=(0.5, 0.1, 0.0))
-    # The clock is known: the reference is read 0.05 s before each scan.
-    track = np.column_stack([t, truth])
-    log = logs.Log("jarvis", np.zeros((200, 181)), scanner, truth, truth, t + 0.05, track=track)
-    off = np.array([0.02, -0.01, 0.01])
-    wrong = mount.remounted(truth, np.array(scanner.mount) + off, -off)
-    found = mount.fitted(log, wrong, slice(0, 100), (0.02, 0.02, 0.01, 0.0))
-    assert np.abs(found - (*off, 0.05)).max() < 2e-3
-    steps = mount.drifts(wrong[100:], truth[100:], 5.0)
-    assert (
-        mount.drifts(mount.remounted(wrong, np.array(scanner.mount), found[:3])[100:], truth[100:], 5.0)[0]
-        < 0.2 * steps[0]
-    )

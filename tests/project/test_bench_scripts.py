@@ -75,25 +75,6 @@ def test_all_kinds_of_landmark_calls_run(tmp_path: Path) -> None:
     assert all(row["what"].endswith("30 landmarks, tracking") and row["readings"] > 0 for row in rows)
 
 
-@pytest.mark.slow
-def test_sonar_field_runs(tmp_path: Path) -> None:
-    """Every method is tuned and scored, and the drawings are made; an absent recorded run is left out."""
-    report = run_script(
-        "studies/sonar_field.py", "--quick", "--places", "building", "--backend", "numpy", "--scans", "4",
-        "--particles", "30", "--figures", str(tmp_path / "drawn"), output=tmp_path / "sonar",
-    )  # fmt: skip
-    rows = report["rows"]
-    assert len({row["model"] for row in rows}) == 4 and {row["window"] for row in rows} == {1, 8}
-    for row in rows:
-        assert len(row["rank"]) == (4 if row["window"] == 1 else 2)
-        assert all(0 <= rank <= 1 for rank in row["rank"] + row["global rank"])
-        assert all(-50 < value <= math.log(31) + 1e-9 for value in row["information"])
-        assert all(0 <= error < 5 for error in row["error"])
-        # Tuned methods have some information on a pose from a single frame.
-        assert row["window"] == 8 or sum(row["information"]) > 0
-    assert sorted(file.name for file in (tmp_path / "drawn").glob("*.png")) == ["sonar-scene.png", "sonar-scores.png"]
-
-
 @pytest.mark.parametrize("selection", ["opencl"])
 def test_small_calls_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--particles", "50", "--particles", "90", "--beams", "12", "--scans", "3", "--calls", "4"]
@@ -249,15 +230,6 @@ def test_runs_among_landmarks(needs: Callable[[str], str], data_dir: Path, tmp_p
         assert all(row["association"][0]["right"] > 0.75 for row in one["rows"] if "association" in row)
     for row in [*mrclam["rows"], *lego["rows"], *freiburg["rows"]]:
         assert row["filter"]["error_median"] < 0.2
-
-
-@pytest.mark.slow
-def test_offsets_of_beacons_run(data_dir: Path, tmp_path: Path) -> None:
-    arguments = ("--data", str(data_dir), "--set", "simulated")
-    report = run_script("studies/beacon_offsets.py", *arguments, output=tmp_path / "beacon_offsets")
-    (found,) = report["sets"]
-    none, common, each = found["rows"]
-    assert each["nees"] < 3 < each["raw"] and each["held_out"] > common["held_out"] > none["held_out"]
 
 
 @pytest.mark.slow

@@ -41,7 +41,7 @@ def test_quick_run_writes_whole_files(needs, tmp_path, capsys):
         assert set(point) == POINT_KEYS
         assert point["status"] == "ok", point["reason"]
         assert set(point["time"]) == TIMES
-        assert set(point["memory"]) == {"table_bytes", "device_bytes", "peak_bytes"}
+        assert set(point["memory"]) == {"table_bytes"}
         kinds = set(ERRORS) - ({"ranges"} if point["problem"] == "field" else set())
         known = {k: ERRORS[k] for k in kinds}
         if point["cloud"] == "tracking" and point["problem"] != "ranges":

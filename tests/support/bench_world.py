@@ -11,7 +11,6 @@ from gpusense.evaluation.benchmark import candidates, report, runner, scenes
 
 TIMES = {
     "first_s", "build_s", "compile_s", "call_min_s", "call_q1_s", "call_median_s", "call_q3_s", "processor_s", "calls",
-    "launch_min_s", "launch_q1_s", "launch_median_s", "launch_q3_s", "launches", "upload_s", "download_s",
 }  # fmt: skip
 ERRORS = {
     "ranges": {"median", "p95", "p99", "max", "mean", "wrong_1", "wrong_2"},
@@ -56,8 +55,8 @@ def made_point(**changes):
         "scene": "s", "cloud": "global", "problem": "ranges", "backend": "numpy", "device": "d", "kind": "cpu",
         "method": "exact", "variant": "", "knob": "", "value": None, "code": "", "precision": "float32", "exact": False,
         "outside": False, "particles": 10, "beams": 10, "work": 100, "checked": 5, "status": "ok", "reason": "",
-        "time": dict.fromkeys(TIMES, 1.0) | {"calls": 20, "launches": 20},
-        "memory": {"table_bytes": 8, "device_bytes": 16, "peak_bytes": 24},
+        "time": dict.fromkeys(TIMES, 1.0) | {"calls": 20},
+        "memory": {"table_bytes": 8},
         "errors": {kind: dict.fromkeys(names, 0.5) for kind, names in ERRORS.items()},
     }  # fmt: skip
     point = copy.deepcopy(point)

@@ -165,7 +165,7 @@ def entries(
     listed = []
     for (method, at, precision), group in groups.items():
         errors = [error_of(point, measure.kind, measure.name) for point in group]
-        times = [time_of(point, "call") for point in group]
+        times = [time_of(point) for point in group]
         if any(value is None for value in (*errors, *times)):
             continue
         seconds = math.exp(sum(math.log(time or 1.0) for time in times) / len(times))
@@ -224,11 +224,7 @@ def choose(
     fastest = min(entry.seconds for entry in exact)
     if standing in able and standing.error <= CLOSE**2 * least and standing.seconds <= ALIKE**2 * fastest:
         return standing
-    return min((entry for entry in exact if entry.seconds <= ALIKE * fastest), key=_preference)
-
-
-def _preference(entry: Entry) -> tuple[bool, bool, int, bool, str, float]:
-    return entry.preference
+    return min((entry for entry in exact if entry.seconds <= ALIKE * fastest), key=lambda entry: entry.preference)
 
 
 def error_text(value: float, unit: str) -> str:
@@ -304,7 +300,7 @@ def error_of(point: Mapping[str, Any], kind: str, name: str) -> float | None:
     return None if value is None or point["status"] != "ok" else float(value)
 
 
-def time_of(point: Mapping[str, Any], timing: str) -> float | None:
-    """Return the least time of a point's calls or launches [s]; None where it was not measured."""
-    value = (point.get("time") or {}).get(f"{timing}_min_s")
+def time_of(point: Mapping[str, Any]) -> float | None:
+    """Return the least time of a point's calls [s]; None where it was not measured."""
+    value = (point.get("time") or {}).get("call_min_s")
     return float(value) if value else None

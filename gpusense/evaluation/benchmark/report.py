@@ -23,14 +23,14 @@ _DIGITS = 6
 _READING = """\
 A row is a method with a value of its knob on a device, in a scene with a cloud; report.json has all figures. Times are
 nanoseconds per particle-beam: *call* is the shortest call with NumPy arrays in and out (a star marks a single call),
-*processor* its processor time over all threads, *launch* its launches alone. *build* builds the map's tables.
+*processor* its processor time over all threads. *build* builds the map's tables.
 
 Errors are against the exact caster and the models in float64: rays wrong by more than a cell, root mean square of log p
 in nats, and for the posterior at a comparable temperature the Kullback-Leibler divergence in nats and the shift of its
 mean. *fewer beams* counts each of every n-th beam n times; *compat* computes another program's model."""
 _COLUMNS = (
     "problem", "scene", "cloud", "backend", "method", "knob", "precision", "remark", "call ns", "processor ns",
-    "launch ns", "build s", "table MB", "> 1 cell", "log p rms", "KL", "shift m",
+    "build s", "table MB", "> 1 cell", "log p rms", "KL", "shift m",
 )  # fmt: skip
 _WORDS = _COLUMNS.index("call ns")
 
@@ -132,7 +132,7 @@ def _row(point: Mapping[str, Any]) -> list[str]:
     return [
         *(str(point[key]) for key in ("problem", "scene", "cloud")), backend, name, setting(point), point["precision"],
         remark, _per_beam(point, "call_min_s") + ("*" if time_s.get("calls") == 1 else ""),
-        *(_per_beam(point, f"{kind}_s") for kind in ("processor", "launch_min")), _text(time_s.get("build_s")),
+        _per_beam(point, "processor_s"), _text(time_s.get("build_s")),
         _text(memory.get("table_bytes"), 1e-6), "-" if wrong is None else f"{100 * wrong:.2g} %",
         *(_text(error_of(point, *place)) for place in errors),
     ]  # fmt: skip

@@ -12,7 +12,7 @@ import numpy as np
 from gpusense.backends import Backend
 from gpusense.evaluation.benchmark.accuracy import Truth, UnstableError, errors, fine_errors, truth_device
 from gpusense.evaluation.benchmark.candidates import Candidate
-from gpusense.evaluation.benchmark.measure import Cost, Earlier, Runner, measure
+from gpusense.evaluation.benchmark.measure import Made, Runner, measure
 from gpusense.evaluation.benchmark.scenes import CLOUDS, MapSource, Scene, make_scene
 from gpusense.localization.weights import normalize_weights
 
@@ -48,8 +48,7 @@ class Plan:
         seed: Seed of all random numbers.
         build_limit: Longest time to build a table [s]; a point above it is left out.
         deadline: Measuring time, without compiling, after which no further point begins [s].
-        slow_to_make: Duration of a first call above which building includes compiling [s], and tables of the whole map
-            are built for the first cloud of a scene alone; None: each cloud builds its tables, see ``measure``.
+        slow_to_make: Duration of a first call above which building includes compiling [s]; None as in ``measure``.
     """
 
     sources: Sequence[MapSource]
@@ -86,6 +85,11 @@ class Job:
     candidate: Candidate
     backend: Backend | None
     precision: str
+
+    @property
+    def place(self) -> tuple[str, str]:
+        """Return the device's selection string, or ``"outside"``, and the precision."""
+        return self.backend.info.selection if self.backend else "outside", self.precision
 
 
 @dataclass
@@ -130,38 +134,37 @@ def run(plan: Plan, step: Callable[[str], None] = lambda text: None, outcome: Ou
     outcome.truth = {"backend": info.selection, "device": info.name, "precision": "float64", "note": note}
     for source in plan.sources:
         scene = make_scene(source, device, beams=plan.beams, particles=plan.cloud, seed=plan.seed)
-        outcome.scenes.append(_description(scene))
+        truths = {cloud: Truth(scene, scene.clouds[cloud][: plan.checked], device) for cloud in CLOUDS}
+        outcome.scenes.append(_description(scene, truths))
         paces: dict[tuple[str, str], float] = {}
-        built: dict[tuple[str, ...], float] = {}
-        earlier: dict[Job, list[Earlier]] = {}
-        for cloud in CLOUDS:
-            truth = Truth(scene, scene.clouds[cloud][: plan.checked], device)
-            outcome.scenes[-1]["clouds"][cloud] = _cloud_description(truth)
-            for job in jobs(plan):
+        for job in jobs(plan):
+            made: Made | None = None
+            for cloud, truth in truths.items():
                 step(f"{scene.name}, {cloud}, {job.candidate.label}")
-                reason = _left_out(plan, job, scene, paces, built, spent)
+                reason = _left_out(plan, job, scene, paces.get(job.place), made, spent)
                 begin = time.perf_counter()
-                shared = job.candidate.whole and plan.slow_to_make is not None
-                point = point_of(plan, job, truth, cloud, reason, earlier.setdefault(job, []) if shared else None)
+                point, made = point_of(plan, job, truth, cloud, reason, made)
                 outcome.points.append(point)
                 spent += time.perf_counter() - begin
                 if point["time"]:
                     # Compiling does not count, so a first run measures about as many points as the next one.
                     spent -= point["time"]["compile_s"] or 0.0
-                    built[*_place(job), job.candidate.label] = point["time"]["build_s"]
                     if job.candidate.method == "exact" and job.candidate.problem == "ranges":
-                        paces[_place(job)] = point["work"] / point["time"]["call_min_s"]
+                        paces[job.place] = point["work"] / point["time"]["call_min_s"]
     return outcome
 
 
 def point_of(
-    plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "", earlier: list[Earlier] | None = None
-) -> dict[str, Any]:
+    plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "", made: Made | None = None
+) -> tuple[dict[str, Any], Made | None]:
     """Measure one point; a failure becomes its status and reason.
+
+    ``made``: The runner of another cloud, which serves this one if its table is of the whole map.
 
     Returns:
         Plain values. ``status`` is ``"ok"``, ``"failed"`` after an exception, ``"unstable"`` for results that are not
-        finite, or ``"left out"`` for a point that was not tried. ``reason`` explains the status.
+        finite, or ``"left out"`` for a point that was not tried. ``reason`` explains the status. And the runner, or
+        None without a measurement.
     """
     scene, candidate, backend = truth.scene, job.candidate, job.backend
     particles = plan.particles_on(backend)
@@ -178,21 +181,23 @@ def point_of(
         "memory": None, "errors": None,
     }  # fmt: skip
     if reason:
-        return point
+        return point, made
+    made = made if candidate.whole else None
     try:
-        cost, runner = measure(
-            lambda device: candidate.make(scene, device, job.precision), backend, scene.clouds[cloud][:particles],
-            plan.repeats, plan.seconds, plan.slow_to_make, earlier,
+        cost, made = measure(
+            lambda: candidate.make(scene, backend, job.precision), backend, scene.clouds[cloud][:particles],
+            plan.repeats, plan.seconds, plan.slow_to_make, made,
         )  # fmt: skip
-        point |= _split(cost)
-        point["errors"] = _errors(truth, candidate, runner, fine=cloud == FINE_CLOUD)
+        times = asdict(cost)
+        point |= {"memory": {"table_bytes": times.pop("table_bytes")}, "time": times}
+        point["errors"] = _errors(truth, candidate, made.runner, fine=cloud == FINE_CLOUD)
     except LeftOutError as error:
         point |= {"status": "left out", "reason": str(error)}
     except UnstableError as error:
         point |= {"status": "unstable", "reason": str(error)}
     except Exception as error:
         point |= {"status": "failed", "reason": " ".join(f"{type(error).__name__}: {error}".split())}
-    return point
+    return point, made
 
 
 def _errors(truth: Truth, candidate: Candidate, runner: Runner, *, fine: bool) -> dict[str, dict[str, float]]:
@@ -207,51 +212,33 @@ def _errors(truth: Truth, candidate: Candidate, runner: Runner, *, fine: bool) -
     return found
 
 
-def _split(cost: Cost) -> dict[str, dict[str, Any]]:
-    """Split a cost into seconds and bytes."""
-    values = asdict(cost)
-    memory = {name: values.pop(name) for name in list(values) if name.endswith("_bytes")}
-    return {"time": values, "memory": memory}
-
-
-def _place(job: Job) -> tuple[str, str]:
-    return (job.backend.info.selection if job.backend else "outside", job.precision)
-
-
-def _left_out(
-    plan: Plan,
-    job: Job,
-    scene: Scene,
-    paces: Mapping[tuple[str, str], float],
-    built: Mapping[tuple[str, ...], float],
-    spent: float,
-) -> str:
+def _left_out(plan: Plan, job: Job, scene: Scene, pace: float | None, made: Made | None, spent: float) -> str:
     """Return why a point is left out; empty if it is measured.
 
-    ``spent``: Measuring time so far [s].
+    ``pace``: Rays per second of the exact caster. ``made``: The runner of the scene's other cloud. ``spent``: Measuring
+    time so far [s].
     """
     if job.candidate.missing:
         return job.candidate.missing
     if spent > plan.deadline:
         return f"the {plan.deadline:g} s of this run were over"
     rays = job.candidate.table_rays(scene) if job.candidate.table_rays else 0.0
-    pace = paces.get(_place(job))
     if pace and rays / pace > plan.build_limit:
         return f"building its table would take about {rays / pace:.0f} s, more than {plan.build_limit:g} s"
-    seconds = built.get((*_place(job), job.candidate.label))
-    if seconds is not None and seconds > plan.build_limit:
-        return f"building its table has taken {seconds:.0f} s in this scene, more than {plan.build_limit:g} s"
+    if made is not None and made.build_s > plan.build_limit:
+        return f"building its table has taken {made.build_s:.0f} s in this scene, more than {plan.build_limit:g} s"
     return ""
 
 
-def _description(scene: Scene) -> dict[str, Any]:
+def _description(scene: Scene, truths: Mapping[str, Truth]) -> dict[str, Any]:
     rows, cols = scene.grid.shape
     return {
         "name": scene.name, "map": scene.origin, "rows": rows, "cols": cols, "resolution": scene.grid.resolution,
         "occupied": int(np.count_nonzero(scene.grid.occupied)), "free": int(np.count_nonzero(scene.grid.free)),
         "range_max": scene.scanner.range_max, "beams": scene.scanner.count, "hits": scene.hits,
         "pose": scene.pose.tolist(), "beam": scene.beam.to_dict(), "field": scene.field.to_dict(),
-        "fingerprint": scene.fingerprint, "clouds": {},
+        "fingerprint": scene.fingerprint,
+        "clouds": {cloud: _cloud_description(truth) for cloud, truth in truths.items()},
     }  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from gpusense._util.files import check_writable, write_whole
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import BACKEND_HELP, add_json, open_backends, positive_number, whole_number
 from gpusense.commands.output import print_json, print_result, print_table
+from gpusense.commands.signals import held
 from gpusense.evaluation.benchmark.choice import Wish, choices, parse_error, parse_time
 from gpusense.evaluation.machine import machine, machine_line
 
@@ -119,14 +120,9 @@ def run(args: argparse.Namespace) -> int:
     if args.html is not None:
         check_writable(args.html)
     plan, absent = make_plan(args)
-    outcome, stopped = Outcome([], []), None
-    try:
-        with progress(steps(plan)) as step:
-            run_plan(plan, step, outcome)
-    except KeyboardInterrupt as stop:
-        if not outcome.points:
-            raise
-        stopped = stop
+    outcome = Outcome([], [])
+    with held(outcome.points) as stops, progress(steps(plan)) as step:
+        run_plan(plan, step, outcome)
     report = document(plan, outcome, arguments_of(args, plan), machine(), absent, command_of(sys.argv[1:]))
     if args.output is not None:
         write_report(args.output, report)
@@ -136,8 +132,8 @@ def run(args: argparse.Namespace) -> int:
         print_json(report)
     else:
         _print(report, Wish(dict(args.max_error), args.max_time), args.output)
-    if stopped is not None:
-        raise stopped
+    if stops:
+        raise stops[0]
     return 0
 
 

@@ -32,6 +32,7 @@ from gpusense.commands.demo_scene import (
     score_scene,
 )
 from gpusense.commands.output import grouped
+from gpusense.commands.signals import held
 from gpusense.evaluation.machine import machine
 
 NAME = "demo"
@@ -90,27 +91,21 @@ def run(args: argparse.Namespace) -> int:
     if args.verbose:
         _describe(scene, args.seed, backends)
     scores: list[Score] = []
-    drawn, stopped = False, None
-    try:
-        with progress(2 * len(backends) + 3) as step:
-            _score_all(scene, backends, scores, failures, selected=args.backend is not None, step=step)
-            step("picture")
-            drawn = not args.no_plot and {score.name for score in scores} == {BEAM, FIELD}
-            if drawn:
-                draw(scene, scores, args.output)
-    except KeyboardInterrupt as stop:
-        if not scores:
-            raise
-        drawn, stopped = False, stop
-    written = args.output if drawn else None
+    written = None
+    with held(scores) as stops, progress(2 * len(backends) + 3) as step:
+        _score_all(scene, backends, scores, failures, selected=args.backend is not None, step=step)
+        step("picture")
+        if not args.no_plot and {score.name for score in scores} == {BEAM, FIELD}:
+            draw(scene, scores, args.output)
+            written = args.output
     if args.json:
         output.print_json(_document(scene, args.seed, scores, failures, written))
     else:
         _report(scene, scores, failures, written)
     if args.verbose:
         _explain(scores)
-    if stopped is not None:
-        raise stopped
+    if stops:
+        raise stops[0]
     return 1 if failures else 0
 
 

@@ -7,8 +7,8 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 from gpusense.commands.arguments import add_json
-from gpusense.commands.output import driver_text, print_fact, print_json, print_result, print_table
-from gpusense.evaluation.machine import machine, machine_line
+from gpusense.commands.output import driver_text, print_fact, print_report, print_result, print_table
+from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
     from gpusense.backends import Device
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     listed = _with_failures(listed)
     if args.json:
         documents = [asdict(device) | {"auto": device.available and device.selection == auto} for device in listed]
-        print_json({"auto": auto, "auto_error": auto_error, "devices": documents, "machine": machine()})
+        print_report({"auto": auto, "auto_error": auto_error, "devices": documents})
         return 0
     chosen = next((device for device in listed if device.available and device.selection == auto), None)
     print_result(f"NO DEVICE: 'auto' does not work: {auto_error}" if chosen is None else

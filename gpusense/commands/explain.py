@@ -16,9 +16,8 @@ from gpusense.commands.arguments import (
     parameters_of,
     whole_number,
 )
-from gpusense.commands.output import counted, print_fact, print_json, print_result
+from gpusense.commands.output import counted, print_fact, print_report, print_result
 from gpusense.commands.scans import OPTIONS, add_log, add_range_max, read_scan
-from gpusense.evaluation.machine import machine
 
 if TYPE_CHECKING:
     import numpy as np
@@ -77,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     plan = model.plan(measure=args.measure)
     texts = model.sources() if args.sources else {}
     if args.json:
-        print_json(_document(plan) | ({"sources": texts} if args.sources else {}) | {"machine": machine()})
+        print_report(_document(plan) | ({"sources": texts} if args.sources else {}))
         return 0
     _print(plan)
     if args.verbose:

@@ -11,9 +11,10 @@ import numpy as np
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import add_backend, add_json, output_path, positive_number, whole_number
-from gpusense.commands.output import counted, print_fact, print_files, print_json, print_result
+from gpusense.commands.output import counted, print_fact, print_files, print_interrupted, print_report, print_result
 from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans
-from gpusense.evaluation.machine import machine, machine_line
+from gpusense.commands.signals import held
+from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
     from gpusense.features.feature_map import FeatureMap
@@ -72,17 +73,14 @@ def run(args: argparse.Namespace) -> int:
     scans = read_scans(args, posed=posed)
     parts: list[Features] = []
     begun = time.perf_counter()
-    try:
-        with progress(len(scans)) as step:
-            for first in range(0, len(scans), _CALL):
-                parts.append(_extract(args, scans[first : first + _CALL]))
-                for index, _ in scans[first : first + _CALL]:
-                    step(f"scan {index}")
-    except KeyboardInterrupt:
-        if parts:
-            _report(args, scans, parts, posed, time.perf_counter() - begun)
-        raise
+    with held(parts) as stops, progress(len(scans)) as step:
+        for first in range(0, len(scans), _CALL):
+            parts.append(_extract(args, scans[first : first + _CALL]))
+            for index, _ in scans[first : first + _CALL]:
+                step(f"scan {index}")
     _report(args, scans, parts, posed, time.perf_counter() - begun)
+    if stops:
+        raise stops[0]
     return 0
 
 
@@ -115,7 +113,7 @@ def _of_map(args: argparse.Namespace) -> int:
     landmarks = landmarks_of_map(grid, kinds=_landmark_kinds(args), backend=args.backend)
     _write_landmarks(args, landmarks, grid)
     if args.json:
-        print_json({"options": _options(args), "landmarks": _landmark_rows(landmarks), "machine": machine()})
+        print_report({"landmarks": _landmark_rows(landmarks)}, args)
         return 0
     print_result(f"{counted(len(landmarks.kind), 'landmark')} in the map: {_kinds(landmarks.kind)}")
     _print_files(args)
@@ -142,10 +140,9 @@ def _report(
         _draw(args.plot, features, scans[:done])
     counts = {str(kind): int(count) for kind, count in zip(*np.unique(features.kind, return_counts=True), strict=True)}
     if args.json:
-        print_json({
-            "options": _options(args), "scans": done, "counts": counts, "milliseconds_each": 1e3 * seconds / done,
-            "landmarks": None if landmarks is None else _landmark_rows(landmarks), "machine": machine(),
-        })  # fmt: skip
+        rows = None if landmarks is None else _landmark_rows(landmarks)
+        facts = {"scans": done, "counts": counts, "milliseconds_each": 1e3 * seconds / done, "landmarks": rows}
+        print_report(facts, args)
         return
     print_result(f"{counted(len(features.kind), 'feature')} in {counted(done, 'scan')}: "
                  f"{len(features.kind) / done:.2g} a scan")  # fmt: skip
@@ -153,8 +150,7 @@ def _report(
         print_fact("a scan", ", ".join(f"{kind} {count / done:.2g}" for kind, count in counts.items()))
     if landmarks is not None:
         print_fact("landmarks", f"{len(landmarks.kind)}, each in {args.least} scans or more: {_kinds(landmarks.kind)}")
-    if done < len(scans):
-        print(f"interrupted: results of {done} of {len(scans)} scans")
+    print_interrupted(done, len(scans))
     _print_files(args)
     if args.verbose:
         print(f"\n{1e3 * seconds / done:.3g} ms each with the first call's compilation\n{machine_line()}")
@@ -168,10 +164,6 @@ def _kinds(kinds: np.ndarray) -> str:
 
 def _print_files(args: argparse.Namespace) -> None:
     print_files(args.out, args.map_out, args.plot, args.map_plot)
-
-
-def _options(args: argparse.Namespace) -> dict[str, Any]:
-    return {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
 
 
 def _landmark_rows(landmarks: FeatureMap) -> list[dict[str, Any]]:

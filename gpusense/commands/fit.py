@@ -13,9 +13,8 @@ from gpusense._util.files import check_writable, write_whole
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import add_backend, add_json, add_seed, check_writer, whole_number
 from gpusense.commands.fit_results import DOUBT, FitResult, PartialFit, is_doubtful, print_fit
-from gpusense.commands.output import print_json
+from gpusense.commands.output import print_report
 from gpusense.commands.scans import OPTIONS, add_choice, add_log, add_reference, log_options, options_named, read_scans
-from gpusense.evaluation.machine import machine
 
 if TYPE_CHECKING:
     from gpusense.evaluation.range_data import RangeData
@@ -109,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
         raise
     files = _write(args.out, result) if args.out is not None else []
     if args.json:
-        print_json(_document(args, result, files))
+        print_report(_document(result, files), args)
         if is_doubtful(result.fit):
             sys.stderr.write(f"gpusense: {DOUBT}\n")
     else:
@@ -203,11 +202,9 @@ def _motion(args: argparse.Namespace) -> MotionFit | None:
     return fit_odometry_motion(*references_to_learn_from(steps))
 
 
-def _document(args: argparse.Namespace, result: FitResult, files: list[Path]) -> dict[str, Any]:
-    options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
+def _document(result: FitResult, files: list[Path]) -> dict[str, Any]:
     held_out = [{**asdict(row), "parameters": row.parameters.to_dict()} for row in result.held_out]
     return {
-        "options": options,
         "range_max": result.data.range_max,
         "readings": len(result.data.ranges),
         "blocks": len(set(result.data.block.tolist())),
@@ -217,7 +214,6 @@ def _document(args: argparse.Namespace, result: FitResult, files: list[Path]) ->
         "held_out_readings": result.held_out_readings,
         "held_out": held_out,
         "files": files,
-        "machine": machine(),
     }
 
 

@@ -18,8 +18,8 @@ from gpusense.commands.arguments import (
     range_number,
     whole_number,
 )
-from gpusense.commands.output import counted, degrees, length, print_fact, print_json, print_parameters, print_result
-from gpusense.evaluation.machine import machine, machine_line
+from gpusense.commands.output import counted, degrees, length, print_fact, print_parameters, print_report, print_result
+from gpusense.evaluation.machine import machine_line
 from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
         _print_fit(args, fit)
         raise
     if args.json:
-        print_json(_document(args, recorded_run, fit, suspicions, agreement, track, motion, model.device.selection))
+        print_report(_document(recorded_run, fit, suspicions, agreement, track, motion, model.device.selection), args)
     else:
         _print(args, recorded_run, fit, suspicions, agreement, track, motion)
     return LOST if track.lost else 0
@@ -136,19 +136,17 @@ def run(args: argparse.Namespace) -> int:
 def _print_fit(args: argparse.Namespace, fit: LandmarkFit) -> None:
     """Print the fit of a run with an interrupted localisation."""
     if args.json:
-        print_json({"interrupted": True, "fit": fit.to_dict(), "machine": machine()})
+        print_report({"interrupted": True, "fit": fit.to_dict()})
     else:
         print(f"interrupted while localising; the noise of the sensor:\n\n{fit}")
 
 
 def _document(
-    args: argparse.Namespace, recorded_run: LandmarkRun, fit: LandmarkFit, suspicions: Suspicions,
-    agreement: dict[str, float], track: Track, motion: DriftingOdometry, device: str,
+    recorded_run: LandmarkRun, fit: LandmarkFit, suspicions: Suspicions, agreement: dict[str, float], track: Track,
+    motion: DriftingOdometry, device: str,
 ) -> dict[str, Any]:  # fmt: skip
-    options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
     label = recorded_run.labels.tolist()
     return {
-        "options": options,
         "scans": len(recorded_run.time),
         "features": len(recorded_run.ids),
         "left_out": recorded_run.left_out,
@@ -161,7 +159,6 @@ def _document(
         "motion": asdict(motion),
         "filter": track.summary(),
         "device": device,
-        "machine": machine(),
     }
 
 

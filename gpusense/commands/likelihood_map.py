@@ -16,10 +16,10 @@ from gpusense.commands.arguments import (
     positive_number,
     whole_number,
 )
-from gpusense.commands.output import grouped, print_fact, print_files, print_json, print_result, print_table
+from gpusense.commands.output import grouped, print_fact, print_files, print_report, print_result, print_table
 from gpusense.commands.scans import add_log, add_range_max, read_scan
 from gpusense.commands.signals import code_of, word_of
-from gpusense.evaluation.machine import machine, machine_line
+from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
     import numpy as np
@@ -91,12 +91,12 @@ def run(args: argparse.Namespace) -> int:
     result.plot(args.out)
     poses, log_p, gain = refine_modes(model, scan.ranges, result, _MODES)
     if args.json:
-        print_json({
+        print_report({
             "picture": str(args.out), "done": done, "rows": result.log_p.shape[0], "cols": result.log_p.shape[1],
             "headings": result.log_p.shape[2], "resolution": result.resolution, "entropy": result.entropy,
             "log_evidence": result.log_evidence, "gain_of_refinement": gain, "modes": [
                 {"pose": pose, "log_likelihood": value} for pose, value in zip(poses.tolist(), log_p, strict=True)
-            ], "machine": machine(),
+            ],
         })  # fmt: skip
     else:
         _print(args, poses, log_p, gain)

@@ -20,6 +20,7 @@ from gpusense.commands.arguments import (
     whole_number,
 )
 from gpusense.commands.scans import add_choice, add_log
+from gpusense.commands.signals import held
 from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
@@ -128,18 +129,15 @@ def run(args: argparse.Namespace) -> int:
     pose, covariance = start_of(args, read.nav2) or (None, None)
     start(pf, steps, everywhere=args.everywhere, pose=pose, covariance=covariance)
     track, recorders = Track(), _recorders(args, pf, len(steps))
-    try:
-        with progress(len(steps)) as step:
-            step("starting")
-            for one in follow(pf, steps, track):
-                step(_text(track, one))
-                for recorder in recorders.values():
-                    recorder.add(pf, track, one)
-    except KeyboardInterrupt:
-        if track.steps:
-            report(args, pf, track, len(steps), recorders)
-        raise
+    with held(track.steps) as stops, progress(len(steps)) as step:
+        step("starting")
+        for one in follow(pf, steps, track):
+            step(_text(track, one))
+            for recorder in recorders.values():
+                recorder.add(pf, track, one)
     found = report(args, pf, track, len(steps), recorders)
+    if stops:
+        raise stops[0]
     return 0 if found["verdict"] == "tracking" and found["explained_at_end"] is not None else LOST
 
 

@@ -9,10 +9,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpusense.commands.output import degrees, length, print_fact, print_files, print_json, print_result
+from gpusense.commands.output import (
+    degrees,
+    length,
+    print_fact,
+    print_files,
+    print_interrupted,
+    print_report,
+    print_result,
+)
 from gpusense.commands.scans import scan_times
 from gpusense.commands.stretches import print_stretches, stretch_rows
-from gpusense.evaluation.machine import machine, machine_line
+from gpusense.evaluation.machine import machine_line
 from gpusense.localization.spread import WIDE, WIDE_TURN
 
 if TYPE_CHECKING:
@@ -54,12 +62,11 @@ def report(
     for path, recorder in recorders.items():
         recorder.write(track, path)
     if args.json:
-        options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
         poses = [[step.index, *pose.tolist()] for step, pose in zip(track.steps, track.poses, strict=True)]
-        document = {"options": options, "filter": repr(pf), "summary": result, "scans_chosen": chosen}
+        document = {"filter": repr(pf), "summary": result, "scans_chosen": chosen}
         times = [step.scan.time for step in track.steps]
         document |= {"poses": poses, "times": times, "stretches": stretch_rows(stretches), "risk": RISK}
-        print_json(document | {"machine": machine()})
+        print_report(document, args)
         return result
     _print(pf, result, chosen, track)
     if len(stretches) > 1:
@@ -96,8 +103,7 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track
     settled = result["settled_median"] if known else None
     error = "" if settled is None else f"; median error {length(settled)}"
     print_result(_verdict(result, deviations) + error)
-    if result["scans"] < chosen:
-        print(f"interrupted: results of {result['scans']} of {chosen} scans")
+    print_interrupted(result["scans"], chosen)
     if result["verdict"] == "tracking" and result["evidence"] is not None:
         print_fact("but", result["evidence"]["text"])
     print_fact("last pose", f"{_pose(track.poses[-1])}; deviations {_deviations(deviations)}")

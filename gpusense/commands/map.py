@@ -24,10 +24,10 @@ from gpusense.commands.map_chain import (
     print_chain,
     write_chain,
 )
-from gpusense.commands.output import counted, grouped, print_fact, print_files, print_json, print_result
+from gpusense.commands.output import counted, grouped, print_fact, print_files, print_report, print_result
 from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans_of_lasers, scanners_of
 from gpusense.commands.signals import code_of, word_of
-from gpusense.evaluation.machine import machine, machine_line
+from gpusense.evaluation.machine import machine_line
 from gpusense.world.map_greys import MODES
 
 if TYPE_CHECKING:
@@ -145,11 +145,11 @@ def _report(
     rows, cols = grid.shape
     free, occupied = int(grid.free.sum()), int(grid.occupied.sum())
     if args.json:
-        print_json({
+        print_report({
             "map": str(args.out), "image": str(image), "mode": args.mode, "scans": scans[0],
             "scans_chosen": scans[1], "rays": builder.rays, "rows": rows, "cols": cols,
             "resolution": grid.resolution, "origin": grid.origin, "free": free, "occupied": occupied,
-            "chain": None if chained is None else document(args, chained), "machine": machine(),
+            "chain": None if chained is None else document(args, chained),
         })  # fmt: skip
         return
     if chained is None:

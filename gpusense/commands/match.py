@@ -19,9 +19,19 @@ from gpusense.commands.arguments import (
     output_path,
     positive_number,
 )
-from gpusense.commands.output import counted, degrees, length, print_fact, print_files, print_json, print_result
+from gpusense.commands.output import (
+    counted,
+    degrees,
+    length,
+    print_fact,
+    print_files,
+    print_interrupted,
+    print_report,
+    print_result,
+)
 from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans, scan_times
-from gpusense.evaluation.machine import machine, machine_line
+from gpusense.commands.signals import held
+from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
     from gpusense.evaluation.matching import LogMatches
@@ -83,21 +93,18 @@ def run(args: argparse.Namespace) -> int:
     scans = read_scans(args, posed=False)
     parts: list[LogMatches] = []
     begun = time.perf_counter()
-    try:
-        calls = match_log(
-            scans, grid, guess=args.guess or ("odometry" if grid is None else "logged"), method=args.method,
-            backend=args.backend, spread=(args.shift, math.radians(args.turn)), seed=args.seed, noise=args.noise,
-        )  # fmt: skip
-        with progress(len(scans)) as step:
-            for part in calls:
-                parts.append(part)
-                for _ in part.indices:
-                    step(f"scan {part.indices[-1, 1]}")
-    except KeyboardInterrupt:
-        if parts:
-            _report(args, grid, scans, parts, time.perf_counter() - begun)
-        raise
+    calls = match_log(
+        scans, grid, guess=args.guess or ("odometry" if grid is None else "logged"), method=args.method,
+        backend=args.backend, spread=(args.shift, math.radians(args.turn)), seed=args.seed, noise=args.noise,
+    )  # fmt: skip
+    with held(parts) as stops, progress(len(scans)) as step:
+        for part in calls:
+            parts.append(part)
+            for _ in part.indices:
+                step(f"scan {part.indices[-1, 1]}")
     _report(args, grid, scans, parts, time.perf_counter() - begun)
+    if stops:
+        raise stops[0]
     return 0
 
 
@@ -120,12 +127,10 @@ def _report(
     if args.plot is not None:
         _draw(args.plot, grid, dict(scans), matches)
     if args.json:
-        print_json(_document(args, matches, total, len(scans)))
+        print_report(_document(matches, total, len(scans)), args)
         return
     _print(total)
-    expected = len(scans) - (grid is None)
-    if len(matches.match) < expected:
-        print(f"interrupted: results of {len(matches.match)} of {expected} matches")
+    print_interrupted(len(matches.match), len(scans) - (grid is None), "matches")
     print_files(args.out, args.plot, args.tum)
     if args.verbose:
         print(f"\nscore: median {total['score_median']:.3f}\n{total['milliseconds_each']:.3g} ms each with the first "
@@ -155,15 +160,14 @@ def _print(total: dict[str, Any]) -> None:
             print_fact(str(number), f"{status}: {STATUSES[status]}")
 
 
-def _document(args: argparse.Namespace, matches: LogMatches, total: dict[str, Any], chosen: int) -> dict[str, Any]:
-    options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
+def _document(matches: LogMatches, total: dict[str, Any], chosen: int) -> dict[str, Any]:
     match = matches.match
     names = ("pose", "covariance", "score", "iterations", "converged", "eigenvalues", "status")
     rows = [
         {"reference": int(first), "scan": int(second)} | {name: getattr(match, name)[i] for name in names}
         for i, (first, second) in enumerate(matches.indices)
     ]
-    return {"options": options, "scans_chosen": chosen, "summary": total, "matches": rows, "machine": machine()}
+    return {"scans_chosen": chosen, "summary": total, "matches": rows}
 
 
 def _write(path: Path, matches: LogMatches) -> None:

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 from gpusense._util.progress import is_terminal
 
 if TYPE_CHECKING:
+    import argparse
+
     from gpusense.backends import BackendInfo, Device
 
 # Columns of a line of facts, and of their names.
@@ -25,6 +27,15 @@ _OPENERS = {".rrd": "rerun", ".tum": "evo_traj tum"}
 def print_json(document: dict[str, Any]) -> None:
     """Print one JSON document; NaN and infinities become null."""
     print(json.dumps(_plain(document), indent=2, allow_nan=False))
+
+
+def print_report(facts: dict[str, Any], args: argparse.Namespace | None = None) -> None:
+    """Print facts as a JSON document, between the options of a command and the machine."""
+    from gpusense.evaluation.machine import machine
+
+    hidden = ("run", "command", "json")
+    options = {} if args is None else {"options": {k: v for k, v in vars(args).items() if k not in hidden}}
+    print_json({**options, **facts, "machine": machine()})
 
 
 def _plain(value: Any) -> Any:
@@ -51,6 +62,12 @@ def print_result(text: str) -> None:
 def print_fact(name: str, text: str) -> None:
     """Print a named fact below the result, wrapped to 80 columns."""
     print(_wrapped(f"{name:<{_INDENT - 1}} {text}", _WIDTH, " " * _INDENT))
+
+
+def print_interrupted(done: int, total: int, noun: str = "scans") -> None:
+    """Print the share of the work that an interrupted command did."""
+    if done < total:
+        print(f"interrupted: results of {done} of {total} {noun}")
 
 
 def print_files(*paths: os.PathLike[str] | None) -> None:

@@ -30,11 +30,13 @@ from gpusense.commands.output import (
     length,
     print_fact,
     print_files,
-    print_json,
+    print_interrupted,
+    print_report,
     print_result,
 )
 from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans
-from gpusense.evaluation.machine import machine, machine_line
+from gpusense.commands.signals import held
+from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
     from gpusense.evaluation.agreement import Agreement, Model
@@ -111,15 +113,12 @@ def run(args: argparse.Namespace) -> int:
     scans = read_scans(args)
     models = make_models(args, grid, scans)
     scoring, fitness = LogScoring(models, sampler), FitnessOfLog(models[0], seed=args.seed)
-    try:
+    with held(scoring) as stops:
         _score(args, models, scans, scoring, fitness)
-    except KeyboardInterrupt:
-        scores, agreements = scoring.results()
-        if scores:
-            print_report(args, models, scores, agreements, fitness.result(), len(scans))
-        raise
     (scores, agreements), fit = scoring.results(), fitness.result()
-    print_report(args, models, scores, agreements, fit, len(scans))
+    _report(args, models, scores, agreements, fit, len(scans))
+    if stops:
+        raise stops[0]
     if args.plot is not None:
         _draw(args.plot, grid, scores[0], pose_name(args))
         if not args.json:
@@ -189,7 +188,7 @@ def make_models(args: argparse.Namespace, grid: OccupancyGrid, scans: list[tuple
     return list(models.values())
 
 
-def print_report(
+def _report(
     args: argparse.Namespace,
     models: list[Model],
     scores: list[BackendScore],
@@ -199,11 +198,9 @@ def print_report(
 ) -> None:
     """Print the results of all scans, or of the scans before an interrupt."""
     if args.json:
-        more = {
-            "scans_chosen": chosen,
-            "fitness": asdict(fitness) | {"fits": fitness.fits, "verdict": fitness.verdict},
-        }
-        print_json(_document(args, models, scores, agreements) | more)
+        verdict = {"fits": fitness.fits, "verdict": fitness.verdict}
+        facts = _document(models, scores, agreements)
+        print_report({**facts, "scans_chosen": chosen, "fitness": asdict(fitness) | verdict}, args)
         return
     pose = pose_name(args)
     if args.verbose:
@@ -213,8 +210,7 @@ def print_report(
         _print(score, pose)
     for agreement in agreements:
         print_fact("backends", _verdict(agreement, pose))
-    if len(scores[0].scans) < chosen:
-        print(f"interrupted: results of {len(scores[0].scans)} of {chosen} scans")
+    print_interrupted(len(scores[0].scans), chosen)
     if args.verbose:
         _print_details(args, models, scores, agreements)
 
@@ -224,20 +220,15 @@ def pose_name(args: argparse.Namespace) -> str:
     return "logged pose" if args.reference is None else "reference pose"
 
 
-def _document(
-    args: argparse.Namespace, models: list[Model], scores: list[BackendScore], agreements: list[Agreement]
-) -> dict[str, Any]:
+def _document(models: list[Model], scores: list[BackendScore], agreements: list[Agreement]) -> dict[str, Any]:
     from gpusense.evaluation.scoring import summary
 
-    options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
     return {
-        "options": options,
         "parameters": models[0].parameters.to_dict(),
         "temperature": models[0].temperature,
         "range_max": models[0].scanner.range_max,
         "backends": [asdict(score) | {"summary": summary(score)} for score in scores],
         "agreement": [asdict(agreement) | {"same_ranking": agreement.same} for agreement in agreements],
-        "machine": machine(),
     }
 
 

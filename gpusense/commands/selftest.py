@@ -6,17 +6,18 @@ import argparse
 import time
 import warnings
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import BACKEND_HELP, add_json
-from gpusense.commands.output import driver_text, print_fact, print_json, print_result, print_table
-from gpusense.evaluation.machine import machine, machine_line
+from gpusense.commands.output import driver_text, print_fact, print_report, print_result, print_table
+from gpusense.commands.signals import held
+from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from gpusense.backends import Backend
+    from gpusense.backends import Backend, Device
     from gpusense.evaluation.stiff import Row
     from gpusense.evaluation.tolerances import Check
 
@@ -45,6 +46,11 @@ examples:
   gpusense selftest --backend opencl --backend warp:cpu --json"""
 
 
+_COLUMNS = ("backend", "against", "quantity", "largest difference", "tolerance", "unit", "verdict")
+_STIFF_COLUMNS = ("backend", "precision", "case", "quantity", "worst", "bound", "not finite", "verdict")
+_NUMBERS = ("largest difference", "tolerance", "worst", "bound", "not finite")
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.add_argument(
@@ -60,127 +66,93 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare the backends and print a table of the differences; after Ctrl-C, the differences so far."""
+    from gpusense.backends import devices
+    from gpusense.evaluation.selftest import chosen_backends
     from gpusense.world.plausible import PlausibilityWarning
 
-    with warnings.catch_warnings():
+    begin, backends = time.perf_counter(), chosen_backends(args.backend)
+    results: list[Any] = []
+    with warnings.catch_warnings(), held(results) as stops:
         # The scenes have implausible readings on purpose.
         warnings.simplefilter("ignore", PlausibilityWarning)
-        return _run_stiff(args) if args.stiff else _run_pairs(args)
-
-
-def _run_stiff(args: argparse.Namespace) -> int:
-    """Run and print the catalogue of stiff cases; each must keep its bound."""
-    from gpusense.evaluation import selftest, stiff
-
-    backends = selftest.chosen_backends(args.backend)
-    jobs = [
-        (backend, precision)
-        for backend in backends
-        for precision in ("float32", "float64")
-        if precision == "float32" or backend.info.float64
-    ]
-    rows: list[tuple[str, str, Row]] = []
-    stopped = None
-    try:
-        with progress(len(jobs)) as step:
-            for backend, precision in jobs:
-                step(f"{backend.info.selection} {precision}")
-                rows += [(backend.info.selection, precision, row) for row in stiff.run(backend, precision)]
-    except KeyboardInterrupt as stop:
-        stopped = _kept(stop, rows)
-    breaches = sum(not row.ok for _, _, row in rows)
+        (_stiff if args.stiff else _pairs)(backends, results)
+    seconds = time.perf_counter() - begin
+    absent = [] if args.stiff else [device for device in devices() if not device.available]
+    rows = [(_stiff_row if args.stiff else _row)(result) for result in results]
+    breaches = sum(row[-1] == "BREACH" for row in rows)
     if args.json:
-        listed = [{"backend": backend, "precision": precision} | asdict(row) for backend, precision, row in rows]
-        document = {"passed": not breaches and stopped is None, "rows": listed, "machine": machine()}
-        print_json(document)
+        print_report({"passed": not breaches and not stops, **_document(args, backends, absent, results, seconds)})
     else:
-        _print_result(len(rows), "cases", breaches, backends, stopped is not None)
-        columns = ("backend", "precision", "case", "quantity", "worst", "bound", "not finite", "verdict")
-        table = [
-            (backend, precision, row.case, row.quantity, f"{row.worst:.3g}", f"{row.bound:.3g}", str(row.nonfinite),
-             "ok" if row.ok else "BREACH")
-            for backend, precision, row in rows
-            if args.verbose or not row.ok
-        ]  # fmt: skip
-        if table:
+        noun, details = ("cases", "") if args.stiff else ("comparisons", f", in {seconds:.0f} s")
+        _print_result(len(rows), noun, breaches, backends, bool(stops), details)
+        for device in absent if args.verbose else ():
+            print_fact("absent", f"{device.name}: {device.reason}")
+        if shown := [row for row in rows if args.verbose or row[-1] == "BREACH"]:
             print()
-            print_table(columns, table, right=("worst", "bound", "not finite"))
+            print_table(_STIFF_COLUMNS if args.stiff else _COLUMNS, shown, right=_NUMBERS)
         if args.verbose:
             print(f"\n{machine_line()}")
-    if stopped is not None:
-        raise stopped
+    if stops:
+        raise stops[0]
     return BREACH if breaches else 0
 
 
-def _kept(stop: KeyboardInterrupt, results: Sequence[object]) -> KeyboardInterrupt:
-    """Return the interrupt that stopped the comparisons, to raise after printing the results so far."""
-    if not results:
-        raise stop
-    return stop
+def _pairs(backends: Sequence[Backend], checks: list[Check]) -> None:
+    """Compare the backends with the truth and with each other."""
+    from gpusense.evaluation import selftest
+
+    with progress(len(backends)) as step:
+        selftest.run(backends, step=step, checks=checks)
+
+
+def _stiff(backends: Sequence[Backend], rows: list[tuple[str, str, Row]]) -> None:
+    """Run the catalogue of stiff cases; each must keep its bound."""
+    from gpusense.evaluation import stiff
+
+    jobs = [(backend, name) for backend in backends for name in ("float32", "float64")[: 1 + backend.info.float64]]
+    with progress(len(jobs)) as step:
+        for backend, precision in jobs:
+            step(f"{backend.info.selection} {precision}")
+            rows += [(backend.info.selection, precision, row) for row in stiff.run(backend, precision)]
+
+
+def _document(
+    args: argparse.Namespace, backends: Sequence[Backend], absent: Sequence[Device], results: list[Any], seconds: float
+) -> dict[str, Any]:
+    if args.stiff:
+        return {"rows": [{"backend": name, "precision": kind} | asdict(row) for name, kind, row in results]}
+    return {
+        "backends": [asdict(backend.info) for backend in backends],
+        "absent": [asdict(device) for device in absent],
+        "checks": [asdict(check) | {"passed": check.passed} for check in results],
+        "seconds": seconds,
+    }
 
 
 def _print_result(
-    count: int, noun: str, breaches: int, backends: Sequence[Backend], interrupted: bool, details: str = ""
+    count: int, noun: str, breaches: int, backends: Sequence[Backend], interrupted: bool, details: str
 ) -> None:
     """Print the verdict, and the backends under test, with the kernels that their proofs excluded."""
     from gpusense.backends import devices
 
-    verdict = f"FAILED: {breaches} of {count}" if breaches else f"INTERRUPTED after {count}" if interrupted else (
-        f"PASSED: all {count}"
-    )  # fmt: skip
-    print_result(
-        f"{verdict} {noun} within tolerance{details}" if not breaches else f"{verdict} {noun} beyond tolerance"
-    )
+    if breaches:
+        print_result(f"FAILED: {breaches} of {count} {noun} beyond tolerance")
+    else:
+        verdict = f"INTERRUPTED after {count}" if interrupted else f"PASSED: all {count}"
+        print_result(f"{verdict} {noun} within tolerance{details}")
     reasons = {device.selection: device.reason for device in devices()}
     for info in (backend.info for backend in backends):
         reason = reasons.get(info.selection)
         print_fact(info.selection, f"{info.name} ({driver_text(info)}){f': {reason}' if reason else ''}")
 
 
-def _run_pairs(args: argparse.Namespace) -> int:
-    """Compare the backends with the truth and with each other."""
-    from gpusense.backends import devices
-    from gpusense.evaluation import selftest
-
-    begin = time.perf_counter()
-    backends = selftest.chosen_backends(args.backend)
-    checks: list[Check] = []
-    stopped = None
-    try:
-        with progress(len(backends)) as step:
-            selftest.run(backends, step=step, checks=checks)
-    except KeyboardInterrupt as stop:
-        stopped = _kept(stop, checks)
-    seconds = time.perf_counter() - begin
-    absent = [device for device in devices() if not device.available]
-    breaches = sum(not check.passed for check in checks)
-    if args.json:
-        document = {
-            "passed": not breaches and stopped is None,
-            "backends": [asdict(backend.info) for backend in backends],
-            "absent": [asdict(device) for device in absent],
-            "checks": [asdict(check) | {"passed": check.passed} for check in checks],
-            "seconds": seconds,
-            "machine": machine(),
-        }
-        print_json(document)
-    else:
-        _print_result(len(checks), "comparisons", breaches, backends, stopped is not None, f", in {seconds:.0f} s")
-        for device in absent if args.verbose else ():
-            print_fact("absent", f"{device.name}: {device.reason}")
-        columns = ("backend", "against", "quantity", "largest difference", "tolerance", "unit", "verdict")
-        shown = [_row(check) for check in checks if args.verbose or not check.passed]
-        if shown:
-            print()
-            print_table(columns, shown, right=("largest difference", "tolerance"))
-        if args.verbose:
-            print(f"\n{machine_line()}")
-    if stopped is not None:
-        raise stopped
-    return BREACH if breaches else 0
-
-
 def _row(check: Check) -> tuple[str, ...]:
     numbers = f"{check.difference:.3g}", f"{check.tolerance.value:.3g}"
     verdict = "ok" if check.passed else "BREACH"
     return check.left, check.right, check.quantity, *numbers, check.tolerance.unit, verdict
+
+
+def _stiff_row(result: tuple[str, str, Row]) -> tuple[str, ...]:
+    backend, precision, row = result
+    numbers = f"{row.worst:.3g}", f"{row.bound:.3g}", str(row.nonfinite)
+    return backend, precision, row.case, row.quantity, *numbers, "ok" if row.ok else "BREACH"

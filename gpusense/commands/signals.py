@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sized
 from types import FrameType
 from typing import Any
 
@@ -83,6 +83,18 @@ def stopping() -> Iterator[None]:
         for number, handler in before.items():
             signal.signal(number, handler)
         sys.unraisablehook = before_hook
+
+
+@contextlib.contextmanager
+def held(results: Sized) -> Iterator[list[KeyboardInterrupt]]:
+    """Hold back a signal that ends the work, and yield the list that receives it; without results, raise it at once."""
+    stops: list[KeyboardInterrupt] = []
+    try:
+        yield stops
+    except KeyboardInterrupt as stop:
+        if not len(results):
+            raise
+        stops.append(stop)
 
 
 @contextlib.contextmanager

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 from gpusense._util import checks
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import BACKEND_HELP, add_json, output_path, positive_number, whole_number
-from gpusense.commands.output import counted, print_fact, print_files, print_json, print_result
-from gpusense.evaluation.machine import machine, machine_line
+from gpusense.commands.output import counted, print_fact, print_files, print_json, print_report, print_result
+from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
     from gpusense.sweeps.cluster import DaskExecutor
@@ -194,7 +194,7 @@ def _report(args: argparse.Namespace, ended: Sweep, seconds: float) -> None:
         args.plot = None
     if args.json:
         figures = {name: getattr(ended, name) for name in ("jobs", "done", "failed", "skipped", "repeated")}
-        print_json({"table": args.table, "plot": args.plot, **figures, "seconds": seconds, "machine": machine()})
+        print_report({"table": args.table, "plot": args.plot, **figures, "seconds": seconds})
         return
     verdict = "DONE" if not ended.failed else f"{ended.failed} FAILED"
     before = f", {ended.skipped} were in the table before" if ended.skipped else ""

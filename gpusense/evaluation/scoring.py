@@ -223,6 +223,10 @@ class LogScoring:
         self._pairs = list(itertools.combinations(range(len(models)), 2))
         self._comparisons = [Comparison(models[a], models[b]) for a, b in self._pairs]
 
+    def __len__(self) -> int:
+        """Return the number of scored scans."""
+        return len(self._scores)
+
     def add(self, index: int, scan: Scan) -> tuple[ScanScore, ...]:
         """Score a scan with every model on the same particles, and return a score for each."""
         assert scan.pose is not None

@@ -8,8 +8,6 @@
   open and closed, square pillars, poles, boxes). Recall is the share of well-visible features that are found, precision
   the share of returned features that exist. Median errors follow, the mean squared error over the covariance per degree
   of freedom (NEES; 1 is right) without errors beyond 99.9 % of chi squared, and the share of those.
-- ``chance``: poles in scans of independent ranges, which have no shape.
-- ``ransac``: lines by gpusense and by scikit-image's RANSAC, one after another.
 - ``real``: the share of features of recorded scans that are found again from another place, and their distances in
   standard deviations. The assumed deviations of the reference poses are 3 cm and 0.01 rad (jarvis 1 cm and 0.004 rad).
 - ``localisation``: a filter with points (corners, doors and poles), with lines, with both, and with the likelihood
@@ -41,7 +39,7 @@ from support.feature_scenes import floor_plan
 from support.feature_scores import FREE, Score, score_scan
 from support.feature_truth import truth_of
 
-PARTS = ("simulated", "chance", "ransac", "real", "localisation", "rates")
+PARTS = ("simulated", "real", "localisation", "rates")
 BEAMS, NOISES = (180, 360, 1081), (0.0, 0.01, 0.03, 0.05)
 # Recordings, standard deviations of their reference poses, and scans of each to compare.
 RECORDINGS = {
@@ -113,95 +111,6 @@ def simulated(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
                 ])  # fmt: skip
     names = ["beams", "noise [cm]", "kind", "recall [%]", "precision [%]", "error [mm], median", "NEES", "outliers [%]"]
     return "## Simulated floors\n\n" + table(names, rows), report
-
-
-def chance(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
-    """Count the poles in scans of independent ranges."""
-    rng, rows, report = np.random.default_rng(arguments.seed), [], {}
-    for beams in (*BEAMS, 720):
-        shape = 60, beams
-        ranges = {
-            "3 + Exp(0.5)": 3 + rng.exponential(0.5, shape), "3 + Exp(0.2)": 3 + rng.exponential(0.2, shape),
-            "uniform in 1 to 5": rng.uniform(1, 5, shape), "2 + abs N(0, 1)": 2 + np.abs(rng.normal(size=shape)),
-        }  # fmt: skip
-        for name, values in ranges.items():
-            poles = {
-                str(noise): len(gs.extract_features(values, scanner_of(beams), "pole", arguments.backend, noise=noise))
-                for noise in ("auto", 0.02)
-            }
-            report[f"{beams} {name}"] = poles
-            rows.append([beams, name, *poles.values()])
-    names = ["beams", "ranges [m]", "poles in 60 scans, noise auto", "noise 2 cm"]
-    return "## Poles by chance\n\n" + table(names, rows), report
-
-
-def ransac_lines(points: np.ndarray, noise: float, rng: np.random.Generator) -> list[np.ndarray]:
-    """Return lines (x, y, theta, length) by scikit-image's RANSAC, one after another, with gaps up to 0.5 m."""
-    from skimage.measure import LineModelND, ransac
-
-    left, found = points, []
-    while len(left) >= 8:
-        model, inliers = ransac(left, LineModelND, 2, 3 * noise, max_trials=200, rng=rng)
-        if model is None or inliers.sum() < 8:
-            break
-        origin, direction = model.origin, model.direction
-        place = (left - origin) @ direction
-        order = np.argsort(np.where(inliers, place, np.inf))[: inliers.sum()]
-        runs = np.split(order, np.flatnonzero(np.diff(place[order]) > 0.5) + 1)
-        longest = max(runs, key=len)
-        ends = place[longest[[0, -1]]]
-        if len(longest) >= 8 and ends[1] - ends[0] >= 0.3:
-            middle = origin + ends.mean() * direction
-            found.append(np.array([*middle, math.atan2(direction[1], direction[0]), ends[1] - ends[0]]))
-        left = np.delete(left, longest, axis=0)
-    return found
-
-
-def as_features(lines: list[np.ndarray]) -> Features:
-    """Return lines as features without covariance."""
-    rows = np.array(lines).reshape(-1, 4)
-    count = len(rows)
-    return Features(
-        np.full(count, "line"), np.zeros(count, np.int64), rows[:, :3], np.zeros((count, 3, 3)),
-        np.zeros((count, 3, 3)), rows[:, 3], np.ones(count),
-    )  # fmt: skip
-
-
-def rivals(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
-    """Compare gpusense's lines with those of RANSAC on the same scans."""
-    try:
-        import skimage
-    except ImportError:
-        return "## RANSAC\n\nscikit-image is absent.", {}
-    rows, report = [], {}
-    for beams, noise in ((360, 0.01), (360, 0.03), (1081, 0.01), (1081, 0.03)):
-        scanner, scores, seconds = scanner_of(beams), {"ours": {}, "ransac": {}}, {"ours": 0.0, "ransac": 0.0}
-        gs.extract_features(np.ones(beams), scanner, "line", arguments.backend)
-        for seed in range(max(arguments.floors // 5, 1)):
-            ranges, truth = scans_of(arguments.seed + seed, scanner, noise, arguments.scans)
-            begin = time.perf_counter()
-            features = gs.extract_features(ranges, scanner, "line", arguments.backend)
-            seconds["ours"] += time.perf_counter() - begin
-            for k, one in enumerate(truth):
-                score_scan(features.of_scan(k), one, scores["ours"])
-                directions = np.column_stack([np.cos(scanner.bearings), np.sin(scanner.bearings)])
-                begin = time.perf_counter()
-                lines = ransac_lines(ranges[k, :, None] * directions, noise, np.random.default_rng(k))
-                seconds["ransac"] += time.perf_counter() - begin
-                score_scan(as_features(lines), one, scores["ransac"])
-        count = max(arguments.floors // 5, 1) * arguments.scans
-        for name, total in scores.items():
-            line = total["line"]
-            ms = 1000 * seconds[name] / count
-            report[f"{name} {beams} {noise}"] = {
-                "recall": line.recall, "precision": line.precision, "error_m": np.median(line.errors), "ms": ms
-            }  # fmt: skip
-            label = f"scikit-image {skimage.__version__}" if name == "ransac" else "extract_features"
-            error = 1000 * np.median(line.errors)
-            rows.append([beams, f"{100 * noise:g}", label, f"{100 * line.recall:.1f}", f"{100 * line.precision:.1f}",
-                         f"{error:.1f}", f"{ms:.3g}"])  # fmt: skip
-    names = ["beams", "noise [cm]", "lines of", "recall [%]", "precision [%]", "error [mm], median", "ms a scan"]
-    return "## Lines beside RANSAC\n\n" + table(names, rows), report
 
 
 def expected_again(features: Features, relative: np.ndarray, ranges: np.ndarray, scanner: gs.Scanner) -> np.ndarray:
@@ -389,7 +298,7 @@ def main(argv: list[str] | None = None) -> None:
     arguments = parse(parser, argv)
     if arguments.figure:
         return draw(arguments)
-    functions = dict(zip(PARTS, (simulated, chance, rivals, real, localisation, rates), strict=True))
+    functions = dict(zip(PARTS, (simulated, real, localisation, rates), strict=True))
     texts, report = [], {}
     for part in PARTS:
         if part in arguments.parts:

@@ -131,15 +131,6 @@ def test_bits_of_trees_are_compared(
     assert script.main(["compare", str(old), str(new)]) == 1 and "1 results of" in capsys.readouterr().out
 
 
-@pytest.mark.slow
-def test_map_memory_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
-    arguments = ["--backend", needs("opencl"), "--backend", "numpy", "--side", "300", "--scans", "5"]
-    rows = run_script("speed/map_memory.py", *arguments, output=tmp_path / "memory")["rows"]
-    assert [row["what"] for row in rows] == ["opencl", "numpy", "PGM", "PNG, 8 bits", "PNG, 1 bit"]
-    assert rows[0]["result, SHA-256"] == rows[1]["result, SHA-256"] != rows[2]["result, SHA-256"]
-    assert rows[2]["result, SHA-256"] == rows[3]["result, SHA-256"] != rows[4]["result, SHA-256"]
-
-
 def test_fuzz_rays_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--backend", needs("opencl"), "--rays", "30000"]
     report = run_here("accuracy/fuzz_rays.py", *arguments, output=tmp_path / "fuzz")
@@ -232,16 +223,6 @@ def test_runs_among_landmarks(needs: Callable[[str], str], data_dir: Path, tmp_p
         assert row["filter"]["error_median"] < 0.2
 
 
-@pytest.mark.slow
-def test_figures_of_the_discrete_model_are_drawn(tmp_path: Path) -> None:
-    arguments = ["--figures", str(tmp_path / "drawn"), "--most", "64"]
-    report = run_script("accuracy/discrete_convergence.py", *arguments, output=tmp_path / "discrete")
-    drawn = {path.name for path in (tmp_path / "drawn").iterdir()}
-    assert drawn == {"discrete_convergence.png", "discrete_rows.png"}
-    first, second = report["rows"]
-    assert all(1.3 < wide / narrow < 3 for wide, narrow in zip(first, second, strict=True))
-
-
 def test_stretches_of_machine_code_end_at_labels_and_branches(
     needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -296,21 +277,3 @@ def test_calibration_runs(tmp_path: Path) -> None:
     assert [row["model"] for row in report["rows"]] == ["heading", "beam"]
     assert all(sum(counts) == 60 for row in report["rows"] for counts in row["counts"])
     assert all(0 < row["least_p"] <= 1 for row in report["rows"])
-
-
-@pytest.mark.slow
-def test_rays_per_core_runs(needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every caster has rows of both clouds; a substitute replaces range_libc."""
-    monkeypatch.syspath_prepend(str(BENCH))
-    script = importlib.import_module("speed.rays_per_core")
-
-    class Caster:
-        def __init__(self, *arguments: object) -> None: ...
-
-        def cast(self, poses: np.ndarray, angles: np.ndarray) -> np.ndarray:
-            return np.zeros((len(poses), len(angles)), np.float32)
-
-    monkeypatch.setattr(script.range_libc, "Caster", Caster)
-    rows = script.measure(None, needs("opencl"), 20, 1, 1.0)
-    assert [row["cloud"] for row in rows] == ["tracking", "global"] * 3
-    assert all(row["rate"] > 0 and row["apart"] > 0 for row in rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +19,7 @@ Floats = NDArray[np.float64]
 Model = BeamModel | LikelihoodFieldModel
 
 
-@dataclass(frozen=True)
+@dataclass
 class Agreement:
     """Agreement of two backends about the ranks of the same particles, over all scans.
 
@@ -35,18 +36,35 @@ class Agreement:
 
     left: str
     right: str
-    scans: int
-    same_rank: int
-    same_order: int
-    spearman: float
-    difference: float
-    gap: float
-    allowed: float
+    scans: int = 0
+    same_rank: int = 0
+    same_order: int = 0
+    spearman: float = 1.0
+    difference: float = 0.0
+    gap: float = 0.0
+    allowed: float = 0.0
 
     @property
     def same(self) -> bool:
         """Return whether particles change places only where rounding explains it."""
         return self.gap <= self.allowed
+
+    def add(self, models: Sequence[Model], left: Array, right: Array) -> None:
+        """Add the log-likelihoods of one scan's particles by two models; the first particle is the logged pose."""
+        self.scans += 1
+        a, b = ranks(left), ranks(right)
+        self.same_rank += int(a[0] == b[0])
+        gap = max(largest_gap(left, right), largest_gap(right, left))
+        self.same_order += int(gap == 0)
+        self.spearman = min(self.spearman, correlation(a, b))
+        with np.errstate(invalid="ignore"):
+            apart = np.where(left == right, 0.0, np.abs(left.astype(np.float64) - right))
+        self.difference = max(self.difference, float(np.max(apart, initial=0.0)))
+        self.gap = max(self.gap, gap)
+        largest = float(np.max(np.abs(left), initial=0.0, where=np.isfinite(left)))
+        tolerances = [scan_tolerance(m.precision, min(m.scanner.count, 10_000)) for m in models]
+        allowed = sum(t.value * (1.0 if t.unit == "nats" else 1.0 + largest) for t in tolerances)
+        self.allowed = max(self.allowed, allowed)
 
 
 def ranks(values: Array) -> Floats:
@@ -70,37 +88,3 @@ def largest_gap(left: Array, right: Array) -> float:
     lowest = np.minimum.accumulate(b)
     with np.errstate(invalid="ignore"):
         return float(np.max(np.where(b == lowest, 0.0, b - lowest), initial=0.0))
-
-
-class Comparison:
-    """Running comparison of the same model on two backends, scan by scan."""
-
-    def __init__(self, left: Model, right: Model) -> None:
-        self._models = left, right
-        self._scans = self._same_rank = self._same_order = 0
-        self._spearman, self._difference, self._gap, self._allowed = 1.0, 0.0, 0.0, 0.0
-
-    def add(self, left: Array, right: Array) -> None:
-        """Add the log-likelihoods of one scan's particles; the first particle is the logged pose."""
-        self._scans += 1
-        a, b = ranks(left), ranks(right)
-        self._same_rank += int(a[0] == b[0])
-        gap = max(largest_gap(left, right), largest_gap(right, left))
-        self._same_order += int(gap == 0)
-        self._spearman = min(self._spearman, correlation(a, b))
-        with np.errstate(invalid="ignore"):
-            apart = np.where(left == right, 0.0, np.abs(left.astype(np.float64) - right))
-        self._difference = max(self._difference, float(np.max(apart, initial=0.0)))
-        self._gap = max(self._gap, gap)
-        largest = float(np.max(np.abs(left), initial=0.0, where=np.isfinite(left)))
-        tolerances = [scan_tolerance(m.precision, min(m.scanner.count, 10_000)) for m in self._models]
-        allowed = sum(t.value * (1.0 if t.unit == "nats" else 1.0 + largest) for t in tolerances)
-        self._allowed = max(self._allowed, allowed)
-
-    def result(self) -> Agreement:
-        """Return the agreement over all scans added."""
-        left, right = (model.device.selection for model in self._models)
-        return Agreement(
-            left, right, self._scans, self._same_rank, self._same_order, self._spearman, self._difference, self._gap,
-            self._allowed,
-        )  # fmt: skip

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gpusense._util import checks
 from gpusense.backends import BackendInfo
-from gpusense.evaluation.agreement import Agreement, Comparison, Model
+from gpusense.evaluation.agreement import Agreement, Model
 from gpusense.evaluation.worlds import cloud_around, cloud_uniform
 from gpusense.localization.weights import normalize_weights
 from gpusense.logs import Pose, Scan
@@ -221,7 +221,8 @@ class LogScoring:
         self._models, self._sampler = models, sampler
         self._scores: list[tuple[ScanScore, ...]] = []
         self._pairs = list(itertools.combinations(range(len(models)), 2))
-        self._comparisons = [Comparison(models[a], models[b]) for a, b in self._pairs]
+        names = [model.device.selection for model in models]
+        self._agreements = [Agreement(names[a], names[b]) for a, b in self._pairs]
 
     def __len__(self) -> int:
         """Return the number of scored scans."""
@@ -237,8 +238,8 @@ class LogScoring:
             begin = time.perf_counter()
             log_ps.append(model.log_likelihood(poses, scan.ranges))
             scores.append(score_scan(index, poses, log_ps[-1], beams, time.perf_counter() - begin))
-        for comparison, (a, b) in zip(self._comparisons, self._pairs, strict=True):
-            comparison.add(log_ps[a], log_ps[b])
+        for agreement, (a, b) in zip(self._agreements, self._pairs, strict=True):
+            agreement.add((self._models[a], self._models[b]), log_ps[a], log_ps[b])
         self._scores.append(tuple(scores))
         return self._scores[-1]
 
@@ -248,7 +249,7 @@ class LogScoring:
             return [], []
         each = zip(self._models, zip(*self._scores, strict=True), strict=True)
         scores = [BackendScore(model.device, self._sampler.particles, scans) for model, scans in each]
-        return scores, [comparison.result() for comparison in self._comparisons]
+        return scores, self._agreements
 
 
 def score_log(

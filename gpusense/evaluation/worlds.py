@@ -198,6 +198,14 @@ def sample_readings(expected: ArrayLike, range_max: float, parameters: BeamParam
     return np.where(np.isinf(drawn), drawn, np.minimum(drawn, np.nextafter(limit, 0)))
 
 
+def is_free(grid: OccupancyGrid, places: Floats) -> NDArray[np.bool]:
+    """Return (N,) whether each of (N, 2) places is in a free cell [m]."""
+    cols, rows = np.floor(grid.world_to_cells(places)).astype(np.int64).T
+    inside = (rows >= 0) & (rows < grid.shape[0]) & (cols >= 0) & (cols < grid.shape[1])
+    free: NDArray[np.bool] = inside & grid.free[np.where(inside, rows, 0), np.where(inside, cols, 0)]
+    return free
+
+
 def _check(grid: OccupancyGrid, rng: Rng) -> None:
     checks.instance("grid", grid, OccupancyGrid)
     checks.instance("rng", rng, np.random.Generator)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gpusense._util.typing import Precision
 from gpusense.backends import Backend
-from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, sample_readings
+from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, is_free, sample_readings
 from gpusense.models.scan.caster import RayCaster
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.map_files import read_map
@@ -193,18 +193,9 @@ def _cloud_in_free_space(grid: OccupancyGrid, pose: Floats, n: int, rng: np.rand
         if count >= n:
             break
         drawn = cloud_around(pose, n, SIGMA_POSITION, SIGMA_HEADING, rng)
-        kept.append(drawn[is_free(grid, drawn)])
+        kept.append(drawn[is_free(grid, drawn[:, :2])])
         count += len(kept[-1])
     return np.concatenate(kept)[:n]
-
-
-def is_free(grid: OccupancyGrid, poses: Floats) -> NDArray[np.bool]:
-    """Return (N,) whether each of (N, 3) poses is in a free cell."""
-    col, row = np.floor(grid.world_to_cells(poses[:, :2])).astype(np.int64).T
-    rows, cols = grid.shape
-    inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
-    free: NDArray[np.bool] = inside & grid.free[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)]
-    return free
 
 
 def clutter(seed: int = 0, size: tuple[float, float] = (50.0, 50.0), resolution: float = 0.05) -> OccupancyGrid:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,7 @@ from gpusense.backends import Selection
 from gpusense.evaluation.simulation.changes import change_world, make_glass
 from gpusense.evaluation.simulation.crowd import Crowd
 from gpusense.evaluation.simulation.roads import Roads, drive
-from gpusense.evaluation.worlds import sample_readings
+from gpusense.evaluation.worlds import is_free, sample_readings
 from gpusense.localization.motion import OdometryMotion, OmniMotion
 from gpusense.localization.pose_algebra import compose_poses
 from gpusense.models.arguments import check_absent
@@ -163,7 +163,7 @@ def simulate_run(
     )  # fmt: skip
     odometry = draw_odometry(poses, motion, slipping, kidnapped)
     seen = _without_glass(true, glass, glazing)
-    crowd = Crowd(crowd_size, share, _standing(true), every, walking)
+    crowd = Crowd(crowd_size, share, functools.partial(is_free, true), every, walking)
     expected, covered, discs = _with_people(_cast(seen, scanner, poses, backend), scanner, poses, kidnapped, crowd)
     readings = _readings(expected, scanner.range_max, parameters, reading)
     times: Floats = every * np.arange(1, len(poses) + 1, dtype=np.float64)
@@ -217,18 +217,6 @@ def _given(path: Floats, jumps: int) -> tuple[Floats, Bools]:
     if jumps:
         raise ValueError(f"kidnaps: must be 0 with a path, got {jumps}")
     return path, np.zeros(len(path), bool)
-
-
-def _standing(world: OccupancyGrid) -> Callable[[Floats], Bools]:
-    """Return a function that tells whether people can stand at (P, 2) places, in free cells of the world."""
-    free = world.free
-
-    def is_free(places: Floats) -> Bools:
-        cols, rows = np.floor(world.world_to_cells(places)).astype(np.int64).T
-        inside = (rows >= 0) & (rows < free.shape[0]) & (cols >= 0) & (cols < free.shape[1])
-        return inside & free[np.where(inside, rows, 0), np.where(inside, cols, 0)]
-
-    return is_free
 
 
 def _without_glass(world: OccupancyGrid, share: float, rng: Rng) -> OccupancyGrid:

@@ -74,28 +74,19 @@ class Recorder(Proxy):
 
     def _record(self, kernel: str, flags: frozenset[str], arguments: Sequence[Any]) -> Launch:
         real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
-        passed = dict(zip(KERNELS[kernel].arguments, arguments, strict=True))
-        values: dict[str, Any] = {}
+        row = KERNELS[kernel]
+        passed = dict(zip(row.with_flags(flags).arguments, arguments, strict=True))
+        values: dict[str, Any] = dict.fromkeys(argument.name for argument in row.arguments)
         for argument, value in passed.items():
             if argument.is_struct:
                 values[argument.name] = structs.rounded(value, argument.type, real)
             elif argument.shape is None:
                 dtype = argument.dtype(real)
                 values[argument.name] = int(value) if dtype.kind == "i" else dtype.type(value)
-        # A kernel reads these arguments only where the flags are set. The map's table stays on the device.
-        needed = {
-            "parts": {"PER_BEAM"} & flags,
-            "pose_low": {"TWO_PART_POINTS"} & flags,
-            "sensor": {"SENSOR_TABLE"} & flags,
-            "normals": {"INCIDENCE"} & flags,
-            "map_table": {},
-            "world": {"WORLDS"} & flags,
-            "shapes": {},
-            "start": {"SCANS"} & flags,
-            "constant_terms": {"SCANS"} & flags,
-        }
+        # The map's table stays on the device.
+        unread = {"map_table", "shapes"} if "TWO_PART_POINTS" in flags else {"map_table", "shapes", "pose_low"}
         for argument, value in passed.items():
-            if argument.shape is None or not needed.get(argument.name, True):
+            if argument.shape is None or argument.name in unread:
                 continue
             count = argument.elements(values)
             array = self._backend.download(value, np.empty(count * argument.width, argument.dtype(real)))
@@ -111,7 +102,8 @@ class Recorder(Proxy):
         shape = values["particles"], values["rays"]
         outputs = {name: self._backend.empty(shape[0] * shape[1], real) for name in ("ranges", "incidence")}
         kernel = "cast_echoes" if "CONES" in flags else "cast_ranges"
-        arguments = [outputs.get(argument.name, by_name.get(argument.name)) for argument in KERNELS[kernel].arguments]
+        names = (argument.name for argument in KERNELS[kernel].with_flags(flags).arguments)
+        arguments = [outputs.get(name, by_name.get(name)) for name in names]
         self._backend.compile(kernel, flags)(shape[::-1], *arguments)
         ranges = self._backend.download(outputs["ranges"], np.empty(shape, real))
         angles = self._backend.download(outputs["incidence"], np.empty(shape, real)) if "INCIDENCE" in flags else None
@@ -164,7 +156,9 @@ def _as_float64(value: Any) -> Any:
 def _replay_beams(launch: Launch, values: dict[str, Any], shift: float = 0.0) -> np.ndarray:
     """Return the beams' parts; ``shift`` is added to cosines of angles of incidence."""
     assert launch.expected is not None
-    ray_of = np.repeat(np.arange(values["rays"]), np.diff(values["first"]))
+    ray_of = np.arange(values["rays"])
+    if values["first"] is not None:
+        ray_of = np.repeat(ray_of, np.diff(values["first"]))
     expected = launch.expected.astype(np.float64)[:, ray_of]
     z = np.broadcast_to(values["reading"], expected.shape)
     terms = values["terms"]
@@ -189,9 +183,15 @@ def _replay_field(launch: Launch, values: dict[str, Any], shift: tuple[float, fl
     """Return the beams' parts; ``shift`` is added to the poses' x and y [cells]."""
     count, readings = values["particles"], values["readings"]
     parts = np.empty(count * readings)
-    low = values.get("pose_low", np.zeros((count, 4))) + np.array([*shift, 0.0, 0.0])
-    single_scan = {"start": None, "constant_terms": None, "world": np.zeros((0, 2), np.int32), "shapes": None}
-    arguments = {**values, **single_scan, "pose_low": low, "log_p": np.empty(count), "parts": parts}
+    low = values["pose_low"]
+    low = (np.zeros((count, 4)) if low is None else low) + np.array([*shift, 0.0, 0.0])
+    arguments = {
+        **values,
+        "world": np.zeros((0, 2), np.int32),
+        "pose_low": low,
+        "log_p": np.empty(count),
+        "parts": parts,
+    }
     flags = launch.flags | {"FLOAT64", "PER_BEAM", "TWO_PART_POINTS"}
     field_kernels.score_field(flags, *(arguments[argument.name] for argument in KERNELS["score_field"].arguments))
     return parts.reshape(count, readings)

@@ -22,6 +22,7 @@ from gpusense.evaluation.replay import Launch, Recorder, replay
 from gpusense.evaluation.stiff_cases import Case, cases
 from gpusense.evaluation.tolerances import TOLERANCES, beam_tolerance, per_scan
 from gpusense.interface import structs
+from gpusense.interface.launches import launch
 from gpusense.localization.weights import normalize_weights
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.caster import RayCaster
@@ -114,13 +115,12 @@ def density_grid(backend: Selection, precision: str) -> Densities:
     cells = device.upload(np.array([(c, 0) for c in (40, 39, 39, 39, 37, 31, 24, 20)], np.int32))
     pose, ray, ranges = device.upload(poses), device.upload(np.array([[1, 0]], real)), device.empty(count, real)
     wide = frozenset({"FLOAT64"} if real == np.float64 else ())
-    world = structs.Window(0, 0, *obstacles.shape), count, 1
-    casting = structs.Caster(0, 0.0, 0.0), structs.RangeScale(RANGE_MAX, 1.0, RANGE_MAX), structs.Crowd(0, 0, 0, 0, 0.0)
-    none, laser = device.empty(2, real), (structs.MixtureTables(1, 0, 0.0), structs.Cone(1, 0.0))
-    no_worlds = device.upload(np.zeros((1, 2), np.int32))
-    device.compile("cast_ranges", wide)(
-        (1, count), rectangles, no_worlds, none, cells, pose, ray, ranges, *world, *casting,
+    casting = dict(
+        map_table=rectangles, pose_cell=cells, pose=pose, ray=ray, window=structs.Window(0, 0, *obstacles.shape),
+        particles=count, rays=1, caster=structs.Caster(0, 0.0, 0.0),
+        scale=structs.RangeScale(RANGE_MAX, 1.0, RANGE_MAX),
     )  # fmt: skip
+    device.run((launch("cast_ranges", wide, (1, count), **casting, ranges=ranges),))
     expected = device.download(ranges, np.empty(count, real))
 
     # Warp compiles each set of flags for seconds, so its kernel is unspecialised and compiled once.
@@ -136,12 +136,13 @@ def density_grid(backend: Selection, precision: str) -> Densities:
         first = device.upload(np.array([0, len(z)], np.int32))
         mixture = model._pipeline.mixture
         # Rays that are shared do not end behind a reading.
-        device.compile("score_beams", flags | (mixture.flags - {"STOPS"}))(
-            (count,), rectangles, no_worlds, none, none, cells, pose, ray, first, device.upload(z),
-            device.upload(np.stack(mixture.terms, axis=1)), device.upload(mixture.masses), none, none, first, none,
-            device.empty(count, real), parts, *world, len(z), *laser, *casting, structs.Score(0.0, 1.0),
-            structs.ScanBatch(1, 0),
+        scoring = launch(
+            "score_beams", flags | (mixture.flags - {"STOPS"}), (count,), **casting, first=first,
+            reading=device.upload(z), terms=device.upload(np.stack(mixture.terms, axis=1)),
+            masses=device.upload(mixture.masses), log_p=device.empty(count, real), parts=parts, readings=len(z),
+            tables=structs.MixtureTables(1, 0, 0.0), cone=structs.Cone(1, 0.0), score=structs.Score(0.0, 1.0),
         )  # fmt: skip
+        device.run((scoring,))
         log_p = device.download(parts, np.empty(count * len(z), real))
         values = np.repeat(np.array([list(p.to_dict().values())], real).T, log_p.size, axis=1)
         blocks.append(np.vstack([np.tile(z, count), np.repeat(expected, len(z)), log_p, values]))

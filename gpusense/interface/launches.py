@@ -25,7 +25,7 @@ class Launch(NamedTuple):
         kernel: Its name in the signature table.
         flags: Flags of its code.
         size: Number of work-items along each axis of the row's launch shape.
-        arguments: Buffers, scalars and structs in the order of the row.
+        arguments: Buffers, scalars and structs in the order of the row; only those that the code of the flags takes.
     """
 
     kernel: str
@@ -33,18 +33,23 @@ class Launch(NamedTuple):
     size: tuple[int, ...]
     arguments: tuple[Any, ...]
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the arguments."""
+        return _row(self.kernel, self.flags).names
+
     def places(self, names: Container[str]) -> list[tuple[int, str]]:
         """Return the positions and names of the kernel's arguments that are in a set of names."""
-        return [(place, name) for place, name in enumerate(_names(self.kernel)) if name in names]
+        return [(place, name) for place, name in enumerate(self.names) if name in names]
 
     def without(self, names: Container[str]) -> Launch:
         """Return the launch with None in place of the arguments of a set of names."""
-        pairs = zip(_names(self.kernel), self.arguments, strict=True)
+        pairs = zip(self.names, self.arguments, strict=True)
         return self._replace(arguments=tuple([None if name in names else value for name, value in pairs]))
 
     def named(self) -> dict[str, Any]:
         """Return the arguments by name."""
-        return dict(zip(_names(self.kernel), self.arguments, strict=True))
+        return dict(zip(self.names, self.arguments, strict=True))
 
 
 Program = tuple[Launch, ...]
@@ -57,19 +62,21 @@ def launch(kernel: str, flags: Iterable[str], size: tuple[int, ...], /, **argume
         kernel: Its name in the signature table.
         flags: Flags of its code.
         size: Work-items along each axis.
-        **arguments: All arguments of the row, each a buffer, an integer, a real number or a struct.
+        **arguments: Arguments of the row, each a buffer, an integer, a real number or a struct. Those that the code of
+            the flags does not take are dropped.
     """
-    row = _ROWS.get(kernel) or _row(kernel)
-    if len(arguments) != len(row.names):
-        raise TypeError(_difference(kernel, row.names, arguments))
+    flags = frozenset(flags)
+    row = _row(kernel, flags)
     try:
         values = row.take(arguments)
     except KeyError:
-        raise TypeError(_difference(kernel, row.names, arguments)) from None
+        raise TypeError(_difference(kernel, row, arguments)) from None
+    if not arguments.keys() <= row.known:
+        raise TypeError(_difference(kernel, row, arguments))
     types = tuple(map(type, values))
     if types not in row.accepted:
         row.check(types)
-    return Launch(kernel, frozenset(flags), size, values)
+    return Launch(kernel, flags, size, values)
 
 
 def flags_of(program: Program) -> frozenset[str]:
@@ -83,6 +90,7 @@ class _Row:
     def __init__(self, kernel: str, row: Kernel) -> None:
         self._kernel, self._row = kernel, row
         self.names = tuple(argument.name for argument in row.arguments)
+        self.known = frozenset(argument.name for argument in KERNELS[kernel].arguments)
         self.take = itemgetter(*self.names)
         # Types that have passed the check, as calls repeat them.
         self.accepted: set[tuple[type, ...]] = set()
@@ -104,21 +112,19 @@ class _Row:
         self.accepted.add(types)
 
 
-_ROWS: dict[str, _Row] = {}
+_ROWS: dict[tuple[str, frozenset[str]], _Row] = {}
 
 
-def _row(kernel: str) -> _Row:
-    return _ROWS.setdefault(kernel, _Row(kernel, KERNELS[kernel]))
+def _row(kernel: str, flags: frozenset[str]) -> _Row:
+    """Return the row of a kernel's code."""
+    whole = KERNELS[kernel]
+    key = kernel, flags & whole.optional
+    return _ROWS.get(key) or _ROWS.setdefault(key, _Row(kernel, whole.with_flags(flags)))
 
 
-def _names(kernel: str) -> tuple[str, ...]:
-    """Return the names of a kernel's arguments in the order of its row."""
-    return _row(kernel).names
-
-
-def _difference(kernel: str, names: tuple[str, ...], arguments: dict[str, Any]) -> str:
+def _difference(kernel: str, row: _Row, arguments: dict[str, Any]) -> str:
     """Return the message on missing and unknown arguments."""
-    missing = [name for name in names if name not in arguments]
-    unknown = [name for name in arguments if name not in names]
+    missing = [name for name in row.names if name not in arguments]
+    unknown = [name for name in arguments if name not in row.known]
     parts = [f"missing {', '.join(missing)}" if missing else "", f"unknown {', '.join(unknown)}" if unknown else ""]
     return f"{kernel}: arguments must be those of its signature, got {' and '.join(part for part in parts if part)}"

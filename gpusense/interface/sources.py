@@ -13,7 +13,7 @@ from gpusense.interface.directives import resolve
 from gpusense.interface.flags import FLAGS
 from gpusense.interface.kernel_files import has_opencl_source, opencl_source
 from gpusense.interface.lane_functions import takes_scalar_text, written_in_lanes
-from gpusense.interface.signatures import KERNELS
+from gpusense.interface.signatures import KERNELS, Argument
 
 _PRELUDE = """\
 #pragma OPENCL FP_CONTRACT OFF
@@ -28,9 +28,11 @@ typedef {real}4 real4;
 #define FUSES 0
 #endif
 """
-_HEAD = re.compile(r"^kernel void (\w+)\(ARGUMENTS\)", re.MULTILINE)
+_HEAD = re.compile(r"^kernel void (\w+)\(ARGUMENTS\) \{", re.MULTILINE)
 _WORD = re.compile(r"\w+")
 _COMMENT, _DOUBLE = re.compile(r"//.*"), re.compile(r"\bdouble[24]?\b")
+# Flags of arguments that not all code of a kernel has.
+_OPTIONAL = frozenset().union(*(row.optional for row in KERNELS.values()))
 _REQUIRES = re.compile(r"^// requires: (.*)$", re.MULTILINE)
 
 
@@ -53,9 +55,9 @@ def prelude(*, float64: bool, doubles: bool = False) -> str:
     )
 
 
-def parameters(kernel: str) -> str:
-    """Return the parameters of a kernel in OpenCL C, in the order of its row."""
-    row = KERNELS[kernel]
+def parameters(kernel: str, flags: frozenset[str]) -> str:
+    """Return the parameters of a kernel's code in OpenCL C, in the order of its row."""
+    row = KERNELS[kernel].with_flags(flags)
     star = "*restrict " if row.apart else "*"
     return ", ".join(
         f"const {argument.type} {argument.name}"
@@ -65,18 +67,26 @@ def parameters(kernel: str) -> str:
     )
 
 
-def source_text(file: str) -> str:
-    """Return the text of a kernel file with the parameters of its kernels."""
-    return _with_parameters(opencl_source(file), file)
+def source_text(file: str, flags: frozenset[str]) -> str:
+    """Return the text of a kernel file with the parameters of its kernels for a set of flags."""
+    return _with_parameters(opencl_source(file), file, flags & _OPTIONAL)
+
+
+def _without_value(argument: Argument) -> str:
+    """Declare an argument that the code of a kernel names and does not read."""
+    if argument.shape is None:
+        return f"const {argument.type} {argument.name} = {'{0}' if argument.is_struct else '0'};"
+    return f"global {'' if argument.output else 'const '}{argument.type} *{argument.name} = 0;"
 
 
 @functools.lru_cache(maxsize=512)
-def _with_parameters(text: str, file: str) -> str:
+def _with_parameters(text: str, file: str, flags: frozenset[str]) -> str:
     def head(match: re.Match[str]) -> str:
         name = match.group(1)
         if name not in KERNELS:
             raise ValueError(f"{file}.cl: a kernel must have a row in the signature table, got {name!r}")
-        return f"kernel void {name}({parameters(name)})"
+        absent = [one for one in KERNELS[name].arguments if one.flag not in ("", *flags)]
+        return " ".join([f"kernel void {name}({parameters(name, flags)}) {{", *map(_without_value, absent)])
 
     return _HEAD.sub(head, text)
 
@@ -156,7 +166,7 @@ def _resolved(text: str, flags: frozenset[str], name: str) -> str:
 
 def _kept(file: str, flags: frozenset[str]) -> str:
     """Return a kernel file with the branches that the flags select; the file need not name all flags."""
-    text = source_text(file)
+    text = source_text(file, flags)
     return _resolved(text, flags & _words(text), f"{file}.cl")
 
 
@@ -194,7 +204,7 @@ def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
     """Return the flags that change a kernel file's code: one program serves all flags that agree on them."""
     files = required_files(file, flags)
     files += [scalar for scalar in map(_scalar_source, files) if scalar is not None]
-    words = set().union(*(_words(source_text(needed)) for needed in files))
+    words = set().union(*(_words(source_text(needed, _OPTIONAL)) for needed in files))
     words |= _words("".join(structs.declaration(name) for name in structs.STRUCTS if name in words))
     if any({"caster", "lanes/caster"} & set(_requirements(needed)) for needed in files):
         words |= casters.FLAGS.keys()
@@ -203,6 +213,7 @@ def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
     unknown = flags - FLAGS.keys()
     if unknown:
         raise ValueError(f"flags: must be among {sorted(FLAGS)}, got {sorted(unknown)}")
+    words |= set().union(*(row.optional for row in KERNELS.values() if row.file == file))
     if "real" in words:
         words.add("FLOAT64")
     return flags & words

@@ -21,7 +21,7 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.tables.reachable import MapState, ReachableMap
-from gpusense.tables.world_index import InWorlds, WorldIndex, no_worlds
+from gpusense.tables.world_index import InWorlds, WorldIndex
 from gpusense.world.frames import Cells, Mount, frame_of, place_poses
 from gpusense.world.windows import Corners, Window
 
@@ -232,7 +232,7 @@ class PlacedPoses(NamedTuple):
     def places(self) -> dict[str, object]:
         """Return the arguments of kernels that cast rays in worlds, by name."""
         if self.inside is None:
-            return no_worlds(self.space, self.real)
+            return {}
         table = self.inside.worlds.crowd.table(self.real)
         return dict(world=self.world, shapes=table, crowd=self.inside.crowd)
 

@@ -102,7 +102,9 @@ def score_beams(
             )  # fmt: skip
         return
     block = max((1 << 20) // max(readings * cone.rays, 1), 1)
-    ray_of = np.repeat(np.arange(rays), np.diff(first[: rays + 1]))
+    ray_of = np.arange(rays)
+    if "SHARED_RAYS" in flags:
+        ray_of = np.repeat(ray_of, np.diff(first[: rays + 1]))
     for begin in range(0, particles, block):
         end = min(begin + block, particles)
         part, bin_terms = slice(begin, end), terms

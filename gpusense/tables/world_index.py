@@ -12,7 +12,7 @@ from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.flags import flags_if
 from gpusense.interface.structs import Crowd
-from gpusense.tables.crowd import NO_CROWD, CrowdTable
+from gpusense.tables.crowd import CrowdTable
 
 _INT = np.dtype(np.int32)
 _ON_DEVICE = ("int32", "int64")
@@ -101,11 +101,6 @@ class InWorlds(NamedTuple):
     def flags(self) -> frozenset[str]:
         """Flags of kernels that cast rays of these poses."""
         return flags_if(WORLDS=True, SHAPES=self.crowd.stride > 0)
-
-
-def no_worlds(space: Workspace, real: np.dtype) -> dict[str, Any]:
-    """Return the arguments of kernels that cast rays in a single map."""
-    return dict(world=space.empty("no world", 2, _INT), shapes=space.empty("no shapes", 1, real), crowd=NO_CROWD)
 
 
 def _indices(name: str, value: Any, count: int, backend: Backend, worlds: int | None) -> Any:

@@ -44,9 +44,25 @@ def test_named_is_the_inverse():
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_every_kernel_takes_the_names_of_its_row(kernel):
-    row = KERNELS[kernel].arguments
-    values = {one.name: BUFFER if one.shape is not None else struct_of(one.type) if one.is_struct else 1 for one in row}
-    assert launch(kernel, (), (1,), **values).named() == values
+    row = KERNELS[kernel]
+    values = {
+        one.name: BUFFER if one.shape is not None else struct_of(one.type) if one.is_struct else 1
+        for one in row.arguments
+    }
+    assert launch(kernel, row.optional, (1,), **values).named() == values
+    plain = launch(kernel, (), (1,), **values)
+    assert plain.named() == {one.name: values[one.name] for one in row.arguments if not one.flag}
+    assert launch(kernel, (), (1,), **plain.named()) == plain
+
+
+def test_an_argument_of_a_flag_is_required_with_the_flag_alone():
+    values = dict(
+        parts=BUFFER, order=BUFFER, log_p=BUFFER, particles=3, count=2, block=1, score=struct_of("Score")
+    )  # fmt: skip
+    assert launch("sum_parts", ("ORDERED",), (3,), **values).names[:2] == ("parts", "order")
+    assert "order" not in launch("sum_parts", (), (3,), **values).names
+    with pytest.raises(TypeError, match=r"^sum_parts: .* missing counts, constant_terms, batch$"):
+        launch("sum_parts", ("SCANS",), (3,), **values)
 
 
 def test_missing_and_unknown_arguments_are_named():

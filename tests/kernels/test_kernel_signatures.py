@@ -45,21 +45,27 @@ def test_opencl_kernels_have_the_axes_of_their_row(kernel: str) -> None:
 
 
 def test_opencl_parameters_are_written_from_the_row() -> None:
-    assert parameters("sum_parts") == (
+    assert parameters("sum_parts", frozenset({"ORDERED", "SCANS"})) == (
         "global const real *parts, global const int *order, global const int *counts, global const real "
         "*constant_terms, global real *log_p, const int particles, const int count, const int block, "
         "const Score score, const ScanBatch batch"
     )
-    assert "global const real2 *restrict ray, global real *restrict ranges, const Window window, const int " in (
-        parameters("cast_tiles")
+    assert parameters("sum_parts", frozenset()) == (
+        "global const real *parts, global real *log_p, const int particles, const int count, const int block, "
+        "const Score score"
     )
-    assert f"kernel void cast_ranges({parameters('cast_ranges')}) {{" in source_text("ranges")
+    assert "; global const int *order = 0; " in source_text("sums", frozenset()).replace("{ ", "; ")
+    assert "global const real2 *restrict ray, global real *restrict ranges, const Window window, const int " in (
+        parameters("cast_tiles", frozenset())
+    )
+    flags = frozenset({"SHAPES", "WORLDS"})
+    assert f"kernel void cast_ranges({parameters('cast_ranges', flags)}) {{" in source_text("ranges", flags)
 
 
 def test_a_kernel_without_a_row_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sources, "opencl_source", lambda file: "kernel void fourth(ARGUMENTS) {\n}\n")
     with pytest.raises(ValueError, match=r"^ranges.cl: a kernel must have a row in the signature table, got 'fourth'"):
-        source_text("ranges")
+        source_text("ranges", frozenset())
 
 
 def test_twenty_one_kernels_have_a_second_body_in_lanes() -> None:

@@ -31,8 +31,10 @@ ONE_SCAN = ScanBatch(1, 0)
 def run(
     backend: Backend, kernel: str, flags: frozenset[str], size: tuple[int, ...], *values: Any
 ) -> dict[str, np.ndarray]:
-    """Launch a kernel on host arrays in the order of its row and return its outputs."""
+    """Launch a kernel on host arrays, all in the order of its row, and return its outputs."""
     row = KERNELS[kernel]
+    values = row.passed(flags, values)
+    row = row.with_flags(flags)
     bound = [backend.upload(value) if isinstance(value, np.ndarray) else value for value in values]
     backend.compile(kernel, flags)(size, *bound)
     return {

@@ -11,7 +11,7 @@ from support.ray_oracles import Ray, walk
 
 from gpusense.backends import get_backend
 from gpusense.interface.lanes import with_lanes_flag
-from gpusense.interface.structs import Caster, Crowd, RangeScale, Window
+from gpusense.interface.structs import Caster, RangeScale, Window
 from gpusense.tables.rectangles import Planes, empty_rectangles
 
 LAST_FLOAT32 = 1 - 2.0**-24
@@ -75,8 +75,6 @@ def cast(scene: Scene, backend: str, precision: str, form: Planes = ONE_SECTOR, 
         (1, count),
         table,
         cell,
-        ranges,
-        cell,
         pose,
         rays,
         ranges,
@@ -85,7 +83,6 @@ def cast(scene: Scene, backend: str, precision: str, form: Planes = ONE_SECTOR, 
         1,
         Caster(0, 0.0, 0.0),
         RangeScale(scene.limit, 1.0, scene.limit),
-        Crowd(0, 0, 0, 0, 0.0),
     )
     return device.download(ranges, np.empty(count, real))
 

@@ -19,7 +19,7 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.backends.registry import BY_NAME
 from gpusense.interface.casters import ENTRIES
-from gpusense.interface.structs import Crowd, RangeScale, Window
+from gpusense.interface.structs import RangeScale, Window
 from gpusense.models.scan.densities import log_mixture
 from gpusense.tables import casters
 from gpusense.tables.caster_base import CasterInput
@@ -104,10 +104,10 @@ def kernel_cast(scene: Scene, kind: Caster, backend: str, precision: str) -> np.
     pose, count = np.concatenate([scene.frac, scene.direction], axis=1), len(scene.cell)
     result = device.empty(count, real)
     device.compile("cast_ranges", frozenset(flags))(
-        (1, count), table.buffer, *[device.empty(4, kind) for kind in (np.dtype(np.int32), real)],
+        (1, count), table.buffer,
         device.upload(scene.cell.astype(np.int32)), device.upload(pose.astype(real)),
         device.upload(np.array([[1.0, 0.0]], real)), result, Window(0, 0, rows, cols), count, 1, kind.struct(),
-        RangeScale(scene.limit, 1.0, scene.limit), Crowd(0, 0, 0, 0, 0.0),
+        RangeScale(scene.limit, 1.0, scene.limit),
     )  # fmt: skip
     return device.download(result, np.empty(count, real))
 

@@ -12,7 +12,7 @@ from support.raycast_scenes import FAMILIES, Scene, scenes_of
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import TOLERANCES, differing
-from gpusense.interface.structs import Caster, Cone, Crowd, RangeScale, Window
+from gpusense.interface.structs import Caster, Cone, RangeScale, Window
 from gpusense.tables.casters import CASTERS
 from gpusense.tables.rectangles import Planes, empty_rectangles
 from gpusense.world import windows
@@ -167,11 +167,10 @@ def test_the_cell_is_the_one_where_the_walk_ends(family, backend):
         pose = np.concatenate([scene.frac, scene.direction], axis=1).astype(real)
         device.compile("cast_echoes", frozenset(flags))(
             (1, count), empty_rectangles(device, scene.occupied, Planes(1)),
-            *[device.empty(4, kind) for kind in (np.dtype(np.int32), real)],
             device.upload(table),
             device.upload(scene.cell.astype(np.int32)), device.upload(pose), device.upload(np.array([1, 0], real)),
             *buffers, Window(0, 0, rows, cols), count, 1, Cone(1, 0.0), Caster(0, 0.0, 0.0),
-            RangeScale(scene.limit, 1.0, scene.limit), Crowd(0, 0, 0, 0, 0.0),
+            RangeScale(scene.limit, 1.0, scene.limit),
         )  # fmt: skip
         found, incidence = (device.download(buffer, np.empty(count, real)) for buffer in buffers)
         assert differing(found, ranges) == 0

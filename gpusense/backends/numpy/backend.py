@@ -12,13 +12,29 @@ from gpusense.backends.base import Backend, Launcher
 from gpusense.backends.info import BackendInfo
 from gpusense.backends.processor import host_memory
 from gpusense.interface import structs
-from gpusense.interface.signatures import KERNELS
+from gpusense.interface.signatures import KERNELS, Argument
 
 
 def describe() -> BackendInfo:
     """Describe the host as a device."""
     memory = host_memory()
     return BackendInfo("numpy", "numpy", "NumPy reference", "cpu", np.__version__, memory, memory, True)
+
+
+def _bound(argument: Argument, value: Any, real: np.dtype) -> Any:
+    """Return an argument as the reference takes it."""
+    if argument.is_struct:
+        return structs.rounded(value, argument.type, real)
+    if argument.shape is not None:
+        return argument.shaped(value)
+    dtype = argument.dtype(real)
+    return int(value) if dtype.kind == "i" else dtype.type(value)
+
+
+def _nothing(argument: Argument, real: np.dtype) -> Any:
+    """Return a struct of zeros, or an array without numbers."""
+    value: Any = [0] * argument.width if argument.is_struct else np.empty(0, argument.dtype(real))
+    return _bound(argument, value, real)
 
 
 class NumpyBackend(Backend):
@@ -51,19 +67,15 @@ class NumpyBackend(Backend):
         row = KERNELS[kernel]
         body = getattr(importlib.import_module(f"gpusense.reference.{row.file}"), kernel)
         real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
+        taken = row.with_flags(flags).arguments
+        # The reference does not read these.
+        absent = {one.name: _nothing(one, real) for one in row.arguments if one not in taken}
 
         def launch(size: tuple[int, ...], *arguments: Any) -> None:
-            bound: list[Any] = []
-            for declared, value in zip(row.arguments, arguments, strict=True):
-                if declared.is_struct:
-                    bound.append(structs.rounded(value, declared.type, real))
-                elif declared.shape is None:
-                    dtype = declared.dtype(real)
-                    bound.append(int(value) if dtype.kind == "i" else dtype.type(value))
-                else:
-                    bound.append(declared.shaped(value))
+            pairs = zip(taken, arguments, strict=True)
+            bound = absent | {one.name: _bound(one, value, real) for one, value in pairs}
             with np.errstate(all="ignore"):
-                body(flags, *bound)
+                body(flags, *[bound[one.name] for one in row.arguments])
 
         return launch
 

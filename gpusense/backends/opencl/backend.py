@@ -255,11 +255,12 @@ class OpenCLBackend(ProcessBound, Backend):
 
     def _launcher(self, kernel: str, flags: frozenset[str]) -> Launch:
         """Return a kernel; its program is built on first use."""
-        row = KERNELS[kernel]
-        flags = relevant(row.file, flags)
-        if (row.file, flags) not in self._programs:
-            self._programs[row.file, flags] = self._build(row.file, flags)
-        program, key = self._programs[row.file, flags]
+        file = KERNELS[kernel].file
+        flags = relevant(file, flags)
+        row = KERNELS[kernel].with_flags(flags)
+        if (file, flags) not in self._programs:
+            self._programs[file, flags] = self._build(file, flags)
+        program, key = self._programs[file, flags]
         first = None if self._pocl is None else functools.partial(self._pocl.mark, key)
         name = pocl_kernels.own_name(kernel, key) if self._of_bitcode else kernel
         compiled = new_kernel(program, name)

@@ -169,12 +169,11 @@ class WarpBackend(ProcessBound, Backend):
         self.check_process()
         launcher = self._asked.get((kernel, flags))
         if launcher is None:
-            row = KERNELS[kernel]
-            key = (kernel, relevant(row.file, flags))
+            key = (kernel, relevant(KERNELS[kernel].file, flags))
             with LOCK:
                 launcher = self._launchers.get(key)
                 if launcher is None:
-                    launcher = self._launchers[key] = self._build(row, *key)
+                    launcher = self._launchers[key] = self._build(KERNELS[kernel].with_flags(flags), *key)
             self._asked[kernel, flags] = launcher
         return launcher
 

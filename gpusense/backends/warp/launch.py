@@ -46,9 +46,11 @@ class Launch:
         batch: Callable[[], CallQueue | None],
     ) -> None:
         self._device, self._kernel, self._group, self._batch = device, kernel, group, batch
-        self._binds = [
-            _binding(argument, declared.type) for argument, declared in zip(row.arguments, kernel.adj.args, strict=True)
-        ]
+        # Places of the row's arguments among the kernel's; the others are null.
+        declared = {parameter.label: (place, parameter.type) for place, parameter in enumerate(kernel.adj.args)}
+        self._places = [declared[argument.name][0] for argument in row.arguments]
+        self._binds = [_binding(argument, declared[argument.name][1]) for argument in row.arguments]
+        self._null = [None if isinstance(kind, wp.array) else kind() for _, kind in declared.values()]
         self._thread = threading.local()
 
     def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
@@ -72,7 +74,9 @@ class Launch:
         """Launch on a stream, or on the device's current stream; the keys name the arguments."""
         recorded = getattr(self._thread, "recorded", None)
         if recorded is None:
-            bound = [bind(value) for bind, value in zip(self._binds, arguments, strict=True)]
+            bound = [*self._null]
+            for place, bind, value in zip(self._places, self._binds, arguments, strict=True):
+                bound[place] = bind(value)
             command = wp.launch(
                 self._kernel, dim=size[::-1], inputs=bound, device=self._device, block_dim=self._group, record_cmd=True
             )
@@ -83,7 +87,7 @@ class Launch:
                 command.set_dim(size[::-1])
             for i, (key, last) in enumerate(zip(keys, last_keys, strict=True)):
                 if key != last:
-                    command.set_param_at_index(i, self._binds[i](arguments[i]))
+                    command.set_param_at_index(self._places[i], self._binds[i](arguments[i]))
         command.launch(stream)
         self._thread.recorded = (command, size, keys)
 

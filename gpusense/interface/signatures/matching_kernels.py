@@ -12,10 +12,11 @@ _CELLS = "uchar table [scores.tables * (scores.rows + 2 * scores.margin) * (scor
 KERNELS: dict[str, Kernel] = {
     "field_gradient": kernel(
         "field_gradient", "particle", "real table [(window.rows + 4) * (window.cols + 4)]", *PLACED,
-        "real2 point [readings]", "real2 point_low [readings]", "FieldTerms terms [1]", "int start [scans + 1]",
-        "real constant_terms [scans]", f"out real gradient [{GRADIENT_NUMBERS} * particles]", WINDOW,
+        "real2 point [readings]", "real2 point_low [readings]", "FieldTerms terms [1]",
+        "int start [scans + 1] if SCANS", "real constant_terms [scans] if SCANS",
+        f"out real gradient [{GRADIENT_NUMBERS} * particles]", WINDOW,
         "int particles", "int readings", "real guard", "real mount_x", "real mount_y", "real resolution",
-        "Score score", "ScanBatch batch", in_lanes=True,
+        "Score score", "ScanBatch batch if SCANS", in_lanes=True,
     ),
     "fit_lines": kernel(
         "lines", "beam scan", *_POINTS, "int which [chosen]", "out real4 line [points]", "int scans", "int points",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Mapping
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,12 +39,16 @@ def _evaluate(node: ast.expr, values: Mapping[str, Any]) -> int:
 
 @dataclass(frozen=True)
 class Argument:
-    """One argument of a kernel: an array (with its shape in words), or a scalar or struct (shape None)."""
+    """One argument of a kernel: an array (with its shape in words), or a scalar or struct (shape None).
+
+    Only code with ``flag`` has the argument; code of any flags where it is empty.
+    """
 
     name: str
     type: str
     shape: str | None = None
     output: bool = False
+    flag: str = ""
 
     @property
     def is_struct(self) -> bool:
@@ -57,7 +63,7 @@ class Argument:
     @property
     def width(self) -> int:
         """Return the numbers per element: 4 for real4, and the fields of a struct."""
-        if self.holds_structs:
+        if self.type in STRUCTS:
             return len(fields(self.type))
         return _WIDTHS[self.type.lstrip("abcdefghijklmnopqrstuvwxyz")]
 
@@ -99,6 +105,29 @@ class Kernel:
     apart: bool = False
     team: int = 1
 
+    @functools.cached_property
+    def optional(self) -> frozenset[str]:
+        """The flags without which arguments are missing."""
+        return frozenset(argument.flag for argument in self.arguments if argument.flag)
+
+    @functools.cached_property
+    def _rows(self) -> dict[frozenset[str], Kernel]:
+        return {}
+
+    def with_flags(self, flags: frozenset[str]) -> Kernel:
+        """Return the row of the code of a set of flags, without the arguments that the code does not have."""
+        chosen = flags & self.optional
+        row = self._rows.get(chosen)
+        if row is None:
+            kept = tuple(argument for argument in self.arguments if argument.flag in ("", *chosen))
+            row = self._rows[chosen] = dataclasses.replace(self, arguments=kept)
+        return row
+
+    def passed(self, flags: frozenset[str], values: Sequence[Any]) -> list[Any]:
+        """Return those of the values of all arguments that the code of a set of flags takes."""
+        pairs = zip(self.arguments, values, strict=True)
+        return [value for argument, value in pairs if argument.flag in ("", *flags)]
+
 
 # Particles or beams of a work-item of a kernel in lanes.
 LANES = 16
@@ -126,12 +155,13 @@ def kernel(
     apart: bool = False,
     team: int = 1,
 ) -> Kernel:
-    """Return the kernel whose arguments are rows such as ``"out real parts [particles * features]"``."""
+    """Return the kernel whose arguments are rows such as ``"out real parts [particles * features] if PER_BEAM"``."""
     arguments = []
     for row in rows:
-        head, _, shape = row.partition("[")
+        declared, _, flag = row.partition(" if ")
+        head, _, shape = declared.partition("[")
         *output, kind, name = head.split()
-        arguments.append(Argument(name, kind, shape.rstrip("]") if shape else None, output == ["out"]))
+        arguments.append(Argument(name, kind, shape.rstrip("]") if shape else None, output == ["out"], flag))
     return Kernel(file, tuple(launch.split()), tuple(arguments), group, in_lanes, lanes_group, apart, team)
 
 

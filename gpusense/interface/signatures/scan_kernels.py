@@ -5,14 +5,15 @@ from __future__ import annotations
 from gpusense.interface.constants import DRAW_TERMS
 from gpusense.interface.signatures.rows import PLACED, POSES, WINDOW, Kernel, kernel
 
-# Normals of the cells of the map and of a ring around it; not read without INCIDENCE.
-_NORMALS = ("real2 normals [(window.rows + 2) * (window.cols + 2)]",)
+# Normals of the cells of the map and of a ring around it.
+_NORMALS = ("real2 normals [(window.rows + 2) * (window.cols + 2)] if INCIDENCE",)
 _CONES = "real2 ray [rays * cone.rays]"
 # A map's table for a caster, which defines its entries and their number.
-# World and shapes are read with WORLDS and SHAPES; see the kernel file ``shapes``.
-_WORLDS = ("int2 world [2 * particles]", "real shapes [crowd.stride]")
+# See the kernel file ``shapes``.
+_WORLDS = ("int2 world [2 * particles] if WORLDS", "real shapes [crowd.stride] if SHAPES")
 _CAST = ("entry map_table [map]", *_WORLDS)
-_CASTING = ("Caster caster", "RangeScale scale", "Crowd crowd")
+_CROWD = "Crowd crowd if SHAPES"
+_CASTING = ("Caster caster", "RangeScale scale", _CROWD)
 # Poses on their way into a window of the grid.
 _GIVEN = (
     "coordinate poses [particles * 3]", "out int2 pose_cell [particles]", "out real4 pose [particles]",
@@ -21,13 +22,18 @@ _GIVEN = (
 _FRAME = ("Frame frame", WINDOW, "int particles")
 _POINTS = ("real2 point [readings]", "real2 point_low [readings]", "FieldTerms terms [1]")
 _TERMS = (
-    "MixtureTerms terms [tables.incidence_bins]", "real masses [1]", "real edges [tables.incidence_bins]",
-    "real sensor [(tables.cells + 1) * (tables.cells + 1)]",
+    "MixtureTerms terms [tables.incidence_bins]", "real masses [1] if MASS_TABLE",
+    "real edges [tables.incidence_bins] if INCIDENCE",
+    "real sensor [(tables.cells + 1) * (tables.cells + 1)] if SENSOR_TABLE",
 )  # fmt: skip
-# With SCANS: index of the first ray or end point of each scan, and the scan's constant term.
-_SCANS = ("int start [scans + 1]", "real constant_terms [scans]")
-_RESULT = ("out real log_p [particles]", "out real parts [particles * readings]")
-_SCORE = ("Score score", "ScanBatch batch")
+# Index of the first ray or end point of each scan, and the scan's constant term.
+_START = "int start [scans + 1] if SCANS"
+_SCANS = (_START, "real constant_terms [scans] if SCANS")
+_BATCH = "ScanBatch batch if SCANS"
+_ORDER = "int order [particles] if ORDERED"
+_FIRST = "int first [rays + 1] if SHARED_RAYS"
+_RESULT = ("out real log_p [particles]", "out real parts [particles * readings] if PER_BEAM")
+_SCORE = ("Score score", _BATCH)
 _FIELD_TABLE = "real table [(window.rows + 4) * (window.cols + 4)]"
 
 KERNELS: dict[str, Kernel] = {
@@ -55,24 +61,25 @@ KERNELS: dict[str, Kernel] = {
         "int particles", "int rays", *_CASTING, in_lanes=True, lanes_group=8,
     ),
     "score_beams": kernel(
-        "beam", "particle", *_CAST, *_NORMALS, *POSES, _CONES, "int first [rays + 1]", "real reading [readings]",
+        "beam", "particle", *_CAST, *_NORMALS, *POSES, _CONES, _FIRST, "real reading [readings]",
         *_TERMS, *_SCANS, *_RESULT, WINDOW, "int particles", "int rays", "int readings", "MixtureTables tables",
         "Cone cone", *_CASTING, *_SCORE, lanes_group=16,
     ),
     "cast_tiles": kernel(
-        "ranges", "item", *_CAST, *POSES, "int order [particles]", "real2 ray [rays]",
+        "ranges", "item", *_CAST, *POSES, _ORDER, "real2 ray [rays]",
         "out real ranges [particles * rays]", WINDOW, "int particles", "int rays", *_CASTING, "int spread",
         apart=True,
     ),
     "beam_tiles": kernel(
-        "beam", "item", *_CAST, *_NORMALS, *POSES, "int order [particles]", _CONES, "int first [rays + 1]",
-        "real reading [readings]", *_TERMS, "int start [scans + 1]", "out real parts [readings * particles]", WINDOW,
+        "beam", "item", *_CAST, *_NORMALS, *POSES, _ORDER, _CONES, _FIRST, "real reading [readings]", *_TERMS,
+        _START, "out real parts [readings * particles]", WINDOW,
         "int particles", "int rays", "int readings", "MixtureTables tables", "Cone cone", *_CASTING, "int spread",
-        "ScanBatch batch", apart=True,
+        _BATCH, apart=True,
     ),
     "cast_echoes": kernel(
         "echo", "ray particle", *_CAST, *_NORMALS, *POSES, _CONES, "out real ranges [particles * rays]",
-        "out real incidence [particles * rays]", WINDOW, "int particles", "int rays", "Cone cone", *_CASTING,
+        "out real incidence [particles * rays] if INCIDENCE",
+        WINDOW, "int particles", "int rays", "Cone cone", *_CASTING,
     ),
     "draw_readings": kernel(
         "sampling", "ray particle", "real incidence [particles * rays]",
@@ -82,8 +89,8 @@ KERNELS: dict[str, Kernel] = {
         "MixtureTables tables", "RangeScale scale",
     ),
     "sum_parts": kernel(
-        "sums", "place", "real parts [count * particles]", "int order [particles]", "int counts [scans]",
-        "real constant_terms [scans]", "out real log_p [particles]", "int particles", "int count", "int block",
+        "sums", "place", "real parts [count * particles]", _ORDER, "int counts [scans] if SCANS",
+        "real constant_terms [scans] if SCANS", "out real log_p [particles]", "int particles", "int count", "int block",
         *_SCORE,
     ),
     "order_bounds": kernel(
@@ -99,12 +106,12 @@ KERNELS: dict[str, Kernel] = {
         "int particles",
     ),
     "field_blocks": kernel(
-        "field", "item", _FIELD_TABLE, *_WORLDS, *PLACED, *_POINTS, "real guard [readings]", "int start [scans + 1]",
+        "field", "item", _FIELD_TABLE, *_WORLDS, *PLACED, *_POINTS, "real guard [readings]", _START,
         "out real parts [readings * particles]", WINDOW, "int particles", "int readings", "int spread",
-        "ScanBatch batch", "Crowd crowd",
+        _BATCH, _CROWD,
     ),
     "score_field": kernel(
         "field", "particle", _FIELD_TABLE, *_WORLDS, *PLACED, *_POINTS, *_SCANS, *_RESULT, WINDOW, "int particles",
-        "int readings", "real guard", *_SCORE, "Crowd crowd", in_lanes=True,
+        "int readings", "real guard", *_SCORE, _CROWD, in_lanes=True,
     ),
 }  # fmt: skip

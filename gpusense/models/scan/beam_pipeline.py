@@ -55,12 +55,10 @@ class BeamPipeline(ScanPipeline):
         self._terms = upload(np.stack(mixture.terms, axis=1))
         self._constants = dict(
             terms=self._terms, masses=upload(mixture.masses), edges=upload(mixture.cosines.astype(self.real)),
-            sensor=upload(np.zeros(1, self.real) if mixture.table is None else mixture.table),
+            sensor=None if mixture.table is None else upload(mixture.table),
             tables=MixtureTables(mixture.bins, cells, cells / self.scanner.range_max),
             cone=cones.struct,
         )  # fmt: skip
-        # The first reading of each ray where no rays are shared.
-        self._one_each: Buffer = upload(np.arange(self.scanner.count + 1, dtype=np.int32))
 
     @property
     def _top(self) -> float:
@@ -81,18 +79,17 @@ class BeamPipeline(ScanPipeline):
         arrays = dict(ray=vectors.astype(self.real), reading=values)
         if several:
             arrays["constant_terms"] = (scans.constants + self.context.constant_term).astype(self.real)
-        uploaded = dict(zip(arrays, space.upload_all("scan", list(arrays.values())), strict=True))
-        start = counts = self.nothing
+        arguments = dict(zip(arrays, space.upload_all("scan", list(arrays.values())), strict=True))
+        sums: dict[str, Buffer] = {}
         if several:
             begins = np.append(0, np.cumsum(scans.ray_counts)).astype(np.int32)
-            start, counts = space.upload_all("scans", [begins, scans.counts.astype(np.int32)])
-        # Kernels read ``first`` only for shared rays; NumPy's kernel does for a single scan.
-        first = space.upload("first", scans.ray_offsets) if shared and (several or scans.shared) else self._one_each
+            sums["constant_terms"] = arguments.pop("constant_terms")
+            arguments["start"], sums["counts"] = space.upload_all("scans", [begins, scans.counts.astype(np.int32)])
+        if shared:
+            arguments["first"] = space.upload("first", scans.ray_offsets)
         return Readings(
             scans.scans, scans.most_rays, scans.most_readings, flags_if(SHARED_RAYS=shared, SCANS=several),
-            dict(ray=uploaded["ray"], reading=uploaded["reading"], first=first, start=start),
-            dict(counts=counts, constant_terms=uploaded.get("constant_terms", self._terms)),
-            float(scans.constants[0]) + self.context.constant_term,
+            arguments, sums, float(scans.constants[0]) + self.context.constant_term,
             (scans.scans, scans.most_rays, scans.most_readings, len(scans.rays), len(scans.readings)),
         )  # fmt: skip
 
@@ -105,7 +102,7 @@ class BeamPipeline(ScanPipeline):
         )  # fmt: skip
 
     def place_arguments(self, filled: dict[str, Buffer]) -> dict[str, Buffer]:
-        return dict(ray=filled["point"], reading=filled["reading"], first=self._one_each, start=self.nothing)
+        return dict(ray=filled["point"], reading=filled["reading"])
 
     # ---- program
 
@@ -148,15 +145,9 @@ class BeamPipeline(ScanPipeline):
             **placed.places(), **self._constants, **readings.arguments,
         )  # fmt: skip
         if scoring.tiles is None:
-            common |= self.numbers(scoring)
-            constant_terms = readings.sums["constant_terms"]
-            return (
-                launch(
-                    "score_beams", scoring.flags, (count,), **common, constant_terms=constant_terms,
-                    log_p=scoring.log_p,
-                ),
-            )  # fmt: skip
-        order = self.nothing if scoring.tiles.order is None else scoring.tiles.order.order
+            common |= self.numbers(scoring) | readings.constants
+            return (launch("score_beams", scoring.flags, (count,), **common, log_p=scoring.log_p),)
+        order = None if scoring.tiles.order is None else scoring.tiles.order.order
         items, spread = tiles_of(count, readings.rays)
         tiles = launch("beam_tiles", scoring.flags, (items,), **common, order=order, spread=spread)
         summing = sum_launch(

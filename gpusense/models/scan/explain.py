@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from gpusense.interface.plan import Omission, Plan, SceneNotes, share
+from gpusense.interface.signatures import KERNELS
 from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.scoring import LastCall
 
@@ -19,8 +20,19 @@ def plan_of_call(notes: SceneNotes, context: ModelContext, last: LastCall) -> Pl
     title = f"{notes.title}, {device.selection} ({device.name})"
     if not context.rules.specialize:
         return Plan(f"{title}, specialize=False", last.flags, ())
-    omissions = (*notes.omissions, *_launches(last), *_readings(last, context.rules.scanner.count))
+    omissions = (*notes.omissions, *_arguments(last), *_launches(last), *_readings(last, context.rules.scanner.count))
     return Plan(title, last.flags, omissions, tuple(notes.kept), tuple(notes.could_go))
+
+
+def _arguments(last: LastCall) -> list[Omission]:
+    """Return the arguments that the kernels of the last call do not take."""
+    rows = [KERNELS[kernel] for kernel in last.kernels]
+    count = sum(len(row.arguments) for row in rows)
+    absent = count - sum(len(row.with_flags(last.flags).arguments) for row in rows)
+    if not absent:
+        return []
+    why = f"{absent} of {count} arguments belong to parts that are left out"
+    return [Omission("kernel arguments", why, "their setting for each launch")]
 
 
 def _launches(last: LastCall) -> list[Omission]:

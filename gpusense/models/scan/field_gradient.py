@@ -59,14 +59,12 @@ class _Gradient:
         flags, per_scan = with_lanes_flag(backend.info.lanes, "field_gradient", flags), piece.count // readings.scans
         # The particles of a work-item's lanes belong to one scan.
         size = readings.scans * -(-per_scan // LANES) * LANES if "IN_LANES" in flags else piece.count
-        arguments = readings.arguments
         gradient = launch(
             "field_gradient", flags, (size,), table=state.table, pose_cell=placed.cell, pose=placed.pose,
-            pose_low=placed.low, point=arguments["point"], point_low=arguments["point_low"], terms=pipeline.terms,
-            start=arguments["start"], constant_terms=readings.sums["constant_terms"], gradient=numbers,
-            window=placed.frame.window, particles=piece.count, readings=readings.readings,
-            guard=pipeline.guard * readings.reach, mount_x=mount_x, mount_y=mount_y, resolution=resolution,
+            pose_low=placed.low, terms=pipeline.terms, gradient=numbers, window=placed.frame.window,
+            particles=piece.count, readings=readings.readings, mount_x=mount_x, mount_y=mount_y, resolution=resolution,
             score=Score(readings.constant_term, pipeline.context.temperature), batch=ScanBatch(per_scan, 0),
+            **readings.arguments | readings.constants | dict(guard=pipeline.guard * readings.reach),
         )  # fmt: skip
         backend.run((*placing_launches(placed, readings.placing), gradient))
         space.download(numbers, rows)

@@ -130,16 +130,14 @@ class FieldPipeline(ScanPipeline):
         several = scans.scans > 1
         if several:
             arrays["constant_terms"] = (scans.constants + self.context.constant_term).astype(self.real)
-        uploaded = dict(zip(arrays, space.upload_all("points", list(arrays.values())), strict=True))
-        start = counts = self.nothing
+        arguments = dict(zip(arrays, space.upload_all("points", list(arrays.values())), strict=True))
+        sums: dict[str, Buffer] = {}
         if several:
-            blocks = -(-scans.counts // BLOCK_TERMS)
-            begins = np.append(0, np.cumsum(scans.counts))
-            start, counts = space.upload_all("scans", [begins.astype(np.int32), blocks.astype(np.int32)])
+            counts = [np.append(0, np.cumsum(scans.counts)), -(-scans.counts // BLOCK_TERMS)]
+            sums["constant_terms"] = arguments.pop("constant_terms")
+            arguments["start"], sums["counts"] = space.upload_all("scans", [one.astype(np.int32) for one in counts])
         return Readings(
-            scans.scans, scans.most_rays, scans.most_readings, _SCANS if several else _NONE,
-            dict(point=uploaded["point"], point_low=uploaded["point_low"], guard=uploaded.get("guard"), start=start),
-            dict(counts=counts, constant_terms=uploaded.get("constant_terms", self.terms)),
+            scans.scans, scans.most_rays, scans.most_readings, _SCANS if several else _NONE, arguments, sums,
             float(scans.constants[0]) + self.context.constant_term,
             (scans.scans, scans.most_readings, len(scans.readings)), lengths.item(lengths.argmax()) + 2,
         )  # fmt: skip
@@ -162,7 +160,7 @@ class FieldPipeline(ScanPipeline):
         )  # fmt: skip
 
     def place_arguments(self, filled: dict[str, Buffer]) -> dict[str, Buffer]:
-        return dict(point=filled["point"], point_low=filled["point_low"], guard=filled["guard"], start=self.nothing)
+        return dict(point=filled["point"], point_low=filled["point_low"], guard=filled["guard"])
 
     # ---- program
 
@@ -207,17 +205,12 @@ class FieldPipeline(ScanPipeline):
             # Lanes of a work-item are particles, which belong to one scan; lanes of loops are readings.
             grouped = readings.scans * -(-scoring.batch.per_scan // _GROUP) * _GROUP
             size = grouped if self.backend.info.lanes > 1 and "IN_LANES" in scoring.flags else count
-            common |= self.numbers(scoring)
-            return (
-                launch(
-                    "score_field", scoring.flags, (size,), **common, log_p=scoring.log_p,
-                    constant_terms=readings.sums["constant_terms"],
-                ),
-            )  # fmt: skip
+            common |= self.numbers(scoring) | readings.constants
+            return (launch("score_field", scoring.flags, (size,), **common, log_p=scoring.log_p),)
         items = (-(-count // _GROUP) << scoring.tiles.spread) * _GROUP
         blocks = launch("field_blocks", scoring.flags, (items,), **common, spread=scoring.tiles.spread)
         summing = sum_launch(
-            scoring.flags | readings.sum_flags, count, parts, order=self.nothing, log_p=scoring.log_p,
+            scoring.flags | readings.sum_flags, count, parts, log_p=scoring.log_p,
             batch=scoring.batch, **readings.sums, **self.numbers(scoring),
         )  # fmt: skip
         return (blocks, summing) if readings.readings else (summing,)

@@ -70,7 +70,6 @@ class MapCaster:
         self.method, self.outside, self._table_bytes = method, outside, 0
         # Window of the normals of the map's walls, the normals, and their size [bytes].
         self._normals: tuple[Window, Buffer, int] | None = None
-        self._no_normals = backend.upload(np.zeros(2, real))
         self._unknown = unknown
         self._worlds = grid if isinstance(grid, Worlds) else None
         self.map: ReachableMap
@@ -104,14 +103,14 @@ class MapCaster:
         """Bytes of the map's tables on the device."""
         return self._table_bytes + (0 if self._normals is None else self._normals[2])
 
-    def normals(self, window: Window, flags: frozenset[str]) -> Buffer:
-        """Return the normals of the walls in a window, where flags need them; made once for a window.
+    def normals(self, window: Window, flags: frozenset[str]) -> Buffer | None:
+        """Return the normals of the walls in a window, where flags need them, else None; made once for a window.
 
         Raises:
             TableMemoryError: The device cannot hold them.
         """
         if "INCIDENCE" not in flags:
-            return self._no_normals
+            return None
         if self._worlds is not None:
             from gpusense.tables.normals import normals_of_worlds
 
@@ -299,8 +298,11 @@ class MapCaster:
         if self.backend.info.kind == "gpu":
             flags |= flags_if(ORDERED=order is not None)
             items, spread = tiles_of(count, rays)
-            places = placed.cell if order is None else order.order
-            tiles = launch("cast_tiles", flags, (items,), **common, order=places, spread=spread)
-            return (tiles,) if order is None else (*order.launches(), tiles)
+            if order is None:
+                return (launch("cast_tiles", flags, (items,), **common, spread=spread),)
+            return (
+                *order.launches(),
+                launch("cast_tiles", flags, (items,), **common, order=order.order, spread=spread),
+            )
         flags = with_lanes_flag(self.backend.info.lanes, "cast_ranges", flags)
         return (launch("cast_ranges", flags, (rays, count), **common),)

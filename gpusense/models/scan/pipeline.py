@@ -76,7 +76,6 @@ class ScanPipeline(ABC):
 
     Attributes:
         context: The device and the rules.
-        nothing: A buffer for arguments that are not read.
         map: The map's table.
     """
 
@@ -97,7 +96,6 @@ class ScanPipeline(ABC):
         self.scanner, self.specialize = context.rules.scanner, context.rules.specialize
         self._mount = self.scanner.mount
         self._converted = context.weights.readings if context.weights.is_peer else None
-        self.nothing = self.backend.upload(np.zeros(1, np.int32))
         # Flags, keyed by everything on which they depend.
         self._flags: dict[Hashable, frozenset[str]] = {}
         # Flags to add and to remove while omissions are measured.

@@ -33,7 +33,8 @@ class Readings(NamedTuple):
         readings: Largest number of readings of a scan.
         flags: Flags of kernels that score them.
         arguments: Their arguments of scoring kernels, by name.
-        sums: Their arguments of ``sum_parts``, by name: counts of readings or blocks, and constant terms of scans.
+        sums: Their arguments of ``sum_parts``, by name: counts of readings or blocks, and constant terms of scans. A
+            single scan of the host has none.
         constant_term: The constant term of a single scan.
         key: All values on which the launches depend, except buffers.
         reach: Longest range in cells, and a bound of its error; infinite if unknown.
@@ -52,6 +53,11 @@ class Readings(NamedTuple):
     reach: float = np.inf
     constants_there: bool = False
     placing: Placing | None = None
+
+    @property
+    def constants(self) -> dict[str, Any]:
+        """Their constant terms as an argument of scoring kernels, by name."""
+        return {"constant_terms": self.sums["constant_terms"]} if self.sums else {}
 
     @property
     def sum_flags(self) -> frozenset[str]:

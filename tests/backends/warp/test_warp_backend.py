@@ -18,7 +18,7 @@ import pytest
 
 import gpusense as gs
 from gpusense.backends import Backend, get_backend
-from gpusense.interface.structs import Crowd, ScanBatch, Score, Window
+from gpusense.interface.structs import Score, Window
 
 
 @pytest.fixture
@@ -158,11 +158,8 @@ def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
     flags = frozenset({"LOG_TABLE", "TWO_PART_POINTS", "PER_BEAM"})
     launch = backend.compile("score_field", flags)
     assert isinstance(launch, _warp_pieces.SharedLaunch)
-    nowhere = np.zeros(1, np.int32), np.zeros(1, np.float32)
-    table, *others = arrays
-    one_world = np.zeros((1, 2), np.int32), np.zeros(1, np.float32)
-    inputs = [backend.upload(array) for array in (table, *one_world, *others, *nowhere)]
-    scalars = (readings, 1e-4, Score(0.25, 0.5), ScanBatch(1, 0), Crowd(0, 0, 0, 0, 0.0))
+    inputs = [backend.upload(array) for array in arrays]
+    scalars = (readings, 1e-4, Score(0.25, 0.5))
     real = np.dtype(np.float32)
 
     def run(target: Callable[..., None], count: int = particles) -> tuple[np.ndarray, np.ndarray]:

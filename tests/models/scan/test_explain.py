@@ -36,7 +36,7 @@ def test_explain_names_what_is_left_out(monkeypatch):
     assert model.explain().startswith("beam model, float32, ")
     found = left_out(model)
     scene = {"missing readings", "max readings", "thinned beams", "repeated bearings", "entry from outside", "far map"}
-    scene |= {"reduction of huge headings", "other worlds"}
+    scene |= {"reduction of huge headings", "other worlds", "kernel arguments"}
     assert set(found) == always | scene
     assert "z_short = 0" in found["short component"] and "z_rand = 0" in found["rand component"]
     assert "2 of 24" in found["missing readings"] and "of 24" in found["max readings"]
@@ -62,7 +62,7 @@ def test_explain_of_a_full_beam_model(backend):
     model.log_likelihood(cloud(grid, 100), scan())
     needless = {"log-domain sum", "exponents in two parts", "range_bias", "sigma_growth"}
     needless |= {"order of particles"} if model.device.kind == "gpu" else set()
-    assert set(left_out(model)) == needless | {"reduction of huge headings", "other worlds"}
+    assert set(left_out(model)) == needless | {"reduction of huge headings", "other worlds", "kernel arguments"}
 
 
 @pytest.mark.parametrize("kind", ["field", "bilinear"])

@@ -11,7 +11,7 @@ import pytest
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import differing, per_scan
-from gpusense.interface.structs import Caster, Crowd, RangeScale, Window
+from gpusense.interface.structs import Caster, RangeScale, Window
 from gpusense.tables.rectangles import Planes, empty_rectangles
 
 PRECISIONS = ("float32", "float64")
@@ -131,10 +131,9 @@ def test_denormal_direction_components_are_zero(backend, precision):
             placed = np.concatenate([np.array(origins), np.tile(pose, (len(origins), 1))], axis=1).astype(real)
             out = device.empty(len(origins), real)
             device.compile("cast_ranges", frozenset({"FLOAT64"} if precision == "float64" else ()))(
-                (1, len(origins)), table, device.empty(4, np.dtype(np.int32)), device.empty(1, real),
-                device.upload(cells), device.upload(placed), device.upload(ray[None]), out, Window(0, 0,
-                *obstacles.shape), len(origins), 1, Caster(0, 0.0, 0.0), RangeScale(20.0, 1.0, 20.0), Crowd(0, 0, 0, 0,
-                0.0),
+                (1, len(origins)), table,
+                device.upload(cells), device.upload(placed), device.upload(ray[None]), out,
+                Window(0, 0, *obstacles.shape), len(origins), 1, Caster(0, 0.0, 0.0), RangeScale(20.0, 1.0, 20.0),
             )  # fmt: skip
             found.append(device.download(out, np.empty(len(origins), real)))
         return np.array(found)

@@ -56,7 +56,6 @@ def launched(model, poses, ranges, monkeypatch):
     """Return flags and arguments of the gradient's launch, by name."""
     backend = get_backend("numpy")
     compiled, seen = backend.compile, []
-    names = [argument.name for argument in KERNELS["field_gradient"].arguments]
 
     def compile_and_note(kernel, flags):
         launch = compiled(kernel, flags)
@@ -64,6 +63,7 @@ def launched(model, poses, ranges, monkeypatch):
         def note(size, *values):
             if kernel == "field_gradient":
                 copies = [value.copy() if isinstance(value, np.ndarray) else value for value in values]
+                names = (argument.name for argument in KERNELS[kernel].with_flags(flags).arguments)
                 seen.append((flags, SimpleNamespace(**dict(zip(names, copies, strict=True)))))
             launch(size, *values)
 

@@ -11,8 +11,6 @@ from gpusense.backends.proxy import Proxy
 from gpusense.evaluation.tolerances import differing
 from gpusense.interface.signatures import KERNELS
 
-GUARD = [argument.name for argument in KERNELS["score_field"].arguments].index("guard")
-
 
 class Guards(Proxy):
     """A backend that records the bounds of rounding errors in launches of likelihood fields."""
@@ -26,7 +24,8 @@ class Guards(Proxy):
 
         def listed(size, *arguments):
             if kernel == "score_field":
-                self.guards.append(arguments[GUARD])
+                names = [argument.name for argument in KERNELS[kernel].with_flags(flags).arguments]
+                self.guards.append(arguments[names.index("guard")])
             launcher(size, *arguments)
 
         return listed

@@ -239,7 +239,16 @@ def test_a_batch_is_its_scans_one_after_the_other(options, near):
             assert [batch.most_readings, batch.most_rays] == [max(len(scan.readings) for scan in alone)] * 2
             for s, scan in enumerate(alone):
                 part = batch.part(s, s + 1)
-                for name in ("columns", "readings", "vectors", "rays", "first", "counts", "ray_counts", "constants"):
+                for name in (
+                    "columns",
+                    "readings",
+                    "vectors",
+                    "rays",
+                    "ray_offsets",
+                    "counts",
+                    "ray_counts",
+                    "constants",
+                ):
                     np.testing.assert_array_equal(getattr(part, name), getattr(scan, name))
             for name in ("missing", "ignored_max", "thinned"):
                 assert getattr(batch.left_out, name) == getattr(alone[-1].left_out, name)

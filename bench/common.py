@@ -124,8 +124,6 @@ class Scene:
     Attributes:
         grid: The map: the built-in building, or the one that ``--map`` names.
         pose: A free pose in it.
-        rng: The generator of clouds and readings.
-        label: The map in words.
     """
 
     def __init__(self, arguments: argparse.Namespace) -> None:

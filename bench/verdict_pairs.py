@@ -40,7 +40,6 @@ class Pairs:
         half: "A", "B", or "S" for simulations.
         name: The recording, or the map and the number of beams.
         kind: "successive", "near", "places" or "unrelated".
-        scanner: The scanner.
         first: (S, K) readings of the references [m].
         second: (S, K) readings of the second scans [m].
         guess: (S, 3) guesses.

@@ -29,7 +29,6 @@ class Mark:
 
     Attributes:
         error, seconds: Its coordinates; an error below ``SMALLEST`` counts as none.
-        name: Name for the tooltip.
         group: Group, which has a colour.
         best: Whether it belongs to the Pareto front, and has a label.
     """

@@ -31,11 +31,8 @@ class Wish:
     """An upper limit of the error or of the time.
 
     Attributes:
-        words: The wish in words.
-        need: Its need.
         error: The largest error, by the need's first measure; None without a limit.
         seconds: The longest time [s]; None without a limit.
-        only: Function that selects rows.
     """
 
     words: str

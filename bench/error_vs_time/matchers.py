@@ -35,12 +35,8 @@ class Matcher:
     """A program that matches pairs.
 
     Attributes:
-        method: Name of program and method.
-        code: Its call.
-        outside: Version and threads.
         match: Function of (P, K) ranges of both scans, scanner and (P, 3) guesses that returns (P, 3) poses of the
             second scan in the frame of the first; NaN where it fails.
-        missing: Why it cannot run; empty if it can.
     """
 
     method: str

@@ -38,8 +38,6 @@ class Pairs:
     """Pairs of scans with one number of beams.
 
     Attributes:
-        grid: The map.
-        scanner: The scanner.
         one, two: (P, K) readings of both scans [m].
         places: (P, 3) poses of the second scans.
         moved: (P, 3) these poses in the frames of the first scans.

@@ -50,10 +50,7 @@ class Source:
     """A report.
 
     Attributes:
-        name: Name of its file.
         kind: ``"models"`` or ``"tasks"``.
-        report: Its contents.
-        titles: Titles of its devices.
     """
 
     name: str

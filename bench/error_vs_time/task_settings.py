@@ -52,15 +52,10 @@ class Setting:
 
     Attributes:
         need: One of ``NEEDS``.
-        method: Name of the method.
-        options: Its options in words.
-        code: Its call.
-        precision: The precision.
         run: Function that makes a run from a seed, and returns errors and steps.
         outside: Version and threads of another program; empty for gpusense.
         repeats: Number of runs, more than one where errors vary much with the seed.
         errors, seconds, processor: Errors and times of the steps of each run so far.
-        runs: Number of runs so far.
         reason: Why it was left out; empty if it was not.
     """
 

@@ -71,13 +71,9 @@ class Job:
     """A row to measure.
 
     Attributes:
-        what: Its label.
         work: Rays or particle-beams of the call; 0 where a rate is meaningless.
         make: Makes the call of a backend and a precision.
-        poses: Its particles.
-        out: Where it writes.
         checked: Whether results are compared with NumPy's.
-        cast: Whether they are ranges.
     """
 
     what: str

@@ -49,9 +49,7 @@ class Option:
 
     Attributes:
         model: "beam model" or "field".
-        name: The changed property.
         most: The intended upper bound of the ratio to the default's time.
-        make: Function that makes the model on a backend.
     """
 
     model: str

@@ -76,15 +76,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Job:
-    """A row to measure.
-
-    Attributes:
-        what: Its label.
-        make: Makes the model, from a backend and a precision.
-        call: Scores poses with a model.
-        poses: The particles.
-        readings: The number of readings of a call.
-    """
+    """A row to measure."""
 
     what: str
     make: Callable[..., Any]

@@ -42,12 +42,7 @@ class FitResult:
     """Result of the command.
 
     Attributes:
-        data: The readings of the fit.
-        fit: The fit.
-        incidence: The fit by angles of incidence, or None.
         held_out: The comparison on held-out readings; empty without ``--holdout``.
-        held_out_readings: Number of held-out readings.
-        motion: The noise of the odometry, or None.
     """
 
     data: RangeData

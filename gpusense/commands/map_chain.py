@@ -35,9 +35,6 @@ class ChainedScans:
     """Scans with poses from a chain.
 
     Attributes:
-        scans: The chained scans, with their poses.
-        chain: The chain.
-        seconds: Time of the chain [s].
         stop: Signal that interrupted the chain; None for a complete chain.
     """
 

@@ -25,7 +25,6 @@ class Localization:
     """Parameters for a localisation, from a file.
 
     Attributes:
-        sensor: Parameters of the beam model or the likelihood field, or None.
         noise: Arguments of :class:`OdometryMotion`; may be empty.
         nav2: Options of nav2_amcl's node from a file of nav2, or None.
     """

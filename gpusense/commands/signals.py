@@ -23,11 +23,7 @@ _WORDS = {name: word for name, word in (("SIGINT", "interrupted"), ("SIGTERM", "
 
 
 class Stopped(KeyboardInterrupt):
-    """Signal that requests the end of the command.
-
-    Attributes:
-        number: The signal.
-    """
+    """Signal that requests the end of the command."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)

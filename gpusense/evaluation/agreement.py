@@ -24,8 +24,6 @@ class Agreement:
     """Agreement of two backends about the ranks of the same particles, over all scans.
 
     Attributes:
-        left, right: Selection strings of the backends.
-        scans: Number of scans compared.
         same_rank: Number of scans in which the logged pose has the same rank.
         same_order: Number of scans in which no two particles change places; ties on one side may differ on the other.
         spearman: Smallest rank correlation of all particles.

@@ -38,7 +38,6 @@ class Fitness:
         better: Median share of poses anywhere in the free space at which a scan is less likely; None without such
             scans.
         p_lost: Median over the scans of the probability that the logged pose is wrong; None without such scans.
-        evidence: Evidence of the beams of all scans.
     """
 
     scans: int

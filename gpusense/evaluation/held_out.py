@@ -28,14 +28,12 @@ class HeldOut:
     """Score of held-out readings with one set of parameters.
 
     Attributes:
-        name: Source of the parameters.
         parameters: The parameters, with weights that sum to 1.
         per_beam: Mean log-likelihood of a reading [nats]; -inf if a reading is impossible.
         error: Standard error of ``per_beam``, over blocks.
         gain: Mean log-likelihood of the fitted parameters minus ``per_beam`` [nats]; 0 for the fitted ones. If the
             fitted parameters make a reading impossible, the softened ones replace them.
         gain_error: Standard error of ``gain``, over blocks; NaN for fewer than 2 blocks.
-        impossible: Number of readings that are impossible.
     """
 
     name: str

@@ -32,8 +32,6 @@ class LogMatches:
 
     Attributes:
         indices: (S, 2) indices of the reference scan, -1 for a map, and of the second scan.
-        guess: (S, 3) guesses.
-        match: The matches.
         logged: (S, 3) logged poses in the frame of the matches; NaN if the log has none.
     """
 

@@ -25,8 +25,6 @@ class PosedScan:
     """A scan with the pose of a localiser.
 
     Attributes:
-        index: Index of the scan in the log.
-        scan: The scan.
         pose: Pose of the robot on the map [m, m, rad].
         covariance: (3, 3) covariance of the pose; None if unknown.
         odometry: Pose by raw odometry alone [m, m, rad].
@@ -45,7 +43,6 @@ class PosedScans:
 
     Attributes:
         source: Origin of the poses: a topic, frames, or a file.
-        scans: The scans.
     """
 
     source: str

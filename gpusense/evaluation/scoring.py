@@ -40,7 +40,6 @@ class ParticleSampler:
     """Sampler of the particles of a scan.
 
     Attributes:
-        particles: Number of particles, at least 2.
         sigma_position: Deviation of the particles around the logged pose, in x and in y, >= 0 [m].
         sigma_heading: Deviation of their headings, >= 0 [rad].
         seed: Seed; each scan has a separate random stream, so its particles do not depend on the chosen scans.
@@ -69,7 +68,6 @@ class ScanScore:
 
     Attributes:
         index: Index of the scan in its log, from 0.
-        pose: The logged pose.
         rank: Rank of the logged pose, 1 for the best; the mean rank if particles tie with it.
         percentile: Share of the other particles that score worse, with half of the ties [%].
         mean: Weighted mean of the other particles, with the circular mean of headings; None if all weights are 0.
@@ -78,7 +76,6 @@ class ScanScore:
         effective: Effective sample size of the other particles, or None.
         degenerate: Whether every other particle has probability 0.
         beams: Readings that are evaluated at every particle.
-        seconds: Time of the call.
     """
 
     index: int
@@ -96,13 +93,7 @@ class ScanScore:
 
 @dataclass(frozen=True)
 class BackendScore:
-    """Scores of all scans on one backend.
-
-    Attributes:
-        device: Description of the device.
-        particles: Particles per scan.
-        scans: Scores of the scans.
-    """
+    """Scores of all scans on one backend."""
 
     device: BackendInfo
     particles: int

@@ -29,9 +29,7 @@ class Step:
 
     Attributes:
         index: Index of the scan in the log.
-        scan: The scan.
         odometry: Pose by raw odometry alone [m, m, rad].
-        sensor: Index of the scan's laser.
         reference: Pose of the robot for comparison with estimates, by default the logged one; None if unknown.
     """
 

@@ -58,9 +58,6 @@ class Row:
     """Largest error of one quantity in one case, on one backend in one precision.
 
     Attributes:
-        case: Name of the case.
-        quantity: Name and unit of the quantity.
-        worst: Largest error.
         bound: Largest error allowed; for the textbook's formulas the least share of failures.
         nonfinite: Number of results that are NaN, or infinite where the truth is not.
         ok: Whether ``nonfinite`` is 0 and the bound is kept.
@@ -79,10 +76,8 @@ class Densities:
     """The density grid as a device evaluated it: arrays of one length in the device's precision.
 
     Attributes:
-        z: Readings [m].
         expected: Expected ranges, cast by the device [m].
         parameters: The fields of BeamParameters, by name.
-        log_p: Log densities, computed by the device.
     """
 
     z: Floats

@@ -22,8 +22,6 @@ class Case:
     """A scene that is extreme in one respect.
 
     Attributes:
-        name: The extreme property.
-        grid: The map.
         local: (N, 3) poses in the grid's frame [cells, cells, rad].
         beams: Beams of a scanner with a field of view of 360 degrees.
         readings: Readings that a scan repeats [cells]; None for the first pose's expected ranges, with missing and max

@@ -28,10 +28,8 @@ class Tolerance:
     """Largest difference allowed for one quantity.
 
     Attributes:
-        name: The quantity.
         value: Largest difference allowed, inclusive.
         unit: Unit of the difference; eps is float32's, 1.2e-7.
-        reason: Derivation of the value.
     """
 
     name: str
@@ -150,11 +148,8 @@ class Check:
     """One comparison.
 
     Attributes:
-        left: Selection string of a backend.
         right: Selection string of another backend, or the name of the truth.
-        quantity: The quantity compared.
         difference: The largest difference, in the tolerance's unit.
-        tolerance: The largest difference allowed.
     """
 
     left: str

@@ -37,16 +37,11 @@ class Track:
     """Estimated poses along a log.
 
     Attributes:
-        steps: Steps so far.
-        poses: Estimated poses.
-        covariances: Covariances of the estimates.
         ranks: Ranks of the reference poses among the particles (:func:`rank_of`), of the steps that have one.
-        sizes: Effective sample sizes.
         p_lost: Probabilities that the estimates are off by more than 1 m or 0.5 rad.
         verdicts: "tracking", "uncertain" or "lost" for each estimate.
         explained: Shares of beams that the estimates explain; NaN for a scan without beams.
         radii: Radii that errors exceed with at most the probability ``RISK`` [m].
-        temperatures: Temperatures.
         seconds: Seconds of each step: predict, score, resample, estimate.
     """
 

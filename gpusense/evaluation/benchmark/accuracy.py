@@ -58,9 +58,7 @@ class Truth:
     """Exact results for the first particles of a cloud.
 
     Attributes:
-        scene: The scene.
         poses: (M, 3) the particles that are checked.
-        device: The device that computes the results.
     """
 
     scene: Scene

@@ -35,9 +35,6 @@ class Candidate:
     """A method with its parameters for one problem.
 
     Attributes:
-        problem: One of ``PROBLEMS``.
-        method: Name of the method.
-        make: Makes a runner for a scene.
         variant: Difference from the method's other curves.
         knob: Parameter that traces the curve; empty without one.
         value: The knob's value; None without a knob.
@@ -82,7 +79,6 @@ class Curve:
         variant: Difference from the method's other curves.
         knob: The caster's field that varies; empty for none.
         values: The knob's values, from coarse to fine.
-        options: The caster's other fields.
         quick: Indices of ``values`` for quick runs and for the beam model.
     """
 

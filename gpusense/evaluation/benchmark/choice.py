@@ -27,13 +27,7 @@ ROUNDING = 1e-6
 
 @dataclass(frozen=True)
 class Measure:
-    """A kind of error that decides between methods.
-
-    Attributes:
-        kind, name: Place of the error in a point.
-        unit: Unit of the error.
-        text: Description.
-    """
+    """A kind of error that decides between methods."""
 
     kind: str
     name: str
@@ -66,11 +60,8 @@ class Entry:
     Attributes:
         device: Selection string or name of the device.
         method: Method and variant.
-        setting: Knob and value; empty without one.
-        precision: Precision.
         error: Largest error over scenes and clouds, in the unit of its measure (shares as shares, lengths in metres).
         seconds: Geometric mean of the times of a call [s].
-        code: Code that makes it.
         exact: Whether it computes the model itself.
         doubt: Factor of the error within which that of another run lies; 1 where all runs have the same errors.
     """

@@ -35,8 +35,6 @@ class Case:
     """A method in one scene: a map with a cloud.
 
     Attributes:
-        name: Names of map and cloud.
-        seconds: See :class:`Row`.
         errors: By the text of the measure; only measures of this cloud.
     """
 
@@ -53,12 +51,10 @@ class Row:
         need: Need that it serves, a value of ``NEEDS``.
         device: Title of the device.
         scene: Name of the map; ``ALL`` for the worst error and the mean time over all maps.
-        method, setting, precision, code: As in the reports.
         seconds: Time of a call, a step or a match: on a processor its CPU time over all cores, on a GPU the least
             elapsed time.
         quartiles: Quartiles of the elapsed times [s]; geometric means over the maps.
         errors: By the text of the measure.
-        units: Units of the errors.
         exact: Whether it computes the model itself.
         outside: Version and threads of another implementation; empty for gpusense.
         work: Rays or readings of a call; 1 for tasks.

@@ -36,16 +36,9 @@ class Plan:
     """Plan of a run.
 
     Attributes:
-        sources: Maps.
-        backends: Devices.
-        candidates: Candidates of this package and outside ones.
-        precisions: Precisions of this package's candidates.
         particles: N of a timed call; None for the device's default.
         checked: Largest number of particles whose results are checked.
-        beams: K of the scanner.
-        repeats: Most timed calls per point.
         seconds: Longest time of a point's timed calls, of which there are at least three [s].
-        seed: Seed of all random numbers.
         build_limit: Longest time to build a table [s]; a point above it is left out.
         deadline: Measuring time, without compiling, after which no further point begins [s].
         slow_to_make: Duration of a first call above which building includes compiling [s]; None as in ``measure``.
@@ -97,9 +90,7 @@ class Outcome:
     """Result of a run.
 
     Attributes:
-        scenes: Descriptions of the scenes.
         points: One point per scene, cloud and job; see :func:`point_of`.
-        truth: Description of the truth and its device.
     """
 
     scenes: list[dict[str, Any]]

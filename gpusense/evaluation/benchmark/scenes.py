@@ -54,7 +54,6 @@ class MapSource:
     """Source of a scene's map.
 
     Attributes:
-        name: The scene's name.
         origin: Description of a generated map, or the name of the map's file.
         path: The map_server YAML; None for a generated map.
         size: Width and height of a generated map [m].
@@ -78,15 +77,11 @@ class Scene:
     """The inputs that all candidates share.
 
     Attributes:
-        name: Name of the scene.
         origin: Description of a generated map, or the name of the map's file.
         grid: The map; unknown cells and the surroundings of the map are free.
-        scanner: K beams over 360 degrees.
         pose: (3,) true pose of the scan [m, m, rad].
         readings: (K,) the scan, drawn from the beam model [m]; +inf where there is no return.
         clouds: (N, 3) particles by the cloud's name [m, m, rad].
-        beam: Parameters of the beam model and of the simulated scan.
-        field: Parameters of the likelihood field.
     """
 
     name: str

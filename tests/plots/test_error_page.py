@@ -46,7 +46,7 @@ def test_the_script_chooses_as_python_does() -> None:
         f"(list => [paretoFront(list).map(row => row.name), {budgets}.map(s => (recommended(list, s) ?? {{}}).name "
         f"?? null)])({rows})"
     )
-    entries = [choice.Entry("d", name, "", "", error, time) for name, error, time in listed]
+    entries = [choice.Entry(name, "", "", error, time) for name, error, time in listed]
     assert front == [entry.method for entry in choice.front(entries)]
     found = [choice.choose(entries, None, seconds) for seconds in budgets]
     assert chosen == [None if entry is None else entry.method for entry in found]
@@ -144,7 +144,7 @@ def test_a_scene_without_any_method_does_not_count() -> None:
     for extra, maps in (([], {""}), (late, {""}), ([half, *late], {"", "4 of 5 clouds"})):
         rows = model_rows(report | {"points": [*report["points"], *extra]})
         assert {row.maps for row in rows if row.scene == ALL} == maps
-    chosen = choice.entries([*report["points"], *late], "ranges", choice.WRONG, "numpy")
+    chosen = choice.entries([*report["points"], *late], "ranges", "%", "numpy")
     assert {entry.method for entry in chosen} == {"exact", "march"}
 
 

@@ -25,23 +25,10 @@ ROUNDING = 1e-6
 """Errors below this are equal: rounding of float32."""
 
 
-@dataclass(frozen=True)
-class Measure:
-    """A kind of error that decides between methods."""
-
-    kind: str
-    name: str
-    unit: str
-    text: str
-
-
-KL = Measure("comparable", "kl", "nats", "KL divergence of the posterior at a comparable temperature")
-SHIFT = Measure("comparable", "shift_m", "m", "shift of the weighted mean position at a comparable temperature")
-WRONG = Measure("ranges", "wrong_1", "%", "share of rays wrong by more than one cell")
-CELLS = Measure("ranges", "p95", "cells", "95th percentile of the range error")
 LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-MEASURES = {"ranges": {"%": WRONG, "cells": CELLS}, "beam": {"nats": KL, "m": SHIFT}, "field": {"nats": KL, "m": SHIFT}}
-"""By problem and unit, the measure to which a limit applies; the first one is the default."""
+_POSTERIOR = {"nats": ("comparable", "kl"), "m": ("comparable", "shift_m")}
+MEASURES = {"ranges": {"%": ("ranges", "wrong_1"), "cells": ("ranges", "p95")}, "beam": _POSTERIOR, "field": _POSTERIOR}
+"""By problem and unit, the place in a point of the error to which a limit applies; the first one is the default."""
 DEFAULTS = {"ranges": ("%", 0.01), "beam": ("nats", 0.01), "field": ("nats", 0.01)}
 """By problem, the unit and the largest error if no limit is passed."""
 _NUMBER = re.compile(r"[0-9.]+")
@@ -58,7 +45,6 @@ class Entry:
     """A method with its setting on one device.
 
     Attributes:
-        device: Selection string or name of the device.
         method: Method and variant.
         error: Largest error over scenes and clouds, in the unit of its measure (shares as shares, lengths in metres).
         seconds: Geometric mean of the times of a call [s].
@@ -66,13 +52,11 @@ class Entry:
         doubt: Factor of the error within which that of another run lies; 1 where all runs have the same errors.
     """
 
-    device: str
     method: str
     setting: str
     precision: str
     error: float
     seconds: float
-    code: str = ""
     exact: bool = False
     doubt: float = 1.0
 
@@ -133,36 +117,26 @@ def _quantity(text: str, units: Sequence[str], name: str) -> tuple[float, str]:
     return value, match[2]
 
 
-def entries(
-    points: Iterable[Mapping[str, Any]],
-    problem: str,
-    measure: Measure,
-    backend: str,
-) -> list[Entry]:
-    """Return the methods of a problem on one device, over all scenes and clouds where they were measured.
+def entries(points: Iterable[Mapping[str, Any]], problem: str, unit: str, backend: str) -> list[Entry]:
+    """Return the methods of a problem on one device (``"outside"`` for others), over all measured scenes and clouds.
 
     A method that failed, was left out or is not finite in any of them is not listed. A scene where every method was
     left out, such as one after the deadline of a quick run, does not count.
-
-    ``backend``: Selection string of the device, or ``"outside"``.
     """
     chosen = [point for point in points if point["problem"] == problem and point["backend"] == backend]
     places = {(point["scene"], point["cloud"]) for point in chosen if point["status"] != "left out"}
     groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
     for point in chosen:
-        if (point["scene"], point["cloud"]) not in places:
-            continue
-        groups.setdefault((label(point), setting(point), point["precision"]), []).append(point)
+        if (point["scene"], point["cloud"]) in places:
+            groups.setdefault((label(point), setting(point), point["precision"]), []).append(point)
     listed = []
     for (method, at, precision), group in groups.items():
-        errors = [error_of(point, measure.kind, measure.name) for point in group]
+        errors = [error_of(point, *MEASURES[problem][unit]) for point in group]
         times = [time_of(point) for point in group]
-        if any(value is None for value in (*errors, *times)):
-            continue
-        seconds = math.exp(sum(math.log(time or 1.0) for time in times) / len(times))
-        error = max(error or 0.0 for error in errors)
-        first = group[0]
-        listed.append(Entry(backend, method, at, precision, error, seconds, first["code"], bool(first["exact"])))
+        if not any(value is None for value in (*errors, *times)):
+            seconds = math.exp(sum(math.log(time or 1.0) for time in times) / len(times))
+            error = max(error or 0.0 for error in errors)
+            listed.append(Entry(method, at, precision, error, seconds, bool(group[0]["exact"])))
     return listed
 
 
@@ -253,23 +227,20 @@ class Choice:
 def choices(points: Sequence[Mapping[str, Any]], wish: Wish) -> Iterator[Choice]:
     """Yield the choice for each problem and device of a report."""
     for problem, backend in dict.fromkeys((point["problem"], point["backend"]) for point in points):
-        measures = MEASURES[problem]
-        unit = next((unit for unit in wish.errors if unit in measures), None)
-        limit = wish.errors[unit] if unit is not None else None
-        if unit is None and wish.seconds is None:
-            unit, limit = DEFAULTS[problem]
-        measure = measures[unit if unit is not None else DEFAULTS[problem][0]]
-        listed = entries(points, problem, measure, backend)
+        usual, most = DEFAULTS[problem]
+        unit = next((unit for unit in wish.errors if unit in MEASURES[problem]), usual)
+        limit = wish.errors.get(unit, most if wish.seconds is None else None)
+        listed = entries(points, problem, unit, backend)
         size = next(
             f"{p['particles']} x {p['beams']}" for p in points if (p["problem"], p["backend"]) == (problem, backend)
         )
-        wanted = [f"error at most {error_text(limit, measure.unit)}"] if limit is not None else []
+        wanted = [f"error at most {error_text(limit, unit)}"] if limit is not None else []
         wanted += [f"at most {time_text(wish.seconds)}"] if wish.seconds is not None else []
         best, found = choose(listed, limit, wish.seconds), "no method"
         if best is not None:
-            found = f"{best.text}: {time_text(best.seconds)}, {error_text(best.error, measure.unit)}"
+            found = f"{best.text}: {time_text(best.seconds)}, {error_text(best.error, unit)}"
         rows = [
-            (problem, one.text.removesuffix(", float32"), error_text(one.error, measure.unit), time_text(one.seconds))
+            (problem, one.text.removesuffix(", float32"), error_text(one.error, unit), time_text(one.seconds))
             for one in front(listed)
         ]
         yield Choice(backend, f"{problem} on {backend}, {size}, {', '.join(wanted)}: {found}", rows)

@@ -93,8 +93,7 @@ class Row:
     def entry(self, measure: str) -> Entry:
         """Return the row as an entry to choose from, by a measure."""
         return Entry(
-            self.device, self.method, self.setting, self.precision, self.errors[measure], self.seconds, self.code,
-            self.exact, self.doubt,
+            self.method, self.setting, self.precision, self.errors[measure], self.seconds, self.exact, self.doubt,
         )  # fmt: skip
 
 

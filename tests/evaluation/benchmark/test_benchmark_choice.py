@@ -12,7 +12,7 @@ from gpusense.evaluation.benchmark import choice
 
 
 def entry(method: str, error: float, seconds: float, **changes: object) -> choice.Entry:
-    return choice.Entry("d", method, "", "float32", error, seconds, **changes)
+    return choice.Entry(method, "", "float32", error, seconds, **changes)
 
 
 LISTED = [
@@ -66,7 +66,7 @@ def test_of_equal_methods_nothing_measured_decides():
     ]  # fmt: skip
     draw = random.Random(0)
     listed = [
-        choice.Entry("d", *one, draw.uniform(0.1, 0.12), draw.uniform(1, 1.2), exact=one[0] == "exact") for one in order
+        choice.Entry(*one, draw.uniform(0.1, 0.12), draw.uniform(1, 1.2), exact=one[0] == "exact") for one in order
     ]
     for first in range(len(listed)):
         rest = draw.sample(listed[first:], len(listed) - first)
@@ -105,7 +105,7 @@ def test_a_method_is_judged_by_its_worst_scene_and_must_work_in_all():
         made_point(problem="beam", method="dda", comparable=kl),
         made_point(problem="beam", method="dda", scene="t", status="failed", errors=None, time=None),
     ]
-    (only,) = choice.entries(points, "beam", choice.KL, "numpy")
+    (only,) = choice.entries(points, "beam", "nats", "numpy")
     assert (only.method, only.error, only.seconds) == ("exact", 0.3, pytest.approx(2.0))
     (found,) = choice.choices(points, choice.Wish({"nats": 0.1}))
     assert found.answer == "beam on numpy, 10 x 10, error at most 0.1 nats: no method"

@@ -46,8 +46,9 @@ Parameters are fitted at the logged poses. A particle filter then starts around 
 and uses only odometry and readings; with --known also the recorded landmark of each reading. The map is used unchanged:
 readings of exchanged landmarks count as false positives.
 
-The filter's motion noise combines the noise of the odometry and a random walk. The walk of the heading is measured at
-the logged poses unless --drift sets it. Poor odometry needs a large walk; with a small one the robot gets lost.
+The filter's motion noise combines the noise of the odometry (0.09 0.01 0.04 0.0004, or --fit-motion) and a random walk.
+The walk of the heading is measured at the logged poses unless --drift sets it. Poor odometry needs a large walk; with a
+small one the robot gets lost.
 
 The final verdict needs no logged poses: it is 'lost' if the particles predict the last readings hardly better than
 poses anywhere among the landmarks, as on a wrong map.
@@ -70,12 +71,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     kind.add_argument("--unknown", dest="known", action="store_false", help="the landmark of each reading is unknown")
     add("--particles", type=whole_number(low=2), default=DEFAULTS.particles, metavar="N",
         help="number of the filter's particles (default: %(default)s)")  # fmt: skip
-    add("--motion-noise", type=not_negative_number, nargs=4, metavar=("A1", "A2", "A3", "A4"),
-        help="variances of the odometry per squared motion, Probabilistic Robotics table 5.6: of turns by turns "
-        "[rad^2/rad^2] and by translation [rad^2/m^2], of translations by translation and by turns "
-        "(default: 0.09 0.01 0.04 0.0004)")  # fmt: skip
-    add("--reverse", type=_probability, metavar="P",
-        help="probability that a translation was reversed (default: 0)")  # fmt: skip
     add("--drift", type=not_negative_number, nargs=2, metavar=("M", "RAD"),
         help="random walks of the translation [m/sqrt(s)] and of the heading [rad/sqrt(s)] "
         "(default: 0.01 and the measured error of the odometer's heading)")  # fmt: skip
@@ -88,13 +83,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_backend(parser)
     add_seed(parser)
     add_json(parser, verbose=True)
-
-
-def _probability(text: str) -> float:
-    value = not_negative_number(text)
-    if value > 1:
-        raise argparse.ArgumentTypeError(f"must be in [0, 1], got {value:g}")
-    return value
 
 
 def run(args: argparse.Namespace) -> int:
@@ -114,9 +102,8 @@ def run(args: argparse.Namespace) -> int:
     fit = known_fit if args.known else landmark_runs.fit_run(recorded_run, known=False)
     model = LandmarkModel(recorded_run.landmarks, landmark_runs.usable(fit.parameters), backend=args.backend)
     agreement = landmark_runs.association(recorded_run, model)
-    alpha = None if args.motion_noise is None else tuple(args.motion_noise)
     drift = None if args.drift is None else tuple(args.drift)
-    motion = run_motion(recorded_run, alpha=alpha, reverse=args.reverse, drift=drift, fit=args.fit_motion)
+    motion = run_motion(recorded_run, drift=drift, fit=args.fit_motion)
     try:
         with progress((len(recorded_run.time) + 99) // 100) as step:
             track = landmark_runs.localise(

@@ -23,7 +23,7 @@ from gpusense.logs.records import LandmarkRun
 from gpusense.models.landmark.model import LandmarkModel
 from gpusense.world.parameters import LandmarkParameters
 
-ALPHA = (0.09, 0.01, 0.04, 0.0004)
+ALPHA: tuple[float, ...] = (0.09, 0.01, 0.04, 0.0004)
 # Random walk of the position [m / sqrt(s)], and the least measured random walk of the heading [rad / sqrt(s)].
 DRIFT, LEAST_DRIFT_HEADING = 0.01, 0.02
 # Time over which the heading's walk is measured [s].
@@ -48,13 +48,6 @@ class DriftingOdometry:
     reverse: float = 0.0
     drift: float = DRIFT
     drift_heading: float = 0.1
-
-    def __post_init__(self) -> None:
-        plain = OdometryMotion(self.alpha, self.reverse)
-        object.__setattr__(self, "alpha", plain.alpha)
-        object.__setattr__(self, "reverse", plain.reverse)
-        for name in ("drift", "drift_heading"):
-            object.__setattr__(self, name, checks.real(name, getattr(self, name), low=0))
 
     def sampled(self, *arguments: Any) -> SampledMotion:
         """Return the numbers of a step from the odometer's poses before and after it, and its duration."""
@@ -81,27 +74,16 @@ def heading_drift(run: LandmarkRun) -> float:
     return float(np.sqrt(np.mean(error**2 / (run.time[ends] - run.time[begins]))))
 
 
-def run_motion(
-    run: LandmarkRun,
-    *,
-    alpha: tuple[float, ...] | None = None,
-    reverse: float | None = None,
-    drift: tuple[float, float] | None = None,
-    fit: bool = False,
-) -> DriftingOdometry:
-    """Return the motion noise of a run, with missing numbers taken from the run.
+def run_motion(run: LandmarkRun, *, drift: tuple[float, float] | None = None, fit: bool = False) -> DriftingOdometry:
+    """Return the motion noise of a run; ``fit`` learns ``alpha`` and ``reverse`` by :func:`fit_odometry_motion`.
 
-    ``alpha``: (4,) noise of the odometry; None for ``ALPHA``. ``reverse``: Probability of a reverse; None for 0.
     ``drift``: Random walks of translation and heading; None for ``DRIFT`` and the measured walk of the heading.
-    ``fit``: Whether to learn ``alpha`` and ``reverse`` by :func:`fit_odometry_motion` if they are None.
     """
-    if fit and (alpha is None or reverse is None):
+    alpha, reverse = ALPHA, 0.0
+    if fit:
         found = fit_odometry_motion(run.odometry, run.truth, systematic=False).motion
-        alpha = found.alpha if alpha is None else alpha
-        reverse = found.reverse if reverse is None else reverse
-    if drift is None:
-        drift = DRIFT, max(heading_drift(run), LEAST_DRIFT_HEADING)
-    return DriftingOdometry(ALPHA if alpha is None else alpha, 0.0 if reverse is None else reverse, *drift)
+        alpha, reverse = found.alpha, found.reverse
+    return DriftingOdometry(alpha, reverse, *(drift or (DRIFT, max(heading_drift(run), LEAST_DRIFT_HEADING))))
 
 
 Floats = NDArray[np.float64]

@@ -5,9 +5,10 @@ Every caster has a candidate with its default knobs; ``_VARIED`` lists the metho
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,9 +20,8 @@ from gpusense.interface.casters import ENTRIES
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
+from gpusense.peers.weights import PEERS
 from gpusense.tables.casters import CASTERS, Caster
-from gpusense.world.grid import OccupancyGrid
-from gpusense.world.scanner import Scanner
 
 PROBLEMS = ("ranges", "beam", "field")
 """Expected ranges; log-likelihoods of the beam model; log-likelihoods of the likelihood field."""
@@ -70,45 +70,29 @@ class Candidate:
         return ", ".join(word for word in words if word)
 
 
-@dataclass(frozen=True)
-class Curve:
-    """A caster with a knob and its values.
-
-    Attributes:
-        method: A name of ``RayCaster.methods()``.
-        variant: Difference from the method's other curves.
-        knob: The caster's field that varies; empty for none.
-        values: The knob's values, from coarse to fine.
-        quick: Indices of ``values`` for quick runs and for the beam model.
-    """
+class Curve(NamedTuple):
+    """A caster with a knob that varies from coarse to fine; quick runs and the beam model take the first ``few``."""
 
     method: str
     variant: str = ""
     knob: str = ""
-    values: tuple[float, ...] = ()
-    options: Mapping[str, Any] = field(default_factory=dict)
-    quick: tuple[int, ...] = (0,)
+    values: tuple[float | None, ...] = (None,)
+    options: Mapping[str, Any] = {}
+    few: int = 1
 
 
 _VARIED = (
-    Curve("march", "safe", "tolerance", (1.0, 0.1, 0.01), {"rule": "safe"}, (0, 1)),
+    Curve("march", "safe", "tolerance", (1.0, 0.1, 0.01), {"rule": "safe"}, 2),
     # The distance between the centres of two cells is at least 1, and a larger tolerance is slower and less exact.
-    Curve("march", "centre", "tolerance", (1.0,), {"rule": "centre"}, (0,)),
-    Curve("cddt", "", "bins", (108, 720), {"pruned": False}, (0,)),
-    Curve("cddt", "pruned", "bins", (108,), {"pruned": True}, ()),
-    Curve("lookup", "", "bins", (54, 108), {}, (0,)),
+    Curve("march", "centre", "tolerance", (1.0,), {"rule": "centre"}),
+    Curve("cddt", "", "bins", (108, 720), {"pruned": False}),
+    Curve("cddt", "pruned", "bins", (108,), {"pruned": True}, 0),
+    Curve("lookup", "", "bins", (54, 108)),
 )
-CURVES = tuple(
-    curve for name in ENTRIES for curve in [each for each in _VARIED if each.method == name] or [Curve(name)]
-)
-"""The casters, for ranges and for the beam model."""
-
-BIN_WIDTHS = (0.5, 0.2, 0.1, 0.05, 0.02)
-"""Bin widths [m] of the tabulated beam mixture."""
-SHARES = (12, 6, 4, 2)
-"""Strides of the beams of thinned scans."""
-COMPAT = ("amcl", "beluga")
-"""Other packages whose formulas a model can reproduce."""
+# The casters, for ranges and for the beam model.
+_CURVES = [curve for name in ENTRIES for curve in [each for each in _VARIED if each.method == name] or [Curve(name)]]
+# Bin widths [m] of the tabulated beam mixture; strides of the beams of thinned scans.
+_BIN_WIDTHS, _SHARES = (0.5, 0.2, 0.1, 0.05, 0.02), (12, 6, 4, 2)
 
 
 def candidates(problems: Sequence[str], *, quick: bool = False) -> list[Candidate]:
@@ -119,62 +103,51 @@ def candidates(problems: Sequence[str], *, quick: bool = False) -> list[Candidat
 
 def _of_casters(quick: bool) -> Iterator[Candidate]:
     """Yield the casters of all curves, alone and in the beam model."""
-    for curve in CURVES:
-        values: tuple[float | None, ...] = curve.values or (None,)
-        few = tuple(curve.values[i] for i in curve.quick) if curve.values else values
-        for value in few if quick else values:
-            caster, code = caster_of(curve, value), code_of(curve, value)
-            rays = _table_rays(value) if curve.method == "lookup" and value else None
+    for curve in _CURVES:
+        few = curve.values[: curve.few]
+        for value in few if quick else curve.values:
+            options = dict(curve.options) | ({} if value is None else {curve.knob: value})
+            caster, code = CASTERS[curve.method](**options), _code_of(curve.method, options)
+            rays = functools.partial(_table_rays, value) if curve.method == "lookup" and value else None
             for problem, make, made in (
-                ("ranges", _ranges, "RayCaster(grid, range_max"), ("beam", _beam, "BeamModel(grid, scanner"),
-            ):  # fmt: skip
+                ("ranges", functools.partial(_ranges, caster), "RayCaster(grid, range_max"),
+                ("beam", _scores(BeamModel, caster=caster), "BeamModel(grid, scanner"),
+            ):
                 # The problem "ranges" shows a caster's cost and error; the model is measured with a few values only.
                 if problem == "ranges" or value in few:
                     yield Candidate(
-                        problem, curve.method, make(caster), curve.variant, curve.knob, value, exact=caster.exact,
+                        problem, curve.method, make, curve.variant, curve.knob, value, exact=caster.exact,
                         code=f"gs.{made}, caster={code})", whole=caster.whole, table_rays=rays,
                     )  # fmt: skip
 
 
 def _of_models(quick: bool) -> Iterator[Candidate]:
     """Yield the field, and both models with fewer beams, with tables of the sensor, and with weights of peers."""
-    exact = CASTERS["exact"]()
-    beam, field_model = "gs.BeamModel(grid, scanner", "gs.LikelihoodFieldModel(grid, scanner"
-    yield Candidate("field", "field", _field(), exact=True, code=f"{field_model})")
-    for share in SHARES[2:3] if quick else SHARES:
-        for problem, method, make, model in (
-            ("beam", "exact", _beam(exact, share), beam), ("field", "field", _field(share), field_model),
-        ):  # fmt: skip
-            code = f"{model}, beams=range(0, scanner.count, {share})), temperature {share} times"
-            yield Candidate(problem, method, make, "fewer beams", "every", share, temperature=share, code=code)
-    for width in BIN_WIDTHS[2:3] if quick else BIN_WIDTHS:
-        made = _beam(exact, sensor_table=width)
-        code = f"{beam}, sensor_table={width})"
+    models = (("beam", "exact", BeamModel), ("field", "field", LikelihoodFieldModel))
+    codes = {kind: f"gs.{kind.__name__}(grid, scanner" for _, _, kind in models}
+    field = LikelihoodFieldModel
+    yield Candidate("field", "field", _scores(field), exact=True, code=f"{codes[field]})")
+    for share in _SHARES[2:3] if quick else _SHARES:
+        for problem, method, kind in models:
+            code = f"{codes[kind]}, beams=range(0, scanner.count, {share})), temperature {share} times"
+            made = _scores(kind, share)
+            yield Candidate(problem, method, made, "fewer beams", "every", share, temperature=share, code=code)
+    for width in _BIN_WIDTHS[2:3] if quick else _BIN_WIDTHS:
+        made, code = _scores(BeamModel, sensor_table=width), f"{codes[BeamModel]}, sensor_table={width})"
         yield Candidate("beam", "exact", made, "sensor table", "bin width", width, code=code)
-    for name in COMPAT:
-        if _reproduces(BeamModel, name):
-            made, code = _beam(exact, compat=name), f'{beam}, compat="{name}")'
-            yield Candidate("beam", f"compat {name}", made, code=code)
-        if _reproduces(LikelihoodFieldModel, name):
-            made, code = _field(compat=name), f'{field_model}, compat="{name}")'
-            yield Candidate("field", f"compat {name}", made, code=code)
+    for name in PEERS:
+        for problem, _, kind in models:
+            options: dict[str, Any] = {"caster": "exact"} if kind is BeamModel else {}
+            made, code = _scores(kind, compat=name, **options), f'{codes[kind]}, compat="{name}")'
+            yield Candidate(problem, f"compat {name}", made, code=code)
 
 
-def caster_of(curve: Curve, value: float | None) -> Caster:
-    """Make a curve's caster with its knob at a value."""
-    options = dict(curve.options)
-    if value is not None:
-        options[curve.knob] = int(value) if curve.knob == "bins" else value
-    return CASTERS[curve.method](**options)
-
-
-def code_of(curve: Curve, value: float | None) -> str:
-    """Write a curve's caster with its knob at a value as Python code."""
-    options = dict(curve.options) | ({} if value is None else {curve.knob: value})
+def _code_of(method: str, options: Mapping[str, Any]) -> str:
+    """Write a caster as Python code."""
     if not options:
-        return f'"{curve.method}"'
+        return f'"{method}"'
     words = (f"{name}={f'{knob:g}' if isinstance(knob, float) else repr(knob)}" for name, knob in options.items())
-    return f"gs.casters.{CASTERS[curve.method].__name__}({', '.join(words)})".replace("'", '"')
+    return f"gs.casters.{CASTERS[method].__name__}({', '.join(words)})".replace("'", '"')
 
 
 class _ModelRunner:
@@ -197,50 +170,26 @@ class _ModelRunner:
         return None if size is None else int(size)
 
 
-def _ranges(caster: Caster) -> Make:
+def _ranges(caster: Caster, scene: Scene, backend: Backend, precision: Precision) -> Runner:
+    """Make a runner that casts rays."""
+    limit, bearings = scene.scanner.range_max, scene.scanner.bearings
+    ray_caster = RayCaster(scene.grid, limit, caster=caster, backend=backend, precision=precision)
+    return _ModelRunner(ray_caster, lambda poses: ray_caster.cast(poses, bearings))
+
+
+def _scores(kind: type[BeamModel] | type[LikelihoodFieldModel], share: int = 1, **options: Any) -> Make:
+    """Return a function that makes a runner of a model with every ``share``-th beam."""
+
     def make(scene: Scene, backend: Backend, precision: Precision) -> Runner:
-        limit, bearings = scene.scanner.range_max, scene.scanner.bearings
-        ray_caster = RayCaster(scene.grid, limit, caster=caster, backend=backend, precision=precision)
-        return _ModelRunner(ray_caster, lambda poses: ray_caster.cast(poses, bearings))
-
-    return make
-
-
-def _beam(caster: Caster, share: int = 1, **options: Any) -> Make:
-    def make(scene: Scene, backend: Backend, precision: Precision) -> Runner:
-        model = BeamModel(
-            scene.grid, scene.scanner, scene.beam, backend=backend, precision=precision, caster=caster,
-            beams=_beams(scene, share), **options,
-        )  # fmt: skip
+        parameters: Any = scene.beam if kind is BeamModel else scene.field
+        beams = None if share == 1 else np.arange(0, scene.scanner.count, share)
+        model = kind(
+            scene.grid, scene.scanner, parameters, backend=backend, precision=precision, beams=beams, **options
+        )
         return _ModelRunner(model, lambda poses: model.log_likelihood(poses, scene.readings))
 
     return make
 
 
-def _field(share: int = 1, **options: Any) -> Make:
-    def make(scene: Scene, backend: Backend, precision: Precision) -> Runner:
-        model = LikelihoodFieldModel(
-            scene.grid, scene.scanner, scene.field, backend=backend, precision=precision, beams=_beams(scene, share),
-            **options,
-        )  # fmt: skip
-        return _ModelRunner(model, lambda poses: model.log_likelihood(poses, scene.readings))
-
-    return make
-
-
-def _beams(scene: Scene, share: int) -> np.ndarray | None:
-    return None if share == 1 else np.arange(0, scene.scanner.count, share)
-
-
-def _table_rays(bins: float) -> Callable[[Scene], float]:
-    return lambda scene: scene.grid.cells.size * bins
-
-
-def _reproduces(model: Any, name: str) -> bool:
-    """Return whether a model can reproduce another package's formulas."""
-    grid, scanner = OccupancyGrid(np.zeros((1, 1), np.int8)), Scanner([0.0], 1.0)
-    try:
-        model(grid, scanner, backend="numpy", compat=name)
-    except (ValueError, TypeError):
-        return False
-    return True
+def _table_rays(bins: float, scene: Scene) -> float:
+    return scene.grid.cells.size * bins

@@ -10,7 +10,9 @@ third is the default, which can also recover.
 
 ``--histogram STEPS`` instead times ``predict``, ``correct`` and ``estimate`` of the default filter while a simulated
 robot moves. It prints quantiles of the steps after the first 100, since the slowest step limits a control loop, and a
-histogram of step times relative to the median.
+histogram of step times relative to the median. Then it prints the same quantiles by the extra work of steps, and the
+number of copies from the device. This shows which work makes steps slow. Steps also have the processor time of the
+calling thread: on a busy machine, only that one compares programs.
 
 ``--peers`` instead compares the default filter, with its estimate, to the filters of nav2_amcl and Beluga that
 filters.py can compile. The filters take turns on one simulated run. All likelihood fields have the same parameters, and
@@ -19,6 +21,8 @@ the peers multiply the densities of a scan.
 
 from __future__ import annotations
 
+import functools
+import importlib
 import itertools
 import sys
 import time
@@ -105,31 +109,96 @@ def _in_a_row(pf: gs.ParticleFilter, steps: int, recording: Any) -> float:
 # Edges of the histogram, as multiples of the median.
 EDGES = (0.0, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0, np.inf)
 WARM = 100
+QUANTILES = (0.1, 0.5, 0.9, 0.99, 1.0)
+# Methods with extra work, by a word for it; a commit has the methods of its time.
+WORK = {
+    "learn": ("sensors.Sensor", ("correlate", "begin_lesson")),
+    "search": ("rival.Rival", ("start",)),
+    "rival": ("rival.Rival", ("correct",)),
+    "deeper": ("cloud.Cloud", ("_draw",)),
+    "record": ("cloud.RecordedProgram", ("__init__",)),
+}
+
+
+@functools.cache
+def watch_work() -> list[str]:
+    """Return a list that notes extra work when it is done, and each copy from the device as "copy"."""
+    done: list[str] = []
+
+    def watch(kind: Any, name: str, word: str) -> None:
+        inner = getattr(kind, name)
+
+        def noted(self: Any, *arguments: Any, **options: Any) -> Any:
+            done.append(word)
+            return inner(self, *arguments, **options)
+
+        setattr(kind, name, noted)
+
+    for word, (place, names) in WORK.items():
+        module, kind = place.split(".")
+        found = getattr(importlib.import_module(f"gpusense.localization.{module}"), kind)
+        for name in names:
+            if hasattr(found, name):
+                watch(found, name, word)
+    watch(importlib.import_module("gpusense.localization.cloud").Cloud, "_read", "copy")
+    passages = importlib.import_module("gpusense.localization.verdict").passages
+
+    def judged(*arguments: Any) -> Any:
+        done.append("judge")
+        return passages(*arguments)
+
+    importlib.import_module("gpusense.localization.verdict").passages = judged
+    return done
 
 
 def measure_steps(backend: str, particles: int, beams: int, steps: int) -> dict[str, object]:
-    """Return quantiles [ms] and a histogram of the steps of the default filter, and of their processor time."""
+    """Return quantiles [ms] and a histogram of the steps of the default filter, of the thread's time, and by work."""
     scanner = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / (beams - 1), count=beams, range_max=20.0)
     grid = building()
     run = gs.worlds.simulate_run(grid, scanner, scans=WARM + steps, seed=1)
     field = gs.LikelihoodFieldParameters(sigma_hit=0.1)
     pf = gs.ParticleFilter(gs.LikelihoodFieldModel(grid, scanner, field, backend=backend), particles=particles, seed=1)
     pf.initialize(mean=run.poses[0], covariance=np.diag([0.01, 0.01, 0.0025]))
-    times = []
+    times, kinds, done = [], [], watch_work()
     for before, odometry, ranges in zip(run.odometry, run.odometry[1:], run.scans[1:], strict=False):
-        begin, processor = time.perf_counter(), time.process_time()
+        done.clear()
+        begin, thread = time.perf_counter(), time.thread_time()
         pf.predict(before, odometry)
         pf.correct(ranges)
         pf.estimate()
-        times.append((time.perf_counter() - begin, time.process_time() - processor))
+        times.append((time.perf_counter() - begin, time.thread_time() - thread))
+        copies = done.count("copy")
+        words = sorted({word for word in done if word != "copy"})
+        kinds.append(f"{' and '.join(words) or 'nothing'}, {copies} cop{'y' if copies == 1 else 'ies'}")
     elapsed, used = (1000 * np.array(times[WARM:])).T
+    kind = np.array(kinds[WARM:])
     share = np.histogram(elapsed / np.median(elapsed), EDGES)[0] / len(elapsed)
-    quantiles = [[float(np.quantile(kept, q)) for q in (0.5, 0.9, 0.99, 1.0)] for kept in (elapsed, used)]
+    quantiles = [np.quantile(kept, QUANTILES).tolist() for kept in (elapsed, used)]
     error = float(np.hypot(*(pf.estimate().pose - run.poses[-1])[:2]))
+    slow = elapsed >= np.quantile(elapsed, 0.9)
+    by_work = [
+        dict(work=str(one), steps=int(chosen.sum()), slowest_tenth=int((chosen & slow).sum()),
+             wall_ms=np.quantile(elapsed[chosen], QUANTILES).tolist(),
+             thread_ms=np.quantile(used[chosen], QUANTILES).tolist())
+        for one in sorted(set(kind.tolist())) if (chosen := kind == one).any()
+    ]  # fmt: skip
     return dict(
         backend=backend, particles=particles, beams=beams, steps=len(elapsed), wall_ms=quantiles[0],
-        processor_ms=quantiles[1], histogram=share.tolist(), error_m=error,
+        thread_ms=quantiles[1], histogram=share.tolist(), error_m=error, by_work=by_work,
     )  # fmt: skip
+
+
+def print_steps(one: dict[str, Any]) -> None:
+    """Print the histogram of a size, and its steps by their work, the most frequent first."""
+    heads = ("work", "steps", "of the slowest tenth", "10, 50, 90, 99, 100 % ms", "of the thread")
+    print(f"\n{one['particles']} x {one['beams']}:\n\n| {' | '.join(heads)} |\n|{' --- |' * len(heads)}")
+    whole = dict(one, work="all", slowest_tenth="-")
+    for row in (whole, *sorted(one["by_work"], key=lambda row: -row["steps"])):
+        times = [", ".join(f"{t:.3f}" for t in row[name]) for name in ("wall_ms", "thread_ms")]
+        print(f"| {row['work']} | {row['steps']} | {row['slowest_tenth']} | {times[0]} | {times[1]} |")
+    bins = [f"{low:g}-{high:g}" for low, high in itertools.pairwise(EDGES)]
+    shares = [f"{name}: {100 * share:.1f} %" for name, share in zip(bins, one["histogram"], strict=True)]
+    print(f"\nMultiples of the median: {', '.join(shares)}", flush=True)
 
 
 def measure_peers(backend: str, particles: int, beams: int, scans: int) -> list[dict[str, object]]:
@@ -184,20 +253,9 @@ def main() -> None:
     args = parser.parse_args()
     rows: list[dict[str, object]] = []
     if args.histogram:
-        bins = [f"{low:g}-{high:g}" for low, high in itertools.pairwise(EDGES)]
-        heads = (
-            "particles x beams",
-            "50, 90, 99, 100 % ms",
-            "of the processor",
-            *(f"{one} medians, %" for one in bins),
-        )
-        print(f"| {' | '.join(heads)} |\n|{' --- |' * len(heads)}")
         for particles, beams in args.size or SIZES:
-            one = measure_steps(args.backend, particles, beams, args.histogram)
-            rows.append(one)
-            numbers = [", ".join(f"{t:.3f}" for t in one[name]) for name in ("wall_ms", "processor_ms")]  # type: ignore
-            shares = [f"{100 * share:.1f}" for share in one["histogram"]]  # type: ignore
-            print(f"| {' | '.join([f'{particles} x {beams}', *numbers, *shares])} |", flush=True)
+            rows.append(measure_steps(args.backend, particles, beams, args.histogram))
+            print_steps(rows[-1])
         return _write(args, rows)
     if args.peers:
         names = ("filter", "particles x beams", "median ms", "least ms", "of all cores, median ms")

@@ -79,6 +79,9 @@ STAGE = 8
 EVIDENCE, SLOW, FAST, INJECTED = 48, 49, 50, 51
 STATE = 64
 # Kernel file estimate: sums of a block, numbers of an estimate (pose, covariance by rows of its upper half, the sum of
-# weights, and 1 where headings are too far apart for one pass), and lanes of a block.
+# weights, and 1 where headings are too far apart for one pass, or after the second pass the share of poses far off the
+# mean), and lanes of a block.
 ESTIMATE_SUMS, ESTIMATE, ESTIMATE_LANES = 13, 11, 8
-MOMENTS, WIDE_HEADINGS = 9, 10
+MOMENTS, WIDE_HEADINGS, FAR_SHARE = 9, 10, 10
+# Least errors of a pose far off [m, rad].
+FAR, FAR_TURN = 1.0, 0.5

@@ -13,9 +13,6 @@ from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import Verdict
 from gpusense.localization.words import verdict_label
 
-# Most particles for counting the spread; a normal density approximates larger narrow clouds.
-_MOST_LOOKED_AT = 100_000
-
 
 def estimate_of(tracker: Tracker, verdict: Verdict, recovery: Recovery, method: str) -> Estimate:
     """Return the estimate of a filter.
@@ -38,7 +35,11 @@ def estimate_of(tracker: Tracker, verdict: Verdict, recovery: Recovery, method: 
         offset = pose - mean
         offset[2] = wrap_angle(offset[2])
         about = about + np.outer(offset, offset)
-    share, distances = _spread_about(tracker, pose, about)
+    share, distances = share_off(about), None
+    if not spread_of(about).narrow:
+        particles = cloud.snapshot(shown)
+        share = cloud.far_share(shown) if method == "mean" else share_off_of(*particles(), pose)
+        distances = Distances(particles, pose)
     if recovery.rival is not None:
         share = 1 - (1 - share) * (1 - recovery.rival.probability(pose))
     wrong = verdict.wrong
@@ -51,17 +52,3 @@ def estimate_of(tracker: Tracker, verdict: Verdict, recovery: Recovery, method: 
         summary.temperature, summary.degenerate, shown, widening,
         None if method == "mean" else about, distances,
     )  # fmt: skip
-
-
-def _spread_about(tracker: Tracker, pose: np.ndarray, about: np.ndarray) -> tuple[float, Distances | None]:
-    """Return the share of particles far off a pose, and distances of spread-out particles.
-
-    Args:
-        tracker: The particles.
-        pose: (3,) pose.
-        about: (3, 3) second moments of the particles about the pose.
-    """
-    if spread_of(about).narrow or tracker.shown > _MOST_LOOKED_AT:
-        return share_off(about), None
-    poses, weights = tracker.host_particles(), tracker.cloud.host_weights(tracker.shown)
-    return share_off_of(poses, weights, pose), Distances(poses, weights, pose)

@@ -7,6 +7,8 @@ recorded program.
 from __future__ import annotations
 
 import math
+import threading
+import weakref
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
@@ -14,7 +16,7 @@ import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.programs import ProgramCache, RecordedProgram, RepeatedPrograms
-from gpusense.interface.constants import ESTIMATE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
+from gpusense.interface.constants import ESTIMATE, FAR_SHARE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
 from gpusense.localization.cloud_state import Contents, Summary, deeper, is_starved, meaningful, summary_of
 from gpusense.localization.map_judge import JUDGED, MapJudge
@@ -24,6 +26,37 @@ _DOUBLE = np.dtype(np.float64)
 _MOST_RECORDED, _MOST_STAGES = 64, 48
 # Consecutive corrections with a read estimate after which corrections compute the estimate.
 _ASKED = 3
+
+
+class Snapshot:
+    """Particles of one moment, copied to the host when they are asked for, or before a step overwrites them.
+
+    Args:
+        cloud: The cloud.
+        count: Number of shown particles.
+
+    Attributes:
+        places: Their buffers.
+    """
+
+    def __init__(self, cloud: Cloud, count: int) -> None:
+        self.places, self._count, self._lock = cloud.places, count, threading.Lock()
+        self._cloud: Cloud | None = cloud
+        self._copies: tuple[np.ndarray, np.ndarray] | None = None
+
+    @property
+    def is_on_device(self) -> bool:
+        """Whether the particles have not been copied yet."""
+        return self._copies is None
+
+    def __call__(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (N, 3) poses and (N,) unnormalised weights."""
+        with self._lock:
+            if self._copies is None and (cloud := self._cloud) is not None:
+                poses = cloud.host_poses(self.places.shown, self._count)
+                self._copies, self._cloud = (poses, cloud._read(cloud.weights[self.places.weight], self._count)), None
+        assert self._copies is not None
+        return self._copies
 
 
 class Cloud(Particles):
@@ -49,6 +82,8 @@ class Cloud(Particles):
         self._results: np.ndarray | None = None
         self._estimated_of: Hashable = None
         self._known: tuple[Hashable, np.ndarray] | None = None
+        self._far: tuple[Hashable, float] | None = None
+        self._snapshots: list[weakref.ref[Snapshot]] = []
         # Consecutive corrections with a read estimate; whether the last one's was read; number of its last stage;
         # whether the present stage computes the estimate.
         self._asked, self._was_asked, self._last_stage, self._estimates_too = 0, False, 0, False
@@ -89,9 +124,14 @@ class Cloud(Particles):
         self._uploads.clear()
 
     def _begin_change(self) -> None:
-        """Invalidate the results on the host."""
-        self._results = self._known = self._estimated_of = None
+        """Invalidate the results on the host, and save the particles that the change may overwrite."""
+        self._results = self._known = self._estimated_of = self._far = None
         self._judges, self._prepared = (), None
+        for one in self._snapshots:
+            snapshot = one()
+            if snapshot is not None and snapshot.places.free() != self.kept.free():
+                snapshot()
+        self._snapshots = [one for one in self._snapshots if (kept := one()) is not None and kept.is_on_device]
 
     # ---- steps
 
@@ -108,7 +148,7 @@ class Cloud(Particles):
 
     def run_stages(
         self, settings: np.ndarray, stages: list[Stage], drawn: int, sensors: int, score: Callable[[Stage], None],
-        judges: Callable[[], list[MapJudge]] | None = None,
+        judges: Callable[[], list[MapJudge]] | None = None, meanwhile: Callable[[], None] | None = None,
     ) -> None:  # fmt: skip
         """Run a correction: stages until the temperature is used up.
 
@@ -119,6 +159,7 @@ class Cloud(Particles):
             sensors: Number of sensors, the first ones of ``log_p``.
             score: Runs a stage: motion if it is the first one, log-likelihoods, and weighing.
             judges: Prepares and returns the judges of scans at the estimated pose; called if the pose is estimated.
+            meanwhile: Called while the device works on the first stage.
         """
         self.use(sensors)
         self._begin_change()
@@ -133,6 +174,9 @@ class Cloud(Particles):
             self._estimates_too = self._asked >= _ASKED and stage.number >= self._last_stage
             self._results = None
             score(stage)
+            if meanwhile is not None:
+                meanwhile()
+                meanwhile = None
             if not last:
                 numbers, deep = self._deepen(stage, settings)
                 last = numbers[stage.number * STAGE + LEFT] == 0.0
@@ -277,6 +321,19 @@ class Cloud(Particles):
             numbers = self._estimate(count, 0)
             self._known = key, self._estimate(count, 1) if numbers[WIDE_HEADINGS] else numbers
         return self._known[1].copy()
+
+    def far_share(self, count: int) -> float:
+        """Return the share of the shown particles beyond 1 m or 0.5 rad of the mean that ``estimate`` has returned."""
+        key = self.places, count
+        if self._far is None or self._far[0] != key:
+            self._far = key, float(self._estimate(count, 1)[FAR_SHARE])
+        return self._far[1]
+
+    def snapshot(self, count: int) -> Snapshot:
+        """Return the function that copies the shown particles of now to the host, at any later time."""
+        made = Snapshot(self, count)
+        self._snapshots.append(weakref.ref(made))
+        return made
 
     def _estimate(self, count: int, second_pass: int) -> np.ndarray:
         """Return the result of a pass of the estimate; run the pass unless the last correction did."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,6 +49,7 @@ class Step(NamedTuple):
         readings: Indices of sensors with their readings.
         judged: Scans to judge at the new pose, with the indices of their sensors; a cloud may leave this to the
             verdict.
+        meanwhile: Called while the device works on the first stage.
     """
 
     settings: np.ndarray
@@ -57,6 +58,7 @@ class Step(NamedTuple):
     drawn: int
     readings: list[SensorReadings]
     judged: Sequence[SensorReadings] = ()
+    meanwhile: Callable[[], None] | None = None
 
 
 class Contents(NamedTuple):

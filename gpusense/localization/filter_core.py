@@ -119,12 +119,20 @@ class FilterCore:
             verdict.predicted(*tracker.moved_particles(), everything)
         if share is not None:
             used = skipping.skipped(self.sensors, used, tracker.moved_particles(), verdict.anywhere, share)
-        tracker.weigh(used, judged=verdict.expected(everything, tracker.progress.motion))
+        for sensor in self.sensors:
+            sensor.receive()
+        judged = verdict.expected(everything, tracker.progress.motion)
+        tracker.weigh(used, judged=judged, meanwhile=self._learn)
         # The caller may reuse the arrays for the next readings.
         self.last = {index: tuple(map(_copied, reading)) for index, reading in everything.items()}
         verdict.corrected()
         tracker.learn(used, self.recovery.is_doubted)
         self.recovery.corrected(used, self.last)
+
+    def _learn(self) -> None:
+        """Learn from the scans of the last correction."""
+        for sensor in self.sensors:
+            sensor.learn()
 
     def reset(self) -> None:
         """Replace half of the particles by poses that make the last readings likely, moved by all later motion."""
@@ -140,6 +148,8 @@ class FilterCore:
     def state(self) -> tuple[Contents, dict[str, Any]]:
         """Return particles and memory as plain data."""
         tracker = self.tracker
+        for sensor in self.sensors:
+            sensor.receive()
         return tracker.cloud.contents(tracker.shown), memory_of(tracker, self.verdict, self.recovery, self.last)
 
     def restore(self, contents: Contents, memory: Mapping[str, Any]) -> None:

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,18 +39,20 @@ class Distances:
     """Distances of particles from a pose, sorted when a radius is first asked for: a filter's step has no use for them.
 
     Args:
-        poses: (N, 3) particles.
-        weights: (N,) weights >= 0, not necessarily normalised.
+        particles: Returns (N, 3) particles and (N,) weights >= 0, not necessarily normalised.
         pose: (3,) pose.
     """
 
-    def __init__(self, poses: Floats, weights: Floats, pose: Floats) -> None:
-        self._particles = poses, weights, pose
+    def __init__(self, particles: Callable[[], tuple[Floats, Floats]], pose: Floats) -> None:
+        self._particles, self._pose = particles, pose
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_sorted": self._sorted}
 
     @functools.cached_property
     def _sorted(self) -> tuple[Floats, Floats]:
         """Distances (N,) [m], increasing, and the share of the particles that is farther than each."""
-        poses, weights, pose = self._particles
+        (poses, weights), pose = self._particles(), self._pose
         distance = np.hypot(poses[:, 0] - pose[0], poses[:, 1] - pose[1])
         order = np.argsort(distance, kind="stable")
         sums = np.cumsum(weights[order])

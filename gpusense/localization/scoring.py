@@ -159,7 +159,7 @@ class FilterCloud(Cloud):
         score = self._scoring.of(self, step.readings)
         stages = self.places.stages(self.kept, step.stages, step.drawn, step.kind, same=step.drawn == self.count)
         judges = functools.partial(self._judges_of, step.judged) if step.judged else None
-        self.run_stages(step.settings, stages, step.drawn, len(step.readings), score, judges)
+        self.run_stages(step.settings, stages, step.drawn, len(step.readings), score, judges, step.meanwhile)
 
     def _judges_of(self, judged: Sequence[SensorReadings]) -> list[MapJudge]:
         """Prepare and return the judges of scans."""

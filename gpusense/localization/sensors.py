@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import copy
+import functools
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gpusense._util import checks
 from gpusense.backends import arrays
-from gpusense.backends.base import Backend
+from gpusense.backends.base import Backend, Buffer
 from gpusense.interface.constants import DEPTH, TEMPERATURE
 from gpusense.interface.launches import Program
 from gpusense.localization.defaults import DEFAULTS
@@ -31,6 +32,22 @@ _MOST_STARTED = 64
 _MOST_SENSORS = DEPTH - TEMPERATURE
 
 
+class Lesson(NamedTuple):
+    """A scan that teaches the temperature.
+
+    Attributes:
+        terms: (7, K) terms of its readings at :func:`poses_around` the estimate, or the function that waits for them.
+        axes: (3, 3) steps between these poses.
+        directions: (K,) directions of the beams in the world [rad].
+        follows: Whether the scan directly follows the previous lesson.
+    """
+
+    terms: Any
+    axes: np.ndarray
+    directions: np.ndarray
+    follows: bool
+
+
 class Sensor:
     """Measurement model of a filter.
 
@@ -48,7 +65,7 @@ class Sensor:
             landmarks.
     """
 
-    MEMORY, PARTS = ("_correlation", "_seen", "_learned"), ()
+    MEMORY, PARTS = ("_correlation", "_seen", "_learned", "_lesson"), ()
 
     def __init__(self, model: Any) -> None:
         if not isinstance(model, (ScanModel, PointModel)):
@@ -64,6 +81,13 @@ class Sensor:
         # A temperature and its correlation; learning replaces the correlation.
         self._known: tuple[BeamCorrelation, float] | None = None
         self._seen, self._learned = 0, -1
+        self._lesson: Lesson | None = None
+        # The poses and the call that scores readings around an estimate, or no call; the reading on the
+        # device, and its values if they came from the host.
+        self._terms: tuple[Any, DeviceCall | None] | None = None
+        self._uploaded: object = None
+        self._values: np.ndarray | None = None
+        self._sent: list[np.ndarray] = []
         self._ranges: Any = None
         self._judge: MapJudge | None = None
         self.seconds, self._started = 0.0, 0
@@ -91,14 +115,53 @@ class Sensor:
         """Count a scan."""
         self._seen += 1
 
-    def correlate(self, pose: np.ndarray, covariance: np.ndarray, reading: tuple[Any, ...]) -> None:
-        """Learn the correlation of beams from the last counted scan, at the estimated pose."""
-        axes, scanner = axes_of(covariance), self.model.scanner
-        parts = self.parts(poses_around(pose, axes), reading)
-        # A new object, since the correlation is part of the state.
-        correlation = copy.copy(self._correlation)
-        correlation.add(parts, axes, scanner.bearings + pose[2], follows=self._learned == self._seen - 1)
-        self._correlation, self._learned = correlation, self._seen
+    def begin_lesson(self, pose: np.ndarray, covariance: np.ndarray, reading: tuple[Any, ...]) -> None:
+        """Start scoring the last counted scan around the estimated pose, for ``learn`` in the next correction."""
+        axes = axes_of(covariance)
+        terms = self._start_terms(poses_around(pose, axes), reading)
+        follows = self._learned == self._seen - 1
+        self._lesson = Lesson(terms, axes, self.model.scanner.bearings + pose[2], follows)
+        self._learned = self._seen
+
+    def _start_terms(self, poses: np.ndarray, reading: tuple[Any, ...]) -> np.ndarray | Callable[[], np.ndarray]:
+        """Return (7, K) terms of a scan's readings, or the function that waits for terms that the device computes."""
+        if not self.records(reading):
+            return self.parts(poses, reading)
+        if self._uploaded is not reading:
+            self.upload(reading)
+        if self._terms is None:
+            backend, count = self.backend, len(poses)
+            around = backend.blank(poses.size, _DOUBLE)
+            ranges = backend.view(self._ranges, (self.model.scanner.count,), _DOUBLE)
+            out = backend.view(backend.blank(count, self.precision), (count,), self.precision)
+            self._terms = around, self.model.bind_terms(backend.view(around, poses.shape, _DOUBLE), ranges, out)
+        around, call = self._terms
+        if call is None:
+            return self.parts(poses, reading)
+        self._send(poses, around)
+        call()
+        return functools.partial(self._read_terms, call, self._values)
+
+    def _read_terms(self, call: DeviceCall, ranges: np.ndarray | None) -> np.ndarray:
+        """Wait for the terms of a scan's readings, and return them."""
+        if ranges is None:
+            ranges = self.backend.download(self._ranges, np.empty(self.model.scanner.count))
+        return call.terms(ranges)
+
+    def receive(self) -> None:
+        """Copy the terms of a started lesson to the host, before the buffers are used again."""
+        self._uploaded, lesson = None, self._lesson
+        if lesson is not None and callable(lesson.terms):
+            self._lesson = lesson._replace(terms=np.asarray(lesson.terms(), np.float64))
+
+    def learn(self) -> None:
+        """Learn the correlation of beams from the received lesson."""
+        if self._lesson is not None:
+            # A new object, since the correlation is part of the state.
+            correlation = copy.copy(self._correlation)
+            terms, axes, directions, follows = self._lesson
+            correlation.add(terms, axes, directions, follows=follows)
+            self._correlation, self._lesson = correlation, None
 
     def judge(self) -> MapJudge:
         """Return the present map on the device for judging beams, copied on first use."""
@@ -163,7 +226,7 @@ class Sensor:
 
     def upload(self, reading: tuple[Any, ...]) -> None:
         """Copy the ranges of a scan to the array for recorded programs."""
-        ranges = reading[0]
+        ranges, self._uploaded, self._values = reading[0], reading, None
         count = self.model.scanner.count
         if self._ranges is None:
             self._ranges = self.backend.empty_external(count, _DOUBLE)
@@ -174,7 +237,16 @@ class Sensor:
                 return
         ranges = arrays.copied_to_host(ranges, self.backend, "ranges")
         values = checks.array("ranges", ranges, (count,), finite=False, dtype=None)
-        self.backend.upload(np.ascontiguousarray(float64_readings(values, self.model.scanner)), self._ranges)
+        self._values = np.array(float64_readings(values, self.model.scanner))
+        self._send(self._values, self._ranges)
+
+    def _send(self, array: np.ndarray, buffer: Buffer) -> None:
+        """Start copying an array that does not change, and keep it alive until the device has read it."""
+        if len(self._sent) >= _MOST_STARTED:
+            self.backend.synchronize()
+            self._sent.clear()
+        self._sent.append(array)
+        self.backend.upload(array, buffer, wait=False)
 
     def program(self, poses: Any, out: Any) -> tuple[Program, object]:
         """Return the launches for scoring poses on the device, and the owner of their memory."""

@@ -8,12 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense.interface import constants
 from gpusense.localization.pose_algebra import wrap_angle
 
 Floats = NDArray[np.float64]
 
 # Least errors of a pose far off, in the definition of p_lost [m, rad].
-FAR, FAR_TURN = 1.0, 0.5
+FAR, FAR_TURN = constants.FAR, constants.FAR_TURN
 # Largest deviations of concentrated particles [m, rad].
 WIDE, WIDE_TURN = 0.5, 0.25
 # Largest deviations for a normal density instead of particles [m, rad].

@@ -78,37 +78,51 @@ def poses_around(pose: np.ndarray, axes: np.ndarray) -> np.ndarray:
 
 
 class _Scores(NamedTuple):
-    """Scores of beams along the axes.
+    """Scores of beams along the axes, of a scan with K used beams.
 
     Attributes:
         numbers: (12 K,) scores of each beam, and their outer products.
         curvature: Curvature.
+        blocks: (16, 12) sums of the numbers over short blocks of neighbours.
         fit: (3,) change of the scores by a fit.
         outer: (3, 3) sum of the outer products.
+        inverse: (3, 3) its inverse.
     """
 
     numbers: np.ndarray
     curvature: float
+    blocks: np.ndarray
     fit: np.ndarray
     outer: np.ndarray
+    inverse: np.ndarray
 
-    def of_blocks(self, places: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return (count, 3) scores of blocks after the fit, and (count, 3, 3) outer products."""
-        sums = np.bincount(places, self.numbers, 12 * count).reshape(count, 12)
-        outer = sums[:, 3:].reshape(count, 3, 3)
+    def fitted(self, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (B, 3) scores of blocks after the fit, and (B, 3, 3) outer products, from their (B, 12) sums."""
+        outer = sums[:, 3:].reshape(-1, 3, 3)
         return sums[:, :3] - outer @ self.fit, outer
+
+    def variances(self, count: int) -> tuple[float, float]:
+        """Return the variance of ``count`` blocks' scores after a fit, measured and for independent beams."""
+        blocks, outer = self.fitted(self.blocks.reshape(count, -1, 12).sum(axis=1))
+        taken = float((outer @ self.inverse * outer).sum())
+        return float((blocks * blocks).sum()), float(self.outer.trace()) - taken
 
 
 def _scores_of(parts: np.ndarray) -> _Scores:
     """Return the scores of (7, K) log-likelihoods at the poses of ``poses_around``."""
-    each = (parts[1:4] - parts[4:7]) / (2 * _FAR)
-    curvature = float(np.sum(2 * parts[0] - parts[1:4] - parts[4:7])) / _FAR**2
-    outer = each @ each.T
-    regular = outer + 1e-9 * max(float(np.trace(outer)), 1e-30) * _IDENTITY
-    numbers = np.empty((each.shape[1], 12))
-    numbers[:, :3] = each.T
-    np.multiply(each.T[:, :, None], each.T[:, None, :], out=numbers[:, 3:].reshape(-1, 3, 3))
-    return _Scores(numbers.reshape(-1), curvature, np.linalg.solve(regular, each.sum(axis=1)), regular)
+    beams = parts.shape[1]
+    each = (parts[1:4] - parts[4:7]).T / (2 * _FAR)
+    at, *around = parts.sum(axis=1).tolist()
+    rows = np.empty((beams, 12))
+    rows[:, :3] = each
+    np.multiply(each[:, :, None], each[:, None, :], out=rows[:, 3:].reshape(-1, 3, 3))
+    numbers = rows.reshape(-1)
+    blocks = np.bincount(_places_of_neighbors(beams), numbers, 12 * _SHORT).reshape(_SHORT, 12)
+    total = blocks.sum(axis=0)
+    outer = total[3:].reshape(3, 3)
+    outer = outer + 1e-9 * max(float(outer.trace()), 1e-30) * _IDENTITY
+    inverse = np.linalg.inv(outer)
+    return _Scores(numbers, (6 * at - sum(around)) / _FAR**2, blocks, inverse @ total[:3], outer, inverse)
 
 
 def _places_of(block: np.ndarray) -> np.ndarray:
@@ -117,9 +131,9 @@ def _places_of(block: np.ndarray) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=64)
-def _places_of_neighbors(beams: int, count: int) -> np.ndarray:
-    """Return the indices of beams' numbers in the sums of ``count`` blocks of neighbours."""
-    return _places_of(np.arange(beams) * count // beams)
+def _places_of_neighbors(beams: int) -> np.ndarray:
+    """Return the indices of beams' numbers in the sums of short blocks of neighbours; four of them are a long block."""
+    return _places_of(np.arange(beams) * _SHORT // beams)
 
 
 class BeamCorrelation:
@@ -151,15 +165,15 @@ class BeamCorrelation:
         """
         values = checks.array("parts", parts, (7, "K"), finite=False)
         steps = checks.array("axes", axes, (3, 3))
-        used = np.isfinite(values).all(axis=0) & (values != 0).any(axis=0)
+        used = np.isfinite(values).all(axis=0) & values.any(axis=0)
         count = int(np.count_nonzero(used))
         if count < _FEWEST:
             self._previous = None
             return
         scores = _scores_of(values[:, used])
         gain = min(max(self.temperature(count) * scores.curvature / 3, 0.0), 1.0)
-        independent = float(np.trace(scores.outer)) * count / (count - 3)
-        found = np.array([scores.curvature, independent, *_variances(scores, _LONG), *_variances(scores, _SHORT)])
+        independent = float(scores.outer.trace()) * count / (count - 3)
+        found = np.array([scores.curvature, independent, *scores.variances(_LONG), *scores.variances(_SHORT)])
         keep = 1 - 1 / min(self.scans + 1, _MEMORY)
         self._sums = keep * self._sums + (1 - keep) * found
         self._gain = keep * self._gain + (1 - keep) * gain
@@ -179,15 +193,16 @@ class BeamCorrelation:
         gap = max(float(np.max(ordered[1:] - ordered[:-1])), float(ordered[0] + 2 * np.pi - ordered[-1]))
         around = max(round(_SECTORS * 2 * np.pi / max(2 * np.pi - gap, 0.1)), 1)
         block = (ahead[used] * (around / (2 * np.pi))).astype(np.int64) % around
-        blocks, _ = scores.of_blocks(_places_of(block), around)
+        sums = np.bincount(_places_of(block), scores.numbers, 12 * around).reshape(around, 12)
+        blocks, _ = scores.fitted(sums)
         # Gradients in the world, times this scan's root of the covariance.
         world = np.linalg.solve(axes.T, blocks.T).T
         seen = np.bincount(block, minlength=around) > 0
         if follows and self._previous is not None and len(self._previous[1]) == around:
             both = seen & self._previous[1]
-            now, then = world[both] @ axes, self._previous[0][both] @ axes
+            now, then = blocks[both], self._previous[0][both] @ axes
             keep = 1 - 1 / min(self._pairs + 1, _MEMORY)
-            found = np.array([np.sum(now * then), (np.sum(now * now) + np.sum(then * then)) / 2])
+            found = np.array([(now * then).sum(), ((now * now).sum() + (then * then).sum()) / 2])
             self._products = keep * self._products + (1 - keep) * found
             self._pairs += 1
         self._previous = world, seen
@@ -232,13 +247,6 @@ class BeamCorrelation:
         repeated = self.repeat * self.kept
         found = (1 - repeated) / (1 + repeated) * self._sums[0] / (self._sums[1] * self.inflation)
         return min(1.0, max(found, INDEPENDENT_AT_LEAST / max(count, 1)))
-
-
-def _variances(scores: _Scores, count: int) -> tuple[float, float]:
-    """Return the variance of blocks' scores after a fit, measured and for independent beams."""
-    blocks, outer = scores.of_blocks(_places_of_neighbors(len(scores.numbers) // 12, count), count)
-    taken = np.einsum("bij,bij->", outer, np.linalg.solve(scores.outer, outer).transpose(0, 2, 1))
-    return float(np.sum(blocks**2)), float(np.trace(scores.outer) - taken)
 
 
 def learn_from_scan(correlation: BeamCorrelation, model: Any, ranges: AnyArray, pose: AnyArray) -> None:

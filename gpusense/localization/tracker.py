@@ -161,12 +161,16 @@ class Tracker:
             self.cloud.move(self.settings(motion, []), motion.kind)
             self.shown, self.progress = self.cloud.count, self.progress._replace(motion=None)
 
-    def weigh(self, readings: list[SensorReadings], *, judged: Sequence[SensorReadings] = ()) -> None:
+    def weigh(
+        self, readings: list[SensorReadings], *, judged: Sequence[SensorReadings] = (),
+        meanwhile: Callable[[], None] | None = None,
+    ) -> None:  # fmt: skip
         """Run a postponed motion, and correct the particles by readings of sensors.
 
         Args:
             readings: Indices of sensors with their readings.
             judged: Scans to judge at the pose after the correction.
+            meanwhile: Called while the device works.
         """
         chosen, drawn = self.options, self.cloud.count
         if chosen.least != chosen.most:
@@ -179,7 +183,7 @@ class Tracker:
         motion = self.progress.motion or STILL
         settings = self.settings(motion, [index for index, _ in readings])
         self.shown, self.progress = self.cloud.count, Progress(self.progress.step, copies=copies)
-        self.cloud.correct(Step(settings, motion.kind, chosen.stages, drawn, readings, judged))
+        self.cloud.correct(Step(settings, motion.kind, chosen.stages, drawn, readings, judged, meanwhile))
         self.wide = max(self.wide - 1, 0)
 
     def sample_size(self) -> float:
@@ -193,7 +197,7 @@ class Tracker:
         return min(max(size, 1.0), float(self.shown))
 
     def learn(self, readings: list[SensorReadings], is_doubted: Callable[[], bool]) -> None:
-        """Determine whether the particles are concentrated, and learn from scans at an uncontradicted pose.
+        """Determine whether the particles are concentrated, and begin lessons of scans at an uncontradicted pose.
 
         Args:
             readings: Indices of sensors with the readings of the last correction.
@@ -207,7 +211,7 @@ class Tracker:
         self.together = is_together(covariance)
         if due and self.together and not is_doubted() and self.cloud.summary().effective_sample_size >= 2:
             for sensor, reading in due:
-                sensor.correlate(pose, covariance, reading)
+                sensor.begin_lesson(pose, covariance, reading)
 
     def settings(self, motion: SampledMotion, indices: list[int]) -> np.ndarray:
         """Return the settings of the present step with readings of the sensors ``indices``."""

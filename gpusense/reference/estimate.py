@@ -2,8 +2,8 @@
 
 Sums are relative to the first particle. If no heading is more than a right angle from the first particle's, covariances
 follow from these sums; otherwise a second pass is relative to the mean. Mardia and Jupp, *Directional Statistics*
-(2000), section 2.2. In a block, every eighth particle belongs to the same lane; each lane is summed in the order of its
-particles, and the lanes are then added in order.
+(2000), section 2.2. That pass also finds the share of the particles far off the mean. In a block, every eighth particle
+belongs to the same lane; each lane is summed in the order of its particles, and the lanes are then added in order.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from gpusense.interface.constants import ESTIMATE_LANES, ESTIMATE_SUMS, WIDE_HEADINGS
+from gpusense.interface.constants import ESTIMATE_LANES, ESTIMATE_SUMS, FAR, FAR_SHARE, FAR_TURN, WIDE_HEADINGS
 from gpusense.reference.elementary import angle_of
 from gpusense.reference.heading import cos_sin
 from gpusense.reference.motion import wrap_once
@@ -22,7 +22,7 @@ def sum_poses(
     flags: frozenset[str], poses: np.ndarray, weight: np.ndarray, estimate: np.ndarray, sums: np.ndarray,
     particles: int, block: int, lanes: int, second_pass: int,
 ) -> None:  # fmt: skip
-    """Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings.
+    """Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings or far poses.
 
     A row of sums takes ``lanes`` lanes of a block.
     """
@@ -31,9 +31,10 @@ def sum_poses(
     x, y = pose[:, 0] - reference[0], pose[:, 1] - reference[1]
     angle = wrap_once(pose[:, 2] - reference[2])
     cosine, sine = cos_sin(angle)
+    far = (x * x + y * y > FAR**2) | (np.abs(angle) > FAR_TURN) if second_pass else np.abs(angle) > math.pi / 2
     columns: tuple[np.ndarray, ...]
     columns = (w, w * x, w * y, w * cosine, w * sine, w * angle, w * x * x, w * x * y, w * x * angle, w * y * y)
-    columns = (*columns, w * y * angle, w * angle * angle, np.where(np.abs(angle) > math.pi / 2, w, 0.0))
+    columns = (*columns, w * y * angle, w * angle * angle, np.where(far, w, 0.0))
     each = ESTIMATE_LANES // lanes
     for b, begin in enumerate(range(0, particles, block)):
         end = min(begin + block, particles)
@@ -57,6 +58,8 @@ def finish_estimate(
         estimate[0], estimate[1], estimate[2] = poses[0] + x, poses[1] + y, wrap_once(poses[2] + mean)
         estimate[9] = weight
         estimate[WIDE_HEADINGS] = total[12] > 0.0 or abs(mean) > math.pi / 2
+    else:
+        estimate[FAR_SHARE] = total[12] / weight
     estimate[3], estimate[4] = total[6] / weight - x * x, total[7] / weight - x * y
     estimate[5], estimate[6] = total[8] / weight - x * angle, total[9] / weight - y * y
     estimate[7] = total[10] / weight - y * angle

@@ -1,33 +1,38 @@
 // Weighted mean, circular in the heading, and covariance of a cloud of particles. Sums are relative to the first
 // particle. If no heading is more than a right angle from the first particle's, covariances follow from these sums;
-// otherwise a second pass is relative to the mean. Mardia and Jupp, "Directional Statistics" (2000), section 2.2. In a
-// block, every eighth particle belongs to the same lane; each lane is summed in the order of its particles, and the
+// otherwise a second pass is relative to the mean. That pass also finds the share of the particles far off the mean.
+// Mardia and Jupp, "Directional Statistics" (2000), section 2.2. In a block, every eighth particle belongs to the same lane; each lane is summed in the order of its particles, and the
 // lanes are then added in order.
 // requires: motion
 
 #define ESTIMATE_SUMS 13
 #define ESTIMATE_LANES 8
 #define RIGHT_ANGLE 1.5707963267948966
+#define FAR 1.0
+#define FAR_TURN 0.5
 #define WIDE_HEADINGS 10
+#define FAR_SHARE 10
 
-// Add a particle's weight, offset and turn to the sums.
-void add_pose(const double w, const double x, const double y, const double angle, double *part) {
+// Add a particle's weight, offset and turn to the sums; the last sum is of weights beyond a squared distance or a turn.
+void add_pose(const double w, const double x, const double y, const double angle, const double far, const double turn,
+              double *part) {
     const double2 heading = cos_sin(angle);
     const double w_x = w * x, w_y = w * y, w_angle = w * angle;
     part[0] += w, part[1] += w_x, part[2] += w_y;
     part[3] += w * heading.x, part[4] += w * heading.y, part[5] += w_angle;
     part[6] += w_x * x, part[7] += w_x * y, part[8] += w_x * angle;
     part[9] += w_y * y, part[10] += w_y * angle, part[11] += w_angle * angle;
-    part[12] += fabs(angle) > RIGHT_ANGLE ? w : 0.0;
+    part[12] += x * x + y * y > far || fabs(angle) > turn ? w : 0.0;
 }
 
-// Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings: one work-item takes a
-// number of lanes of a block.
+// Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings, or in the second pass of
+// far poses: one work-item takes a number of lanes of a block.
 kernel void sum_poses(ARGUMENTS) {
     const int i = get_global_id(0), each = ESTIMATE_LANES / lanes, begin = i / each * block, first = i % each * lanes;
     if (begin >= particles) return;
     global const double *reference = second_pass ? estimate : poses;
     const double x0 = reference[0], y0 = reference[1], theta0 = reference[2];
+    const double far = second_pass ? FAR * FAR : INFINITY, turn = second_pass ? FAR_TURN : RIGHT_ANGLE;
     const int end = min(begin + block, particles);
     double total[ESTIMATE_SUMS];
     for (int k = 0; k < ESTIMATE_SUMS; k++) total[k] = 0.0;
@@ -36,7 +41,7 @@ kernel void sum_poses(ARGUMENTS) {
         for (int k = 0; k < ESTIMATE_SUMS; k++) part[k] = 0.0;
         for (int n = begin + lane; n < end; n += ESTIMATE_LANES) {
             const double w = weight[n], x = poses[3 * (long)n] - x0, y = poses[3 * (long)n + 1] - y0;
-            add_pose(w, x, y, wrap_once(poses[3 * (long)n + 2] - theta0), part);
+            add_pose(w, x, y, wrap_once(poses[3 * (long)n + 2] - theta0), far, turn, part);
         }
         for (int k = 0; k < ESTIMATE_SUMS; k++) total[k] += part[k];
     }
@@ -44,7 +49,7 @@ kernel void sum_poses(ARGUMENTS) {
 }
 
 // Write the mean pose and the covariance about it from the sums of all groups, and whether headings require a second
-// pass; that pass writes the covariance only. One work-item takes all.
+// pass; that pass writes the covariance, and the share of far poses. One work-item takes all.
 kernel void finish_estimate(ARGUMENTS) {
     if (get_global_id(0) > 0) return;
     double total[ESTIMATE_SUMS];
@@ -60,6 +65,7 @@ kernel void finish_estimate(ARGUMENTS) {
         estimate[9] = weight;
         estimate[WIDE_HEADINGS] = total[12] > 0.0 || fabs(mean) > RIGHT_ANGLE ? 1.0 : 0.0;
     }
+    if (second_pass) estimate[FAR_SHARE] = total[12] / weight;
     estimate[3] = total[6] / weight - x * x, estimate[4] = total[7] / weight - x * y;
     estimate[5] = total[8] / weight - x * angle, estimate[6] = total[9] / weight - y * y;
     estimate[7] = total[10] / weight - y * angle, estimate[8] = total[11] / weight - mean * (2.0 * angle - mean);

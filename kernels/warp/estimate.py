@@ -2,8 +2,8 @@
 
 Sums are relative to the first particle. If no heading is more than a right angle from the first particle's, covariances
 follow from these sums; otherwise a second pass is relative to the mean. Mardia and Jupp, *Directional Statistics*
-(2000), section 2.2. In a block, every eighth particle belongs to the same lane; each lane is summed in the order of its
-particles, and the lanes are then added in order.
+(2000), section 2.2. That pass also finds the share of the particles far off the mean. In a block, every eighth particle
+belongs to the same lane; each lane is summed in the order of its particles, and the lanes are then added in order.
 """
 
 import functools
@@ -14,8 +14,9 @@ from . import heading, motion
 from .elementary import angle_of
 from .prelude import kernel
 
-ESTIMATE_SUMS, ESTIMATE_LANES, WIDE_HEADINGS = (wp.constant(number) for number in (13, 8, 10))
-RIGHT_ANGLE = wp.constant(wp.float64(1.5707963267948966))
+ESTIMATE_SUMS, ESTIMATE_LANES, WIDE_HEADINGS, FAR_SHARE = (wp.constant(number) for number in (13, 8, 10, 10))
+RIGHT_ANGLE, FAR, FAR_TURN = (wp.constant(wp.float64(number)) for number in (1.5707963267948966, 1.0, 0.5))
+ANY = wp.constant(wp.float64(float("inf")))
 ZERO, ONE, TWO = (wp.constant(wp.float64(number)) for number in (0.0, 1.0, 2.0))
 totals = wp.types.vector(length=13, dtype=wp.float64)
 
@@ -28,8 +29,8 @@ def make(name, flags):
 
     @kernel(flags)
     def sum_poses(poses, weight, estimate, sums, particles, block, lanes, second_pass):
-        """Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings: one work-item
-        takes a number of lanes of a block.
+        """Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings (far poses in
+        the second pass): one work-item takes a number of lanes of a block.
         """
         i = wp.tid()
         each = ESTIMATE_LANES / lanes
@@ -40,7 +41,11 @@ def make(name, flags):
         x0 = poses[0]
         y0 = poses[1]
         theta0 = poses[2]
+        far = ANY + ZERO
+        most = RIGHT_ANGLE + ZERO
         if second_pass != 0:
+            far = FAR * FAR
+            most = FAR_TURN + ZERO
             x0 = estimate[0]
             y0 = estimate[1]
             theta0 = estimate[2]
@@ -65,7 +70,7 @@ def make(name, flags):
                 part[9] += w * y * y
                 part[10] += w * y * angle
                 part[11] += w * angle * angle
-                part[12] += wp.where(wp.abs(angle) > RIGHT_ANGLE, w, ZERO)
+                part[12] += wp.where(x * x + y * y > far or wp.abs(angle) > most, w, ZERO)
             for k in range(13):
                 total[k] += part[k]
         for k in range(13):
@@ -74,7 +79,7 @@ def make(name, flags):
     @kernel(flags)
     def finish_estimate(poses, sums, estimate, groups, second_pass):
         """Write the mean pose and the covariance about it from the sums of all groups, and whether headings require a
-        second pass; that pass writes the covariance only. One work-item takes all.
+        second pass; that pass writes the covariance, and the share of far poses. One work-item takes all.
         """
         i = wp.tid()
         if i > 0:
@@ -95,6 +100,8 @@ def make(name, flags):
             estimate[2] = wrap_once(poses[2] + mean)
             estimate[9] = weight
             estimate[WIDE_HEADINGS] = wp.where(total[12] > ZERO or wp.abs(mean) > RIGHT_ANGLE, ONE, ZERO)
+        if second_pass != 0:
+            estimate[FAR_SHARE] = total[12] / weight
         estimate[3] = total[6] / weight - x * x
         estimate[4] = total[7] / weight - x * y
         estimate[5] = total[8] / weight - x * angle

@@ -282,7 +282,9 @@ def test_estimates_are_the_moments_of_the_cloud(backend, name):
     expected = ((rest * w[:, None]).T @ rest).astype(float)
     # Offsets of 20 m from the reference, squared, cost 9 digits of squares of a millimetre.
     np.testing.assert_allclose(covariance_of(numbers), expected, rtol=1e-10, atol=2e-12 * max(far, spread) ** 2)
-    assert numbers[c.WIDE_HEADINGS] == (turn > 1)
+    off = (rest[:, :2] ** 2).sum(axis=1) > c.FAR**2
+    far_off = off | (np.abs(rest[:, 2]) > c.FAR_TURN)
+    assert cloud.far_share(len(poses)) == pytest.approx(float(w[far_off].sum()), rel=1e-12)
 
 
 # Deviations of turns: none, for a jump of 100 m, and the largest of a filter.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 from types import SimpleNamespace
 
 import mpmath
@@ -115,6 +116,18 @@ def test_a_cloud_of_a_filter_has_its_quantile(backend: str) -> None:
     e = pf.estimate()
     far = np.quantile(np.hypot(*(pf.host_particles() - e.pose)[:, :2].T), 1 - (0.02 - e.p_lost) / (1 - e.p_lost))
     assert e.protection_level(0.02) == pytest.approx(far, rel=0.01) and far > 0.85
+
+
+def test_an_estimate_keeps_the_particles_of_its_moment(backend: str) -> None:
+    pf = at_poses(np.random.default_rng(0).normal((5.0, 5.0, 0.0), (0.3, 0.1, 0.12), (500, 3)), backend)
+    kept = []
+    for step in range(5):
+        e = pf.estimate()
+        kept.append((e, np.hypot(*(pf.host_particles() - e.pose)[:, :2].T)))
+        pf.predict((0, 0, 0), (1.0, 0.1 * step, 0.3))
+        pf.correct(np.array([6.0 + step, 5.0]))
+    for e, distances in [*kept, (pickle.loads(pickle.dumps(kept[0][0])), kept[0][1])]:
+        assert np.array_equal(e.distances._sorted[0], np.sort(distances))
 
 
 def test_a_cluster_and_the_best_particle_count_all_particles() -> None:

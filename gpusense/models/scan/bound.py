@@ -24,6 +24,7 @@ from gpusense.models.chunking import chunk_of, finish
 from gpusense.models.poses import Poses
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.readings import Readings, device_readings, device_scans
+from gpusense.models.scan.scoring import terms_of
 from gpusense.tables.world_index import WorldIndex
 from gpusense.world.windows import Corners
 
@@ -90,6 +91,7 @@ class DeviceCall(BoundCall):
         limits: The type to which the scanner's limits are rounded; None for the type of the ranges.
         corners: Corners of the box of the poses, where their owner knows them: the map's table may be cropped then.
         inside: The worlds of the poses, on the device; None in a single map. Ranges may then be (N, K).
+        per_beam: Whether to keep the term of each reading, for ``terms``; of few poses in a single map.
     """
 
     waits = False
@@ -105,9 +107,11 @@ class DeviceCall(BoundCall):
         limits: np.dtype | None = None,
         corners: Corners | None = None,
         inside: WorldIndex | None = None,
+        *,
+        per_beam: bool = False,
     ) -> None:
         backend, real = pipeline.backend, pipeline.real
-        self._pipeline, self._lock = pipeline, lock
+        self._pipeline, self._lock, self._per_beam = pipeline, lock, per_beam
         self._poses = Poses(poses, backend, in_place=True)
         self._poses.hull = corners
         count = self._poses.count
@@ -132,7 +136,7 @@ class DeviceCall(BoundCall):
         # Pieces begin where parts of buffers can.
         whole = max(backend.alignment // _INT.itemsize, 1)
         rays = self._readings.readings * pipeline.rays_each
-        chunk = chunk_of(backend, rays, pipeline.kept_bytes())
+        chunk = chunk_of(backend, rays, pipeline.kept_bytes(per_beam=per_beam))
         self._chunk = -(-chunk // whole) * whole
         # The program for the current map, by the version of the map's table.
         self._programs = ProgramCache[RecordedProgram](1)
@@ -163,6 +167,13 @@ class DeviceCall(BoundCall):
         """All launches of a call, for a program of its owner."""
         self._current()
         return self._program()
+
+    def terms(self, ranges: np.ndarray) -> np.ndarray:
+        """Wait for the last call, and return the (N, K) terms of its readings, which are ``ranges``."""
+        pipeline = self._pipeline
+        each = np.empty((self._poses.count, self._readings.readings), pipeline.real)
+        each = pipeline.backend.download(self._parts, each)
+        return terms_of(pipeline, each, pipeline.classed(ranges[None]))
 
     def check(self) -> None:
         self._pipeline.backend.check_process()
@@ -254,6 +265,9 @@ class DeviceCall(BoundCall):
             readings = readings if begin == 0 else readings._replace(placing=None)
             placed, state = pipeline.place(self._poses, part, self._space)
             log_p = pipeline.backend.part(self._log_p, begin, part[1] - begin, pipeline.real)
-            scoring = pipeline.scoring(readings, placed, state.table, log_p, self._space, ordered=False)
+            scoring = pipeline.scoring(
+                readings, placed, state.table, log_p, self._space, per_beam=self._per_beam, ordered=False
+            )
+            self._parts = pipeline.parts(scoring).buffer
             program += pipeline.program(scoring)
         return program

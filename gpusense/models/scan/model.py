@@ -36,7 +36,7 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
 
 if TYPE_CHECKING:
-    from gpusense.models.scan.bound import BoundCall
+    from gpusense.models.scan.bound import BoundCall, DeviceCall
     from gpusense.models.scan.packed_call import PackedCallCache
 
 
@@ -297,6 +297,26 @@ class ScanModel(Pickled):
         """Wait for calls that ``start_scoring`` has begun."""
         with self._lock:
             finish(self._workspace, on_device=True)
+
+    def bind_terms(self, poses: Any, ranges: Any, out: Any) -> DeviceCall | None:
+        """Bind arrays on the device to a call that keeps the term of each reading, for ``DeviceCall.terms``.
+
+        Args:
+            poses: (N, 3) poses, few.
+            ranges: (K,) float64 readings [m].
+            out: (N,) array for the log-likelihoods.
+
+        Returns:
+            The call; None for a model whose readings the host must prepare.
+        """
+        from gpusense.models.scan.bound import DeviceCall
+        from gpusense.models.scan.packed_call import host_task
+
+        pipeline = self._pipeline
+        plain = pipeline.specialize and pipeline.rules.separate and pipeline.setting.possible
+        if not plain or host_task(pipeline):
+            return None
+        return DeviceCall(pipeline, self._lock, poses, ranges, out, per_beam=True)
 
     def _differentiable(self, ranges: AnyArray) -> Differentiable | None:
         """Return the calls that differentiate log-likelihoods; None for a model without a gradient."""

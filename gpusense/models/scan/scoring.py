@@ -62,6 +62,14 @@ def run(pipeline: ScanPipeline, request: Request, space: Workspace, last: LastCa
             space.submit()
 
 
+def terms_of(pipeline: ScanPipeline, each: np.ndarray, scans: ClassedScans) -> np.ndarray:
+    """Return (N, K) terms of the readings of a scan from the (N, R) terms of its rays; readings left out have 0."""
+    terms = np.zeros((len(each), pipeline.scanner.count), pipeline.real)
+    terms[:, scans.columns] = each[:, : len(scans.columns)]
+    terms[:, scans.left_out.constant_max] = NoReturn(pipeline.rules.z_max).number
+    return terms
+
+
 class _Scorer:
     """Run the programs of one group of scans; their readings are uploaded once."""
 
@@ -115,9 +123,8 @@ class _Scorer:
             self._last.together = max(self._last.together, readings.scans)
         if request.per_beam:
             each = np.empty((piece.count, len(scans.readings)), pipeline.real)
-            rows = self._rows(piece)
-            rows[:, scans.columns] = pipeline.backend.download(pipeline.parts(scoring).buffer, each)
-            rows[:, scans.left_out.constant_max] = NoReturn(pipeline.rules.z_max).number
+            each = pipeline.backend.download(pipeline.parts(scoring).buffer, each)
+            self._rows(piece)[...] = terms_of(pipeline, each, scans)
 
     def _fill(self, piece: Piece, scans: ClassedScans, value: float) -> None:
         """Set log-likelihoods that do not depend on the poses; device poses are still inspected."""

@@ -130,9 +130,10 @@ class FilterCore:
         self.recovery.corrected(used, self.last)
 
     def _learn(self) -> None:
-        """Learn from the scans of the last correction."""
+        """Learn from the scans of the last correction, unless they contradict the pose."""
+        doubted = self.recovery.is_doubted()
         for sensor in self.sensors:
-            sensor.learn()
+            sensor.learn(doubted=doubted)
 
     def reset(self) -> None:
         """Replace half of the particles by poses that make the last readings likely, moved by all later motion."""

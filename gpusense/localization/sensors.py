@@ -103,8 +103,8 @@ class Sensor:
         return self._known[1]
 
     def restart(self) -> None:
-        """Reset the count of scans."""
-        self._seen, self._learned = 0, -1
+        """Reset the count of scans, and drop the lesson."""
+        self._seen, self._learned, self._lesson = 0, -1, None
 
     @property
     def due(self) -> bool:
@@ -154,9 +154,11 @@ class Sensor:
         if lesson is not None and callable(lesson.terms):
             self._lesson = lesson._replace(terms=np.asarray(lesson.terms(), np.float64))
 
-    def learn(self) -> None:
-        """Learn the correlation of beams from the received lesson."""
-        if self._lesson is not None:
+    def learn(self, *, doubted: bool) -> None:
+        """Learn the correlation of beams from the received lesson, or drop it if its pose is doubted by now."""
+        if doubted:
+            self._lesson, self._learned = None, -1
+        elif self._lesson is not None:
             # A new object, since the correlation is part of the state.
             correlation = copy.copy(self._correlation)
             terms, axes, directions, follows = self._lesson

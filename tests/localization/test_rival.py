@@ -128,7 +128,7 @@ def test_the_temperature_does_not_learn_from_a_doubtful_pose(model):
         pf.predict((0, 0, 0), (0, 0, 0))
         pf.correct(z)
         found.append((pf.estimate().explained, pf.temperatures))
-    # The filter learned from the first scan elsewhere before it judged it.
+    # The filter drops the first scan elsewhere after judging it.
     doubtful = [after for (explained, before), (_, after) in itertools.pairwise(found) if explained < 0.3]
     assert len(doubtful) > 1 and set(doubtful) == {found[0][1]}
 

@@ -155,6 +155,7 @@ def test_a_filter_learns_from_each_scanner_while_its_particles_lie_together():
     copied = pickle.loads(pickle.dumps(pf))
     for one in (pf, copied):
         assert one.temperatures == known
+        one.correct({one.models[0]: ranges})
         one.initialize_uniform()
         one.correct({one.models[0]: np.full(60, 20.0)})
         assert [sensor._correlation.scans for sensor in one._sensors] == [8, 8]

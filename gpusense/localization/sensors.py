@@ -131,9 +131,9 @@ class Sensor:
             self.upload(reading)
         if self._terms is None:
             backend, count = self.backend, len(poses)
-            around = backend.blank(poses.size, _DOUBLE)
+            around = backend.empty_external(poses.size, _DOUBLE)
             ranges = backend.view(self._ranges, (self.model.scanner.count,), _DOUBLE)
-            out = backend.view(backend.blank(count, self.precision), (count,), self.precision)
+            out = backend.view(backend.empty_external(count, self.precision), (count,), self.precision)
             self._terms = around, self.model.bind_terms(backend.view(around, poses.shape, _DOUBLE), ranges, out)
         around, call = self._terms
         if call is None:

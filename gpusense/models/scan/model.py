@@ -313,7 +313,7 @@ class ScanModel(Pickled):
         from gpusense.models.scan.packed_call import host_task
 
         pipeline = self._pipeline
-        plain = pipeline.specialize and pipeline.rules.separate and pipeline.setting.possible
+        plain = pipeline.specialize and pipeline.rules.separate and pipeline.context.possible
         if not plain or host_task(pipeline):
             return None
         return DeviceCall(pipeline, self._lock, poses, ranges, out, per_beam=True)

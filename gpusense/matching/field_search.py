@@ -35,7 +35,7 @@ from gpusense.world.scanner import classify_ranges
 # Side of the largest block with one bound, relative to the field's max_distance, and most levels.
 _BLOCK, _MOST_LEVELS = 0.8, 5
 # Tiles along a side of a cell for bilinear fields, if this many table cells suffice.
-_TILES, _MOST_TABLE_CELLS = (4, 2, 1), 1 << 28
+_TILES, _MOST_TABLE_CELLS = (4, 2, 1), 1 << 25
 # Most poses of scans that are searched together.
 _MOST_POSES = 1 << 33
 # Rounding of a log-likelihood, in steps for each hit.

@@ -19,8 +19,8 @@ RUN = 16
 SHIFT_ROWS = 8
 # Levels between the blocks of a level and the steps of their first cells.
 _STEP = 2
-# Largest score of a cell.
-TOP = 255
+# Largest score of a cell, and scores in a unit of the losses of folded tables.
+TOP, _UNIT = 255, 8
 # Cells of a table and of its copies, which kernels index in 32 bits.
 _MOST_CELLS = (1 << 31) - 1
 
@@ -50,6 +50,7 @@ class Folded(NamedTuple):
         period: Cells of the tables between neighbouring cells of an image.
         step: Cells between first cells of neighbouring images.
         offset: Column and row of the tables' first cell in the images' source.
+        unit: Scores in a unit of a loss.
     """
 
     table: Buffer
@@ -57,6 +58,7 @@ class Folded(NamedTuple):
     period: int
     step: int
     offset: int
+    unit: int
 
 
 class ScoreTables:
@@ -90,16 +92,21 @@ class ScoreTables:
         padded[:, inside, inside] = stack
         self._levels: list[Buffer] = [backend.upload(padded)]
         self._folded: dict[int, Folded] = {}
+        self._quarters: dict[tuple[int, bool], Buffer] = {}
 
     @staticmethod
     def _cells(shape: ScoreTable) -> int:
         return shape.tables * (shape.rows + 2 * shape.margin) * (shape.cols + 2 * shape.margin)
 
     @property
+    def _size(self) -> tuple[int, int, int]:
+        return self.shape.cols + 2 * self.shape.margin, self.shape.rows + 2 * self.shape.margin, self.shape.tables
+
+    @property
     def table_bytes(self) -> int:
         """Bytes of all tables made on the device so far."""
         folded = sum(self._cells(one.shape) for one in self._folded.values())
-        return len(self._levels) * self._cells(self.shape) + folded
+        return (len(self._levels) + 4 * len(self._quarters)) * self._cells(self.shape) + folded
 
     @staticmethod
     def step(level: int) -> int:
@@ -115,18 +122,28 @@ class ScoreTables:
     def _pooled(self, table: Buffer, reach: int) -> Buffer:
         """Return tables of the largest score of each cell and the cells up to ``reach`` further."""
         made = self.backend.empty(self._cells(self.shape), _BYTE)
-        size = (self.shape.cols + 2 * self.shape.margin, self.shape.rows + 2 * self.shape.margin, self.shape.tables)
-        self.backend.compile("pool_scores", _NO_FLAGS)(size, table, made, self.shape, reach)
+        self.backend.compile("pool_scores", _NO_FLAGS)(self._size, table, made, self.shape, reach)
         return made
 
+    def quarters(self, level: int, *, top: bool) -> Buffer:
+        """Return the losses of four blocks of a level that make a block of the next one, in the bytes of numbers.
+
+        They are relative to the score of the larger block or, with ``top``, to the largest score of a cell.
+        """
+        if (level, top) not in self._quarters:
+            table, made = self.level(level), self.backend.empty(self._cells(self.shape), np.dtype(np.int32))
+            pack = self.backend.compile("pack_quarters", _NO_FLAGS)
+            pack(self._size, table, made, self.shape, (1 << level) * self.stride, int(top))
+            self._quarters[level, top] = made
+        return self._quarters[level, top]
+
     def folded(self, level: int) -> Folded:
-        """Return the tables of a level in which blocks of positions are neighbours.
+        """Return the losses of a level in tables in which blocks of positions are neighbours.
 
         Their cells begin at multiples of a step, so a cell covers additional cells for points off the multiples.
+        Losses of poses are exact; losses of blocks are rounded down to units.
         """
-        period, step = self.stride << level, self.step(level)
-        if period == 1:
-            return Folded(self.level(0), self.shape, 1, 1, 0)
+        period, step, unit = self.stride << level, self.step(level), _UNIT if level else 1
         if level not in self._folded:
             lines, stride = self.shape.rows + 2 * self.shape.margin, self.shape.cols + 2 * self.shape.margin
             images = self.shape.tables * (period // step) ** 2
@@ -137,8 +154,8 @@ class ScoreTables:
             size = (shape.cols + 2 * RUN, shape.rows + 2 * RUN, shape.tables)
             source = self._pooled(self.level(level), step - 1) if step > 1 else self.level(level)
             fold = self.backend.compile("fold_scores", _NO_FLAGS)
-            fold(size, source, made, self.shape, shape, period, step, self._beyond)
+            fold(size, source, made, self.shape, shape, period, step, self._beyond, unit)
             # The pooled copy lives until the launch has ended.
             self.backend.synchronize()
-            self._folded[level] = Folded(made, shape, period, step, self.shape.margin)
+            self._folded[level] = Folded(made, shape, period, step, self.shape.margin, unit)
         return self._folded[level]

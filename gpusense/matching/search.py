@@ -23,23 +23,21 @@ __all__ = ["Found", "PoseGrid", "Search"]
 
 _INT = np.dtype(np.int32)
 _NO_FLAGS: frozenset[str] = frozenset()
-# Blocks of a scan that the first lower bound comes from, and growth of their number from round to round.
-_FIRST, _GROWTH = 128, 16
-# Above all bounds.
-_HIGHEST = np.iinfo(np.int32).max
-# Blocks of a round some of which are followed first.
-_CROWDED = 1 << 13
+# Blocks of a scan that are followed down to poses for its first lower bound.
+_FOLLOWED = 512
 # Sums of a scan's bounds that a level of smaller blocks may take.
 _MOST_SUMS = 1 << 29
-# Blocks for which a round has room at first, most blocks of a launch that divides them, and most poses that are kept.
-_ROOM, _MOST_BLOCKS, _MOST_KEPT = 1 << 17, 1 << 17, 1 << 18
+# Blocks for which a launch has room at first, most blocks of a launch that divides them, and most poses that are kept.
+_ROOM, _MOST_BLOCKS, _MOST_KEPT = 1 << 17, 1 << 18, 1 << 18
 # Most items of one launch: some drivers allow 65535 groups along the last axis.
 _MOST_ITEMS = 1 << 15
 # Counts between two uploads of zeros.
 _COUNTS = 64
+# Turn of the circle between points that are summed in turns, so that few of them tell about all directions.
+_TURN = (5**0.5 - 1) / 2
 # Arrays that place end points, and arrays of placed points.
 _GIVEN = ("end", "heading", "start", "first", "image")
-_MADE = ("point", "run", "run image", "weight", "runs")
+_MADE = ("point", "folded", "folded image")
 
 
 class Search:
@@ -88,8 +86,7 @@ class Search:
         if level == 0:
             run.keep_all()
         else:
-            run.dive()
-            run.descend_all()
+            run.search()
         return run.found()
 
     def _first_level(self, points: Sequence[np.ndarray], grid: PoseGrid) -> int:
@@ -127,9 +124,6 @@ class _Run:
         self._kept: list[np.ndarray] = []
         self._evaluated = 0
         self._bounds_made: Buffer | None = None
-        # The lower bounds on the device, and the counts of launches.
-        self._low: Buffer | None = None
-        self._floor_there: np.ndarray | None = None
         self._counts, self._slot = None, -1
 
     def place(self, points: Sequence[np.ndarray], images: Sequence[np.ndarray] | None) -> None:
@@ -140,14 +134,19 @@ class _Run:
         if images is None:
             several = self._tables.shape.tables > 1
             images = [np.full(len(part), scan if several else 0) for scan, part in enumerate(points)]
-        each = [np.tile(part, self._turns) if part.ndim == 1 else part.reshape(-1) for part in images]
+        orders = [np.argsort(np.arange(len(part)) * _TURN % 1) for part in points]
+        each = [
+            np.tile(part[order], self._turns) if part.ndim == 1 else part[:, order].reshape(-1)
+            for part, order in zip(images, orders, strict=True)
+        ]
         turned = np.stack([np.cos(grid.headings), np.sin(grid.headings)], axis=-1)
+        ends = [part[order] for part, order in zip(points, orders, strict=True)]
         given: tuple[np.ndarray, ...] = (
-            _filled(np.concatenate([*points, np.empty((0, 2))])), turned.reshape(-1), grid.start.astype(np.float64),
+            _filled(np.concatenate([*ends, np.empty((0, 2))])), turned.reshape(-1), grid.start.astype(np.float64),
             first, _filled(np.concatenate(each).astype(np.int32)),
         )  # fmt: skip
         total = max(int(first[-1]), 1)
-        sizes = 2 * total, 2 * total, total, total, len(counts)
+        sizes = 2 * total, 2 * total, total
         made: list[Any]
         uploaded: list[Any]
         if self._backend.info.float64:
@@ -162,98 +161,84 @@ class _Run:
         if not self._backend.info.float64:
             uploaded = [space.upload(name, array) for name, array in zip(_GIVEN, given, strict=True)]
             made = [space.upload(name, array) for name, array in zip(_MADE, made, strict=True)]
-        self._first, self._images = uploaded[-2:]
-        self._points, self._runs = made[0], made[1:]
+        first_there, images_there = uploaded[-2:]
+        self._ends, self._folded_ends = (made[0], images_there, first_there), (made[1], made[2], first_there)
 
     def _bounds(self) -> Buffer:
         """Start bounding all blocks, and return their scores (S * A, rows, cols) on the device; others have -1."""
         if self._bounds_made is None:
-            folded, space, items = self._tables.folded(self._level), self._space, self._grid.headings.size
-            run, image, weight, runs = self._runs
-            score = space.empty("bounds", items * self._height * self._width, _INT)
+            folded, items = self._tables.folded(self._level), self._grid.headings.size
+            score = self._space.empty("bounds", items * self._height * self._width, _INT)
             flags = with_lanes_flag(self._backend.info.lanes, "shift_scores", _NO_FLAGS)
             shift = self._backend.compile("shift_scores", flags)
             for begin in range(0, items, _MOST_ITEMS):
                 end = min(begin + _MOST_ITEMS, items)
                 shift(
-                    (self._width, -(-self._height // SHIFT_ROWS), end - begin), folded.table, run, image, weight,
-                    self._first, runs, self._allowed[self._level], score, folded.shape, begin, end, self._height,
-                    self._width,
+                    (self._width, -(-self._height // SHIFT_ROWS), end - begin), folded.table, *self._folded_ends,
+                    self._allowed[self._level], score, folded.shape, begin, end, self._height, self._width, folded.unit,
                 )  # fmt: skip
             self._evaluated += items * self._height * self._width
             self._bounds_made = score
         return self._bounds_made
 
-    def dive(self) -> None:
-        """Find first lower bounds: follow the best blocks of each scan, and the best of their parts, down to poses."""
+    def search(self) -> None:
+        """Find first lower bounds, then divide all blocks whose bounds reach them."""
         rows, scans = self._grid.headings.size * self._height, len(self._best)
         self._maxima = self._space.empty("row maxima", 2 * rows, _INT)
         self._backend.compile("row_maxima", _NO_FLAGS)((rows,), self._bounds(), self._maxima, rows, self._width)
         best = np.empty((rows, 2), np.int32)
         self._space.read(self._maxima, best)
         of_scan = best[:, 0].reshape(scans, -1)
-        # In rising order: the k-th largest of a scan bounds the blocks of a round.
-        self._ladder = np.sort(of_scan, axis=1)
-        least = np.maximum(self._ladder[:, -min(_FIRST, of_scan.shape[1])], 0)
+        most = min(_FOLLOWED, of_scan.shape[1])
+        least = np.maximum(np.partition(of_scan, -most, axis=1)[:, -most], 0)
         flat = np.concatenate([
-            _thinned(np.flatnonzero(values >= low), _FIRST) + scan * of_scan.shape[1]
+            _thinned(np.flatnonzero(values >= low), _FOLLOWED) + scan * of_scan.shape[1]
             for scan, (values, low) in enumerate(zip(of_scan, least, strict=True))
         ])  # fmt: skip
         item, row = np.divmod(flat, self._height)
         blocks = np.stack([item, row << self._level, best[flat, 1] << self._level, best[flat, 0]], axis=1)
-        self._follow(blocks, _FIRST)
+        self._follow(self._space.upload("followed", blocks.astype(np.int32)), len(blocks))
+        self._descend(*self._choose(), self._level)
 
-    def _follow(self, blocks: np.ndarray, most: int) -> None:
-        """Raise lower bounds: follow the best parts of blocks, ``most`` of each scan and level, down to poses."""
-        none = np.full(len(self._best), -1)
+    def _follow(self, blocks: Buffer, count: int) -> None:
+        """Raise lower bounds: follow the best parts of blocks down to poses."""
         for level in range(self._level - 1, -1, -1):
-            here = self._space.upload("followed", np.ascontiguousarray(blocks, np.int32))
-            made, count = self._divide(here, len(blocks), level, none)
-            if not count:
-                return
-            blocks = self._read(made, count)
-            blocks = blocks[_ranks(blocks[:, 0] // self._turns, blocks[:, 3]) < most]
-        self._raise(blocks)
+            top = level == self._level - 1
+            self._backend.compile("follow_blocks", _NO_FLAGS)(
+                (count,), self._tables.quarters(level, top=top), *self._ends, self._allowed[level], blocks,
+                self._tables.shape, count, self._grid.height, self._grid.width, -(-self._grid.width >> level), level,
+                self._tables.stride, int(top),
+            )  # fmt: skip
+        self._evaluated += 4 * self._level * count
+        poses = np.empty((count, 4), np.int32)
+        self._space.read(blocks, poses)
+        self._raise(poses)
 
-    def descend_all(self) -> None:
-        """Divide all blocks whose bounds reach the floor, each scan's best blocks first."""
-        most, high = _FIRST, np.full(len(self._best), _HIGHEST)
-        room = _ROOM
+    def _choose(self) -> tuple[Buffer, int]:
+        """Return the blocks whose bounds reach the floor of their scan, and their number."""
+        space, rows, room = self._space, self._grid.headings.size * self._height, _ROOM
         while True:
-            # Blocks without an allowed position have -1.
-            floor = np.maximum(self._floor, 0)
-            most = min(most * _GROWTH, self._ladder.shape[1])
-            low = floor if most == self._ladder.shape[1] else np.maximum(self._ladder[:, -most], floor)
-            blocks, count = self._choose(low, high, room)
-            if count > room:
-                room = count
-                blocks, count = self._choose(low, high, room)
-            if count > _CROWDED and high[0] == _HIGHEST:
-                # Many equal bounds: some of the blocks raise the floor before all are divided.
-                self._follow(_thinned(self._read(blocks, count), _CROWDED // 8), _CROWDED // 8)
-            self._descend(blocks, count, self._level)
-            if (low <= floor).all():
-                return
-            high = low
+            made, low = space.empty("blocks", 4 * room, _INT), space.upload("low", self._low())
+            counter, slot = self._counter()
+            self._backend.compile("choose_blocks", _NO_FLAGS)(
+                (rows,), self._bounds(), self._maxima, low, made, counter, rows, self._height, self._width,
+                self._turns, self._level, room, slot,
+            )  # fmt: skip
+            count = self._counted()
+            if count <= room:
+                return made, count
+            room = count
 
-    def _choose(self, low: np.ndarray, high: np.ndarray, room: int) -> tuple[Buffer, int]:
-        """Return the blocks whose bounds lie between two scores of their scan, and their number."""
-        space, rows = self._space, self._grid.headings.size * self._height
-        made = space.empty("blocks", 4 * room, _INT)
-        limits = [space.upload(name, part.astype(np.int32)) for name, part in (("low", low), ("high", high))]
-        self._low, self._floor_there = limits[0], low
-        count, slot = self._counter()
-        self._backend.compile("choose_blocks", _NO_FLAGS)(
-            (rows,), self._bounds(), self._maxima, *limits, made, count, rows, self._height, self._width, self._turns,
-            self._level, room, slot,
-        )  # fmt: skip
-        return made, self._counted()
+    def _low(self) -> np.ndarray:
+        """Return the least scores of blocks that are divided; blocks without an allowed position have -1."""
+        low: np.ndarray = np.maximum(self._floor, 0).astype(np.int32)
+        return low
 
     def _descend(self, blocks: Buffer, count: int, level: int) -> None:
         """Divide blocks of a level down to poses, and keep those that reach the floor."""
         for begin in range(0, count, _MOST_BLOCKS):
             part = self._backend.part(blocks, 4 * begin, 4 * min(_MOST_BLOCKS, count - begin), _INT)
-            made, some = self._divide(part, min(_MOST_BLOCKS, count - begin), level - 1, self._floor)
+            made, some = self._divide(part, min(_MOST_BLOCKS, count - begin), level - 1)
             if some and level > 1:
                 self._descend(made, some, level - 1)
             elif some:
@@ -261,20 +246,15 @@ class _Run:
                 self._raise(poses)
                 self.keep(poses)
 
-    def _divide(self, blocks: Buffer, count: int, level: int, low: np.ndarray) -> tuple[Buffer, int]:
-        """Return the allowed quarters of blocks whose bounds reach ``low`` of their scan, and their number."""
-        if not count:
-            return blocks, 0
-        space, tables = self._space, self._tables
-        made = space.empty(f"parts {level}", 16 * count, _INT)
-        if self._floor_there is None or not np.array_equal(self._floor_there, low):
-            self._low = space.upload("low", low.astype(np.int32))
-            self._floor_there = low.copy()
+    def _divide(self, blocks: Buffer, count: int, level: int) -> tuple[Buffer, int]:
+        """Return the allowed quarters of blocks whose bounds reach the floor of their scan, and their number."""
+        made, low = self._space.empty(f"parts {level}", 16 * count, _INT), self._space.upload("low", self._low())
         counter, slot = self._counter()
+        top = level == self._level - 1
         self._backend.compile("divide_blocks", _NO_FLAGS)(
-            (count,), tables.level(level), tables.level(level + 1), self._points, self._images, self._first, blocks,
-            self._allowed[level], self._low, made, counter, tables.shape, count, self._grid.height, self._grid.width,
-            -(-self._grid.width >> level), self._turns, level, tables.stride, slot,
+            (count,), self._tables.quarters(level, top=top), *self._ends, self._allowed[level], blocks, low, made,
+            counter, self._tables.shape, count, self._grid.height, self._grid.width, -(-self._grid.width >> level),
+            self._turns, level, self._tables.stride, int(top), slot,
         )  # fmt: skip
         self._evaluated += 4 * count
         return made, self._counted()

@@ -8,8 +8,8 @@ integers, so a bound is never below a score that it bounds.
 
 Tables are consecutive, each with a margin of cells around the map. An item is a scan at a heading; its points are
 first[item] to first[item + 1] - 1, each of which names the table (image) that it reads. A folded table holds every
-period-th cell of a table as a separate image: shifts by whole periods read neighbours. A run is a number of
-neighbouring points that read the same cell.
+period-th cell of a table as a separate image: shifts by whole periods read neighbours. It holds losses: the largest
+score less the cell's, divided by a unit and rounded down, so that losses of several points fit a byte.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.interface.structs import ScoreTable
-from gpusense.reference.score_cells import cell_index, padded_lines, padded_stride
+from gpusense.reference.score_cells import TOP, cell_index, padded_lines, padded_stride
 
 # Sums of a block of candidates.
 _BLOCK = 1 << 22
@@ -35,36 +35,77 @@ def pool_scores(flags: frozenset[str], table: np.ndarray, pooled: np.ndarray, sc
 
 def fold_scores(
     flags: frozenset[str], table: np.ndarray, out: np.ndarray, scores: ScoreTable, folded: ScoreTable, period: int,
-    step: int, beyond: int,
+    step: int, beyond: int, unit: int,
 ) -> None:  # fmt: skip
-    """Write every period-th row and column of each padded table as an image, for first cells that are step apart."""
+    """Write the losses of every period-th row and column of each table as an image, for first cells step apart."""
     lines, stride = padded_lines(scores), padded_stride(scores)
     images = table[: scores.tables * lines * stride].reshape(scores.tables, lines, stride)
     side = period // step
     shape = (scores.tables, side, side, padded_lines(folded), padded_stride(folded))
     target = out[: int(np.prod(shape))].reshape(shape)
-    target[...] = beyond
+    target[...] = (TOP - beyond) // unit
     margin = folded.margin
     for i in range(side):
         for j in range(side):
             part = images[:, i * step :: period, j * step :: period]
-            target[:, i, j, margin : margin + part.shape[1], margin : margin + part.shape[2]] = part
+            target[:, i, j, margin : margin + part.shape[1], margin : margin + part.shape[2]] = (TOP - part) // unit
+
+
+def pack_quarters(
+    flags: frozenset[str], table: np.ndarray, quarters: np.ndarray, scores: ScoreTable, reach: int, top: int
+) -> None:
+    """Write the losses of the quarters of the block that begins at each cell, as bytes of a number.
+
+    They are relative to the largest of the four scores or, with ``top``, to the largest possible score.
+    """
+    lines, stride = padded_lines(scores), padded_stride(scores)
+    images = table[: scores.tables * lines * stride].reshape(scores.tables, lines, stride)
+    line, col = (np.minimum(np.arange(size) + reach, size - 1) for size in (lines, stride))
+    four = np.stack([images, images[:, :, col], images[:, line], images[:, line][:, :, col]], axis=-1)
+    most = TOP if top else four.max(axis=-1, keepdims=True)
+    losses = np.ascontiguousarray(most - four, dtype="u1")
+    quarters[: images.size] = losses.view("<u4")[..., 0].astype(np.uint32).view(np.int32).ravel()
+
+
+def divided(
+    quarters: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray, block: np.ndarray,
+    scores: ScoreTable, spacing: int, top: int,
+) -> np.ndarray:  # fmt: skip
+    """Return the scores (M, 4) of the quarters of blocks (M, 4): score less the losses of the item's points."""
+    size = padded_lines(scores) * padded_stride(scores)
+    total = np.empty((len(block), 4), np.int32)
+    for item in np.unique(block[:, 0]):
+        points = slice(first[item], first[item + 1])
+        begin = image[points].astype(np.int64) * size
+        mine = np.flatnonzero(block[:, 0] == item)
+        step = max(_BLOCK // max(len(begin), 1), 1)
+        for chosen in (mine[i : i + step] for i in range(0, len(mine), step)):
+            row = spacing * block[chosen, 1, None] + point[None, points, 1]
+            col = spacing * block[chosen, 2, None] + point[None, points, 0]
+            four = quarters[begin + cell_index(scores, row, col)]
+            score = TOP * len(begin) if top else block[chosen, 3]
+            for i in range(4):
+                total[chosen, i] = score - (four >> 8 * i & 255).sum(axis=1, dtype=np.int32)
+    return total
 
 
 def shift_scores(
-    flags: frozenset[str], table: np.ndarray, run: np.ndarray, image: np.ndarray, weight: np.ndarray,
-    first: np.ndarray, runs: np.ndarray, allowed: np.ndarray, score: np.ndarray, scores: ScoreTable, begin: int,
-    items: int, height: int, width: int,
+    flags: frozenset[str], table: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray,
+    allowed: np.ndarray, score: np.ndarray, scores: ScoreTable, begin: int, items: int, height: int, width: int,
+    unit: int,
 ) -> None:  # fmt: skip
-    """Sum the cells of each item's runs at all shifts by less than height rows and width columns; -1 if not allowed."""
+    """Sum the losses of each item's points at all shifts by less than height rows and width columns, and write scores.
+
+    A shift that is not allowed has -1.
+    """
     size = padded_lines(scores) * padded_stride(scores)
     total = score[: items * height * width].reshape(items, height, width)
     rows, cols = np.arange(height)[:, None], np.arange(width)[None, :]
     for item in range(begin, items):
-        total[item] = 0
-        for k in range(first[item], first[item] + runs[item]):
-            cells = table[int(image[k]) * size + cell_index(scores, run[k, 1] + rows, run[k, 0] + cols)]
-            total[item] += weight[k] * cells.astype(np.int32)
+        total[item] = TOP * (first[item + 1] - first[item])
+        for k in range(first[item], first[item + 1]):
+            cells = table[int(image[k]) * size + cell_index(scores, point[k, 1] + rows, point[k, 0] + cols)]
+            total[item] -= unit * cells.astype(np.int32)
     total[:, allowed[: height * width].reshape(height, width) == 0] = -1
 
 
@@ -77,51 +118,58 @@ def row_maxima(flags: frozenset[str], score: np.ndarray, best: np.ndarray, rows:
 
 
 def choose_blocks(
-    flags: frozenset[str], score: np.ndarray, best: np.ndarray, low: np.ndarray, high: np.ndarray, block: np.ndarray,
-    count: np.ndarray, rows: int, height: int, width: int, turns: int, level: int, room: int, slot: int,
+    flags: frozenset[str], score: np.ndarray, best: np.ndarray, low: np.ndarray, block: np.ndarray, count: np.ndarray,
+    rows: int, height: int, width: int, turns: int, level: int, room: int, slot: int,
 ) -> None:  # fmt: skip
-    """Collect the shifts whose scores are at least low and less than high of their scan."""
+    """Collect the shifts whose scores are at least low of their scan."""
     values = score[: rows * width].reshape(-1, height, width)
     scan = np.arange(len(values)) // turns
-    item, row, col = np.nonzero((values >= low[scan][:, None, None]) & (values < high[scan][:, None, None]))
+    item, row, col = np.nonzero(values >= low[scan][:, None, None])
     chosen = np.stack([item, row << level, col << level, values[item, row, col]], axis=1)[:room]
     block[: chosen.size] = chosen.ravel()
     count[slot] += len(item)
 
 
+def follow_blocks(
+    flags: frozenset[str], quarters: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray,
+    allowed: np.ndarray, block: np.ndarray, scores: ScoreTable, blocks: int, height: int, width: int, columns: int,
+    level: int, spacing: int, top: int,
+) -> None:  # fmt: skip
+    """Replace blocks by their best allowed quarters of 2^level x 2^level; a block without any has the score -1."""
+    here = block[: 4 * blocks].reshape(blocks, 4)
+    mine = np.flatnonzero(here[:, 3] >= 0)
+    total = divided(quarters, point, image, first, here[mine], scores, spacing, top)
+    parts, within = _quarters_of(here[mine], allowed, height, width, columns, level)
+    total = np.where(within, total, -1)
+    best = total.argmax(axis=1)
+    chosen = np.arange(len(mine)), best
+    some = total[chosen] >= 0
+    here[mine[some], 1:3] = parts[chosen][some]
+    here[mine, 3] = np.maximum(total[chosen], -1)
+
+
 def divide_blocks(
-    flags: frozenset[str], table: np.ndarray, above: np.ndarray, point: np.ndarray, image: np.ndarray,
-    first: np.ndarray, block: np.ndarray, allowed: np.ndarray, low: np.ndarray, part: np.ndarray, count: np.ndarray,
-    scores: ScoreTable, blocks: int, height: int, width: int, columns: int, turns: int, level: int, spacing: int,
-    slot: int,
+    flags: frozenset[str], quarters: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray,
+    allowed: np.ndarray, block: np.ndarray, low: np.ndarray, part: np.ndarray, count: np.ndarray, scores: ScoreTable,
+    blocks: int, height: int, width: int, columns: int, turns: int, level: int, spacing: int, top: int, slot: int,
 ) -> None:  # fmt: skip
     """Divide blocks into quarters of 2^level x 2^level, and collect the allowed ones that reach low of their scan."""
-    quarter = 1 << level
-    quarters = np.array([[0, i, j] for i in (0, quarter) for j in (0, quarter)])
-    parts = (block[: 4 * blocks].reshape(blocks, 1, 4)[..., :3] + quarters).reshape(-1, 3)
-    parts = parts[(parts[:, 1] < height) & (parts[:, 2] < width)]
-    parts = parts[allowed[(parts[:, 1] >> level) * columns + (parts[:, 2] >> level)] > 0]
-    total = _sums(table, point, image, first, parts * np.array([1, spacing, spacing]), scores)
-    reached = total >= low[parts[:, 0] // turns]
-    made = np.column_stack([parts, total])[reached]
+    here = block[: 4 * blocks].reshape(blocks, 4)
+    total = divided(quarters, point, image, first, here, scores, spacing, top)
+    parts, within = _quarters_of(here, allowed, height, width, columns, level)
+    number, which = np.nonzero(within & (total >= low[here[:, 0] // turns, None]))
+    made = np.column_stack([here[number, 0], parts[number, which], total[number, which]])
     begin = 4 * int(count[slot])
     part[begin : begin + made.size] = made.ravel()
     count[slot] += len(made)
 
 
-def _sums(
-    table: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray, shifts: np.ndarray, scores: ScoreTable
-) -> np.ndarray:
-    """Sum the cells of points at shifts (M, 3): an item, and rows and columns of cells."""
-    size = padded_lines(scores) * padded_stride(scores)
-    total = np.empty(len(shifts), np.int32)
-    for item in np.unique(shifts[:, 0]):
-        points = slice(first[item], first[item + 1])
-        begin = image[points].astype(np.int64) * size
-        mine = np.flatnonzero(shifts[:, 0] == item)
-        step = max(_BLOCK // max(len(begin), 1), 1)
-        for chosen in (mine[i : i + step] for i in range(0, len(mine), step)):
-            row = shifts[chosen, 1, None] + point[None, points, 1]
-            col = shifts[chosen, 2, None] + point[None, points, 0]
-            total[chosen] = table[begin + cell_index(scores, row, col)].sum(axis=1, dtype=np.int32)
-    return total
+def _quarters_of(
+    block: np.ndarray, allowed: np.ndarray, height: int, width: int, columns: int, level: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return first rows and columns (M, 4, 2) of the quarters of blocks (M, 4), and which are allowed (M, 4)."""
+    parts = block[:, None, 1:3] + (np.array([(0, 0), (0, 1), (1, 0), (1, 1)], np.int32) << level)
+    row, col = parts[..., 0], parts[..., 1]
+    within = (row < height) & (col < width)
+    within[within] = allowed[(row[within] >> level) * columns + (col[within] >> level)] > 0
+    return parts, within

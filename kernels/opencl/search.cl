@@ -7,9 +7,12 @@
 //
 // Tables are consecutive, each with a margin of cells around the map. An item is a scan at a heading; its points are
 // first[item] to first[item + 1] - 1, each of which names the table (image) that it reads. A folded table holds every
-// period-th cell of a table as a separate image: shifts by whole periods read neighbours. A run is a number of neighbouring
-// points that read the same cell.
+// period-th cell of a table as a separate image: shifts by whole periods read neighbours. It holds losses: the largest score
+// less the cell's, divided by a unit and rounded down, so that losses of several points fit a byte.
 // requires: score_cells
+
+// Points after which sums are compared.
+#define STEP 16
 
 // Write the maximum of each cell and the cells up to reach rows and columns further. One work-item takes a cell.
 kernel void pool_scores(ARGUMENTS) {
@@ -23,8 +26,8 @@ kernel void pool_scores(ARGUMENTS) {
     pooled[(image * lines + line) * stride + col] = (uchar)max(upper, lower);
 }
 
-// Write every period-th row and column of each padded table as an image, for each of (period / step)^2 first cells, step
-// apart. One work-item takes a cell of an image.
+// Write the losses of every period-th row and column of each padded table as an image, for each of (period / step)^2 first
+// cells, step apart. One work-item takes a cell of an image.
 kernel void fold_scores(ARGUMENTS) {
     const int col = get_global_id(0), line = get_global_id(1), image = get_global_id(2);
     const int lines = padded_lines(folded), stride = padded_stride(folded);
@@ -34,27 +37,66 @@ kernel void fold_scores(ARGUMENTS) {
     const int from_col = (col - folded.margin) * period + phase % side * step;
     const int rows = padded_lines(scores), cols = padded_stride(scores);
     const bool within = line >= folded.margin && col >= folded.margin && from_line < rows && from_col < cols;
-    out[(image * lines + line) * stride + col] =
-        within ? table[(source * rows + from_line) * cols + from_col] : (uchar)beyond;
+    const int value = within ? table[(source * rows + from_line) * cols + from_col] : beyond;
+    out[(image * lines + line) * stride + col] = (uchar)((TOP - value) / unit);
 }
 
-// Sum the cells of each item's runs at all shifts by less than height rows and width columns; a shift that is not allowed
-// has -1. One work-item takes SHIFT_ROWS rows of a column of an item.
+// Write the losses of the quarters of the block that begins at each cell, as bytes of a number: upper left, upper right,
+// lower left, lower right. They are relative to the largest of the four scores or, with top, to the largest possible score.
+// A quarter has reach rows and columns. One work-item takes a cell.
+kernel void pack_quarters(ARGUMENTS) {
+    const int col = get_global_id(0), line = get_global_id(1), image = get_global_id(2);
+    const int lines = padded_lines(scores), stride = padded_stride(scores);
+    if (col >= stride || line >= lines || image >= scores.tables) return;
+    global const uchar *cells = table + image * lines * stride;
+    const int low = min(line + reach, lines - 1) * stride, right = min(col + reach, stride - 1);
+    const uint four[4] = {cells[line * stride + col], cells[line * stride + right], cells[low + col], cells[low + right]};
+    const uint most = top ? TOP : max(max(four[0], four[1]), max(four[2], four[3]));
+    uint packed = 0;
+    for (int i = 0; i < 4; ++i) packed |= (most - four[i]) << (8 * i);
+    quarters[(image * lines + line) * stride + col] = (int)packed;
+}
+
+// Return the scores of a block's quarters: score less the losses of points begin to end - 1. Once all are below least, the
+// other points are left out.
+int4 divided(global const int *quarters, global const int2 *point, global const int *image, const ScoreTable scores,
+             const int begin, const int end, const int row, const int col, const int score, const int least) {
+    const int size = padded_lines(scores) * padded_stride(scores);
+    int4 total = (int4)(score);
+    for (int k = begin; k < end;) {
+        const int stop = end - k > STEP ? k + STEP : end;
+        // Two sums of 16 bits in a number.
+        int even = 0, odd = 0;
+        for (; k < stop; ++k) {
+            const int four = quarters[image[k] * size + block_index(scores, point[k].y + row, point[k].x + col, 0, 0)];
+            even += four & 0xff00ff;
+            odd += four >> 8 & 0xff00ff;
+        }
+        total -= (int4)(even & 0xffff, odd & 0xffff, even >> 16, odd >> 16);
+        if (total.x < least && total.y < least && total.z < least && total.w < least) break;
+    }
+    return total;
+}
+
+// Sum the losses of each item's points at all shifts by less than height rows and width columns, and write the scores; a
+// shift that is not allowed has -1. One work-item takes SHIFT_ROWS rows of a column of an item.
 kernel void shift_scores(ARGUMENTS) {
     const int col = get_global_id(0), row = SHIFT_ROWS * get_global_id(1), item = begin + get_global_id(2);
     if (col >= width || row >= height || item >= items) return;
     int some = 0;
     for (int i = 0; i < SHIFT_ROWS && row + i < height; ++i) some |= allowed[(row + i) * width + col];
     const int stride = padded_stride(scores), size = padded_lines(scores) * stride;
-    const int last = first[item] + (some ? runs[item] : 0);
+    const int last = some ? first[item + 1] : first[item];
     int total[SHIFT_ROWS] = {0};
     for (int k = first[item]; k < last; ++k) {
         global const uchar *cells =
-            table + image[k] * size + block_index(scores, run[k].y + row, run[k].x + col, SHIFT_ROWS - 1, 0);
-        for (int i = 0; i < SHIFT_ROWS; ++i) total[i] += weight[k] * cells[i * stride];
+            table + image[k] * size + block_index(scores, point[k].y + row, point[k].x + col, SHIFT_ROWS - 1, 0);
+        for (int i = 0; i < SHIFT_ROWS; ++i) total[i] += cells[i * stride];
     }
-    for (int i = 0; i < SHIFT_ROWS && row + i < height; ++i)
-        score[(item * height + row + i) * width + col] = allowed[(row + i) * width + col] ? total[i] : -1;
+    for (int i = 0; i < SHIFT_ROWS && row + i < height; ++i) {
+        const int n = (row + i) * width + col;
+        score[item * height * width + n] = allowed[n] ? TOP * (last - first[item]) - unit * total[i] : -1;
+    }
 }
 
 // Find the largest score of each row of shifts, and its first column. One work-item takes a row of an item.
@@ -71,17 +113,17 @@ kernel void row_maxima(ARGUMENTS) {
     best[2 * n + 1] = place;
 }
 
-// Collect the shifts whose scores are at least low and less than high of their scan, in no certain order: item, first
-// row and column of each block, and score. count[slot], which the caller clears, may exceed room: then some are left out.
-// best is the result of row_maxima. One work-item takes a row of an item.
+// Collect the shifts whose scores are at least low of their scan, in no certain order: item, first row and column of each
+// block, and score. count[slot], which the caller clears, may exceed room: then some are left out. best is the result of
+// row_maxima. One work-item takes a row of an item.
 kernel void choose_blocks(ARGUMENTS) {
     const int k = get_global_id(0);
     if (k >= rows) return;
-    const int item = k / height, least = low[item / turns], most = high[item / turns];
+    const int item = k / height, least = low[item / turns];
     if (best[2 * k] < least) return;
     for (int col = 0; col < width; ++col) {
         const int value = score[k * width + col];
-        if (value < least || value >= most) continue;
+        if (value < least) continue;
         const int n = atomic_add(&count[slot], 1);
         if (n >= room) continue;
         block[4 * n] = item;
@@ -91,30 +133,39 @@ kernel void choose_blocks(ARGUMENTS) {
     }
 }
 
+// Replace blocks of positions by their best allowed quarters of 2^level x 2^level, the first of equal ones; a block without
+// an allowed quarter has the score -1. One work-item takes a block.
+kernel void follow_blocks(ARGUMENTS) {
+    const int n = get_global_id(0);
+    if (n >= blocks || block[4 * n + 3] < 0) return;
+    const int item = block[4 * n], row = block[4 * n + 1], col = block[4 * n + 2], quarter = 1 << level;
+    const int begin = first[item], end = first[item + 1], score = top ? TOP * (end - begin) : block[4 * n + 3];
+    const int4 sums =
+        divided(quarters, point, image, scores, begin, end, spacing * row, spacing * col, score, -1);
+    const int total[4] = {sums.x, sums.y, sums.z, sums.w};
+    int most = -1;
+    for (int i = 0; i < 4; ++i) {
+        const int part_row = row + i / 2 * quarter, part_col = col + i % 2 * quarter;
+        if (part_row >= height || part_col >= width || total[i] <= most) continue;
+        if (!allowed[(part_row >> level) * columns + (part_col >> level)]) continue;
+        most = total[i];
+        block[4 * n + 1] = part_row;
+        block[4 * n + 2] = part_col;
+    }
+    block[4 * n + 3] = most;
+}
+
 // Divide blocks of positions into quarters of 2^level x 2^level, and collect the allowed ones whose scores are at least low
-// of their scan, in no certain order. above has the tables of the blocks. The caller clears count[slot]. One work-item takes
-// a block.
+// of their scan, in no certain order. The caller clears count[slot]. One work-item takes a block.
 kernel void divide_blocks(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= blocks) return;
     const int item = block[4 * n], row = block[4 * n + 1], col = block[4 * n + 2], quarter = 1 << level;
-    const int stride = padded_stride(scores), size = padded_lines(scores) * stride, reach = spacing * quarter;
-    const int last = first[item + 1], least = low[item / turns], below = reach * stride;
-    int total[4] = {0, 0, 0, 0}, rest = block[4 * n + 3];
-    for (int k = first[item]; k < last; ++k) {
-        const int cell = image[k] * size +
-                         block_index(scores, point[k].y + spacing * row, point[k].x + spacing * col, reach, reach);
-        total[0] += table[cell];
-        total[1] += table[cell + reach];
-        total[2] += table[cell + below];
-        total[3] += table[cell + below + reach];
-        rest -= above[cell];
-        // The remaining points add no more than they do to the block's bound.
-        if (k % 16 == 15) {
-            const int upper = total[0] > total[1] ? total[0] : total[1], lower = total[2] > total[3] ? total[2] : total[3];
-            if ((upper > lower ? upper : lower) + rest < least) return;
-        }
-    }
+    const int begin = first[item], end = first[item + 1], least = low[item / turns];
+    const int score = top ? TOP * (end - begin) : block[4 * n + 3];
+    const int4 sums =
+        divided(quarters, point, image, scores, begin, end, spacing * row, spacing * col, score, least);
+    const int total[4] = {sums.x, sums.y, sums.z, sums.w};
     for (int i = 0; i < 4; ++i) {
         const int part_row = row + i / 2 * quarter, part_col = col + i % 2 * quarter;
         if (part_row >= height || part_col >= width || total[i] < least) continue;

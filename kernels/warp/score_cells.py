@@ -6,6 +6,8 @@ from .prelude import precision
 
 # Neighbouring rows of shifts that a work-item sums; the margin holds as many.
 SHIFT_ROWS = 8
+# Largest score of a cell.
+TOP = 255
 # The struct has integers only, and so is the same in both precisions.
 ScoreTable = precision(frozenset()).ScoreTable
 

@@ -8,17 +8,19 @@ integers, so a bound is never below a score that it bounds.
 
 Tables are consecutive, each with a margin of cells around the map. An item is a scan at a heading; its points are
 first[item] to first[item + 1] - 1, each of which names the table (image) that it reads. A folded table holds every
-period-th cell of a table as a separate image: shifts by whole periods read neighbours. A run is a number of
-neighbouring points that read the same cell.
+period-th cell of a table as a separate image: shifts by whole periods read neighbours. It holds losses: the largest
+score less the cell's, divided by a unit and rounded down, so that losses of several points fit a byte.
 """
 
 import warp as wp
 
 from .prelude import kernel
-from .score_cells import SHIFT_ROWS, block_index, padded_lines, padded_stride
+from .score_cells import SHIFT_ROWS, TOP, ScoreTable, block_index, padded_lines, padded_stride
 
 # Sums of neighbouring rows.
 Rows = wp.types.vector(length=SHIFT_ROWS, dtype=wp.int32)
+# Points after which sums are compared.
+STEP = 16
 
 
 @kernel()
@@ -38,9 +40,9 @@ def pool_scores(table, pooled, scores, reach):
 
 
 @kernel()
-def fold_scores(table, out, scores, folded, period, step, beyond):
-    """Write every period-th row and column of each padded table as an image, for each of (period / step)^2 first cells,
-    step apart. One work-item takes a cell of an image.
+def fold_scores(table, out, scores, folded, period, step, beyond, unit):
+    """Write the losses of every period-th row and column of each padded table as an image, for each of
+    (period / step)^2 first cells, step apart. One work-item takes a cell of an image.
     """
     image, line, col = wp.tid()
     lines = padded_lines(folded)
@@ -54,16 +56,69 @@ def fold_scores(table, out, scores, folded, period, step, beyond):
     from_col = (col - folded.margin) * period + phase % side * step
     rows = padded_lines(scores)
     cols = padded_stride(scores)
-    value = wp.uint8(beyond)
+    value = int(beyond)
     if line >= folded.margin and col >= folded.margin and from_line < rows and from_col < cols:
-        value = table[(source * rows + from_line) * cols + from_col]
-    out[(image * lines + line) * stride + col] = value
+        value = int(table[(source * rows + from_line) * cols + from_col])
+    out[(image * lines + line) * stride + col] = wp.uint8((TOP - value) // unit)
 
 
 @kernel()
-def shift_scores(table, run, image, weight, first, runs, allowed, score, scores, begin, items, height, width):
-    """Sum the cells of each item's runs at all shifts by less than height rows and width columns; a shift that is not
-    allowed has -1. One work-item takes SHIFT_ROWS rows of a column of an item.
+def pack_quarters(table, quarters, scores, reach, top):
+    """Write the losses of the quarters of the block that begins at each cell, as bytes of a number: upper left, upper
+    right, lower left, lower right. They are relative to the largest of the four scores or, with top, to the largest
+    possible score. A quarter has reach rows and columns. One work-item takes a cell.
+    """
+    image, line, col = wp.tid()
+    lines = padded_lines(scores)
+    stride = padded_stride(scores)
+    if col >= stride or line >= lines or image >= scores.tables:
+        return
+    begin = image * lines * stride
+    low = begin + wp.min(line + reach, lines - 1) * stride
+    right = wp.min(col + reach, stride - 1)
+    here = begin + line * stride
+    four = wp.vec4i(int(table[here + col]), int(table[here + right]), int(table[low + col]), int(table[low + right]))
+    most = wp.max(four)
+    if top != 0:
+        most = int(TOP)
+    packed = int(0)
+    for i in range(4):
+        packed = packed | ((most - four[i]) << (8 * i))
+    quarters[here + col] = packed
+
+
+@wp.func
+def divided(
+    quarters: wp.array(dtype=wp.int32), point: wp.array(dtype=wp.vec2i), image: wp.array(dtype=wp.int32),
+    scores: ScoreTable, begin: wp.int32, end: wp.int32, row: wp.int32, col: wp.int32, score: wp.int32, least: wp.int32,
+):  # fmt: skip
+    """Return the scores of a block's quarters: score less the losses of points begin to end - 1. Once all are below
+    least, the other points are left out.
+    """
+    size = padded_lines(scores) * padded_stride(scores)
+    total = wp.vec4i(score, score, score, score)
+    k = int(begin)
+    while k < end:
+        stop = wp.min(k + STEP, end)
+        # Two sums of 16 bits in a number.
+        even = int(0)
+        odd = int(0)
+        while k < stop:
+            cell = point[k]
+            four = quarters[image[k] * size + block_index(scores, cell.y + row, cell.x + col, 0, 0)]
+            even = even + (four & 0xFF00FF)
+            odd = odd + ((four >> 8) & 0xFF00FF)
+            k = k + 1
+        total = total - wp.vec4i(even & 0xFFFF, odd & 0xFFFF, even >> 16, odd >> 16)
+        if wp.max(total) < least:
+            k = end
+    return total
+
+
+@kernel()
+def shift_scores(table, point, image, first, allowed, score, scores, begin, items, height, width, unit):
+    """Sum the losses of each item's points at all shifts by less than height rows and width columns, and write the
+    scores; a shift that is not allowed has -1. One work-item takes SHIFT_ROWS rows of a column of an item.
     """
     part, block, col = wp.tid()
     item = begin + part
@@ -77,19 +132,19 @@ def shift_scores(table, run, image, weight, first, runs, allowed, score, scores,
     size = padded_lines(scores) * stride
     last = first[item]
     if some > 0:
-        last = first[item] + runs[item]
+        last = first[item + 1]
     total = Rows()
     for k in range(first[item], last):
-        cell = run[k]
+        cell = point[k]
         place = image[k] * size + block_index(scores, cell.y + row, cell.x + col, SHIFT_ROWS - 1, 0)
         for i in range(SHIFT_ROWS):
-            total[i] = total[i] + weight[k] * int(table[place + i * stride])
+            total[i] = total[i] + int(table[place + i * stride])
     for i in range(SHIFT_ROWS):
         if row + i < height:
             n = (row + i) * width + col
             value = int(-1)
             if allowed[n] > wp.uint8(0):
-                value = total[i]
+                value = TOP * (last - first[item]) - unit * total[i]
             score[item * height * width + n] = value
 
 
@@ -110,22 +165,21 @@ def row_maxima(score, best, rows, width):
 
 
 @kernel()
-def choose_blocks(score, best, low, high, block, count, rows, height, width, turns, level, room, slot):
-    """Collect the shifts whose scores are at least low and less than high of their scan, in no certain order: item,
-    first row and column of each block, and score. count[slot], which the caller clears, may exceed room: then some
-    are left out. best is the result of row_maxima. One work-item takes a row of an item.
+def choose_blocks(score, best, low, block, count, rows, height, width, turns, level, room, slot):
+    """Collect the shifts whose scores are at least low of their scan, in no certain order: item, first row and column
+    of each block, and score. count[slot], which the caller clears, may exceed room: then some are left out. best is
+    the result of row_maxima. One work-item takes a row of an item.
     """
     k = wp.tid()
     if k >= rows:
         return
     item = k // height
     least = low[item // turns]
-    most = high[item // turns]
     if best[2 * k] < least:
         return
     for col in range(width):
         value = score[k * width + col]
-        if value >= least and value < most:
+        if value >= least:
             n = wp.atomic_add(count, slot, 1)
             if n < room:
                 block[4 * n] = item
@@ -135,13 +189,45 @@ def choose_blocks(score, best, low, high, block, count, rows, height, width, tur
 
 
 @kernel()
+def follow_blocks(
+    quarters, point, image, first, allowed, block, scores, blocks, height, width, columns, level, spacing, top
+):  # fmt: skip
+    """Replace blocks of positions by their best allowed quarters of 2^level x 2^level, the first of equal ones; a block
+    without an allowed quarter has the score -1. One work-item takes a block.
+    """
+    n = wp.tid()
+    if n >= blocks:
+        return
+    score = block[4 * n + 3]
+    if score < 0:
+        return
+    item = block[4 * n]
+    row = block[4 * n + 1]
+    col = block[4 * n + 2]
+    begin = first[item]
+    end = first[item + 1]
+    if top != 0:
+        score = TOP * (end - begin)
+    total = divided(quarters, point, image, scores, begin, end, spacing * row, spacing * col, score, -1)
+    most = int(-1)
+    for i in range(4):
+        part_row = row + ((i // 2) << level)
+        part_col = col + ((i % 2) << level)
+        if part_row < height and part_col < width and total[i] > most:
+            if allowed[(part_row >> level) * columns + (part_col >> level)] > wp.uint8(0):
+                most = total[i]
+                block[4 * n + 1] = part_row
+                block[4 * n + 2] = part_col
+    block[4 * n + 3] = most
+
+
+@kernel()
 def divide_blocks(
-    table, above, point, image, first, block, allowed, low, part, count, scores, blocks, height, width, columns, turns,
-    level, spacing, slot,
+    quarters, point, image, first, allowed, block, low, part, count, scores, blocks, height, width, columns, turns,
+    level, spacing, top, slot,
 ):  # fmt: skip
     """Divide blocks of positions into quarters of 2^level x 2^level, and collect the allowed ones whose scores are at
-    least low of their scan, in no certain order. above has the tables of the blocks. The caller clears count[slot].
-    One work-item takes a block.
+    least low of their scan, in no certain order. The caller clears count[slot]. One work-item takes a block.
     """
     n = wp.tid()
     if n >= blocks:
@@ -149,30 +235,16 @@ def divide_blocks(
     item = block[4 * n]
     row = block[4 * n + 1]
     col = block[4 * n + 2]
-    quarter = 1 << level
-    stride = padded_stride(scores)
-    size = padded_lines(scores) * stride
-    reach = spacing * quarter
-    last = first[item + 1]
+    begin = first[item]
+    end = first[item + 1]
     least = low[item // turns]
-    below = reach * stride
-    total = wp.vec4i()
-    rest = block[4 * n + 3]
-    for k in range(first[item], last):
-        cell = point[k]
-        begin = image[k] * size
-        begin += block_index(scores, cell.y + spacing * row, cell.x + spacing * col, reach, reach)
-        rest = rest - int(above[begin])
-        total[0] = total[0] + int(table[begin])
-        total[1] = total[1] + int(table[begin + reach])
-        total[2] = total[2] + int(table[begin + below])
-        total[3] = total[3] + int(table[begin + below + reach])
-        # The remaining points add no more than they do to the block's bound.
-        if k % 16 == 15 and wp.max(total) + rest < least:
-            return
+    score = block[4 * n + 3]
+    if top != 0:
+        score = TOP * (end - begin)
+    total = divided(quarters, point, image, scores, begin, end, spacing * row, spacing * col, score, least)
     for i in range(4):
-        part_row = row + i // 2 * quarter
-        part_col = col + i % 2 * quarter
+        part_row = row + ((i // 2) << level)
+        part_col = col + ((i % 2) << level)
         if part_row < height and part_col < width and total[i] >= least:
             if allowed[(part_row >> level) * columns + (part_col >> level)] > wp.uint8(0):
                 m = wp.atomic_add(count, slot, 1)

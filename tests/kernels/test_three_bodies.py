@@ -113,7 +113,7 @@ ON_PURPOSE = [
     Purpose("scan", "count_informative read_block chosen_of placed_of longest_beside fill_item", KERNELS_ONLY, BLOCKS),
     Purpose("score_cells", "block_index", KERNELS_ONLY, "the reference clamps each cell by itself"),
     Purpose("score_cells", "cell_index", REFERENCE_ONLY, ARRAYS),
-    Purpose("search", "_sums", REFERENCE_ONLY, ARRAYS),
+    Purpose("search", "_quarters_of", REFERENCE_ONLY, ARRAYS),
     Purpose("search_ends", "floored", KERNELS_ONLY, "NumPy's division of integers rounds down"),
     Purpose("segments", "add_row", KERNELS_ONLY, "points come one after another, added by rotations"),
     Purpose("segments", "with_point", (WARP,), "OpenCL's functions take pointers to rows"),

@@ -77,34 +77,41 @@ def test_kernels_have_the_sums_of_the_reference(name, needs):
     # The margin holds the value of cells beyond the table.
     table = np.full((2, 52, 63), 9, np.uint8)
     table[:, 16:-16, 16:-16] = rng.integers(0, 256, (2, 20, 31))
-    above = np.full_like(table, 255)
-    first, runs = np.array([0, 40, 40, 700], np.int32), np.array([33, 0, 650], np.int32)
-    point = rng.integers(-60, 90, (700, 2)).astype(np.int32)
-    image, weight = rng.integers(0, 2, 700).astype(np.int32), rng.integers(1, 65, 700).astype(np.int32)
+    quarters = rng.integers(-(2**31), 2**31, (2, 52, 63)).astype(np.int32)
+    losses = table // 8
+    first = np.array([0, 40, 40, 2700], np.int32)
+    point = rng.integers(-60, 90, (2700, 2)).astype(np.int32)
+    image = rng.integers(0, 2, 2700).astype(np.int32)
     allowed = (rng.random((11, 21)) < 0.4).astype(np.uint8)
     allowed[:8, :16] = 0
     bounds = rng.integers(-1, 50, (3, 11, 21)).astype(np.int32)
-    block = np.column_stack([rng.integers(0, 3, 200), rng.integers(0, 11, (200, 2)), np.full(200, 178500)])
+    block = np.column_stack([rng.integers(0, 3, 200), rng.integers(0, 11, (200, 2)), rng.integers(-1, 400_000, 200)])
     block = block.astype(np.int32)
-    low, high = np.array([[30], [45]], np.int32)
+    low = np.array([30], np.int32)
     mask = (rng.random((6, 11)) < 0.6).astype(np.uint8)
     end, start = rng.uniform(-40, 40, (30, 2)), rng.uniform(-9, 9, (2, 2))
-    end[5:15] = end[5] + rng.uniform(0, 2, (10, 2))
     heading = rng.uniform(-1, 1, (6, 2))
     ends = np.array([0, 20, 40, 60, 70, 80, 90], np.int32)
-    made = [np.zeros(180, np.int32), np.zeros(180, np.int32), *np.zeros((2, 90), np.int32), np.zeros(6, np.int32)]
+    made = [np.zeros(180, np.int32), np.zeros(180, np.int32), np.zeros(90, np.int32)]
     counts = np.array([7, 0], np.int32)
+    blocks = (shape, 200, 12, 22, 11)
     calls = [
         ("pool_scores", (63, 52, 2), table, np.zeros_like(table), shape, 4),
-        ("fold_scores", (48, 45, 8), table, np.zeros(8 * 45 * 48, np.uint8), shape, folded, 4, 2, 9),
+        ("fold_scores", (48, 45, 8), table, np.zeros(8 * 45 * 48, np.uint8), shape, folded, 4, 2, 9, 8),
+        ("pack_quarters", (63, 52, 2), table, np.zeros_like(quarters), shape, 4, 0),
+        ("pack_quarters", (63, 52, 2), table, np.zeros_like(quarters), shape, 4, 1),
         ("place_ends", (6,), end, heading, start, ends, image[:90], *made, 6, 3, 8, 4, 18),
-        ("shift_scores", (21, 2, 3), table, point, image, weight, first, runs, allowed,
-         np.zeros(3 * 11 * 21, np.int32), shape, 0, 3, 11, 21),
+        ("shift_scores", (21, 2, 3), losses, point, image, first, allowed, np.zeros(3 * 11 * 21, np.int32), shape,
+         0, 3, 11, 21, 8),
+        ("shift_scores", (21, 2, 3), table, point, image, first, allowed, np.zeros(3 * 11 * 21, np.int32), shape,
+         0, 3, 11, 21, 1),
         ("row_maxima", (33,), bounds, np.zeros(66, np.int32), 33, 21),
-        ("choose_blocks", (33,), bounds, bounds.max(axis=2).repeat(2), low, high, np.zeros(4 * 693, np.int32), counts,
+        ("choose_blocks", (33,), bounds, bounds.max(axis=2).repeat(2), low, np.zeros(4 * 693, np.int32), counts,
          33, 11, 21, 3, 1, 693, 1),
-        ("divide_blocks", (200,), table, above, point, image, first, block, mask, np.array([1500], np.int32),
-         np.zeros(16 * 200, np.int32), counts, shape, 200, 12, 22, 11, 3, 1, 2, 1),
+        ("follow_blocks", (200,), quarters, point, image, first, mask, block, *blocks, 1, 2, 0),
+        ("follow_blocks", (200,), quarters, point, image, first, mask, block, *blocks, 1, 2, 1),
+        ("divide_blocks", (200,), quarters, point, image, first, mask, block, low, np.zeros(16 * 200, np.int32),
+         counts, *blocks, 3, 1, 2, 0, 1),
     ]  # fmt: skip
     device = get_backend(needs(name))
     for kernel, size, *values in calls:

@@ -7,7 +7,10 @@ from gpusense.interface.signatures.rows import PLACED, WINDOW, Kernel, kernel
 
 # Points of all scans, sorted by bearing in each scan: x, y [m], bearing in [0, 2 pi), range [m].
 _POINTS = ("real4 point [points]", "int start [scans + 1]")
+# Tables of scores, the losses of quarters of blocks, and the end points of scans that read them.
 _CELLS = "uchar table [scores.tables * (scores.rows + 2 * scores.margin) * (scores.cols + 2 * scores.margin)]"
+_QUARTERS = "int quarters [scores.tables * (scores.rows + 2 * scores.margin) * (scores.cols + 2 * scores.margin)]"
+_ENDS = ("int2 point [points]", "int image [points]", "int first [items + 1]")
 
 KERNELS: dict[str, Kernel] = {
     "field_gradient": kernel(
@@ -44,32 +47,37 @@ KERNELS: dict[str, Kernel] = {
     "fold_scores": kernel(
         "search", "col line image", _CELLS,
         "out uchar out [folded.tables * (folded.rows + 2 * folded.margin) * (folded.cols + 2 * folded.margin)]",
-        "ScoreTable scores", "ScoreTable folded", "int period", "int step", "int beyond",
+        "ScoreTable scores", "ScoreTable folded", "int period", "int step", "int beyond", "int unit",
+    ),
+    "pack_quarters": kernel(
+        "search", "col line image", _CELLS, f"out {_QUARTERS}", "ScoreTable scores", "int reach", "int top",
     ),
     "place_ends": kernel(
         "search_ends", "item", "double end [2 * ends]", "double heading [2 * items]", "double start [2 * scans]",
-        "int first [items + 1]", "int image [points]", "out int2 point [points]", "out int2 run [points]",
-        "out int run_image [points]", "out int weight [points]", "out int runs [items]", "int items", "int turns",
-        "int period", "int step", "int offset",
+        "int first [items + 1]", "int image [points]", "out int2 point [points]", "out int2 folded [points]",
+        "out int folded_image [points]", "int items", "int turns", "int period", "int step", "int offset",
     ),
     "shift_scores": kernel(
-        "search", "col rows item", _CELLS, "int2 run [points]", "int image [points]", "int weight [points]",
-        "int first [items + 1]", "int runs [items]", "uchar allowed [height * width]",
+        "search", "col rows item", _CELLS, *_ENDS, "uchar allowed [height * width]",
         "out int score [items * height * width]", "ScoreTable scores", "int begin", "int items", "int height",
-        "int width", in_lanes=True,
+        "int width", "int unit", in_lanes=True,
     ),
     "row_maxima": kernel(
         "search", "row", "int score [rows * width]", "out int best [2 * rows]", "int rows", "int width",
     ),
     "choose_blocks": kernel(
-        "search", "row", "int score [rows * width]", "int best [2 * rows]", "int low [scans]", "int high [scans]",
+        "search", "row", "int score [rows * width]", "int best [2 * rows]", "int low [scans]",
         "out int block [4 * room]", "out int count [counts]", "int rows", "int height", "int width", "int turns",
         "int level", "int room", "int slot",
     ),
+    "follow_blocks": kernel(
+        "search", "block", _QUARTERS, *_ENDS, "uchar allowed [rows * columns]", "out int block [4 * blocks]",
+        "ScoreTable scores", "int blocks", "int height", "int width", "int columns", "int level", "int spacing",
+        "int top",
+    ),
     "divide_blocks": kernel(
-        "search", "block", _CELLS, _CELLS.replace("table", "above", 1), "int2 point [points]", "int image [points]",
-        "int first [items + 1]", "int block [4 * blocks]", "uchar allowed [rows * columns]", "int low [scans]",
-        "out int part [16 * blocks]", "out int count [counts]", "ScoreTable scores", "int blocks", "int height",
-        "int width", "int columns", "int turns", "int level", "int spacing", "int slot",
+        "search", "block", _QUARTERS, *_ENDS, "uchar allowed [rows * columns]", "int block [4 * blocks]",
+        "int low [scans]", "out int part [16 * blocks]", "out int count [counts]", "ScoreTable scores", "int blocks",
+        "int height", "int width", "int columns", "int turns", "int level", "int spacing", "int top", "int slot",
     ),
 }  # fmt: skip

@@ -6,6 +6,9 @@ stands still. A loss is a run of at least five scans that are off by more than 1
 found if a judged pose says "lost" within it, after ``LATE`` scans at most, or at its end if that is earlier. A false
 stretch says "lost" without such a scan in it or in the ``LATE`` scans before it.
 
+The poses have no covariance, so their radius comes from the scans. The second table has its integrity at an alert limit
+of ``ALERT_LIMIT``, with the truth of the logs (``gs.integrity``); limits of shares as in ``protection_report``.
+
     python bench/studies/judge.py --output judge_cpu
     python bench/studies/judge.py --times --output judge_times_cpu
 """
@@ -23,6 +26,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
+import protection_report
 import recordings
 import verdict_runs as runs
 from accuracy.compiled_peers import Follower, Weigher
@@ -48,10 +52,17 @@ CASES = ("as recorded", "carried away")
 LEAST, LATE, FAR, FAR_TURN = 5, 20, 1.0, 0.5
 # Errors of poses that are certainly right [m, rad].
 NEAR, NEAR_TURN = 0.3, 0.15
+# Largest safe error [m].
+ALERT_LIMIT = 0.5
 COLUMNS = (
     "program", "case", "runs", "scans", "losses", "found", "missed", "median delay [scans]", "false stretches",
     "right scans", "said lost [%]", "scans within 0.3 m", "said lost [%]",
     "not said tracking of wrong scans [%]", "place within 1 m",
+)  # fmt: skip
+INTEGRITY = (
+    "program", "case", "risk [%]", "scans", "above the radius [%]", "upper 95 % limit [%]",
+    "hazardously misleading [%]", "misleading [%]", "available while right [%]", "median radius [cm]",
+    "scans to an alert: median, most; within 5",
 )  # fmt: skip
 
 
@@ -104,6 +115,8 @@ def one_run(recording, models, weigher, chosen, case, args, rng):
     losses, delays, false = rate(found, wrong)
     near = (off[:, 0] < NEAR) & (off[:, 1] < NEAR_TURN)
     lost, sure = (np.array([one == word for one in found.verdicts]) for word in ("lost", "tracking"))
+    known = off[:, 0], ~wrong
+    rated = {risk: integrity_of(models, scans, poses, risk, *known) for risk in protection_report.RISKS}
     places = []
     for stretch in found.stretches:
         if stretch.place is not None and stretch.place.found and wrong[stretch.first : stretch.last + 1].any():
@@ -114,7 +127,37 @@ def one_run(recording, models, weigher, chosen, case, args, rng):
         right=int((~wrong).sum()), right_lost=int((lost & ~wrong).sum()),
         near=int(near.sum()), near_lost=int((lost & near).sum()),
         wrong=int(wrong.sum()),
-        wrong_doubted=int((~sure & wrong).sum()), places=places,
+        wrong_doubted=int((~sure & wrong).sum()), places=places, integrity=rated,
+    )  # fmt: skip
+
+
+def integrity_of(models, scans, poses, risk, errors, right):
+    """Return the figures of the radii of a trajectory at a risk."""
+    radii = gs.judge_trajectory(models, scans, poses, risk=risk, searches=0).radii
+    rated, block = gs.integrity(errors, radii, alert_limit=ALERT_LIMIT), protection_report.BLOCK
+    over = errors > radii
+    return dict(
+        blocks=[float(over[k : k + block].mean()) for k in range(0, len(over), block)], over=int(over.sum()),
+        hazardous=rated.hazardous * len(over), misleading=rated.misleading * len(over), right=int(right.sum()),
+        available=int((radii[right] <= ALERT_LIMIT).sum()), radii=radii[right & np.isfinite(radii)].tolist(),
+        alerts=rated.times_to_alert.tolist(),
+    )  # fmt: skip
+
+
+def integrity_row(name, case, risk, chosen):
+    """Return a row of the table of integrity."""
+    every, scans = [one["integrity"][risk] for one in chosen], sum(one["scans"] for one in chosen)
+    share = {key: 100 * sum(one[key] for one in every) / scans for key in ("over", "hazardous", "misleading")}
+    blocks, radii, alerts = (
+        np.array([value for one in every for value in one[key]]) for key in ("blocks", "radii", "alerts")
+    )
+    limit = protection_report.upper_limit(blocks, np.random.default_rng(0))
+    available, right = (sum(one[key] for one in every) for key in ("available", "right"))
+    late = f"{np.median(alerts):.0f}, {alerts.max():.0f}; {(alerts <= 5).sum()} of {len(alerts)}"
+    return (
+        name, case, f"{100 * risk:g}", scans, f"{share['over']:.2f}", f"{100 * limit:.2f}",
+        f"{share['hazardous']:.2f}", f"{share['misleading']:.2f}", f"{100 * available / max(right, 1):.1f}",
+        f"{100 * np.median(radii):.0f}" if len(radii) else "-", late if len(alerts) else "-",
     )  # fmt: skip
 
 
@@ -137,7 +180,7 @@ def row_of(name, case, chosen):
 
 def study(args):
     """Run all programs on all logs."""
-    results, rows = [], []
+    results, rows, rated = [], [], []
     model, parameters = MODELS[args.model]
     for number, (name, (_, package, _)) in enumerate(PEERS.items()):
         compiled, version, missing = load(name)
@@ -159,13 +202,16 @@ def study(args):
                     if found is not None:
                         results.append(found | dict(program=version))
         mine = [one for one in results if one["program"] == version]
-        rows += [row_of(version, case, [one for one in mine if one["case"] == case]) for case in CASES]
+        for case in CASES:
+            part = [one for one in mine if one["case"] == case]
+            rows.append(row_of(version, case, part))
+            rated += [integrity_row(version, case, risk, part) for risk in protection_report.RISKS]
     per_log = [
         row_of("both", log, [one for one in results if one["log"] == log])
         for log in dict.fromkeys(one["log"] for one in results)
     ]
     text = "\n\n".join([
-        "### Programs", table(COLUMNS, rows), "### Logs", table(("program", "log", *COLUMNS[2:]), per_log),
+        "### Programs", table(COLUMNS, rows), "### Integrity", table(INTEGRITY, rated), "### Logs", table(("program", "log", *COLUMNS[2:]), per_log),
     ])  # fmt: skip
     publish(__file__, args, text, dict(results=results, settings=dict(scans=args.scans, particles=args.particles)),
             f"The programs' field model: {args.model}; odometry noise 0.02.")  # fmt: skip

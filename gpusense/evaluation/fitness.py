@@ -109,8 +109,8 @@ class FitnessOfLog:
             float(np.median(values)) if values else None for values in (known, self._better, self._p_lost)
         )
         evidence = evidence_of(self._scans)
-        if p_lost is not None and p_lost > LOST:
-            evidence = replace(evidence, cause="map")
+        if p_lost is not None:
+            evidence = replace(evidence, cause="map" if p_lost > LOST else "none")
         return Fitness(len(self._scans), explained, better, p_lost, evidence)
 
 

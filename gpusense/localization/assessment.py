@@ -6,7 +6,7 @@ import numpy as np
 
 from gpusense.localization.estimates import Estimate, clustered
 from gpusense.localization.pose_algebra import wrap_angle
-from gpusense.localization.protection import WIDENING, Distances
+from gpusense.localization.protection import Distances, margins_of
 from gpusense.localization.recovery import Recovery
 from gpusense.localization.spread import share_off, share_off_of, spread_of
 from gpusense.localization.tracker import Tracker
@@ -46,9 +46,9 @@ def estimate_of(tracker: Tracker, verdict: Verdict, recovery: Recovery, method: 
     p_lost, spread = wrong + (1 - wrong) * share, spread_of(covariance)
     word = verdict_label(p_lost, wrong, wide=spread.wide, apart=spread.apart)
     temperature = tracker.sensors[0].temperature(tracker.options.temperature)
-    widening = WIDENING if verdict.informed and verdict.state.corrections else 1.0
+    margins = margins_of(tracker.sensors) if verdict.informed and verdict.state.corrections else (1.0, 0.0)
     return Estimate(
         pose, covariance, tracker.sample_size(), p_lost, word, verdict.state.explained, temperature,
-        summary.temperature, summary.degenerate, shown, widening,
+        summary.temperature, summary.degenerate, shown, *margins,
         None if method == "mean" else about, distances,
     )  # fmt: skip

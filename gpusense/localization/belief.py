@@ -4,8 +4,7 @@ The states are "right" (the robot is inside the localiser's distribution) and "w
 probability of "wrong" is ``START``. Over n scans and d metres a right pose becomes wrong, by a silent divergence or a
 carried robot, with probability ``1 - exp(-(PER_SCAN n + PER_METRE d))``; a wrong pose becomes right with probability
 ``FOUND`` per scan. While the distribution is wide enough to cover several places, both happen with probability ``WIDE``
-per scan. While the distribution is wide enough to
-cover several places, both happen with probability ``WIDE`` per scan.
+per scan.
 
 A scan yields a log-likelihood ratio r of "wrong" against "right". Consecutive ratios are dependent: moved furniture is
 wrong in all scans of a room. The ratios are modelled as a first-order autoregressive process; the correlation ``rho =
@@ -15,10 +14,15 @@ exact increment of the log odds is then
     (r_t - rho r_{t-1}) / (1 + rho),
 
 so a standing robot gains almost nothing from its hundredth scan, and a change is detected at once (Hamilton, "A new
-approach to the economic analysis of nonstationary time series", *Econometrica* 57 (1989), treats such regimes).
+approach to the economic analysis of nonstationary time series", *Econometrica* 57 (1989), treats such regimes). A pose
+that became wrong since the last scan has another place, and the last ratio says nothing about it. Its share of "wrong"
+gets the whole ratio instead, and a rise by D counts as further evidence, since the ratio of a right pose would have
+stayed:
+
+    r_t + max(r_t - r_{t-1}, 0) rho / (1 + rho).
 
 Some wrong places look like the right one: scans agree there equally, and are no evidence. ``ALIKE`` is the prior share
-of such places among wrong ones. Places stop looking alike at the rates of ``ALIKE_LENGTH`` and ``ALIKE_TURN``. If a
+of such places among wrong ones, and ``ALIKE_CHOSEN`` among places from a search, which prefers them. Places stop looking alike at the rates of ``ALIKE_LENGTH`` and ``ALIKE_TURN``. If a
 share a still looks alike, an increment i of the log odds becomes
 
     log(a + (1 - a) e^i),   a <- a / (a + (1 - a) e^i),
@@ -44,11 +48,11 @@ import numpy as np
 # Prior probability of "wrong" after a start at a pose. Rates of becoming wrong per scan and per metre, of becoming
 # right again, and of both while the distribution is wide.
 START = 0.1
-PER_SCAN, PER_METRE, FOUND, WIDE = 1e-3, 2e-3, 0.003, 0.05
+PER_SCAN, PER_METRE, FOUND, WIDE = 5e-4, 2e-3, 0.003, 0.05
 # Correlation of the ratios of two scans at a place; distance and turn over which it falls to 1 / e [m, rad].
 STAYS, LENGTH, TURN = 0.95, 2.0, 1.0
-# Prior share of wrong places that look like the right one; distance and turn over which it falls to 1 / e [m, rad].
-ALIKE, ALIKE_LENGTH, ALIKE_TURN = 0.12, 8.0, 2.0
+# Prior shares of wrong places that look like the right one; distance and turn over which they fall to 1 / e [m, rad].
+ALIKE, ALIKE_CHOSEN, ALIKE_LENGTH, ALIKE_TURN = 0.08, 0.12, 8.0, 2.0
 # Searches per wrong result on a right map; largest number of wrong results.
 MISSES, MOST_PLACES = 8, 2
 # Longest counted motion between scans [m]; a longer motion is a jump of the localiser.
@@ -113,7 +117,7 @@ class Belief(NamedTuple):
         Args:
             after: Number of failed searches before. On a right map one in ``MISSES`` fails.
         """
-        return cls(math.log(MISSES) * min(after, MOST_PLACES), chosen=True, compared=Comparison(chosen=True))
+        return cls._chosen(math.log(MISSES) * min(after, MOST_PLACES))
 
     def counted(self) -> Belief:
         """Return the belief after counting a scan."""
@@ -121,8 +125,12 @@ class Belief(NamedTuple):
 
     def widened(self) -> Belief:
         """Return the belief after scans without a tracked pose: the next pose may be anywhere."""
-        log_odds = self._moved(WIDE, WIDE, min(self.scans, 100))[0]
-        return Belief(log_odds, chosen=True, compared=Comparison(chosen=True))
+        return self._chosen(self._moved(WIDE, WIDE, min(self.scans, 100))[0])
+
+    @classmethod
+    def _chosen(cls, log_odds: float) -> Belief:
+        """Return the belief at a place that scans will choose."""
+        return cls(log_odds, chosen=True, alike=ALIKE_CHOSEN, compared=Comparison(chosen=True))
 
     def judged(self, pose: tuple[float, float, float], ratio: float) -> Belief:
         """Return the belief after a scan.
@@ -137,13 +145,22 @@ class Belief(NamedTuple):
             way, turn = motion_between(pose, self.pose)
             rho = correlation(way, turn)
         lost = 1 - math.exp(-PER_SCAN * self.scans - PER_METRE * min(way, _FASTEST * self.scans))
-        log_odds, alike = self._moved(lost, 1 - (1 - FOUND) ** self.scans, 1)
+        found = 1 - (1 - FOUND) ** self.scans
         if math.isnan(ratio):
+            log_odds, alike = self._moved(lost, found, 1)
             return self._replace(log_odds=log_odds, scans=0, alike=alike)
-        alike *= math.exp(-way / ALIKE_LENGTH - turn / ALIKE_TURN)
-        new = new_part(ratio, ratio, STAYS) if repeats else new_part(ratio, self.ratio, rho)
-        moved = self._replace(log_odds=log_odds, ratio=ratio, pose=pose, scans=0, chosen=False, alike=alike)
-        return moved._changed(new)
+        rise = max(ratio - self.ratio, 0.0) * rho / (1 + rho)
+        # The increments of places that were wrong before, and of places that became wrong since.
+        new, fresh = new_part(ratio, self.ratio, rho), ratio + rise
+        if repeats:
+            new = fresh = new_part(ratio, ratio, STAYS)
+        alike = self.alike * math.exp(-way / ALIKE_LENGTH - turn / ALIKE_TURN)
+        stays, added = self.wrong * (1 - found), (1 - self.wrong) * lost
+        after = stays * _changed(alike, new) + added * _changed(ALIKE, fresh)
+        return self._replace(
+            log_odds=math.log(after) - math.log1p(-stays - added), ratio=ratio, pose=pose, scans=0, chosen=False,
+            alike=(stays * alike + added * ALIKE) / after,
+        )  # fmt: skip
 
     def compared_with(self, pose: tuple[float, float, float], ratio: float) -> Belief:
         """Return the belief after comparing the last judged pose with other places.
@@ -158,12 +175,9 @@ class Belief(NamedTuple):
         rho, before = (STAYS, ratio) if last.chosen and ratio < 0 else (0.0, 0.0)
         if not rho and last.pose is not None:
             rho, before = correlation(*motion_between(pose, last.pose)), last.ratio
-        return self._replace(compared=Comparison(ratio, pose))._changed(new_part(ratio, before, rho))
-
-    def _changed(self, new: float) -> Belief:
-        """Return the belief after new evidence [nats]; places that look alike yield none."""
-        change = self.alike + (1 - self.alike) * math.exp(new)
-        return self._replace(log_odds=self.log_odds + math.log(change), alike=self.alike / change)
+        change = _changed(self.alike, new_part(ratio, before, rho))
+        log_odds = self.log_odds + math.log(change)
+        return self._replace(compared=Comparison(ratio, pose), log_odds=log_odds, alike=self.alike / change)
 
     def _moved(self, lost: float, found: float, times: int) -> tuple[float, float]:
         """Return the log odds, and the share that looks alike, after transitions."""
@@ -173,6 +187,11 @@ class Belief(NamedTuple):
             wrong = stays + added
             alike = (stays * alike + added * ALIKE) / wrong
         return math.log(wrong) - math.log1p(-wrong), alike
+
+
+def _changed(alike: float, new: float) -> float:
+    """Return the factor of the odds by new evidence [nats], of which places that look alike yield none."""
+    return alike + (1 - alike) * math.exp(new)
 
 
 def new_part(ratio: float, before: float, rho: float) -> float:

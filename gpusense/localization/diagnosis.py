@@ -107,6 +107,8 @@ class Diagnosis:
         return f"{100 * self.agree / self.counted:.0f} % of the beams agree with the map"
 
     def _cause(self) -> str:
+        if self.cause == "unknown":
+            return "unknown" if self.counted or self.inside or self.off or self.motion else ""
         if self.cause == "start" and self.elsewhere is not None:
             return "wrong start, or carried away: x = {:.1f}, y = {:.1f}, theta = {:.2f} fits".format(*self.elsewhere)
         if self.cause == "moved" and self.moved is not None:

@@ -36,6 +36,7 @@ class Estimate:
         degenerate: True if no particle was possible at the last correction, which then changed nothing.
         particles: Number of particles.
         widening: Factor of the spread in :meth:`protection_level`; 1 without a map, and before the first correction.
+        margin: Length added to the radius there [m]; 0 without a map, and before the first correction.
         moments: (3, 3) second moments of the particles about the pose, for the methods "cluster" and "best"; otherwise
             the covariance.
         distances: Distances of the particles from the pose, unless the covariance describes them.
@@ -57,6 +58,7 @@ class Estimate:
     degenerate: bool
     particles: int
     widening: float = 1.0
+    margin: float = 0.0
     moments: np.ndarray | None = field(default=None, repr=False, compare=False)
     distances: Distances | None = field(default=None, repr=False, compare=False)
 
@@ -82,7 +84,7 @@ class Estimate:
         """Return the radius that the error of the position exceeds with at most a stated probability [m].
 
         It is the smallest r with ``p_lost + (1 - p_lost) P(|error| > r | not lost) <= risk``. P comes from the
-        particles, with the spread times ``widening``; see ``docs/localization.md``.
+        particles, with the spread times ``widening`` and plus ``margin``; see ``docs/localization.md``.
 
         Args:
             risk: The probability, from 0.01 to 1, the range supported by logs.
@@ -102,7 +104,8 @@ class Estimate:
         moments = self.covariance if self.moments is None else self.moments
         if not self.effective_sample_size >= LEAST_SAMPLE:
             moments = np.full((3, 3), math.inf)
-        return protection_level(risk, self.p_lost, moments, self.widening, self.distances)
+        margins = dict(widening=self.widening, margin=self.margin)
+        return protection_level(risk, self.p_lost, moments, self.distances, **margins)
 
 
 def covariance_of(numbers: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 from gpusense.localization import starts
 from gpusense.localization.diagnosis import Diagnosis, diagnose
-from gpusense.localization.protection import WIDENING, protection_level
+from gpusense.localization.protection import Distances, distances_by_scan, margins_of, protection_level
 from gpusense.localization.scoring import readings_of
 from gpusense.localization.sensors import sensors_of
 from gpusense.localization.spread import share_off, spread_of
@@ -35,6 +35,8 @@ class PoseVerdict:
         explained: Agreeing share of the explainable beams at the pose; NaN without any.
         covariance: (3, 3) covariance of the pose; None if the localiser states none.
         widening: Factor of the spread in :meth:`protection_level`.
+        margin: Length added to the radius there [m].
+        distances: Distances of poses around a pose without a covariance, by the likelihood of its scan.
 
     Example:
         >>> import gpusense as gs
@@ -47,6 +49,8 @@ class PoseVerdict:
     explained: float
     covariance: np.ndarray | None = field(default=None, repr=False, compare=False)
     widening: float = field(default=1.0, repr=False)
+    margin: float = field(default=0.0, repr=False)
+    distances: Distances | None = field(default=None, repr=False, compare=False)
 
     @property
     def lost(self) -> bool:
@@ -57,8 +61,9 @@ class PoseVerdict:
         """Return the radius that the error of the position exceeds with at most a stated probability [m].
 
         It is the smallest r with ``p_lost + (1 - p_lost) P(|error| > r | not lost) <= risk``. P comes from a normal
-        density with the pose's covariance and the widening factor of this package's filter. If the localiser states no
-        covariance, the radius is 1 m, the largest error of a pose that is not lost.
+        density with the pose's covariance, widened as this package's filter does. If the localiser states no
+        covariance, P comes from the likelihood of the scan at poses around the pose, and the radius is at most 1 m,
+        the largest error of a pose that is not lost.
 
         Args:
             risk: The probability, from 0.01 to 1, the range supported by logs.
@@ -74,7 +79,8 @@ class PoseVerdict:
             >>> gs.PoseVerdict(0.002, "tracking", 0.9).protection_level(risk=0.01)
             1.0
         """
-        return protection_level(risk, self.p_lost, self.covariance, self.widening)
+        margins = dict(widening=self.widening, margin=self.margin)
+        return protection_level(risk, self.p_lost, self.covariance, self.distances, **margins)
 
 
 class PoseMonitor:
@@ -144,7 +150,12 @@ class PoseMonitor:
         wrong = self._verdict.wrong
         p_lost, beyond = wrong + (1 - wrong) * share_off(spread), spread_of(spread)
         word = verdict_label(p_lost, wrong, wide=beyond.wide, apart=beyond.apart)
-        return PoseVerdict(p_lost, word, explained, None if covariance is None else spread, WIDENING)
+        margins = margins_of(self._sensors)
+        if covariance is not None:
+            return PoseVerdict(p_lost, word, explained, spread, *margins)
+        return PoseVerdict(
+            p_lost, word, explained, None, *margins, distances_by_scan(self._sensors, readings, place)
+        )  # fmt: skip
 
     @property
     def state(self) -> VerdictState:

@@ -5,27 +5,32 @@ Let p_lost be the probability that the pose is lost. The protection level is the
     p_lost + (1 - p_lost) P(|error| > r | not lost) <= risk
 
 (Joerger and others, "Integrity monitoring of localization systems", *Sensors* 18(8), 2018, 2740, use the same terms).
-P comes from a normal density with the covariance of the position, and from the distances of spread-out particles.
-Errors of filters have longer tails than the particles, so the spread is multiplied by a factor measured on logs.
+P comes from a normal density with the covariance of the position, and from the distances of spread-out particles. If
+the localiser states no covariance, it comes from the last scan: the likelihoods of poses around the pose, up to the
+errors of a lost one, with the temperature of ten independent beams.
+
+Errors of filters have longer tails than the particles, and the walls of a map are off by about a cell. So the radius is
+multiplied by a factor, and a margin is added; both were measured on logs.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util import checks
-from gpusense.localization.spread import FAR, deviations
+from gpusense.localization.sensors import Sensor
+from gpusense.localization.spread import FAR, FAR_TURN, deviations
 
 Floats = NDArray[np.float64]
 
-# Factor of the spread, and least risk that its calibration supports.
-WIDENING, LEAST_RISK = 2.0, 0.01
+# Factor of the spread, least margin [m], and least risk that their calibration supports.
+WIDENING, MARGIN, LEAST_RISK = 1.25, 0.05, 0.01
 # Least effective sample size of a meaningful covariance.
 LEAST_SAMPLE = 10.0
 # Angles of the integral over a normal position: middles of parts of a quarter turn.
@@ -33,6 +38,9 @@ _PARTS = 96
 _COSINES = np.cos((np.arange(_PARTS) + 0.5) * (math.pi / 2 / _PARTS)) ** 2
 # Steps of the bisection; each halves the interval.
 _STEPS = 60
+# Number of poses around one without a covariance, and the steps of their low-discrepancy sequence: powers of the
+# inverse of the root of x^4 = x + 1 (Roberts, "The unreasonable effectiveness of quasirandom sequences" (2018)).
+_AROUND, _SEQUENCE = 2048, 1.2207440846057596 ** -np.arange(1.0, 4.0)
 
 
 class Distances:
@@ -75,8 +83,51 @@ def check_risk(risk: float) -> float:
     return risk
 
 
+def distances_by_scan(
+    sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]], pose: Floats
+) -> Distances:
+    """Return distances of poses within 1 m and 0.5 rad of a pose, weighted by the likelihoods of readings there.
+
+    The poses are denser near the pose; their weights make up for it.
+
+    Args:
+        sensors: The sensors.
+        readings: Readings by the index of their sensor.
+        pose: (3,) pose.
+    """
+    far, angle, turn = (np.arange(1, _AROUND + 1)[:, None] * _SEQUENCE % 1).T
+    far, angle, turn = far**2, math.tau * angle, 2 * turn - 1
+    offsets = np.column_stack([
+        FAR * far * np.cos(angle), FAR * far * np.sin(angle), FAR_TURN * turn * np.abs(turn),
+    ])  # fmt: skip
+    poses = pose + offsets
+
+    def particles() -> tuple[Floats, Floats]:
+        log_p = np.zeros(_AROUND)
+        for index, reading in readings.items():
+            sensor = sensors[index]
+            log_p += sensor.temperature("auto") * np.asarray(sensor.log_likelihood(poses, reading), np.float64)
+        best = log_p.max()
+        likelihood = np.exp(log_p - best) if math.isfinite(best) else np.ones(_AROUND)
+        return poses, np.asarray(likelihood * far**1.5 * np.abs(turn))
+
+    return Distances(particles, pose)
+
+
+def margins_of(sensors: Sequence[Sensor]) -> tuple[float, float]:
+    """Return the factor of the spread and the margin [m] of poses that sensors with a map judge."""
+    cells = [sensor.model.grid.resolution for sensor in sensors if sensor.calibrates]
+    return WIDENING, max([MARGIN, *cells])
+
+
 def protection_level(
-    risk: float, p_lost: float, covariance: Floats | None, widening: float, distances: Distances | None = None
+    risk: float,
+    p_lost: float,
+    covariance: Floats | None,
+    distances: Distances | None = None,
+    *,
+    widening: float = 1.0,
+    margin: float = 0.0,
 ) -> float:
     """Return the protection level of a pose [m].
 
@@ -85,21 +136,22 @@ def protection_level(
         p_lost: Probability that the pose is lost.
         covariance: (3, 3) covariance of x, y [m] and heading; None if unknown: a pose that is not lost is off by at
             most 1 m.
-        widening: Factor of the spread.
         distances: Distances of the particles from the pose; None if the covariance describes them.
+        widening: Factor of the spread.
+        margin: Added to the radius [m].
     """
     risk = check_risk(risk)
     if risk == 1:
         return 0.0
     if not p_lost <= risk:
         return math.inf
-    if covariance is None:
-        return FAR
     beyond = (risk - p_lost) / (1 - p_lost)
+    if covariance is None:
+        return FAR if distances is None else min(widening * distances.radius(beyond) + margin, FAR)
     radius = normal_radius(covariance, beyond)
     if distances is not None:
         radius = max(radius, distances.radius(beyond))
-    return widening * radius
+    return widening * radius + margin
 
 
 def normal_radius(covariance: Floats, beyond: float) -> float:

@@ -209,7 +209,7 @@ class _Places:
         if known.as_is >= _MOST and not motion.mirrored:
             return self._scaled(windows, known, steady=True) if steady and known.as_is < 1 else known
         steady = steady or motion.mirrored
-        known = known._replace(mirrored=self._share(windows, steady=steady, mirrored=True))
+        known = known._replace(mirrored=self._share(windows, steady=steady, mirrored=True)[0])
         if max(known.as_is, known.mirrored) >= _MOST:
             return known
         return self._scaled(windows, known, steady=steady)
@@ -254,22 +254,30 @@ class _Places:
             fitting = [scale for scale in _SCALES if places[scale].fits]
             if known.as_is >= _MOST:
                 fitting = [scale for scale in fitting if max(scale, 1 / scale) >= _LEAST_SCALE]
-            for scale in sorted(fitting, key=lambda scale: -places[scale].share)[:_BEST_SCALES]:
-                share = self._share(windows, steady=steady, scale=scale)
-                if share > known.scaled:
-                    known = known._replace(scaled=share, scale=scale)
-                if known.scaled >= _ALMOST_ALL:
-                    return known
+            best = sorted(fitting, key=lambda scale: -places[scale].share)[:_BEST_SCALES]
+            shares = {scale: self._share(windows, steady=steady, scale=scale) for scale in best}
+            # Windows also fit at neighbouring scales, but fewer of their beams agree.
+            scale = max(best, key=lambda scale: shares[scale], default=1.0)
+            if best and shares[scale][0] > known.scaled:
+                known = known._replace(scaled=shares[scale][0], scale=scale)
+            if known.scaled >= _ALMOST_ALL:
+                break
         return known
 
-    def _share(self, windows: list[Window], *, steady: bool, mirrored: bool = False, scale: float = 1.0) -> float:
-        """Return the share of windows that fit with a hypothesis; the search ends where it cannot hold any more."""
+    def _share(
+        self, windows: list[Window], *, steady: bool, mirrored: bool = False, scale: float = 1.0
+    ) -> tuple[float, float]:
+        """Return the share of windows that fit with a hypothesis, and the mean share of their beams that agree.
+
+        The search ends where the hypothesis cannot hold any more.
+        """
         found: list[Place] = []
         for window in windows:
             found.append(self.place(window, mirrored=mirrored, scale=scale))
             if sum(not one.fits for one in found) > (1 - _MOST) * len(windows):
-                return sum(one.fits for one in found) / len(windows)
-        return float(self._consistent(windows, found, steady=steady, scale=scale).mean())
+                return sum(one.fits for one in found) / len(windows), 0.0
+        fits = self._consistent(windows, found, steady=steady, scale=scale)
+        return float(fits.mean()), float(np.mean([one.share for one in found]))
 
     def _displacement(
         self, windows: list[Window], places: list[Place], fits: NDArray[np.bool_]

@@ -151,8 +151,37 @@ def test_estimates_by_scans_are_widened(backend: str) -> None:
     pf.correct(ranges)
     e, monitor = pf.estimate(), gs.PoseMonitor(model)
     plain = gs.PoseVerdict(e.p_lost, e.verdict, e.explained, e.covariance).protection_level(0.5)
-    assert e.widening > 1 and e.protection_level(0.5) == pytest.approx(e.widening * plain)
+    assert e.widening > 1 and e.margin == 0.1
+    assert e.protection_level(0.5) == pytest.approx(e.widening * plain + e.margin)
     v = monitor.update(e.pose, ranges, e.covariance)
     alone = gs.PoseVerdict(v.p_lost, v.verdict, v.explained, e.covariance).protection_level(0.5)
-    assert v.protection_level(0.5) == pytest.approx(e.widening * alone)
-    assert monitor.update(e.pose, ranges).protection_level(0.5) == 1.0
+    assert v.protection_level(0.5) == pytest.approx(e.widening * alone + e.margin)
+
+
+def test_the_scan_bounds_a_pose_without_a_covariance(backend: str) -> None:
+    scanner = gs.Scanner.uniform(angle_min=-3.1, angle_increment=0.1, count=62, range_max=12.0)
+    model = gs.LikelihoodFieldModel(ROOM, scanner, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend=backend)
+    pose = np.array([3.0, 2.0, 0.3])
+    ranges = gs.RayCaster(ROOM, range_max=12.0, backend="numpy").cast(pose[None], scanner.bearings)[0]
+
+    def radius(place, readings, risk=0.3):
+        found = gs.PoseMonitor(model).update(place, readings)
+        return gs.PoseVerdict(0.0, "tracking", found.explained, distances=found.distances).protection_level(risk)
+
+    # The exact radius, from a grid of all poses within the errors of a lost pose.
+    x, y, turn = np.meshgrid(np.arange(-1, 1.01, 0.04), np.arange(-1, 1.01, 0.04), np.arange(-0.5, 0.501, 0.02))
+    offsets = np.column_stack([x.ravel(), y.ravel(), turn.ravel()])
+    offsets = offsets[np.hypot(x, y).ravel() <= 1]
+    for off in (0.0, 0.3):
+        place = pose + np.array([off, 0.0, 0.0])
+        log_p = np.asarray(model.log_likelihood(place + offsets, ranges), np.float64) * 10 / 62
+        weight, far = np.exp(log_p - log_p.max()), np.hypot(*offsets[:, :2].T)
+        order = np.argsort(far)
+        beyond = 1 - np.cumsum(weight[order]) / weight.sum()
+        for risk in (0.05, 0.3):
+            exact = far[order][np.argmax(beyond <= risk)]
+            assert radius(place, ranges, risk) == pytest.approx(exact, abs=0.06)
+    # A scan without a reading bounds nothing, so that a pose that is not lost may be off by up to 1 m.
+    assert radius(pose, np.full(62, np.nan), 0.01) > 0.98
+    promised = gs.PoseMonitor(model).update(pose, np.full(62, np.nan)).protection_level(0.5)
+    assert 0.7 < promised <= 1.0

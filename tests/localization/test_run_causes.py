@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import gpusense as gs
+from gpusense.evaluation.steps import read_steps
 from gpusense.localization.diagnosis import Diagnosis
 from gpusense.localization.run_causes import RunEvidence, diagnose_run, likely_cause
 from gpusense.localization.scan_motion import Moment, ScanMotion, scan_motion
@@ -100,6 +101,17 @@ def test_wrong_maps_are_told_from_wrong_scales(backend, grid, run) -> None:
     assert diagnosed(backend, gs.OccupancyGrid(blocks, 0.1), run).cause == "map"
 
 
+@pytest.mark.parametrize("scale", [0.9, 1.1])
+def test_the_scale_of_a_real_map_is_measured(backend, data_dir, scale) -> None:
+    fr079 = gs.read_map(data_dir / "carmen_logs" / "derived_maps" / "freiburg-079_even_05cm.yaml")
+    steps = read_steps(data_dir / "carmen_logs" / "freiburg-079-corrected.log.gz", every=2, offset=1, limit=120)
+    scanner = steps[0].scan.scanner
+    scaled = gs.OccupancyGrid(fr079.cells, fr079.resolution / scale, fr079.origin)
+    model = gs.LikelihoodFieldModel(scaled, scanner, PARAMETERS, backend=backend, beams=90)
+    found = diagnose_run(model, [Moment(one.scan.ranges, one.scan.pose, one.odometry, one.scan.time) for one in steps])
+    assert found.cause == "scale" and found.scale == pytest.approx(scale, rel=0.03)
+
+
 def test_a_moved_map_is_told_from_a_robot_that_was_carried_away(backend, grid, run) -> None:
     moved = gs.OccupancyGrid(grid.cells, grid.resolution, (grid.origin[0] + 2.0, grid.origin[1] - 1.0, 0.0))
     found = diagnosed(backend, moved, run)
@@ -131,7 +143,8 @@ def test_few_scans_and_no_odometry_blame_nothing(backend, grid, run) -> None:
 def test_mixed_evidence_is_unknown() -> None:
     motion = ScanMotion(20, 20, [], "none", 0.01, 0.01)
     beams = Diagnosis(10, 10, 0)
-    assert likely_cause(beams, RunEvidence(motion, 5, as_is=0.5, mirrored=0.5)).cause == "unknown"
+    unknown = likely_cause(beams, RunEvidence(motion, 5, as_is=0.5, mirrored=0.5))
+    assert unknown.cause == "unknown" and unknown.text.endswith("; likely cause: unknown")
     assert likely_cause(beams, RunEvidence(motion, 5, as_is=0.2)).cause == "map"
     assert likely_cause(beams, RunEvidence(motion, 5, as_is=0.8, last=(1.0, 2.0, 0.0))).cause == "start"
     assert likely_cause(beams, RunEvidence(motion, 5, as_is=0.8)).cause == "unknown"

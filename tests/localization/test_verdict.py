@@ -11,8 +11,9 @@ import pytest
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.interface.constants import AGREES, NOTHING, SHORT, THROUGH, VANISHED
+from gpusense.localization import belief as constants
 from gpusense.localization.beam_consistency import beam_consistency
-from gpusense.localization.belief import ALIKE, ALIKE_LENGTH, FOUND, LENGTH, PER_METRE, PER_SCAN, STAYS, Belief
+from gpusense.localization.belief import ALIKE, ALIKE_CHOSEN, FOUND, LENGTH, PER_METRE, PER_SCAN, STAYS, Belief
 from gpusense.localization.map_judge import MapJudge
 from gpusense.localization.scan_evidence import LIMITS, explained_of_scan, ratio_of_scan
 from gpusense.localization.spread import share_off, share_off_of
@@ -179,8 +180,9 @@ def test_comparisons_are_a_second_series_of_the_belief():
     assert chosen.compared_with((0.0, 0.0, 0.0), 1.2).wrong > 0.7
     # Likewise for a place after scans without a tracked pose, for any earlier comparison.
     wide = Belief().compared_with((0.0, 0.0, 0.0), 1.2).widened()
-    repeated = wide.compared_with((9.0, 9.0, 0.0), -4.0).log_odds
-    assert repeated == pytest.approx(wide._changed(-4.0 * (1 - STAYS) / (1 + STAYS)).log_odds)
+    repeated = wide.compared_with((9.0, 9.0, 0.0), -4.0).log_odds - wide.log_odds
+    change = ALIKE_CHOSEN + (1 - ALIKE_CHOSEN) * math.exp(-4.0 * (1 - STAYS) / (1 + STAYS))
+    assert repeated == pytest.approx(math.log(change))
     # A pose that looks alike also beats other places.
     assert Belief(0.0).compared_with((0.0, 0.0, 0.0), -40.0).log_odds == pytest.approx(math.log(ALIKE))
 
@@ -201,6 +203,34 @@ def test_transitions_of_the_belief():
     assert standing.log_odds - turned.log_odds > 1.9
 
 
+@pytest.mark.parametrize("gap", [0.0, 0.05, 0.3, 1.0])
+@pytest.mark.parametrize("before", [-4.0, -1.0, 3.0])
+def test_a_pose_that_became_wrong_since_the_last_scan_has_no_earlier_ratio(gap, before) -> None:
+    """Bayes' rule for three cases: right, wrong since before, and wrong since the last scan."""
+    rho, pose = STAYS * math.exp(-gap / LENGTH), (gap, 0.0, 0.0)
+    for ratio in (-4.0, -0.5, 2.0):
+        belief = Belief(-2.0, before, (0.0, 0.0, 0.0), alike=0.0).counted()
+        wrong, added = belief.wrong, 1 - math.exp(-PER_SCAN - PER_METRE * min(gap, 1.0))
+        old = wrong * (1 - FOUND) * math.exp((ratio - rho * before) / (1 + rho))
+        rise = max(ratio - before, 0.0) * rho / (1 + rho)
+        new = (1 - wrong) * added * (ALIKE + (1 - ALIKE) * math.exp(ratio + rise))
+        right = 1 - wrong * (1 - FOUND) - (1 - wrong) * added
+        assert belief.judged(pose, ratio).log_odds == pytest.approx(math.log((old + new) / right))
+
+
+@pytest.mark.parametrize("step", [0.0, 0.02, 0.1, 0.5])
+def test_agreement_takes_p_lost_below_the_least_risk_at_any_pace(step) -> None:
+    belief = Belief()
+    for k in range(1, 1000):
+        belief = belief.counted().judged((step * k, 0.0, 0.1 * step * k), -4.0)
+        if step * k > 8:
+            assert belief.wrong < 0.005
+    assert belief.wrong < 0.02
+    # A contradiction withdraws it at once.
+    jumped = belief.counted().judged((step * 1001, 0.0, 0.1 * step * 1001), 3.0)
+    assert jumped.wrong > 0.05
+
+
 def test_agreement_with_a_place_that_scans_have_chosen_is_no_evidence():
     found = Belief.anywhere().counted().widened().counted().judged((0.0, 0.0, 0.0), -3.0)
     assert found.wrong > 0.45
@@ -218,7 +248,7 @@ def test_a_short_log_leaves_places_that_look_alike():
     for k in range(1, 30):
         near = near.counted().judged((0.01 * k, 0.0, 0.0), -4.0)
         far = far.counted().judged((0.6 * k, 0.2 * k, 0.1 * k), -4.0)
-    least = ALIKE / (1 + ALIKE)
+    least = ALIKE_CHOSEN / (1 + ALIKE_CHOSEN)
     assert least < near.wrong < 0.35 and far.wrong < 0.4 * least
     # If no scans come between, the share follows Bayes' rule.
     one = Belief(0.0, 0.0, (0.0, 0.0, 0.0)).judged((9.0, 0.0, 0.0), -3.0)

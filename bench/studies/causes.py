@@ -4,11 +4,13 @@ A filter at its defaults tracks each run from the true start, with a map, a lase
 In runs in which the robot is carried away the filter has no recovery, so that it stays lost. Poses among people, and on
 a map that was moved since, are true poses with an error of a few centimetres, like those of another localiser.
 
-    python bench/studies/causes.py --runs 20 --output causes
+    python bench/studies/causes.py --shard 1/2 --raw shard_1.npz
+    python bench/studies/causes.py --join shard_*.npz --output causes
 """
 
 from __future__ import annotations
 
+import ast
 import math
 import sys
 import time
@@ -19,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 import recordings
+import verdict_runs as runs
 from common import make_parser, note, parse, publish, table
 
 import gpusense as gs
@@ -29,7 +32,7 @@ from gpusense.localization.scan_motion import Moment
 
 CAUSES = ("none", "people", "start", "moved", "mount", "mirrored", "map", "scale", "odometry", "time")
 FOUND = (*CAUSES, "unknown")
-COLUMNS = ("cause", "runs", *FOUND, "right [%]", "median ms")
+COLUMNS = ("cause", "runs", *FOUND, "right [%]", "right or unknown [%]", "median ms")
 
 
 def useless(odometry, rng):
@@ -111,48 +114,57 @@ def moved_map(grid, rng):
     return gs.OccupancyGrid(grid.cells, grid.resolution, tuple(compose_poses(about, np.array(grid.origin))))
 
 
-def diagnosed(cause, seed, args):
-    """Return the likely cause of a run, and the milliseconds of the diagnosis."""
-    grid, scanner, run, ranges, odometry, rng = made(cause, seed, args.scans, args.backend)
+def run(job, args):
+    """Return the number of the likely cause of a run, and the milliseconds of its diagnosis; and the evidence."""
+    _, cause, seed = job
+    grid, scanner, made_run, ranges, odometry, rng = made(cause, seed, args.scans, args.backend)
     if cause == "moved":
         grid = moved_map(grid, rng)
     model = recordings.field(args.backend)(grid, scanner)
-    poses = poses_of(cause, model, run, ranges, odometry, rng, args.particles)
-    moments = [Moment(*one) for one in zip(ranges, poses, odometry, run.times, strict=True)]
+    poses = poses_of(cause, model, made_run, ranges, odometry, rng, args.particles)
+    moments = [Moment(*one) for one in zip(ranges, poses, odometry, made_run.times, strict=True)]
     begin = time.perf_counter()
     found = diagnose_run(model, moments)
     ms = (time.perf_counter() - begin) * 1000
-    return ("mirrored" if found.mirrored else found.cause), ms, found.text
+    return np.array([[FOUND.index("mirrored" if found.mirrored else found.cause), ms]]), (found.text,)
+
+
+def page(files):
+    """Return the confusion table of shards as text, and its figures."""
+    found = []
+    for file in files:
+        with np.load(file) as data:
+            for job, (number, ms) in zip(data["jobs"], data["rows"].tolist(), strict=True):
+                _, cause, seed, text = ast.literal_eval(str(job))
+                found.append((cause, seed, FOUND[int(number)], ms, text))
+    rows, result = [], {}
+    for cause in dict.fromkeys(name for name in CAUSES if name in {one[0] for one in found}):
+        mine = sorted(one for one in found if one[0] == cause)
+        counts = Counter(one[2] for one in mine)
+        ms = float(np.median([one[3] for one in mine]))
+        shares = (100 * each / len(mine) for each in (counts[cause], counts[cause] + counts["unknown"]))
+        rows.append((cause, len(mine), *(counts[name] or "" for name in FOUND), *(f"{one:.0f}" for one in shares),
+                     f"{ms:.0f}"))  # fmt: skip
+        result[cause] = dict(counts, ms=ms)
+        for _, seed, name, _, text in mine:
+            if name != cause:
+                note(f"{cause} {seed}: {name}: {text}")
+    return table(COLUMNS, rows), dict(causes=result)
 
 
 def main() -> None:
     parser = make_parser(__doc__, backend="opencl", seed=False)
     parser.add_argument("--runs", type=int, default=20, help="of each cause (default: %(default)s)")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first run (default: %(default)s)")
     parser.add_argument("--scans", type=int, default=120, help="of each run (default: %(default)s)")
     parser.add_argument("--particles", type=int, default=1000)
     parser.add_argument("--causes", nargs="+", default=list(CAUSES), choices=CAUSES)
-    parser.add_argument("--processes", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=math.inf, help="after which a cause starts no more runs")
+    runs.add_shards(parser, "causes_shard.npz")
     args = parse(parser)
-    rows, result = [], {}
-    for cause in args.causes:
-        found, begin = [], time.perf_counter()
-        for k in range(0, args.runs, args.processes):
-            if found and time.perf_counter() - begin > args.seconds:
-                break
-            jobs = [(cause, args.first + each, args) for each in range(k, min(k + args.processes, args.runs))]
-            found += recordings.results(diagnosed, jobs, args.processes)
-        counts = Counter(name for name, _, _ in found)
-        right = counts[cause]
-        ms = float(np.median([ms for _, ms, _ in found]))
-        rows.append((cause, len(found), *(counts[name] or "" for name in FOUND), f"{100 * right / len(found):.0f}",
-                     f"{ms:.0f}"))  # fmt: skip
-        result[cause] = dict(counts, ms=ms)
-        for name, _, text in found:
-            if name != cause:
-                note(f"{cause}: {name}: {text}")
-    publish(__file__, args, table(COLUMNS, rows), dict(causes=result))
+    if args.join is None:
+        jobs = [("simulated", cause, seed) for seed in range(args.runs) for cause in args.causes]
+        runs.run_shard(args, jobs, lambda job: run(job, args), "bench/studies/causes.py")
+        return
+    publish(__file__, args, *page(args.join))
 
 
 if __name__ == "__main__":

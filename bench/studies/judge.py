@@ -211,7 +211,8 @@ def study(args):
         for log in dict.fromkeys(one["log"] for one in results)
     ]
     text = "\n\n".join([
-        "### Programs", table(COLUMNS, rows), "### Integrity", table(INTEGRITY, rated), "### Logs", table(("program", "log", *COLUMNS[2:]), per_log),
+        "### Programs", table(COLUMNS, rows), "### Integrity", table(INTEGRITY, rated),
+        "### Logs", table(("program", "log", *COLUMNS[2:]), per_log),
     ])  # fmt: skip
     publish(__file__, args, text, dict(results=results, settings=dict(scans=args.scans, particles=args.particles)),
             f"The programs' field model: {args.model}; odometry noise 0.02.")  # fmt: skip

@@ -22,8 +22,9 @@ stayed:
     r_t + max(r_t - r_{t-1}, 0) rho / (1 + rho).
 
 Some wrong places look like the right one: scans agree there equally, and are no evidence. ``ALIKE`` is the prior share
-of such places among wrong ones, and ``ALIKE_CHOSEN`` among places from a search, which prefers them. Places stop looking alike at the rates of ``ALIKE_LENGTH`` and ``ALIKE_TURN``. If a
-share a still looks alike, an increment i of the log odds becomes
+of such places among wrong ones, and ``ALIKE_CHOSEN`` among places from a search, which prefers them. Places stop
+looking alike at the rates of ``ALIKE_LENGTH`` and ``ALIKE_TURN``. If a share a still looks alike, an increment i of the
+log odds becomes
 
     log(a + (1 - a) e^i),   a <- a / (a + (1 - a) e^i),
 

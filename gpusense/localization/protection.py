@@ -83,9 +83,7 @@ def check_risk(risk: float) -> float:
     return risk
 
 
-def distances_by_scan(
-    sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]], pose: Floats
-) -> Distances:
+def distances_by_scan(sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]], pose: Floats) -> Distances:
     """Return distances of poses within 1 m and 0.5 rad of a pose, weighted by the likelihoods of readings there.
 
     The poses are denser near the pose; their weights make up for it.

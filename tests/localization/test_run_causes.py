@@ -104,7 +104,7 @@ def test_wrong_maps_are_told_from_wrong_scales(backend, grid, run) -> None:
 @pytest.mark.parametrize("scale", [0.9, 1.1])
 def test_the_scale_of_a_real_map_is_measured(backend, data_dir, scale) -> None:
     fr079 = gs.read_map(data_dir / "carmen_logs" / "derived_maps" / "freiburg-079_even_05cm.yaml")
-    steps = read_steps(data_dir / "carmen_logs" / "freiburg-079-corrected.log.gz", every=2, offset=1, limit=120)
+    steps = read_steps(data_dir / "carmen_logs" / "freiburg-079-corrected.log.gz", every=2, offset=1, limit=80)
     scanner = steps[0].scan.scanner
     scaled = gs.OccupancyGrid(fr079.cells, fr079.resolution / scale, fr079.origin)
     model = gs.LikelihoodFieldModel(scaled, scanner, PARAMETERS, backend=backend, beams=90)

@@ -252,7 +252,7 @@ def test_a_short_log_leaves_places_that_look_alike():
     assert least < near.wrong < 0.35 and far.wrong < 0.4 * least
     # If no scans come between, the share follows Bayes' rule.
     one = Belief(0.0, 0.0, (0.0, 0.0, 0.0)).judged((9.0, 0.0, 0.0), -3.0)
-    alike = ALIKE * math.exp(-9.0 / ALIKE_LENGTH)
+    alike = ALIKE * math.exp(-9.0 / constants.ALIKE_LENGTH)
     assert one.wrong / (1 - one.wrong) == pytest.approx(alike + (1 - alike) * math.exp(one_step(9.0, -3.0)))
     # A pose that looks alike and is contradicted is detected within a few scans.
     for k in range(1, 4):

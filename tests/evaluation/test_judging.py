@@ -50,8 +50,8 @@ def test_covariances_set_the_radius(model):
     spread = np.broadcast_to(np.diag([1e-4, 1e-4, 1e-4]), (SCANS, 3, 3)).copy()
     spread[40] = np.nan
     found = gs.judge_trajectory(model, scans(), truth(), covariances=spread, risk=0.1, searches=0)
-    # If the covariance is unknown, a pose that is not lost is within 1 m.
-    assert found.radii[40] == 1.0 and 0.02 < found.radii[41] < 0.1
+    # If the covariance is unknown, the scan bounds the pose.
+    assert 0.1 < found.radii[41] < 0.15 < found.radii[40] < 0.5
 
 
 def test_poses_may_be_unknown(model):

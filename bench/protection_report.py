@@ -9,11 +9,13 @@ import math
 import numpy as np
 from common import table
 
-from gpusense.localization.protection import WIDENING
+from gpusense.localization.protection import MARGIN, WIDENING
 
 GROUPS = ("tuning", "held out", "simulated")
 RISKS = (0.01, 0.05)
-# Columns of a row, the last of which are the radii of the risks, before they are widened.
+# Factors of the radius and margins [m] that are compared.
+CHOICES = ((2.0, 0.0), (1.5, 0.0), (1.5, 0.05), (1.25, 0.03), (WIDENING, MARGIN), (1.0, 0.05), (1.0, 0.1))
+# Columns of a row, the last of which are the radii of the risks, without factor and margin.
 ERROR, HEADING, P_LOST, WORD, RADII = range(5)
 # Radius up to which a position can be used [m]; scans of a block.
 ALERT_LIMIT, BLOCK = 0.5, 13
@@ -46,7 +48,7 @@ def is_right(rows):
     return (rows[:, ERROR] < 1) & (rows[:, HEADING] < 0.5)
 
 
-def figures(found, risk, widening, rng):
+def figures(found, risk, rng, widening=WIDENING, margin=MARGIN):
     """Return figures of runs at a risk.
 
     Excesses are scans whose error is larger than their radius, of all scans with a reference; available are radii of at
@@ -54,7 +56,7 @@ def figures(found, risk, widening, rng):
     """
     excesses, blocks, available, radii, late = [], [], [], [], []
     for _, _, _, _, jump, rows in found:
-        radius = widening * rows[:, RADII + RISKS.index(risk)]
+        radius = widening * rows[:, RADII + RISKS.index(risk)] + margin
         known, right = np.isfinite(rows[:, ERROR]), is_right(rows)
         over = (rows[:, ERROR] > radius)[known]
         excesses.append(over)
@@ -113,7 +115,7 @@ def page(files):
         chosen += [(f"{group}: {name}", [run for run in runs if run[1] == name]) for name in names]
     for name, runs in chosen:
         for risk in RISKS if runs else ():
-            one = figures(runs, risk, WIDENING, rng)
+            one = figures(runs, risk, rng)
             result[f"{name.strip('*')}, {risk}"] = one
             late = sorted(one["late"])
             alerts = f"{np.median(late):.0f}, {late[-1]}; {sum(k <= 5 for k in late)} of {len(late)}" if late else "-"
@@ -123,15 +125,17 @@ def page(files):
                 "-" if one["radius"] is None else f"{100 * one['radius']:.0f}", alerts,
             ))  # fmt: skip
     tuning, factors = [run for run in groups["tuning"] if run[2] == "own"], []
-    for factor in (1.0, 1.25, 1.5, 1.75, 2.0, 2.5):
-        every = [figures(tuning, risk, factor, rng) for risk in RISKS]
-        factors.append([f"{factor:g}", *(f"{100 * one['share']:.2f}, {100 * one['limit']:.2f}" for one in every)])
+    for factor, margin in CHOICES if tuning else ():
+        every = [figures(tuning, risk, rng, factor, margin) for risk in RISKS]
+        factors.append([f"{factor:g}, {margin:g}", *(
+            f"{100 * one['share']:.2f}, {100 * one['limit']:.2f}; {100 * one['available']:.1f}" for one in every
+        )])  # fmt: skip
     text = "\n\n".join((
-        f"Widened by {WIDENING:g}; blocks of {BLOCK} scans; the errors of recorded runs are correlated over "
+        f"Radii times {WIDENING:g} and plus {MARGIN:g} m; blocks of {BLOCK} scans; the errors of recorded runs are correlated over "
         f"{correlation_length(recorded):.1f} scans.",
         table(COLUMNS, rows),
-        "Excesses on the whole tuning logs by factor: share and upper 95 % limit [%] at a risk of "
-        + ", ".join(f"{100 * risk:g}" for risk in RISKS) + " %",
-        table(("factor", *(f"{100 * risk:g} %" for risk in RISKS)), factors),
+        "Excesses on the whole tuning logs by factor and margin [m]: share, upper 95 % limit; availability [%], at a "
+        "risk of " + ", ".join(f"{100 * risk:g}" for risk in RISKS) + " %",
+        table(("factor, margin", *(f"{100 * risk:g} %" for risk in RISKS)), factors),
     ))  # fmt: skip
     return text, dict(figures=result, factors=factors)

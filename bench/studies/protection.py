@@ -1,7 +1,7 @@
 """Protection levels of a filter against the truth: excesses, availability, time to alert.
 
-The factor that widens the spread is chosen on the logs ``verdict_runs.TUNING``, and the table shows the logs of
-``HELD_OUT`` and simulated buildings, on which it was not chosen. Whole logs are tracked; other runs are carried away
+Factor and margin of the radius are chosen on the logs ``verdict_runs.TUNING``, and the table shows the logs of
+``HELD_OUT`` and simulated buildings, on which they were not chosen. Whole logs are tracked; other runs are carried away
 once. Scans of a run are dependent, so a limit of a share comes from a bootstrap that draws blocks of scans, or from the
 interval of Clopper and Pearson for the number of blocks if that is larger. A shard writes its runs to a file;
 ``--join`` makes the page of all.
@@ -37,7 +37,7 @@ def follow(places, events, *, backend, particles, beams, seed):
     rows = []
     for event in recordings.play(pf, models, events):
         e = pf.estimate()
-        radii = [e.protection_level(risk) / e.widening for risk in report.RISKS]
+        radii = [(e.protection_level(risk) - e.margin) / e.widening for risk in report.RISKS]
         rows.append((*recordings.errors(e.pose, event.truth), e.p_lost, WORDS.index(e.verdict), *radii))
     return np.array(rows)
 

@@ -87,6 +87,16 @@ def upper_limit(blocks, rng):
     return max(float(np.quantile(drawn, 0.95)), alone)
 
 
+def losses_of(found):
+    """Return how many poses went wrong from one scan with a reference to the next, and the number of such scans."""
+    lost = scans = 0
+    for *_, rows in found:
+        known, right = np.isfinite(rows[:, ERROR]), is_right(rows)
+        pairs = known[1:] & known[:-1]
+        lost, scans = lost + int((pairs & right[:-1] & ~right[1:]).sum()), scans + int(pairs.sum())
+    return lost, scans
+
+
 def correlation_length(found):
     """Return the integrated autocorrelation of the errors in radii, in scans: the mean of runs without a jump."""
     lengths = []
@@ -130,9 +140,10 @@ def page(files):
         factors.append([f"{factor:g}, {margin:g}", *(
             f"{100 * one['share']:.2f}, {100 * one['limit']:.2f}; {100 * one['available']:.1f}" for one in every
         )])  # fmt: skip
+    lost, scans = losses_of(whole)
     text = "\n\n".join((
-        f"Radii times {WIDENING:g} and plus {MARGIN:g} m; blocks of {BLOCK} scans; the errors of recorded runs are correlated over "
-        f"{correlation_length(recorded):.1f} scans.",
+        f"Radii times {WIDENING:g} and plus {MARGIN:g} m; blocks of {BLOCK} scans; the errors of recorded runs are "
+        f"correlated over {correlation_length(recorded):.1f} scans. On the whole logs {lost} pose(s) went wrong in {scans} scans.",
         table(COLUMNS, rows),
         "Excesses on the whole tuning logs by factor and margin [m]: share, upper 95 % limit; availability [%], at a "
         "risk of " + ", ".join(f"{100 * risk:g}" for risk in RISKS) + " %",

@@ -193,6 +193,25 @@ def test_the_cause_comes_once_from_scans_at_their_stamps(monkeypatch: pytest.Mon
     assert "wrong times" not in own.status({})["message"]
 
 
+def test_the_node_names_a_wrong_odometry(needs: Any) -> None:
+    """The odometry turns by 0.2 rad more than the robot at each scan, and counts as exact: the robot is soon lost."""
+    walls, scanner = gs.worlds.building(seed=4, size=(24.0, 16.0)), gs.Scanner(np.linspace(-2, 2, 81), range_max=15.0)
+    run = gs.worlds.simulate_run(walls, scanner, scans=30, seed=3)
+    exact = {f"alpha{number}": 0.001 for number in range(1, 6)}
+    options = from_nav2({"sigma_hit": 0.1, "update_min_d": 0.0, "update_min_a": 0.0} | exact)
+    own, odometry = localizer.Localizer(options, backend=needs("opencl")), run.odometry[0]
+    own.set_map(walls)
+    own.start_at(run.poses[0], np.diag([0.01, 0.01, 0.01]))
+    steps = gs.pose_difference(run.odometry[:-1], run.odometry[1:]) + np.array([0.0, 0.0, 0.2])
+    for k, (ranges, step) in enumerate(zip(run.scans, [np.zeros(3), *steps], strict=True)):
+        odometry, message = gs.compose_poses(odometry, step), scan_of(81, k)
+        message.angle_min, message.angle_increment, message.range_max = -2.0, 4.0 / 80, 15.0
+        message.ranges = ranges
+        assert own.update(message, tuple(odometry.tolist()), np.eye(4))
+    status = own.status({})
+    assert status["level"] == 2 and status["message"].endswith("likely cause: wrong odometry")
+
+
 # ------------------------------------------------------------------------------------------------- the watching node
 
 
@@ -238,6 +257,7 @@ def test_the_watcher_publishes_the_verdict() -> None:
         assert step(7.0 + k, truth + np.array([0.1 * k, 0.0, 0.0]), truth + np.array([1.8 + 0.1 * k, 1.5, 2.0]))
     status = own.status(15.0)
     assert status["level"] == 2 and status["message"].startswith("lost: ") and "likely cause" in status["message"]
+    assert {"key": "cause", "value": "start"} in status["values"]
     assert {"key": "radius", "value": "inf"} in status["values"]
     # No scan of this time, and a scan that breaks a rule.
     assert not own.add_pose(pose_message(20.0, truth))

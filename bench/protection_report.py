@@ -143,7 +143,7 @@ def page(files):
     lost, scans = losses_of(whole)
     text = "\n\n".join((
         f"Radii times {WIDENING:g} and plus {MARGIN:g} m; blocks of {BLOCK} scans; the errors of recorded runs are "
-        f"correlated over {correlation_length(recorded):.1f} scans. On the whole logs {lost} of {scans} poses went wrong.",
+        f"correlated over {correlation_length(recorded):.1f} scans. On the whole logs {lost} of {scans} went wrong.",
         table(COLUMNS, rows),
         "Excesses on the whole tuning logs by factor and margin [m]: share, upper 95 % limit; availability [%], at a "
         "risk of " + ", ".join(f"{100 * risk:g}" for risk in RISKS) + " %",

@@ -37,8 +37,8 @@ def test_the_study_of_protection_levels_counts_excesses_and_alerts(monkeypatch: 
     # Ten errors are larger than the widened radius; a jump at scan 40 shows after three scans.
     rows[:10, report.ERROR], rows[40:, report.ERROR], rows[43:, report.RADII :] = 0.21, 5.0, np.inf
     run = ("held out", "intel", "kidnapped", 0, 40, rows)
-    found = report.figures([run], report.RISKS[0], 2.0, np.random.default_rng(0))
+    found = report.figures([run], report.RISKS[0], np.random.default_rng(0), 2.0, 0.0)
     assert found["excesses"] == 13 and found["scans"] == 60 and found["available"] == 1 and found["late"] == [3]
-    assert report.figures([run], report.RISKS[0], 2.2, np.random.default_rng(0))["excesses"] == 3
+    assert report.figures([run], report.RISKS[0], np.random.default_rng(0), 2.0, 0.02)["excesses"] == 3
     # The limit is about 3 / n if no error exceeds.
     assert report.upper_limit(np.zeros(300), np.random.default_rng(0)) == pytest.approx(3 / 300, rel=0.01)

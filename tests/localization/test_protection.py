@@ -98,7 +98,7 @@ def test_a_risk_that_no_data_support_is_refused(judged, risk) -> None:
 
 def at_poses(poses, backend="numpy"):
     """Return a filter without a map, with particles that are copies of poses."""
-    pf = gs.ParticleFilter(gs.PositionModel(gs.PositionParameters(), backend=backend), particles=len(poses))
+    pf = gs.ParticleFilter(gs.PositionModel(gs.PositionParameters(sigma=0.5), backend=backend), particles=len(poses))
     pf.initialize_from(SimpleNamespace(log_p=np.zeros(len(poses)), positions=poses))
     return pf
 

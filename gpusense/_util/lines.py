@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import math
 import warnings
 import zlib
 from collections.abc import Callable, Iterator
@@ -17,6 +18,14 @@ MOST_BYTES = 1 << 24
 """Length limit of lines [bytes], checked before a line is read completely."""
 # Most lines of a compressed file beyond one line per compressed byte.
 _LINES = 1 << 22
+
+
+def number_in(field: bytes) -> float:
+    """Return the number that a field states; NaN if it states none. Python, unlike C, reads 1_000 as a number."""
+    try:
+        return math.nan if b"_" in field else float(field)
+    except ValueError:
+        return math.nan
 
 
 def numbered_lines(file: Path) -> Iterator[tuple[int, bytes]]:

@@ -1,10 +1,15 @@
-"""Types of arguments: literal names, and arrays of other libraries."""
+"""Types of arguments and arrays: literal names, dtypes, and arrays of other libraries."""
 
 from __future__ import annotations
 
 from typing import Any, Literal, Protocol, TypeAlias
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats: TypeAlias = NDArray[np.float64]
+Integers: TypeAlias = NDArray[np.int64]
+Flags: TypeAlias = NDArray[np.bool]
 
 Precision: TypeAlias = Literal["float32", "float64"]
 Space: TypeAlias = Literal["free", "occupied"]

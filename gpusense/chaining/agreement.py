@@ -11,15 +11,11 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Flags, Floats, Integers
 from gpusense.chaining.links import Links
 from gpusense.chaining.motion import relative
 from gpusense.localization.pose_algebra import compose_poses, invert_poses, wrap_angle
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Flags = NDArray[np.bool]
 
 # Least number of agreeing matches, including the match.
 _AGREE = 3

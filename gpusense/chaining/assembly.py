@@ -7,14 +7,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.typing import Flags, Floats
 from gpusense.chaining.front import Front
 from gpusense.chaining.graph import solve
 from gpusense.chaining.links import MOTION, ODOMETRY, Links
 from gpusense.chaining.motion import constant_motion_deviation, fitted_motion, odometry_links, relative
 from gpusense.localization.motion import OdometryMotion
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool]
 
 TEMPERATURE = 0.04
 """Factor of the information of matches: recorded scans have repeating errors that no single match reveals."""

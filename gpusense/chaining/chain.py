@@ -7,10 +7,10 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from gpusense._util import checks
-from gpusense._util.typing import Precision
+from gpusense._util.typing import Floats, Integers, Precision
 from gpusense.backends import Selection, get_backend
 from gpusense.chaining.assembly import (
     TEMPERATURE,
@@ -37,9 +37,6 @@ from gpusense.matching.match import readings
 from gpusense.models.arguments import real_dtype
 from gpusense.world.scanner import Scanner
 from gpusense.world.sensor_scans import check_scans
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 def chain_scans(

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Flags, Floats, Integers
 from gpusense.chaining.agreement import EVIDENCE, EVIDENCE_OVER_WEAK, agreeing
 from gpusense.chaining.drift import Drift
 from gpusense.chaining.equations import Equations
@@ -24,10 +24,6 @@ from gpusense.chaining.matcher import BATCH, TeamMatcher
 from gpusense.chaining.motion import relative
 from gpusense.chaining.place_recognition import overlaps
 from gpusense.localization.pose_algebra import wrap_angle
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Flags = NDArray[np.bool]
 
 # Windows of searches [m, rad], with the least cell size of places [m] and the most candidates for each.
 _LEVELS = (
@@ -197,7 +193,7 @@ class Loops:
             taken = left[agree]
             links, poses = Links.joined([self.links, taken]), self.solution.poses
             equations = Equations(len(poses), links.first, links.second, 0, ordered=True)
-            if (taken.squared_distances(poses) > KERNEL**2 / _WEIGHT).any():
+            if (taken.squared(taken.residuals(poses)) > KERNEL**2 / _WEIGHT).any():
                 poses = solve(poses, links, kernel=_WIDE * KERNEL, least=_GAIN, equations=equations).poses
             self.solution = solve(poses, links, least=_GAIN, equations=equations)
             weight = self.solution.links.weight[len(self.links) :]

@@ -5,14 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Flags, Floats, Integers
 from gpusense.chaining.graph import Solution, normal_equations, pose_jacobians
 from gpusense.chaining.links import CLOSURE, Links
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Flags = NDArray[np.bool]
 
 # Most poses with a kept joint covariance; in a longer graph each represents the poses up to the next. Largest share of
 # sides of loose steps, to represent breaks of the chain, and their variance in multiples of the usual one.

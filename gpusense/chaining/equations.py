@@ -10,10 +10,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from gpusense._util.typing import Floats, Integers
 
 # Columns per panel, fewer than SuperLU's default, since few columns of a pose graph are alike.
 _PANEL = 4
@@ -32,7 +30,7 @@ class Equations:
         place = np.full(count, -1)
         place[self.rows] = np.arange(count - 1)
         if ordered:
-            self.rows = self.rows[_order_of(*self._slots(place)[:2])]
+            self.rows = self.rows[order_of(*self._slots(place)[:2])]
             place[self.rows] = np.arange(count - 1)
         row, column, self._slot = self._slots(place)
         self._lay_out(row, column)
@@ -120,7 +118,7 @@ def _sums(number: Integers, values: Floats, count: int) -> Floats:
     return np.stack([np.bincount(number, row, count) for row in values])
 
 
-def _order_of(row: Integers, column: Integers) -> Integers:
+def order_of(row: Integers, column: Integers) -> Integers:
     """Return an order of rows and columns with little fill, by minimum degree; the diagonal is among the entries."""
     from scipy import sparse
 

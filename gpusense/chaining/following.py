@@ -11,15 +11,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Flags, Floats, Integers
 from gpusense.chaining.matcher import SURE, Matcher
 from gpusense.localization.pose_algebra import wrap_angle
 from gpusense.matching.result import ScanMatch
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Flags = NDArray[np.bool]
 
 # Half widths of a second search after a failed one [m, rad].
 _WIDE = (2.0, math.pi)

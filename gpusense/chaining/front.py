@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util.angles import wrapped
+from gpusense._util.typing import Flags, Floats, Integers
 from gpusense.chaining.following import matched_again, matched_by_motion, motions_around, weakened
 from gpusense.chaining.links import MATCH, Links, chained
 from gpusense.chaining.matcher import GROUP, GUIDED_GROUP, NEAR, SURE, Matcher
@@ -21,10 +22,6 @@ from gpusense.chaining.options import ChainOptions, jumps_of
 from gpusense.localization.pose_algebra import compose_poses, invert_poses, pose_difference, wrap_angle
 from gpusense.matching.result import ScanMatch
 from gpusense.world.scanner import Scanner
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Flags = NDArray[np.bool]
 
 # Number of preceding key scans to match with a key scan.
 LOCAL = 4

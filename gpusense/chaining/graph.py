@@ -18,12 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.typing import Flags, Floats
 from gpusense.chaining.equations import Equations
 from gpusense.chaining.links import Links, chained
 from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool]
 
 # Scale of Cauchy's kernel [deviations of a link].
 KERNEL = 3.0
@@ -59,7 +57,7 @@ def solve(
     """
     at, damping, fails = np.array(poses, np.float64), np.full(len(poses), _DAMPING), 0
     residual = links.residuals(at)
-    squared = _squared(links, residual)
+    squared = links.squared(residual)
     cost, count = _cost(squared, kernel), 0
     if len(at) < 2 or not len(links):
         return Solution(at, replace(links, weight=_weights(squared, kernel)), cost, 0)
@@ -72,7 +70,7 @@ def solve(
         step = np.insert(equations.step(matrix, gradient), fixed, 0.0, axis=0)
         tried = [_moved(at, step)] + ([_moved_along(at, step, fixed)] if settle else [])
         trials = [(trial, links.residuals(trial)) for trial in tried]
-        distances = [_squared(links, off) for _, off in trials]
+        distances = [links.squared(off) for _, off in trials]
         costs = [_cost(there, kernel) for there in distances]
         best = int(np.argmin(costs))
         if not costs[best] <= cost * (1 + 1e-12):
@@ -140,12 +138,6 @@ def pose_jacobians(poses: Floats, first: NDArray[np.int64], second: NDArray[np.i
     one_side = np.stack([-c, -s, y, s, -c, -x, zero, zero, -one], axis=1).reshape(-1, 3, 3)
     other_side = np.stack([c, s, zero, -s, c, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)
     return one_side, other_side
-
-
-def _squared(links: Links, residual: Floats) -> Floats:
-    """Return (L,) squared distances of residuals in deviations."""
-    squared: Floats = np.maximum(np.einsum("li,lij,lj->l", residual, links.information, residual), 0.0)
-    return squared
 
 
 def _weights(squared: Floats, kernel: float) -> Floats:

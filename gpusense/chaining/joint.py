@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Flags, Floats, Integers
 from gpusense.chaining.assembly import shared_odometry
 from gpusense.chaining.front import Front
 from gpusense.chaining.links import COUPLING, Links, chained
@@ -19,10 +19,6 @@ from gpusense.chaining.matcher import SURE
 from gpusense.chaining.motion import constant_motion_deviation, filled_motion, partial_motion, relative
 from gpusense.localization.motion import OdometryMotion
 from gpusense.localization.pose_algebra import pose_difference
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Flags = NDArray[np.bool]
 
 # Deviations of a pose between scans of two scanners: by mounts and clocks [m, rad], and a share of the motion.
 _MOUNTS, _MOUNTS_TURN, _SHARE = 0.01, 0.01, 0.1

@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util.angles import wrapped
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from gpusense._util.typing import Floats, Integers
 
 MATCH, ODOMETRY, MOTION, COUPLING, CLOSURE = "match", "odometry", "motion", "coupling", "closure"
 KINDS = {
@@ -82,11 +80,10 @@ class Links:
         off[:, 2] = wrapped(off[:, 2])
         return off
 
-    def squared_distances(self, poses: Floats) -> Floats:
-        """Return (L,) squared distances of residuals in deviations."""
-        off = self.residuals(poses)
-        squared: Floats = np.maximum(np.einsum("li,lij,lj->l", off, self.information, off), 0.0)
-        return squared
+    def squared(self, residuals: Floats) -> Floats:
+        """Return (L,) squared distances of (L, 3) residuals in deviations."""
+        squared: Floats = np.einsum("li,lij,lj->l", residuals, self.information, residuals)
+        return np.maximum(squared, 0.0)
 
 
 def chained(first: Floats, steps: Floats) -> Floats:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats, Integers
 from gpusense.backends import get_backend
 from gpusense.chaining.links import Links
 from gpusense.chaining.options import ChainOptions
@@ -18,9 +19,6 @@ from gpusense.matching.match import WINDOW, match_log, match_scan
 from gpusense.matching.noise import scan_noise
 from gpusense.matching.result import ScanMatch
 from gpusense.world.scanner import Scanner
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 GROUP, GUIDED_GROUP = 256, 1024
 """Scans of a group without and with odometry; an interrupt keeps the matches of finished groups."""

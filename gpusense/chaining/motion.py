@@ -7,12 +7,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.localization.motion import OdometryMotion, turns_between
 from gpusense.localization.motion_fit import fit_odometry_motion
 from gpusense.localization.pose_algebra import pose_difference, wrap_angle
 from gpusense.world.deskew import part_of_arc
-
-Floats = NDArray[np.float64]
 
 # Least deviations of a motion by odometry [m, rad], for finite information.
 _LEAST = (1e-3, 5e-4)

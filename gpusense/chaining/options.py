@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util import checks
-from gpusense._util.typing import Precision
+from gpusense._util.typing import Floats, Precision
 from gpusense.backends import Selection
 from gpusense.localization.motion import OdometryMotion
-
-Floats = NDArray[np.float64]
 
 # Least time gap of a jump, in usual steps and [s].
 _JUMP_STEPS, _JUMP = 10.0, 2.0

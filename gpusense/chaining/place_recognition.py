@@ -5,14 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats, Integers
 from gpusense.localization.pose_algebra import wrap_angle
 from gpusense.matching.points import ScanPoints, scan_points
 from gpusense.world.sensor_scans import SensorScans
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # Least share of common cells of a scan.
 _SHARE = 0.3

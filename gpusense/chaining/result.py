@@ -8,12 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats, Integers
 from gpusense.chaining.joint import Joint
 from gpusense.chaining.links import CLOSURE, Links
 from gpusense.localization.motion import OdometryMotion
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 REASONS = {
     "no match": "the scan matches neither its predecessor nor key scans: its motion is from odometry or a guess",

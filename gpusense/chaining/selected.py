@@ -12,13 +12,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats, Integers
 from gpusense.chaining.drift import DAMPING
+from gpusense.chaining.equations import order_of
 from gpusense.chaining.graph import Solution, normal_equations
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 def pose_covariances(solution: Solution) -> Floats:
@@ -38,7 +36,8 @@ def inverse_blocks(matrix: Any, damping: float) -> Floats:
     """Return the diagonal blocks (N, 3, 3) of the inverse of a sparse positive definite matrix plus damping."""
     blocks = matrix.tobsr((3, 3))
     blocks.sort_indices()
-    order = _order(blocks, blocks.shape[0] // 3)
+    count = blocks.shape[0] // 3
+    order = order_of(blocks.indices, np.repeat(np.arange(count), np.diff(blocks.indptr)))
     tree = Tree(_parts_of(blocks, order), len(order))
     factors, inverses = _eliminated(blocks, order, tree, damping)
     fronts: dict[int, Floats] = {}
@@ -64,19 +63,6 @@ def inverse_blocks(matrix: Any, damping: float) -> Floats:
         for group in tree.last_used[k]:
             del fronts[group]
     return result
-
-
-def _order(blocks: Any, count: int) -> Integers:
-    """Return an elimination order of the blocks with little fill: minimum degree, by SuperLU."""
-    from scipy import sparse
-    from scipy.sparse.linalg import splu
-
-    pattern = sparse.csr_matrix((np.ones(len(blocks.indices)), blocks.indices, blocks.indptr), shape=(count, count))
-    dominant = (-pattern + sparse.diags(np.asarray(pattern.sum(axis=1)).ravel() + 2.0)).tocsc()
-    factor = splu(dominant, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    # Column j of the matrix is column perm_c[j] of the factors.
-    order: Integers = np.argsort(factor.perm_c)
-    return order
 
 
 def _parts_of(blocks: Any, order: Integers) -> list[tuple[int, int, Integers]]:

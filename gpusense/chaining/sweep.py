@@ -7,13 +7,11 @@ corrected for the motion by the right order they agree best.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.chaining.links import chained
 from gpusense.chaining.matcher import GROUP, NEAR, Matcher
 from gpusense.chaining.motion import relative, scan_motions
-
-Floats = NDArray[np.float64]
 
 # Most inspected scans; scans between the two of a pair; most pairs; least informative turn during a scan [rad].
 _SCANS, _LAG, _PAIRS, _TURN = 2000, 5, 120, 0.01

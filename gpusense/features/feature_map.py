@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from gpusense._util import checks
 from gpusense._util.files import write_whole
 from gpusense._util.lines import numbered_lines
-from gpusense.features.result import KIND_TYPE, Floats, signature_of
+from gpusense._util.typing import Floats
+from gpusense.features.result import KIND_TYPE, check_kinds, signature_of
 from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.line_map import LineMap
 
@@ -70,7 +71,7 @@ class FeatureMap:
             TypeError: not names of kinds.
             ValueError: another kind than "corner", "door", "pole" and "reflector".
         """
-        chosen = np.isin(self.kind, kinds_of(kinds, LANDMARK_KINDS))
+        chosen = np.isin(self.kind, check_kinds("kinds", kinds, LANDMARK_KINDS))
         return LandmarkMap(self.pose[chosen, :2], signature_of(self.kind[chosen], self.size[chosen]))
 
     def lines(self) -> LineMap:
@@ -124,15 +125,6 @@ class FeatureMap:
     def __repr__(self) -> str:
         counts = [f"{np.count_nonzero(self.kind == name)} {name}s" for name in MAP_KINDS if name in self.kind]
         return f"FeatureMap({', '.join(counts) or 'none'})"
-
-
-def kinds_of(kinds: str | Sequence[str], allowed: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the checked kinds as a tuple."""
-    try:
-        names = (kinds,) if isinstance(kinds, str) else tuple(kinds)
-    except TypeError:
-        raise TypeError(f"kinds: must be kinds of features, got {checks.show(kinds)}") from None
-    return tuple(checks.choice("kinds", name, allowed) for name in names)
 
 
 def joined_maps(parts: Sequence[FeatureMap]) -> FeatureMap:

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
+from gpusense._util.typing import Floats
 from gpusense.backends import Selection
 from gpusense.features.extract import extract_features
-from gpusense.features.feature_map import LANDMARK_KINDS, MAP_KINDS, FeatureMap, joined_maps, kinds_of
+from gpusense.features.feature_map import LANDMARK_KINDS, MAP_KINDS, FeatureMap, joined_maps
 from gpusense.features.line_clusters import lines_of
-from gpusense.features.result import KIND_TYPE, Features, Floats
+from gpusense.features.result import KIND_TYPE, Features, check_kinds
 from gpusense.models.scan.caster import RayCaster
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
@@ -63,7 +64,7 @@ def map_features(
         FeatureMap(4 lines, 4 corners)
     """
     checks.instance("features", features, Features)
-    wanted = kinds_of(kinds, MAP_KINDS)
+    wanted = check_kinds("kinds", kinds, MAP_KINDS)
     placed = checks.array("poses", poses, ("S", 3), largest=checks.FARTHEST)
     scans = int(features.scan.max(initial=-1)) + 1
     if len(placed) < scans:
@@ -110,7 +111,7 @@ def landmarks_of_map(
         FeatureMap(4 lines, 4 corners)
     """
     checks.instance("grid", grid, OccupancyGrid)
-    kinds = kinds_of(kinds, MAP_KINDS)
+    kinds = check_kinds("kinds", kinds, MAP_KINDS)
     limit = checks.real("range_max", range_max, above=0, high=checks.FARTHEST)
     poses = _free_places(grid, checks.real("spacing", spacing, low=checks.SMALLEST, high=checks.FARTHEST))
     scanner = Scanner(np.arange(_BEAMS) * (2 * math.pi / _BEAMS) - math.pi, limit)

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense._util.angles import wrapped
+from gpusense._util.typing import Floats
 from gpusense.features.feature_map import FeatureMap
-from gpusense.features.result import KIND_TYPE, Features, Floats, across_lines
+from gpusense.features.result import KIND_TYPE, Features, across_lines
 
 # Pieces of one line agree within this many deviations plus this offset [m] and angle [rad], with at most this gap
 # [m].

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from gpusense._util import checks
 from gpusense._util.angles import wrapped
-
-Floats = NDArray[np.float64]
+from gpusense._util.typing import Floats
 
 KIND_TYPE = "<U9"
 """Type of names of kinds."""
@@ -171,15 +170,13 @@ def signature_of(kind: NDArray[np.str_], size: Floats) -> Floats:
     return signature
 
 
-def check_kinds(name: str, kinds: str | Sequence[str]) -> tuple[str, ...]:
+def check_kinds(name: str, kinds: str | Sequence[str], allowed: tuple[str, ...] = KINDS) -> tuple[str, ...]:
     """Return the checked kinds as a tuple."""
-    if isinstance(kinds, str):
-        return (checks.choice(name, kinds, KINDS),)
     try:
-        names = tuple(kinds)
+        names = (kinds,) if isinstance(kinds, str) else tuple(kinds)
     except TypeError:
         raise TypeError(f"{name}: must be kinds of features, got {checks.show(kinds)}") from None
-    return tuple(checks.choice(name, one, KINDS) for one in names)
+    return tuple(checks.choice(name, one, allowed) for one in names)
 
 
 @dataclass

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from gpusense._util.typing import Floats
 
 # Scaled information below this share of the largest counts as none.
 _FLAT = 1e-10

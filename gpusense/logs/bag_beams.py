@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util.notices import warn_user
-from gpusense.logs.records import Floats, Pose
+from gpusense._util.typing import Floats
+from gpusense.logs.records import Pose
 from gpusense.world.messages import distinct_beams, laser_beams, nearest_beams, real_field
 from gpusense.world.messages import field as field_of
 from gpusense.world.scanner import Scanner

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gpusense._util.notices import warn_user
-from gpusense.logs.records import Floats, Pose
+from gpusense._util.typing import Floats
+from gpusense.logs.records import Pose
 from gpusense.logs.transform_buffer import TransformBuffer
 from gpusense.world.messages import LEVEL, planar_part, tilt_of
 from gpusense.world.messages import field as field_of
@@ -133,6 +134,12 @@ def _track_of(transforms: TransformBuffer, frame: str) -> Track:
         track.poses.append((float(pose[0, 3]), float(pose[1, 3]), math.atan2(pose[1, 0], pose[0, 0])))
         track.tilts.append(tilt_of(pose))
     return track
+
+
+def bases_of(transforms: TransformBuffer) -> list[str]:
+    """Return the frames with a usual name of a robot's base, the likeliest first."""
+    names = {name for link in transforms.links() for name in (link.parent, link.child)}
+    return sorted((name for name in names if name.rpartition("/")[2] in BASES), key=base_order)
 
 
 def base_order(frame: str) -> tuple[int, str]:

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from gpusense._util.notices import warn_user
-from gpusense.logs.bag_odometry import BASES, Track, base_order, warn_of_tilt
+from gpusense._util.typing import Floats
+from gpusense.logs.bag_odometry import Track, bases_of, warn_of_tilt
 from gpusense.logs.bag_survey import frame_of
 from gpusense.logs.bags import ODOMETRY, TRANSFORMS, messages, topics_of
-from gpusense.logs.records import Floats
 from gpusense.logs.transform_buffer import TransformBuffer, TransformError
 from gpusense.world.messages import field, planar_part, stamp_of, tilt_of
 
@@ -123,9 +123,8 @@ def _of_transforms(path: Path, times: Floats, map_frame: str) -> PoseTrack:
     if skipped:
         warn_user(f"{path}: skipped transforms: {skipped}")
     frame = map_frame.strip("/")
-    names = {name for link in buffer.links() for name in (link.parent, link.child)}
     problem = f"no transforms from {frame} to the robot's base"
-    for base in sorted((name for name in names if name.rpartition("/")[2] in BASES), key=base_order):
+    for base in bases_of(buffer):
         track = Track(f"the transforms from {frame} to {base}")
         for time in dict.fromkeys(times.tolist()):
             try:

@@ -16,7 +16,7 @@ import numpy as np
 
 from gpusense._util.extras import library
 from gpusense._util.files import naming
-from gpusense.logs.bags import ODOMETRY, SCAN, TRANSFORMS
+from gpusense.logs.bags import ODOMETRY, SCAN, TRANSFORMS, type_store
 from gpusense.logs.records import Pose, Scan
 
 _LASER, _BASE, _ODOM = "laser", "base_link", "odom"
@@ -68,12 +68,8 @@ class _Writer:
     def __init__(self, path: Path, *, first: bool) -> None:
         from rosbags.rosbag1 import Writer as Writer1
         from rosbags.rosbag2 import Writer as Writer2
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-        self._first = first
-        self._store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
-        if TRANSFORMS not in self._store.types:
-            self._store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
+        self._first, self._store = first, type_store(first)
         self._writer: Any = Writer1(path) if first else Writer2(path, version=9)
         self._connections: dict[str, Any] = {}
 

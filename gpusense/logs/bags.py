@@ -114,13 +114,20 @@ def errors_at(where: str) -> Iterator[None]:
         raise ValueError(f"{where}: must be a sound ROS message or bag, got {text[:200]}") from None
 
 
-def _decoder(path: Path) -> Callable[[bytes, str], Any]:
-    """Return the function that decodes a message of a type."""
-    first = is_ros1(path)
-    types = library("rosbags.typesys", f"{path}: a ROS bag")
+def type_store(first: bool) -> Any:
+    """Return the message types of ROS 1 (``first``) or ROS 2, transforms included."""
+    types = library("rosbags.typesys", "a ROS bag")
     store = types.get_typestore(types.Stores.ROS1_NOETIC if first else types.Stores.ROS2_HUMBLE)
     if TRANSFORMS not in store.types:
         store.register(types.get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
+    return store
+
+
+def _decoder(path: Path) -> Callable[[bytes, str], Any]:
+    """Return the function that decodes a message of a type."""
+    first = is_ros1(path)
+    library("rosbags.typesys", f"{path}: a ROS bag")
+    store = type_store(first)
     if first:
         return lambda data, kind: store.deserialize_ros1(data, kind)
     return lambda data, kind: store.deserialize_cdr(unpacked(data), kind)

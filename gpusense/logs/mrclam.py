@@ -26,8 +26,9 @@ from pathlib import Path
 import numpy as np
 
 from gpusense._util import checks
-from gpusense._util.lines import until_cut
-from gpusense.logs.records import Floats, Integers, LandmarkRun
+from gpusense._util.lines import number_in, until_cut
+from gpusense._util.typing import Floats, Integers
+from gpusense.logs.records import LandmarkRun
 from gpusense.world.landmarks import LandmarkMap
 
 # Indices of subjects that are no landmarks: a robot, and the owner of an unlisted barcode.
@@ -143,10 +144,7 @@ def _row(where: str, fields: list[bytes], columns: tuple[str, ...]) -> list[floa
         raise ValueError(f"{where}: must have {len(columns)} fields ({', '.join(columns)}), got {len(fields)}")
     values = []
     for name, text in zip(columns, fields, strict=True):
-        try:
-            value = math.nan if b"_" in text else float(text)
-        except ValueError:
-            value = math.nan
+        value = number_in(text)
         if not math.isfinite(value):
             raise ValueError(f"{where}: {name} must be a finite number, got {text.decode(errors='replace')[:40]!r}")
         if name in ("subject", "barcode") and not (value == int(value) and abs(value) < 2**53):

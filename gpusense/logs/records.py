@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util import masks
+from gpusense._util.typing import Floats, Integers
 from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.scanner import Scanner
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 Pose = tuple[float, float, float]
 """(x, y, theta) [m, m, rad]."""
 

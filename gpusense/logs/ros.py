@@ -41,11 +41,12 @@ import numpy as np
 
 from gpusense._util.angles import wrapped
 from gpusense._util.notices import warn_user
+from gpusense._util.typing import Floats
 from gpusense.logs.bag_beams import Beams, shared_beams
-from gpusense.logs.bag_odometry import BASES, base_order, odometry_pose
+from gpusense.logs.bag_odometry import BASES, bases_of, odometry_pose
 from gpusense.logs.bag_survey import Bag, frame_of, scans_on, survey
 from gpusense.logs.bags import ODOMETRY, Message, messages
-from gpusense.logs.records import Floats, Odometry, Pose, Scan
+from gpusense.logs.records import Odometry, Pose, Scan
 from gpusense.logs.transform_buffer import TransformError
 from gpusense.logs.transforms import planar_mount
 from gpusense.world.messages import LEVEL, stamp_of
@@ -219,8 +220,7 @@ def _bases(bag: Bag) -> list[str]:
     """Return candidates for the robot's base frame, the likeliest first."""
     if bag.track.base:
         return [bag.track.base]
-    names = {name for link in bag.transforms.links() for name in (link.parent, link.child)}
-    return sorted((name for name in names if name.rpartition("/")[2] in BASES), key=base_order) or list(BASES)
+    return bases_of(bag.transforms) or list(BASES)
 
 
 def _compare(bag: Bag, given: Pose, place: Pose) -> None:

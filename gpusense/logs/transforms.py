@@ -9,7 +9,8 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense._util.angles import wrapped
-from gpusense.logs.records import Floats, Pose, Scan
+from gpusense._util.typing import Floats
+from gpusense.logs.records import Pose, Scan
 from gpusense.world.messages import tilt_of
 
 # Least tilt of a laser whose beams run clockwise [rad].

@@ -20,8 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gpusense._util.lines import until_cut
-from gpusense.logs.records import Floats, Odometry, Pose, Scan
+from gpusense._util.lines import number_in, until_cut
+from gpusense._util.typing import Floats
+from gpusense.logs.records import Odometry, Pose, Scan
 from gpusense.world.scanner import Scanner
 
 _BEAMS, _RANGE_MAX = 180, 81.83
@@ -75,10 +76,7 @@ def _numbers(where: str, fields: list[bytes]) -> Floats:
         raise ValueError(f"{where}: {name}: must have {1 + count} fields, got {len(fields)}")
     values = np.empty(count)
     for k, field in enumerate(fields[1:]):
-        try:
-            values[k] = math.nan if b"_" in field else float(field)
-        except ValueError:
-            values[k] = math.nan
+        values[k] = number_in(field)
         if not math.isfinite(values[k]):
             text = field.decode(errors="replace")[:40]
             raise ValueError(f"{where}: {name}: field {k + 1} must be a finite number, got {text!r}")

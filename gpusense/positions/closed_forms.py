@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from gpusense._util.typing import Floats
+
 Complexes = NDArray[np.complex128]
 Words = NDArray[np.str_]
 

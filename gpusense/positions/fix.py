@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpusense._util.html import card
-
-Floats = NDArray[np.float64]
+from gpusense._util.typing import Floats
 
 STATUSES = {
     "unique": "one solution",

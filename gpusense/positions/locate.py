@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util.angles import wrapped
-from gpusense._util.typing import Loss
+from gpusense._util.typing import Floats, Loss
 from gpusense.positions.closed_forms import two_circles, wrap
 from gpusense.positions.fix import PositionFix
-from gpusense.positions.problem import Floats, Problem, check_operands, make_problem, subsets
+from gpusense.positions.problem import Problem, check_operands, make_problem, subsets
 from gpusense.positions.solver import minima, pick
 
 # Standard deviation of a bearing without information [rad].

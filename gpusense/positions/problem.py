@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense._util.typing import Floats
 from gpusense.positions.closed_forms import EPS, Complexes, wrap
 from gpusense.positions.fix import STATUSES, PositionFix
 from gpusense.world.plausible import look_at_bearings
-
-Floats = NDArray[np.float64]
 
 # rho(z), rho'(z) and rho''(z) of the squared residual z, by the names of scipy.optimize.least_squares.
 LOSSES: dict[str, Callable[[Floats], tuple[Floats, Floats, Floats]]] = {

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gpusense._util.typing import Loss
+from gpusense._util.typing import Floats, Loss
 from gpusense.positions.closed_forms import two_circles
 from gpusense.positions.fix import PositionFix
-from gpusense.positions.problem import Floats, Problem, check_operands, make_problem, subsets
+from gpusense.positions.problem import Problem, check_operands, make_problem, subsets
 from gpusense.positions.solver import distinct, in_line, minima, pick, reflect
 
 

@@ -18,14 +18,13 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
-from concurrent.futures import CancelledError, Executor, Future, InvalidStateError
+from concurrent.futures import CancelledError, Future, InvalidStateError
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from gpusense._util import checks
 from gpusense._util.extras import library
-from gpusense.sweeps.executors import device_names
+from gpusense.sweeps.executors import Terminable, device_names
 from gpusense.sweeps.on_worker import DEVICES, answer, one_start, processes
 from gpusense.sweeps.process import WorkerDied, result_of
 from gpusense.sweeps.worker import error_text
@@ -38,7 +37,7 @@ _RESOURCE = "gpusense"
 _LOOK, _ANSWER, _GOODBYE = 1.0, 5.0, 10.0
 
 
-class DaskExecutor(Executor):
+class DaskExecutor(Terminable):
     """Jobs on a Dask cluster, one at a time on each worker, in a process that the worker supervises.
 
     Workers of a cluster at an address are started by ``GPUSENSE_SWEEP_DEVICE=warp:cuda:0 dask worker ADDRESS
@@ -125,19 +124,12 @@ class DaskExecutor(Executor):
     def __repr__(self) -> str:
         return f"DaskExecutor({self.address!r}, {self.slots} slots)"
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> bool | None:
-        if kind is not None:
-            self.terminate()
-        return super().__exit__(kind, error, trace)
-
     # ---- the cluster
 
     def _workers(self) -> Mapping[str, Any] | None:
         """Return the scheduler's list of workers; None if it does not answer."""
         try:
-            answer = self._client.sync(_identity, self._client, callback_timeout=_ANSWER)
+            answer = self._client.sync(self._client.scheduler.identity, n_workers=-1, callback_timeout=_ANSWER)
         except Exception:
             return None
         workers: Mapping[str, Any] = answer["workers"]
@@ -299,11 +291,6 @@ def _check_address(address: str) -> None:
     except ValueError as error:
         rule = "dask: must be an address such as tcp://10.0.0.1:8786"
         raise ValueError(f"{rule}, got {checks.show(address)}: {error}") from None
-
-
-async def _identity(client: Any) -> Any:
-    """Return a scheduler's description of itself and its workers."""
-    return await client.scheduler.identity(n_workers=-1)
 
 
 def _local_cluster(names: list[str], security: Any) -> Any:

@@ -42,7 +42,22 @@ class SerialExecutor(Executor):
         return future
 
 
-class ProcessExecutor(Executor):
+class Terminable(Executor):
+    """Executor that ends its jobs at once if its ``with`` block ends by an exception."""
+
+    def terminate(self) -> None:
+        """End the running jobs."""
+        raise NotImplementedError
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool | None:
+        if kind is not None:
+            self.terminate()
+        return super().__exit__(kind, error, trace)
+
+
+class ProcessExecutor(Terminable):
     """Run jobs in a spawned process for each device.
 
     A process runs one job at a time. If it ends during its job, it raises :class:`WorkerDied` in the job's future and
@@ -78,13 +93,6 @@ class ProcessExecutor(Executor):
 
     def __repr__(self) -> str:
         return f"ProcessExecutor({self._names if any(self._names) else self.slots})"
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> bool | None:
-        if kind is not None:
-            self.terminate()
-        return super().__exit__(kind, error, trace)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Queue a function of a module for the next free process."""

@@ -116,14 +116,11 @@ def score(job: Job, store: Store) -> Values:
 
 def fit(job: Job, store: Store) -> Values:
     """Fit the parameters of the beam model to the log; seeds above 0 draw its blocks anew (bootstrap)."""
-    from gpusense.evaluation.range_data import data_of_log
-    from gpusense.learning.beam.fit import fit_beam_parameters
-
     scans, block = store.scans(job), job.option("block", 10)
     chosen = [job.option(name) for name in ("range_max", "topic", "every", "offset", "limit")]
 
     def cast() -> Any:
-        return data_of_log(store.grid(job.map), scans, backend=store.device, block=block)
+        return range_data.data_of_log(store.grid(job.map), scans, backend=store.device, block=block)
 
     data = store.keep("data", (job.map, job.log, block, *chosen), cast)
     ranges, expected = data.ranges, data.expected

@@ -141,7 +141,7 @@ def test_a_graph_without_links_stays(poses: np.ndarray) -> None:
 def test_the_cost_never_rises(settle: bool) -> None:
     for seed in range(5):
         start, links = scene(seed, outlier=True)
-        squared = links.squared_distances(start)
+        squared = links.squared(links.residuals(start))
         before = float(np.sum(KERNEL**2 * np.log1p(squared / KERNEL**2)))
         assert solve(start, links, settle=settle).cost <= before
 

@@ -13,15 +13,15 @@ analysis using generalized linear models".
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense._util.typing import Floats
 from gpusense.learning.beam.pairs import Pairs
-from gpusense.learning.beam.point import BIAS, FORM, HIT, MAX, RAND, RATE, SHORT, SIGMA, Floats, Point
+from gpusense.learning.beam.point import BIAS, FORM, HIT, MAX, RAND, RATE, SHORT, SIGMA, Point
 from gpusense.learning.beam.problem import Problem
+from gpusense.learning.information import scatter_of
 from gpusense.learning.point.densities import by_shape, truncated
 from gpusense.world.range_causes import ShortDensity
 from gpusense.world.scanner import Reading
@@ -53,11 +53,7 @@ def count_blocks(pairs: Pairs) -> int:
 def block_scatter(problem: Problem, point: Point) -> Floats:
     """Return the scatter of the log-likelihood's gradient over blocks; NaN for fewer than 2 blocks."""
     sums, counts = block_gradients(problem, point)
-    blocks = int(np.count_nonzero(counts))
-    if blocks < 2:
-        return np.full((sums.shape[1],) * 2, math.nan)
-    off = sums[counts > 0] - sums.sum(axis=0) / blocks
-    return (off.T @ off) * (blocks / (blocks - 1))
+    return scatter_of(sums[counts > 0])
 
 
 def block_gradients(problem: Problem, point: Point) -> tuple[Floats, NDArray[np.intp]]:

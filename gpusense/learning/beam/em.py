@@ -24,7 +24,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gpusense.learning.beam.point import BIAS, FORM, HIT, RATE, SHORT, SIGMA, Floats, Point
+from gpusense._util.typing import Floats
+from gpusense.learning.beam.point import BIAS, FORM, HIT, RATE, SHORT, SIGMA, Point
 from gpusense.learning.beam.problem import NOTHING, SMALL_FORM, Problem, Value
 from gpusense.learning.information import newton_direction
 

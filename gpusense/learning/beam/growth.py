@@ -15,8 +15,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.learning.beam.pairs import Pairs
-from gpusense.learning.beam.point import Bounds, Floats
+from gpusense.learning.beam.point import Bounds
 from gpusense.learning.beam.result import BeamFit
 from gpusense.learning.beam.shapes import without_ranges
 from gpusense.learning.point.densities import by_shape, truncated

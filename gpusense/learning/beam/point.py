@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.learning.beam.pairs import Pairs
 from gpusense.world.hit_shapes import NORMAL, HitShape, name_of, shape_of
 from gpusense.world.parameters import BeamParameters
-
-Floats = NDArray[np.float64]
 
 # FORM is the first coordinate of the shape of hits.
 HIT, SHORT, MAX, RAND, SIGMA, RATE, BIAS, FORM = range(8)

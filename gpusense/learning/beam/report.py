@@ -8,13 +8,14 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.learning.beam.blocks import block_scatter, count_blocks
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.em import Climb, Watch, climb_em
 from gpusense.learning.beam.optimum import Search
 from gpusense.learning.beam.options import Options
 from gpusense.learning.beam.pairs import Pairs
-from gpusense.learning.beam.point import BIAS, FORM, HIT, NAMES, RATE, SHORT, SIGMA, Floats, Point
+from gpusense.learning.beam.point import BIAS, FORM, HIT, NAMES, RATE, SHORT, SIGMA, Point
 from gpusense.learning.beam.problem import NOTHING, Problem, Value
 from gpusense.learning.beam.result import BeamFit
 from gpusense.learning.information import errors_of

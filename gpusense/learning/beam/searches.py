@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from gpusense._util.typing import Floats
 from gpusense.learning.beam.em import Climb, Watch, free_direction, without_needless
-from gpusense.learning.beam.point import BIAS, RAND, Floats, Point
+from gpusense.learning.beam.point import BIAS, RAND, Point
 from gpusense.learning.beam.problem import Problem, Value
 
 # Bound on a log weight relative to the reference: weights are between e^-25 and e^25 times the reference weight.

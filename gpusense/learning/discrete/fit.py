@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from gpusense._util import checks
+from gpusense._util.typing import Floats
 from gpusense.learning.discrete.causes import DiscreteCauses, DiscreteFit
 from gpusense.learning.discrete.probabilities import MOST_BINS, bins_of, check_pairs, separate_causes
 from gpusense.learning.information import errors_of, scatter_of
-
-Floats = NDArray[np.float64]
 
 NAMES = ("lambda_short", "lambda_rand", "p_detect", "sigma_hit")
 # Steps of first and second central differences of the mean log-likelihood; they balance rounding and truncation

@@ -24,11 +24,9 @@ from numpy.typing import NDArray
 from scipy.special import erfcx, logsumexp
 
 from gpusense._util import checks
+from gpusense._util.typing import Floats, Integers
 from gpusense.world.range_causes import RandomDensity, ShortDensity
 from gpusense.world.scanner import Reading, reading_classes
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _LOG_ROOT_2PI = 0.5 * math.log(2 * math.pi)

@@ -13,19 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from gpusense._util.typing import Floats, Integers
 from gpusense.learning.information import newton_direction
-from gpusense.learning.landmark.pairs import (
-    RANGE,
-    RANGE_BIAS,
-    SIGNATURE,
-    Floats,
-    Integers,
-    Pairs,
-    Point,
-    Value,
-    evaluate,
-    hessian,
-)
+from gpusense.learning.landmark.pairs import RANGE, RANGE_BIAS, SIGNATURE, Pairs, Point, Value, evaluate, hessian
 from gpusense.models.landmark.features import wrapped
 from gpusense.world.parameters import LandmarkParameters
 

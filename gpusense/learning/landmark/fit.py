@@ -13,14 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
+from gpusense._util.typing import Floats, Integers
 from gpusense.learning.information import scaled_axes
 from gpusense.learning.landmark.em import NOTHING, SIGMAS, bounds_of, climb, first_guess, free
 from gpusense.learning.landmark.pairs import (
     BEARING_BIAS,
     ODDS,
     RANGE_BIAS,
-    Floats,
-    Integers,
     Limits,
     Pairs,
     Value,

@@ -15,11 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from gpusense._util.typing import Floats, Integers
 from gpusense.models.landmark.features import wrapped
 from gpusense.world.frames import Mount
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 RANGE, BEARING, SIGNATURE, ODDS, RANGE_BIAS, BEARING_BIAS = range(6)
 # Distance below which a landmark has no bearing [m].

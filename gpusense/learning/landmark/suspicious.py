@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
-from gpusense.learning.landmark.pairs import Floats, Limits, Point, evaluate, make_pairs, sensor_poses
+from gpusense._util.typing import Floats
+from gpusense.learning.landmark.pairs import Limits, Point, evaluate, make_pairs, sensor_poses
 from gpusense.models.landmark.features import check_correspondence, check_features
 from gpusense.models.landmark.sensor import span_of
 from gpusense.world.landmarks import LandmarkMap

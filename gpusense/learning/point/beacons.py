@@ -10,17 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
+from gpusense._util.typing import Floats, Integers
 from gpusense.learning.point.densities import truncated
-from gpusense.learning.point.problem import (
-    Floats,
-    Integers,
-    Problem,
-    check_labels,
-    mix,
-    number_blocks,
-    of_weight,
-    places_of,
-)
+from gpusense.learning.point.problem import Problem, check_labels, mix, number_blocks, of_weight, places_of
 from gpusense.learning.point.result import PointFit, report
 from gpusense.learning.point.search import maximize
 from gpusense.world.hit_shapes import NORMAL, StudentHit

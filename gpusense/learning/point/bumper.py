@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
-from gpusense._util.typing import Precision, Space
+from gpusense._util.typing import Floats, Precision, Space
 from gpusense.backends import Selection, get_backend
-from gpusense.learning.point.problem import Floats, Problem, check_labels, mix, number_blocks, of_weight
+from gpusense.learning.point.problem import Problem, check_labels, mix, number_blocks, of_weight
 from gpusense.learning.point.result import PointFit, report
 from gpusense.learning.point.search import maximize
 from gpusense.models.point.bumper import BumperModel

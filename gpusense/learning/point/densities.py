@@ -7,11 +7,10 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.world.hit_shapes import HitShape
 
-Floats = NDArray[np.float64]
 Limits: TypeAlias = tuple[tuple[float, float], ...]
 
 # Relative step of numerical derivatives by a coordinate of the shape.

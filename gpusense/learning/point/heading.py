@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense._util.angles import wrapped
+from gpusense._util.typing import Floats
 from gpusense.learning.point.densities import von_mises, wrapped_normal
-from gpusense.learning.point.problem import Floats, Problem, check_labels, mix, number_blocks, of_weight
+from gpusense.learning.point.problem import Problem, check_labels, mix, number_blocks, of_weight
 from gpusense.learning.point.result import PointFit, report
 from gpusense.learning.point.search import maximize
 from gpusense.world.sensor_parameters import HeadingParameters

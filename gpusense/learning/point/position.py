@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
-from gpusense.learning.point.problem import Floats, Problem, check_labels, mix, number_blocks, of_weight, places_of
+from gpusense._util.typing import Floats
+from gpusense.learning.point.problem import Problem, check_labels, mix, number_blocks, of_weight, places_of
 from gpusense.learning.point.result import PointFit, report
 from gpusense.learning.point.search import maximize
 from gpusense.world.sensor_parameters import PositionParameters

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util import checks
+from gpusense._util.typing import Floats, Integers
 
 
 def places_of(poses: Floats, mount: object) -> Floats:
@@ -19,9 +20,6 @@ def places_of(poses: Floats, mount: object) -> Floats:
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     return poses[:, :2] + np.stack([c * x - s * y, s * x + c * y], axis=1)
 
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # Step of differences as a share of a coordinate's scale; the relative error is about its square.
 _STEP = 1e-5

@@ -8,9 +8,10 @@ from typing import TypeVar
 
 import numpy as np
 
+from gpusense._util.typing import Floats, Integers
 from gpusense.learning.fitted import Fitted
 from gpusense.learning.information import errors_of, scatter_of
-from gpusense.learning.point.problem import Floats, Integers, Problem
+from gpusense.learning.point.problem import Problem
 from gpusense.learning.point.search import Climb
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.sensor_parameters import BeaconParameters, BumperParameters, HeadingParameters, PositionParameters

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.learning.point.problem import Floats, Problem
+from gpusense._util.typing import Floats
+from gpusense.learning.point.problem import Problem
 
 # Number of starts to follow, and of readings for choosing them.
 _CLIMBED, _SAMPLE = 3, 20_000
@@ -34,9 +35,9 @@ class Climb:
     free: NDArray[np.bool_]  # (k,) mask of the coordinates that are not held at a bound
 
 
-def maximize(problem: Problem, max_iterations: int, tolerance: float, start: Floats | None = None) -> Climb:
+def maximize(problem: Problem, max_iterations: int, tolerance: float) -> Climb:
     """Search from the likeliest starts, and return the end with exchangeable parts in canonical order."""
-    end = _best_end(problem, max_iterations, tolerance, start)
+    end = _best_end(problem, max_iterations, tolerance)
     theta = problem.ordered(end.theta)
     if np.array_equal(theta, end.theta):
         return end
@@ -44,10 +45,8 @@ def maximize(problem: Problem, max_iterations: int, tolerance: float, start: Flo
     return replace(end, theta=theta, free=_free(theta, problem.total(theta)[1], *problem.bounds()))
 
 
-def _best_end(problem: Problem, max_iterations: int, tolerance: float, start: Floats | None) -> Climb:
+def _best_end(problem: Problem, max_iterations: int, tolerance: float) -> Climb:
     """Return the end of the likeliest search, first on a subset of the readings, then on all."""
-    if start is not None:
-        return climb(problem, start, max_iterations, tolerance)
     every = max(1, problem.readings // _SAMPLE)
     sample = problem.part(every) if every > 1 else problem
     low, high = problem.bounds()

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gpusense.evaluation.held_out import HeldOut
     from gpusense.evaluation.range_data import RangeData
     from gpusense.learning.beam.incidence import IncidenceFit
-    from gpusense.learning.beam.result import BeamFit
+    from gpusense.learning.fitted import BeamFit
     from gpusense.localization.motion_fit import MotionFit
     from gpusense.world.parameters import BeamParameters
 

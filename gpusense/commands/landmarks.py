@@ -24,7 +24,7 @@ from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
     from gpusense.evaluation.landmark_runs import DriftingOdometry, Track
-    from gpusense.learning.landmark.result import LandmarkFit
+    from gpusense.learning.fitted import LandmarkFit
     from gpusense.learning.landmark.suspicious import Suspicions
     from gpusense.logs.records import LandmarkRun
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util import checks
+from gpusense.learning.fitted import LandmarkFit
 from gpusense.learning.landmark.fit import fit_landmark_parameters
-from gpusense.learning.landmark.result import LandmarkFit
 from gpusense.learning.landmark.suspicious import Suspicions, suspicious_landmarks
 from gpusense.localization.filter import ParticleFilter
 from gpusense.localization.motion import OdometryMotion, SampledMotion

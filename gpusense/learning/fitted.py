@@ -1,17 +1,20 @@
-"""Base class of results of fits: conversion to dictionaries, and tables."""
+"""Results of fits, with their tables and conversion to dictionaries."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpusense._util.html import FIT_HEAD, card
+from gpusense._util.typing import Floats
+from gpusense.world.parameters import BeamParameters, LandmarkParameters
+from gpusense.world.sensor_parameters import BeaconParameters, BumperParameters, HeadingParameters, PositionParameters
 
 P = TypeVar("P")
+Q = TypeVar("Q", BeaconParameters, BeamParameters, BumperParameters, HeadingParameters, PositionParameters)
 
 
 class FitRow(NamedTuple):
@@ -25,21 +28,30 @@ class FitRow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Fitted(Generic[P]):
-    """Result of a fit; subclasses describe the attributes."""
+    """Result of a fit; ``print(fit)`` shows a table of parameters and standard errors."""
 
     parameters: P
+    """The parameters."""
     log_likelihood: float
-    trace: NDArray[np.float64]
+    """Log-likelihood of the readings, natural log."""
+    trace: Floats
+    """(iterations + 1,) log-likelihood at the start and after each iteration."""
     converged: bool
+    """Whether the search ended at an optimum; ``status`` gives the reason for False."""
     status: str
+    """Summary of the fit in words."""
     standard_errors: dict[str, float]
+    """Standard errors by name, over blocks if there are any: NaN for a held parameter, infinite if undetermined."""
     held: dict[str, str]
+    """Reason why a parameter has no standard error, by name."""
     iterations: int
+    """Iterations of the search."""
     missing: int
+    """Number of missing readings."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return all attributes except arrays of readings as plain numbers, lists and strings; None if not finite."""
-        return {field.name: _plain(getattr(self, field.name)) for field in fields(self) if field.repr}
+        return {one.name: _plain(getattr(self, one.name)) for one in fields(self) if one.repr}
 
     def _rows(self) -> list[FitRow]:
         """List the rows of the table."""
@@ -52,6 +64,15 @@ class Fitted(Generic[P]):
     def _value(self, name: str) -> Any:
         """Return a parameter; None without readings of it."""
         return getattr(self.parameters, name)
+
+    def __repr__(self) -> str:
+        values = [(name, self._value(name)) for name in self.standard_errors]
+        return self._short({name: value for name, value in values if value is not None})
+
+    def _short(self, values: dict[str, Any]) -> str:
+        """Format the values and the end of the search on one line."""
+        text = ", ".join(f"{name}={v!r}" if isinstance(v, str) else f"{name}={v:.4g}" for name, v in values.items())
+        return f"{type(self).__name__}({text}, converged={self.converged})"
 
     def _repr_html_(self) -> str:
         rows = [(row.name, row.value, _error(row.error), row.note) for row in self._rows()]
@@ -67,6 +88,179 @@ class Fitted(Generic[P]):
             second = f"{_error(independent[name]):>16}" if independent else ""
             lines.append(f"{name:16}{number}{_error(error):>13}{second} {units.get(name, ''):4}  {note}".rstrip())
         return lines
+
+
+_BEAM_UNITS = {"sigma_hit": "m", "lambda_short": "1/m", "range_bias": "m"}
+
+
+@dataclass(frozen=True, eq=False)
+class BeamFit(Fitted[BeamParameters]):
+    """Parameters of the beam model, fitted to readings by :func:`fit_beam_parameters`.
+
+    With a prior, ``trace`` includes its log density. Hits count with densities [1/m], max readings with probabilities.
+    ``"em-book"`` converges at a solution of the book's equations, other methods at an optimum of the likelihood.
+    Standard errors for independent readings come from the observed information.
+
+    Attributes:
+        range_bias: Offset b of correct ranges, z = z* + b [m]: its maximum-likelihood estimate jointly with the other
+            parameters. Unless ``range_bias=True``, a second search estimates it, and ``parameters`` do not contain it.
+            NaN if a search did not converge, and for ``"em-book"``.
+        range_bias_error: Standard error of ``range_bias`` [m], as in ``standard_errors``.
+        bias_fitted: Whether the parameters were fitted together with the offset.
+        passes: Passes over the pairs.
+        hits: Number of readings that are ranges.
+        max_readings: Number of readings that are "no return".
+        outliers: Number of hits whose likeliest cause is z_rand: unexplained readings.
+        method: Name of the method.
+        precision: ``"float64"`` or ``"float32"``, of the sums over pairs.
+        device: Text that selects the device of the fit.
+        independent_errors: Standard errors for independent readings, by name; equal to ``standard_errors`` without
+            blocks.
+        blocks: Number of blocks behind ``standard_errors``; 0 without blocks.
+        responsibilities: (n, 4) probabilities of hit, short, max and rand for each reading, or None; NaN for missing
+            readings.
+
+    Example:
+        >>> import gpusense as gs
+        >>> fit = gs.fit_beam_parameters([3.9, 4.1, 4.0, 8.0], [4.0] * 4, range_max=8.0, backend="numpy")
+        >>> fit.converged, fit.hits, fit.max_readings, round(fit.parameters.z_max, 3)
+        (True, 3, 1, 0.25)
+    """
+
+    range_bias: float
+    range_bias_error: float
+    bias_fitted: bool
+    passes: int
+    hits: int
+    max_readings: int
+    outliers: int
+    method: str
+    precision: str
+    device: str
+    independent_errors: dict[str, float]
+    blocks: int
+    responsibilities: Floats | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        return self._short(self.parameters.to_dict())
+
+    def _rows(self) -> list[FitRow]:
+        return [*super()._rows(), _offset("range_bias", self.range_bias, self.range_bias_error, self.bias_fitted)]
+
+    def __str__(self) -> str:
+        lines = self._table(_BEAM_UNITS, self.independent_errors if self.blocks else {})
+        if self.blocks:
+            lines.append(f"standard errors over {self.blocks} blocks of readings")
+        lines.append(
+            f"log-likelihood {self.log_likelihood:.6f} of {self.hits} hits and {self.max_readings} max readings; "
+            f"{self.missing} missing, {self.outliers} unexplained"
+        )
+        lines.append(f"{self.method}, {self.iterations} iterations, {self.precision} on {self.device}: {self.status}")
+        return "\n".join(lines)
+
+
+_LANDMARK_UNITS = {"sigma_range": "m", "sigma_bearing": "rad", "range_bias": "m", "bearing_bias": "rad"}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LandmarkFit(Fitted[LandmarkParameters]):
+    """Parameters of the landmark model, fitted by :func:`fit_landmark_parameters`.
+
+    A standard deviation is None if no feature has this part; p_detect keeps its initial value unless it was counted.
+    Densities are in 1/m, 1/rad and 1/unit of the signature. Standard errors come from the observed information;
+    p_detect has the error of a share.
+
+    Attributes:
+        range_bias: Offset of ranges, r = d + offset: fitted with ``bias=True``, else the mean residual of features
+            from landmarks; NaN without ranges [m].
+        range_bias_error: Standard error of ``range_bias`` [m].
+        bearing_bias: Offset of bearings, as for ranges [rad].
+        bearing_bias_error: Standard error of ``bearing_bias`` [rad].
+        bias_fitted: Whether the parameters were fitted together with the offsets.
+        features: Number of features with at least one measured part.
+        false_positives: Expected number of false positives.
+        expected: Number of landmarks in view, over all poses; 0 without ``scan``.
+        detected: Expected number of detected landmarks among these.
+        false: (F,) probability that each feature is a false positive; NaN for missing features.
+
+    Example:
+        >>> import gpusense as gs
+        >>> landmarks = gs.LandmarkMap([(5, 0), (0, 5)])
+        >>> features = [(5.1, 0.0), (4.9, 0.0), (5.0, 1.6), (5.1, 1.5)]
+        >>> fit = gs.fit_landmark_parameters([(0, 0, 0)] * 4, features, landmarks, correspondence=[0, 0, 1, 1])
+        >>> fit.converged, fit.features, round(fit.parameters.sigma_range, 3)
+        (True, 4, 0.087)
+    """
+
+    range_bias: float
+    range_bias_error: float
+    bearing_bias: float
+    bearing_bias_error: float
+    bias_fitted: bool
+    features: int
+    false_positives: float
+    expected: int
+    detected: float
+    false: Floats = field(repr=False)
+
+    def _rows(self) -> list[FitRow]:
+        biases = [
+            ("range_bias", self.range_bias, self.range_bias_error),
+            ("bearing_bias", self.bearing_bias, self.bearing_bias_error),
+        ]
+        return [*super()._rows(), *(_offset(*bias, self.bias_fitted) for bias in biases if math.isfinite(bias[1]))]
+
+    def __str__(self) -> str:
+        lines = self._table(_LANDMARK_UNITS, {})
+        lines.append(
+            f"log-likelihood {self.log_likelihood:.6f} of {self.features} features; {self.missing} missing, "
+            f"{self.false_positives:.1f} false positives"
+        )
+        if self.expected:
+            lines.append(f"{self.detected:.1f} of {self.expected} landmarks in view were seen")
+        lines.append(f"{self.iterations} iterations: {self.status}")
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PointFit(Fitted[Q]):
+    """Parameters of a position, heading, beacon or bumper model, fitted to readings at known poses.
+
+    Attributes:
+        independent_errors: Standard errors for independent readings.
+        values: Fitted parameters by the names in ``standard_errors``.
+        readings: Number of used readings.
+        blocks: Number of blocks; 0 without blocks.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> noise = np.random.default_rng(0).normal(0.02, 0.1, 1000)
+        >>> fit = gs.fit_heading_parameters(np.zeros((1000, 3)), noise)
+        >>> fit.converged, round(fit.parameters.sigma, 2), sorted(fit.standard_errors)
+        (True, 0.1, ['offset', 'sigma', 'z_hit', 'z_rand'])
+    """
+
+    independent_errors: dict[str, float]
+    values: dict[str, float]
+    readings: int
+    blocks: int
+
+    def _value(self, name: str) -> float:
+        return self.values[name]
+
+    def __str__(self) -> str:
+        lines = self._table({}, self.independent_errors if self.blocks else {})
+        blocks = f"; errors over {self.blocks} blocks" if self.blocks else ""
+        lines.append(
+            f"log-likelihood {self.log_likelihood:.6f} of {self.readings} readings, {self.missing} missing{blocks}"
+        )
+        lines.append(f"{self.iterations} iterations: {self.status}")
+        return "\n".join(lines)
+
+
+def _offset(name: str, value: float, error: float, is_fitted: bool) -> FitRow:
+    """Return the row of an offset, which may be estimated beside the parameters."""
+    return FitRow(name, value, error, "fitted" if is_fitted else "estimated, not in the parameters")
 
 
 def _plain(value: Any) -> Any:

@@ -25,9 +25,9 @@ from gpusense.learning.beam.pairs import Pairs, make_pairs
 from gpusense.learning.beam.point import HIT, SHORT, Bounds, Point, first_guess, random_start
 from gpusense.learning.beam.problem import NO_PRIOR, Prior, Problem, Value
 from gpusense.learning.beam.report import report
-from gpusense.learning.beam.result import BeamFit
 from gpusense.learning.beam.searches import climb_genetic, climb_gradient, climb_hill
 from gpusense.learning.beam.shapes import fit_shape
+from gpusense.learning.fitted import BeamFit
 from gpusense.world.hit_shapes import SHAPES, HitName
 from gpusense.world.parameters import BeamParameters
 

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from gpusense._util.typing import Floats
 from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import Bounds
-from gpusense.learning.beam.result import BeamFit
 from gpusense.learning.beam.shapes import without_ranges
+from gpusense.learning.fitted import BeamFit
 from gpusense.learning.point.densities import by_shape, truncated
 from gpusense.learning.point.problem import Problem, mix, of_weight
-from gpusense.learning.point.result import report
+from gpusense.learning.point.report import report
 from gpusense.learning.point.search import Climb, climb, maximize
 from gpusense.world.hit_shapes import SHAPES, HitName, HitShape
 from gpusense.world.hit_tables import TabulatedHit

@@ -22,8 +22,8 @@ from gpusense.learning.beam.options import Callback, Options, check_options, mak
 from gpusense.learning.beam.pairs import Pairs, make_pairs
 from gpusense.learning.beam.point import Bounds, Point, first_guess
 from gpusense.learning.beam.problem import Prior
-from gpusense.learning.beam.result import BeamFit
 from gpusense.learning.beam.shapes import fit_shape
+from gpusense.learning.fitted import BeamFit
 from gpusense.world.hit_shapes import SHAPES, HitName
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.scanner import Reading

@@ -17,7 +17,7 @@ from gpusense.learning.beam.options import Options
 from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import BIAS, FORM, HIT, NAMES, RATE, SHORT, SIGMA, Point
 from gpusense.learning.beam.problem import NOTHING, Problem, Value
-from gpusense.learning.beam.result import BeamFit
+from gpusense.learning.fitted import BeamFit
 from gpusense.learning.information import errors_of
 from gpusense.world.scanner import Reading
 

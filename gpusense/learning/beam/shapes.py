@@ -20,7 +20,7 @@ from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import Bounds, Point
 from gpusense.learning.beam.problem import NO_PRIOR, Problem, Value
 from gpusense.learning.beam.report import report
-from gpusense.learning.beam.result import BeamFit
+from gpusense.learning.fitted import BeamFit
 from gpusense.world.hit_shapes import SHAPES, HitName, shape_of
 from gpusense.world.parameters import BeamParameters
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers
+from gpusense.learning.fitted import LandmarkFit
 from gpusense.learning.information import scaled_axes
 from gpusense.learning.landmark.em import NOTHING, SIGMAS, bounds_of, climb, first_guess, free
 from gpusense.learning.landmark.pairs import (
@@ -28,7 +29,6 @@ from gpusense.learning.landmark.pairs import (
     make_pairs,
     sensor_poses,
 )
-from gpusense.learning.landmark.result import LandmarkFit
 from gpusense.models.landmark.features import check_correspondence, check_features
 from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.parameters import LandmarkParameters
@@ -43,7 +43,6 @@ class Sightings:
 
     sensors: Floats  # (S, 3) poses of the sensor
     scan: Integers  # (F,) index of each feature's pose
-    features: Floats  # (F, 3) range, bearing and signature; NaN for missing parts
     indices: Integers  # (F,) indices of these features among the caller's
     total: int  # number of the caller's features
     pairs: Pairs  # the features with their possible landmarks
@@ -146,7 +145,7 @@ def _sightings(
     sensors = sensor_poses(robots, (x, y, yaw))
     known = None if known is None else known[used]
     pairs = make_pairs(sensors[index[used]], full[used], landmarks.xy, map_signatures, known, limits)
-    return Sightings(sensors, index[used], full[used], used, len(full), pairs)
+    return Sightings(sensors, index[used], used, len(full), pairs)
 
 
 def _count_detected(sightings: Sightings, landmarks: LandmarkMap, value: Value) -> tuple[int, float]:

@@ -11,9 +11,10 @@ from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers
+from gpusense.learning.fitted import PointFit
 from gpusense.learning.point.densities import truncated
-from gpusense.learning.point.problem import Problem, check_labels, mix, number_blocks, of_weight, places_of
-from gpusense.learning.point.result import PointFit, report
+from gpusense.learning.point.problem import Problem, mix, number_blocks, of_weight, places_of
+from gpusense.learning.point.report import report
 from gpusense.learning.point.search import maximize
 from gpusense.world.hit_shapes import NORMAL, StudentHit
 from gpusense.world.range_causes import RandomDensity
@@ -189,13 +190,12 @@ def fit_beacon_parameters(
     most = checks.integer("max_iterations", max_iterations, low=1)
     least = checks.real("tolerance", tolerance, above=0)
     pose, z, index = _readings(poses, ranges, len(points), ids)
-    labels = None if blocks is None else check_labels(blocks, len(pose))[index[0]]
     antenna = places_of(pose, mount)
     distances = np.hypot(*(points[index[1]] - antenna[index[0]]).T)
     used = (z >= 0) & (z <= longest)
     if not used.any():
         raise ValueError(f"ranges: must hold one in [0, {longest:g}] m, got {len(z)} without")
-    numbers = number_blocks(None if labels is None else labels[used])
+    numbers = number_blocks(blocks, len(pose), index[0][used])
     residual = z[used] - distances[used]
     spread = 1.4826 * float(np.median(np.abs(residual - np.median(residual)))) or float(np.ptp(residual))
     problem = _Beacons(

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import Floats, Precision, Space
 from gpusense.backends import Selection, get_backend
-from gpusense.learning.point.problem import Problem, check_labels, mix, number_blocks, of_weight
-from gpusense.learning.point.result import PointFit, report
+from gpusense.learning.fitted import PointFit
+from gpusense.learning.point.problem import Problem, mix, number_blocks, of_weight
+from gpusense.learning.point.report import report
 from gpusense.learning.point.search import maximize
 from gpusense.models.point.bumper import BumperModel
 from gpusense.world.grid import OccupancyGrid
@@ -131,8 +132,7 @@ def fit_bumper_parameters(
         raise ValueError(f"pressed: every value must be 0, 1 or nan, got {checks.show(table[used].max())}")
     if not used.any():
         raise ValueError(f"pressed: must hold one that is not nan, got {table.size} without")
-    labels = None if blocks is None else np.broadcast_to(check_labels(blocks, len(pose))[:, None], table.shape)[used]
-    numbers = number_blocks(labels)
+    numbers = number_blocks(blocks, len(pose), np.nonzero(used)[0])
     problem = _Bumps(outline_gaps(model, pose)[used], table[used], grid.resolution)
     end = maximize(problem, most, least)
     return report(problem, end, BumperParameters(**problem.values(end.theta)), numbers, int((~used).sum()))

@@ -117,16 +117,15 @@ def mix(parts: list[tuple[float, Floats]]) -> tuple[Floats, Floats, list[Floats]
     return log_p, shares, ratios
 
 
-def check_labels(blocks: object, rows: int) -> Integers:
-    """Return (rows,) labels of blocks."""
-    return checks.array("blocks", blocks, (rows,), dtype=np.int64)
+def number_blocks(blocks: object, rows: int, of: NDArray[Any]) -> Integers | None:
+    """Return the blocks of some rows, numbered from 0; None without blocks.
 
-
-def number_blocks(labels: Integers | None) -> Integers | None:
-    """Return the blocks of the readings numbered from 0; None without blocks."""
-    if labels is None:
+    ``blocks`` labels all rows; ``of`` holds the rows of the readings, as indices or a mask.
+    """
+    if blocks is None:
         return None
-    known, numbers = np.unique(labels, return_inverse=True)
+    labels: Integers = checks.array("blocks", blocks, (rows,), dtype=np.int64)
+    known, numbers = np.unique(labels[of], return_inverse=True)
     if len(known) < 2:
         raise ValueError(f"blocks: must be at least 2 with a reading that is not missing, got {len(known)}")
     return numbers.ravel().astype(np.int64)

@@ -10,7 +10,7 @@ from scipy import optimize
 from support.gradients import check_gradients
 
 import gpusense as gs
-from gpusense.learning.point import beacons, bumper, heading, position
+from gpusense.learning.point import absolute, beacons, bumper
 from gpusense.learning.point.problem import Problem
 
 NAN = float("nan")
@@ -43,13 +43,13 @@ def problems() -> list[tuple[str, Problem, list[float]]]:
             at = [0.1, 0.2, *heavy, *[0.2, 0.3, 0.1][:biases]]
             found.append((f"{kind} {biases}", beacons._Beacons(z, d, ids, kind, nu, 20.0, biases, 1.0), at))
     for kind, shape in (("wrapped_normal", 0.0), ("wrapped_normal", 0.8), ("von_mises", 1.0), ("von_mises", 12.0)):
-        found.append((f"{kind} {shape}", heading._Headings(angles, kind), [shape, 0.2, 0.3]))
+        found.append((f"{kind} {shape}", absolute._Headings(angles, kind), [shape, 0.2, 0.3]))
     pressed = (rng.random(60) < 0.5).astype(float)
     found.append(("bumper", bumper._Bumps(rng.normal(0, 1, 60), pressed, 0.1), [0.9, 0.1, -0.3]))
     for correlated, mounted in ((False, False), (True, True)):
         at = [0.2, -0.3, *([0.1, -0.5] if correlated else []), *([0.1, 0.3] if mounted else [])]
         errors, inside = rng.normal(0, 2, (60, 2)), rng.random(60) < 0.9
-        fixes = position._Fixes(errors, np.cos(angles), np.sin(angles), inside, correlated, 100.0, (0, 0), mounted, 2.0)
+        fixes = absolute._Fixes(errors, np.cos(angles), np.sin(angles), inside, correlated, 100.0, (0, 0), mounted, 2.0)
         found.append((f"position {correlated}", fixes, at))
     return found
 

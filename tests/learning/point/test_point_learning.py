@@ -139,8 +139,8 @@ def test_errors_are_those_of_repeated_experiments_and_blocks_see_repeats() -> No
 @pytest.mark.parametrize("sigma", [1e-4, 0.2, 1.2])
 def test_headings(kind: Any, sigma: float, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Any] = []
-    real = heading.maximize
-    monkeypatch.setattr(heading, "maximize", lambda p, *rest: seen.append((p, end := real(p, *rest))) or end)
+    real = absolute.maximize
+    monkeypatch.setattr(absolute, "maximize", lambda p, *rest: seen.append((p, end := real(p, *rest))) or end)
     rng = np.random.default_rng(3)
     poses = rng.uniform(-9, 9, (1200, 3))
     z = poses[:, 2] + 3.0 + rng.normal(0, sigma, 1200)

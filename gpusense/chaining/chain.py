@@ -24,13 +24,12 @@ from gpusense.chaining.front import LOCAL, Front
 from gpusense.chaining.graph import Solution, solve
 from gpusense.chaining.joint import Joint
 from gpusense.chaining.links import CLOSURE, Links
-from gpusense.chaining.matcher import Matcher, TeamMatcher
+from gpusense.chaining.matcher import Matcher, TeamMatcher, signed_duration
 from gpusense.chaining.motion import relative
 from gpusense.chaining.options import ChainOptions, check_durations, check_steps, check_times
 from gpusense.chaining.place_recognition import place_points_of
 from gpusense.chaining.result import ScanChain, doubts_of
 from gpusense.chaining.selected import pose_covariances
-from gpusense.chaining.sweep import signed_duration
 from gpusense.localization.motion import OdometryMotion
 from gpusense.localization.pose_algebra import compose_poses, pose_difference
 from gpusense.matching.match import readings

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-from gpusense._util.inflate import inflated
+from gpusense._util.lines import inflated
 from gpusense.logs.bag_storage import LARGEST, MCAP, ROS1, Raw, Storage, Topic, zstd
 
 # Kinds of records in MCAP: header, footer, schema, channel, message, chunk, index of messages, end of the data.

@@ -1,13 +1,19 @@
-"""Decode the messages of known types in a bag by the library rosbags, with errors that name file and place.
+"""Find the files of a bag, and decode the messages of known types, with errors that name file and place.
 
-The library would turn a bag's message definitions into code, so they are never used: messages are decoded by the
-layouts of rosbags, and by one layout that is defined here.
+A database with a journal, or a file that is compressed as a whole, is copied to a temporary folder that exists until
+the end of the process. The recording is never written. The library rosbags would turn a bag's message definitions into
+code, so they are never used: messages are decoded by its layouts, and by one layout that is defined here.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import functools
 import math
+import re
+import shutil
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -17,9 +23,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpusense._util.extras import library
+from gpusense._util.lines import most_bytes
 from gpusense._util.notices import warn_user
-from gpusense.logs.bag_files import is_ros1, storages
-from gpusense.logs.bag_storage import Topic, unpacked
+from gpusense.logs.bag_chunks import Mcap, Ros1
+from gpusense.logs.bag_storage import MCAP, ROS1, SQLITE, ZSTD, Sqlite, Storage, Topic, unpacked, zstd
 
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 ECHOES = "sensor_msgs/msg/MultiEchoLaserScan"
@@ -131,3 +138,123 @@ def _decoder(path: Path) -> Callable[[bytes, str], Any]:
     if first:
         return lambda data, kind: store.deserialize_ros1(data, kind)
     return lambda data, kind: store.deserialize_cdr(unpacked(data), kind)
+
+
+# Suffixes of a database's write-ahead log and of its rollback journal, and first bytes of the latter in use.
+_WAL, _ROLLBACK, _IN_USE = "-wal", "-journal", b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
+# Files listed in metadata.yaml, and the searched part of it [bytes].
+_LISTED = re.compile(r"""^ *- +['"]?([^\s'"]+\.(?:db3|mcap)(?:\.zstd)?)['"]? *\r?$""", re.MULTILINE)
+_LARGEST_METADATA = 1 << 24
+_PIECE = 1 << 20
+_FOLDERS: list[Any] = []
+
+
+def begins(file: Path, *firsts: bytes) -> bool:
+    """Return whether a file begins with one of several byte strings."""
+    with file.open("rb") as stream:
+        return stream.read(max(map(len, firsts))).startswith(firsts)
+
+
+def is_ros1(path: Path) -> bool:
+    """Return whether a bag is from ROS 1, by its first bytes, or by its suffix if the bytes are unknown."""
+    if path.is_dir() or begins(path, MCAP, SQLITE, ZSTD):
+        return False
+    return begins(path, ROS1) or path.suffix.lower() == ".bag"
+
+
+def is_bag_folder(folder: Path) -> bool:
+    """Return whether a folder is a ROS 2 bag."""
+    return (folder / "metadata.yaml").is_file() or bool(_parts(folder))
+
+
+def storages(path: Path) -> list[Storage]:
+    """Return the files of a bag in the order of time."""
+    files = _parts(path) if path.is_dir() else [path]
+    packed = [file for file in files if begins(file, ZSTD)]
+    metadata = path / "metadata.yaml"
+    if packed and not path.is_dir():
+        rule = "must be decompressed, or replaced by the folder of its bag"
+        raise ValueError(f"{path}: {rule}, got a file that is compressed as a whole")
+    if metadata.is_file() and metadata.stat().st_size:
+        _check_parts(metadata, files)
+    elif packed:
+        raise ValueError(f"{packed[0]}: must be decompressed in a folder without metadata.yaml, got a zstd file")
+    return sorted(map(_storage, files), key=lambda each: each.start)
+
+
+def _check_parts(metadata: Path, files: list[Path]) -> None:
+    """Check that a folder holds all files listed in its metadata."""
+    with metadata.open("rb") as stream:
+        text = stream.read(_LARGEST_METADATA).decode(errors="replace")
+    known = {file.name for file in files} | {file.with_suffix("").name for file in files}
+    for name in _LISTED.findall(text):
+        if not known.intersection((Path(name).name, Path(name).with_suffix("").name)):
+            raise ValueError(f"{metadata.parent}: must hold the file {name} of its metadata.yaml, got none")
+
+
+def _parts(folder: Path) -> list[Path]:
+    """Return the files of messages in a folder by name; a compressed file only if the plain one is absent."""
+    files = [file for file in sorted(folder.iterdir()) if file.is_file() and begins(file, MCAP, SQLITE, ZSTD)]
+    return [file for file in files if not begins(file, ZSTD) or file.with_suffix("") not in files]
+
+
+def _storage(file: Path) -> Storage:
+    stats = [one.stat() for one in (file, *_journals(file))]
+    return _read(file, tuple((each.st_size, each.st_mtime_ns) for each in stats))
+
+
+@functools.lru_cache(maxsize=16)
+def _read(file: Path, stats: tuple[tuple[int, int], ...]) -> Storage:
+    """Find the records of a file; ``stats``, sizes and modification times, belong to the cache key."""
+    if begins(file, ZSTD):
+        file = _decompressed(file)
+    if begins(file, MCAP):
+        return Mcap(file)
+    if begins(file, ROS1):
+        return Ros1(file)
+    if begins(file, SQLITE):
+        return Sqlite(_with_journal(file) if _journals(file) else file, _folder)
+    with file.open("rb") as stream:
+        raise ValueError(f"{file}: must begin as a bag of ROS 1 (version 2.0), MCAP or SQLite, got {stream.read(16)!r}")
+
+
+def _folder() -> Path:
+    """Make a folder that exists until the end of the process."""
+    made = tempfile.TemporaryDirectory(prefix="gpusense-bag-")
+    _FOLDERS.append(made)
+    return Path(made.name)
+
+
+def _decompressed(file: Path) -> Path:
+    """Decompress a file, up to a bound."""
+    out = _folder() / file.with_suffix("").name
+    room = min(most_bytes(file.stat().st_size), shutil.disk_usage(tempfile.gettempdir()).free * 9 // 10)
+    with file.open("rb") as packed, zstd().open(packed, "rb") as stream, out.open("wb") as target:
+        while data := stream.read(_PIECE):
+            room -= len(data)
+            if room < 0:
+                rule = "must hold no more than 100 times its size and the disk's room"
+                raise ValueError(f"{file}: {rule}, got more")
+            target.write(data)
+    return out
+
+
+def _journals(file: Path) -> list[Path]:
+    """Return the journals with pages that a database lacks."""
+    wal, rollback = file.with_name(file.name + _WAL), file.with_name(file.name + _ROLLBACK)
+    found = [wal] if wal.is_file() and wal.stat().st_size else []
+    return [*found, rollback] if rollback.is_file() and begins(rollback, _IN_USE) else found
+
+
+def _with_journal(file: Path) -> Path:
+    """Return a copy of a database with all committed messages; SQLite applies the journal to it."""
+    import sqlite3
+
+    folder = _folder()
+    for one in (file, *_journals(file)):
+        shutil.copyfile(one, folder / one.name)
+    with contextlib.closing(sqlite3.connect(folder / file.name)) as database:
+        database.execute("PRAGMA trusted_schema = OFF")
+        database.execute("SELECT count(*) FROM sqlite_master").fetchall()
+        database.execute("PRAGMA journal_mode = DELETE")
+    return folder / file.name

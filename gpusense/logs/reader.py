@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense._util.lines import numbered_lines
-from gpusense.logs.bag_files import is_bag_folder
 from gpusense.logs.bag_storage import MCAP, SQLITE, ZSTD
+from gpusense.logs.bags import is_bag_folder
 from gpusense.logs.records import Odometry, Scan
 from gpusense.world.scanner import Scanner
 

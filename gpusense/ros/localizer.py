@@ -15,8 +15,18 @@ from gpusense.localization.nav2 import Nav2Options
 from gpusense.localization.run_causes import CAUSES_OF_RUNS, diagnose_run
 from gpusense.localization.scan_motion import Moment
 from gpusense.logs.records import Pose
-from gpusense.ros.conversions import host_array, laser_scan, map_to_odometry, moved_enough
-from gpusense.ros.diagnostics import ERROR, LEVELS, STALE, WARN, radius_text, status_fields
+from gpusense.ros.conversions import (
+    ERROR,
+    LEVELS,
+    STALE,
+    WARN,
+    host_array,
+    laser_scan,
+    map_to_odometry,
+    moved_enough,
+    radius_text,
+    status_fields,
+)
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.messages import spread_readings, stamp_of
 from gpusense.world.scanner import Scanner

@@ -15,8 +15,7 @@ from gpusense.evaluation.tracking import RISK
 from gpusense.localization.diagnosis import Diagnosis
 from gpusense.localization.monitor import PoseMonitor, PoseVerdict
 from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.ros.conversions import laser_scan, start_of
-from gpusense.ros.diagnostics import LEVELS, STALE, radius_text, status_fields
+from gpusense.ros.conversions import LEVELS, STALE, laser_scan, radius_text, start_of, status_fields
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.messages import stamp_of
 from gpusense.world.scanner import Scanner

@@ -14,9 +14,8 @@ from gpusense._util.angles import wrapped
 from gpusense._util.typing import Floats
 from gpusense.learning.fitted import PointFit
 from gpusense.learning.point.densities import von_mises, wrapped_normal
-from gpusense.learning.point.problem import Problem, mix, number_blocks, of_weight, places_of
+from gpusense.learning.point.problem import Problem, maximize, mix, number_blocks, of_weight, places_of
 from gpusense.learning.point.report import report
-from gpusense.learning.point.search import maximize
 from gpusense.world.sensor_parameters import HeadingParameters, PositionParameters
 
 _LOG_TWO_PI = math.log(2 * math.pi)

@@ -13,9 +13,8 @@ from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers
 from gpusense.learning.fitted import PointFit
 from gpusense.learning.point.densities import truncated
-from gpusense.learning.point.problem import Problem, mix, number_blocks, of_weight, places_of
+from gpusense.learning.point.problem import Problem, maximize, mix, number_blocks, of_weight, places_of
 from gpusense.learning.point.report import report
-from gpusense.learning.point.search import maximize
 from gpusense.world.hit_shapes import NORMAL, StudentHit
 from gpusense.world.range_causes import RandomDensity
 from gpusense.world.sensor_parameters import MOST_DEGREES, BeaconParameters

@@ -13,9 +13,8 @@ from gpusense._util import checks
 from gpusense._util.typing import Floats, Precision, Space
 from gpusense.backends import Selection, get_backend
 from gpusense.learning.fitted import PointFit
-from gpusense.learning.point.problem import Problem, mix, number_blocks, of_weight
+from gpusense.learning.point.problem import Problem, maximize, mix, number_blocks, of_weight
 from gpusense.learning.point.report import report
-from gpusense.learning.point.search import maximize
 from gpusense.models.point.bumper import BumperModel
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.sensor_parameters import BumperParameters

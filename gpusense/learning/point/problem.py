@@ -1,10 +1,16 @@
-"""Base class of likelihoods of readings at known poses, with bounded coordinates, log p and gradients."""
+"""Likelihoods of readings at known poses, with bounded coordinates, log p and gradients, and the search for a maximum.
+
+Newton steps begin at the likeliest of several starts. A coordinate at a bound stays there while the gradient points
+outwards. In the remaining coordinates a step follows the eigenvectors of the second derivatives, uphill along each, and
+is halved until the log-likelihood rises enough (Nocedal and Wright, *Numerical Optimization*, sections 3.4 and 16.7).
+"""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -134,3 +140,105 @@ def number_blocks(blocks: object, rows: int, of: NDArray[Any]) -> Integers | Non
 def of_weight(weight: float) -> float:
     """Return the step size for a weight in [0, 1]."""
     return max(min(weight, 1 - weight), 1e-4)
+
+
+# Number of starts to follow, and of readings for choosing them.
+_CLIMBED, _SAMPLE = 3, 20_000
+# Smallest share of the expected gain that a step must achieve, and largest number of halvings.
+_ARMIJO, _HALVINGS = 1e-4, 50
+# Scaled curvature below the first share of the largest counts as none; errors of differences stay below the second.
+_FLAT, _NEGATIVE = 1e-10, 1e-7
+
+
+@dataclass(frozen=True)
+class Climb:
+    """End of a search."""
+
+    theta: Floats  # (k,) coordinates
+    value: float  # log-likelihood
+    trace: list[float]  # log-likelihood at the start and after each iteration
+    converged: bool  # True if the end is a maximum
+    free: NDArray[np.bool_]  # (k,) mask of the coordinates that are not held at a bound
+
+
+def maximize(problem: Problem, max_iterations: int, tolerance: float) -> Climb:
+    """Search from the likeliest starts, and return the end with exchangeable parts in canonical order."""
+    end = _best_end(problem, max_iterations, tolerance)
+    theta = problem.ordered(end.theta)
+    if np.array_equal(theta, end.theta):
+        return end
+    # Rounding decides which of several equal maxima a search reaches.
+    return replace(end, theta=theta, free=_free(theta, problem.total(theta)[1], *problem.bounds()))
+
+
+def _best_end(problem: Problem, max_iterations: int, tolerance: float) -> Climb:
+    """Return the end of the likeliest search, first on a subset of the readings, then on all."""
+    every = max(1, problem.readings // _SAMPLE)
+    sample = problem.part(every) if every > 1 else problem
+    low, high = problem.bounds()
+    starts = [np.clip(each, low, high) for each in problem.starts()]
+    starts = sorted(starts, key=lambda each: -sample.total(each)[0])[:_CLIMBED]
+    ends = [climb(sample, each, max_iterations, tolerance) for each in starts]
+    best = max(ends, key=lambda end: end.value)
+    return best if sample is problem else climb(problem, best.theta, max_iterations, tolerance)
+
+
+def climb(problem: Problem, start: Floats, max_iterations: int, tolerance: float) -> Climb:
+    """Search for a maximum from one start."""
+    low, high = problem.bounds()
+    theta: Floats = np.clip(start, low, high)
+    value, gradient = problem.total(theta)
+    trace, converged = [value], False
+    for _ in range(max_iterations):
+        step, gain, top = _step(problem, theta, gradient, _free(theta, gradient, low, high))
+        if top and gain < tolerance:
+            converged = True
+            break
+        moved = _line_search(problem, theta, value, gradient, step)
+        if moved is None:
+            # A gain below the sum's rounding error cannot be measured.
+            converged = top and gain < 1e-12 * max(abs(value), 1.0)
+            break
+        theta, value, gradient = moved
+        trace.append(value)
+    return Climb(theta, value, trace, converged, _free(theta, gradient, low, high))
+
+
+def _free(theta: Floats, gradient: Floats, low: Floats, high: Floats) -> NDArray[np.bool_]:
+    return ~(((theta <= low) & (gradient <= 0)) | ((theta >= high) & (gradient >= 0)))
+
+
+def _step(problem: Problem, theta: Floats, gradient: Floats, free: NDArray[np.bool_]) -> tuple[Floats, float, bool]:
+    """Return the (k,) step, the expected gain, and whether the Hessian is negative semidefinite."""
+    step = np.zeros(len(theta))
+    if not free.any():
+        return step, 0.0, True
+    curve, g, scale = -problem.hessian(theta, free), gradient[free], problem.scales(theta)[free]
+    diagonal = np.abs(np.diag(curve)) * scale**2
+    scale = scale / np.sqrt(np.maximum(diagonal, max(1e-12 * float(diagonal.max()), 1e-300)))
+    size, axes = np.linalg.eigh(curve * np.outer(scale, scale))
+    flat = _FLAT * max(float(np.abs(size).max()), 1e-300)
+    along: Floats = axes.T @ (scale * g)
+    moves = along / np.maximum(np.abs(size), flat)
+    step[free] = scale * (axes @ moves)
+    # Longer steps leave the region where the curvature is valid.
+    limit = 4 * problem.scales(theta)
+    step *= min(1.0, float((limit / np.maximum(np.abs(step), 1e-300)).min()))
+    top = bool(size.min() >= -_NEGATIVE * float(np.abs(size).max()))
+    return step, 0.5 * float(along @ moves), top
+
+
+def _line_search(
+    problem: Problem, theta: Floats, value: float, gradient: Floats, step: Floats
+) -> tuple[Floats, float, Floats] | None:
+    """Return the first point along the step that is likely enough, its log-likelihood and gradient; or None."""
+    low, high = problem.bounds()
+    for halvings in range(_HALVINGS):
+        moved: Floats = np.clip(theta + step * 0.5**halvings, low, high)
+        if np.array_equal(moved, theta):
+            return None
+        reached, slope = problem.total(moved)
+        rise = float(gradient @ (moved - theta))
+        if math.isfinite(reached) and reached > value and reached >= value + _ARMIJO * rise:
+            return moved, reached, slope
+    return None

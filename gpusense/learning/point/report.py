@@ -9,8 +9,7 @@ import numpy as np
 from gpusense._util.typing import Floats, Integers
 from gpusense.learning.fitted import PointFit, Q
 from gpusense.learning.information import errors_of, scatter_of
-from gpusense.learning.point.problem import Problem
-from gpusense.learning.point.search import Climb
+from gpusense.learning.point.problem import Climb, Problem
 
 # Standard errors over fewer blocks are rough.
 _FEW_BLOCKS = 10

@@ -20,8 +20,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from gpusense.logs.records import Pose
 from gpusense.logs.transform_buffer import TransformBuffer
 from gpusense.logs.transforms import planar_mount
-from gpusense.ros.conversions import odometry_fields, pose_matrix
-from gpusense.ros.diagnostics import ERROR
+from gpusense.ros.conversions import ERROR, odometry_fields, pose_matrix
 from gpusense.world.messages import LEVEL
 
 try:

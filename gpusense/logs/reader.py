@@ -52,33 +52,22 @@ class LogOptions(TypedDict, total=False):
     odometry_from: str | None
 
 
+class _ReadOptions(LogOptions, total=False):
+    """Further options of :func:`read_log`."""
+
+    rear: bool
+    topic: str | None
+
+
 @overload
 def read_log(
-    path: str | os.PathLike[str],
-    *,
-    range_max: float | None = None,
-    odometry: Literal[False] = False,
-    rear: bool = False,
-    range_min: float | None = None,
-    topic: str | None = None,
-    frame: str | None = None,
-    mount: ArrayLike | None = None,
-    odometry_from: str | None = None,
+    path: str | os.PathLike[str], *, odometry: Literal[False] = False, **options: Unpack[_ReadOptions]
 ) -> Iterator[Scan]: ...
 
 
 @overload
 def read_log(
-    path: str | os.PathLike[str],
-    *,
-    range_max: float | None = None,
-    odometry: bool,
-    rear: bool = False,
-    range_min: float | None = None,
-    topic: str | None = None,
-    frame: str | None = None,
-    mount: ArrayLike | None = None,
-    odometry_from: str | None = None,
+    path: str | os.PathLike[str], *, odometry: bool, **options: Unpack[_ReadOptions]
 ) -> Iterator[Scan | Odometry]: ...
 
 

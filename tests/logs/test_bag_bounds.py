@@ -11,7 +11,7 @@ import pytest
 from support.bags import BASE, LASER, Writer
 
 import gpusense as gs
-from gpusense.logs import bag_chunks, bag_files, bag_storage
+from gpusense.logs import bag_chunks, bag_storage, bags
 
 pytest.importorskip("rosbags", reason="the library rosbags is not installed: pip install 'gpusense[ros]'")
 
@@ -45,8 +45,8 @@ def test_compressed_bags_are_read_up_to_their_bounds(tmp_path: Path, monkeypatch
     assert [len(scan.ranges) for scan in gs.read_log(path)] == [200_000] * 2
     for module in (bag_chunks, bag_storage):
         monkeypatch.setattr(module, "LARGEST", 100_000)
-    monkeypatch.setattr(bag_files, "most_bytes", lambda size: 100_000)
-    bag_files._read.cache_clear()
+    monkeypatch.setattr(bags, "most_bytes", lambda size: 100_000)
+    bags._read.cache_clear()
     tracemalloc.start()
     try:
         with pytest.raises(ValueError, match=f"{path.name}.*must hold (at most 100000 bytes|no more than 100)"):

@@ -119,8 +119,9 @@ def fit_beam_parameters(
     if blocks is not None:
         pairs = replace(pairs, block=check_blocks(blocks, np.shape(ranges), pairs))
     options = check_options(
-        method, max_iterations, tolerance, restarts, seed, range_bias, progress, callback, responsibilities
-    )
+        method=method, max_iterations=max_iterations, tolerance=tolerance, restarts=restarts, seed=seed,
+        range_bias=range_bias, progress=progress, callback=callback, responsibilities=responsibilities,
+    )  # fmt: skip
     bounds = make_bounds(pairs, sigma_bounds, lambda_bounds)
     checks.instance("initial", initial, BeamParameters, optional=True)
     checks.boolean("sigma_growth", sigma_growth)

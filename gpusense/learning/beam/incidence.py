@@ -258,8 +258,9 @@ def fit_incidence_parameters(
     if isinstance(method, str) and method == "em-book":
         raise ValueError("method: must not be 'em-book', which has no prior, got 'em-book'")
     options = check_options(
-        method, max_iterations, tolerance, restarts, seed, range_bias, progress, callback, responsibilities=False
-    )
+        method=method, max_iterations=max_iterations, tolerance=tolerance, restarts=restarts, seed=seed,
+        range_bias=range_bias, progress=progress, callback=callback,
+    )  # fmt: skip
     checks.choice("hit", hit, tuple(SHAPES))
     surface = ~np.isnan(angles)
     if not ((pairs.kinds != Reading.MISSING) & surface).any():

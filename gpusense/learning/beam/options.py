@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -38,41 +39,26 @@ class Options:
     range_bias: bool
     progress: bool
     callback: Callback | None
-    responsibilities: bool
+    responsibilities: bool = False
 
 
-def check_options(
-    method: str,
-    max_iterations: int | None,
-    tolerance: float,
-    restarts: int,
-    seed: int,
-    range_bias: bool,
-    progress: bool,
-    callback: Callback | None,
-    responsibilities: bool,
-) -> Options:
-    """Check the options of a fit."""
-    method = checks.choice("method", method, METHODS)
-    if max_iterations is None:
-        max_iterations = {"em": 500, "em-book": 60}.get(method, 1000)
-    if callback is not None and not callable(callback):
-        raise TypeError(f"callback: must be callable, got {checks.show(callback)}")
-    for name, flag in (("range_bias", range_bias), ("progress", progress), ("responsibilities", responsibilities)):
-        checks.boolean(name, flag)
-    if method == "em-book" and range_bias:
+def check_options(**given: Any) -> Options:
+    """Check the options of a fit; None as ``max_iterations`` becomes the method's default."""
+    options = Options(**given)
+    method = checks.choice("method", options.method, METHODS)
+    if options.callback is not None and not callable(options.callback):
+        raise TypeError(f"callback: must be callable, got {checks.show(options.callback)}")
+    names = ("range_bias", "progress", "responsibilities")
+    flags = {name: checks.boolean(name, getattr(options, name)) for name in names}
+    if method == "em-book" and flags["range_bias"]:
         raise ValueError("range_bias: must be False with method 'em-book', which has no offset, got True")
-    return Options(
-        method,
-        checks.integer("max_iterations", max_iterations, low=1),
-        checks.real("tolerance", tolerance, above=0),
-        checks.integer("restarts", restarts, low=0, high=MOST_RESTARTS),
-        checks.integer("seed", seed, low=0),
-        bool(range_bias),
-        bool(progress),
-        callback,
-        bool(responsibilities),
-    )
+    most = {"em": 500, "em-book": 60}.get(method, 1000) if given["max_iterations"] is None else options.max_iterations
+    return replace(
+        options, **flags, max_iterations=checks.integer("max_iterations", most, low=1),
+        tolerance=checks.real("tolerance", options.tolerance, above=0),
+        restarts=checks.integer("restarts", options.restarts, low=0, high=MOST_RESTARTS),
+        seed=checks.integer("seed", options.seed, low=0),
+    )  # fmt: skip
 
 
 def open_device(backend: Selection, precision: str | None) -> tuple[Backend, np.dtype]:

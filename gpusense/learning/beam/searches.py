@@ -91,11 +91,21 @@ class _Search:
         self.best = without_needless(self.problem, self.problem.value(self.best.point, second=True))
         return free_direction(self.problem, self.best)[1]
 
+    def stopped(self, tolerance: float) -> Climb:
+        """Return the end of a search that gains nothing: an optimum if the quadratic model predicts no gain either."""
+        left = self.left()
+        if left <= max(1e3 * tolerance, self.problem.noise(self.best)):
+            return Climb(self.best, self.trace, True)
+        return Climb(self.best, self.trace, False, [f"no progress, with {left:.2g} nats left to gain"])
+
+    def exhausted(self, max_iterations: int) -> Climb:
+        """Return the end of a search that took all iterations."""
+        return Climb(self.best, self.trace, False, [f"no convergence within {max_iterations} iterations"])
+
 
 def climb_gradient(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
     """Run L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995) with the analytic gradient, restarted as long as it gains."""
-    search = _Search(problem, start, watch)
-    return _refine(search, max_iterations, tolerance)
+    return _refine(_Search(problem, start, watch), max_iterations, tolerance)
 
 
 def _refine(search: _Search, max_iterations: int, tolerance: float) -> Climb:
@@ -125,11 +135,8 @@ def _refine(search: _Search, max_iterations: int, tolerance: float) -> Climb:
         if result.nit == 0:
             search.end_iteration()
         if gained <= max(tolerance, search.problem.noise(search.best)):
-            left = search.left()
-            if left <= max(1e3 * tolerance, search.problem.noise(search.best)):
-                return Climb(search.best, search.trace, True)
-            return Climb(search.best, search.trace, False, [f"no progress, with {left:.2g} nats left to gain"])
-    return Climb(search.best, search.trace, False, [f"no convergence within {max_iterations} iterations"])
+            return search.stopped(tolerance)
+    return search.exhausted(max_iterations)
 
 
 def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
@@ -164,14 +171,12 @@ def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance
             },
         )
         if search.best.objective - before <= max(10 * tolerance, problem.noise(search.best)):
-            left = search.left()
-            if left <= max(1e3 * tolerance, problem.noise(search.best)):
-                return Climb(search.best, search.trace, True)
-            if turns == _TURNS:
-                return Climb(search.best, search.trace, False, [f"no progress, with {left:.2g} nats left to gain"])
+            end = search.stopped(tolerance)
+            if end.converged or turns == _TURNS:
+                return end
             turns += 1
             directions = np.linalg.qr(rng.normal(size=directions.shape))[0]
-    return Climb(search.best, search.trace, False, [f"no convergence within {max_iterations} iterations"])
+    return search.exhausted(max_iterations)
 
 
 def climb_genetic(

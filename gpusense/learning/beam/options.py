@@ -49,7 +49,7 @@ def check_options(**given: Any) -> Options:
     if options.callback is not None and not callable(options.callback):
         raise TypeError(f"callback: must be callable, got {checks.show(options.callback)}")
     names = ("range_bias", "progress", "responsibilities")
-    flags = {name: checks.boolean(name, getattr(options, name)) for name in names}
+    flags: dict[str, Any] = {name: checks.boolean(name, getattr(options, name)) for name in names}
     if method == "em-book" and flags["range_bias"]:
         raise ValueError("range_bias: must be False with method 'em-book', which has no offset, got True")
     most = {"em": 500, "em-book": 60}.get(method, 1000) if given["max_iterations"] is None else options.max_iterations

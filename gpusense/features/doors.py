@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense._util.angles import wrapped
-from gpusense.features.hallways import first_apart, pairs_of
-from gpusense.features.lines import scores_of
+from gpusense.features.lines import first_apart, pairs_of, scores_of
 from gpusense.features.result import Found
 from gpusense.features.segments import Beams, Segments
 

@@ -16,8 +16,7 @@ from gpusense.backends import Selection, get_backend
 from gpusense.backends.base import Backend
 from gpusense.features.device import ScanDevice
 from gpusense.features.doors import find_doors
-from gpusense.features.hallways import find_hallways
-from gpusense.features.lines import find_lines, scores_of, straight
+from gpusense.features.lines import find_hallways, find_lines, scores_of, straight
 from gpusense.features.poles import find_poles
 from gpusense.features.result import KINDS, Features, Found, check_kinds, features_of, joined, nothing
 from gpusense.features.segments import Segments, beams_of, find_segments

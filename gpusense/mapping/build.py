@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.memory import check_room
 from gpusense.backends import Selection, get_backend
-from gpusense.mapping.counts import BandCounts, bands
-from gpusense.mapping.rays import SCANS, RayEnds, Survey, batches, check_lengths, extent
+from gpusense.mapping.rays import SCANS, BandCounts, RayEnds, Survey, bands, batches, check_lengths, extent
 from gpusense.world.deskew import check_motion
 from gpusense.world.grid import OccupancyGrid, grid_of_checked
 from gpusense.world.grid_frame import GridFrame, check_origin, check_resolution

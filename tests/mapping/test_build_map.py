@@ -15,8 +15,7 @@ import gpusense as gs
 from gpusense._util import memory
 from gpusense.backends import get_backend
 from gpusense.mapping.build import MapBuilder
-from gpusense.mapping.counts import BandCounts
-from gpusense.mapping.rays import RayEnds
+from gpusense.mapping.rays import BandCounts, RayEnds
 from gpusense.world.grid_frame import GridFrame
 from gpusense.world.windows import Window
 

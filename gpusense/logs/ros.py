@@ -36,6 +36,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -56,34 +57,17 @@ from gpusense.world.scanner import Scanner
 _APART = (0.02, math.radians(2))
 
 
-def read(
-    path: Path,
-    *,
-    range_max: float | None,
-    odometry: bool,
-    rear: bool,
-    range_min: float | None = None,
-    topic: str | None = None,
-    frame: str | None = None,
-    mount: Pose | None = None,
-    odometry_from: str | None = None,
-) -> Iterator[Scan | Odometry]:
+def read(path: Path, *, rear: bool, **options: Any) -> Iterator[Scan | Odometry]:
     """Read the records of a bag; see :func:`gpusense.read_log` for arguments and errors."""
     if rear:
         raise ValueError("rear: must be False for a ROS bag, whose lasers have topics (topic=), got True")
-    return _records(path, range_max, range_min, odometry, topic, frame, mount, odometry_from)
+    return _records(path, **options)
 
 
 def _records(
-    path: Path,
-    range_max: float | None,
-    range_min: float | None,
-    odometry: bool,
-    topic: str | None,
-    frame: str | None,
-    mount: Pose | None,
-    odometry_from: str | None,
-) -> Iterator[Scan | Odometry]:
+    path: Path, *, range_max: float | None, odometry: bool, range_min: float | None, topic: str | None,
+    frame: str | None, mount: Pose | None, odometry_from: str | None,
+) -> Iterator[Scan | Odometry]:  # fmt: skip
     bag = survey(path, topic, frame, odometry_from)
     lasers = _lasers(bag, mount, range_min, range_max)
     times, poses = bag.track.sorted()

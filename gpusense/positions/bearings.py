@@ -9,7 +9,7 @@ from gpusense._util.typing import Floats, Loss
 from gpusense.positions.closed_forms import EPS, ROUNDINGS, three_bearings, two_rays
 from gpusense.positions.fix import PositionFix
 from gpusense.positions.problem import Problem, check_operands, make_problem, subsets
-from gpusense.positions.solver import in_line, minima, pick
+from gpusense.positions.solver import in_line, solve
 
 
 def triangulate(
@@ -77,10 +77,8 @@ def triangulate(
     if len(problem.xy) == least:
         return _on_circle(problem, sets, clarity, _exact(problem, starts, rho[0]))
     linear = _nearest_point(problem) if heading is not None else _linear_pose(problem)
-    states, status = pick(*minima(problem, np.vstack([linear, starts])), known_sigma=sigma is not None)
-    if problem.at_beacon(states[0]):
-        status = "at a beacon"
-    elif status == "unique" and np.abs(problem.residuals(states[:1])).max() > np.pi / 2:
+    states, status = solve(problem, np.vstack([linear, starts]), known_sigma=sigma is not None)
+    if status == "unique" and np.abs(problem.residuals(states[:1])).max() > np.pi / 2:
         status = "behind"
     return _on_circle(problem, sets, clarity, problem.fix(states, status))
 

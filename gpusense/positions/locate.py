@@ -12,7 +12,7 @@ from gpusense._util.typing import Floats, Loss
 from gpusense.positions.closed_forms import two_circles, wrap
 from gpusense.positions.fix import PositionFix
 from gpusense.positions.problem import Problem, check_operands, make_problem, subsets
-from gpusense.positions.solver import minima, pick
+from gpusense.positions.solver import solve
 
 # Standard deviation of a bearing without information [rad].
 NO_BEARING = 1e100
@@ -82,10 +82,7 @@ def locate(
     problem = replace(
         problem, sigma_bearing=np.where(problem.ranges <= problem.touch, NO_BEARING, problem.sigma_bearing)
     )
-    states, status = pick(*minima(problem, _starts(problem)), known_sigma=True)
-    if problem.at_beacon(states[0]):
-        status = "at a beacon"
-    return problem.fix(states, status)
+    return problem.fix(*solve(problem, _starts(problem), known_sigma=True))
 
 
 def _starts(problem: Problem) -> Floats:

@@ -9,7 +9,7 @@ from gpusense._util.typing import Floats, Loss
 from gpusense.positions.closed_forms import two_circles
 from gpusense.positions.fix import PositionFix
 from gpusense.positions.problem import Problem, check_operands, make_problem, subsets
-from gpusense.positions.solver import distinct, in_line, minima, pick, reflect
+from gpusense.positions.solver import distinct, in_line, minima, pick, reflect, solve
 
 
 def trilaterate(
@@ -71,10 +71,7 @@ def trilaterate(
     starts = np.vstack([_linearised(problem), _pairs(problem, subsets(len(problem.xy), 2))[0]])
     if line is not None:
         return _beside_line(problem, starts, line, known_sigma=sigma is not None)
-    states, status = pick(*minima(problem, starts), known_sigma=sigma is not None)
-    if problem.at_beacon(states[0]):
-        status = "at a beacon"
-    return problem.fix(states, status)
+    return problem.fix(*solve(problem, starts, known_sigma=sigma is not None))
 
 
 def _pairs(problem: Problem, pairs: NDArray[np.intp]) -> tuple[Floats, NDArray[np.str_]]:

@@ -112,6 +112,12 @@ def pick(states: Floats, costs: Floats, *, known_sigma: bool) -> tuple[Floats, s
     return states[near], "ambiguous" if near.sum() > 1 else "unique"
 
 
+def solve(problem: Problem, starts: Sequence[Floats] | Floats, *, known_sigma: bool) -> tuple[Floats, str]:
+    """Return the solutions from starts, the best first, and the status."""
+    states, status = pick(*minima(problem, starts), known_sigma=known_sigma)
+    return states, "at a beacon" if problem.at_beacon(states[0]) else status
+
+
 def in_line(points: Floats, noise: float) -> tuple[Floats, Floats] | None:
     """Return the line through points: a point and a unit vector, from the first point to the farthest.
 

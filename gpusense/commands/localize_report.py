@@ -191,6 +191,6 @@ def _doubt(deviations: list[float], agrees: bool) -> str:
 
 def _draw(path: Path, pf: ParticleFilter, track: Track) -> None:
     from gpusense.plots.drawing import save
-    from gpusense.plots.tracks import track_figure
+    from gpusense.plots.runs import track_figure
 
     save(track_figure(pf, track), path)

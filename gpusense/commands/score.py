@@ -157,7 +157,7 @@ def _row(backend: str, scan: ScanScore) -> dict[str, str]:
 
 def _draw(path: Path, grid: OccupancyGrid, score: BackendScore, pose: str) -> None:
     from gpusense.plots.drawing import save
-    from gpusense.plots.scores import scores_figure
+    from gpusense.plots.runs import scores_figure
 
     save(scores_figure(grid, score, pose), path)
 

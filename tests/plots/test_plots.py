@@ -181,7 +181,7 @@ def test_save_refuses(name, error, message, tmp_path, monkeypatch):
 def test_a_track_is_titled_by_its_verdict_and_faint_before_convergence(converged, verdict):
     from types import SimpleNamespace
 
-    from gpusense.plots.tracks import track_figure
+    from gpusense.plots.runs import track_figure
 
     poses = np.column_stack([np.arange(4.0), np.ones(4), np.zeros(4)])
     pf = SimpleNamespace(grid=gs.worlds.building(), host_particles=lambda: poses)

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gpusense.backends import SPEED_CLASSES, Backend, devices, get_backend
-from gpusense.evaluation.benchmark.fine_posterior import FinePosterior, fine_posterior
 from gpusense.evaluation.benchmark.scenes import Scene
 from gpusense.localization.weights import normalize_weights
 from gpusense.models.scan.beam import BeamModel
@@ -37,6 +37,9 @@ MOST_FACTOR = 1e6
 
 # Particles per piece when the host scores ranges.
 _PIECE = 256
+# Of a fine grid of poses: half widths of the first one [m, m, rad], and poses along each axis. A grid is fine enough if
+# each deviation is at least this many spacings; the next one spans this many deviations on each side.
+_HALF, _SIDE, _FINE, _SPAN, _ROUNDS = (0.3, 0.3, 0.15), 13, 1.0, 5.0, 10
 
 
 class UnstableError(ValueError):
@@ -51,6 +54,21 @@ def truth_device() -> Backend:
         if device.available and place < rank and (backend := get_backend(device.selection)).info.float64:
             best, rank = backend, place
     return best
+
+
+@dataclass(frozen=True)
+class FinePosterior:
+    """Poses of a regular grid with their exact log-likelihoods.
+
+    Attributes:
+        poses: (M, 3) poses [m, m, rad].
+        log_p: (M,) log-likelihoods.
+        deviation: (3,) standard deviations of the posterior [m, m, rad].
+    """
+
+    poses: Floats
+    log_p: Floats
+    deviation: Floats
 
 
 @dataclass(frozen=True)
@@ -184,6 +202,30 @@ def fine_errors(truth: Truth, problem: str, log_p: NDArray[np.floating], tempera
     """
     fine = truth.fine(problem)
     return posterior_errors(temperature * _checked("log-likelihoods", log_p, fine.log_p), fine.log_p, fine.poses)
+
+
+def fine_posterior(score: Callable[[Floats], NDArray[np.floating]], pose: ArrayLike) -> FinePosterior:
+    """Find the posterior near a pose, with a uniform prior.
+
+    The first grid is 0.6 m wide. While a standard deviation is below the grid's spacing, the next grid is narrower and
+    lies around the mean.
+
+    ``score``: Returns the log-likelihoods of (M, 3) poses, finite. ``pose``: (3,) pose at the middle of the first grid
+    [m, m, rad].
+    """
+    middle, half = np.asarray(pose, np.float64), np.array(_HALF)
+    steps = np.linspace(-1.0, 1.0, _SIDE)
+    unit = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    for _ in range(_ROUNDS):
+        spacing, poses = 2 * half / (_SIDE - 1), middle + unit * half
+        log_p = np.asarray(score(poses), np.float64)
+        weights = normalize_weights(log_p).weights
+        mean = weights @ poses
+        deviation = np.sqrt(weights @ np.square(poses - mean))
+        if (deviation >= _FINE * spacing).all():
+            break
+        middle, half = mean, np.minimum(_SPAN * np.maximum(deviation, 0.5 * spacing), half)
+    return FinePosterior(poses, log_p, deviation)
 
 
 def _checked(quantity: str, computed: NDArray[np.floating], right: Floats) -> Floats:

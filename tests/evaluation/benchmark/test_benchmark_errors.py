@@ -10,7 +10,7 @@ from support.bench_world import quick_scene
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.evaluation.benchmark import accuracy, candidates, fine_posterior, scenes
+from gpusense.evaluation.benchmark import accuracy, candidates, scenes
 from gpusense.evaluation.tolerances import TOLERANCES
 from gpusense.evaluation.worlds import is_free
 
@@ -126,7 +126,7 @@ def test_thinned_beams_count_as_often_as_they_stand_for():
 def test_fine_posterior_of_a_normal_density():
     """Deviations and mean equal the density's up to the grid's spacing, even if narrow."""
     mean, sigma = np.array([3.01, -2.0, 0.4]), np.array([0.004, 0.03, 0.001])
-    fine = fine_posterior.fine_posterior(lambda x: -0.5 * np.square((x - mean) / sigma).sum(axis=1), (3.0, -2.0, 0.41))
+    fine = accuracy.fine_posterior(lambda x: -0.5 * np.square((x - mean) / sigma).sum(axis=1), (3.0, -2.0, 0.41))
     np.testing.assert_allclose(fine.deviation, sigma, rtol=0.01)
     weights = gs.normalize_weights(fine.log_p).weights
     np.testing.assert_allclose(weights @ fine.poses, mean, atol=1e-4)

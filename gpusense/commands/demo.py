@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gpusense import plots
 from gpusense._util.extras import check_library
 from gpusense._util.files import check_writable
 from gpusense._util.progress import progress
@@ -53,7 +54,8 @@ examples:
 
 Exit codes: 0 success, 1 a device failed (the report has its error), 2 bad input."""
 
-LATTICE = 0.1
+# Distance between poses of the pictures [m]; most particles drawn.
+LATTICE, DRAWN_PARTICLES = 0.1, 20_000
 NOTE = "Generated building; scan drawn from the beam model's mixture. Colour scales end at the median of the values."
 
 
@@ -86,42 +88,80 @@ def run(args: argparse.Namespace) -> int:
     if not args.no_plot:
         check_library("matplotlib", "the picture, which --no-plot leaves out,")
         check_writable(args.output)
-    backends, failures = arguments.open_backends(args.backend)
-    scene = make_scene(args.seed, args.particles, args.beams)
+    parts = _Parts()
+    parts.begin("devices, scene and references")
+    # Children prove new devices, so this process has time for the rest.
+    with ThreadPoolExecutor(1) as other:
+        prepared = other.submit(_prepare, args)
+        backends, failures = arguments.open_backends(args.backend)
+        scene, references = prepared.result()
     if args.verbose:
         _describe(scene, args.seed, backends)
     scores: list[Score] = []
     written = None
-    with held(scores) as stops, progress(2 * len(backends) + 3) as step:
-        _score_all(scene, backends, scores, failures, selected=args.backend is not None, step=step)
+    with held(scores) as stops, progress(2 * len(backends) + 1) as shown:
+
+        def step(name: str) -> None:
+            parts.begin(name)
+            shown(name)
+
+        _score_all(scene, references, backends, scores, failures, selected=args.backend is not None, step=step)
         step("picture")
         if not args.no_plot and {score.name for score in scores} == {BEAM, FIELD}:
             draw(scene, scores, args.output)
             written = args.output
+    parts.begin("report")
     if args.json:
-        output.print_json(_document(scene, args.seed, scores, failures, written))
+        output.print_json(_document(scene, args.seed, scores, failures, written) | {"seconds": parts.seconds})
     else:
         _report(scene, scores, failures, written)
     if args.verbose:
         _explain(scores)
+        print("\nSeconds: " + ", ".join(f"{name} {seconds:.2f}" for name, seconds in parts.seconds.items()))
     if stops:
         raise stops[0]
     return 1 if failures else 0
 
 
+class _Parts:
+    """Seconds of the parts of a run, by name."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._name, self._begin = "", 0.0
+
+    def begin(self, name: str) -> None:
+        """End the last part, and begin another."""
+        now = time.perf_counter()
+        if self._name:
+            self.seconds[self._name] = now - self._begin
+        self._name, self._begin = name, now
+
+
+def _prepare(args: argparse.Namespace) -> tuple[Scene, dict[str, np.ndarray]]:
+    """Make the scene and its float64 log-likelihoods by model, and import the plots."""
+    scene = make_scene(args.seed, args.particles, args.beams)
+    references = {}
+    for name in (BEAM, FIELD):
+        truth = make_model(scene, name, "numpy", "float64")
+        references[name] = np.asarray(truth.log_likelihood(scene.poses[:-1][scene.checked], scene.ranges))
+    if not args.no_plot:
+        from gpusense import plots
+
+        plots.new_figure(1.0, 1.0)
+    return scene, references
+
+
 def _score_all(
-    scene: Scene, backends: list[Backend], scores: list[Score], failures: list[str], *, selected: bool,
-    step: Callable[[str], None],
+    scene: Scene, references: dict[str, np.ndarray], backends: list[Backend], scores: list[Score],
+    failures: list[str], *, selected: bool, step: Callable[[str], None],
 ) -> None:  # fmt: skip
     """Score the scene with both models on all backends; append scores, and errors of unselected backends."""
     for name in (BEAM, FIELD):
-        step(f"{name}, float64 reference")
-        truth = make_model(scene, name, "numpy", "float64")
-        reference = np.asarray(truth.log_likelihood(scene.poses[:-1][scene.checked], scene.ranges))
         for backend in backends:
             step(f"{name} on {backend.info.selection}")
             try:
-                scores.append(score_scene(scene, name, backend, reference))
+                scores.append(score_scene(scene, name, backend, references[name]))
             except Exception as error:
                 if selected:
                     raise
@@ -130,6 +170,8 @@ def _score_all(
 
 def draw(scene: Scene, scores: list[Score], path: Path) -> None:
     """Draw the scan at the best pose, the particles, and P(z | x, m) at the best heading by both models."""
+    from gpusense import plots
+
     beam = _fastest(scores, BEAM)
     best = beam.best
     poses, free, extent = plots.pose_lattice(scene.grid, LATTICE, float(best[2]))
@@ -138,8 +180,17 @@ def draw(scene: Scene, scores: list[Score], path: Path) -> None:
         density = np.full(free.shape, np.nan)
         density[free] = _fastest(scores, name).model.log_likelihood(poses[free.ravel()], scene.ranges)
         densities[f"{name.capitalize()}: every position at the best heading; ring: the truth"] = density
+    shown = slice(None, None, -(-len(scene.poses) // DRAWN_PARTICLES))
     figure = plots.localization_figure(
-        scene.grid, scene.scanner, scene.ranges, scene.truth, best, beam.poses[:-1], beam.log_p[:-1], densities, extent
+        scene.grid,
+        scene.scanner,
+        scene.ranges,
+        scene.truth,
+        best,
+        beam.poses[:-1][shown],
+        beam.log_p[:-1][shown],
+        densities,
+        extent,
     )
     title = f"Where is the robot?   P(z | x, m) of one scan, {scene.beams} of its {BEAMS} beams, by gpusense"
     figure.suptitle(title, fontsize=15)

@@ -71,6 +71,7 @@ def test_demo_prints_details_on_request(capsys):
     out = capsys.readouterr().out
     assert "particles  400: half over all free cells" in out
     assert out.count("Specialisation of the kernels: ") == 2
+    assert re.search(r"\nSeconds: devices, scene and references \d+\.\d\d, beam model on numpy \d+\.\d\d, ", out)
 
 
 def test_numpy_scores_a_part_of_many_poses(monkeypatch, capsys):

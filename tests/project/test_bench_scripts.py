@@ -196,16 +196,6 @@ def test_fits_of_real_sensors_run(needs: Callable[[str], str], data_dir: Path, t
     assert abs(bias["sonar1"] + 0.027) < 0.01 and abs(bias["sonar2"]) < 0.01 and 0 < bias["lidar_wall"] < 0.01
 
 
-def test_localisation_with_fitted_parameters_runs(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
-    arguments = ["--data", str(data_dir), "--backend", needs("opencl"), "--log", "intel", "--scans", "2"]
-    report = run_here("studies/fit_localisation.py", *arguments, "--particles", "500", output=tmp_path / "fits")
-    (log,) = report["logs"]
-    assert [row["parameters_of"] for row in log["rows"]][:2] == ["fitted", "nav2_amcl's defaults"] and len(
-        log["rows"]
-    ) == 5
-    assert log["scored_scans"] == 2 and all(1 <= row["rank"]["median"] < 20 for row in log["rows"])
-
-
 @pytest.mark.slow
 def test_runs_among_landmarks(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
     chosen = [word for name in ("mrclam_2", "beacons", "lego", "freiburg") for word in ("--set", name)]

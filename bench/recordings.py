@@ -19,7 +19,6 @@ import numpy as np
 import gpusense as gs
 from gpusense.evaluation.steps import read_steps
 from gpusense.evaluation.tracking import START, coverage_report, rank_of
-from gpusense.localization.defaults import DEFAULTS
 
 CARMEN = {name: name for name in ("intel", "csail", "aces", "belgioioso", "fhw", "seattle")} | {"fr079": "freiburg-079"}
 JARVIS = ("jarvis-s3000", "jarvis-nav350", "jarvis-fused")
@@ -144,9 +143,8 @@ def wean(log):
 
 
 def field(backend, **options):
-    """Return a maker of the command's likelihood field."""
-    parameters = gs.LikelihoodFieldParameters(**DEFAULTS.field)
-    return lambda grid, scanner: gs.LikelihoodFieldModel(grid, scanner, parameters, backend=backend, **options)
+    """Return a maker of the default likelihood field."""
+    return lambda grid, scanner: gs.LikelihoodFieldModel(grid, scanner, backend=backend, **options)
 
 
 # Parameters of a beam model: a scanner with a deviation of a few centimetres among people.
@@ -158,7 +156,8 @@ def makers(kind, backend, beams):
     if kind == "field":
         return field(backend, beams=beams)
     if kind == "wide":
-        return lambda grid, scanner: gs.LikelihoodFieldModel(grid, scanner, backend=backend, beams=beams)
+        wide = gs.LikelihoodFieldParameters()
+        return lambda grid, scanner: gs.LikelihoodFieldModel(grid, scanner, wide, backend=backend, beams=beams)
     parameters = gs.BeamParameters(**BEAM)
 
     def make(grid, scanner):

@@ -20,7 +20,7 @@ grid = gs.build_map(scans[:60], poses[:60], scanner, resolution=0.1)
 print(grid)
 
 # Where was the last scan taken?
-model = gs.LikelihoodFieldModel(grid, scanner, beams=180)
+model = gs.LikelihoodFieldModel(grid, scanner, gs.LikelihoodFieldParameters(), beams=180)  # AMCL's wide field
 found = gs.locate_scan(model, scans[60], resolution=0.1)
 print(f"truth {poses[60].round(2)}, {found.status} {found.pose.round(2)}, score {found.score:.3f}")
 print(f"{found.evaluated} evaluations instead of {found.poses}; {len(found.modes)} modes")

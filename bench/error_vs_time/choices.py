@@ -143,9 +143,11 @@ def _figures(row: Row, measure: str) -> str:
 
 
 def answers(rows: Sequence[Row], devices: Sequence[str], wishes: Sequence[Wish], standing: Standing) -> list[str]:
-    """Return the table of wishes."""
-    lines = [
-        (wish.words, *(answer(rows, wish, device, standing.get((device, wish.words), "")) for device in devices))
-        for wish in wishes
-    ]
-    return table(("to do", *devices), lines, 1 + len(devices))
+    """Return the tables of wishes: one for all wishes that the same devices have been measured for."""
+    tables: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
+    for wish in wishes:
+        said = {device: answer(rows, wish, device, standing.get((device, wish.words), "")) for device in devices}
+        said = {device: text for device, text in said.items() if text != "-"}
+        tables.setdefault(tuple(said), []).append((wish.words, *said.values()))
+    made = [table(("to do", *measured), lines, 1 + len(measured)) for measured, lines in tables.items() if measured]
+    return [line for lines in made for line in (*lines, "")][:-1]

@@ -39,7 +39,6 @@ from gpusense.evaluation.benchmark.accuracy import factor_for, posterior_errors,
 from gpusense.evaluation.benchmark.report import commit, plain, to_json
 from gpusense.evaluation.machine import machine
 from gpusense.evaluation.simulation.changes import surface_of
-from gpusense.localization.defaults import DEFAULTS
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
@@ -81,10 +80,8 @@ def scan_model(kind: str, run: Any, beams: int, device: Backend, precision: str)
     made: dict[str, Any] = {"backend": device, "precision": precision, "beams": beams}
     words = f"beams={beams}" + (', precision="float64"' if precision == "float64" else "")
     if kind == "field":
-        parameters = gs.LikelihoodFieldParameters(**DEFAULTS.field)
-        return gs.LikelihoodFieldModel(
-            run.grid, run.scanner, parameters, **made
-        ), f"gs.LikelihoodFieldModel(grid, scanner, {words})"
+        model = gs.LikelihoodFieldModel(run.grid, run.scanner, **made)
+        return model, f"gs.LikelihoodFieldModel(grid, scanner, {words})"
     chosen: Any = gs.BeamParameters(**BEAM)
     if kind == "discrete":
         chosen = gs.DiscreteBeamModel(chosen, range_max=run.scanner.range_max, bins=600)

@@ -81,6 +81,7 @@ def methods(rows: Sequence[Row], need: str, devices: Sequence[str], *, fronts: b
         chosen = own(rows, need, device)
         for row in best(chosen, measures[0]) if fronts else chosen:
             shown.setdefault(row.text, {})[device] = row
+    devices = [device for device in devices if any(device in each for each in shown.values())]
     columns = ["method", *devices, *measures, "code"]
     lines = []
     for text, each in shown.items():

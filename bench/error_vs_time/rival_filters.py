@@ -27,13 +27,13 @@ PARTICLES, BEAMS = (500, 2000, 10_000), 60
 # Most particles of a beam model: these programs walk its rays cell by cell.
 MOST_CAST = 2000
 # By method: the peers' model; z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, max_distance; noise of odometry.
-_FIELD = DEFAULTS.field
-_DISTANCE = gs.LikelihoodFieldParameters().max_distance
+_FIELD = gs.LikelihoodFieldParameters.tracking()
+_DISTANCE = _FIELD.max_distance
 _CAST = gs.BeamParameters(**BEAM)
 METHODS: dict[str, tuple[str, tuple[float, ...], tuple[float, ...]]] = {
     "defaults": ("field", (0.5, 0.05, 0.05, 0.5, 0.2, 0.1, 2.0), (0.2,) * 4),
     "product": (
-        "field, prob", (_FIELD["z_hit"], 0.0, 0.0, _FIELD["z_rand"], _FIELD["sigma_hit"], 0.1, _DISTANCE),
+        "field, prob", (_FIELD.z_hit, 0.0, 0.0, _FIELD.z_rand, _FIELD.sigma_hit, 0.1, _DISTANCE),
         DEFAULTS.alpha,
     ),
     "beam": (

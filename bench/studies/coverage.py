@@ -20,7 +20,6 @@ import recordings
 from common import make_parser, note, parse, publish, table
 
 import gpusense as gs
-from gpusense.localization.defaults import DEFAULTS
 
 # Description: temperature, weights of a peer.
 WEIGHTS = {
@@ -33,8 +32,7 @@ def maker(kind, backend, beams, peer):
     """Return ``make(grid, scanner)``: a model of a kind, or nav2's field with the command's parameters."""
     if peer is None:
         return recordings.makers(kind, backend, beams)
-    shared = {name: DEFAULTS.field[name] for name in ("z_hit", "z_max", "z_rand", "sigma_hit")}
-    weights = gs.LikelihoodFieldParameters(**shared)
+    weights = gs.LikelihoodFieldParameters.tracking().replace(interpolation="nearest")
     return lambda grid, scanner: gs.LikelihoodFieldModel(
         grid, scanner, weights, compat=peer, beams=beams, backend=backend
     )

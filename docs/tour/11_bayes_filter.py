@@ -16,7 +16,7 @@ grid = gs.worlds.building(seed=1)
 scanner = gs.Scanner(np.radians(np.arange(-90, 91, 3)), range_max=12.0)
 run = gs.worlds.simulate_run(grid, scanner, scans=150, hidden=0.2, seed=6)
 
-model = gs.LikelihoodFieldModel(grid, scanner, gs.LikelihoodFieldParameters(z_hit=0.7, z_rand=0.3, sigma_hit=0.07))
+model = gs.LikelihoodFieldModel(grid, scanner)
 pf = gs.ParticleFilter(model, particles=1000, seed=0)
 pf.initialize(mean=run.poses[0] + (0.4, -0.3, 0.2), covariance=np.diag([0.25, 0.25, 0.1]))
 poses, clouds = [], {}

@@ -237,7 +237,7 @@ def parameters_of(args: argparse.Namespace) -> BeamParameters | LikelihoodFieldP
     if args.model == "field":
         if args.parameters is not None:
             raise ValueError(f"--parameters: must be left out with the field, got {args.parameters}")
-        return LikelihoodFieldParameters().replace(**changes)
+        return LikelihoodFieldParameters.tracking().replace(**changes)
     beam = BeamParameters()
     if args.parameters is not None:
         from gpusense.commands.parameter_files import read_beam_parameters

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import add_backend, add_json, output_path, positive_number
 from gpusense.commands.scans import add_choice, add_log, log_options, options_named
-from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
     from gpusense.evaluation.steps import Step
@@ -114,8 +113,6 @@ def _source(text: str) -> str | Path:
 def _models(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step]) -> list[ScanModel]:
     """Return the likelihood field of each scanner."""
     from gpusense.models.scan.field import LikelihoodFieldModel
-    from gpusense.world.parameters import LikelihoodFieldParameters
 
-    parameters = LikelihoodFieldParameters(**DEFAULTS.field)
     scanners = dict.fromkeys(step.scan.scanner for step in steps)
-    return [LikelihoodFieldModel(grid, one, parameters, backend=args.backend) for one in scanners]
+    return [LikelihoodFieldModel(grid, one, backend=args.backend) for one in scanners]

@@ -82,13 +82,13 @@ def make_filter(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step]
     from gpusense.localization.filter import ParticleFilter
     from gpusense.models.scan.beam import BeamModel
     from gpusense.models.scan.field import LikelihoodFieldModel
-    from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
+    from gpusense.world.parameters import BeamParameters
 
     scanners = {step.sensor: step.scan.scanner for step in steps}
     for sensor, name in enumerate(args.topic):
         if sensor not in scanners:
             raise ValueError(f"--topic: must have scans that are chosen, got none of {name}")
-    parameters, nav2 = read.sensor or LikelihoodFieldParameters.tracking(), read.nav2
+    parameters, nav2 = read.sensor, read.nav2
     beams = args.beams or (DEFAULTS.beams if nav2 is None else nav2.max_beams)
     kind: Any = BeamModel if isinstance(parameters, BeamParameters) else LikelihoodFieldModel
     models = [kind(grid, scanners[one], parameters, beams=beams, backend=args.backend) for one in sorted(scanners)]

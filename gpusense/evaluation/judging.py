@@ -14,7 +14,6 @@ from gpusense._util.typing import AnyArray
 from gpusense.evaluation.posed_scans import NEAR
 from gpusense.evaluation.tracking import RISK, Track
 from gpusense.evaluation.trajectory_files import nearest_index, poses_at
-from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.diagnosis import Diagnosis
 from gpusense.localization.monitor import PoseMonitor
 from gpusense.localization.protection import check_risk
@@ -27,7 +26,6 @@ from gpusense.matching.locate import locate_scan
 from gpusense.matching.location import Location
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.models.scan.model import ScanModel
-from gpusense.world.parameters import LikelihoodFieldParameters
 from gpusense.world.scanner import Scanner
 
 Floats = NDArray[np.float64]
@@ -255,9 +253,8 @@ class TrajectoryJudge:
         if scan.scanner not in self._locators:
             model = self._models[scan.scanner]
             if not (isinstance(model, LikelihoodFieldModel) and model.compat is None):
-                parameters = LikelihoodFieldParameters(**DEFAULTS.field)
                 model = LikelihoodFieldModel(
-                    model.grid, scan.scanner, parameters, beams=model.beams, backend=model.device.selection
+                    model.grid, scan.scanner, beams=model.beams, backend=model.device.selection
                 )
             self._locators[scan.scanner] = model
         return locate_scan(self._locators[scan.scanner], scan.ranges, resolution=_RESOLUTION, angle=_ANGLE)

@@ -2,16 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
-from typing import Any, NamedTuple
-
-from gpusense.world.parameters import LikelihoodFieldParameters
-
-_TRACKING = LikelihoodFieldParameters.tracking()
-_FIELD = MappingProxyType(
-    {name: getattr(_TRACKING, name) for name in ("z_hit", "z_max", "z_rand", "sigma_hit", "interpolation")}
-)
+from typing import NamedTuple
 
 
 class Defaults(NamedTuple):
@@ -37,7 +28,6 @@ class Defaults(NamedTuple):
         recovery: Recovery of the filter.
         temperature: Temperature of the filter.
         calibrations: Number of first corrections that all teach the temperature; later two in ten do.
-        field: Parameters of the likelihood field of ``gpusense localize``.
         alpha: Noise of the odometry.
         reverse: Probability that a translation went the other direction.
         least: Least deviations of a step [m, rad].
@@ -64,7 +54,6 @@ class Defaults(NamedTuple):
     recovery: str = "sensor"
     temperature: str = "auto"
     calibrations: int = 60
-    field: Mapping[str, Any] = _FIELD
     alpha: tuple[float, float, float, float] = (0.02, 0.02, 0.02, 0.02)
     reverse: float = 0.02
     least: tuple[float, float] = (0.01, 0.005)

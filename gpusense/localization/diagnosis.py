@@ -15,6 +15,7 @@ from gpusense.localization.beam_consistency import BeamConsistency
 from gpusense.localization.scan_evidence import ratio_of_scan
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.verdict import sightings
+from gpusense.matching.field_search import searchable
 
 Floats = NDArray[np.float64]
 Cause = Literal["none", "people", "start", "moved", "mount", "map", "scale", "odometry", "time", "unknown"]
@@ -227,7 +228,7 @@ def _best_elsewhere(
     def score(poses: Floats) -> Floats:
         total = np.zeros(len(poses))
         for index, reading in scanning.items():
-            total += np.asarray(sensors[index].log_likelihood(poses, reading), np.float64)
+            total += np.asarray(searchable(sensors[index].model).log_likelihood(poses, *reading), np.float64)
         return total
 
     poses, rng = random_poses(_TRIED), np.random.default_rng(0)

@@ -15,7 +15,7 @@ import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple, cast
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -27,9 +27,11 @@ from gpusense.matching.score_tables import TOP, ScoreTables, quantized
 from gpusense.matching.search import Search
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
+from gpusense.models.scan.model import ScanModel
 from gpusense.tables.distances import distance_transform
 from gpusense.world.field_density import FieldDensity
 from gpusense.world.grid import OccupancyGrid
+from gpusense.world.parameters import LikelihoodFieldParameters
 from gpusense.world.scanner import classify_ranges
 
 # Side of the largest block with one bound, relative to the field's max_distance, and most levels.
@@ -255,6 +257,22 @@ def _complete(run: Callable[[slice, int], Found], headings: slice, floor: int) -
 
 
 _SEARCHES: weakref.WeakKeyDictionary[LikelihoodFieldModel, dict[int, FieldSearch]] = weakref.WeakKeyDictionary()
+
+
+M = TypeVar("M", bound=ScanModel)
+# The wide fields in place of default ones, while those live.
+_WIDE: weakref.WeakKeyDictionary[LikelihoodFieldModel, LikelihoodFieldModel] = weakref.WeakKeyDictionary()
+
+
+def searchable(model: M) -> M:
+    """Return the model to search a map with: a field with AMCL's wide parameters in place of one with defaults."""
+    if not (isinstance(model, LikelihoodFieldModel) and model._has_defaults):
+        return model
+    wide = _WIDE.get(model)
+    if wide is None or wide.grid is not model.grid:
+        changed = model._arguments() | {"parameters": LikelihoodFieldParameters()}
+        wide = _WIDE[model] = LikelihoodFieldModel(**changed, backend=model.backend)
+    return cast(M, wide)
 
 
 def field_search(model: LikelihoodFieldModel, stride: int) -> FieldSearch:

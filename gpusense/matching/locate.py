@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks, masks
 from gpusense._util.angles import wrapped
-from gpusense.matching.field_search import Candidates, FieldSearch, field_search, log_likelihoods_of
+from gpusense.matching.field_search import Candidates, FieldSearch, field_search, log_likelihoods_of, searchable
 from gpusense.matching.location import Location, PoseMode, Status
 from gpusense.matching.location_evidence import NAMES, location_evidence, probability_right
 from gpusense.matching.pose_grid import PoseGrid, distinct_poses
@@ -77,15 +77,17 @@ def locate_scan(
     Positions are centres of map cells, and headings are multiples of an angle from the map's x axis. Branch and bound
     (Hess et al., 2016) over integer scores finds every pose whose score can belong to the largest log-likelihood, and
     the model evaluates them. So the pose equals the result of brute force with ``model.log_likelihood``; ties go to the
-    lowest row, then column, then heading. Damped Gauss-Newton on the model's interpolated field then refines it, until
-    a step is shorter than 0.1 mm and 1e-4 rad in float64, and three times that in float32.
+    lowest row, then column, then heading. The default parameters of a model, made for tracking, are too narrow for a
+    search: ``LikelihoodFieldParameters()`` then take their place, also in brute force. Damped Gauss-Newton on the
+    model's interpolated field then refines it, until a step is shorter than 0.1 mm and 1e-4 rad in float64, and three
+    times that in float32.
 
     ``p_right`` is the probability that the pose is right. It is computed from the shares of the readings that agree
     with the map, pass through its walls or end before them, at this pose and at other poses of nearly the same score. A
     pose is ``"found"`` if ``p_right`` is at least ``min_probability``.
 
     Args:
-        model: A likelihood field; its beams, parameters and device are used.
+        model: A likelihood field; its beams, device and explicit parameters are used.
         ranges: (K,) readings [m], or (S, K) for a joint search of S scans.
         resolution: Distance between neighbouring positions [m], > 0; rounded to whole cells, at least one.
         angle: Angle between neighbouring headings [rad], up to a right angle; rounded down to a divisor of a right
@@ -116,7 +118,7 @@ def locate_scan(
         raise ValueError(
             f"model: must have compat=None, since weights of peers are no likelihood, got {model.compat!r}"
         )
-    ranges = masks.filled(ranges)
+    model, ranges = searchable(model), masks.filled(ranges)
     cell = model.grid.resolution
     stride = max(round(checks.real("resolution", resolution, above=0, high=checks.FARTHEST) / cell), 1)
     turns = 4 * math.ceil(math.pi / 2 / checks.real("angle", angle, above=1e-4, high=math.pi / 2) - 1e-9)

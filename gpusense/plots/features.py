@@ -71,7 +71,7 @@ def _draw_one(ax: Axes, kind: str, pose: tuple[float, float, float], size: float
     colour = COLOURS[kind]
     c, s = math.cos(theta), math.sin(theta)
     if kind in ("pole", "reflector"):
-        ax.add_patch(Circle((x, y), max(size, 0.03), fill=False, color=colour, linewidth=2.0, zorder=5, label=label))
+        ax.add_patch(Circle((x, y), max(size, 0.03), fill=False, color=colour, linewidth=2.0, zorder=8, label=label))
     elif kind in ("line", "door"):
         # A door's theta is the direction across it.
         ahead, aside = (c, s) if kind == "line" else (-s, c)
@@ -79,8 +79,8 @@ def _draw_one(ax: Axes, kind: str, pose: tuple[float, float, float], size: float
         wide, alpha = (1.6, 1.0) if kind == "line" else (5.0, 0.55)
         ax.plot(ends[:, 0], ends[:, 1], color=colour, linewidth=wide, alpha=alpha, zorder=4, label=label)
     else:
-        ax.plot([x, x + _ARROW * c], [y, y + _ARROW * s], color=colour, linewidth=1.5, zorder=5)
-        ax.plot([x], [y], MARKS[kind], color=colour, ms=5, zorder=6, label=label)
+        ax.plot([x, x + _ARROW * c], [y, y + _ARROW * s], color=colour, linewidth=1.5, zorder=8)
+        ax.plot([x], [y], MARKS[kind], color=colour, ms=5, zorder=9, label=label)
 
 
 def draw_landmarks(ax: Axes, landmarks: FeatureMap) -> None:

@@ -87,7 +87,7 @@ def draw_likelihood_field(
     Args:
         ax: Axes to draw onto.
         grid: The map.
-        parameters: Parameters of the field.
+        parameters: Parameters of the field; ``LikelihoodFieldParameters.tracking()`` by default.
         range_max: Largest range of the scanner, for z_rand [m].
 
     Returns:
@@ -99,7 +99,7 @@ def draw_likelihood_field(
         >>> gs.plots.draw_likelihood_field(ax, gs.OccupancyGrid([[0, 100, 0]], 0.5)).get_array().argmax()
         np.int64(1)
     """
-    p = LikelihoodFieldParameters() if parameters is None else parameters
+    p = LikelihoodFieldParameters.tracking() if parameters is None else parameters
     distance = distance_transform(grid.occupied, resolution=grid.resolution, backend="numpy")
     density = FieldDensity(p, checks.real("range_max", range_max, above=0))
     image = _over_grid(ax, grid, density.log(density.capped(distance)), cmap=colours(), interpolation="nearest")

@@ -112,10 +112,14 @@ def draw_beacons(ax: Axes, xy: ArrayLike) -> None:
     """
     places = checks.array("xy", xy, ("M", 2))
     ax.scatter(places[:, 0], places[:, 1], marker="s", s=42, c=OCCUPIED, edgecolors="white", linewidths=1.0, zorder=6)
-    for k, place in enumerate(places):
+    # Outside the beacons, where no curve between them passes.
+    away = places - places.mean(axis=0)
+    away /= np.maximum(np.hypot(*away.T), 1e-9)[:, None]
+    for k, (place, (x, y)) in enumerate(zip(places, away.tolist(), strict=True)):
         ax.annotate(
-            f"P{k + 1}", place, xytext=(6, 6), textcoords="offset points", color=OCCUPIED, fontsize=11, zorder=6
-        )
+            f"P{k + 1}", place, xytext=(14 * x, 14 * y or 14), textcoords="offset points", ha="center", va="center",
+            color=OCCUPIED, fontsize=11, zorder=6,
+        )  # fmt: skip
 
 
 def draw_solution_set(

@@ -13,7 +13,6 @@ from gpusense.evaluation import held_out, range_data
 from gpusense.learning.beam.fit import fit_beam_parameters
 from gpusense.learning.discrete.causes import DiscreteCauses
 from gpusense.learning.discrete.table import DiscreteBeamModel
-from gpusense.localization.defaults import DEFAULTS
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.sweeps.job import Job
@@ -64,7 +63,7 @@ def model_of(job: Job, store: Store, scanner: Scanner, *, temperature: float = 1
 def _parameters(job: Job, store: Store) -> Any:
     values = job.group("parameters")
     if job.model == "field":
-        return LikelihoodFieldParameters(**{**DEFAULTS.field, **values})
+        return LikelihoodFieldParameters.tracking().replace(**values)
     learned = job.option("fit", False) if job.model == "beam" else not values
     if not learned:
         if job.model == "beam":

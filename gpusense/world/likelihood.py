@@ -33,7 +33,7 @@ class Likelihood:
 
     name: ClassVar[Any] = None
     beam: ClassVar[BeamParameters] = BeamParameters()
-    field: ClassVar[LikelihoodFieldParameters] = LikelihoodFieldParameters()
+    field: ClassVar[LikelihoodFieldParameters] = LikelihoodFieldParameters.tracking()
     constant_term: ClassVar[float] = 0.0
     outside: ClassVar[str] = "free"
     unknown: ClassVar[str] = "free"

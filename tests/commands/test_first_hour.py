@@ -47,7 +47,7 @@ def test_no_beams_are_an_error(capsys, recorded):
 
 
 @pytest.mark.parametrize(
-    "model, parameters", [("beam", gs.BeamParameters()), ("field", gs.LikelihoodFieldParameters())]
+    "model, parameters", [("beam", gs.BeamParameters()), ("field", gs.LikelihoodFieldParameters.tracking())]
 )
 def test_commands_have_the_defaults_of_the_library(capsys, recorded, model, parameters):
     assert main(score(recorded, "--model", model, "--limit", "1", "--json")) == 0

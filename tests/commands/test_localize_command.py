@@ -300,10 +300,7 @@ def test_python_localizes_as_the_command_does(place, capsys):
     assert cli.main(arguments) == 0
     report = json.loads(capsys.readouterr().out)
     scans = list(gs.read_log(place / "run.log", range_max=20.0))
-    parameters = gs.LikelihoodFieldParameters.tracking()
-    model = gs.LikelihoodFieldModel(
-        gs.read_map(place / "map.yaml"), scans[0].scanner, parameters, backend="numpy", beams=60
-    )
+    model = gs.LikelihoodFieldModel(gs.read_map(place / "map.yaml"), scans[0].scanner, backend="numpy", beams=60)
     pf = gs.ParticleFilter(model, particles=300, seed=0)
     pf.initialize(mean=(3, 1.5, 0.2), covariance=np.diag([0.25, 0.25, 0.0676]))
     for before, scan in zip([None, *scans], scans, strict=False):

@@ -169,7 +169,9 @@ def test_an_end_point_on_an_edge_may_go_to_either_cell_but_no_other_one(precisio
     corners = (grid.cell_centers(row + 1, col + 1) + grid.cell_centers(row, col)) / 2
     poses = np.column_stack([corners, np.zeros(900)])
     recorder = Recorder(get_backend("numpy"))
-    model = gs.LikelihoodFieldModel(grid, gs.Scanner([0.0, math.pi / 2], 5.0), backend=recorder, precision=precision)
+    model = gs.LikelihoodFieldModel(
+        grid, gs.Scanner([0.0, math.pi / 2], 5.0), gs.LikelihoodFieldParameters(), backend=recorder, precision=precision
+    )
     model.log_likelihood(poses, [0.3, 0.5], per_beam=True)
     (launch,) = recorder.launches
     assert differing(replay(launch)[1].astype(launch.parts.dtype), launch.parts) == 0

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import copy
+import importlib
 import inspect
 import re
 from pathlib import Path
 
+from support.bench_scripts import BENCH
+
 import gpusense as gs
-from gpusense.commands import landmarks, localize
+from gpusense.commands import arguments, landmarks, localize
 from gpusense.localization.defaults import DEFAULTS
 
 
@@ -25,6 +29,23 @@ def test_the_page_has_the_table():
     rows = dict(re.findall(r"^\| (\w+) \| (.*?) \| .* \|$", page[page.index("## Defaults") :], re.M))
     rows.pop("name")
     assert rows == {name: shown(value) for name, value in DEFAULTS._asdict().items()}
+
+
+def test_class_commands_sweeps_and_bench_have_one_field(monkeypatch):
+    """``test_sweeps.py`` compares a sweep with the class, ``test_localize_command.py`` the filter with ``localize``."""
+    grid, scanner, tracking = (
+        gs.OccupancyGrid([[0, 100]]),
+        gs.Scanner([0.0], 1.0),
+        gs.LikelihoodFieldParameters.tracking(),
+    )
+    model = gs.LikelihoodFieldModel(grid, scanner, backend="numpy")
+    assert model.parameters == copy.copy(model).parameters == tracking != gs.LikelihoodFieldParameters()
+    monkeypatch.syspath_prepend(BENCH)
+    assert importlib.import_module("recordings").field("numpy")(grid, scanner).parameters == tracking
+    parser = argparse.ArgumentParser()
+    arguments.add_model(parser)
+    arguments.add_parameters(parser)
+    assert arguments.parameters_of(parser.parse_args(["--model", "field"])) == tracking
 
 
 def test_library_and_commands_have_its_values():

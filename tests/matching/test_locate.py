@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 
@@ -212,6 +213,23 @@ def test_a_changed_map_is_searched_anew():
     model.update_map(np.full((40, 1), 100), (4, 25))
     after = gs.locate_scan(model, ranges, resolution=0.2, angle=0.1)
     assert before.status == "found" and after.status == "no match"
+
+
+def test_a_default_model_is_searched_with_the_wide_field():
+    grid = house()
+    ranges = scan_at(grid, (2.05, 2.55, 1.0), 0.02)
+
+    def located(*parameters):
+        model = gs.LikelihoodFieldModel(grid, SCANNER, *parameters, backend="numpy", beams=40)
+        return model, gs.locate_scan(model, ranges, resolution=0.2, angle=0.1)
+
+    wide, tracking = gs.LikelihoodFieldParameters(), gs.LikelihoodFieldParameters.tracking()
+    model, found = located()
+    assert found.log_likelihood == located(wide)[1].log_likelihood != located(tracking)[1].log_likelihood
+    assert gs.locate_scan(copy.copy(model), ranges, resolution=0.2, angle=0.1).log_likelihood == found.log_likelihood
+    model.update_map(np.full((40, 1), 100), (4, 25))
+    after = gs.locate_scan(model, ranges, resolution=0.2, angle=0.1)
+    assert (found.status, after.status) == ("found", "no match")
 
 
 def test_bad_arguments_are_named():

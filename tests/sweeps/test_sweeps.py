@@ -17,7 +17,6 @@ import gpusense as gs
 from gpusense.commands import cli
 from gpusense.evaluation.steps import read_steps
 from gpusense.evaluation.tracking import Track, follow, start, summary
-from gpusense.localization.defaults import DEFAULTS
 from gpusense.sweep import Job, ProcessExecutor, SerialExecutor, SweepLost
 from gpusense.sweeps.plan import jobs_of
 from gpusense.sweeps.store import contents_of
@@ -74,10 +73,7 @@ def test_a_serial_sweep_is_that_of_the_parts(serial, folder):
     jobs, table = serial
     assert table["key"] == [job.key for job in jobs] and table["axis.weights"][1:3] == ["plain", "auto"]
     steps = read_steps(folder / "run.log", range_max=20, limit=4)
-    parameters = gs.LikelihoodFieldParameters(**DEFAULTS.field)
-    model = gs.LikelihoodFieldModel(
-        gs.read_map(folder / "map.yaml"), steps[0].scan.scanner, parameters, beams=20, backend="numpy"
-    )
+    model = gs.LikelihoodFieldModel(gs.read_map(folder / "map.yaml"), steps[0].scan.scanner, beams=20, backend="numpy")
     pf = gs.ParticleFilter(model, particles=100, seed=1)
     start(pf, steps, everywhere=False)
     track = Track()

@@ -124,8 +124,11 @@ def _of_casters(quick: bool) -> Iterator[Candidate]:
 def _of_models(quick: bool) -> Iterator[Candidate]:
     """Yield the field, and both models with fewer beams, with tables of the sensor, and with weights of peers."""
     models = (("beam", "exact", BeamModel), ("field", "field", LikelihoodFieldModel))
-    codes = {kind: f"gs.{kind.__name__}(grid, scanner" for _, _, kind in models}
     field = LikelihoodFieldModel
+    codes = {
+        BeamModel: "gs.BeamModel(grid, scanner",
+        field: "gs.LikelihoodFieldModel(grid, scanner, gs.LikelihoodFieldParameters()",
+    }
     yield Candidate("field", "field", _scores(field), exact=True, code=f"{codes[field]})")
     for share in _SHARES[2:3] if quick else _SHARES:
         for problem, method, kind in models:

@@ -40,7 +40,8 @@ class LikelihoodFieldModel(ScanModel):
     Args:
         grid: The map.
         scanner: The scanner's geometry.
-        parameters: Weights, deviation, cap and interpolation.
+        parameters: Weights, deviation, cap and interpolation; ``LikelihoodFieldParameters.tracking()`` by default.
+            ``LikelihoodFieldParameters()`` has the wider default of AMCL.
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
         unknown: Treatment of unknown cells: ``"free"`` (the default) or ``"occupied"``.
@@ -81,6 +82,7 @@ class LikelihoodFieldModel(ScanModel):
     ) -> None:
         weights = choose(compat)
         check_no_worlds(grid, compat)
+        self._has_defaults = parameters is None and compat is None
         self.parameters = weights.field if parameters is None else parameters
         checks.instance("parameters", self.parameters, LikelihoodFieldParameters)
         check_weights(self.parameters, compat)
@@ -97,7 +99,7 @@ class LikelihoodFieldModel(ScanModel):
         )
 
     def _arguments(self) -> dict[str, Any]:
-        return super()._arguments() | {"parameters": self.parameters}
+        return super()._arguments() | {"parameters": None if self._has_defaults else self.parameters}
 
     @property
     def _pipeline(self) -> FieldPipeline:

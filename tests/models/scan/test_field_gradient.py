@@ -105,4 +105,4 @@ def test_vectors_hold_particles_of_one_scan(device):
 def test_gradients_need_interpolation():
     grid, poses, ranges = scene()
     with pytest.raises(ValueError, match="interpolation"):
-        gs.LikelihoodFieldModel(grid, SCANNER, backend="numpy").gradient(poses, ranges)
+        gs.LikelihoodFieldModel(grid, SCANNER, gs.LikelihoodFieldParameters(), backend="numpy").gradient(poses, ranges)

@@ -232,7 +232,7 @@ def test_a_cloud_in_a_map_longer_than_distances_reach(backend):
     cells[0, [0, 50_000]] = 100
     grid = gs.OccupancyGrid(cells, 0.05)
     poses = [[2500.025 - 1.0, 0.025, 0.0], [2500.025 - 1.5, 0.025, 0.0]]
-    model = gs.LikelihoodFieldModel(grid, gs.Scanner([0.0], 30.0), backend=backend)
+    model = gs.LikelihoodFieldModel(grid, gs.Scanner([0.0], 30.0), gs.LikelihoodFieldParameters(), backend=backend)
     expected = np.log(0.9 / (0.2 * math.sqrt(2 * math.pi)) * np.exp(-np.array([0, 2.5**2]) / 2) + 0.1 / 30)
     np.testing.assert_allclose(model.log_likelihood(poses, [1.0]), expected, rtol=1e-5)
 
@@ -242,7 +242,7 @@ def test_a_window_that_fits_is_not_refused_for_its_room_to_move(backend):
     cells = np.zeros((1, 60_001), int)
     cells[0, 30_000] = 100
     grid = gs.OccupancyGrid(cells, 0.001)
-    model = gs.LikelihoodFieldModel(grid, gs.Scanner([0.0], 10.0), backend=backend)
+    model = gs.LikelihoodFieldModel(grid, gs.Scanner([0.0], 10.0), gs.LikelihoodFieldParameters(), backend=backend)
     expected = math.log(0.9 / (0.2 * math.sqrt(2 * math.pi)) + 0.1 / 10)
     assert model.log_likelihood([[29.5005, 0.0005, 0.0]], [0.5])[0] == pytest.approx(expected, rel=1e-5)
 

@@ -14,7 +14,10 @@ from gpusense.backends.base import Backend
 SCANNER = gs.Scanner(np.linspace(-2, 2, 19), range_max=6.0, mount=(0.1, 0.0, 0.2))
 MODELS: dict[str, tuple[Any, dict[str, Any]]] = {
     "beam": (gs.BeamModel, {}),
-    "field": (gs.LikelihoodFieldModel, {"unknown": "occupied", "outside": "occupied"}),
+    "field": (
+        gs.LikelihoodFieldModel,
+        {"parameters": gs.LikelihoodFieldParameters(), "unknown": "occupied", "outside": "occupied"},
+    ),
     "bilinear": (gs.LikelihoodFieldModel, {"parameters": gs.LikelihoodFieldParameters(interpolation="bilinear")}),
 }
 

@@ -278,13 +278,13 @@ def test_end_points_on_edges_of_cells(resolution, quarter_turns, as_gpu):
     grid = gs.OccupancyGrid(world()[0].cells, resolution)
     scanner = gs.Scanner(np.arange(-16, 17) * (math.pi / (8 if quarter_turns else 4)), 30 * resolution)
     z = np.resize(np.arange(1, 29) * resolution, scanner.count)
-    model = gs.LikelihoodFieldModel(grid, scanner, backend=as_gpu())
+    model = gs.LikelihoodFieldModel(grid, scanner, FIELD["nearest"], backend=as_gpu())
     poses = lattice(resolution, quarter_turns)
     found = model.log_likelihood(poses, z)
     assert {"ROUNDED_CELLS"} <= code_of(model)
     together, parts = model.log_likelihood(poses, z, per_beam=True)
     assert differing(found, together) == 0
-    truth = gs.LikelihoodFieldModel(grid, scanner, backend=as_gpu(), precision="float64")
+    truth = gs.LikelihoodFieldModel(grid, scanner, FIELD["nearest"], backend=as_gpu(), precision="float64")
     exact = truth.log_likelihood(poses, z, per_beam=True)[1]
     assert differing(parts, exact.astype(np.float32)) == 0
 
@@ -307,7 +307,7 @@ def test_end_points_at_the_border(as_gpu, backend):
     z = np.random.default_rng(2).uniform(0, 1.99, BEAMS)
     z[5] = 1.99
     for outside in ("free", "occupied"):
-        model = gs.LikelihoodFieldModel(grid, scanner, backend=as_gpu(), outside=outside)
+        model = gs.LikelihoodFieldModel(grid, scanner, FIELD["nearest"], backend=as_gpu(), outside=outside)
         seen = set()
         for poses in border_poses(grid, 2.0):
             found = model.log_likelihood(poses, z)

@@ -1,6 +1,6 @@
 """Make the pictures of README.md and of the site's first page: python docs/make_pictures.py.
 
-They are the animation of README's commands, the picture of ``gpusense demo`` at half its size with a palette of 128
+They are the animation of README's commands, the picture of ``gpusense demo`` at half its size with a palette of 256
 colours, and the picture of ``docs/judge.md``: a trajectory that slides away for a third of a simulated run.
 """
 
@@ -16,7 +16,7 @@ from PIL import Image
 
 import gpusense as gs
 
-WIDTH, COLOURS = 1100, 128
+WIDTH, COLOURS = 1100, 256
 TARGET = Path(__file__).parent / "img" / "demo.png"
 MOVIE = TARGET.with_name("run.gif")
 COMMANDS = (

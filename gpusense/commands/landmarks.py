@@ -161,8 +161,9 @@ def _print(
                f"{length(s['error_max'])}; heading {degrees(s['heading_median'])}, "
                f"{degrees(s['heading_90'])} and {degrees(float(track.error_heading.max()))} degrees")  # fmt: skip
     _print_suspicions(recorded_run, suspicions)
-    print_fact("likeliest", f"landmark at the logged pose: right {agreement['right']:.1%}, wrong "
-               f"{agreement['wrong']:.1%}, taken for false positives {agreement['none']:.1%}")  # fmt: skip
+    right, wrong, none = (f"{100 * agreement[name]:.1f} %" for name in ("right", "wrong", "none"))
+    print_fact("likeliest", f"landmark at the logged pose: right {right}, wrong {wrong}, taken for false "
+               f"positives {none}")  # fmt: skip
     print_fact("readings", f"{len(recorded_run.ids)} of {len(recorded_run.landmarks)} landmarks in "
                f"{len(recorded_run.time)} scans, {args.particles} particles, {kind} landmarks")  # fmt: skip
     print_parameters(fit.parameters, fit.standard_errors, _UNITS)
@@ -191,11 +192,11 @@ def _print_suspicions(recorded_run: LandmarkRun, suspicions: Suspicions) -> None
     labels = recorded_run.labels
     for pair in suspicions.exchanged:
         a, b = labels[pair.first], labels[pair.second]
-        print_fact("SUSPICIOUS", f"landmarks {a} and {b} fit better exchanged: {pair.before[0]:.0%} and "
-                   f"{pair.before[1]:.0%} of their readings agree with the map, {pair.after[0]:.0%} and "
-                   f"{pair.after[1]:.0%} with both exchanged")  # fmt: skip
+        before, after = (" and ".join(f"{100 * each:.0f} %" for each in both) for both in (pair.before, pair.after))
+        print_fact("SUSPICIOUS", f"landmarks {a} and {b} fit better exchanged: {before} of their readings agree with "
+                   f"the map, {after} with both exchanged")  # fmt: skip
     for each in suspicions.misplaced:
-        print_fact("SUSPICIOUS", f"landmark {labels[each.landmark]}: {each.agree:.0%} of its readings agree with its "
-                   "place")  # fmt: skip
+        print_fact("SUSPICIOUS", f"landmark {labels[each.landmark]}: {100 * each.agree:.0f} % of its readings agree "
+                   "with its place")  # fmt: skip
     if not (suspicions.exchanged or suspicions.misplaced):
         print_fact("map", "no landmark is suspicious")

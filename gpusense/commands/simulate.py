@@ -221,7 +221,7 @@ def _report(args: argparse.Namespace, made: SimulatedRun) -> None:
         return
     print_result(f"SIMULATED: {counted(len(made.times), 'scan')} of {counted(made.scanner.count, 'beam')} over "
                  f"{length:.0f} m")  # fmt: skip
-    print_fact("readings", f"{none:.1%} without return, {made.hidden.mean():.1%} hidden by people")
+    print_fact("readings", f"{100 * none:.1f} % without return, {100 * made.hidden.mean():.1f} % hidden by people")
     if made.kidnapped.any():
         scans = ", ".join(map(str, np.flatnonzero(made.kidnapped).tolist()))
         print_fact("kidnaps", f"carried elsewhere before scans {scans}")

@@ -49,7 +49,7 @@ def match_figure(
             ax.plot(*points_of(reference, scanner).T, ".", color=OCCUPIED, ms=3, label="reference")
         ax.plot(*moved.T, ".", color=ESTIMATE, ms=2, label="second scan")
         ax.set(
-            title=f"{title}: {x:.2f} m, {y:.2f} m, {np.degrees(theta):.1f} degrees",
+            title=f"{title}: {x:z.2f} m, {y:z.2f} m, {np.degrees(theta):z.1f} degrees",
             xlabel="x [m]",
             ylabel="y [m]",
             aspect="equal",

@@ -117,7 +117,7 @@ def draw_beacons(ax: Axes, xy: ArrayLike) -> None:
     away /= np.maximum(np.hypot(*away.T), 1e-9)[:, None]
     for k, (place, (x, y)) in enumerate(zip(places, away.tolist(), strict=True)):
         ax.annotate(
-            f"P{k + 1}", place, xytext=(14 * x, 14 * y or 14), textcoords="offset points", ha="center", va="center",
+            f"P{k + 1}", place, xytext=(12 * x, 12 * y or 12), textcoords="offset points", ha="center", va="center",
             color=OCCUPIED, fontsize=11, zorder=6,
         )  # fmt: skip
 

@@ -57,9 +57,9 @@ def track_figure(pf: ParticleFilter, track: Track) -> Figure:
     if first:
         ax.plot(*poses[: first + 1, :2].T, ":", color=ESTIMATE, lw=0.8, alpha=0.4, label="mean before convergence")
     ax.plot(*poses[first:, :2].T, "-", color=ESTIMATE, lw=1.2, label="estimate")
-    ax.plot(*poses[-1, :2], "o", color=ESTIMATE, ms=5, label="last pose")
     cloud = pf.host_particles()
     ax.plot(cloud[:, 0], cloud[:, 1], ".", color=CLOUD, ms=1.5, label="particles after the last scan")
+    ax.plot(*poses[-1, :2], "o", color=ESTIMATE, ms=5, label="last pose")
     add_legend(ax, 3)
     verdict = track.verdicts[-1]
     ax.set_title(f"{verdict.upper()} (p_lost {track.p_lost[-1]:.2g})", color=VERDICTS[verdict], loc="left")

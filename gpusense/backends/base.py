@@ -206,8 +206,9 @@ class _ProgramRecording(Recording):
             raise TypeError(f"stream: must be None on {self._backend.info.selection}, got {stream!r}")
         self._backend.run(self._program)
 
-    def wait(self) -> None:
-        self._backend.synchronize()
+    def wait(self, *, elsewhere: bool = False) -> None:
+        if not elsewhere:
+            self._backend.synchronize()
 
     def explain(self) -> str:
         return f"{pluralize(len(self._program), 'launch')} one by one: {self._backend.info.selection} has no graphs"

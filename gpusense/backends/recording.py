@@ -14,8 +14,13 @@ class Recording(ABC):
         """Start it on a stream of the device, or on its current one."""
 
     @abstractmethod
-    def wait(self) -> None:
-        """Wait until all starts have ended."""
+    def wait(self, *, elsewhere: bool = False) -> None:
+        """Wait until all starts have ended.
+
+        Args:
+            elsewhere: Wait only for starts on streams other than the device's current one; copies on that one follow
+                its launches without a wait.
+        """
 
     @abstractmethod
     def explain(self) -> str:

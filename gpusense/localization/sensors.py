@@ -20,7 +20,7 @@ from gpusense.localization.map_judge import MapJudge
 from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around
 from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.point.base import PointModel
-from gpusense.models.scan.bound import DeviceCall
+from gpusense.models.scan.bound import RecordedCall
 from gpusense.models.scan.model import ScanModel
 from gpusense.tables.world_map import check_one_map
 from gpusense.world.grid import OccupancyGrid
@@ -84,7 +84,7 @@ class Sensor:
         self._lesson: Lesson | None = None
         # The poses and the call that scores readings around an estimate, or no call; the reading on the
         # device, and its values if they came from the host.
-        self._terms: tuple[Any, DeviceCall | None] | None = None
+        self._terms: tuple[Any, RecordedCall | None] | None = None
         self._uploaded: object = None
         self._values: np.ndarray | None = None
         self._sent: list[np.ndarray] = []
@@ -142,7 +142,7 @@ class Sensor:
         call()
         return functools.partial(self._read_terms, call, self._values)
 
-    def _read_terms(self, call: DeviceCall, ranges: np.ndarray | None) -> np.ndarray:
+    def _read_terms(self, call: RecordedCall, ranges: np.ndarray | None) -> np.ndarray:
         """Wait for the terms of a scan's readings, and return them."""
         if ranges is None:
             ranges = self.backend.download(self._ranges, np.empty(self.model.scanner.count))
@@ -254,7 +254,7 @@ class Sensor:
         """Return the launches for scoring poses on the device, and the owner of their memory."""
         ranges = self.backend.view(self._ranges, (self.model.scanner.count,), _DOUBLE)
         call = self.model.bind(poses, ranges, out=out)
-        if not isinstance(call, DeviceCall):
+        if not isinstance(call, RecordedCall):
             raise RuntimeError(f"the model's call cannot be recorded: {call.explain()}")
         return call.program, (call, ranges)
 

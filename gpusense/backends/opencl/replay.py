@@ -59,15 +59,15 @@ class OpenCLRecording(Recording):
         if getattr(self, "_used", None):
             run(self._wait_for_all)
 
-    def wait(self) -> None:
-        self._wait_for_all()
+    def wait(self, *, elsewhere: bool = False) -> None:
+        self._wait_for_all(elsewhere=elsewhere)
         with self._lock:
             self._used.clear()
 
-    def _wait_for_all(self) -> None:
-        """Wait for the device's queue, and for users' queues; repeated after an interrupt, it waits for all again."""
+    def _wait_for_all(self, *, elsewhere: bool = False) -> None:
+        """Wait for the device's queue and for users' queues; repeated after an interrupt, it waits for all again."""
         with self._lock:
-            used = [self._queue, *self._used]
+            used = [*self._used] if elsewhere else [self._queue, *self._used]
         with driver_errors():
             for queue in used:
                 queue.finish()

@@ -59,10 +59,11 @@ class WarpRecording(Recording, Step):
             else:
                 wp.capture_launch(self._graph, where)
 
-    def wait(self) -> None:
+    def wait(self, *, elsewhere: bool = False) -> None:
         used, self._used = self._used, set()
+        current = self._device.stream if elsewhere and self._device.is_cuda else None
         for stream in used:
-            if stream is not None:
+            if stream is not None and stream is not current:
                 wp.synchronize_stream(stream)
 
     def _capture(self) -> None:

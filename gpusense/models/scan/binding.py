@@ -1,9 +1,4 @@
-"""``bind`` of a model: the choice among bound calls, and bound calls of arrays in host memory.
-
-A call that waits is the ordinary one, except for NumPy arrays of few particles on a GPU. They are copied to the device,
-as :mod:`.packed_call` describes. The choice names every kind of call, so it belongs above :mod:`.bound`; filters make
-those calls themselves.
-"""
+"""``bind`` of a model: the choice among bound calls, and bound calls that wait."""
 
 from __future__ import annotations
 
@@ -16,11 +11,49 @@ import numpy as np
 from gpusense._util import checks, masks
 from gpusense.backends import arrays
 from gpusense.backends.results import Result
-from gpusense.models.scan.bound import BoundCall, DeviceCall
+from gpusense.models.scan.bound import BoundCall, RecordedCall
 from gpusense.models.scan.packed_call import LARGEST, MOST_CELLS, PackedCall, fits, host_task, is_short
 from gpusense.models.scan.pipeline import ScanPipeline
+from gpusense.models.scan.request import FLOATS
 from gpusense.tables.world_index import WorldIndex
 from gpusense.tables.worlds import Worlds
+
+
+class WaitingCall(BoundCall):
+    """A call that has ended when it returns: a packed call of few particles, or else the ordinary call.
+
+    Attributes:
+        packed: The packed call; None for the ordinary one.
+    """
+
+    waits = True
+
+    def __init__(self, score: Callable[..., Any], bound: tuple[Any, Any], out: Any, reason: str) -> None:
+        self._score, self._bound, self.out, self._reason = score, bound, out, reason
+        self.packed: PackedCall | None = None
+        self._lock = threading.Lock()
+
+    def __call__(self, stream: Any = None) -> Any:
+        if stream is not None:
+            raise TypeError(f"stream: must be None for a call that waits, got {checks.show(stream)}")
+        if self.packed is not None:
+            try:
+                with self._lock:
+                    if self.packed.score(*self._bound, self.out):
+                        return self.out
+            except MemoryError:
+                # This call would need the whole table of a changed map; the ordinary call needs only a part.
+                pass
+        # The ordinary call's message names the pose that is not finite.
+        return self._score(*self._bound, out=self.out)
+
+    def explain(self) -> str:
+        if self.packed is None:
+            return f"the ordinary call: {self._reason}"
+        return f"NumPy arrays are copied with each call: {self.packed.explain()}"
+
+    def check(self) -> None:
+        """See BoundCall.check."""
 
 
 def bind(
@@ -36,176 +69,89 @@ def bind(
         ranges: (K,) readings.
         out: The array for the log-likelihoods, or None.
     """
-    _check_bound(poses, ranges)
-    in_host = [name for name, array in (("poses", poses), ("ranges", ranges)) if not arrays.on_device(array)]
-    obstacle = host_task(pipeline)
-    if not in_host and not obstacle and pipeline.backend.info.kind == "gpu":
-        return DeviceCall(pipeline, lock, poses, ranges, out)
-    host = _HostCall(pipeline, score, poses, ranges, out)
-    if not in_host:
+    on_device = _check_bound(poses, ranges)
+    backend, beams, obstacle = pipeline.backend, pipeline.scanner.count, host_task(pipeline)
+    if all(on_device) and not obstacle and backend.info.kind == "gpu":
+        return RecordedCall(pipeline, lock, poses, ranges, out)
+    if on_device[0]:
+        count = arrays.adopt_poses(poses, backend, "poses")[1]
+    else:
+        count = _shape_of("poses", poses, ("N", 3))[0]
+    if on_device[1]:
+        arrays.adopt_readings(ranges, backend, (beams,), in_place=False)
+    else:
+        _shape_of("ranges", ranges, (beams,))
+    result = Result(poses, out, (count,), pipeline.real, backend, on_device=on_device[0]).user_array()
+    if all(on_device):
         obstacle = obstacle or "processors score scans that the host prepares"
-    host.reason = obstacle or host.long_reason()
-    if not host.reason:
+    bound = poses, ranges
+    call = WaitingCall(score, bound, result, obstacle or _long_reason(pipeline, *bound, result))
+    if not call._reason:
+        inputs = tuple(None if type(array) is np.ndarray else array for array in bound)
+        limits = None if inputs[1] is not None else ranges.dtype
+        target = None if type(result) is np.ndarray else result
         try:
-            return _StagedCall(host, lock)
+            call.packed = PackedCall(pipeline, lock, count, cast(Any, inputs), target, limits)
         except MemoryError:
             # The ordinary call needs only a part of the map's table.
-            host.reason = "the table of the whole map does not fit the device"
-    return host
+            call._reason = "the table of the whole map does not fit the device"
+    return call
 
 
 def bind_worlds(
     pipeline: ScanPipeline, lock: threading.Lock, score: Callable[..., Any], worlds: Worlds, poses: Any, ranges: Any,
-    world: Any, ignore: Any, out: Any,
+    out: Any, **indices: Any,
 ) -> BoundCall:  # fmt: skip
-    """Bind arrays of robots in many worlds; see ``ScanModel.bind``.
-
-    Args:
-        pipeline: The stages of the model.
-        lock: Held while the model's buffers are in use.
-        score: ``log_likelihood`` of the model.
-        worlds: The worlds.
-        poses: (N, 3) poses.
-        ranges: (K,) or (N, K) readings.
-        world: (N,) indices of worlds, or one for all.
-        ignore: (N,) indices of shapes, one for all, or None.
-        out: The array for the log-likelihoods, or None.
-    """
-    _check_bound(poses, ranges)
+    """Bind arrays of robots in many worlds; ``indices`` are ``world`` and ``ignore`` of ``ScanModel.bind``."""
     backend, rules = pipeline.backend, pipeline.rules
-    there = arrays.on_device(poses) and arrays.on_device(ranges)
-    if not there or backend.info.kind != "gpu":
-        return _WorldsCall(score, poses, ranges, world, ignore, out)
-    if len(ranges.shape) == 2 and not (rules.choice.every and rules.separate and pipeline.context.possible):
-        # Scans whose beams are chosen by their readings, or share rays, are prepared by the host.
-        return _WorldsCall(score, poses, ranges, world, ignore, out)
-    count = int(poses.shape[0])
-    inside = WorldIndex(worlds, world, ignore, count, backend).resident(backend)
-    return DeviceCall(pipeline, lock, poses, ranges, out, inside=inside)
+    # Scans whose beams are chosen by their readings, or share rays, are prepared by the host.
+    placed = rules.choice.every and rules.separate and pipeline.context.possible
+    if all(_check_bound(poses, ranges)) and backend.info.kind == "gpu" and (placed or len(ranges.shape) == 1):
+        inside = WorldIndex(worlds, indices["world"], indices["ignore"], int(poses.shape[0]), backend)
+        return RecordedCall(pipeline, lock, poses, ranges, out, inside=inside.resident(backend))
+
+    def scored(poses: Any, ranges: Any, out: Any) -> Any:
+        return score(poses, ranges, out=out, **indices)
+
+    # The first call checks the arguments, and makes the result.
+    result = scored(poses, ranges, out)
+    return WaitingCall(
+        scored, (poses, ranges), result, "poses or ranges are in host memory, or the host prepares the scans"
+    )
 
 
-def _check_bound(poses: Any, ranges: Any) -> None:
-    """Refuse poses and ranges that are not arrays, or that cannot change."""
+def bind_terms(pipeline: ScanPipeline, lock: threading.Lock, poses: Any, ranges: Any, out: Any) -> RecordedCall | None:
+    """Return the call that keeps the term of each reading; None where the host must prepare the readings."""
+    plain = pipeline.specialize and pipeline.rules.separate and pipeline.context.possible
+    if not plain or host_task(pipeline):
+        return None
+    return RecordedCall(pipeline, lock, poses, ranges, out, per_beam=True)
+
+
+def _long_reason(pipeline: ScanPipeline, poses: Any, ranges: Any, out: Any) -> str:
+    """Return why arrays in host memory are not copied with a recorded program; empty for arrays of a short call."""
+    if not pipeline.backend.replays:
+        return f"{pipeline.backend.info.selection} starts launches fast enough without a recording"
+    here = [a for a in (poses, ranges, out) if not arrays.on_device(a)]
+    if not all(type(a) is np.ndarray and a.dtype in FLOATS for a in here):
+        return "only NumPy arrays of float32 or float64 are copied with a recorded program"
+    if not fits(len(poses), len(ranges)):
+        return f"poses and ranges take more than {LARGEST >> 10} KiB"
+    if pipeline.grid.cells.size > MOST_CELLS:
+        return f"the map has more than {MOST_CELLS} cells"
+    if not is_short(len(poses), len(ranges)):
+        return f"{len(poses)} poses times {len(ranges)} readings are no short call"
+    return ""
+
+
+def _check_bound(poses: Any, ranges: Any) -> list[bool]:
+    """Refuse poses and ranges that are not arrays, or that cannot change; return which are on the device."""
     for name, array in (("poses", poses), ("ranges", ranges)):
         if not (isinstance(array, np.ndarray) or hasattr(array, "__dlpack__") or arrays.on_device(array)):
             raise TypeError(f"{name}: must be an array, whose numbers every call reads anew, got {checks.show(array)}")
         if type(array).__module__.startswith("jax"):
             raise TypeError(f"{name}: must be an array whose numbers can change, got one of JAX, where none do")
-
-
-class _WorldsCall(BoundCall):
-    """An ordinary call of ``log_likelihood`` of a model of worlds."""
-
-    waits = True
-
-    def __init__(self, score: Callable[..., Any], poses: Any, ranges: Any, world: Any, ignore: Any, out: Any) -> None:
-        self._score, self._arrays = score, (poses, ranges)
-        self._options = dict(world=world, ignore=ignore)
-        # The first call checks the arguments, and makes the result.
-        self.out = score(poses, ranges, out=out, **self._options)
-
-    def __call__(self, stream: Any = None) -> Any:
-        if stream is not None:
-            raise TypeError(f"stream: must be None for a call that waits, got {checks.show(stream)}")
-        return self._score(*self._arrays, out=self.out, **self._options)
-
-    def explain(self) -> str:
-        return "the ordinary call: poses or ranges are in host memory, or the host prepares the scans"
-
-    def check(self) -> None:
-        """See BoundCall.check."""
-
-
-class _HostCall(BoundCall):
-    """An ordinary call of ``log_likelihood``.
-
-    Attributes:
-        reason: Why no program is recorded.
-    """
-
-    waits = True
-    reason = ""
-
-    def __init__(self, pipeline: ScanPipeline, score: Callable[..., Any], poses: Any, ranges: Any, out: Any) -> None:
-        backend, real, beams = pipeline.backend, pipeline.real, pipeline.scanner.count
-        on_device = arrays.on_device(poses)
-        if on_device:
-            count = arrays.adopt_poses(poses, backend, "poses")[1]
-        else:
-            count = _shape_of("poses", poses, ("N", 3))[0]
-        if arrays.on_device(ranges):
-            arrays.adopt_readings(ranges, backend, (beams,), in_place=False)
-        else:
-            _shape_of("ranges", ranges, (beams,))
-        self.out = Result(poses, out, (count,), real, backend, on_device=on_device).user_array()
-        self.pipeline, self.arrays, self._score = pipeline, (poses, ranges), score
-
-    def __call__(self, stream: Any = None) -> Any:
-        if stream is not None:
-            raise TypeError(f"stream: must be None for a call that waits, got {checks.show(stream)}")
-        return self._score(*self.arrays, out=self.out)
-
-    def explain(self) -> str:
-        return f"the ordinary call: {self.reason}"
-
-    def check(self) -> None:
-        """See BoundCall.check."""
-
-    def long_reason(self) -> str:
-        """Return why arrays in host memory are not copied with a recorded program; empty for arrays of a short call."""
-        poses, ranges = self.arrays
-        if not self.pipeline.backend.replays:
-            return f"{self.pipeline.backend.info.selection} starts launches fast enough without a recording"
-        here = [a for a in (poses, ranges, self.out) if not arrays.on_device(a)]
-        if not all(type(a) is np.ndarray and a.dtype in (np.float32, np.float64) for a in here):
-            return "only NumPy arrays of float32 or float64 are copied with a recorded program"
-        if not fits(len(poses), len(ranges)):
-            return f"poses and ranges take more than {LARGEST >> 10} KiB"
-        if self.pipeline.grid.cells.size > MOST_CELLS:
-            return f"the map has more than {MOST_CELLS} cells"
-        if not is_short(len(poses), len(ranges)):
-            return f"{len(poses)} poses times {len(ranges)} readings are no short call"
-        return ""
-
-
-class _StagedCall(BoundCall):
-    """A call of few particles in NumPy arrays: inputs go to the device as one array, and results come back as one."""
-
-    waits = True
-
-    def __init__(self, host: _HostCall, lock: threading.Lock) -> None:
-        self._host, self.out, (self._poses, self._ranges) = host, host.out, host.arrays
-        count = len(self._poses)
-        there = {
-            name: array
-            for name, array in (("poses", self._poses), ("ranges", self._ranges), ("out", self.out))
-            if type(array) is not np.ndarray
-        }
-        limits = None if "ranges" in there else self._ranges.dtype
-        self._packed = PackedCall(host.pipeline, lock, count, limits, **there)
-        # Host arrays: every call copies their numbers.
-        self._copied = [None if name in there else array for name, array in (
-            ("poses", self._poses), ("ranges", self._ranges), ("out", self.out))]  # fmt: skip
-        self._lock = threading.Lock()
-
-    def __call__(self, stream: Any = None) -> Any:
-        if stream is not None:
-            return self._host(stream)
-        try:
-            with self._lock:
-                if self._packed.score(*self._copied):
-                    return self.out
-        except MemoryError:
-            # This call would need the whole table of a changed map; the ordinary call needs only a part.
-            pass
-        # The ordinary call's message names the pose that is not finite.
-        return self._host()
-
-    def explain(self) -> str:
-        return f"NumPy arrays are copied with each call: {self._packed.explain()}"
-
-    def check(self) -> None:
-        """See BoundCall.check."""
+    return [arrays.on_device(array) for array in (poses, ranges)]
 
 
 def _shape_of(name: str, value: Any, shape: tuple[int | str, ...]) -> tuple[int, ...]:

@@ -80,8 +80,8 @@ class BoundCall(ABC):
         """
 
 
-class DeviceCall(BoundCall):
-    """A recorded program on arrays of the device.
+class RecordedCall(BoundCall):
+    """A recorded program on arrays of the device, made anew when the map's table changes.
 
     Args:
         pipeline: The stages of the model.
@@ -152,11 +152,7 @@ class DeviceCall(BoundCall):
         return "nothing is recorded: the map has changed, and its new table did not fit the device"
 
     def begin(self, corners: Corners | None = None) -> None:
-        """Start the recording, as part of this thread's batch.
-
-        Args:
-            corners: Corners of the box of the poses, where their owner knows them.
-        """
+        """Start the recording as part of this thread's batch; ``corners`` are those of the box of the poses."""
         if corners is not None:
             self._poses.hull = corners
             self._pipeline.map.ensure(corners)
@@ -177,7 +173,8 @@ class DeviceCall(BoundCall):
 
     def check(self) -> None:
         self._pipeline.backend.check_process()
-        self._wait()
+        for _, program in self._programs.items():
+            program.recording.wait(elsewhere=True)
         finish(self._space, on_device=True)
 
     def _placed_readings(self, adopted: Adopted, limits: np.dtype) -> Readings:

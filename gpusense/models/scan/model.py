@@ -16,6 +16,7 @@ from gpusense._util import checks
 from gpusense._util.html import card, split_options
 from gpusense._util.typing import AnyArray, Compat, Precision
 from gpusense.backends import Backend, BackendInfo, Selection, get_backend
+from gpusense.backends.programs import ProgramCache
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.plan import Plan, SceneNotes
 from gpusense.models.arguments import check_scene, map_words, real_dtype
@@ -25,10 +26,9 @@ from gpusense.models.poses import Poses
 from gpusense.models.scan.differentiable import Differentiable, is_recorded, log_likelihood_of
 from gpusense.models.scan.explain import plan_of_call
 from gpusense.models.scan.pipeline import ScanPipeline
-from gpusense.models.scan.repeated import ResidentCall
 from gpusense.models.scan.request import Request, make_request
 from gpusense.models.scan.rules import Beams, BeamSelection, ModelContext, check_beams
-from gpusense.models.scan.scoring import LastCall, run
+from gpusense.models.scan.scoring import LastCall, ResidentPoses, run
 from gpusense.peers.weights import Peer, choose
 from gpusense.tables.worlds import Worlds
 from gpusense.world.frames import ray_vectors
@@ -36,8 +36,11 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
 
 if TYPE_CHECKING:
-    from gpusense.models.scan.bound import BoundCall, DeviceCall
+    from gpusense.models.scan.bound import BoundCall, RecordedCall
     from gpusense.models.scan.packed_call import PackedCallCache
+
+# Most arrays of poses in place that are kept.
+_MOST_RESIDENT = 16
 
 
 class ScanModel(Pickled):
@@ -89,6 +92,7 @@ class ScanModel(Pickled):
         # Threads may share a model: its buffers serve one call at a time.
         self._lock = threading.Lock()
         self._last_call = LastCall()
+        self._resident = ProgramCache[ResidentPoses](_MOST_RESIDENT)
 
     @functools.cached_property
     def _short(self) -> PackedCallCache | None:
@@ -98,11 +102,6 @@ class ScanModel(Pickled):
         from gpusense.models.scan.packed_call import PackedCallCache
 
         return PackedCallCache.of(self._pipeline)
-
-    @functools.cached_property
-    def _repeated(self) -> ResidentCall:
-        """Scans of poses that stay in place."""
-        return ResidentCall(self._pipeline, self._workspace, self._last_call)
 
     @property
     def _last(self) -> LastCall:
@@ -260,9 +259,9 @@ class ScanModel(Pickled):
             calls = self._differentiable(ranges)
             if calls is not None:
                 return cast(np.ndarray, log_likelihood_of(poses, ranges, calls))
-        if self._short is not None and self._worlds is None:
+        if self._short is not None and not per_beam:
             with self._lock:
-                result = self._short.score(poses, ranges, out, per_beam=per_beam)
+                result = self._short.score(poses, ranges, out)
             if result is not None:
                 return result
         request = make_request(
@@ -285,38 +284,31 @@ class ScanModel(Pickled):
             out: (N,) array on the device for the log-likelihoods.
             before: Function called before poses are read, to start the launches that write them.
         """
+        key = id(poses), id(out)
         with self._lock, self._workspace:
-            if self._repeated.start(poses, ranges, out, before):
+            resident = self._resident.get(key)
+            if resident is not None and resident.start(ranges, before):
                 return
         request = make_request(self._context, poses, ranges, out, before=before)
         with self._lock, self._workspace:
             self._run(request)
-            self._repeated.remember(poses, out, request)
+            if ResidentPoses.holds(self._pipeline, request):
+                made = ResidentPoses(self._pipeline, request, self._workspace, self._last_call)
+                self._resident.keep(key, made)
 
     def finish_scoring(self) -> None:
         """Wait for calls that ``start_scoring`` has begun."""
         with self._lock:
             finish(self._workspace, on_device=True)
 
-    def bind_terms(self, poses: Any, ranges: Any, out: Any) -> DeviceCall | None:
-        """Bind arrays on the device to a call that keeps the term of each reading, for ``DeviceCall.terms``.
+    def bind_terms(self, poses: Any, ranges: Any, out: Any) -> RecordedCall | None:
+        """Bind (N, 3) poses and (K,) float64 readings on the device to a call for ``RecordedCall.terms``.
 
-        Args:
-            poses: (N, 3) poses, few.
-            ranges: (K,) float64 readings [m].
-            out: (N,) array for the log-likelihoods.
-
-        Returns:
-            The call; None for a model whose readings the host must prepare.
+        A model whose readings the host must prepare returns None.
         """
-        from gpusense.models.scan.bound import DeviceCall
-        from gpusense.models.scan.packed_call import host_task
+        from gpusense.models.scan.binding import bind_terms
 
-        pipeline = self._pipeline
-        plain = pipeline.specialize and pipeline.rules.separate and pipeline.context.possible
-        if not plain or host_task(pipeline):
-            return None
-        return DeviceCall(pipeline, self._lock, poses, ranges, out, per_beam=True)
+        return bind_terms(self._pipeline, self._lock, poses, ranges, out)
 
     def _differentiable(self, ranges: AnyArray) -> Differentiable | None:
         """Return the calls that differentiate log-likelihoods; None for a model without a gradient."""
@@ -348,7 +340,8 @@ class ScanModel(Pickled):
 
         score = self.log_likelihood
         if self._worlds is not None:
-            return bind_worlds(self._pipeline, self._lock, score, self._worlds, poses, ranges, world, ignore, out)
+            indices = dict(world=world, ignore=ignore)
+            return bind_worlds(self._pipeline, self._lock, score, self._worlds, poses, ranges, out, **indices)
         for name, value in (("world", world), ("ignore", ignore)):
             if value is not None:
                 raise ValueError(f"{name}: must be None for a model of a single map, got {checks.show(value)}")

@@ -1,30 +1,27 @@
-"""Calls of few particles on a GPU: inputs of the host go to the device as one array, results come back as one.
+"""Calls of few particles on a GPU: a recorded program, with the copies of its inputs and of its result.
 
-Arrays on the device are copied to the places of the recorded program, or used in place by bound calls.
-
-A copy of few numbers takes as long as a launch, and the device classes a scan faster than the host. Therefore the
-recording of :class:`.bound.DeviceCall` follows the copy, and the device classes the readings. On CUDA, copies and
-launches form one graph. Bound calls of such arrays work like this, and so do ordinary calls that repeat a size.
+Arrays of the host go to the device as one array, and results come back as one: a copy of few numbers takes as long as a
+launch, and the device classes a scan faster than the host. On CUDA, copies and launches form one graph. Arrays on the
+device are used in place by bound calls, and copied to the slots of the program by ordinary calls that repeat a size, as
+each of these has other arrays.
 """
 
 from __future__ import annotations
 
-import functools
 import math
 import threading
-from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gpusense.backends import Backend, arrays
-from gpusense.backends.base import Buffer
 from gpusense.backends.programs import ProgramCache
 from gpusense.backends.results import Result
 from gpusense.backends.workspace import Workspace
 from gpusense.models.poses import corners_of
-from gpusense.models.scan.bound import DeviceCall
+from gpusense.models.scan.bound import RecordedCall
 from gpusense.models.scan.pipeline import ScanPipeline
+from gpusense.models.scan.request import FLOATS
 from gpusense.models.scan.tiles import LEAST_ORDERED
 from gpusense.world.scanner import classify_ranges
 from gpusense.world.windows import Corners
@@ -34,11 +31,6 @@ LARGEST = 256 << 10
 # Largest map of which a short call makes the whole table [cells].
 MOST_CELLS = 1 << 22
 _DOUBLE, _INT = np.dtype(np.float64), np.dtype(np.int32)
-_FLOATS = (np.dtype(np.float32), _DOUBLE)
-# Types of poses and readings on the device (None on the host), type of the limits; buffers; owners of their memory.
-_Adoption: TypeAlias = tuple[
-    tuple[np.dtype | None, np.dtype | None, np.dtype], tuple[Buffer | None, Buffer | None], tuple[Any, ...]
-]
 # Alignment of arrays that are copied as one [bytes], enough for every device.
 _ALIGNED = 1024
 # Number of sizes of short calls that are kept; ordinary calls of a size before the first short one.
@@ -65,14 +57,7 @@ def host_task(pipeline: ScanPipeline) -> str:
 
 
 class _Pack:
-    """Packed arrays, on the host and on the device, that are copied as one.
-
-    Attributes:
-        host: The packed array on the host.
-        on_device: The packed array on the device.
-        views: The arrays on the host.
-        parts: The arrays on the device.
-    """
+    """Arrays that are copied as one: the packed array and its parts on the host (``views``) and on the device."""
 
     def __init__(self, backend: Backend, dtype: np.dtype, *arrays: tuple[int, np.dtype]) -> None:
         begins, size = [], 0
@@ -90,78 +75,92 @@ class _Pack:
 
 
 class PackedCall:
-    """The recorded program of a number of poses, of which host arrays are copied with the launches.
+    """The recorded program of a number of poses, with the copies of its inputs and of its result.
 
-    Poses and readings of the host are float64 on the device, exact for float32. Limits of readings are rounded to the
-    precision of the readings, as on the host.
+    Each of poses, ranges and result is None for an array of the host, a type for arrays of the device that are copied,
+    or an array of the device that is used in place. Poses and readings of the host are float64 on the device, exact for
+    float32. Limits of readings are rounded to the precision of the readings, as on the host.
 
     Args:
         pipeline: The stages of the model.
         lock: Held while the program is recorded.
         count: Number of poses.
-        limits: The type of the readings; None for the type of those on the device.
+        inputs: The (N, 3) poses and the (K,) readings.
+        out: The (N,) log-likelihoods.
+        limits: The type of the readings; None for the type of readings on the device.
         corners: Corners of the box of the first poses; None for the table of the whole map.
-        poses: (N, 3) poses on the device, used in place; None for poses of the host.
-        ranges: (K,) readings on the device, used in place; None for readings of the host.
-        out: (N,) array on the device for the log-likelihoods; None for a host array.
 
     Attributes:
         arrays: The poses and the readings of the last call.
     """
 
     def __init__(
-        self, pipeline: ScanPipeline, lock: threading.Lock, count: int, limits: np.dtype | None,
-        corners: Corners | None = None, *, poses: Any = None, ranges: Any = None, out: Any = None,
+        self, pipeline: ScanPipeline, lock: threading.Lock, count: int, inputs: tuple[Any, Any], out: Any,
+        limits: np.dtype | None, corners: Corners | None = None,
     ) -> None:  # fmt: skip
         self._backend = backend = pipeline.backend
-        readings, real = pipeline.scanner.count, pipeline.real
-        self._inputs = _Pack(
-            backend, _DOUBLE, (3 * count if poses is None else 0, _DOUBLE), (readings if ranges is None else 0, _DOUBLE)
-        )
+        real, sizes = pipeline.real, (3 * count, pipeline.scanner.count)
+        shapes = (count, 3), (pipeline.scanner.count,)
+        in_host = [(size if kind is None else 0, _DOUBLE) for kind, size in zip(inputs, sizes, strict=True)]
+        self._inputs = _Pack(backend, _DOUBLE, *in_host)
         self._outputs = _Pack(backend, real, (count if out is None else 0, real), (2, _INT))
-        self._copied = self._inputs.views[0].reshape(-1, 3), self._inputs.views[1]
-        self.arrays = tuple(
-            here if there is None else there for here, there in zip(self._copied, (poses, ranges), strict=True)
-        )
-        parts, (log_p, status) = self._inputs.parts, self._outputs.parts
-        poses = backend.wrap_external(parts[0], (count, 3), _DOUBLE) if poses is None else poses
-        ranges = backend.wrap_external(parts[1], (readings,), _DOUBLE) if ranges is None else ranges
-        out = backend.wrap_external(log_p, (count,), real) if out is None else out
-        self._device = DeviceCall(pipeline, lock, poses, ranges, out, status, limits, corners)
+        # The places of the inputs: host arrays, buffers with their bytes, or None for arrays that are used in place.
+        self._slots: list[Any] = []
+        there: list[Any] = []
+        shown: list[Any] = []
+        for kind, shape, view, part in zip(inputs, shapes, self._inputs.views, self._inputs.parts, strict=True):
+            if kind is None:
+                self._slots.append(view.reshape(shape))
+                there.append(backend.wrap_external(part, shape, _DOUBLE))
+            elif isinstance(kind, np.dtype):
+                size = math.prod(shape)
+                self._slots.append((backend.empty_external(size, kind), size * kind.itemsize))
+                there.append(backend.wrap_external(self._slots[-1][0], shape, kind))
+            else:
+                self._slots.append(None)
+                there.append(kind)
+            shown.append(self._slots[-1] if kind is None else there[-1])
+        self.arrays = tuple(shown)
+        log_p, status = self._outputs.parts
+        self._result, self._in_host = None, out is None
+        if isinstance(out, np.dtype):
+            log_p = backend.empty_external(count, real)
+            self._result = log_p, count * real.itemsize
+        if out is None or self._result is not None:
+            out = backend.wrap_external(log_p, (count,), real)
+        self._recorded = RecordedCall(pipeline, lock, there[0], there[1], out, status, limits, corners)
         self._space = Workspace(backend)
 
-    def score(
-        self, poses: np.ndarray | None, ranges: np.ndarray | None, out: np.ndarray | None,
-        corners: Corners | None = None, then: Callable[[], None] | None = None,
-    ) -> bool:  # fmt: skip
-        """Score poses, and write their log-likelihoods.
+    def score(self, poses: Any, ranges: Any, out: Any, corners: Corners | None = None) -> bool:
+        """Score poses, and write their log-likelihoods; arrays that are used in place are ignored.
 
         Args:
-            poses: (N, 3) poses; None for those on the device.
-            ranges: (K,) readings; None for those on the device.
-            out: (N,) array for the log-likelihoods; None for the one on the device.
+            poses: (N, 3) poses: an array of the host, or a buffer.
+            ranges: (K,) readings, the same.
+            out: (N,) array or buffer for the log-likelihoods.
             corners: Corners of the box of the poses; None for the table of the whole map.
-            then: Function that starts copies of the result on the device.
 
         Returns:
             False where a pose is not finite; nothing is written on the host then.
         """
         backend, inputs, outputs = self._backend, self._inputs, self._outputs
         log_p, status = outputs.views
-        for here, numbers in zip(self._copied, (poses, ranges), strict=True):
-            if numbers is not None:
-                here[...] = numbers
+        for slot, numbers in zip(self._slots, (poses, ranges), strict=True):
+            if type(slot) is tuple:
+                backend.copy(numbers, *slot)
+            elif slot is not None:
+                slot[...] = numbers
         with self._space:
             if inputs.host.size:
                 backend.upload(inputs.host, inputs.on_device, wait=False)
-            self._device.begin(corners)
+            self._recorded.begin(corners)
             backend.download(outputs.on_device, outputs.host, wait=not backend.in_batch)
-            if then is not None:
-                then()
+            if self._result is not None:
+                backend.copy(self._result[0], out, self._result[1])
             if backend.in_batch:
                 backend.synchronize()
         if not status[0]:
-            if out is not None:
+            if self._in_host:
                 out[...] = log_p
             return True
         status[...] = 0
@@ -170,53 +169,19 @@ class PackedCall:
 
     def explain(self) -> str:
         """Return in one line how the launches are started."""
-        return self._device.explain()
+        return self._recorded.explain()
 
 
-class _There:
-    """Arrays on the device that ordinary calls copy to the places of a recorded program, as each call has other arrays.
+# ---- ordinary calls
 
-    Args:
-        backend: The device.
-        count: Number of poses.
-        readings: Number of readings.
-        kinds: Types of poses and of readings on the device; None for host arrays.
-        real: Type of the result.
-    """
 
-    def __init__(
-        self,
-        backend: Backend,
-        count: int,
-        readings: int,
-        kinds: tuple[np.dtype | None, np.dtype | None],
-        real: np.dtype,
-    ) -> None:
-        self._backend = backend
-        self.given: dict[str, Any] = {}
-        self._places: list[tuple[Buffer, int] | None] = []
-        for name, kind, shape in zip(("poses", "ranges"), kinds, ((count, 3), (readings,)), strict=True):
-            place = None
-            if kind is not None:
-                size = math.prod(shape)
-                place = backend.empty_external(size, kind), size * kind.itemsize
-                self.given[name] = backend.wrap_external(place[0], shape, kind)
-            self._places.append(place)
-        self._result = None
-        if kinds[0] is not None:
-            self._result = backend.empty_external(count, real), count * real.itemsize
-            self.given["out"] = backend.wrap_external(self._result[0], (count,), real)
+class _Inputs(NamedTuple):
+    """Poses and readings: types on the device (None on the host), arrays or buffers, owners, and type of limits."""
 
-    def take(self, *buffers: Buffer | None) -> None:
-        """Start copying poses and readings to their places."""
-        for place, buffer in zip(self._places, buffers, strict=True):
-            if place is not None:
-                self._backend.copy(buffer, *place)
-
-    def deliver(self, target: Buffer) -> None:
-        """Start copying the result."""
-        if self._result is not None:
-            self._backend.copy(self._result[0], target, self._result[1])
+    kinds: tuple[np.dtype | None, np.dtype | None]
+    arrays: tuple[Any, Any]
+    owners: tuple[Any, ...]
+    limits: np.dtype
 
 
 class PackedCallCache:
@@ -234,7 +199,7 @@ class PackedCallCache:
     def __init__(self, pipeline: ScanPipeline) -> None:
         self._pipeline = pipeline
         self.last: PackedCall | None = None
-        self._calls = ProgramCache[tuple[PackedCall, _There | None]](_MOST_SIZES)
+        self._calls = ProgramCache[PackedCall](_MOST_SIZES)
         # Number of calls by size so far.
         self._seen = ProgramCache[int](_MOST_SIZES)
         # A private lock, since the scoring thread holds the model's lock.
@@ -248,126 +213,78 @@ class PackedCallCache:
         certain = pipeline.specialize and pipeline.rules.separate and pipeline.context.possible
         return PackedCallCache(pipeline) if certain else None
 
-    def score(self, poses: Any, ranges: Any, out: Any, *, per_beam: bool) -> np.ndarray | None:
-        """Score poses by the readings of a scan; None if the ordinary call must do it.
-
-        Args:
-            poses: Poses as ``log_likelihood`` takes them.
-            ranges: Its readings.
-            out: Its array for the result, or None.
-            per_beam: True if the log-likelihoods of the readings are requested.
-        """
+    def score(self, poses: Any, ranges: Any, out: Any) -> Any:
+        """Score poses by the readings of a scan, as ``log_likelihood``; None if the ordinary call must do it."""
         self.last = None
-        if type(poses) is np.ndarray and type(ranges) is np.ndarray:
-            return None if per_beam else self._score_host(poses, ranges, out)
         pipeline, size = self._pipeline, self._pipeline.scanner.count
-        if per_beam or getattr(ranges, "shape", None) != (size,):
+        shape: tuple[int, ...] = getattr(poses, "shape", ())
+        if shape[1:] != (3,) or getattr(ranges, "shape", None) != (size,):
             return None
-        count = poses.shape[0] if getattr(poses, "shape", ())[1:] == (3,) else 0
-        kinds = self._kinds(poses, ranges)
-        if kinds is None or not is_short(count, size) or not fits(count, size) or not self._takes(count, out, kinds):
+        count = shape[0]
+        inputs = self._inputs(poses, ranges) if is_short(count, size) and fits(count, size) else None
+        if inputs is None:
             return None
-        there = self._adopted(poses, ranges, kinds)
-        if there is None or not self._repeats((count, *there[0])):
+        there, in_host = inputs.kinds[0], inputs.kinds[0] is None
+        key = (count, *inputs.kinds, inputs.limits)
+        if not (out is None or not in_host or self._writes(count, out)) or not self._repeats(key):
             return None
-        corners = None if kinds[0] else self._corners(poses)
-        if not kinds[0] and corners is None:
+        corners = self._corners(poses) if in_host else None
+        if in_host and corners is None:
             return None
-        if pipeline.context.temperature < 1 and (kinds[1] or not self._has_range(ranges)):
+        if pipeline.context.temperature < 1 and (inputs.kinds[1] is not None or not self._has_range(ranges)):
             return None
         try:
-            return self._scored(poses, ranges, out, count, there, corners)
+            result = None
+            if in_host:
+                target = np.empty(count, pipeline.real) if out is None else out
+            else:
+                result = Result(poses, out, (count,), pipeline.real, pipeline.backend, on_device=True)
+                target = result.flat
+            call = self._calls.get(key)
+            if call is None:
+                result_type = None if there is None else pipeline.real
+                call = PackedCall(pipeline, self._lock, count, inputs.kinds, result_type, inputs.limits, corners)
+                self._calls.keep(key, call)
+            if not call.score(*inputs.arrays, target, corners) and not in_host:
+                return None
         except MemoryError:
             # The buffers of both kinds of calls may not fit the device at once.
             self._calls.clear()
             return None
+        self.last, rules = call, pipeline.rules
+        if rules.first_scans.left:
+            rules.first_scans.look_at("ranges", ranges[None], rules.map_size)
+        return target if result is None else result.user_array()
 
-    def _score_host(self, poses: np.ndarray, ranges: np.ndarray, out: Any) -> np.ndarray | None:
-        """Score poses and readings of the host; a call takes so little time that each check counts."""
-        pipeline, count = self._pipeline, len(poses) if poses.ndim else 0
-        size = pipeline.scanner.count
-        if poses.shape != (count, 3) or ranges.shape != (size,) or not is_short(count, size) or not fits(count, size):
-            return None
-        if poses.dtype not in _FLOATS or ranges.dtype not in _FLOATS or not self._takes(count, out, (False, False)):
-            return None
-        key = (count, None, None, ranges.dtype)
-        corners = self._corners(poses) if self._repeats(key) else None
-        if corners is None or (pipeline.context.temperature < 1 and not self._has_range(ranges)):
-            return None
-        result = np.empty(count, pipeline.real) if out is None else out
-        try:
-            kept = self._calls.get(key)
-            if kept is None:
-                kept = PackedCall(pipeline, self._lock, count, ranges.dtype, corners), None
-                self._calls.keep(key, kept)
-            kept[0].score(poses, ranges, result, corners)
-        except MemoryError:
-            # The buffers of both kinds of calls may not fit the device at once.
-            self._calls.clear()
-            return None
-        return self._delivered(kept[0], ranges, result)
-
-    def _kinds(self, poses: Any, ranges: Any) -> tuple[bool, bool] | None:
-        """Return whether poses and readings are on the device; None for arrays that the ordinary call must read."""
-        kinds = []
+    def _inputs(self, poses: Any, ranges: Any) -> _Inputs | None:
+        """Return the inputs of a call; None for arrays that the ordinary call must read or refuse."""
+        if type(poses) is np.ndarray and type(ranges) is np.ndarray:
+            usable = poses.dtype in FLOATS and ranges.dtype in FLOATS
+            return _Inputs((None, None), (poses, ranges), (), ranges.dtype) if usable else None
+        backend = self._pipeline.backend
         for array in (poses, ranges):
             if type(array) is np.ndarray:
-                if array.dtype not in _FLOATS:
+                if array.dtype not in FLOATS:
                     return None
-                kinds.append(False)
-            elif self._pipeline.backend.reads(array) and arrays.on_device(array):
-                kinds.append(True)
-            else:
+            elif not (backend.reads(array) and arrays.on_device(array)):
                 return None
-        # The first scans are inspected on the host.
-        return None if kinds[1] and self._pipeline.rules.first_scans.left else (kinds[0], kinds[1])
-
-    def _adopted(self, poses: Any, ranges: Any, kinds: tuple[bool, bool]) -> _Adoption | None:
-        """Return the types of arrays and their buffers; None for arrays that the ordinary call must refuse."""
-        backend, single = self._pipeline.backend, _FLOATS[0]
-        kind: np.dtype | None = None
-        buffer, owner = None, None
+        kind, taken, owner = None, poses, None
         try:
-            if kinds[0]:
-                buffer, _, is_single, owner = arrays.adopt_poses(poses, backend, "poses")
-                kind = single if is_single else _DOUBLE
-            if not kinds[1]:
-                return (kind, None, ranges.dtype), (buffer, None), (owner,)
+            if type(poses) is not np.ndarray:
+                taken, _, single, owner = arrays.adopt_poses(poses, backend, "poses")
+                kind = FLOATS[0] if single else _DOUBLE
+            if type(ranges) is np.ndarray:
+                return _Inputs((kind, None), (taken, ranges), (owner,), ranges.dtype)
+            # The first scans are inspected on the host.
+            if self._pipeline.rules.first_scans.left:
+                return None
             adopted = arrays.adopt_readings(ranges, backend, (self._pipeline.scanner.count,), in_place=False)
         except (TypeError, ValueError):
             return None
-        return (kind, adopted.dtype, adopted.dtype), (buffer, adopted.buffer), (owner, adopted)
+        return _Inputs((kind, adopted.dtype), (taken, adopted.buffer), (owner, adopted), adopted.dtype)
 
-    def _scored(self, poses: Any, ranges: Any, out: Any, count: int, there: _Adoption, corners: Corners | None) -> Any:
-        """Score poses; None where one of them is not finite."""
-        pipeline, backend = self._pipeline, self._pipeline.backend
-        kinds, buffers, _ = there
-        kept = self._calls.get((count, *kinds))
-        result = Result(poses, out, (count,), pipeline.real, backend, on_device=kinds[0] is not None)
-        if kept is None:
-            made = _There(backend, count, pipeline.scanner.count, kinds[:2], pipeline.real)
-            packed = PackedCall(pipeline, self._lock, count, kinds[2], corners, **made.given)
-            kept = self._calls.keep((count, *kinds), (packed, made))
-        call, places = kept
-        assert places is not None
-        places.take(*buffers)
-        host = [None if buffer is not None else array for array, buffer in zip((poses, ranges), buffers, strict=True)]
-        flat = None if kinds[0] is not None else result.flat
-        if not call.score(host[0], host[1], flat, corners, functools.partial(places.deliver, result.flat)):
-            return None
-        return self._delivered(call, ranges, result.user_array())
-
-    def _delivered(self, call: PackedCall, ranges: Any, result: Any) -> Any:
-        """Note a call that has succeeded, and return its result."""
-        self.last, rules = call, self._pipeline.rules
-        if rules.first_scans.left:
-            rules.first_scans.look_at("ranges", ranges[None], rules.map_size)
-        return result
-
-    def _takes(self, count: int, out: Any, kinds: tuple[bool, bool]) -> bool:
-        """Return whether results can be written."""
-        if out is None or kinds[0]:
-            return True
+    def _writes(self, count: int, out: Any) -> bool:
+        """Return whether results can be written to an array of the host."""
         usable = type(out) is np.ndarray and out.dtype == self._pipeline.real and out.shape == (count,)
         return usable and out.flags.c_contiguous and out.flags.writeable
 

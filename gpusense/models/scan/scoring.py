@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from gpusense.backends.programs import ChangingProgram, RecordedProgram
 from gpusense.backends.workspace import Workspace
 from gpusense.models.chunking import Piece, chunk_of, run_pieces
 from gpusense.models.poses import Frame, Part, place
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.readings import Readings
-from gpusense.models.scan.request import Request
+from gpusense.models.scan.request import FLOATS, Request
 from gpusense.world.range_causes import NoReturn
 from gpusense.world.windows import whole
 
@@ -68,6 +71,61 @@ def terms_of(pipeline: ScanPipeline, each: np.ndarray, scans: ClassedScans) -> n
     terms[:, scans.columns] = each[:, : len(scans.columns)]
     terms[:, scans.left_out.constant_max] = NoReturn(pipeline.rules.z_max).number
     return terms
+
+
+class ResidentPoses:
+    """Poses in place on a processor, such as a filter's: only the readings of a scan change from call to call.
+
+    Args:
+        pipeline: The stages of the model.
+        request: A request of these poses; it keeps the arrays alive, so that their identities stay unique.
+        space: Holds the buffers.
+        last: Receives the facts that ``explain`` reports.
+    """
+
+    def __init__(self, pipeline: ScanPipeline, request: Request, space: Workspace, last: LastCall) -> None:
+        self._pipeline, self._space, self._last = pipeline, space, last
+        # Without the function of its owner, which the model must not keep alive.
+        self._request = request._replace(before=None)
+        self._log_p = pipeline.backend.part(request.result.flat, 0, request.poses.count, pipeline.real)
+
+    @staticmethod
+    def holds(pipeline: ScanPipeline, request: Request) -> bool:
+        """Return whether calls of a request's poses can be repeated."""
+        backend, poses = pipeline.backend, request.poses
+        whole = request.scans == 1 and 0 < poses.count <= chunk_of(backend, pipeline.scanner.count)
+        return backend.info.kind == "cpu" and poses.on_device and whole
+
+    def start(self, ranges: Any, before: Callable[[], None] | None) -> bool:
+        """Start a scan, and return whether it could be; see ``ScanModel.start_scoring``."""
+        pipeline, space, last = self._pipeline, self._space, self._last
+        plain = type(ranges) is np.ndarray and ranges.shape == (pipeline.scanner.count,) and ranges.dtype in FLOATS
+        if not plain or pipeline.trial is not None:
+            return False
+        scans = pipeline.classed(ranges[None])
+        if pipeline.value(scans) is not None:
+            return False
+        readings = pipeline.upload(scans, space)
+        kept = space.kept(self, pipeline.map.version)
+        if kept is None:
+            # The map's table or a buffer is new.
+            placed, state = pipeline.place(self._request.poses, (0, self._request.poses.count), space)
+            kept = placed, state, RecordedProgram(pipeline.backend, placed.launches())
+            space.keep(self, kept, state.version)
+        placed, state, placing = kept
+        scoring = pipeline.scoring(readings, placed, state.table, self._log_p, space)
+        key, numbers = (self, scoring.flags, readings.key), pipeline.numbers(scoring)
+        program = space.kept(key, state.version)
+        if program is None:
+            made = ChangingProgram(pipeline.backend, pipeline.score_launches(scoring), numbers)
+            program = space.keep(key, made, state.version)
+        if before is not None:
+            before()
+        placing.start()
+        program(numbers)
+        last.flags = program.flags | (placing.flags - _IN_LANES)
+        last.scans, last.together, last.kernels = scans, 0, pipeline.kernel_names[False]
+        return True
 
 
 class _Scorer:

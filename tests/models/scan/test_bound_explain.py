@@ -177,7 +177,7 @@ def test_a_table_that_does_not_fit(batching, monkeypatch):
     def full(*arguments, **options):
         raise MemoryError
 
-    monkeypatch.setattr(packed_call, "DeviceCall", full)
+    monkeypatch.setattr(packed_call, "RecordedCall", full)
     assert ordinary(batching[0], cloud(1), mixed(1)) == "the table of the whole map does not fit the device"
 
 

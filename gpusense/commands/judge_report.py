@@ -42,7 +42,10 @@ def report(
         from gpusense.evaluation.integrity import integrity
 
         rated = integrity(
-            errors[known], found.radii[known], alert_limit=args.alert_limit, times=_increasing(found.times[known])
+            errors[known],
+            found.radii[known],
+            alert_limit=args.alert_limit,
+            times=found.times[known] if (np.diff(found.times[known]) > 0).all() else None,
         )
     if args.csv is not None:
         _write_csv(args.csv, found, errors)
@@ -115,11 +118,6 @@ def _print_integrity(rated: Integrity, risk: float) -> None:
         alerted = delays[np.isfinite(delays)]
         longest = f", after at most {alerted.max():.2g} s" if len(alerted) else ""
         print_fact("alerts", f"{len(alerted)} of {counted(len(delays), 'error')} above the alert limit{longest}")
-
-
-def _increasing(times: np.ndarray) -> np.ndarray | None:
-    """Return times if they increase, else None."""
-    return times if (np.diff(times) > 0).all() else None
 
 
 def _write_csv(path: Path, found: Judgement, errors: np.ndarray) -> None:

@@ -202,12 +202,7 @@ class TrajectoryJudge:
         )  # fmt: skip
 
     def _explained(self, stretch: Stretch, *, of_run: bool) -> Stretch:
-        """Return a stretch with its likely cause and, if it is lost, the likeliest place.
-
-        Args:
-            stretch: A stretch that is not tracking.
-            of_run: Whether to diagnose all scans of the stretch in sequence, which takes seconds.
-        """
+        """Return a stretch with its likely cause, ``of_run`` by all its scans, and if lost the likeliest place."""
         count = min(self._searches, stretch.last - stretch.first + 1)
         if not count:
             return stretch
@@ -331,13 +326,7 @@ def judge_trajectory(
 
 
 def errors_of(found: Judgement, times: Floats, poses: Floats) -> Floats:
-    """Return (N,) distances of judged poses from a true trajectory [m]; NaN where it has no pose.
-
-    Args:
-        found: The judgement.
-        times: (T,) increasing times of the trajectory [s].
-        poses: (T, 3) its poses.
-    """
+    """Return (N,) distances of judged poses from a true trajectory of T poses [m]; NaN where it has no pose."""
     none = (math.nan,) * 3
     true = np.array([pose or none for pose in poses_at(found.times.tolist(), times, poses, name="--truth")])
     return np.asarray(np.hypot(*(found.poses - true)[:, :2].T))
@@ -346,16 +335,7 @@ def errors_of(found: Judgement, times: Floats, poses: Floats) -> Floats:
 def stretches_of(
     times: Floats, poses: Floats, verdicts: Sequence[Word], p_lost: Floats, explained: Floats, radii: Floats
 ) -> list[Stretch]:
-    """Return the stretches of successive poses with the same verdict, and without a long gap of time.
-
-    Args:
-        times: (N,) times [s].
-        poses: (N, 3) poses.
-        verdicts: Their verdicts.
-        p_lost: (N,) their p_lost.
-        explained: (N,) shares of beams that agree with the map.
-        radii: (N,) radii [m].
-    """
+    """Return the stretches of N successive poses (N, 3) with the same verdict, and without a long gap of time."""
     steps = np.diff(times)
     longest = max(_GAP, _GAP_STEPS * float(np.median(steps))) if len(steps) else _GAP
     # A stretch also ends where the clock goes back.

@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.interface.constants import AGREES, SHORT, THROUGH
-from gpusense.localization.beam_consistency import BeamConsistency
+from gpusense.interface.constants import THROUGH
+from gpusense.localization.beam_consistency import BeamConsistency, counts_of
 from gpusense.localization.scan_evidence import ratio_of_scan
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.verdict import sightings
@@ -138,19 +138,12 @@ def diagnose(
     pose: Floats,
     random_poses: Callable[[int], Floats] | None,
 ) -> Diagnosis:
-    """Return the evidence of readings at a pose.
-
-    Args:
-        sensors: Sensors of a filter.
-        readings: Readings by the index of their sensor.
-        pose: (3,) pose.
-        random_poses: Returns poses anywhere on the map; None to skip the search elsewhere.
-    """
+    """Return the evidence of readings at a pose (3,); None for ``random_poses`` skips the search elsewhere."""
     scans = sightings(sensors, readings, pose, _STILL)
     found = evidence_of(scans)
     if not found.counted and not (found.inside or found.off):
         return found
-    if _fits(scans) or ratio_of_scan(scans) < 0:
+    if explains(scans) or ratio_of_scan(scans) < 0:
         crowded = found.short > _CROWD * found.counted
         return replace(found, cause="people" if crowded else "none")
     if random_poses is None:
@@ -161,7 +154,7 @@ def diagnose(
     best = _best_elsewhere(sensors, readings, random_poses)
     if best is None or math.dist(best[:2], pose[:2]) < _ELSEWHERE:
         return found
-    if _fits(sightings(sensors, readings, best, _STILL)):
+    if explains(sightings(sensors, readings, best, _STILL)):
         x, y, theta = (float(value) for value in best)
         return replace(found, elsewhere=(x, y, theta), cause="start")
     return replace(found, cause="map")
@@ -169,16 +162,16 @@ def diagnose(
 
 def evidence_of(scans: Sequence[BeamConsistency]) -> Diagnosis:
     """Return the evidence of judged beams, without a cause."""
-    agree, through, short = (sum(one.count(kind) for one in scans) for kind in (AGREES, THROUGH, SHORT))
+    counts = counts_of(scans)
     inside, off = any(one.inside for one in scans), any(one.off for one in scans)
-    return Diagnosis(agree, through, short, _place(scans), inside, off)
+    return Diagnosis(counts.agree, counts.through, counts.short, _place(scans), inside, off)
 
 
-def _fits(scans: Sequence[BeamConsistency]) -> bool:
-    """Return whether a pose explains scans: most beams that meet walls agree, and most informative beams."""
-    agree, through, short = (sum(one.count(kind) for one in scans) for kind in (AGREES, THROUGH, SHORT))
-    inside = any(one.inside or one.off for one in scans)
-    return not inside and agree > _FITS * (agree + through) and agree > _FITS_OF_ALL * (agree + through + short)
+def explains(scans: Sequence[BeamConsistency], of_walls: float = _FITS, of_all: float = _FITS_OF_ALL) -> bool:
+    """Return whether larger shares of the beams that meet walls, and of all informative beams, agree at a pose."""
+    counts = counts_of(scans)
+    least = max(of_walls * (counts.agree + counts.through), of_all * counts.informative_count)
+    return counts.agree > least and not any(one.inside or one.off for one in scans)
 
 
 def _place(scans: Sequence[BeamConsistency]) -> tuple[float, float] | None:
@@ -206,8 +199,8 @@ def _mount(
             if not mirrored and abs(angle) < _LEAST_TURN:
                 continue
             scans = sightings(sensors, seen, pose + np.array([0.0, 0.0, angle]), _STILL)
-            agree = sum(one.count(AGREES) for one in scans)
-            if agree > best[0] and _fits(scans):
+            agree = counts_of(scans).agree
+            if agree > best[0] and explains(scans):
                 best = agree, angle, mirrored
     return best[1], best[2]
 

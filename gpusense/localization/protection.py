@@ -38,9 +38,9 @@ _PARTS = 96
 _COSINES = np.cos((np.arange(_PARTS) + 0.5) * (math.pi / 2 / _PARTS)) ** 2
 # Steps of the bisection; each halves the interval.
 _STEPS = 60
-# Number of poses around a pose without a covariance. Steps of a low-discrepancy sequence: the first powers of 1 / x for
+# Number of poses around a pose without a covariance, and of beams that weigh them. Steps of a low-discrepancy sequence: the first powers of 1 / x for
 # x^4 = x + 1 (Roberts, "The unreasonable effectiveness of quasirandom sequences" (2018)).
-_AROUND, _SEQUENCE = 2048, 1.2207440846057596 ** -np.arange(1.0, 4.0)
+_AROUND, _BEAMS, _SEQUENCE = 2048, 240, 1.2207440846057596 ** -np.arange(1.0, 4.0)
 
 
 class Distances:
@@ -103,8 +103,13 @@ def distances_by_scan(sensors: Sequence[Sensor], readings: Mapping[int, tuple[An
     def particles() -> tuple[Floats, Floats]:
         log_p = np.zeros(_AROUND)
         for index, reading in readings.items():
-            sensor = sensors[index]
-            log_p += sensor.temperature("auto") * np.asarray(sensor.log_likelihood(poses, reading), np.float64)
+            sensor, every = sensors[index], 1
+            if sensor.calibrates and sensor.beams == len(reading[0]):
+                # Few beams have as much information at their temperature, in less time.
+                every = max(sensor.beams // _BEAMS, 1)
+                reading = (np.where(np.arange(sensor.beams) % every == 0, reading[0], np.nan), *reading[1:])
+            temperature = min(every * sensor.temperature("auto"), 1.0)
+            log_p += temperature * np.asarray(sensor.log_likelihood(poses, reading), np.float64)
         best = log_p.max()
         likelihood = np.exp(log_p - best) if math.isfinite(best) else np.ones(_AROUND)
         return poses, np.asarray(likelihood * far**1.5 * np.abs(turn))

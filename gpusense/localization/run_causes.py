@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.interface.constants import AGREES, SHORT, THROUGH
+from gpusense.localization.beam_consistency import counts_of
 from gpusense.localization.belief import motion_between
-from gpusense.localization.diagnosis import Diagnosis, evidence_of
+from gpusense.localization.diagnosis import Diagnosis, evidence_of, explains
 from gpusense.localization.pose_algebra import compose_poses, invert_poses, pose_difference, wrap_angle
 from gpusense.localization.rival_search import SPREAD_OF_POSE, RivalSearch
 from gpusense.localization.scan_evidence import ratio_of_scan
@@ -125,13 +125,7 @@ def diagnose_run(models: Any, moments: Sequence[Moment], *, search: bool = True)
 
 
 def likely_cause(beams: Diagnosis, evidence: RunEvidence, *, search: bool = True) -> Diagnosis:
-    """Return a diagnosis with the likely cause by evidence of a run.
-
-    Args:
-        beams: Evidence of the last scan's beams.
-        evidence: Evidence of the run.
-        search: Whether places were searched.
-    """
+    """Return the diagnosis of a run whose last scan has ``beams``; without a search, its places do not count."""
     motion = evidence.motion
     found = replace(beams, motion=_motion_text(motion), cause="unknown")
     flipped = replace(found, cause="mount", turned=motion.turned if motion.mirrored else 0.0, mirrored=True)
@@ -170,12 +164,7 @@ def _motion_text(motion: ScanMotion) -> str:
 
 
 class _Places:
-    """Places of windows on the map.
-
-    Args:
-        sensor: The sensor of all scans.
-        moments: The scans.
-    """
+    """Places of windows on the map, of scans of one sensor."""
 
     def __init__(self, sensor: Sensor, moments: Sequence[Moment]) -> None:
         self._sensor, self._moments = sensor, moments
@@ -226,14 +215,7 @@ class _Places:
     def _consistent(
         self, windows: list[Window], places: list[Place], *, steady: bool, scale: float = 1.0
     ) -> NDArray[np.bool_]:
-        """Return which places fit together with a second place at the distance of the odometry.
-
-        Args:
-            windows: The windows.
-            places: Their places.
-            steady: True if the odometry is right; False to count every place that fits.
-            scale: Ratio of true lengths to lengths on the map.
-        """
+        """Return which places fit, and for a right odometry (``steady``) a second place at the distance it states."""
         fits = np.array([one.fits for one in places])
         odometry = [self._moments[window.moments[0]].odometry for window in windows]
         if not steady or len(windows) < 3 or any(one is None for one in odometry):
@@ -305,14 +287,7 @@ class _Places:
         return np.asarray(self._moments[window.moments[0]].pose, np.float64)
 
     def place(self, window: Window, *, mirrored: bool = False, scale: float = 1.0, quick: bool = False) -> Place:
-        """Return the likeliest place of a window on the map.
-
-        Args:
-            window: The window.
-            mirrored: Whether to take the laser as upside down.
-            scale: Ratio of true lengths to lengths on the map.
-            quick: Whether to search a few scans of it, for few candidates.
-        """
+        """Return the likeliest place of a window on the map, by a few of its scans for ``quick``."""
         scans, relative = self._seen(window, mirrored, scale)
         if quick:
             scans, relative = scans[:_QUICK], relative[:_QUICK]
@@ -367,11 +342,9 @@ class _Places:
         """Return the place of scans with all their beams judged at (L, 3) poses."""
         pairs = zip(poses, scans, strict=True)
         seen = [one for pose, scan in pairs for one in sightings([self._sensor], {0: (scan,)}, pose, _STILL)]
-        agree, through, short = (sum(one.count(kind) for one in seen) for kind in (AGREES, THROUGH, SHORT))
-        every = agree + through + short
-        is_right = agree > _AGREE * (agree + through) and agree > _AGREE_OF_ALL * every
-        is_right = is_right and not any(one.inside or one.off for one in seen)
-        return Place(poses[0], agree / max(every, 1), is_right, short / max(every, 1))
+        counts, is_right = counts_of(seen), explains(seen, _AGREE, _AGREE_OF_ALL)
+        every = max(counts.informative_count, 1)
+        return Place(poses[0], counts.agree / every, is_right, counts.short / every)
 
     def _seen(self, window: Window, mirrored: bool, scale: float) -> tuple[list[Floats], Floats]:
         """Return the scans of a window and their relative poses, as on a map of another scale or by a turned laser."""

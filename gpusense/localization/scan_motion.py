@@ -108,13 +108,7 @@ class ScanMotion(NamedTuple):
 
 
 def scan_motion(moments: Sequence[Moment], scanner: Scanner, backend: Any) -> ScanMotion:
-    """Match scans of a run with one another, and compare their motion with the odometry.
-
-    Args:
-        moments: Scans of one laser, in order of time.
-        scanner: The laser.
-        backend: The device, see ``gpusense.devices()``.
-    """
+    """Match scans of one laser, in order of time, with one another, and compare their motion with the odometry."""
     # The reference matches a hundred times slower than kernels.
     chains = _windows(moments, WINDOWS // 4 if backend == "numpy" else WINDOWS)
     first = [a for chain in chains for a in chain[:-1]]
@@ -141,14 +135,7 @@ def scan_motion(moments: Sequence[Moment], scanner: Scanner, backend: Any) -> Sc
 def _matches(
     moments: Sequence[Moment], first: list[int], second: list[int], scanner: Scanner, backend: Any
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Match pairs of scans from rest, from the odometry and from the poses.
-
-    Args:
-        moments: The run.
-        first: P indices of first scans.
-        second: P indices of second scans.
-        scanner: The laser.
-        backend: The device.
+    """Match P pairs of scans from rest, from the odometry and from the poses.
 
     Returns:
         (P, 3) motions, (P, 3, 3) their information, and (P,) whether matches converge, all to the same motion.
@@ -208,15 +195,7 @@ def _moved(before: Moment, after: Moment) -> tuple[float, float]:
 
 
 class _Compared:
-    """Motions of matched pairs, to be compared with predictions.
-
-    Args:
-        moments: The run.
-        first: (P,) indices of first scans.
-        second: (P,) indices of second scans.
-        found: (P, 3) motions by the scans.
-        information: (P, 3, 3) their information.
-    """
+    """Motions ``found`` (P, 3) of matched pairs with their information (P, 3, 3), to be compared with predictions."""
 
     def __init__(
         self, moments: Sequence[Moment], first: NDArray[np.int64], second: NDArray[np.int64], found: Floats,

@@ -38,8 +38,8 @@ _PARTS = 96
 _COSINES = np.cos((np.arange(_PARTS) + 0.5) * (math.pi / 2 / _PARTS)) ** 2
 # Steps of the bisection; each halves the interval.
 _STEPS = 60
-# Number of poses around a pose without a covariance, and of beams that weigh them. Steps of a low-discrepancy sequence: the first powers of 1 / x for
-# x^4 = x + 1 (Roberts, "The unreasonable effectiveness of quasirandom sequences" (2018)).
+# Number of poses around a pose without a covariance, and of beams that weigh them. Steps of a low-discrepancy sequence:
+# the first powers of 1 / x for x^4 = x + 1 (Roberts, "The unreasonable effectiveness of quasirandom sequences" (2018)).
 _AROUND, _BEAMS, _SEQUENCE = 2048, 240, 1.2207440846057596 ** -np.arange(1.0, 4.0)
 
 

@@ -75,13 +75,7 @@ def add_seed(parser: argparse.ArgumentParser) -> None:
 
 
 def open_backends(selections: Sequence[str] | None) -> tuple[list[Backend], list[str]]:
-    """Open the backends of selection strings, or all devices present except simulators.
-
-    ``selections``: Selection strings, or None.
-
-    Returns:
-        Distinct backends, and the errors of devices that no name selected.
-    """
+    """Open the distinct backends of selections, or all devices but simulators; also return the errors of the latter."""
     from gpusense.backends import devices, get_backend
 
     if selections is not None:
@@ -173,12 +167,7 @@ class Output:
 
 
 def output_path(*suffixes: str) -> Output:
-    """Make a type for ``add_argument``: a file that can be written, checked before any work.
-
-    The library that writes the file must be installed.
-
-    ``suffixes``: Allowed suffixes, such as ``".png"``; none allows every suffix.
-    """
+    """Make a type for ``add_argument``: a file of one of some suffixes that can be written, checked before any work."""
 
     def convert(text: str) -> Path:
         path = Path(text)

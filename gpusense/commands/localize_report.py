@@ -41,11 +41,7 @@ _PARTS = ("predict", "score", "resample", "estimate")
 def report(
     args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: int, recorders: dict[Path, Recorder]
 ) -> dict[str, Any]:
-    """Write the files, and print the results of all scans, or of the scans before an interrupt.
-
-    Returns:
-        The results of :func:`gpusense.evaluation.tracking.summary`.
-    """
+    """Write the files, print the results of the scans (before an interrupt), and return their summary."""
     from gpusense.evaluation.judging import stretches_of_track
     from gpusense.evaluation.tracking import RISK, summary
     from gpusense.evaluation.trajectory_files import write_tum

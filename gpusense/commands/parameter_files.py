@@ -35,10 +35,7 @@ class Localization:
 
 
 def read_localization(path: Path, node: str | None = None) -> Localization:
-    """Read the mappings ``beam_model`` and ``odometry_motion`` of a YAML file, or the parameters of nav2_amcl's node.
-
-    ``node``: Name of the node in a file of nav2; None for its only amcl.
-    """
+    """Read ``beam_model`` and ``odometry_motion`` of a YAML file, or the parameters of nav2_amcl's ``node``."""
     from gpusense._util import checks
     from gpusense.localization.motion import OdometryMotion
     from gpusense.localization.nav2 import from_nav2, has_parameters

@@ -28,11 +28,7 @@ OPTIONS = {
 
 
 def add_log(parser: argparse.ArgumentParser, what: str, *, required: bool = True, several: str | None = None) -> None:
-    """Add ``--log``, and its laser: ``--topic`` and ``--mount``.
-
-    ``required``: True if the option is required. ``several``: Description of the lasers' use, if the command takes
-    several.
-    """
+    """Add ``--log``, and its laser or ``several`` lasers, described by their use: ``--topic`` and ``--mount``."""
     add = parser.add_argument
     add("--log", required=required, type=Path, metavar="FILE", help=f"{what}: {FORMATS}")
     names = "topic of a bag (default: /scan, or the only one); front or rear of a CARMEN log (default: front)"
@@ -101,10 +97,7 @@ def options_named() -> Iterator[None]:
 
 
 def read_scans(args: argparse.Namespace, *, posed: bool = True) -> list[tuple[int, Scan]]:
-    """Read the chosen scans of ``--log`` with their indices and poses.
-
-    ``posed``: True if each scan must have a pose.
-    """
+    """Read the chosen scans of ``--log`` with their indices; if ``posed``, each must have a pose."""
     from gpusense.evaluation.scoring import chosen_scans, with_one_scanner, with_poses
 
     with options_named():

@@ -17,10 +17,7 @@ _MOST = 12
 
 
 def print_stretches(stretches: Sequence[Stretch], begin: float, risk: float) -> None:
-    """Print the stretches in the order of time, the worst ones of many.
-
-    ``begin``: Time of the first scan [s].
-    """
+    """Print the stretches, the worst ones of many, by time since ``begin`` [s]."""
     order = {"lost": 0, "uncertain": 1, "tracking": 2}
     chosen = sorted(stretches, key=lambda one: (order[one.verdict], -one.duration))[:_MOST]
     for one in sorted(chosen, key=lambda one: one.first):

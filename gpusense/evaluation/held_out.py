@@ -46,10 +46,7 @@ class HeldOut:
 
 
 def peer_parameters() -> dict[str, BeamParameters]:
-    """Return the default parameters of nav2_amcl and Beluga's library, with weights divided by their sum, not 1.
-
-    Beluga's node has the defaults of nav2_amcl.
-    """
+    """Return the defaults of nav2_amcl (also of Beluga's node) and of Beluga's library, with weights that sum to 1."""
     parameters = {}
     for beam, label in ((Beluga.beam, "nav2_amcl's defaults"), (Beluga.library, "Beluga's defaults")):
         values = beam.to_dict()

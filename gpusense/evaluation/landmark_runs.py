@@ -151,10 +151,7 @@ class Track:
 
 
 def fit_run(run: LandmarkRun, *, known: bool = True, bias: bool = False) -> LandmarkFit:
-    """Fit the noise of a run's features at its logged poses.
-
-    ``bias``: Whether offsets of range and bearing are also fitted.
-    """
+    """Fit the noise of a run's features at its logged poses, and with ``bias`` offsets of range and bearing."""
     return fit_landmark_parameters(
         run.truth, run.features, run.landmarks, correspondence=run.ids if known else None, scan=run.scan,
         range_max=run.range_max, field_of_view=run.field_of_view, bias=bias,

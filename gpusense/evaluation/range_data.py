@@ -80,10 +80,7 @@ def data_of_log(
     incidence: bool = False,
     step: Callable[[str], None] = lambda text: None,
 ) -> RangeData:
-    """Cast the expected ranges of a log's readings at its logged poses.
-
-    ``range_min``: Readings below this are missing [m].
-    """
+    """Cast the expected ranges of a log's readings at its poses; readings below ``range_min`` [m] are missing."""
     block = checks.integer("block", block, low=1)
     model = BeamModel(grid, scans[0][1].scanner, backend=backend)
     expected, angles = [], []

@@ -108,10 +108,7 @@ class BackendScore:
 
 
 def score_scan(index: int, poses: Floats, log_p: Array, beams: int, seconds: float) -> ScanScore:
-    """Rank the logged pose among a scan's particles and compute the weighted mean of the remaining particles.
-
-    ``poses``: (N, 3) particles; the first is the logged pose [m, m, rad]. ``log_p``: (N,) log-likelihoods.
-    """
+    """Rank the logged pose, the first of (N, 3) particles with (N,) log-likelihoods, and average the others."""
     better, equal = np.count_nonzero(log_p[1:] > log_p[0]), np.count_nonzero(log_p[1:] == log_p[0])
     others = len(log_p) - 1
     normalized = normalize_weights(log_p[1:])

@@ -116,11 +116,7 @@ def run(
 
 
 def evaluate_backend(backend: Backend, scene: Scene, *, sonar: bool = True) -> tuple[Results, list[Check]]:
-    """Compute a scene on a backend, and compare the results with the truth on the backend's rounded inputs.
-
-    Returns:
-        Results by quantity, for comparison with other backends, and the comparisons with the truth.
-    """
+    """Compute a scene on a backend; return the results, and their comparisons with the truth on its rounded inputs."""
     results, checks = _tables(backend, scene)
     launches: dict[str, Launch] = {}
     precisions: tuple[Precision, ...] = ("float32", "float64")

@@ -108,9 +108,6 @@ def references_to_learn_from(steps: Sequence[Step]) -> tuple[list[Pose], list[Po
 
 
 def with_references(steps: Sequence[Step], times: Floats, poses: Floats) -> list[Step]:
-    """Return steps with references from a trajectory at the times of the scans.
-
-    ``times``: (T,) increasing times of the trajectory [s]. ``poses``: (T, 3) its poses.
-    """
+    """Return steps with references from a trajectory: (T, 3) poses at (T,) increasing times [s]."""
     found = poses_at([step.scan.time for step in steps], times, poses)
     return [replace(step, reference=pose) for step, pose in zip(steps, found, strict=True)]

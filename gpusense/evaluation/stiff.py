@@ -236,12 +236,6 @@ def _truth(launch: Launch, parameters: Any) -> Floats:
 
 
 def run(backend: Selection, precision: str) -> list[Row]:
-    """Run the whole catalogue on a backend.
-
-    ``precision``: ``"float32"`` or ``"float64"``.
-
-    Returns:
-        The rows.
-    """
+    """Run the whole catalogue on a backend in a precision."""
     device = get_backend(backend)
     return [*_grid_rows(device, precision), *(row for case in cases() for row in _case_rows(case, device, precision))]

@@ -188,11 +188,7 @@ def scan_tolerance(dtype: DTypeLike, beams: int) -> Tolerance:
 
 
 def per_beam(log_p: ArrayLike, dtype: DTypeLike) -> Floats:
-    """Return the largest error allowed of each beam's log-likelihood.
-
-    Returns:
-        float64 of the same shape [nats]; 0 where log p is infinite, which must be exact.
-    """
+    """Return the largest error allowed of each beam's log-likelihood [nats]; infinite ones must be exact."""
     tolerance = beam_tolerance(dtype)
     scale = tolerance.value * (_EPS if tolerance.unit.startswith("eps") else 1.0)
     size = np.abs(np.asarray(log_p, np.float64))

@@ -99,11 +99,7 @@ def start(
     pose: Sequence[float] | None = None,
     covariance: Floats | None = None,
 ) -> None:
-    """Initialise a filter: everywhere, or around a pose, by default the first reference pose.
-
-    ``pose``: The pose; None for the first reference pose. ``covariance``: (3, 3) covariance of the start; None for the
-    usual one.
-    """
+    """Initialise a filter everywhere, or around a pose with a (3, 3) covariance; by default the first reference."""
     first = steps[0].reference if pose is None else pose
     if everywhere:
         pf.initialize_uniform()
@@ -225,21 +221,14 @@ _NORMAL_95, _BINS = 1.96, 10
 
 
 def nees_of(differences: Floats, covariances: Floats) -> Floats:
-    """Return the normalised estimation errors squared.
-
-    ``differences``: (S, 3) estimates less true poses, headings wrapped. ``covariances``: (S, 3, 3) covariances of the
-    estimates.
-    """
+    """Return normalised squared errors of (S, 3) differences (headings wrapped) with their (S, 3, 3) covariances."""
     regular = covariances + 1e-12 * np.eye(3)
     solved = np.linalg.solve(regular, differences[:, :, None])[:, :, 0]
     return np.asarray(np.einsum("si,si->s", differences, solved))
 
 
 def rank_of(particles: Floats, weights: Floats, truth: Floats) -> Floats:
-    """Return the weights (3,) of the particles behind, to the right of and clockwise of the true pose, each 0 to 1.
-
-    ``particles``: (N, 3) poses. ``weights``: (N,) weights, sum 1. ``truth``: (3,) the true pose.
-    """
+    """Return the weights (3,), 0 to 1, of (N, 3) particles behind, right of and clockwise of a (3,) true pose."""
     cosine, sine = math.cos(truth[2]), math.sin(truth[2])
     behind = np.zeros(3)
     # In blocks that stay in a cache: a sign is -1 behind the pose, and 0 at it.

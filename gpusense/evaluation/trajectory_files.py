@@ -27,10 +27,7 @@ _INDICES = "# indices of scans, not times"
 
 
 def write_tum(path: Path, times: Iterable[float], poses: Iterable[Floats], *, indices: bool = False) -> None:
-    """Write poses as a TUM trajectory.
-
-    ``times``: Times [s]. ``poses``: Poses (x, y [m], theta), as many.
-    """
+    """Write poses (x, y [m], theta) and as many times [s], or ``indices`` of scans, as a TUM trajectory."""
 
     def write(stream: BinaryIO) -> None:
         if indices:

@@ -38,10 +38,7 @@ def distances_of(data: RangeData, count: int = 3) -> list[float]:
 
 
 def readings_figure(data: RangeData, distances: list[float]) -> Figure:
-    """Draw readings against expected ranges, and raw readings around some expected ranges (book figure 6.5).
-
-    ``distances``: The expected ranges [m].
-    """
+    """Draw readings against expected ranges, and raw readings around some distances [m] (book figure 6.5)."""
     from matplotlib.colors import LogNorm
 
     figure = new_figure(12.0, 5.0)
@@ -77,10 +74,7 @@ def readings_figure(data: RangeData, distances: list[float]) -> Figure:
 
 
 def density_figure(data: RangeData, parameters: BeamParameters, distances: list[float]) -> Figure:
-    """Draw histograms of readings around some expected ranges, with the fitted density (book figure 6.6).
-
-    ``distances``: The expected ranges [m].
-    """
+    """Draw histograms of readings around some distances [m], with the fitted density (book figure 6.6)."""
     figure = new_figure(5.0 * max(len(distances), 1), 4.2)
     axes = figure.subplots(1, max(len(distances), 1), squeeze=False)[0]
     for ax, distance in zip(axes, distances, strict=False):
@@ -122,10 +116,7 @@ def _density_panel(ax: Axes, data: RangeData, parameters: BeamParameters, distan
 
 
 def trace_figure(trace: NDArray[np.float64], method: str) -> Figure:
-    """Draw the log-likelihood after each iteration, and its distance from the highest value.
-
-    ``trace``: (I,) log-likelihoods [nats].
-    """
+    """Draw (I,) log-likelihoods [nats] after each iteration, and their distances from the highest one."""
     figure = new_figure(10.0, 3.8)
     left, right = figure.subplots(1, 2)
     iteration = np.arange(len(trace))

@@ -99,13 +99,7 @@ class Recording:
 
 
 def end_points(scanner: Scanner, ranges: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (M, 2) end points of the hits in the world.
-
-    Args:
-        scanner: The scanner.
-        ranges: (K,) readings [m].
-        pose: (3,) pose of the robot.
-    """
+    """Return the (M, 2) end points in the world of the hits of (K,) readings [m] at a (3,) pose."""
     hit = classify(ranges, scanner) == Reading.HIT
     x, y, theta = compose_poses(pose, np.array(scanner.mount))
     angle, z = theta + scanner.bearings[hit], np.asarray(ranges)[hit]

@@ -132,7 +132,7 @@ class Truth:
 def temperature_of(log_p: Floats) -> float:
     """Find the factor of log-likelihoods, in (0, 1], at which the effective sample size is a tenth of the particles.
 
-    With the plain product over beams nearly all weight lies on one particle, and its posterior hides most errors.
+    The plain product over beams gives one particle nearly all weight, and such a posterior hides most errors.
 
     ``log_p``: (M,) log-likelihoods, finite.
     """
@@ -196,10 +196,7 @@ def errors(
 
 
 def fine_errors(truth: Truth, problem: str, log_p: NDArray[np.floating], temperature: float = 1.0) -> dict[str, float]:
-    """Compare log-likelihoods on the fine grid of poses with the true, untempered posterior there.
-
-    ``problem``: ``"beam"`` or ``"field"``.
-    """
+    """Compare log-likelihoods on the fine grid of poses with the true, untempered posterior of a problem there."""
     fine = truth.fine(problem)
     return posterior_errors(temperature * _checked("log-likelihoods", log_p, fine.log_p), fine.log_p, fine.poses)
 

@@ -88,11 +88,7 @@ class Wish:
 
 
 def parse_error(text: str) -> tuple[str, float]:
-    """Read a limit of the error, such as ``"0.01 nats"``, ``"2 cm"``, ``"1 %"`` or ``"0.5 cells"``.
-
-    Returns:
-        The unit (``"nats"``, ``"m"``, ``"%"`` or ``"cells"``) and the value in it; for ``"%"`` the share.
-    """
+    """Read a limit of the error, such as "0.01 nats", "2 cm" or "1 %"; return unit and value (a share for "%")."""
     value, unit = _quantity(text, ("nats", "cells", "%", *LENGTHS), "--max-error")
     if unit in LENGTHS:
         return "m", value * LENGTHS[unit]
@@ -141,11 +137,7 @@ def entries(points: Iterable[Mapping[str, Any]], problem: str, unit: str, backen
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Find the points that no other point dominates, that is, is no larger in both and smaller in one.
-
-    Returns:
-        Indices of these points by rising error; of equal points the first.
-    """
+    """Return indices of the points that none dominates, by rising error; of equal points the first."""
     front: list[int] = []
     fastest = math.inf
     for i in sorted(range(len(points)), key=lambda i: (*points[i], i)):
@@ -166,8 +158,8 @@ def choose(
 ) -> Entry | None:
     """Choose the entry for a largest error and a longest time.
 
-    With a largest error, the fastest method within both limits is chosen. With a longest time alone, the fastest of the
-    most exact methods within it is chosen. Of equal ones the preferred one is chosen.
+    A largest error selects the fastest method within both limits; a longest time alone selects the fastest of the most
+    exact methods within it. The preferred one wins a tie.
 
     ``error``: The largest error; None without a limit. ``seconds``: The longest time [s]; None without a limit.
     ``standing``: The choice of an earlier day among ``listed``: it stands where its error and time keep the limits and

@@ -98,10 +98,7 @@ class Row:
 
 
 def title_of(point: Mapping[str, Any], machine: Mapping[str, Any], driver: str = "", target: str = "") -> str:
-    """Name the device of a point: its library, and the processor with its cores or the GPU.
-
-    ``target``: The processor for which PoCL compiles; ``"haswell"`` has no AVX-512.
-    """
+    """Name a point's device: library, and processor with cores or GPU; PoCL's ``target`` "haswell" has no AVX-512."""
     library = {"opencl": "OpenCL", "warp:cuda": "CUDA", "warp:cpu": "Warp"}
     if driver.startswith("Intel"):
         library["opencl"] = "Intel's OpenCL"

@@ -112,10 +112,7 @@ class Scene:
 
 
 def sources(names: Sequence[str] | None = None, maps: Sequence[Path] = (), *, quick: bool = False) -> list[MapSource]:
-    """List the maps of a run.
-
-    ``names``: Names of scenes; None for all available scenes, or for ``maps`` alone if there are some.
-    """
+    """List the maps of a run by names of scenes; None for ``maps`` alone, or else for all available scenes."""
     sizes = _QUICK_SIZES if quick else _SIZES
     known = {name: MapSource(name, f"generated, {w:g} x {h:g} m", None, (w, h)) for name, (w, h) in sizes.items()}
     folder = os.environ.get(DATA, "")
@@ -194,13 +191,7 @@ def _cloud_in_free_space(grid: OccupancyGrid, pose: Floats, n: int, rng: np.rand
 
 
 def clutter(seed: int = 0, size: tuple[float, float] = (50.0, 50.0), resolution: float = 0.05) -> OccupancyGrid:
-    """Generate a walled hall full of boxes: a few shelves, some crates, and many objects of at most 4 cells.
-
-    ``size``: (W, H) of the grid along x and y [m]. ``resolution``: The side of a cell [m].
-
-    Returns:
-        A grid with its origin at (0, 0, 0) whose cells are 0 (free) or 100 (occupied).
-    """
+    """Generate a walled hall of (W, H) [m] full of boxes: shelves, crates, and many objects of at most 4 cells."""
     rng = np.random.default_rng(seed)
     cols, rows = (round(side / resolution) for side in size)
     cells = np.zeros((rows, cols), np.int8)

@@ -15,8 +15,8 @@ from gpusense.localization.belief import Belief
 from gpusense.localization.diagnosis import Diagnosis, evidence_of
 from gpusense.localization.map_judge import MapJudge
 from gpusense.localization.scan_evidence import explained_of_scan, ratio_of_scan
+from gpusense.localization.spread import LOST, TRACKING, Word
 from gpusense.localization.temperature import BeamCorrelation, learn_from_scan
-from gpusense.localization.words import LOST, TRACKING, Word
 from gpusense.logs import Scan
 
 # Number of random poses per scan, and the stream of their random numbers.

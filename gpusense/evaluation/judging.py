@@ -19,8 +19,7 @@ from gpusense.localization.monitor import PoseMonitor
 from gpusense.localization.protection import check_risk
 from gpusense.localization.run_causes import diagnose_run
 from gpusense.localization.scan_motion import Moment
-from gpusense.localization.spread import FAR
-from gpusense.localization.words import WORDS, Word
+from gpusense.localization.spread import FAR, WORDS, Word
 from gpusense.logs import Pose, Scan
 from gpusense.matching.locate import locate_scan
 from gpusense.matching.location import Location

@@ -18,7 +18,7 @@ from gpusense.localization.filter import ParticleFilter
 from gpusense.localization.motion import OdometryMotion, SampledMotion
 from gpusense.localization.motion_fit import fit_odometry_motion
 from gpusense.localization.pose_algebra import wrap_angle
-from gpusense.localization.words import LOST
+from gpusense.localization.spread import LOST
 from gpusense.logs.records import LandmarkRun
 from gpusense.models.landmark.model import LandmarkModel
 from gpusense.world.parameters import LandmarkParameters

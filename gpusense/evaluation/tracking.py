@@ -15,7 +15,7 @@ from gpusense.evaluation.steps import Step, repeats_odometry
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.filter import ParticleFilter
 from gpusense.localization.pose_algebra import pose_difference, wrap_angle
-from gpusense.localization.words import WORDS, Word
+from gpusense.localization.spread import WORDS, Word
 
 Floats = NDArray[np.float64]
 # Largest errors of the next scans of a converged track [m, rad].

@@ -123,6 +123,11 @@ class Summary(NamedTuple):
     numbers: np.ndarray
     resampled: bool
 
+    @property
+    def evidence(self) -> float:
+        """Log p(z | earlier readings); -inf if no particle was possible."""
+        return -math.inf if self.degenerate else float(self.numbers[EVIDENCE])
+
 
 def summary_of(numbers: np.ndarray) -> Summary:
     """Return the summary of a state in the kernels' layout."""
@@ -149,10 +154,10 @@ def is_starved(numbers: np.ndarray, settings: np.ndarray, stage: int, count: int
         count: Particles.
     """
     own = numbers[stage * STAGE : (stage + 1) * STAGE]
+    if not own[SAMPLE_SIZE] < min(settings[SHARE] * count, _FEWEST):
+        return False
     lowest = left_of(numbers, stage) * settings[DEPTH] * LOWEST
-    least = min(settings[SHARE] * count, _FEWEST)
-    few = own[RUNG] == lowest > 0.0 and not own[DEGENERATE] and own[SAMPLE_SIZE] < least
-    return bool(few and settings[DEPTH] > _DEEPEST)
+    return bool(own[RUNG] == lowest > 0.0 and not own[DEGENERATE] and settings[DEPTH] > _DEEPEST)
 
 
 def deeper(settings: np.ndarray) -> np.ndarray:

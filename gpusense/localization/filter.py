@@ -10,7 +10,6 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 from gpusense.backends import BackendInfo
 from gpusense.localization import options
-from gpusense.localization.assessment import estimate_of
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.diagnosis import Diagnosis, diagnose
 from gpusense.localization.estimates import Estimate
@@ -272,8 +271,8 @@ class ParticleFilter(Transactional):
             ValueError: another method.
         """
         checks.choice("method", method, ("mean", "cluster", "best"))
-        parts = self._parts
-        return estimate_of(self._moved(), parts.verdict, parts.recovery, method)
+        self._moved()
+        return self._parts.estimate(method)
 
     @consistent
     def diagnose(self, *, search: bool = True) -> Diagnosis:

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 
 from gpusense._util.typing import AnyArray
+from gpusense.backends import arrays
 from gpusense.localization import skipping, starts
 from gpusense.localization.cloud_state import Contents
 from gpusense.localization.defaults import DEFAULTS
+from gpusense.localization.estimates import Estimate, clustered
+from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.options import Options
-from gpusense.localization.pose_algebra import compose_poses
-from gpusense.localization.recovery import Recovery
+from gpusense.localization.pose_algebra import compose_poses, wrap_angle
+from gpusense.localization.protection import Distances, margins_of
+from gpusense.localization.rival import Recovery
 from gpusense.localization.scoring import FilterCloud, readings_of
 from gpusense.localization.sensors import Sensor, grid_of
-from gpusense.localization.state import memory_of, remember
+from gpusense.localization.spread import share_off, share_off_of, spread_of, verdict_label
 from gpusense.localization.tracker import Tracker, is_together
 from gpusense.localization.verdict import Verdict
 
@@ -144,6 +149,41 @@ class FilterCore:
         moved = compose_poses(likely, tracker.progress.moved or np.zeros(3))
         tracker.place(starts.with_poses(tracker.next_particles(), moved, tracker.key()))
 
+    # ---- results
+
+    def estimate(self, method: str) -> Estimate:
+        """Return the estimate by "mean", "cluster" or "best"."""
+        tracker, verdict, rival = self.tracker, self.verdict, self.recovery.rival
+        cloud, shown = tracker.cloud, tracker.shown
+        mean, covariance = tracker.mean_and_covariance()
+        pose, about = mean, covariance
+        summary = cloud.summary()
+        if method == "best":
+            pose = tracker.host_particles()[int(np.argmax(cloud.host_weights(shown)))]
+        elif method == "cluster":
+            pose, covariance = clustered(tracker.host_particles(), cloud.host_weights(shown))
+        if method != "mean":
+            offset = pose - mean
+            offset[2] = wrap_angle(offset[2])
+            about = about + np.outer(offset, offset)
+        share, distances = share_off(about), None
+        if not spread_of(about).narrow:
+            particles = cloud.snapshot(shown)
+            share = cloud.far_share(shown) if method == "mean" else share_off_of(*particles(), pose)
+            distances = Distances(particles, pose)
+        if rival is not None:
+            share = 1 - (1 - share) * (1 - rival.probability(pose))
+        wrong = verdict.wrong
+        p_lost, spread = wrong + (1 - wrong) * share, spread_of(covariance)
+        word = verdict_label(p_lost, wrong, wide=spread.wide, apart=spread.apart)
+        temperature = tracker.sensors[0].temperature(tracker.options.temperature)
+        margins = margins_of(tracker.sensors) if verdict.informed and verdict.state.corrections else (1.0, 0.0)
+        return Estimate(
+            pose, covariance, tracker.sample_size(), p_lost, word, verdict.state.explained, temperature,
+            summary.temperature, summary.degenerate, shown, *margins,
+            None if method == "mean" else about, distances,
+        )  # fmt: skip
+
     # ---- state
 
     def state(self) -> tuple[Contents, dict[str, Any]]:
@@ -151,12 +191,27 @@ class FilterCore:
         tracker = self.tracker
         for sensor in self.sensors:
             sensor.receive()
-        return tracker.cloud.contents(tracker.shown), memory_of(tracker, self.verdict, self.recovery, self.last)
+        memory = {
+            "tracker": plain_state(tracker), "verdict": plain_state(self.verdict), "recovery": self.recovery.state(),
+            "sensors": [plain_state(sensor) for sensor in self.sensors],
+            "readings": {index: tuple(map(self._on_host, reading)) for index, reading in self.last.items()},
+        }  # fmt: skip
+        return tracker.cloud.contents(tracker.shown), memory
+
+    def _on_host(self, part: Any) -> Any:
+        """Return a part of a reading in host memory."""
+        plain = part is None or isinstance(part, (int, float, str))
+        return part if plain else arrays.copied_to_host(part, self.tracker.cloud.backend, "readings")
 
     def restore(self, contents: Contents, memory: Mapping[str, Any]) -> None:
         """Take over particles and memory."""
         self.tracker.cloud.restore(contents)
-        self.last = remember(memory, self.tracker, self.verdict, self.recovery)
+        set_state(self.tracker, memory["tracker"])
+        set_state(self.verdict, memory["verdict"])
+        for sensor, values in zip(self.sensors, memory["sensors"], strict=True):
+            set_state(sensor, values)
+        self.recovery.restore(memory["recovery"])
+        self.last = {index: tuple(map(copy.copy, reading)) for index, reading in memory["readings"].items()}
 
 
 def _copied(reading: Any) -> Any:

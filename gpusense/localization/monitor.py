@@ -15,9 +15,8 @@ from gpusense.localization.diagnosis import Diagnosis, diagnose
 from gpusense.localization.protection import Distances, distances_by_scan, margins_of, protection_level
 from gpusense.localization.scoring import readings_of
 from gpusense.localization.sensors import sensors_of
-from gpusense.localization.spread import share_off, spread_of
+from gpusense.localization.spread import LOST, Word, share_off, spread_of, verdict_label
 from gpusense.localization.verdict import Verdict, VerdictState
-from gpusense.localization.words import LOST, Word, verdict_label
 from gpusense.world.scanner import float64_readings
 
 # Number of poses drawn from a covariance for predicting features.

@@ -177,7 +177,9 @@ class Particles:
 
     def set_particles(self, places: BufferSlots, count: int) -> None:
         """Set the buffers, the number of particles, and the number in a block of weights."""
-        self.places, self.count, self.block = places, count, weight_block(self.backend, count)
+        if count != self.count:
+            self.block = weight_block(self.backend, count)
+        self.places, self.count = places, count
 
     def use(self, sensors: int) -> None:
         """Set the number of sensors of the next correction."""

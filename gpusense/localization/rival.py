@@ -20,22 +20,22 @@ after ``LONGEST`` scans.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 
-from gpusense.interface.constants import EVIDENCE
 from gpusense.localization import starts
 from gpusense.localization.belief import correlation, motion_between, new_part
-from gpusense.localization.cloud_state import Contents, SensorReadings, Summary
+from gpusense.localization.cloud_state import Contents, SensorReadings
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import SampledMotion
-from gpusense.localization.rival_search import RivalSearch, are_apart, drawn
+from gpusense.localization.rival_search import RivalSearch, are_apart, can_search, drawn
 from gpusense.localization.scan_evidence import ratio_of_scan
-from gpusense.localization.spread import FAR, FAR_TURN, deviations
+from gpusense.localization.scoring import FilterCloud
+from gpusense.localization.spread import FAR, FAR_TURN, WIDE, deviations
 from gpusense.localization.tracker import Progress, Tracker
-from gpusense.localization.verdict import sightings
+from gpusense.localization.verdict import Verdict, sightings
 
 # Log Bayes factors of a winning and a losing rival; scans to win for a converged rival, and for a rival with several
 # places; largest number of scans.
@@ -46,19 +46,18 @@ SETTLES = 5
 COMPARISONS = 3
 # Prior log odds of a rival of a tracked pose at an unknown place.
 PRIOR = -7.0
+# Mask that turns the filter's seed into the rival's seed.
+_RIVAL = 0x9E3779B97F4A7C15
+# Probability of another place that starts the search for a rival; above the prior before the first scan.
+_DOUBT = 0.2
 # Particles of a rival; half widths around each of its initial poses [m, m, rad].
 PARTICLES, _SPREAD = 1000, (0.1, 0.1, 0.05)
-# Largest deviation of a concentrated cloud [m]; largest distance and turn between two clouds at a place [m, rad].
-_TOGETHER, _SAME, _SAME_TURN = 0.5, 0.5, 0.3
+# Largest distance and turn between two clouds at a place [m, rad].
+_SAME, _SAME_TURN = 0.5, 0.3
 # Largest mean ratio of wrong against right of a supported pose; share of the old mean after a new scan.
 _RIGHT, _AGAINST, _KEPT = -1.0, 0.0, 0.6
 # Largest contribution of a scan [nats].
 _MOST = 50.0
-
-
-def evidence_of(summary: Summary) -> float:
-    """Return log p(z | earlier readings) of the last correction; -inf if no particle was possible."""
-    return -math.inf if summary.degenerate else float(summary.numbers[EVIDENCE])
 
 
 class Rival:
@@ -151,11 +150,11 @@ class Rival:
 
         Args:
             readings: Indices of sensors with their readings.
-            evidence: Evidence of the filter, by :func:`evidence_of`.
+            evidence: Log evidence of the filter, by its summary.
             pose: (3,) estimated pose of the particles.
         """
         self._tracker.weigh(readings)
-        mine = evidence_of(self._tracker.cloud.summary())
+        mine = self._tracker.cloud.summary().evidence
         if math.isfinite(mine) or math.isfinite(evidence):
             ratio = min(max(mine - evidence, -_MOST), _MOST)
             sensors = tuple(index for index, _ in readings)
@@ -178,7 +177,7 @@ class Rival:
         """
         self._place, own = self._tracker.mean_and_covariance()
         gain = self.log_odds - self._prior
-        together = deviations(own)[0] < _TOGETHER
+        together = deviations(own)[0] < WIDE
         if not together:
             # The mean of several places is no place.
             poses, weights = self._tracker.host_particles(), self._tracker.host_weights()
@@ -236,3 +235,129 @@ class Rival:
         if not self.active or not self._scans or self.is_at(pose) or not self._is_plausible():
             return 0.0
         return 1 / (1 + math.exp(-min(max(self.log_odds, -_MOST), _MOST)))
+
+
+class Recovery:
+    """Rivals of a filter's particles.
+
+    Args:
+        tracker: The particles.
+        verdict: Verdict on their pose.
+
+    Attributes:
+        rival: The rival of the particles, if there was one.
+        everywhere: Number of places still to be compared with the pose.
+    """
+
+    MEMORY: ClassVar[tuple[str, ...]] = ("rival", "everywhere")
+    PARTS: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, tracker: Tracker, verdict: Verdict) -> None:
+        self._tracker, self._verdict = tracker, verdict
+        self._searches = tracker.options.recovery == "sensor" and can_search(tracker.sensors)
+        self.rival: Rival | None = None
+        self.everywhere = 0
+
+    @property
+    def active(self) -> Rival | None:
+        """The competing rival, or None."""
+        return self.rival if self.rival is not None and self.rival.active else None
+
+    def changing(self) -> tuple[Any, ...]:
+        """Return the objects whose state a call may change."""
+        return (self,) if self.rival is None else (self, *self.rival.changing())
+
+    def keep(self) -> None:
+        """Record the buffers that the present call must not overwrite."""
+        if self.rival is not None:
+            self.rival.keep()
+
+    def restart(self) -> None:
+        """Forget the rival for new particles."""
+        self.everywhere = 0
+        if self.rival is not None:
+            self.rival.stop()
+
+    def expect_anywhere(self) -> None:
+        """Compare the pose with other places after convergence."""
+        self.everywhere = COMPARISONS
+
+    def follow(self, motion: SampledMotion) -> None:
+        """Move the rival."""
+        if self.rival is not None:
+            self.rival.predict(motion)
+
+    def is_doubted(self) -> bool:
+        """Return whether the last judged scans contradict the pose, or a rival competes with it."""
+        verdict = self._verdict
+        apart = self.active is not None or not self._tracker.together
+        return apart or verdict.wrong > _DOUBT or verdict.explains_little
+
+    def corrected(self, readings: list[SensorReadings], last: Mapping[int, tuple[Any, ...]]) -> None:
+        """Compare the particles with their rival, judge their pose, and search for a rival if scans contradict it.
+
+        A search needs two consecutive judgements that contradict the pose, or one at every fifth to tenth correction.
+
+        Args:
+            readings: Indices of sensors with the readings of the correction.
+            last: Copies of the same readings with all beams.
+        """
+        tracker, verdict, rival = self._tracker, self._verdict, self.active
+        searches = self._searches and rival is None and (verdict.due or self._is_wanted())
+        if rival is not None:
+            self._compare(rival, readings)
+        if not verdict.is_informed_by(last):
+            return
+        pose, covariance = tracker.mean_and_covariance()
+        verdict.judge(pose, covariance, last, tracker.cloud.summary().evidence)
+        if searches and self._is_wanted():
+            prior = 0.0 if self.everywhere else PRIOR
+            self.everywhere = max(self.everywhere - 1, 0)
+            step = tracker.progress.step
+            ratio = self._made().start(pose, covariance, list(last.items()), step=step, prior=prior)
+            verdict.compared(pose, covariance, ratio)
+
+    def _is_wanted(self) -> bool:
+        """Return whether the pose is contradicted or due for comparison, and the particles are not too wide."""
+        tracker = self._tracker
+        if tracker.wide or (self.everywhere and not tracker.together):
+            return False
+        return bool(self.everywhere) or self.is_doubted()
+
+    def _compare(self, rival: Rival, readings: list[SensorReadings]) -> None:
+        """Correct the rival, and replace the particles if it has won."""
+        tracker = self._tracker
+        pose, covariance = tracker.mean_and_covariance()
+        rival.correct(readings, tracker.cloud.summary().evidence, pose)
+        won = rival.judge(pose, covariance, readings)
+        if won is not None:
+            poses, weights = won
+            # The next scans must confirm the new particles.
+            tracker.place(poses[starts.rows_by_weight(weights, tracker.cloud.count)])
+            self._verdict.doubt()
+            self.expect_anywhere()
+
+    def _made(self) -> Rival:
+        """Return the rival, made on first use with the sensors of the filter."""
+        if self.rival is None:
+            tracker = self._tracker
+            options = tracker.options._replace(
+                least=PARTICLES, most=PARTICLES, seed=tracker.options.seed ^ _RIVAL, recovery=None, beam_skip=None
+            )
+            cloud = FilterCloud(tracker.sensors, PARTICLES, residual=options.resampling == "residual")
+            self.rival = Rival(Tracker(tracker.sensors, options, cloud))
+        return self.rival
+
+    # ---- state
+
+    def state(self) -> dict[str, Any]:
+        """Return the state as plain data."""
+        return {"everywhere": self.everywhere, "rival": None if self.active is None else self.active.state()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take over a state."""
+        self.everywhere = state["everywhere"]
+        if state["rival"] is not None:
+            self._made().restore(state["rival"])
+        elif self.rival is not None:
+            self.rival.stop()

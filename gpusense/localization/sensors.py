@@ -232,12 +232,13 @@ class Sensor:
         count = self.model.scanner.count
         if self._ranges is None:
             self._ranges = self.backend.empty_external(count, _DOUBLE)
-        if arrays.on_device(ranges) and self.backend.reads(ranges):
+        if type(ranges) is not np.ndarray and arrays.on_device(ranges) and self.backend.reads(ranges):
             adopted = self.backend.adopt(ranges, "ranges")
             if adopted.dtype == _DOUBLE and adopted.shape == (count,) and adopted.contiguous:
                 self.backend.copy(adopted.buffer, self._ranges, count * _DOUBLE.itemsize)
                 return
-        ranges = arrays.copied_to_host(ranges, self.backend, "ranges")
+        if type(ranges) is not np.ndarray:
+            ranges = arrays.copied_to_host(ranges, self.backend, "ranges")
         values = checks.array("ranges", ranges, (count,), finite=False, dtype=None)
         self._values = np.array(float64_readings(values, self.model.scanner))
         self._send(self._values, self._ranges)

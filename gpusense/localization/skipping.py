@@ -18,15 +18,16 @@ from gpusense.backends import arrays
 from gpusense.localization.cloud_state import SensorReadings
 from gpusense.localization.pose_algebra import mean_pose
 from gpusense.localization.sensors import Sensor
+from gpusense.localization.spread import WIDE
 
-# Number of evaluated particles; largest deviation of concentrated particles [m]; largest share of skipped beams.
-_ASKED, TOGETHER, _MOST_SKIPPED = 100, 0.5, 0.7
+# Number of evaluated particles; largest share of skipped beams.
+_ASKED, _MOST_SKIPPED = 100, 0.7
 
 
 def together(poses: np.ndarray, weights: np.ndarray) -> bool:
     """Return whether the deviation of particles is at most half a metre along x and along y."""
     d = poses[:, :2] - mean_pose(poses, weights)[:2]
-    return bool(np.all(weights @ d**2 <= TOGETHER**2 * weights.sum()))
+    return bool(np.all(weights @ d**2 <= WIDE**2 * weights.sum()))
 
 
 def skipped(

@@ -1,9 +1,9 @@
-"""Compute the probability that a pose is far off, from particles or from a covariance."""
+"""Compute the probability that a pose is far off, from particles or from a covariance, and its word."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,10 @@ from gpusense.localization.pose_algebra import wrap_angle
 
 Floats = NDArray[np.float64]
 
+Word = Literal["tracking", "uncertain", "lost"]
+WORDS: tuple[Word, ...] = ("tracking", "uncertain", "lost")
+# Bounds on the probability of "lost" (above) and "tracking" (up to).
+LOST, TRACKING = 0.5, 0.1
 # Least errors of a pose far off, in the definition of p_lost [m, rad].
 FAR, FAR_TURN = constants.FAR, constants.FAR_TURN
 # Largest deviations of concentrated particles [m, rad].
@@ -61,6 +65,16 @@ def spread_of(covariance: Floats) -> Spread:
 def is_wide(covariance: Floats) -> bool:
     """Return whether the position's deviation exceeds 0.5 m, or the heading's 0.25 rad."""
     return spread_of(covariance).wide
+
+
+def verdict_label(p_lost: float, wrong: float, *, wide: bool, apart: bool) -> Word:
+    """Return the word for the probability of being lost, and of another place being right by the scans.
+
+    A distribution that is ``apart`` may cover several places, so that scans cannot contradict a single one.
+    """
+    if wrong > LOST and not apart:
+        return "lost"
+    return "uncertain" if wide or apart or p_lost > TRACKING else "tracking"
 
 
 def share_off(covariance: Floats) -> float:

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.backends import arrays
-from gpusense.backends.base import Backend
 from gpusense.localization.cloud_state import Contents
-from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.options import Options
-from gpusense.localization.recovery import Recovery
 from gpusense.localization.sensors import Sensor
-from gpusense.localization.tracker import Tracker
-from gpusense.localization.verdict import Verdict
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,42 +71,6 @@ def constructor_options(options: Options, motion: Any) -> dict[str, Any]:
 def model_names(sensors: Sequence[Sensor]) -> tuple[str, ...]:
     """Return the names of the classes of models."""
     return tuple(type(sensor.model).__name__ for sensor in sensors)
-
-
-def memory_of(
-    tracker: Tracker, verdict: Verdict, recovery: Recovery, readings: Mapping[int, tuple[Any, ...]]
-) -> dict[str, Any]:
-    """Return the filter's state without particles as plain data, with arrays in host memory."""
-    return {
-        "tracker": plain_state(tracker), "verdict": plain_state(verdict), "recovery": recovery.state(),
-        "sensors": [plain_state(sensor) for sensor in tracker.sensors],
-        "readings": readings_on_host(readings, tracker.sensors[0].backend),
-    }  # fmt: skip
-
-
-def remember(
-    memory: Mapping[str, Any], tracker: Tracker, verdict: Verdict, recovery: Recovery
-) -> dict[int, tuple[Any, ...]]:
-    """Restore the result of ``memory_of``, and return the last readings."""
-    set_state(tracker, memory["tracker"])
-    set_state(verdict, memory["verdict"])
-    for sensor, values in zip(tracker.sensors, memory["sensors"], strict=True):
-        set_state(sensor, values)
-    recovery.restore(memory["recovery"])
-    return {index: tuple(map(copy.copy, reading)) for index, reading in memory["readings"].items()}
-
-
-def readings_on_host(readings: Mapping[int, tuple[Any, ...]], backend: Backend) -> dict[int, tuple[Any, ...]]:
-    """Return readings by the index of their sensor, with arrays in host memory."""
-    return {
-        index: tuple(
-            one
-            if one is None or isinstance(one, (int, float, str))
-            else arrays.copied_to_host(one, backend, "readings")
-            for one in each
-        )
-        for index, each in readings.items()
-    }
 
 
 def check_state(state: object, options: dict[str, Any], models: tuple[str, ...]) -> FilterState:

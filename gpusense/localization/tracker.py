@@ -13,7 +13,6 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.localization import starts
-from gpusense.localization.adaptive import kld_count
 from gpusense.localization.cloud_state import Contents, SensorReadings, Step
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.estimates import covariance_of, sample_size_of
@@ -22,8 +21,11 @@ from gpusense.localization.motion import STILL, SampledMotion
 from gpusense.localization.options import Options, settings_of_step
 from gpusense.localization.scoring import FilterCloud
 from gpusense.localization.sensors import Sensor
-from gpusense.localization.skipping import TOGETHER
+from gpusense.localization.spread import WIDE
 
+# Bins of the cloud [m, rad], error bound of its density, and normal quantile of the bound's probability.
+BIN, BIN_TURN = 0.5, math.radians(10)
+ERROR, QUANTILE = 0.02, 2.326
 # Interval between checks that a converged filter is still converged [corrections].
 _LOOK = 5
 
@@ -238,9 +240,22 @@ def _due_of(sensors: Sequence[Sensor], readings: Sequence[SensorReadings]) -> li
 
 
 def is_together(covariance: np.ndarray) -> bool:
-    """Return whether particles are concentrated: their deviations along x and y are at most half a metre.
+    """Return whether the deviations of a (3, 3) covariance along x and y are at most half a metre."""
+    return bool(max(covariance[0, 0], covariance[1, 1]) <= WIDE**2)
 
-    Args:
-        covariance: (3, 3) covariance of their poses [m, m, rad].
+
+def kld_count(poses: np.ndarray, least: int, most: int) -> int:
+    """Return the particles that bound the Kullback-Leibler distance to the density of (N, 3) poses by ``ERROR``.
+
+    Fox, *KLD-sampling: adaptive particle filters* (2001); *Probabilistic Robotics* table 8.4.
     """
-    return bool(max(covariance[0, 0], covariance[1, 1]) <= TOGETHER**2)
+    scaled = np.floor(poses / (BIN, BIN, BIN_TURN)).astype(np.int64)
+    scaled -= scaled.min(axis=0)
+    spans = scaled.max(axis=0) + 1
+    filled = len(np.unique((scaled[:, 0] * spans[1] + scaled[:, 1]) * spans[2] + scaled[:, 2]))
+    if filled < 2:
+        return least
+    k = filled - 1
+    part = 2 / (9 * k)
+    count = k / (2 * ERROR) * (1 - part + math.sqrt(part) * QUANTILE) ** 3
+    return int(min(max(math.ceil(count), least), most))

@@ -26,8 +26,7 @@ from gpusense.localization.landmark_gain import LEAST_GAIN, Evidence, Gains
 from gpusense.localization.motion import STILL, SampledMotion
 from gpusense.localization.scan_evidence import evidence_of_scan, ratio_of_features
 from gpusense.localization.sensors import Sensor
-from gpusense.localization.spread import Spread, is_wide, spread_of
-from gpusense.localization.words import TRACKING
+from gpusense.localization.spread import TRACKING, Spread, is_wide, spread_of
 from gpusense.models.landmark.base import FeatureModel
 from gpusense.world.scanner import float64_readings
 

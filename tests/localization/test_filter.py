@@ -7,10 +7,10 @@ import pytest
 
 import gpusense as gs
 from gpusense.interface.constants import SHARE
-from gpusense.localization.adaptive import kld_count
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.estimates import clustered
 from gpusense.localization.motion import STILL
+from gpusense.localization.tracker import kld_count
 
 GRID = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
 SCANNER = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.1, count=60, range_max=10.0)

@@ -198,12 +198,11 @@ def test_a_second_rival_has_nothing_of_the_first(backend, monkeypatch):
     assert found[0] == found[2] != found[1]
 
 
-def test_scans_of_a_robot_that_stands_count_once_for_a_rival(monkeypatch):
+def test_scans_of_a_robot_that_stands_count_once_for_a_rival():
     """The same furniture is wrong in all of them; scans far apart count in full."""
-    monkeypatch.setattr(rival, "evidence_of", lambda summary: -1.0)
     gains = []
     for step in (0.0, 100.0):
-        cloud = SimpleNamespace(summary=lambda: None)
+        cloud = SimpleNamespace(summary=lambda: SimpleNamespace(evidence=-1.0))
         one = rival.Rival(SimpleNamespace(sensors=[], cloud=cloud, weigh=lambda readings: None))
         for scan in range(20):
             one.correct([], -4.0, np.array([step * scan, 0.0, 0.0]))

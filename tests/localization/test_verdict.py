@@ -16,8 +16,7 @@ from gpusense.localization.beam_consistency import beam_consistency
 from gpusense.localization.belief import ALIKE, ALIKE_CHOSEN, FOUND, LENGTH, PER_METRE, PER_SCAN, STAYS, Belief
 from gpusense.localization.map_judge import MapJudge
 from gpusense.localization.scan_evidence import LIMITS, explained_of_scan, ratio_of_scan
-from gpusense.localization.spread import share_off, share_off_of
-from gpusense.localization.words import verdict_label
+from gpusense.localization.spread import share_off, share_off_of, verdict_label
 
 STILL = np.zeros((3, 3))
 

@@ -115,7 +115,7 @@ WORK = {
     "learn": ("sensors.Sensor", ("correlate", "begin_lesson")),
     "search": ("rival.Rival", ("start",)),
     "rival": ("rival.Rival", ("correct",)),
-    "deeper": ("cloud.Cloud", ("_draw",)),
+    "stage": ("cloud.Cloud", ("_draw",)),
     "record": ("cloud.RecordedProgram", ("__init__",)),
 }
 
@@ -141,13 +141,13 @@ def watch_work() -> list[str]:
             if hasattr(found, name):
                 watch(found, name, word)
     watch(importlib.import_module("gpusense.localization.cloud").Cloud, "_read", "copy")
-    passages = importlib.import_module("gpusense.localization.verdict").passages
+    judge = importlib.import_module("gpusense.localization.verdict").beam_consistency
 
     def judged(*arguments: Any) -> Any:
         done.append("judge")
-        return passages(*arguments)
+        return judge(*arguments)
 
-    importlib.import_module("gpusense.localization.verdict").passages = judged
+    importlib.import_module("gpusense.localization.verdict").beam_consistency = judged
     return done
 
 

@@ -174,14 +174,7 @@ def adopt_numbers(array: object, backend: Backend, name: str) -> Adopted:
 
 
 def adopt_integers(array: object, backend: Backend, name: str, kinds: tuple[str, ...]) -> Adopted:
-    """Return a C-contiguous array of integers on the device.
-
-    Args:
-        array: The array.
-        backend: The device.
-        name: The array's name in messages.
-        kinds: Names of the types that it may have.
-    """
+    """Return a C-contiguous array of integers on the device."""
     adopted = _adopt(array, backend, name)
     if adopted.dtype.name not in kinds:
         raise TypeError(f"{name}: must hold {' or '.join(kinds)} on the device, got {adopted.dtype.name}")

@@ -32,37 +32,22 @@ class Launcher(Protocol):
 
 @dataclass(frozen=True)
 class Adopted:
-    """An array in a device's memory: one of another library without a copy, or the head of a buffer.
+    """An array in a device's memory: one of another library without a copy, or the head of a buffer."""
 
-    Attributes:
-        buffer: Its numbers; only of a C-contiguous array.
-        shape: Its shape.
-        dtype: Type of its numbers.
-        strides: Bytes from one number to the next along each axis.
-        contiguous: True if it is C-contiguous.
-        to_host: Function that copies it to the host, after all earlier work.
-        owner: The object that keeps the memory alive.
-    """
-
-    buffer: Buffer
+    buffer: Buffer  # its numbers; only of a C-contiguous array
     shape: tuple[int, ...]
-    dtype: np.dtype
-    strides: tuple[int, ...]
-    contiguous: bool
-    to_host: Callable[[], np.ndarray]
-    owner: object
+    dtype: np.dtype  # type of its numbers
+    strides: tuple[int, ...]  # bytes from one number to the next along each axis
+    contiguous: bool  # true if it is C-contiguous
+    to_host: Callable[[], np.ndarray]  # function that copies it to the host, after all earlier work
+    owner: object  # the object that keeps the memory alive
 
 
 class Backend(ABC):
-    """A device that holds buffers and runs programs.
+    """A device that holds buffers and runs programs."""
 
-    Attributes:
-        info: The device behind this backend.
-        alignment: Parts of buffers begin at multiples of this number of bytes.
-    """
-
-    info: BackendInfo
-    alignment: int = 1
+    info: BackendInfo  # the device behind this backend
+    alignment: int = 1  # parts of buffers begin at multiples of this number of bytes
     # Memory of freed results on the host; None where a new array costs less.
     _results: ResultMemory | None = None
 

@@ -23,30 +23,19 @@ _LAST = "numpy"
 
 @dataclass(frozen=True)
 class Failure:
-    """A device that was passed over, or a backend without one.
+    """A device that was passed over, or a backend without one."""
 
-    Attributes:
-        selection: Its selection string; empty without one.
-        reason: The reason, with the remedy.
-        line: Device and reason, as messages have them.
-        lasting: True if the reason is an earlier, already reported verdict.
-    """
-
-    selection: str
-    reason: str
-    line: str
-    lasting: bool
+    selection: str  # its selection string; empty without one
+    reason: str  # the reason, with the remedy
+    line: str  # device and reason, as messages have them
+    lasting: bool  # true if the reason is an earlier, already reported verdict
 
 
 @dataclass
 class FallbackOrder:
-    """The usable devices, the fastest first.
+    """The usable devices, the fastest first."""
 
-    Attributes:
-        failures: The devices that were passed over so far.
-    """
-
-    failures: list[Failure] = field(default_factory=list)
+    failures: list[Failure] = field(default_factory=list)  # the devices that were passed over so far
 
     def __iter__(self) -> Iterator[Device]:
         """Yield devices; the library of a slower class is loaded only when needed."""

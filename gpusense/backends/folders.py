@@ -32,15 +32,10 @@ _reported: set[str] = set()
 
 
 class Place(NamedTuple):
-    """Where a cache may be.
-
-    Attributes:
-        folder: The folder.
-        variable: The environment variable that it comes from.
-    """
+    """Where a cache may be."""
 
     folder: Path
-    variable: str
+    variable: str  # the environment variable that it comes from
 
 
 def chosen_place() -> Place | None:

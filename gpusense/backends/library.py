@@ -10,17 +10,11 @@ from gpusense.backends.info import BackendInfo
 
 
 class Absent(NamedTuple):
-    """A part of a backend that is missing on this machine.
+    """A part of a backend that is missing on this machine."""
 
-    Attributes:
-        name: The library or device that is absent.
-        kind: The kind of device that it would provide, ``"cpu"`` or ``"gpu"``.
-        reason: The reason, with the remedy.
-    """
-
-    name: str
-    kind: str
-    reason: str
+    name: str  # the library or device that is absent
+    kind: str  # the kind of device that it would provide, ``"cpu"`` or ``"gpu"``
+    reason: str  # the reason, with the remedy
 
 
 class Library(ABC):

@@ -44,19 +44,12 @@ _NOISE = re.compile(r"^(\s*$|Stack dump|PLEASE submit|\s*#?\d+[.\s]|\d+ warnings
 
 @dataclass(frozen=True)
 class Outcome:
-    """The reports and the end of a child process.
+    """The reports and the end of a child process."""
 
-    Attributes:
-        said: Its reports, in order, without the last one.
-        failure: The failure in one line; empty where it ended well.
-        conclusive: False if something other than the driver may have ended it.
-        started: False if the system started no child.
-    """
-
-    said: list[dict[str, Any]]
-    failure: str = ""
-    conclusive: bool = True
-    started: bool = True
+    said: list[dict[str, Any]]  # its reports, in order, without the last one
+    failure: str = ""  # the failure in one line; empty where it ended well
+    conclusive: bool = True  # false if something other than the driver may have ended it
+    started: bool = True  # false if the system started no child
 
 
 def is_off() -> bool:

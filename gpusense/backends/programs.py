@@ -78,11 +78,6 @@ class ChangingProgram:
 class RecordedProgram:
     """The recording of a program.
 
-    Args:
-        backend: The device.
-        program: The program.
-        owners: Owners of its memory, which stay alive as long as it does.
-
     Attributes:
         flags: Flags of its launches.
         recording: The recording.

@@ -48,24 +48,15 @@ _OTHERWISE = "update the driver, or choose another device with GPUSENSE_BACKEND 
 
 @dataclass(frozen=True)
 class DeviceCheck:
-    """The families of kernels that a device runs correctly.
+    """The families of kernels that a device runs correctly."""
 
-    Attributes:
-        usable: Whether models can run on it.
-        lanes: Lanes that were proved; 1 if only scalar kernels were.
-        float64: Whether float64 kernels were proved.
-        reason: The failures, empty where nothing failed.
-        remedy: The remedy for them.
-        rate: Calls of a scan per second, the rank of a device in its class; 0 if not measured.
-        passing: True if the failure is due to the state of the machine, without a proof; such a verdict is not cached.
-    """
-
-    usable: bool
-    lanes: int
-    float64: bool
-    reason: str = ""
-    remedy: str = ""
-    rate: float = 0.0
+    usable: bool  # whether models can run on it
+    lanes: int  # lanes that were proved; 1 if only scalar kernels were
+    float64: bool  # whether float64 kernels were proved
+    reason: str = ""  # the failures, empty where nothing failed
+    remedy: str = ""  # the remedy for them
+    rate: float = 0.0  # calls of a scan per second, the rank of a device in its class; 0 if not measured
+    # True if the failure is due to the state of the machine, without a proof; such a verdict is not cached.
     passing: bool = False
 
 

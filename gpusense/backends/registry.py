@@ -19,33 +19,21 @@ from gpusense.backends.library import Library
 
 @dataclass(frozen=True)
 class Entry:
-    """A backend, known before its library is loaded.
+    """A backend, known before its library is loaded."""
 
-    Attributes:
-        name: The head of its selection strings.
-        package: The library that it needs, by the name under which Python imports it.
-        module: The module that holds its ``LIBRARY``.
-        install: The command that installs the library.
-        selections: Its selection strings, as messages list them.
-        speed: Rank of each kind of its devices among the devices of all backends; 0 is the fastest.
-        by_name: Whether a part of a device's or driver's name selects a device.
-        compiles: Whether a driver compiles its kernels, and so must be proved.
-        queue: The objects other than strings that select its devices, as messages name them; empty where none do.
-        array_module: The module whose class ``Array`` has its arrays, where they have neither DLPack nor the CUDA array
-            interface.
-        array_selection: The value of ``backend=`` that takes arrays on its devices; empty where none can be taken.
-    """
-
-    name: str
-    package: str
-    module: str
-    install: str
-    selections: tuple[str, ...]
-    speed: Mapping[str, int]
-    by_name: bool = False
-    compiles: bool = True
+    name: str  # the head of its selection strings
+    package: str  # the library that it needs, by the name under which Python imports it
+    module: str  # the module that holds its ``LIBRARY``
+    install: str  # the command that installs the library
+    selections: tuple[str, ...]  # its selection strings, as messages list them
+    speed: Mapping[str, int]  # rank of each kind of its devices among the devices of all backends; 0 is the fastest
+    by_name: bool = False  # whether a part of a device's or driver's name selects a device
+    compiles: bool = True  # whether a driver compiles its kernels, and so must be proved
+    # The objects other than strings that select its devices, as messages name them; empty where none do.
     queue: str = ""
+    # The module whose class ``Array`` has its arrays, where they have neither DLPack nor the CUDA array interface.
     array_module: str = ""
+    # The value of ``backend=`` that takes arrays on its devices; empty where none can be taken.
     array_selection: str = ""
 
     @property

@@ -31,13 +31,9 @@ _LEAST_THREADS = 4
 
 
 class Slot(ABC):
-    """A piece of page-locked memory.
+    """A piece of page-locked memory."""
 
-    Attributes:
-        bytes: The memory as an array of the host.
-    """
-
-    bytes: np.ndarray
+    bytes: np.ndarray  # the memory as an array of the host
 
     @abstractmethod
     def to_device(self, buffer: Any, first: int, size: int) -> None:

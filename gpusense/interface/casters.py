@@ -7,19 +7,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class CasterEntry:
-    """A caster as host and kernels know it.
+    """A caster as host and kernels know it."""
 
-    Attributes:
-        name: Its name for users.
-        file: The kernel file with its ``cast_ray``; the name is the same in OpenCL, Warp and NumPy.
-        flag: The flag that selects it in kernels; empty for the exact caster.
-        code: The meaning of the flag.
-    """
-
-    name: str
-    file: str
-    flag: str = ""
-    code: str = ""
+    name: str  # its name for users
+    file: str  # the kernel file with its ``cast_ray``; the name is the same in OpenCL, Warp and NumPy
+    flag: str = ""  # the flag that selects it in kernels; empty for the exact caster
+    code: str = ""  # the meaning of the flag
 
 
 # The caster's class, with its knobs, error and memory, is in gpusense/tables/casters.py.

@@ -19,30 +19,18 @@ _PASSED = ("define", "pragma")
 
 @dataclass
 class _Branches:
-    """An open ``#if`` and the state of its branches.
+    """An open ``#if`` and the state of its branches."""
 
-    Attributes:
-        line: Line number of the ``#if``.
-        taken: The current branch is kept.
-        done: This branch or an earlier one is kept.
-        ended: ``#else`` has been read.
-    """
-
-    line: int
-    taken: bool
-    done: bool
-    ended: bool = False
+    line: int  # line number of the ``#if``
+    taken: bool  # the current branch is kept
+    done: bool  # this branch or an earlier one is kept
+    ended: bool = False  # ``#else`` has been read
 
 
 def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
     """Keep the taken branches of ``#if`` and ``#elif`` with ``FLAG`` or ``!FLAG``; the rest becomes empty lines.
 
     Lines keep their numbers, so that a compiler's message names the place in the file.
-
-    Args:
-        text: The source.
-        flags: The flags that are set.
-        name: Name of the file for messages.
     """
     kept: list[str] = []
     open_branches: list[_Branches] = []

@@ -58,11 +58,7 @@ def has_opencl_source(name: str) -> bool:
 
 
 def warp_module(name: str) -> ModuleType:
-    """Import ``warp/<name>.py`` as ``gpusense.kernels.warp.<name>``.
-
-    Args:
-        name: The file's name without its suffix.
-    """
+    """Import ``warp/<name>.py`` as ``gpusense.kernels.warp.<name>``."""
     _register_package()
     return importlib.import_module(f"{_PACKAGE}.warp.{name}")
 

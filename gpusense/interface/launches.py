@@ -19,18 +19,12 @@ _NUMBERS = (int, float, np.integer, np.floating)
 
 
 class Launch(NamedTuple):
-    """A launch of a kernel.
+    """A launch of a kernel."""
 
-    Attributes:
-        kernel: Its name in the signature table.
-        flags: Flags of its code.
-        size: Number of work-items along each axis of the row's launch shape.
-        arguments: Buffers, scalars and structs in the order of the row; only those that the code of the flags takes.
-    """
-
-    kernel: str
-    flags: frozenset[str]
-    size: tuple[int, ...]
+    kernel: str  # its name in the signature table
+    flags: frozenset[str]  # flags of its code
+    size: tuple[int, ...]  # number of work-items along each axis of the row's launch shape
+    # Buffers, scalars and structs in the order of the row; only those that the code of the flags takes.
     arguments: tuple[Any, ...]
 
     @property

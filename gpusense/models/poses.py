@@ -50,11 +50,9 @@ class Poses:
         in_place: An array on the device must be used without a copy, now and later.
         late: A GPU may bound parts of many host poses, and so reveal values that are not finite, when their corners
             are asked for first.
-
-    Attributes:
-        hull: Corners of the box of poses on the device, if their owner knows them; they affect only the table.
     """
 
+    # Corners of the box of poses on the device, if their owner knows them; they affect only the table.
     hull: Corners | None = None
 
     # The worlds of the poses; None in a single map.
@@ -148,45 +146,27 @@ class Poses:
 
 
 class Frame(NamedTuple):
-    """The frame in which poses are placed.
+    """The frame in which poses are placed."""
 
-    Attributes:
-        window: The part of the map that the table covers.
-        cells: The map's shape, resolution and origin.
-        mount: The sensor's pose on the robot; its yaw belongs to the bearings.
-    """
-
-    window: Window
-    cells: Cells
-    mount: Mount
+    window: Window  # the part of the map that the table covers
+    cells: Cells  # the map's shape, resolution and origin
+    mount: Mount  # the sensor's pose on the robot; its yaw belongs to the bearings
 
 
 class PlacedPoses(NamedTuple):
-    """Sensor poses in the frame of a window, on the device.
+    """Sensor poses in the frame of a window, on the device."""
 
-    Attributes:
-        count: Their number.
-        corners: Corners of the box of the robot's poses; None where they are not known.
-        frame: The frame.
-        space: The workspace, which holds their buffers.
-        real: Precision of the buffers.
-        lows: Numbers of ``low``.
-        flags: Flags of the kernels that place them.
-        source: The poses of the request; None where the host has placed them.
-        lanes: Particles that the device computes at once.
-        inside: The worlds of the poses; None in a single map.
-    """
-
+    # Their number.
     count: int  # type: ignore[assignment]  # hides tuple.count
-    corners: Corners | None
+    corners: Corners | None  # corners of the box of the robot's poses; None where they are not known
     frame: Frame
-    space: Workspace
-    real: np.dtype
-    lows: int
-    flags: frozenset[str]
-    source: Buffer = None
-    lanes: int = 1
-    inside: InWorlds | None = None
+    space: Workspace  # the workspace, which holds their buffers
+    real: np.dtype  # precision of the buffers
+    lows: int  # numbers of ``low``
+    flags: frozenset[str]  # flags of the kernels that place them
+    source: Buffer = None  # the poses of the request; None where the host has placed them
+    lanes: int = 1  # particles that the device computes at once
+    inside: InWorlds | None = None  # the worlds of the poses; None in a single map
 
     @property
     def cell(self) -> Buffer:

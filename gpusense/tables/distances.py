@@ -62,14 +62,6 @@ def _by_lines(backend: Backend, obstacles: np.ndarray, squared: Buffer, most: in
 def squared_of_stack(backend: Backend, space: Workspace, occupied: Buffer, rows: int, cols: int, worlds: int) -> Buffer:
     """Start computing squared distances [cells^2] in several maps of one size with interleaved rows.
 
-    Args:
-        backend: The device.
-        space: Holds the distances.
-        occupied: (rows, worlds, cols) bytes.
-        rows: Rows of each map.
-        cols: Columns of each map.
-        worlds: Number of maps.
-
     Returns:
         (rows, worlds, cols) int32.
     """

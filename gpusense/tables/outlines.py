@@ -18,19 +18,13 @@ _DIRECTIONS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
 
 @dataclass(frozen=True)
 class Span:
-    """Windows of consecutive sides for fitting a line.
+    """Windows of consecutive sides for fitting a line."""
 
-    Attributes:
-        count: Sides of a window.
-        least: Fewest sides before and after the side.
-        residual: Largest mean square distance of the middles to the line [cells^2].
-        advance: For windows at corners, upper limit of the advance of the next CORNER sides along the line at the
-            nearer end [cells]; None for all windows.
-    """
-
-    count: int
-    least: int
-    residual: float
+    count: int  # sides of a window
+    least: int  # fewest sides before and after the side
+    residual: float  # largest mean square distance of the middles to the line [cells^2]
+    # For windows at corners, upper limit of the advance of the next CORNER sides along the line at the nearer end
+    # [cells]; None for all windows.
     advance: float | None = None
 
 
@@ -47,15 +41,10 @@ _PART = 1 << 15
 
 @dataclass(frozen=True)
 class Line:
-    """Line fitted to M windows of an outline.
+    """Line fitted to M windows of an outline."""
 
-    Attributes:
-        normal: (M, 2) unit vectors towards the free side.
-        residual: (M,) mean square distance of the middles of sides to the line [cells^2].
-    """
-
-    normal: np.ndarray
-    residual: np.ndarray
+    normal: np.ndarray  # (M, 2) unit vectors towards the free side
+    residual: np.ndarray  # (M,) mean square distance of the middles of sides to the line [cells^2]
 
 
 class Outlines:

@@ -33,25 +33,15 @@ class TableMemoryError(MemoryError):
 
 @dataclass(frozen=True)
 class MapState:
-    """Map and table; a single assignment replaces both, so that no interrupt can separate them.
+    """Map and table; a single assignment replaces both, so that no interrupt can separate them."""
 
-    Attributes:
-        grid: The map.
-        obstacles: (H, W) mask of the map; None if an interrupted update may have written to it.
-        shared: True if the array of obstacles belongs to the grid and is read-only.
-        table: The table, or None.
-        window: The table's window; empty without a table.
-        preparations: Number of tables made.
-        version: Counter of changes.
-    """
-
-    grid: OccupancyGrid
-    obstacles: np.ndarray | None = None
-    shared: bool = True
-    table: Buffer = None
-    window: Window = _NOWHERE
-    preparations: int = 0
-    version: int = 0
+    grid: OccupancyGrid  # the map
+    obstacles: np.ndarray | None = None  # (H, W) mask of the map; None if an interrupted update may have written to it
+    shared: bool = True  # true if the array of obstacles belongs to the grid and is read-only
+    table: Buffer = None  # the table, or None
+    window: Window = _NOWHERE  # the table's window; empty without a table
+    preparations: int = 0  # number of tables made
+    version: int = 0  # counter of changes
 
 
 class ReachableMap:

@@ -33,15 +33,10 @@ _FOUR_SECTORS = 1 << 25
 
 @dataclass(frozen=True)
 class Planes:
-    """Storage layout of empty rectangles.
+    """Storage layout of empty rectangles."""
 
-    Attributes:
-        sectors: Sectors per quadrant: 1, 2 or 4. More sectors make steps longer and tables larger.
-        group: Rows of a group: 1, or ``ROWS`` on GPUs.
-    """
-
-    sectors: int
-    group: int = 1
+    sectors: int  # sectors per quadrant: 1, 2 or 4. More sectors make steps longer and tables larger.
+    group: int = 1  # rows of a group: 1, or ``ROWS`` on GPUs
 
     def __post_init__(self) -> None:
         if self.group not in (1, ROWS):

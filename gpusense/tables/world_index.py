@@ -76,21 +76,13 @@ class WorldIndex:
 
 
 class InWorlds(NamedTuple):
-    """Worlds of some poses on the device.
-
-    Attributes:
-        worlds: The worlds.
-        index: Index of the world of each pose.
-        ignore: Index of the shape that each pose does not see; not read without shapes.
-        wide: Numbers of 32 bits of each index of a world.
-        wide_ignore: The same of each index of a shape.
-    """
+    """Worlds of some poses on the device."""
 
     worlds: ManyWorlds
-    index: Buffer
-    ignore: Buffer
-    wide: int
-    wide_ignore: int
+    index: Buffer  # index of the world of each pose
+    ignore: Buffer  # index of the shape that each pose does not see; not read without shapes
+    wide: int  # numbers of 32 bits of each index of a world
+    wide_ignore: int  # the same of each index of a shape
 
     @property
     def crowd(self) -> Crowd:

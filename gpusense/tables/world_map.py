@@ -17,10 +17,6 @@ from gpusense.world.windows import Window
 class WorldMap:
     """The table of all worlds for a model, in place of a map's reachable window.
 
-    Args:
-        worlds: The worlds.
-        make: Function that returns the table.
-
     Attributes:
         grid: The worlds.
         window: A window of the size of the largest world.

@@ -12,21 +12,13 @@ from gpusense.backends.workspace import Workspace
 
 
 class Stack(NamedTuple):
-    """Some worlds of one size whose tables are made together.
+    """Some worlds of one size whose tables are made together."""
 
-    Attributes:
-        indices: (W,) indices of the worlds.
-        rows: Rows of each.
-        cols: Columns of each.
-        place: First cell of each in tables with a ring, on the device.
-        space: Memory besides the tables.
-    """
-
-    indices: np.ndarray
-    rows: int
-    cols: int
-    place: Buffer
-    space: Workspace
+    indices: np.ndarray  # (W,) indices of the worlds
+    rows: int  # rows of each
+    cols: int  # columns of each
+    place: Buffer  # first cell of each in tables with a ring, on the device
+    space: Workspace  # memory besides the tables
 
     @property
     def worlds(self) -> int:
@@ -35,14 +27,8 @@ class Stack(NamedTuple):
 
 
 class Table(NamedTuple):
-    """A table of all worlds.
+    """A table of all worlds."""
 
-    Attributes:
-        buffer: The table.
-        size: Its size [bytes].
-        fill: Function that fills the parts of a stack of worlds.
-    """
-
-    buffer: Buffer
-    size: int
-    fill: Callable[[Stack, Buffer], None]
+    buffer: Buffer  # the table
+    size: int  # its size [bytes]
+    fill: Callable[[Stack, Buffer], None]  # function that fills the parts of a stack of worlds

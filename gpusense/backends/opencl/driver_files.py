@@ -25,15 +25,10 @@ _INTEL = ("intel-opencl-rt", "libintelocl.so")
 
 @dataclass(frozen=True)
 class Driver:
-    """A driver as its ``.icd`` file has it.
+    """A driver as its ``.icd`` file has it."""
 
-    Attributes:
-        file: The file; Intel's library itself where the file is made here.
-        library: The library that the loader loads.
-    """
-
-    file: Path
-    library: str
+    file: Path  # the file; Intel's library itself where the file is made here
+    library: str  # the library that the loader loads
 
 
 def installed() -> tuple[tuple[Driver, ...], bool]:

@@ -46,17 +46,11 @@ _NAMES = ("OCL_", "OPENCL_", "POCL_")
 
 @dataclass(frozen=True)
 class Choice:
-    """The drivers that the loader loads.
+    """The drivers that the loader loads."""
 
-    Attributes:
-        drivers: The drivers, where the loader does not find them by itself; else None.
-        left_out: Drivers that end the process, with the reason.
-        failure: Why no driver can be loaded; empty if some can.
-    """
-
-    drivers: tuple[Driver, ...] | None
-    left_out: tuple[tuple[str, str], ...] = ()
-    failure: str = ""
+    drivers: tuple[Driver, ...] | None  # the drivers, where the loader does not find them by itself; else None
+    left_out: tuple[tuple[str, str], ...] = ()  # drivers that end the process, with the reason
+    failure: str = ""  # why no driver can be loaded; empty if some can
 
 
 _lock = threading.RLock()

@@ -32,19 +32,12 @@ NAME = "Portable Computing Language"
 
 
 class Library(NamedTuple):
-    """A library of OpenCL functions in PoCL.
+    """A library of OpenCL functions in PoCL."""
 
-    Attributes:
-        name: The end of its file's name.
-        needs: Instruction sets, by Linux's names, with which PoCL chooses it.
-        processor: The processor for which it was compiled, by LLVM's name.
-        uses: Further instruction sets that code for that processor has.
-    """
-
-    name: str
-    needs: frozenset[str]
-    processor: str
-    uses: frozenset[str] = frozenset()
+    name: str  # the end of its file's name
+    needs: frozenset[str]  # instruction sets, by Linux's names, with which PoCL chooses it
+    processor: str  # the processor for which it was compiled, by LLVM's name
+    uses: frozenset[str] = frozenset()  # further instruction sets that code for that processor has
 
 
 def _sets(words: str) -> frozenset[str]:

@@ -89,14 +89,7 @@ class PoclKernels:
     def built(
         self, key: str, kernels: Sequence[str], compiled: Callable[[], _Program], loaded: Callable[[bytes], _Program]
     ) -> _Program:
-        """Return a program, made of its bitcode; it is compiled where its entry has none.
-
-        Args:
-            key: Key of the program's entry.
-            kernels: Names of its kernels, as :func:`own_name` returns them.
-            compiled: Compiles it from its source.
-            loaded: Makes it of bitcode.
-        """
+        """Return a program, made of its bitcode; it is compiled where its entry has none."""
         file = self.folder / _hash(key) / _BITCODE
         with self._lock, self.building(key):
             self._folders[key] |= {file.parent.name, *kernels}

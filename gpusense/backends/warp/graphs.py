@@ -32,17 +32,11 @@ SHORT = "a graph would save nothing"
 
 
 class Capture(NamedTuple):
-    """An attempt to capture steps.
+    """An attempt to capture steps."""
 
-    Attributes:
-        graph: The graph; None where there is none.
-        reason: Why there is none.
-        final: True if the driver refuses these steps, so that another attempt is useless.
-    """
-
-    graph: Any
-    reason: str = ""
-    final: bool = False
+    graph: Any  # the graph; None where there is none
+    reason: str = ""  # why there is none
+    final: bool = False  # true if the driver refuses these steps, so that another attempt is useless
 
 
 class GraphCache:

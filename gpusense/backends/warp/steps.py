@@ -11,19 +11,12 @@ from gpusense.backends.recording import pluralize
 
 
 class Step(ABC):
-    """Work that a stream does.
+    """Work that a stream does."""
 
-    Attributes:
-        key: The work and its memory: steps of equal keys are the same.
-        launches: Number of launches in it.
-        copies: Number of copies in it.
-        reports: True if it reports how the call with it is started.
-    """
-
-    key: Hashable
-    launches: int = 0
-    copies: int = 0
-    reports: bool = False
+    key: Hashable  # the work and its memory: steps of equal keys are the same
+    launches: int = 0  # number of launches in it
+    copies: int = 0  # number of copies in it
+    reports: bool = False  # true if it reports how the call with it is started
 
     @abstractmethod
     def start(self, stream: wp.Stream | None) -> None:

@@ -37,21 +37,13 @@ _PER_READING = 8
 
 @dataclass(frozen=True)
 class Call:
-    """Values that all particles of a call share.
+    """Values that all particles of a call share."""
 
-    Attributes:
-        prepared: The evaluated features.
-        places: Places of the landmarks of known features among the buckets.
-        fixed: The constant term: log-likelihoods of known false positives.
-        flags: Flags of the scoring kernel.
-        joint: True if the features are assigned jointly.
-    """
-
-    prepared: PreparedFeatures
-    places: np.ndarray
-    fixed: float
-    flags: frozenset[str]
-    joint: bool
+    prepared: PreparedFeatures  # the evaluated features
+    places: np.ndarray  # places of the landmarks of known features among the buckets
+    fixed: float  # the constant term: log-likelihoods of known false positives
+    flags: frozenset[str]  # flags of the scoring kernel
+    joint: bool  # true if the features are assigned jointly
 
     @property
     def count(self) -> int:

@@ -104,17 +104,11 @@ def check_correspondence(correspondence: object, count: int, landmarks: int) -> 
 
 @dataclass(frozen=True)
 class Reach:
-    """Bounds of the landmarks that can matter to a feature.
+    """Bounds of the landmarks that can matter to a feature."""
 
-    Attributes:
-        reach: Distance of the disc's centre along the bearing [m].
-        radius: Radius of the disc [m]; negative where no landmark matters.
-        hole: Least distance from the sensor [m].
-    """
-
-    reach: float
-    radius: float
-    hole: float
+    reach: float  # distance of the disc's centre along the bearing [m]
+    radius: float  # radius of the disc [m]; negative where no landmark matters
+    hole: float  # least distance from the sensor [m]
 
 
 def reach_of(p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarray, bound: float) -> Reach:
@@ -156,19 +150,12 @@ def reach_of(p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarr
 
 @dataclass(frozen=True)
 class PreparedFeatures:
-    """Features as kernels take them.
+    """Features as kernels take them."""
 
-    Attributes:
-        columns: (K,) positions of the features that are evaluated.
-        numbers: (K, FEATURE) in the model's precision; see ``gpusense.reference.landmarks``.
-        measured: (K, 3) whether range, bearing and signature were measured.
-        false: (F,) float64 log densities of each feature as a false positive; 0 where nothing was measured.
-    """
-
-    columns: np.ndarray
-    numbers: np.ndarray
-    measured: np.ndarray
-    false: np.ndarray
+    columns: np.ndarray  # (K,) positions of the features that are evaluated
+    numbers: np.ndarray  # (K, FEATURE) in the model's precision; see ``gpusense.reference.landmarks``
+    measured: np.ndarray  # (K, 3) whether range, bearing and signature were measured
+    false: np.ndarray  # (F,) float64 log densities of each feature as a false positive; 0 where nothing was measured
 
     @property
     def radius(self) -> np.ndarray:

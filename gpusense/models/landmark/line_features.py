@@ -66,21 +66,13 @@ def _check_covariances(covariance: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class _Whitened:
-    """Covariances of features by Cholesky's factor: the exponent is (a da)^2 + (b da + c dr)^2.
+    """Covariances of features by Cholesky's factor: the exponent is (a da)^2 + (b da + c dr)^2."""
 
-    Attributes:
-        a: (K,) factor of the angle.
-        b: (K,) factor of the angle in the second root.
-        c: (K,) factor of the distance.
-        slope: (K,) change of the expected distance with the angle [m/rad].
-        spread: (K,) standard deviation of the distance [m].
-    """
-
-    a: np.ndarray
-    b: np.ndarray
-    c: np.ndarray
-    slope: np.ndarray
-    spread: np.ndarray
+    a: np.ndarray  # (K,) factor of the angle
+    b: np.ndarray  # (K,) factor of the angle in the second root
+    c: np.ndarray  # (K,) factor of the distance
+    slope: np.ndarray  # (K,) change of the expected distance with the angle [m/rad]
+    spread: np.ndarray  # (K,) standard deviation of the distance [m]
 
 
 def _whitened(features: np.ndarray, p: LineParameters) -> _Whitened:

@@ -16,21 +16,15 @@ _SPREAD = 4.0
 
 @dataclass(frozen=True)
 class Sensor:
-    """Constants of a sensor and its map, in float64.
+    """Constants of a sensor and its map, in float64."""
 
-    Attributes:
-        scales: 1 / (sigma sqrt 2) of range, bearing and signature; 0 for a part that is left out.
-        peaks: Logarithms of the components' largest densities, before the mass is divided out.
-        least_masses: Logarithms of the least mass of each, including a bearing's on a full circle.
-        uniforms: Logarithms of the uniform densities of range, bearing and signature.
-        span: The smallest and largest signature.
-    """
-
+    # 1 / (sigma sqrt 2) of range, bearing and signature; 0 for a part that is left out.
     scales: tuple[float, float, float]
-    peaks: tuple[float, float, float]
+    peaks: tuple[float, float, float]  # logarithms of the components' largest densities, before the mass is divided out
+    # Logarithms of the least mass of each, including a bearing's on a full circle.
     least_masses: tuple[float, float, float]
-    uniforms: tuple[float, float, float]
-    span: tuple[float, float]
+    uniforms: tuple[float, float, float]  # logarithms of the uniform densities of range, bearing and signature
+    span: tuple[float, float]  # the smallest and largest signature
 
 
 def span_of(p: LandmarkParameters, landmarks: LandmarkMap) -> tuple[float, float]:

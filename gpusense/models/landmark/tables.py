@@ -19,26 +19,17 @@ from gpusense.world.parameters import LandmarkParameters
 
 @dataclass(frozen=True)
 class LandmarkTables:
-    """Buffers by the names of the kernels' arguments.
+    """Buffers by the names of the kernels' arguments."""
 
-    Attributes:
-        landmark: (M,) real4 positions in the buckets' frame, by place, and their rounding errors (low parts).
-        normal: (M,) real4 normals of lines, x and y, each with its rounding error; one number for landmarks.
-        signature: (M,) real4 signatures, their rounding errors (low parts), and -log of their mass on the span; for
-            lines half their length, and 1 if they are seen from both sides.
-        start: (rows * columns + 1,) place of the first landmark of each bucket.
-        terms: The sensor's numbers.
-        arcs: Arcs of the slopes i / 8.
-        norm: The largest -log of a signature's mass.
-    """
-
-    landmark: Buffer
-    normal: Buffer
+    landmark: Buffer  # (M,) real4 positions in the buckets' frame, by place, and their rounding errors (low parts)
+    normal: Buffer  # (M,) real4 normals of lines, x and y, each with its rounding error; one number for landmarks
+    # (M,) real4 signatures, their rounding errors (low parts), and -log of their mass on the span; for lines half
+    # their length, and 1 if they are seen from both sides.
     signature: Buffer
-    start: Buffer
-    terms: Buffer
-    arcs: Buffer
-    norm: float
+    start: Buffer  # (rows * columns + 1,) place of the first landmark of each bucket
+    terms: Buffer  # the sensor's numbers
+    arcs: Buffer  # arcs of the slopes i / 8
+    norm: float  # the largest -log of a signature's mass
 
 
 def upload_tables(

@@ -33,21 +33,13 @@ _FLAT = 1e-7
 
 @dataclass(frozen=True)
 class Draws:
-    """Random numbers of N poses, or of S N poses of S scans.
+    """Random numbers of N poses, or of S N poses of S scans."""
 
-    Attributes:
-        poses: (N, 3) or (S N, 3) poses.
-        shape: (N,) or (S, N).
-        particle: Index of each pose in its scan.
-        step: Step of each pose.
-        key: The seed's two words.
-    """
-
-    poses: Floats
-    shape: tuple[int, ...]
-    particle: NDArray[np.int64]
-    step: NDArray[np.int64]
-    key: tuple[int, int]
+    poses: Floats  # (N, 3) or (S N, 3) poses
+    shape: tuple[int, ...]  # (N,) or (S, N)
+    particle: NDArray[np.int64]  # index of each pose in its scan
+    step: NDArray[np.int64]  # step of each pose
+    key: tuple[int, int]  # the seed's two words
 
     def uniform(self, stream: int, call: int = 0) -> tuple[Floats, Floats]:
         """Return two independent numbers in (0, 1) for each pose."""

@@ -17,19 +17,12 @@ _BEYOND = 1.5
 
 @dataclass(frozen=True)
 class BeamDensity:
-    """The density of a beam model.
+    """The density of a beam model."""
 
-    Attributes:
-        mixtures: Parameters of each bin in the kernels' order, first for beams without a hit.
-        cosines: Cosines between the bins.
-        incidence: The parameters by angle of incidence, or None.
-        table: The table of a sensor in place of the mixtures, or None.
-    """
-
-    mixtures: tuple[BeamParameters, ...]
-    cosines: np.ndarray
-    incidence: IncidenceParameters | None = None
-    table: SensorTable | None = None
+    mixtures: tuple[BeamParameters, ...]  # parameters of each bin in the kernels' order, first for beams without a hit
+    cosines: np.ndarray  # cosines between the bins
+    incidence: IncidenceParameters | None = None  # the parameters by angle of incidence, or None
+    table: SensorTable | None = None  # the table of a sensor in place of the mixtures, or None
 
     @property
     def parameters(self) -> BeamParameters | SensorTable | None:

@@ -34,14 +34,7 @@ _MOMENTS = (
 
 
 def scene_notes(pipeline: BeamPipeline, last: LastCall, density: BeamDensity, weights_note: str) -> SceneNotes:
-    """Return the report's title and the parts left out, kept, and removable, as of the last call.
-
-    Args:
-        pipeline: The stages of the model.
-        last: The last call.
-        density: The density of the model.
-        weights_note: Words of the title about weights of other programs.
-    """
+    """Return the report's title and the parts left out, kept, and removable, as of the last call."""
     flags, real, weights = last.flags, pipeline.real.name, pipeline.context.weights
     mixtures, discrete = density.mixtures, density.table is not None
     tabulated = discrete or pipeline.mixture.table is not None

@@ -16,23 +16,14 @@ from gpusense.world.scanner import Scanner, classify_ranges
 
 
 class OmittedReadings(NamedTuple):
-    """Readings of a scan that are not evaluated at every pose; they are counted when asked for.
+    """Readings of a scan that are not evaluated at every pose; they are counted when asked for."""
 
-    Attributes:
-        hit: (K,) whether each reading is a range.
-        far: True if it is a max reading.
-        used: True if it is a used range.
-        used_max: True if it is a used max reading.
-        constant: True if it is part of the constant term.
-        informs: True if max readings have information: z_max > 0.
-    """
-
-    hit: np.ndarray
-    far: np.ndarray
-    used: np.ndarray
-    used_max: np.ndarray
-    constant: np.ndarray
-    informs: bool
+    hit: np.ndarray  # (K,) whether each reading is a range
+    far: np.ndarray  # true if it is a max reading
+    used: np.ndarray  # true if it is a used range
+    used_max: np.ndarray  # true if it is a used max reading
+    constant: np.ndarray  # true if it is part of the constant term
+    informs: bool  # true if max readings have information: z_max > 0
 
     @property
     def missing(self) -> int:

@@ -15,17 +15,11 @@ from gpusense.world.scanner import Scanner
 
 @dataclass(frozen=True)
 class Cones:
-    """Cones of a sensor.
+    """Cones of a sensor."""
 
-    Attributes:
-        rays: Rays of each cone; 1 for a laser.
-        critical: Least cosine of an angle of incidence at which a surface returns; 0 without a limit.
-        incidence: True if angles of incidence are computed, not ranges.
-    """
-
-    rays: int = 1
-    critical: float = 0.0
-    incidence: bool = False
+    rays: int = 1  # rays of each cone; 1 for a laser
+    critical: float = 0.0  # least cosine of an angle of incidence at which a surface returns; 0 without a limit
+    incidence: bool = False  # true if angles of incidence are computed, not ranges
 
     @property
     def struct(self) -> structs.Cone:

@@ -15,17 +15,12 @@ from gpusense._util import checks
 
 
 class Differentiable(NamedTuple):
-    """The calls of a model that an operation makes.
+    """The calls of a model that an operation makes."""
 
-    Attributes:
-        log_p: Log-likelihoods of poses.
-        gradient: Log-likelihoods of poses, and their derivatives with respect to the poses; NumPy arrays.
-        real: Precision of both.
-    """
-
-    log_p: Callable[[Any], Any]
+    log_p: Callable[[Any], Any]  # log-likelihoods of poses
+    # Log-likelihoods of poses, and their derivatives with respect to the poses; NumPy arrays.
     gradient: Callable[[Any], tuple[np.ndarray, np.ndarray]]
-    real: np.dtype
+    real: np.dtype  # precision of both
 
 
 def is_recorded(poses: object) -> bool:
@@ -98,10 +93,6 @@ def _jax_log_likelihood(jax: Any, poses: Any, calls: Differentiable) -> Any:
 
 def _batches(poses: np.ndarray, axes: int) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
     """Join batches of (N, 3) or (S, N, 3) poses to one of more poses.
-
-    Args:
-        poses: (..., N, 3) or (..., S, N, 3).
-        axes: Axes of a batch, 2 or 3.
 
     Returns:
         (M, 3) or (S, M, 3) poses, and a function that splits results of this leading shape into the batches.

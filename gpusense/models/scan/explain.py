@@ -9,13 +9,7 @@ from gpusense.models.scan.scoring import LastCall
 
 
 def plan_of_call(notes: SceneNotes, context: ModelContext, last: LastCall) -> Plan:
-    """Return the plan as of the last call.
-
-    Args:
-        notes: The notes of the model on its scene.
-        context: The model's device and rules.
-        last: The last call.
-    """
+    """Return the plan as of the last call."""
     device = context.backend.info
     title = f"{notes.title}, {device.selection} ({device.name})"
     if not context.rules.specialize:

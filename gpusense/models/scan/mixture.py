@@ -24,20 +24,13 @@ _MOST_BINS = 8192
 
 @dataclass(frozen=True)
 class Mixture:
-    """The mixture of a beam model, as arguments of kernels.
+    """The mixture of a beam model, as arguments of kernels."""
 
-    Attributes:
-        flags: Flags of its components.
-        terms: Its numbers; each field is an array with a number for each bin of angles of incidence.
-        masses: Tables of the masses of hits; one 0 without a table.
-        cosines: Cosines between these bins.
-        table: Log densities over readings and expected ranges; None where the mixture is evaluated.
-    """
-
-    flags: frozenset[str]
-    terms: MixtureTerms
-    masses: np.ndarray
-    cosines: np.ndarray = field(default_factory=lambda: np.zeros(1))
+    flags: frozenset[str]  # flags of its components
+    terms: MixtureTerms  # its numbers; each field is an array with a number for each bin of angles of incidence
+    masses: np.ndarray  # tables of the masses of hits; one 0 without a table
+    cosines: np.ndarray = field(default_factory=lambda: np.zeros(1))  # cosines between these bins
+    # Log densities over readings and expected ranges; None where the mixture is evaluated.
     table: np.ndarray | None = None
 
     @property

@@ -367,9 +367,6 @@ class ScanModel(Pickled):
     def plan(self, *, measure: bool = False) -> Plan:
         """Return the report of :meth:`explain` as data.
 
-        Args:
-            measure: As in :meth:`explain`.
-
         Returns:
             The title, the flags of the code, and the parts that are left out, kept, and could go.
         """

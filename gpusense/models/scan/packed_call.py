@@ -189,9 +189,6 @@ class PackedCallCache:
 
     Results have the bits of ordinary calls; a call for which this is not certain is left to the ordinary path.
 
-    Args:
-        pipeline: The stages of the model.
-
     Attributes:
         last: The last call; None if it was not a short one.
     """

@@ -33,37 +33,22 @@ TOGETHER = {"gpu": 1 << 22, "cpu": 1 << 20}
 
 
 class Tiles(NamedTuple):
-    """A launch in tiles of particles and rays.
+    """A launch in tiles of particles and rays."""
 
-    Attributes:
-        spread: log2 of the number of groups of each tile.
-        order: The order of the particles, where sorting pays.
-    """
-
-    spread: int
-    order: Order | None
+    spread: int  # log2 of the number of groups of each tile
+    order: Order | None  # the order of the particles, where sorting pays
 
 
 class ScanLaunch(NamedTuple):
-    """A piece of a request on the device, from which its program follows.
-
-    Attributes:
-        readings: The readings.
-        placed: The poses.
-        table: The map's table for the window of the poses.
-        log_p: The buffer for the log-likelihoods.
-        flags: Flags of the scoring kernel.
-        tiles: The tiles of GPUs, which sum in a second launch; None if a single launch does everything.
-        per_beam: True if the log-likelihoods of single readings are kept.
-    """
+    """A piece of a request on the device, from which its program follows."""
 
     readings: Readings
-    placed: PlacedPoses
-    table: Buffer
-    log_p: Buffer
-    flags: frozenset[str]
-    tiles: Tiles | None
-    per_beam: bool
+    placed: PlacedPoses  # the poses
+    table: Buffer  # the map's table for the window of the poses
+    log_p: Buffer  # the buffer for the log-likelihoods
+    flags: frozenset[str]  # flags of the scoring kernel
+    tiles: Tiles | None  # the tiles of GPUs, which sum in a second launch; None if a single launch does everything
+    per_beam: bool  # true if the log-likelihoods of single readings are kept
 
     @property
     def batch(self) -> ScanBatch:

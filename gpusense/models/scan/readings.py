@@ -25,34 +25,21 @@ _GROUP = 64
 
 
 class Readings(NamedTuple):
-    """Readings of S scans on the device.
+    """Readings of S scans on the device."""
 
-    Attributes:
-        scans: S.
-        rays: Largest number of rays of a scan.
-        readings: Largest number of readings of a scan.
-        flags: Flags of kernels that score them.
-        arguments: Their arguments of scoring kernels, by name.
-        sums: Their arguments of ``sum_parts``, by name: counts of readings or blocks, and constant terms of scans. A
-            single scan of the host has none.
-        constant_term: The constant term of a single scan.
-        key: All values on which the launches depend, except buffers.
-        reach: Longest range in cells, and a bound of its error; infinite if unknown.
-        constants_there: True if a constant term of a single scan is in ``constant_terms`` on the device.
-        placing: The launch that places them on the device; None where the host has placed them.
-    """
-
-    scans: int
-    rays: int
-    readings: int
-    flags: frozenset[str]
-    arguments: dict[str, Any]
+    scans: int  # S
+    rays: int  # largest number of rays of a scan
+    readings: int  # largest number of readings of a scan
+    flags: frozenset[str]  # flags of kernels that score them
+    arguments: dict[str, Any]  # their arguments of scoring kernels, by name
+    # Their arguments of ``sum_parts``, by name: counts of readings or blocks, and constant terms of scans. A single
+    # scan of the host has none.
     sums: dict[str, Any]
-    constant_term: float
-    key: Hashable = None
-    reach: float = np.inf
-    constants_there: bool = False
-    placing: Placing | None = None
+    constant_term: float  # the constant term of a single scan
+    key: Hashable = None  # all values on which the launches depend, except buffers
+    reach: float = np.inf  # longest range in cells, and a bound of its error; infinite if unknown
+    constants_there: bool = False  # true if a constant term of a single scan is in ``constant_terms`` on the device
+    placing: Placing | None = None  # the launch that places them on the device; None where the host has placed them
 
     @property
     def constants(self) -> dict[str, Any]:
@@ -67,46 +54,27 @@ class Readings(NamedTuple):
 
 @dataclass(frozen=True)
 class Placing:
-    """Readings that the kernel ``place_inputs`` places, along with poses; see the kernel file ``scan``.
+    """Readings that the kernel ``place_inputs`` places, along with poses; see the kernel file ``scan``."""
 
-    Attributes:
-        flags: Flags of the kernel.
-        arguments: Its arguments that are not those of ``place_poses``.
-    """
-
-    flags: frozenset[str]
-    arguments: dict[str, Any]
+    flags: frozenset[str]  # flags of the kernel
+    arguments: dict[str, Any]  # its arguments that are not those of ``place_poses``
 
 
 @dataclass(frozen=True)
 class ReadingLayout:
-    """Rules for readings that are on the device.
+    """Rules for readings that are on the device."""
 
-    Attributes:
-        scanner: The scanner's geometry.
-        beams: The beams that are used.
-        vectors: (K, C, 2) float64 cosines and sines of the rays of each beam.
-        z_max: Probability of a max reading.
-        end_points: Whether readings become end points.
-        max_depends: Whether the probability of a max reading depends on the pose.
-        possible: True if some range is possible.
-        specialize: False leaves nothing out.
-        top: Largest range below a max reading.
-        guard_scale: Bound of the rounding errors of end points per cell of range.
-        real: Precision of the model.
-    """
-
-    scanner: Scanner
-    beams: Beams
-    vectors: np.ndarray = field(repr=False)
-    z_max: float
-    end_points: bool
-    max_depends: bool
-    possible: bool
-    specialize: bool
-    top: float
-    guard_scale: float
-    real: np.dtype
+    scanner: Scanner  # the scanner's geometry
+    beams: Beams  # the beams that are used
+    vectors: np.ndarray = field(repr=False)  # (K, C, 2) float64 cosines and sines of the rays of each beam
+    z_max: float  # probability of a max reading
+    end_points: bool  # whether readings become end points
+    max_depends: bool  # whether the probability of a max reading depends on the pose
+    possible: bool  # true if some range is possible
+    specialize: bool  # false leaves nothing out
+    top: float  # largest range below a max reading
+    guard_scale: float  # bound of the rounding errors of end points per cell of range
+    real: np.dtype  # precision of the model
 
     @property
     def choice(self) -> BeamChoice:

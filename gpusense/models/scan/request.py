@@ -23,27 +23,17 @@ Known = MutableMapping[int | None, Poses]
 
 
 class Request(NamedTuple):
-    """S scans of N poses each.
+    """S scans of N poses each."""
 
-    Attributes:
-        ranges: (S, K) readings [m].
-        poses: The S N poses, one scan after the other.
-        shape: Shape of the result, (N,) or (S, N).
-        result: Memory of the result.
-        parts: (S, N, K) log-likelihoods of the readings; (S, N, 0) where they are not requested.
-        per_beam: True if they are requested, of a scanner with beams.
-        before: Called once readings are on the device; it starts the launches that write the poses.
-        own_scans: True if each of (N, 3) poses has a separate scan.
-    """
-
-    ranges: np.ndarray
-    poses: Poses
-    shape: tuple[int, ...]
-    result: Result
-    parts: np.ndarray
-    per_beam: bool
+    ranges: np.ndarray  # (S, K) readings [m]
+    poses: Poses  # the S N poses, one scan after the other
+    shape: tuple[int, ...]  # shape of the result, (N,) or (S, N)
+    result: Result  # memory of the result
+    parts: np.ndarray  # (S, N, K) log-likelihoods of the readings; (S, N, 0) where they are not requested
+    per_beam: bool  # true if they are requested, of a scanner with beams
+    # Called once readings are on the device; it starts the launches that write the poses.
     before: Callable[[], None] | None = None
-    own_scans: bool = False
+    own_scans: bool = False  # true if each of (N, 3) poses has a separate scan
 
     @property
     def scans(self) -> int:

@@ -26,17 +26,11 @@ def _evenly(most: int, count: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class BeamChoice:
-    """The beams that ``beams=`` chooses.
+    """The beams that ``beams=`` chooses."""
 
-    Attributes:
-        columns: Beams that may be used.
-        most: Largest number of readings that are used, evenly chosen from more.
-        every: True if all beams are used.
-    """
-
-    columns: np.ndarray
-    most: int
-    every: bool
+    columns: np.ndarray  # beams that may be used
+    most: int  # largest number of readings that are used, evenly chosen from more
+    every: bool  # true if all beams are used
 
     @staticmethod
     def of(beams: Beams, count: int) -> BeamChoice:
@@ -71,27 +65,16 @@ class BeamChoice:
 
 @dataclass(frozen=True)
 class BeamSelection:
-    """Rules that class, thin and group readings.
+    """Rules that class, thin and group readings."""
 
-    Attributes:
-        scanner: The scanner's geometry.
-        vectors: (K, 2) float64 cosines and sines of the bearings, the mount's yaw included.
-        z_max: Probability of a max reading; 0 makes it missing.
-        beams: The beams that are used.
-        specialize: False keeps readings without information, and casts equal bearings separately.
-        max_is_range: Evaluate finite max readings like ranges.
-        max_depends: The probability of a max reading depends on the pose, so such readings are evaluated.
-        map_size: Diagonal of the map [m]; None without a map.
-    """
-
-    scanner: Scanner
-    vectors: np.ndarray
-    z_max: float
-    beams: Beams
-    specialize: bool
-    max_is_range: bool = False
-    max_depends: bool = False
-    map_size: float | None = None
+    scanner: Scanner  # the scanner's geometry
+    vectors: np.ndarray  # (K, 2) float64 cosines and sines of the bearings, the mount's yaw included
+    z_max: float  # probability of a max reading; 0 makes it missing
+    beams: Beams  # the beams that are used
+    specialize: bool  # false keeps readings without information, and casts equal bearings separately
+    max_is_range: bool = False  # evaluate finite max readings like ranges
+    max_depends: bool = False  # the probability of a max reading depends on the pose, so such readings are evaluated
+    map_size: float | None = None  # diagonal of the map [m]; None without a map
 
     @functools.cached_property
     def choice(self) -> BeamChoice:
@@ -155,27 +138,16 @@ def choose_beams(kinds: np.ndarray, beams: Beams, informative_max: bool) -> np.n
 
 @dataclass(frozen=True)
 class ModelContext:
-    """The device, and the rules for readings, of a scan model.
+    """The device, and the rules for readings, of a scan model."""
 
-    Attributes:
-        backend: The device.
-        real: Precision.
-        rules: How readings are classed; they hold the scanner.
-        weights: The book's likelihood, or the program whose weights are reproduced.
-        cubes: Whether the model sums cubes of densities instead of logarithms.
-        temperature: Multiplies the sum over readings.
-        constant_term: The first term of that sum.
-        possible: True if some range is possible at some pose.
-    """
-
-    backend: Backend
-    real: np.dtype
-    rules: BeamSelection
-    weights: Likelihood
-    cubes: bool
-    temperature: float
-    constant_term: float
-    possible: bool
+    backend: Backend  # the device
+    real: np.dtype  # precision
+    rules: BeamSelection  # how readings are classed; they hold the scanner
+    weights: Likelihood  # the book's likelihood, or the program whose weights are reproduced
+    cubes: bool  # whether the model sums cubes of densities instead of logarithms
+    temperature: float  # multiplies the sum over readings
+    constant_term: float  # the first term of that sum
+    possible: bool  # true if some range is possible at some pose
 
 
 def check_beams(beams: Beams, count: int) -> Beams:

@@ -29,31 +29,18 @@ MOST_SEED, MOST_STEP = (1 << 64) - 1, (1 << 31) - 1
 
 @dataclass(frozen=True)
 class Drawing:
-    """The numbers from which readings are drawn.
+    """The numbers from which readings are drawn."""
 
-    Attributes:
-        mixture: Numbers of the mixture for each bin of angles of incidence, then the tables of the hit shape.
-        edges: Cosines between these bins, in the model's precision.
-        chances: Cumulative probabilities of a table of a sensor; one number without a table.
-        cells: Number of range bins of the table; 0 without one.
-        range_max: Longest range [m].
-        real: Precision of ranges and readings.
-        seed: The seed.
-        step: Step of the first scan.
-        per_scan: Particles of each scan.
-        shape_flags: Flags of the shape of hits.
-    """
-
-    mixture: np.ndarray
-    edges: np.ndarray
-    chances: np.ndarray
-    cells: int
-    range_max: float
-    real: np.dtype
+    mixture: np.ndarray  # numbers of the mixture for each bin of angles of incidence, then the tables of the hit shape
+    edges: np.ndarray  # cosines between these bins, in the model's precision
+    chances: np.ndarray  # cumulative probabilities of a table of a sensor; one number without a table
+    cells: int  # number of range bins of the table; 0 without one
+    range_max: float  # longest range [m]
+    real: np.dtype  # precision of ranges and readings
     seed: int
-    step: int
-    per_scan: int
-    shape_flags: frozenset[str] = frozenset()
+    step: int  # step of the first scan
+    per_scan: int  # particles of each scan
+    shape_flags: frozenset[str] = frozenset()  # flags of the shape of hits
 
     @property
     def bins(self) -> int:

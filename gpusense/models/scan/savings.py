@@ -28,13 +28,6 @@ def measured_savings(
 ) -> dict[str, float]:
     """Time a call with and without each part that flags of the scoring kernel bring back.
 
-    Args:
-        make_request: Makes the request of poses and a scan.
-        pipeline: The stages of the model.
-        last: Its last call.
-        plan: The parts that are left out.
-        beams: Beams of the scanner.
-
     Returns:
         Median differences [s] of a call with a part and one without it, by the names of the parts.
     """

@@ -24,19 +24,12 @@ _IN_LANES = frozenset({"IN_LANES"})
 
 @dataclass
 class LastCall:
-    """The last call, as ``explain`` reports it.
+    """The last call, as ``explain`` reports it."""
 
-    Attributes:
-        flags: Flags of its launches.
-        scans: The readings of its last scans; None before there is a call.
-        together: Number of scans that shared launches.
-        kernels: The kernels of its last piece, from the poses to log-likelihoods.
-    """
-
-    flags: frozenset[str] = frozenset()
-    scans: ClassedScans | None = None
-    together: int = 0
-    kernels: tuple[str, ...] = ()
+    flags: frozenset[str] = frozenset()  # flags of its launches
+    scans: ClassedScans | None = None  # the readings of its last scans; None before there is a call
+    together: int = 0  # number of scans that shared launches
+    kernels: tuple[str, ...] = ()  # the kernels of its last piece, from the poses to log-likelihoods
 
     @property
     def scan(self) -> ClassedScans | None:

@@ -105,17 +105,12 @@ def tiles_of(particles: int, rays: int) -> tuple[int, int]:
 
 
 class Parts(NamedTuple):
-    """Numbers that a particle's sum adds.
+    """Numbers that a particle's sum adds."""
 
-    Attributes:
-        count: Numbers of each particle.
-        block: 1 for sums of blocks or strands, BLOCK_TERMS for terms of single readings.
-        buffer: All of them, the numbers of a place ``particles`` apart.
-    """
-
+    # Numbers of each particle.
     count: int  # type: ignore[assignment]  # hides tuple.count
-    block: int
-    buffer: Buffer = None
+    block: int  # 1 for sums of blocks or strands, BLOCK_TERMS for terms of single readings
+    buffer: Buffer = None  # all of them, the numbers of a place ``particles`` apart
 
 
 def sum_launch(flags: frozenset[str], particles: int, parts: Parts, **arguments: Any) -> Launch:

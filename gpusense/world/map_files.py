@@ -193,6 +193,9 @@ def write_map(
 
 
 def _read_yaml(file: Path) -> _MapYaml:
+    if file.suffix in (".bag", ".db3", ".mcap", ".log"):
+        other = "a recording is passed by --log or read by gs.read_log"
+        raise ValueError(f"{file}: must be the YAML file of a map, got {file.suffix}; {other}")
     data = read_mapping(file)
     for key in ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh"):
         if key not in data:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util.notices import warn_user
 
@@ -77,9 +77,12 @@ def look_at_heading(name: str, heading: float) -> None:
         )
 
 
-def look_at_poses(name: str, poses: NDArray[np.floating]) -> None:
+def look_at_poses(name: str, poses: ArrayLike) -> None:
     """Warn of headings that spread like degrees: over more than four turns, and none beyond 720."""
-    headings = poses[..., 2]
+    try:
+        headings = np.asarray(poses)[..., 2]
+    except (IndexError, ValueError):  # of another shape, which the models refuse
+        return
     if not headings.size or headings.dtype.kind not in "fiu":
         return
     low, high = float(headings.min()), float(headings.max())

@@ -1,4 +1,4 @@
-"""An image in place of the YAML file of a map, and a YAML file whose image is missing."""
+"""An image or a recording in place of the YAML file of a map, and a YAML file whose image is missing."""
 
 from __future__ import annotations
 
@@ -21,6 +21,13 @@ def test_an_image_names_its_yaml_file(room):
     (room / "broken.yaml").write_text("a: [")
     with pytest.raises(ValueError, match=rf"{rule} {room}/ground floor.yml$"):
         gs.read_map(room / "room.pgm")
+
+
+@pytest.mark.parametrize("name", ["run.bag", "run.db3", "run.mcap", "run.log"])
+def test_a_recording_names_its_option(room, name):
+    (room / name).write_bytes(b"#ROSBAG V2.0\n")
+    with pytest.raises(ValueError, match=rf"^{room}/{name}: .*; a recording is passed by --log or read by "):
+        gs.read_map(room / name)
 
 
 def test_an_image_alone_names_the_keys_that_it_needs(room):

@@ -208,13 +208,14 @@ def test_ordinary_starts_are_quiet() -> None:
 @pytest.mark.parametrize(
     ("factor", "offset", "warned"), [(1, 0, False), (1, 40, False), (180 / np.pi, 0, True), (1e5, 0, False)]
 )
+@pytest.mark.parametrize("given", [np.asarray, np.ndarray.tolist])
 @pytest.mark.parametrize("kind", [gs.BeamModel, gs.LikelihoodFieldModel])
-def test_headings_that_spread_like_degrees_are_named(kind, factor, offset, warned):
+def test_headings_that_spread_like_degrees_are_named(kind, given, factor, offset, warned):
     """Unwrapped and huge headings are legal; degrees spread over many turns, none of them far from 0."""
     model = kind(gs.worlds.building(), gs.Scanner([-0.5, 0.5], range_max=9.0), backend="numpy")
     poses = gs.worlds.cloud_uniform(model.grid, 50, np.random.default_rng(0))
     poses[:, 2] = factor * poses[:, 2] + offset
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        model.log_likelihood(poses, [1.0, 2.0])
+        model.log_likelihood(given(poses), [1.0, 2.0])
     assert [str(one.message)[:41] for one in caught] == ["poses: have headings over more than four "] * warned

@@ -78,7 +78,7 @@ def make_request(
         ignore: (N,) indices of the shapes that poses do not see.
     """
     backend, real, scanner = context.backend, context.real, context.rules.scanner
-    if scanner._first_scans.left and type(poses) is np.ndarray and poses.shape[-1:] == (3,):
+    if scanner._first_scans.left and isinstance(poses, (np.ndarray, list, tuple)):
         look_at_poses("poses", poses)
     beams = scanner.count
     if type(ranges) is np.ndarray and ranges.shape == (beams,) and ranges.dtype in FLOATS:

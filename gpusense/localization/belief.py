@@ -21,6 +21,9 @@ stayed:
 
     r_t + max(r_t - r_{t-1}, 0) rho / (1 + rho).
 
+Such a place looks like the right one (see below) with probability ``ALIKE (1 - rho)``, since near the last pose its
+scan must repeat the last scan as well.
+
 Some wrong places look like the right one: scans agree there equally, and are no evidence. ``ALIKE`` is the prior share
 of such places among wrong ones, and ``ALIKE_CHOSEN`` among places from a search, which prefers them. Places stop
 looking alike at the rates of ``ALIKE_LENGTH`` and ``ALIKE_TURN``. If a share a still looks alike, an increment i of the
@@ -157,10 +160,12 @@ class Belief(NamedTuple):
             new = fresh = new_part(ratio, ratio, STAYS)
         alike = self.alike * math.exp(-way / ALIKE_LENGTH - turn / ALIKE_TURN)
         stays, added = self.wrong * (1 - found), (1 - self.wrong) * lost
-        after = stays * _changed(alike, new) + added * _changed(ALIKE, fresh)
+        # A place that became wrong since must also repeat the last scan to look alike.
+        added_alike = ALIKE * (1 - rho)
+        after = stays * _changed(alike, new) + added * _changed(added_alike, fresh)
         return self._replace(
             log_odds=math.log(after) - math.log1p(-stays - added), ratio=ratio, pose=pose, scans=0, chosen=False,
-            alike=(stays * alike + added * ALIKE) / after,
+            alike=(stays * alike + added * added_alike) / after,
         )  # fmt: skip
 
     def compared_with(self, pose: tuple[float, float, float], ratio: float) -> Belief:

@@ -53,14 +53,7 @@ class Beams(NamedTuple):
 
 
 class _Setting(NamedTuple):
-    """A scanner in a map.
-
-    Attributes:
-        scanner: The scanner.
-        turn: Direction of bearing 0 in the map relative to the robot's heading [rad].
-        frame: Frame of the map.
-        rules: Rules for readings, and first row and column of the map's part.
-    """
+    """A scanner in a map, with the direction of bearing 0 relative to the robot's heading [rad] as ``turn``."""
 
     scanner: Scanner
     turn: float
@@ -69,14 +62,7 @@ class _Setting(NamedTuple):
 
 
 class _Expected(NamedTuple):
-    """Scan to be judged by a correction.
-
-    Attributes:
-        scanner: The scanner.
-        ranges: The bytes of its (K,) readings.
-        beams: Judged beams.
-        version: The part of the map.
-    """
+    """Scan to be judged by a correction: bytes of its readings, judged beams, and version of the part of the map."""
 
     scanner: Scanner
     ranges: bytes

@@ -86,12 +86,7 @@ def check_risk(risk: float) -> float:
 def distances_by_scan(sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]], pose: Floats) -> Distances:
     """Return distances of poses within 1 m and 0.5 rad of a pose, weighted by the likelihoods of readings there.
 
-    The poses are denser near the pose; their weights make up for it.
-
-    Args:
-        sensors: The sensors.
-        readings: Readings by the index of their sensor.
-        pose: (3,) pose.
+    The poses are denser near the pose (3,); their weights make up for it. Keys of the readings are indices of sensors.
     """
     far, angle, turn = (np.arange(1, _AROUND + 1)[:, None] * _SEQUENCE % 1).T
     far, angle, turn = far**2, math.tau * angle, 2 * turn - 1

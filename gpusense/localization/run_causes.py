@@ -54,14 +54,7 @@ _STILL = np.zeros((3, 3))
 
 
 class Place(NamedTuple):
-    """Likeliest place of a window on the map.
-
-    Attributes:
-        pose: (3,) pose of the robot at its first scan.
-        share: Share of its beams that agree, of those that give evidence.
-        fits: Whether it explains all scans of the window.
-        short: Share of its beams that end in mapped free space.
-    """
+    """Likeliest place of a window: (3,) pose at its first scan, shares of agreeing and short beams, whether it fits."""
 
     pose: Floats
     share: float

@@ -26,7 +26,7 @@ from gpusense.localization.landmark_gain import LEAST_GAIN, Evidence, Gains
 from gpusense.localization.motion import STILL, SampledMotion
 from gpusense.localization.scan_evidence import evidence_of_scan, ratio_of_features
 from gpusense.localization.sensors import Sensor
-from gpusense.localization.spread import TRACKING, Spread, is_wide, spread_of
+from gpusense.localization.spread import TRACKING, is_wide, spread_of
 from gpusense.models.landmark.base import FeatureModel
 from gpusense.world.scanner import float64_readings
 
@@ -94,11 +94,7 @@ class Verdict:
         self.state = VerdictState()
 
     def reset(self, *, anywhere: bool = False) -> None:
-        """Forget all scans.
-
-        Args:
-            anywhere: True for a search on the whole map.
-        """
+        """Forget all scans; ``anywhere`` begins a search on the whole map."""
         self.state = VerdictState(Belief.anywhere() if anywhere else Belief())
 
     def is_informed_by(self, readings: Mapping[int, tuple[Any, ...]]) -> bool:
@@ -172,20 +168,14 @@ class Verdict:
         readings: Mapping[int, tuple[Any, ...]],
         evidence: float = -math.inf,
     ) -> float:
-        """Judge a pose by the last readings, unless they add almost nothing to a sure pose.
+        """Judge a pose (3,) by the last readings, unless they add almost nothing to a sure pose.
 
-        Args:
-            pose: (3,) estimated pose.
-            covariance: (3, 3) its covariance.
-            readings: Last readings by the index of their sensor.
-            evidence: log p(last readings | earlier readings) of the particles; -inf always judges.
-
-        Returns:
-            Share of explained beams; NaN without beams.
+        The evidence is log p(last readings | earlier readings) of the particles. Return the share of explained beams,
+        NaN without beams.
         """
         state, spread = self.state, spread_of(covariance)
         self._pose = pose
-        if self._adds_nothing(pose, spread, evidence):
+        if not spread.wide and evidence >= state.evidence - _DROP and self._is_near(pose):
             return state.explained
         scans = sightings(self._sensors, readings, pose, covariance)
         ratio, explained = evidence_of_scan(scans)
@@ -213,13 +203,9 @@ class Verdict:
     def expected(
         self, readings: Mapping[int, tuple[Any, ...]], motion: SampledMotion | None
     ) -> list[tuple[int, tuple[Any, ...]]]:
-        """Return the scans that will probably be judged after the next correction, for judging them within it.
-
-        Args:
-            readings: Readings of the next correction by the index of their sensor.
-            motion: The motion before it, or None.
-        """
-        if self._pose is None or self._stays(self._pose, STILL if motion is None else motion):
+        """Return the scans that will probably be judged after the next correction, for judging them within it."""
+        # A sure pose will probably stay near the last judged pose.
+        if self._pose is None or self._is_near((motion or STILL).after(self._pose.tolist()), 1):
             return []
         scans = []
         for index, (ranges, *_) in readings.items():
@@ -230,38 +216,21 @@ class Verdict:
                 scans.append((index, (ranges.astype(np.float64, copy=False),)))
         return scans
 
-    def _stays(self, pose: np.ndarray, motion: SampledMotion) -> bool:
-        """Return whether a pose is sure and will probably stay near the last judged pose."""
+    def _is_near(self, pose: np.ndarray | Sequence[float], later: int = 0) -> bool:
+        """Return whether a pose is sure, and near the last judged pose but few corrections ago."""
         state = self.state
         before = state.belief.pose
         if before is None or state.judged < 0 or state.belief.wrong > _SURE or state.ratios:
             return False
-        way, turn = motion_between(motion.after(pose.tolist()), before)
-        return way < _WAY and turn < _TURNED and state.corrections + 1 - state.judged < _SELDOM
+        way, turn = motion_between(pose, before)
+        return way < _WAY and turn < _TURNED and state.corrections + later - state.judged < _SELDOM
 
     def compared(self, pose: np.ndarray, covariance: np.ndarray, ratio: float) -> None:
-        """Add a comparison of the last judged pose with other places of the map, unless its covariance is wide.
-
-        Args:
-            pose: (3,) the pose.
-            covariance: (3, 3) its covariance.
-            ratio: Log-likelihood ratio of other places against the pose, or NaN.
-        """
+        """Add the ratio of other places against the last judged pose (3,), or NaN, unless its covariance is wide."""
         if is_wide(covariance):
             return
         x, y, theta = (float(value) for value in pose)
         self.state = self.state._replace(belief=self.state.belief.compared_with((x, y, theta), ratio))
-
-    def _adds_nothing(self, pose: np.ndarray, spread: Spread, evidence: float) -> bool:
-        """Return whether a pose is sure and near the last judged pose, so that its scan adds almost no evidence."""
-        state = self.state
-        before = state.belief.pose
-        if before is None or state.judged < 0 or state.belief.wrong > _SURE or state.ratios or spread.wide:
-            return False
-        if not evidence >= state.evidence - _DROP:
-            return False
-        way, turn = motion_between(pose, before)
-        return way < _WAY and turn < _TURNED and state.corrections - state.judged < _SELDOM
 
 
 def sightings(

@@ -124,6 +124,19 @@ def test_integrity_is_that_of_the_rows(tmp_path, capsys):
     assert delay == pytest.approx(TIMES[first] - TIMES[CARRIED.start]) and delay <= 5 * STEP
 
 
+def test_poses_without_a_covariance_are_available(tmp_path, capsys):
+    log = write_bag(tmp_path, truth(), "none")
+    write_tum(tmp_path / "run.tum", TIMES, carried())
+    write_tum(tmp_path / "true.tum", TIMES, truth())
+    more = ["--poses", tmp_path / "run.tum", "--truth", tmp_path / "true.tum", "--risk", 0.05, "--alert-limit", 0.5]
+    _, found = judged(capsys, call(tmp_path, log, *more))
+    radii = np.array([np.inf if one is None else one for one in found["radii"]])
+    right = np.array(found["errors"]) < 0.1
+    assert (radii[right] <= 0.5).mean() > 0.5 and radii[np.isfinite(radii)].max() <= 1
+    rated = found["integrity"]
+    assert rated["hazardous"] == 0 and rated["times_to_alert"] == [0.0]
+
+
 def test_the_run_is_recorded_for_the_viewer(tmp_path, capsys):
     pytest.importorskip("rerun")
     log = write_bag(tmp_path, carried(), "covariance")

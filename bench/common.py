@@ -10,9 +10,7 @@ import argparse
 import contextlib
 import json
 import os
-import platform
 import shlex
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -26,6 +24,8 @@ import gpusense as gs
 from gpusense.backends.base import Backend, Launcher
 from gpusense.backends.proxy import Proxy
 from gpusense.backends.recording import Recording
+from gpusense.evaluation.benchmark.report import commit
+from gpusense.evaluation.machine import machine
 from gpusense.evaluation.scoring import chosen_scans, with_poses
 from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
 from gpusense.interface.launches import Launch, Program
@@ -101,8 +101,6 @@ def part_of(text: str) -> tuple[int, int]:
 
 def stated_commit(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> str:
     """Return ``--commit``, or the checkout's commit; exit with an error where it has changes that no commit has."""
-    from gpusense.evaluation.benchmark.report import commit
-
     stated = arguments.commit or commit() or ""
     if not stated or stated.endswith("+"):
         parser.error(f"--commit: the checkout must have no uncommitted changes, got {stated or 'no repository'}")
@@ -372,28 +370,13 @@ def command_line(script: str) -> str:
     return shlex.join(["python", *os.environ.get(THROUGH, "").split(), script, *words])
 
 
-def machine(commit: str) -> dict[str, str]:
-    """Describe the machine and the versions; an empty commit is replaced by git's."""
-    commit = (
-        commit
-        or subprocess.run(
-            ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False, cwd=ROOT
-        ).stdout.strip()
-    )
-    return {
-        "date": time.strftime("%Y-%m-%d"), "python": platform.python_version(), "numpy": np.__version__,
-        "gpusense": gs.__version__, "commit": commit, "platform": platform.platform(terse=True),
-        "threads": str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()),
-    }  # fmt: skip
-
-
 def publish(script: str, arguments: argparse.Namespace, text: str, report: dict[str, Any], remark: str = "") -> None:
     """Print a script's tables, then machine and command, and write them and the report to ``--output``."""
     command = command_line(Path(script).resolve().relative_to(ROOT).as_posix())
     if getattr(arguments, "data", None) is not None:
         # The path of the data means nothing on other machines.
         command = command.replace(str(arguments.data), "DATA")
-    host = machine(arguments.commit)
+    host = {"date": time.strftime("%Y-%m-%d"), "commit": arguments.commit or commit() or "unknown", **machine()}
     described = ", ".join(f"{name} {value}" for name, value in host.items())
     text = f"{text}\n\n{remark and remark + ' '}Machine: {described}. Command: `{command}`.\n"
     print(text)

@@ -36,10 +36,10 @@ import json
 import numpy as np
 from accuracy.compiled_peers import Follower, Weigher
 from common import command_line, make_parser, middle_pose
-from common import machine as described
 from speed.filters import PEERS, load
 
 import gpusense as gs
+from gpusense.evaluation.benchmark.report import commit
 from gpusense.evaluation.machine import machine, machine_line
 from gpusense.evaluation.worlds import building
 
@@ -291,7 +291,7 @@ def main() -> None:
 def _write(args: Any, rows: list[dict[str, object]]) -> None:
     print(f"\n{machine_line()}")
     if args.output is not None:
-        stated = {"command": command_line("bench/speed/filter_step.py"), "commit": described(args.commit)["commit"]}
+        stated = {"command": command_line("bench/speed/filter_step.py"), "commit": args.commit or commit()}
         report = stated | {"machine": machine(), "rows": rows}
         Path(args.output).with_suffix(".json").write_text(json.dumps(report, indent=1))
 

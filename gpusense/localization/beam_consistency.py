@@ -79,15 +79,7 @@ class BeamConsistency(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """Counts of the beams of simultaneous scans, by their evidence.
-
-    Attributes:
-        agree: Agreeing beams.
-        close: Beams in close agreement.
-        through: Beams that pass through walls.
-        short: Short beams.
-        nothing: Beams without evidence.
-    """
+    """Counts of the beams of simultaneous scans, by their evidence; ``close`` ones also agree."""
 
     agree: int
     close: int
@@ -116,16 +108,7 @@ def beam_consistency(
     covariance: Floats = _STILL,
     judge: MapJudge | None = None,
 ) -> BeamConsistency:
-    """Judge the beams of a scan.
-
-    Args:
-        grid: The map.
-        scanner: The scanner.
-        pose: (3,) pose of the robot [m, m, rad].
-        ranges: (K,) readings [m].
-        covariance: (3, 3) covariance of the pose.
-        judge: The map on a device; None judges on the host.
-    """
+    """Judge the beams of a scan (K,) at a (3,) pose with a (3, 3) covariance, by the map on a device or on the host."""
     if judge is None:
         beams = chosen_beams(scanner, ranges)
         judged = judged_on_host(grid, scanner, pose, covariance, beams)

@@ -116,11 +116,7 @@ class Belief(NamedTuple):
 
     @classmethod
     def anywhere(cls, after: int = 0) -> Belief:
-        """Return the belief at a place from a search on a map.
-
-        Args:
-            after: Number of failed searches before. On a right map one in ``MISSES`` fails.
-        """
+        """Return the belief at a place from a search, after failed ones; on a right map one in ``MISSES`` fails."""
         return cls._chosen(math.log(MISSES) * min(after, MOST_PLACES))
 
     def counted(self) -> Belief:
@@ -137,12 +133,7 @@ class Belief(NamedTuple):
         return cls(log_odds, chosen=True, alike=ALIKE_CHOSEN, compared=Comparison(chosen=True))
 
     def judged(self, pose: tuple[float, float, float], ratio: float) -> Belief:
-        """Return the belief after a scan.
-
-        Args:
-            pose: Pose of the judgement [m, m, rad].
-            ratio: Log-likelihood ratio of "wrong" against "right"; NaN for a scan without evidence.
-        """
+        """Return the belief after a scan with a log-likelihood ratio of wrong against right; NaN has no evidence."""
         way, turn, rho = 0.0, 0.0, 0.0
         repeats = self.chosen and ratio < 0
         if self.pose is not None and not repeats:
@@ -169,12 +160,7 @@ class Belief(NamedTuple):
         )  # fmt: skip
 
     def compared_with(self, pose: tuple[float, float, float], ratio: float) -> Belief:
-        """Return the belief after comparing the last judged pose with other places.
-
-        Args:
-            pose: The pose [m, m, rad].
-            ratio: Its ratio (:func:`gpusense.localization.scan_evidence.ratio_of_places`); NaN for none.
-        """
+        """Return the belief after comparing the last judged pose with other places; a ratio of NaN compares nothing."""
         if math.isnan(ratio):
             return self
         last = self.compared

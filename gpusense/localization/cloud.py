@@ -29,15 +29,7 @@ _ASKED = 3
 
 
 class Snapshot:
-    """Particles of one moment, copied to the host when they are asked for, or before a step overwrites them.
-
-    Args:
-        cloud: The cloud.
-        count: Number of shown particles.
-
-    Attributes:
-        places: Their buffers.
-    """
+    """Particles of one moment, copied to the host when they are asked for, or before a step overwrites them."""
 
     def __init__(self, cloud: Cloud, count: int) -> None:
         self.places, self._count, self._lock = cloud.places, count, threading.Lock()
@@ -46,7 +38,7 @@ class Snapshot:
 
     @property
     def is_on_device(self) -> bool:
-        """Whether the particles have not been copied yet."""
+        """Return whether the particles have not been copied yet."""
         return self._copies is None
 
     def __call__(self) -> tuple[np.ndarray, np.ndarray]:
@@ -60,15 +52,7 @@ class Snapshot:
 
 
 class Cloud(Particles):
-    """Particles with recorded steps.
-
-    Args:
-        backend: The device.
-        capacity: Most particles.
-        sensors: Most sensors of a correction.
-        precision: Precision of the log-likelihoods.
-        residual: Whether to draw by residual resampling.
-    """
+    """Particles with recorded steps."""
 
     def __init__(
         self, backend: Backend, capacity: int, sensors: int, precision: np.dtype, *, residual: bool = False
@@ -251,13 +235,7 @@ class Cloud(Particles):
         self._stages.run((stage.key, drawn, self.count, "draw"), lambda: self.draw(stage, drawn))
 
     def replay(self, stage: Stage, key: Hashable, scoring: Callable[[int], tuple[Program, object]]) -> None:
-        """Run a stage as one recorded program.
-
-        Args:
-            stage: The stage.
-            key: Key of the sensors' programs.
-            scoring: Returns the program that scores the poses of a buffer, and the owners of its memory.
-        """
+        """Run a stage as one recorded program; ``scoring`` makes the sensors' part for a buffer of poses."""
         whole = (key, stage, self.count, self._estimates_too, self._prepare_judges())
         recorded = self._recordings.get(whole)
         if recorded is None:

@@ -86,14 +86,7 @@ class Contents(NamedTuple):
         return len(self.poses if self.next_poses is None else self.next_poses)
 
     def places_and_arrays(self, now: BufferSlots) -> tuple[BufferSlots, list[tuple[str, int, np.ndarray]]]:
-        """Return buffers for these particles that keep present buffers intact, and the array for each buffer.
-
-        Args:
-            now: The buffers at the beginning of the call, to keep.
-
-        Returns:
-            Buffer slots, and arrays by the name ("poses" or "weights") and index of their buffer.
-        """
+        """Return buffers that keep those of ``now`` intact, and the array for each by name and index of the buffer."""
         places = now.placed(now)
         if self.next_poses is None or self.next_weights is None:
             return places, [("poses", places.shown, self.poses), ("weights", places.weight, self.weights)]
@@ -145,14 +138,7 @@ def summary_of(numbers: np.ndarray) -> Summary:
 
 
 def is_starved(numbers: np.ndarray, settings: np.ndarray, stage: int, count: int) -> bool:
-    """Return whether the tempering ladder is too shallow: its last rung leaves too few particles with weight.
-
-    Args:
-        numbers: The state after the stage.
-        settings: Numbers of the step.
-        stage: The stage.
-        count: Particles.
-    """
+    """Return whether the tempering ladder is too shallow: its last rung leaves too few particles with weight."""
     own = numbers[stage * STAGE : (stage + 1) * STAGE]
     if not own[SAMPLE_SIZE] < min(settings[SHARE] * count, _FEWEST):
         return False
@@ -169,12 +155,7 @@ def deeper(settings: np.ndarray) -> np.ndarray:
 
 
 def meaningful(numbers: np.ndarray, averages: bool) -> np.ndarray:
-    """Clear unused numbers of a state: stages that did not run, and unused averages.
-
-    Args:
-        numbers: The state in the kernels' layout.
-        averages: Whether recovery follows the averages of the likelihood.
-    """
+    """Clear unused numbers of a state: stages that did not run, and averages that recovery does not follow."""
     end, result = summary_of(numbers).stages * STAGE, np.zeros(STATE)
     result[:end] = numbers[:end]
     if averages:

@@ -116,12 +116,7 @@ def covariance_of(numbers: np.ndarray) -> np.ndarray:
 
 
 def sample_size_of(weights: np.ndarray, poses: np.ndarray | None = None) -> float:
-    """Return the effective sample size of particles.
-
-    Args:
-        weights: (N,) weights >= 0.
-        poses: (N, 3) particles; equal ones count once. None if all differ.
-    """
+    """Return the effective sample size of (N,) weights; equal ones among (N, 3) poses count once."""
     if poses is not None:
         order = np.lexsort(poses.T)
         ordered = poses[order]
@@ -131,12 +126,7 @@ def sample_size_of(weights: np.ndarray, poses: np.ndarray | None = None) -> floa
 
 
 def clustered(poses: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and covariance of the heaviest cluster of touching bins.
-
-    Args:
-        poses: (N, 3) particles.
-        weights: (N,) weights >= 0.
-    """
+    """Return mean and covariance of the heaviest cluster of touching bins, of (N, 3) poses and (N,) weights."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

@@ -30,14 +30,7 @@ from gpusense.localization.verdict import Verdict
 class FilterCore:
     """Particles, the verdict on their pose, and recovery from a wrong pose.
 
-    Args:
-        sensors: The sensors.
-        options: Options of the filter.
-        cloud: Room for the particles.
-
     Attributes:
-        sensors: The sensors.
-        options: Options of the filter.
         tracker: The particles, and the numbers of each step.
         verdict: The verdict on their pose.
         recovery: Recovery with the rivals of the particles.

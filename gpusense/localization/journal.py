@@ -64,12 +64,7 @@ def _attributes(owner: Any) -> dict[str, Any]:
 
 
 class Journal:
-    """The complete state of objects at one moment.
-
-    Args:
-        owners: The objects.
-        frame: The call that may change them.
-    """
+    """The complete state of objects at one moment, and the call that may change them."""
 
     __slots__ = ("_containers", "_frame", "_objects")
 
@@ -193,12 +188,7 @@ def consistent(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W
 
 
 class Held(NamedTuple):
-    """State of an object of this package as plain data.
-
-    Attributes:
-        kind: Module and name of its class.
-        values: Its attributes by name.
-    """
+    """State of an object of this package as plain data: module and name of its class, and its attributes by name."""
 
     kind: tuple[str, str]
     values: dict[str, Any]
@@ -209,12 +199,7 @@ class _NotPlainError(Exception):
 
 
 def plain_state(owner: Any, *, without: Collection[str] = ()) -> dict[str, Any]:
-    """Return the state of an object as plain data that pickles and holds no device.
-
-    Args:
-        owner: The object.
-        without: Names of attributes to omit.
-    """
+    """Return the state of an object, without some attributes, as plain data that pickles and holds no device."""
     found = {}
     for name, value in _attributes(owner).items():
         if name not in without:

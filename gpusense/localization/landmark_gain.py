@@ -24,12 +24,7 @@ LEAST_GAIN, MEMORY, _ANYWHERE, _MARGIN = 1.0, 20, 1000, 1.0
 
 
 class Evidence:
-    """Gain in predicting features.
-
-    Args:
-        model: The model of the landmarks or lines.
-        seed: Seed of the poses anywhere.
-    """
+    """Gain in predicting features of a model of landmarks or lines."""
 
     def __init__(self, model: FeatureModel, *, seed: int = 0) -> None:
         self._model = model
@@ -40,17 +35,10 @@ class Evidence:
         )
 
     def gain(self, poses: Floats, weights: Floats, features: Floats) -> float:
-        """Return the gain of particles over chance in predicting a scan [nats], before the scan corrects them.
+        """Return the gain of (N, 3) predicted particles over chance in predicting (F, ...) features [nats].
 
-        Landmarks count as unidentified, since exchanged landmarks of a map leave a right pose right.
-
-        Args:
-            poses: (N, 3) predicted particles.
-            weights: (N,) their weights.
-            features: (F, ...) features of the scan, F > 0.
-
-        Returns:
-            The gain of all features; NaN if neither particles nor chance can explain them.
+        Landmarks count as unidentified, since exchanged landmarks of a map leave a right pose right. The gain is NaN if
+        neither particles nor chance can explain the features.
         """
         count = len(features)
         false = self._log_p(self._poses[:1], features, np.full(count, -1))[0]
@@ -66,11 +54,7 @@ class Evidence:
 
 
 class Gains(NamedTuple):
-    """Gains of recent scans; immutable.
-
-    Attributes:
-        recent: Gain [nats] and number of features of the last ``MEMORY`` scans.
-    """
+    """Gains [nats] and numbers of features of the last ``MEMORY`` scans; immutable."""
 
     recent: tuple[tuple[float, int], ...] = ()
 

@@ -152,12 +152,7 @@ def nodes_of(content: Mapping[Any, Any], path: str = "") -> Iterator[tuple[str, 
 
 
 def first_pose(name: str, parameters: Mapping[str, Any]) -> Row:
-    """Return the first pose (x, y, yaw) [m, m, rad].
-
-    Args:
-        name: Name of the file.
-        parameters: Parameters by dotted names.
-    """
+    """Return the first pose (x, y, yaw) [m, m, rad] of parameters by dotted names."""
     if _START in parameters:
         raise TypeError(f"{name}: {_START}: must be a mapping, got {checks.show(parameters[_START])}")
     x, y, yaw = (checks.real(f"{name}: {key}", parameters.get(key, 0.0)) for key in _POSE)

@@ -44,19 +44,7 @@ _DRAWS = {"systematic": SYSTEMATIC, "stratified": INDEPENDENT, "residual": RESID
 
 
 class Options(NamedTuple):
-    """Options of :class:`gpusense.ParticleFilter`; see there.
-
-    Attributes:
-        least: Fewest particles.
-        most: Most particles.
-        seed: Seed of the random numbers.
-        temperature: Factor of the log-likelihoods of scans, or "auto".
-        resampling: "systematic", "stratified" or "residual".
-        threshold: Resample below this share of the particles.
-        stages: Most stages of a correction.
-        recovery: None, "augmented" or "sensor".
-        beam_skip: None, or a share of the particles.
-    """
+    """Options of :class:`gpusense.ParticleFilter`, see there; ``particles`` are from ``least`` to ``most``."""
 
     least: int
     most: int
@@ -117,18 +105,7 @@ def settings_of_step(
     sensors: Sequence[tuple[float, int]],
     one_peak: bool,
 ) -> np.ndarray:
-    """Return the settings of a step, indexed by ``interface.constants``.
-
-    Args:
-        options: Options of the filter.
-        motion: First motion of the step.
-        step: Number of the step.
-        count: Number of particles.
-        pool: Number of poses for recovery to inject, and half widths of the box around each in x, y [m] and heading
-            [rad].
-        sensors: Temperature and beams of each sensor in use.
-        one_peak: True if the particles are concentrated, and no sensor has several peaks among them.
-    """
+    """Return the settings of a step, indexed by ``interface.constants``; sensors are temperatures and beams."""
     settings = _settings_of_run(options, count, pool, tuple(sensors), one_peak).copy()
     settings[STEP] = step
     settings[MEAN : DEVIATION + 4], settings[REVERSE] = settings_of(motion)

@@ -52,15 +52,7 @@ class BufferSlots(NamedTuple):
 
     @functools.lru_cache(maxsize=64)  # noqa: B019 - plain values
     def stages(self, kept: BufferSlots, most: int, drawn: int, kind: int, *, same: bool = False) -> list[Stage]:
-        """Return the stages of a correction.
-
-        Args:
-            kept: Buffers to keep intact.
-            most: Largest number of stages.
-            drawn: Particles of the next step.
-            kind: Kind of the motion before the first stage.
-            same: True if the present step has equally many particles, so that each stage draws this number.
-        """
+        """Return the stages of a correction; with ``same`` each stage draws the number of the next step."""
         (poses, weights), state = kept.free(), 1 - kept.state
         known = drawn if same or most == 1 else 0
         first = Stage(poses, 0, most, known, self.before, weights, state, self.next, kind)
@@ -122,22 +114,12 @@ class Stage(NamedTuple):
 class Particles:
     """Particles and weights on a device, and their launches.
 
-    Args:
-        backend: The device.
-        capacity: Most particles.
-        sensors: Most sensors of a correction.
-        precision: Precision of the log-likelihoods.
-        residual: Whether to draw by residual resampling.
-
     Attributes:
         count: Particles of the next step.
         places: Buffers of the particles.
         kept: Buffers at the beginning of a call of the filter, which steps never overwrite.
         pool_size: Number of poses for recovery to inject.
         results: Two states of corrections, the estimate, and the judged beams of each sensor, at ``result_begins``.
-        states: The two states.
-        estimated: The estimate.
-        judged: The judged beams of each sensor.
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("count", "block", "places", "pool", "pool_size")

@@ -61,10 +61,7 @@ _MOST = 50.0
 
 
 class Rival:
-    """Rival of a filter.
-
-    Args:
-        tracker: A second set of particles with the filter's sensors.
+    """Rival of a filter: a second set of particles with the filter's sensors.
 
     Attributes:
         active: True if a rival competes.
@@ -112,14 +109,9 @@ class Rival:
         step: int,
         prior: float = PRIOR,
     ) -> float:
-        """Search for a rival by the last readings.
+        """Search for a rival by the last readings; equal steps give equal rivals.
 
-        Args:
-            pose: (3,) estimated pose of the particles.
-            covariance: (3, 3) their covariance.
-            readings: Indices of sensors with the last readings.
-            step: Number of the last step of the filter; equal steps give equal rivals.
-            prior: Prior log odds; 0 excludes places near the estimate.
+        Prior log odds of 0 exclude places near the estimate, a (3,) pose with a (3, 3) covariance.
 
         Returns:
             Log-likelihood ratio of other places against the estimate; NaN without a search of the whole map.
@@ -146,13 +138,7 @@ class Rival:
             self._tracker.follow(motion)
 
     def correct(self, readings: list[SensorReadings], evidence: float, pose: np.ndarray) -> None:
-        """Correct the rival, and compare it with the particles.
-
-        Args:
-            readings: Indices of sensors with their readings.
-            evidence: Log evidence of the filter, by its summary.
-            pose: (3,) estimated pose of the particles.
-        """
+        """Correct the rival, and compare it with particles at a (3,) pose by the log evidence of both."""
         self._tracker.weigh(readings)
         mine = self._tracker.cloud.summary().evidence
         if math.isfinite(mine) or math.isfinite(evidence):
@@ -168,13 +154,7 @@ class Rival:
     def judge(
         self, pose: np.ndarray, covariance: np.ndarray, readings: list[SensorReadings]
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the rival's particles and weights if it has won; end it if it cannot win.
-
-        Args:
-            pose: (3,) estimated pose of the particles.
-            covariance: (3, 3) their covariance.
-            readings: Indices of sensors with their readings.
-        """
+        """Return the rival's particles and weights if it has won over a (3,) pose; end it if it cannot win."""
         self._place, own = self._tracker.mean_and_covariance()
         gain = self.log_odds - self._prior
         together = deviations(own)[0] < WIDE
@@ -238,11 +218,7 @@ class Rival:
 
 
 class Recovery:
-    """Rivals of a filter's particles.
-
-    Args:
-        tracker: The particles.
-        verdict: Verdict on their pose.
+    """Rivals of a filter's particles, by the verdict on their pose.
 
     Attributes:
         rival: The rival of the particles, if there was one.
@@ -297,10 +273,7 @@ class Recovery:
         """Compare the particles with their rival, judge their pose, and search for a rival if scans contradict it.
 
         A search needs two consecutive judgements that contradict the pose, or one at every fifth to tenth correction.
-
-        Args:
-            readings: Indices of sensors with the readings of the correction.
-            last: Copies of the same readings with all beams.
+        ``last`` holds all beams of the readings.
         """
         tracker, verdict, rival = self._tracker, self._verdict, self.active
         searches = self._searches and rival is None and (verdict.due or self._is_wanted())

@@ -70,11 +70,7 @@ class Candidates(NamedTuple):
 
 
 class RivalSearch:
-    """Search for rivals.
-
-    Args:
-        sensors: The sensors of the rival.
-    """
+    """Search for rivals of a filter with these sensors."""
 
     def __init__(self, sensors: Sequence[Sensor]) -> None:
         self._sensors = sensors
@@ -89,15 +85,7 @@ class RivalSearch:
         key: starts.Key,
         temperature: float | str,
     ) -> Candidates:
-        """Return candidates for the last readings, and compare the estimate with them.
-
-        Args:
-            pose: (3,) estimated pose of the particles.
-            covariance: (3, 3) their covariance.
-            readings: Indices of sensors with the last readings.
-            key: Seed and step of random poses.
-            temperature: Temperature of the filter.
-        """
+        """Return candidates for the last readings, and compare the estimated (3,) pose with them."""
         tries, effective = self._on_map(readings), _EFFECTIVE
         on_map = len(tries) > 0
         if not on_map:
@@ -136,13 +124,7 @@ class RivalSearch:
         return np.empty((0, 3))
 
     def likely(self, sensor: Sensor, ranges: np.ndarray, *, quick: bool = False) -> np.ndarray:
-        """Return the likeliest poses (M, 3) of a scan (K,) on the whole map, by all beams and by the longer half.
-
-        Args:
-            sensor: The sensor of the scan.
-            ranges: (K,) readings [m].
-            quick: Whether to search by all beams alone.
-        """
+        """Return the likeliest poses (M, 3) of a scan (K,), by all beams and unless ``quick`` by the longer half."""
         if quick:
             return likely_poses(self.field_of(sensor), ranges, _CANDIDATES)
         scanner = sensor.model.scanner

@@ -60,11 +60,7 @@ _OF_GAIN, _LIMIT_OF_GAIN = 0.25, 3.0
 
 
 def ratio_of_scan(scans: Sequence[BeamConsistency]) -> float:
-    """Return the ratio of simultaneous scans; NaN without evidence.
-
-    Args:
-        scans: Judged beams of each scanner at a pose.
-    """
+    """Return the ratio of simultaneous scans, by the judged beams of each scanner; NaN without evidence."""
     return evidence_of_scan(scans)[0]
 
 
@@ -121,13 +117,7 @@ def ratio_of_places(lead: float, beams: float, walls: float, *, is_found: bool) 
 
 
 def ratio_of_features(gain: float, count: int, least: float) -> float:
-    """Return the ratio from the prediction of features.
-
-    Args:
-        gain: Gain over chance in predicting the features [nats].
-        count: Number of features.
-        least: Gain per feature at which right and wrong are equally likely [nats].
-    """
+    """Return the ratio from predicting features; at the gain ``least`` of each, right is as likely as wrong."""
     if math.isnan(gain):
         return gain
     return min(max(_OF_GAIN * (least * count - gain), -_LIMIT_OF_GAIN), _LIMIT_OF_GAIN)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,10 +27,7 @@ _DOUBLE = np.dtype(np.float64)
 def readings_of(readings: Any, sensors: Sequence[Sensor]) -> list[SensorReadings]:
     """Return the valid readings in the order of the sensors.
 
-    Args:
-        readings: The reading of the only sensor, or a mapping from models to readings. A tuple that begins with an
-            array holds several arguments; any other tuple is an array.
-        sensors: The sensors.
+    A tuple that begins with an array holds several arguments of a reading; any other tuple is an array.
     """
     if type(readings) is np.ndarray and len(sensors) == 1:
         return [(0, (readings,))]
@@ -57,114 +54,82 @@ def _is_several(value: Any) -> bool:
     return isinstance(value, tuple) and len(value) > 0 and (isinstance(value[0], list) or np.ndim(value[0]) > 0)
 
 
-class FilterScoring:
-    """Score the particles of the owning cloud.
+class FilterCloud(Cloud):
+    """Particles of a filter on the device of its sensors.
 
-    Args:
-        sensors: The sensors of the filter.
-
-    Attributes:
-        timed: Whether to wait for and time the log-likelihoods of each stage.
+    Steps never write buffers named in ``kept``, and finally name the new buffers in ``places``. Restoring the
+    attributes in ``MEMORY`` therefore undoes an interrupted call of a filter.
     """
 
-    timed = False
-
-    def __init__(self, sensors: Sequence[Sensor]) -> None:
-        self._sensors, self._backend = sensors, sensors[0].backend
+    def __init__(self, sensors: Sequence[Sensor], capacity: int, *, residual: bool = False) -> None:
+        super().__init__(sensors[0].backend, capacity, len(sensors), sensors[0].precision, residual=residual)
+        self._scored, self._timed = sensors, False
         self._programs = ProgramCache[tuple[Program, object]](_MOST_PROGRAMS)
         # Views of buffers for models, by the number of particles.
         self._views: dict[tuple[str, int, int], Any] = {}
 
-    def records(self, readings: Sequence[SensorReadings]) -> bool:
-        """Return whether a stage with such readings is a recorded program: on a GPU that can score all of them."""
-        gpu = self._backend.info.kind == "gpu"
-        return gpu and all(self._sensors[index].records(reading) for index, reading in readings)
+    def correct(self, step: Step) -> None:
+        """Run a correction."""
+        gpu, readings = self.backend.info.kind == "gpu", step.readings
+        if gpu and all(self._scored[index].records(reading) for index, reading in readings):
+            for index, reading in readings:
+                self._scored[index].upload(reading)
+            score = functools.partial(self._replay, readings)
+        else:
+            score = functools.partial(self._call, readings)
+        stages = self.places.stages(self.kept, step.stages, step.drawn, step.kind, same=step.drawn == self.count)
+        judges = functools.partial(self._judges_of, step.judged) if step.judged else None
+        self.run_stages(step.settings, stages, step.drawn, len(readings), score, judges, step.meanwhile)
 
-    def of(self, cloud: Cloud, readings: Sequence[SensorReadings]) -> Callable[[Stage], None]:
-        """Return the function that runs a stage with readings."""
-        if not self.records(readings):
-            return functools.partial(self._called, cloud, readings)
-        for index, reading in readings:
-            self._sensors[index].upload(reading)
-        return functools.partial(self._recorded, cloud, readings)
+    def _judges_of(self, judged: Sequence[SensorReadings]) -> list[MapJudge]:
+        """Prepare and return the judges of scans."""
+        sensors = ((self._scored[index], reading[0]) for index, reading in judged)
+        return [judge for sensor, ranges in sensors if (judge := sensor.judge()).expects(sensor.model.scanner, ranges)]
 
-    def _called(self, cloud: Cloud, readings: Sequence[SensorReadings], stage: Stage) -> None:
+    def _call(self, readings: Sequence[SensorReadings], stage: Stage) -> None:
         """Start the log-likelihoods of a stage call by call, and weigh."""
-        poses = self._poses(cloud, stage.source)
-        before = None if stage.kind is None else functools.partial(cloud.begin, stage)
+        poses = self._poses(stage.source)
+        before = None if stage.kind is None else functools.partial(self.begin, stage)
         for place, (index, reading) in enumerate(readings):
-            self._sensors[index].score(poses, reading, self._log_p(cloud, place), before=before, timed=self.timed)
+            self._scored[index].score(poses, reading, self._log_p(place), before=before, timed=self._timed)
             before = None
-        cloud.weigh(stage)
+        self.weigh(stage)
 
-    def _recorded(self, cloud: Cloud, readings: Sequence[SensorReadings], stage: Stage) -> None:
+    def _replay(self, readings: Sequence[SensorReadings], stage: Stage) -> None:
         """Run a stage as one recorded program."""
-        key = (tuple((index, self._sensors[index].version) for index, _ in readings), cloud.count)
-        cloud.replay(stage, key, lambda source: self._program(cloud, key, source, readings))
+        key = (tuple((index, self._scored[index].version) for index, _ in readings), self.count)
+        self.replay(stage, key, functools.partial(self._program, key, readings))
 
-    def _program(
-        self, cloud: Cloud, key: Hashable, source: int, readings: Sequence[SensorReadings]
-    ) -> tuple[Program, object]:
+    def _program(self, key: Hashable, readings: Sequence[SensorReadings], source: int) -> tuple[Program, object]:
         """Return the launches that score the poses of a buffer, and the owners of their memory."""
         kept = self._programs.get((key, source))
         if kept is not None:
             return kept
         program: Program = ()
         owners: list[object] = []
-        poses = self._poses(cloud, source)
+        poses = self._poses(source)
         for place, (index, _) in enumerate(readings):
-            out = self._log_p(cloud, place)
-            launches, owner = self._sensors[index].program(poses, out)
+            out = self._log_p(place)
+            launches, owner = self._scored[index].program(poses, out)
             program += launches
             owners.append((poses, out, owner))
         return self._programs.keep((key, source), (program, owners))
 
-    def _poses(self, cloud: Cloud, source: int) -> Any:
-        count = cloud.count
-        key = ("poses", source, count)
-        return self._views.get(key) or self._view(key, cloud.poses[source], (count, 3), _DOUBLE)
+    def _poses(self, source: int) -> Any:
+        key = ("poses", source, self.count)
+        return self._views.get(key) or self._view(key, self.poses[source], (self.count, 3), _DOUBLE)
 
-    def _log_p(self, cloud: Cloud, place: int) -> Any:
+    def _log_p(self, place: int) -> Any:
         """Return the array for a sensor's log-likelihoods."""
-        count = cloud.count
-        key = ("log_p", place, count)
-        return self._views.get(key) or self._view(key, cloud.log_p[place], (count,), cloud.precision)
+        key = ("log_p", place, self.count)
+        return self._views.get(key) or self._view(key, self.log_p[place], (self.count,), self.precision)
 
     def _view(self, key: tuple[str, int, int], buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> Any:
         """Return a cached view of a buffer; clouds of one size have few views."""
         if len(self._views) >= _MOST_VIEWS:
             self._views.clear()
-        self._views[key] = self._backend.view(buffer, shape, dtype)
+        self._views[key] = self.backend.view(buffer, shape, dtype)
         return self._views[key]
-
-
-class FilterCloud(Cloud):
-    """Particles of a filter on the device of its sensors.
-
-    Steps never write buffers named in ``kept``, and finally name the new buffers in ``places``. Restoring the
-    attributes in ``MEMORY`` therefore undoes an interrupted call of a filter.
-
-    Args:
-        sensors: The sensors of the filter.
-        capacity: Most particles.
-        residual: Whether to draw by residual resampling.
-    """
-
-    def __init__(self, sensors: Sequence[Sensor], capacity: int, *, residual: bool = False) -> None:
-        super().__init__(sensors[0].backend, capacity, len(sensors), sensors[0].precision, residual=residual)
-        self._scored, self._scoring = sensors, FilterScoring(sensors)
-
-    def correct(self, step: Step) -> None:
-        """Run a correction."""
-        score = self._scoring.of(self, step.readings)
-        stages = self.places.stages(self.kept, step.stages, step.drawn, step.kind, same=step.drawn == self.count)
-        judges = functools.partial(self._judges_of, step.judged) if step.judged else None
-        self.run_stages(step.settings, stages, step.drawn, len(step.readings), score, judges, step.meanwhile)
-
-    def _judges_of(self, judged: Sequence[SensorReadings]) -> list[MapJudge]:
-        """Prepare and return the judges of scans."""
-        sensors = ((self._scored[index], reading[0]) for index, reading in judged)
-        return [judge for sensor, ranges in sensors if (judge := sensor.judge()).expects(sensor.model.scanner, ranges)]
 
     @property
     def scoring_seconds(self) -> float:
@@ -173,4 +138,4 @@ class FilterCloud(Cloud):
 
     def time_scoring(self) -> None:
         """Wait for the log-likelihoods of each stage from now on, for ``scoring_seconds``."""
-        self._scoring.timed = True
+        self._timed = True

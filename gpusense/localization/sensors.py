@@ -51,13 +51,7 @@ class Lesson(NamedTuple):
 class Sensor:
     """Measurement model of a filter.
 
-    Args:
-        model: A scan, landmark or point model.
-
     Attributes:
-        model: The model.
-        backend: Device of the model.
-        precision: Precision of its log-likelihoods.
         beams: Used beams of a scan; 0 for other models.
         seconds: Time of all calls of ``score``.
         calibrates: Whether temperature="auto" learns from this sensor.
@@ -188,14 +182,9 @@ class Sensor:
         before: Callable[[], None] | None = None,
         timed: bool = False,
     ) -> None:
-        """Write the log-likelihoods of poses on the device; scans are complete once the device has finished.
+        """Start writing the log-likelihoods of (N, 3) poses on the device to (N,) ``out``.
 
-        Args:
-            poses: (N, 3) poses on the device.
-            reading: The reading.
-            out: (N,) array on the device.
-            before: Called before poses are read; starts the launches that write them.
-            timed: Whether to wait for the log-likelihoods and add their time to ``seconds``.
+        ``before`` starts the launches that write the poses. With ``timed`` the call waits, for ``seconds``.
         """
         begin = time.perf_counter()
         if self.calibrates:
@@ -261,11 +250,7 @@ class Sensor:
 
 
 def sensors_of(models: Any) -> list[Sensor]:
-    """Return the sensors of models with a common device and precision.
-
-    Args:
-        models: A measurement model, or several.
-    """
+    """Return the sensors of one or several models with a common device and precision."""
     chosen = list(models) if isinstance(models, Sequence) else [models]
     if not 0 < len(chosen) <= _MOST_SENSORS:
         raise ValueError(f"models: must be 1 to {_MOST_SENSORS} measurement models, got {len(chosen)}")

@@ -37,15 +37,7 @@ def skipped(
     anywhere: Callable[[], np.ndarray],
     share: float,
 ) -> list[SensorReadings]:
-    """Return readings without the beams that too few particles explain.
-
-    Args:
-        sensors: The filter's sensors.
-        readings: Indices of sensors with their readings.
-        particles: (N, 3) poses and (N,) weights.
-        anywhere: Returns (M, 3) poses anywhere in the free space.
-        share: Least weight of the particles that explain a used beam, as a share.
-    """
+    """Return readings without the beams that less than a share of (N, 3) particles, by (N,) weights, explains."""
     poses, weights = particles
     if not together(poses, weights):
         return readings
@@ -65,16 +57,7 @@ def without_skipped(
     elsewhere: np.ndarray,
     share: float,
 ) -> tuple[Any, ...]:
-    """Return a scan with missing readings for the beams that too few particles explain.
-
-    Args:
-        sensor: A sensor of scans.
-        reading: The scan.
-        poses: (N, 3) particles.
-        weights: (N,) their weights.
-        elsewhere: (M, 3) poses anywhere in the free space.
-        share: Least weight of the particles that explain a used beam, as a share.
-    """
+    """Return a scan with missing readings for the beams that less than a share of the particles explains."""
     parts = sensor.parts(np.vstack([poses, elsewhere]), reading)
     near, far = parts[: len(poses)], parts[len(poses) :]
     used = (near != 0).any(axis=0)
@@ -90,14 +73,7 @@ def without_skipped(
 
 
 def boundary(elsewhere: np.ndarray) -> float | None:
-    """Return the least log-likelihood of an explained beam, between a poor and a good beam.
-
-    Args:
-        elsewhere: (M, K) log-likelihoods of used beams at poses anywhere in the free space.
-
-    Returns:
-        The boundary; None if all beams are equally likely everywhere or impossible.
-    """
+    """Return the least log-likelihood of an explained beam, from (M, K) at poses anywhere; None if all are alike."""
     values = elsewhere[np.isfinite(elsewhere)]
     if not values.size:
         return None

@@ -78,12 +78,9 @@ def verdict_label(p_lost: float, wrong: float, *, wide: bool, apart: bool) -> Wo
 
 
 def share_off(covariance: Floats) -> float:
-    """Return the probability that a normal error is beyond 1 m or 0.5 rad.
+    """Return the probability that a normal error with a (3, 3) covariance is beyond 1 m or 0.5 rad.
 
     Position and heading are treated as independent, correct to second order in each.
-
-    Args:
-        covariance: (3, 3) covariance of x, y [m] and heading [rad]; infinite entries are far off.
     """
     large, heading = deviations(covariance)
     if math.isinf(large):
@@ -95,13 +92,7 @@ def share_off(covariance: Floats) -> float:
 
 
 def share_off_of(poses: Floats, weights: Floats, pose: Floats) -> float:
-    """Return the share of weighted particles that are beyond 1 m or 0.5 rad of a pose.
-
-    Args:
-        poses: (N, 3) particles.
-        weights: (N,) weights >= 0, not necessarily normalised.
-        pose: (3,) pose.
-    """
+    """Return the share of (N, 3) particles, by (N,) weights, that are beyond 1 m or 0.5 rad of a (3,) pose."""
     total = float(weights.sum())
     if not total > 0:
         return 1.0

@@ -58,15 +58,7 @@ def normal(mean: Any, covariance: Any, count: int, key: Key) -> np.ndarray:
 
 
 def spread(pool: np.ndarray, half: Spread, count: int, key: Key, *, each: bool = False) -> np.ndarray:
-    """Draw poses uniformly in boxes around the poses of a pool.
-
-    Args:
-        pool: (M, 3) centres.
-        half: Half widths of the box [m, m, rad].
-        count: Poses to draw.
-        key: Seed and step.
-        each: Whether to cycle through the centres instead of drawing them.
-    """
+    """Draw poses uniformly in boxes around (M, 3) centres, in turns with ``each`` and otherwise at random."""
     first, more = _words(count, key, 1), _words(count, key, 2)
     row = np.arange(count) % len(pool)
     if not each:
@@ -129,12 +121,7 @@ def likely_pool(likelihood: Any, count: int, key: Key) -> tuple[np.ndarray, Spre
 
 
 def look_at(pose: np.ndarray, grid: OccupancyGrid | None) -> None:
-    """Warn of an implausible start.
-
-    Args:
-        pose: (3,) pose.
-        grid: The map, or None.
-    """
+    """Warn of an implausible start at a (3,) pose."""
     if grid is None:
         look_at_heading("start", float(pose[2]))
         return
@@ -159,15 +146,7 @@ def likeliest(
     readings: Mapping[int, tuple[Any, ...]],
     temperature: float | str,
 ) -> np.ndarray:
-    """Return the likeliest of ``tries``, the centres of a reset's draws.
-
-    Args:
-        tries: (M, 3) poses anywhere.
-        particles: Number of particles.
-        sensors: The filter's sensors.
-        readings: Last readings by the index of their sensor.
-        temperature: Temperature of scans, or "auto".
-    """
+    """Return the likeliest of (M, 3) ``tries``, the centres of a reset's draws."""
     score = np.zeros(len(tries))
     for index, reading in readings.items():
         sensor = sensors[index]

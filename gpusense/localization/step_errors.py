@@ -50,13 +50,7 @@ def corrected(turns: np.ndarray, repeated: np.ndarray) -> np.ndarray:
 
 
 def errors_of(turns: np.ndarray, references: np.ndarray, at: np.ndarray) -> Errors:
-    """Return the errors between references.
-
-    Args:
-        turns: (M, 3) first turn, translation and second turn of each step [rad, m, rad].
-        references: (G + 1, 3) reference poses.
-        at: (G + 1,) indices of their steps: reference g is the pose before step ``at[g]``.
-    """
+    """Return the errors between (G + 1, 3) references before steps ``at``, of (M, 3) steps [rad, m, rad]."""
     first, trans, second = turns.T
     heading = np.r_[0.0, np.cumsum(first + second)]
     way = heading[:-1] + first

@@ -43,11 +43,7 @@ def reduction_fans(blocks: int) -> tuple[int, ...]:
 
 
 class Sums:
-    """Buffers of sums, and their launches.
-
-    Args:
-        backend: The device.
-        capacity: Most particles.
+    """Buffers of sums of at most ``capacity`` particles, and their launches.
 
     Attributes:
         largest: Largest score of each block.
@@ -81,13 +77,7 @@ class Sums:
         return program, self._largest_of_groups, groups
 
     def weigh(self, numbers: dict[str, Any], scored: tuple[Buffer, int], stage: int) -> Program:
-        """Return the launches that weigh particles.
-
-        Args:
-            numbers: Arguments by name: score, before, settings, state, particles, block, blocks.
-            scored: Largest scores of groups, and the number of groups.
-            stage: The stage.
-        """
+        """Return the launches that weigh particles, by the largest scores of a number of groups."""
         largest, groups = scored
         blocks = numbers["blocks"]
         weigh = self.launch("weigh_particles", blocks, largest=largest, groups=groups, sums=self.rows,
@@ -95,27 +85,14 @@ class Sums:
         return weigh + self._weight_totals(blocks)
 
     def set_weights(self, numbers: dict[str, Any], place: tuple[int, int], out: tuple[Buffer, Buffer]) -> Program:
-        """Return the launch that sets weights after weighing.
-
-        Args:
-            numbers: Arguments by name, as for the weighing.
-            place: The stage, and the most stages.
-            out: Buffers that receive the weights and their cumulative sums.
-        """
+        """Return the launch that writes weights and their cumulative sums after weighing, for a stage of all stages."""
         (stage, stages), (weight, ends), blocks = place, out, numbers["blocks"]
         return self.launch("set_weights", blocks + 1, highest=self._highest, sums=self.rows, joined=self._joined,
                            totals=self.totals, fan=reduction_fans(blocks)[0], stage=stage, stages=stages, weight=weight,
                            ends=ends, **numbers)  # fmt: skip
 
     def copies(self, numbers: dict[str, Any], copies: Buffer, drawn: int, stage: int) -> Program:
-        """Return the launches that add up certain copies of residual resampling; they overwrite the sums of weights.
-
-        Args:
-            numbers: Arguments by name: ends, state, particles, block, blocks.
-            copies: Receives their cumulative numbers.
-            drawn: Particles to draw.
-            stage: The stage.
-        """
+        """Return the launches that add up certain copies of residual resampling; they overwrite the sums of weights."""
         blocks = numbers["blocks"]
         return (
             *self.launch("count_copies", blocks, sums=self.rows, drawn=drawn, stage=stage, **numbers),

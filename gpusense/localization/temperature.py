@@ -60,11 +60,7 @@ _FIRST_STEPS = (0.05, 0.05, 0.0125)
 
 
 def axes_of(covariance: np.ndarray) -> np.ndarray:
-    """Return steps as columns of a (3, 3) array: deviations along the axes of a covariance, 0.1 mm to 10 cm.
-
-    Args:
-        covariance: (3, 3) covariance of a pose [m, m, rad].
-    """
+    """Return steps as columns of a (3, 3) array: deviations along the axes of a (3, 3) covariance, 0.1 mm to 10 cm."""
     units = np.array([1.0, 1.0, _TURN])
     values, vectors = np.linalg.eigh(covariance / np.outer(units, units))
     lengths = np.minimum(np.maximum(np.sqrt(np.maximum(values, 0.0)), _STEPS[0]), _STEPS[1])
@@ -236,11 +232,7 @@ class BeamCorrelation:
         return max(quarters * 3 * growth / (5 - 2 * growth), 1.0)
 
     def temperature(self, beams: int) -> float:
-        """Return the temperature of a sensor with ``beams`` beams from its scans, or an initial one.
-
-        Args:
-            beams: Used beams of a scan.
-        """
+        """Return the temperature of a sensor with ``beams`` used beams from its scans, or an initial one."""
         count = checks.integer("beams", beams, low=0)
         if self.scans < _LEAST_SCANS or not self._sums[1] > 0:
             return min(1.0, INDEPENDENT_AT_FIRST / max(count, 1))
@@ -250,14 +242,7 @@ class BeamCorrelation:
 
 
 def learn_from_scan(correlation: BeamCorrelation, model: Any, ranges: AnyArray, pose: AnyArray) -> None:
-    """Add a scan at a pose; this scan and the present temperature determine the covariance.
-
-    Args:
-        correlation: The running variance of scans' scores.
-        model: A model of scans.
-        ranges: (K,) ranges [m].
-        pose: (3,) pose of the robot [m, m, rad].
-    """
+    """Add a scan (K,) at a (3,) pose; this scan and the present temperature determine the covariance."""
     at, count = checks.array("pose", pose, (3,)), model.used_beams
     sine, cosine = np.sin(at[2]), np.cos(at[2])
     turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])

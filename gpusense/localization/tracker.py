@@ -49,11 +49,6 @@ class Progress(NamedTuple):
 class Tracker:
     """Particles with the sensors that weigh them.
 
-    Args:
-        sensors: The sensors.
-        options: Options of the filter.
-        cloud: The particles.
-
     Attributes:
         started: True after a start.
         progress: Steps so far, and the motion since the last correction.
@@ -61,7 +56,6 @@ class Tracker:
         wide: Number of remaining corrections at a low temperature.
         together: True if the particles are known to be concentrated.
         pool: Number of poses for recovery to inject, and half widths of the box around each.
-        corrections: Corrections so far.
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = (
@@ -167,13 +161,7 @@ class Tracker:
         self, readings: list[SensorReadings], *, judged: Sequence[SensorReadings] = (),
         meanwhile: Callable[[], None] | None = None,
     ) -> None:  # fmt: skip
-        """Run a postponed motion, and correct the particles by readings of sensors.
-
-        Args:
-            readings: Indices of sensors with their readings.
-            judged: Scans to judge at the pose after the correction.
-            meanwhile: Called while the device works.
-        """
+        """Run a postponed motion, correct the particles by readings, and judge scans at the new pose; see ``Step``."""
         chosen, drawn = self.options, self.cloud.count
         if chosen.least != chosen.most:
             self.move()
@@ -199,12 +187,7 @@ class Tracker:
         return min(max(size, 1.0), float(self.shown))
 
     def learn(self, readings: list[SensorReadings], is_doubted: Callable[[], bool]) -> None:
-        """Determine whether the particles are concentrated, and begin lessons of scans at an uncontradicted pose.
-
-        Args:
-            readings: Indices of sensors with the readings of the last correction.
-            is_doubted: Returns whether the pose is contradicted.
-        """
+        """Determine whether the particles are concentrated, and begin lessons of scans at an uncontradicted pose."""
         self.corrections += 1
         due = _due_of(self.sensors, readings) if self.options.temperature == "auto" else []
         if not (due or not self.together or self.corrections % _LOOK == 0):

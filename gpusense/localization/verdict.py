@@ -66,12 +66,7 @@ class VerdictState(NamedTuple):
 
 
 class Verdict:
-    """Running verdict of a filter.
-
-    Args:
-        sensors: The filter's sensors.
-        random_poses: Returns poses anywhere in the free space.
-        seed: Seed of the poses among landmarks.
+    """Running verdict of a filter; ``random_poses`` returns poses anywhere in the free space.
 
     Attributes:
         state: Memory of the verdict.

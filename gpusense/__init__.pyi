@@ -84,7 +84,7 @@ from gpusense.models.scan.joint_scoring import log_likelihoods as log_likelihood
 from gpusense.positions.bearings import triangulate as triangulate
 from gpusense.positions.bearings import triangulate_triangle as triangulate_triangle
 from gpusense.positions.fix import PositionFix as PositionFix
-from gpusense.positions.locate import locate as locate
+from gpusense.positions.ranges import locate as locate
 from gpusense.positions.ranges import trilaterate as trilaterate
 from gpusense.tables.crowd import Shapes as Shapes
 from gpusense.tables.distances import distance_transform as distance_transform

@@ -12,6 +12,7 @@ from gpusense._util.notices import warn_user
 from gpusense._util.typing import Floats
 from gpusense.logs.records import Pose
 from gpusense.logs.transform_buffer import TransformBuffer
+from gpusense.logs.transforms import planar
 from gpusense.world.messages import LEVEL, planar_part, tilt_of
 from gpusense.world.messages import field as field_of
 
@@ -131,7 +132,7 @@ def _track_of(transforms: TransformBuffer, frame: str) -> Track:
     times, poses = transforms.history(frame, base)
     track = Track(frame, Times(times.tolist(), times.tolist()), base=base, frame=frame)
     for pose in poses:
-        track.poses.append((float(pose[0, 3]), float(pose[1, 3]), math.atan2(pose[1, 0], pose[0, 0])))
+        track.poses.append(planar(pose))
         track.tilts.append(tilt_of(pose))
     return track
 

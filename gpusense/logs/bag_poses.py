@@ -14,6 +14,7 @@ from gpusense.logs.bag_odometry import Track, bases_of, warn_of_tilt
 from gpusense.logs.bag_survey import frame_of
 from gpusense.logs.bags import ODOMETRY, TRANSFORMS, messages, topics_of
 from gpusense.logs.transform_buffer import TransformBuffer, TransformError
+from gpusense.logs.transforms import planar
 from gpusense.world.messages import field, planar_part, stamp_of, tilt_of
 
 POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -132,8 +133,7 @@ def _of_transforms(path: Path, times: Floats, map_frame: str) -> PoseTrack:
             except TransformError as error:
                 problem = str(error)
                 continue
-            yaw = math.atan2(matrix[1, 0], matrix[0, 0])
-            track.add(time, time, (float(matrix[0, 3]), float(matrix[1, 3]), yaw), tilt_of(matrix))
+            track.add(time, time, planar(matrix), tilt_of(matrix))
         if track.poses:
             warn_of_tilt(str(path), track.source, track)
             return PoseTrack(track.source, *track.sorted())

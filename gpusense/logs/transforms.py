@@ -20,12 +20,16 @@ _HEADINGS, _PAIRS = 24, 12
 _SHIFT, _TURN = (0.15, 1.0), 0.2
 
 
+def planar(matrix: Floats) -> Pose:
+    """Return (x, y, yaw) of a (4, 4) pose."""
+    return float(matrix[0, 3]), float(matrix[1, 3]), math.atan2(matrix[1, 0], matrix[0, 0])
+
+
 def planar_mount(matrix: Floats) -> tuple[Pose, bool, float]:
     """Return a laser's mount, whether it is upside down (with clockwise bearings), and its tilt [rad]."""
-    pose = float(matrix[0, 3]), float(matrix[1, 3]), math.atan2(matrix[1, 0], matrix[0, 0])
     tilt = tilt_of(matrix)
     upside_down = tilt > _UPSIDE_DOWN
-    return pose, upside_down, math.pi - tilt if upside_down else tilt
+    return planar(matrix), upside_down, math.pi - tilt if upside_down else tilt
 
 
 def check_mount(scans: Sequence[Scan]) -> str | None:

@@ -25,11 +25,6 @@ def quaternion_of(yaw: float) -> dict[str, float]:
     return {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
 
 
-def planar(matrix: np.ndarray) -> Pose:
-    """Return (x, y, yaw) of a (4, 4) pose."""
-    return float(matrix[0, 3]), float(matrix[1, 3]), math.atan2(matrix[1, 0], matrix[0, 0])
-
-
 def pose_matrix(pose: Pose) -> np.ndarray:
     """Return the (4, 4) matrix of a planar pose."""
     c, s = math.cos(pose[2]), math.sin(pose[2])

@@ -12,6 +12,7 @@ import pytest
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.logs.transform_buffer import TransformError
+from gpusense.logs.transforms import planar
 from gpusense.ros import conversions, localizer, parameters, watcher
 from gpusense.ros.scan_queue import ScanQueue
 from gpusense.world.messages import planar_pose
@@ -33,7 +34,7 @@ def test_conversions() -> None:
     np.testing.assert_array_equal(conversions.covariance_of(numbers), covariance)
     message = SimpleNamespace(position=SimpleNamespace(x=0.0, y=0.0, z=9.0), orientation=SimpleNamespace(w=0.0))
     assert planar_pose("pose", conversions.fill(message, conversions.pose_fields(pose))) == pytest.approx(pose)
-    np.testing.assert_allclose(conversions.planar(conversions.pose_matrix(pose)), pose)
+    np.testing.assert_allclose(planar(conversions.pose_matrix(pose)), pose)
     cloud = conversions.cloud_fields(np.arange(30.0).reshape(10, 3), np.full(10, 0.1), most=4)
     assert [each["pose"]["position"]["x"] for each in cloud] == [0.0, 9.0, 18.0, 27.0]
     least = (0.25, 0.2)

@@ -2,5 +2,5 @@
 
 ``fit`` and ``incidence`` hold the public functions, and ``options`` their common options. ``pairs`` classifies the
 readings, ``device_sums`` sums over them on a device, ``problem`` computes the log-likelihood and its derivatives from
-the sums. ``em``, ``textbook`` and ``searches`` maximise it; ``blocks``, ``report`` and ``result`` describe the result.
+the sums. ``em``, ``textbook`` and ``searches`` maximise it; ``report`` describes the result.
 """

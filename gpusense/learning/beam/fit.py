@@ -15,7 +15,6 @@ from gpusense._util import checks
 from gpusense._util.progress import progress as progress_bar
 from gpusense._util.typing import FitMethod, Precision
 from gpusense.backends import Selection
-from gpusense.learning.beam.blocks import check_blocks
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.em import Climb, Watch, climb_em
 from gpusense.learning.beam.growth import fit_jointly
@@ -24,7 +23,7 @@ from gpusense.learning.beam.options import Callback, Options, check_options, mak
 from gpusense.learning.beam.pairs import Pairs, make_pairs
 from gpusense.learning.beam.point import HIT, SHORT, Bounds, Point, first_guess, random_start
 from gpusense.learning.beam.problem import NO_PRIOR, Prior, Problem, Value
-from gpusense.learning.beam.report import report
+from gpusense.learning.beam.report import check_blocks, report
 from gpusense.learning.beam.searches import climb_genetic, climb_gradient, climb_hill
 from gpusense.learning.beam.shapes import fit_shape
 from gpusense.learning.fitted import BeamFit

@@ -15,13 +15,13 @@ from gpusense._util import checks
 from gpusense._util.html import card
 from gpusense._util.typing import FitMethod, Precision
 from gpusense.backends import Backend, Selection
-from gpusense.learning.beam.blocks import check_blocks
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.fit import fit_pairs
 from gpusense.learning.beam.options import Callback, Options, check_options, make_bounds, open_device, start_of
 from gpusense.learning.beam.pairs import Pairs, make_pairs
 from gpusense.learning.beam.point import Bounds, Point, first_guess
 from gpusense.learning.beam.problem import Prior
+from gpusense.learning.beam.report import check_blocks
 from gpusense.learning.beam.shapes import fit_shape
 from gpusense.learning.fitted import BeamFit
 from gpusense.world.hit_shapes import SHAPES, HitName

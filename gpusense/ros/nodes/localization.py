@@ -25,6 +25,7 @@ from std_srvs.srv import Empty
 
 from gpusense.logs.records import Pose
 from gpusense.logs.transform_buffer import BACK
+from gpusense.logs.transforms import planar
 from gpusense.ros import conversions
 from gpusense.ros.localizer import Localizer
 from gpusense.ros.nodes.wiring import Guard, TFMessage, Transforms, diagnostic_array, latched, run, unreliable
@@ -226,7 +227,7 @@ class LocalizationNode(LifecycleNode):
         """Return the pose of the base in the odometry frame at a scan's stamp, and the laser's (4, 4) on the base."""
         laser = self.transforms.laser(message.header.frame_id)
         odometry = self.transforms.buffer.look_up(*self.options.frames[1:], stamp_of("message", message))
-        return conversions.planar(odometry), laser
+        return planar(odometry), laser
 
     def localize(self, message: LaserScan, transforms: tuple[Pose, Any]) -> None:
         """Localise with a scan, and publish the results."""

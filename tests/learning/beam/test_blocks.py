@@ -9,7 +9,7 @@ import pytest
 from support.learning_data import RANGE_MAX, TYPICAL, draw, point, problem_of
 
 import gpusense as gs
-from gpusense.learning.beam.blocks import block_gradients
+from gpusense.learning.beam.report import block_gradients
 
 
 def errors(fit: gs.BeamFit) -> np.ndarray:

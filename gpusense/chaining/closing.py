@@ -110,7 +110,10 @@ class Loops:
         first, second, needed = first[new], second[new], needed[new]
         for k in np.unique(needed):
             some = needed == k
-            self._keep_matches(self._matched(first[some], second[some], _LEVELS[k][0]))
+            found = self._matched(first[some], second[some], _LEVELS[k][0])
+            known = self._pairs(self.matches.first, self.matches.second)
+            again = np.isin(known, self._pairs(found.first, found.second))
+            self.matches = Links.joined([self.matches[~again], found])
         self._keep_tried(first, second, needed)
         self.searched += len(first)
         return bool(len(first))
@@ -162,11 +165,6 @@ class Loops:
         first, second, level, guess = (np.concatenate(parts) for parts in zip(new, self._tried, strict=True))
         _, last = np.unique(self._pairs(first, second), return_index=True)
         self._tried = first[last], second[last], level[last], guess[last]
-
-    def _keep_matches(self, found: Links) -> None:
-        """Replace earlier matches of the same pairs by sure matches."""
-        again = np.isin(self._pairs(self.matches.first, self.matches.second), self._pairs(found.first, found.second))
-        self.matches = Links.joined([self.matches[~again], found])
 
     def _matched(self, first: Integers, second: Integers, window: tuple[float, float]) -> Links:
         """Return the sure matches of candidates."""

@@ -5,10 +5,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections import Counter
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from gpusense._util.notices import warn_user
 from gpusense.logs.bag_beams import Geometry, geometry_of
@@ -65,9 +63,9 @@ def survey(path: Path, topic: str | None, frame: str | None, odometry_from: str 
     bag.track.source = odometer
     stamps = _TransformStamps()
     for message in messages(path, {**scans_on(chosen), ODOMETRY: {odometer}, TRANSFORMS: None}):
-        for take, each in _parts(message):
+        for each in message.fields.transforms if message.kind == TRANSFORMS else (message.fields,):
             try:
-                take(bag, message, each)
+                _take(bag, message, each)
                 stamps.look_at(message, each)
             except ValueError as error:
                 skipped.add(message, error)
@@ -113,29 +111,19 @@ def _scan_topic(path: Path, topics: dict[str, list[str]], topic: str | None) -> 
     return usual[0]
 
 
-def _parts(message: Message) -> Iterator[tuple[Callable[[Bag, Message, Any], None], Any]]:
-    """Yield the independent parts of a message, each with the function that records it."""
+def _take(bag: Bag, message: Message, part: object) -> None:
+    """Record a message, or one of its transforms."""
     if message.kind == TRANSFORMS:
-        yield from ((_take_transform, each) for each in message.fields.transforms)
+        bag.transforms.add(part, static=_is_static(message))
+    elif message.kind == SCAN:
+        geometry = geometry_of(part)
+        bag.lasers.setdefault(frame_of(part), Counter())[geometry] += 1
+        bag.times.add(stamp_of("message", part), message.time)
     else:
-        yield (_take_scan if message.kind == SCAN else _take_odometry), message.fields
-
-
-def _take_scan(bag: Bag, message: Message, scan: object) -> None:
-    geometry = geometry_of(scan)
-    bag.lasers.setdefault(frame_of(scan), Counter())[geometry] += 1
-    bag.times.add(stamp_of("message", scan), message.time)
-
-
-def _take_odometry(bag: Bag, message: Message, odometry: object) -> None:
-    pose, tilt = odometry_pose(odometry)
-    bag.track.add(stamp_of("message", odometry), message.time, pose, tilt)
-    bag.track.base = bag.track.base or str(field_of("message", odometry, "child_frame_id")).strip("/")
-    bag.track.frame = bag.track.frame or frame_of(odometry)
-
-
-def _take_transform(bag: Bag, message: Message, transform: object) -> None:
-    bag.transforms.add(transform, static=_is_static(message))
+        pose, tilt = odometry_pose(part)
+        bag.track.add(stamp_of("message", part), message.time, pose, tilt)
+        bag.track.base = bag.track.base or str(field_of("message", part, "child_frame_id")).strip("/")
+        bag.track.frame = bag.track.frame or frame_of(part)
 
 
 def _is_static(message: Message) -> bool:

@@ -132,11 +132,6 @@ def _angle_rounding(problem: Problem) -> float:
     return EPS * (4 * ROUNDINGS + float(np.abs(problem.bearings).max()))
 
 
-def _blur(problem: Problem) -> float:
-    """Return the rounding error of a zero angle between lines of sight."""
-    return _angle_rounding(problem) + 2 * problem.noise / problem.spread
-
-
 def _triple_blur(problem: Problem, triples: NDArray[np.intp], state: Floats | None = None) -> Floats:
     """Return the (N,) rounding errors of the clarity of triples, see :func:`three_bearings`.
 
@@ -183,7 +178,8 @@ def _no_solution(problem: Problem) -> str:
     if len(places) == 1 or (problem.heading is None and len(places) == 2):
         return "coincident"
     turned = problem.bearings - problem.bearings[0]
-    if np.abs(np.sin(turned)).max() > _blur(problem):
+    # Rounding error of a zero angle between lines of sight.
+    if np.abs(np.sin(turned)).max() > _angle_rounding(problem) + 2 * problem.noise / problem.spread:
         return ""
     # All lines of sight are parallel, and may coincide.
     line = in_line(problem.xy, problem.noise)

@@ -208,7 +208,8 @@ class Starts:
             return Ended(job, future.result(), starts)
         if isinstance(error, WorkerDied):
             if isinstance(error, JobTimeout) or starts >= self._most:
-                return Ended(job, _death(error, starts), starts)
+                times = f", {starts} times" if starts > 1 else ""
+                return Ended(job, _failed(f"{type(error).__name__}: {error}{times}"), starts)
             last = error.outside and starts + 1 == self._most
             (self._suspects if last else self._waiting).appendleft((job, starts))
             return None
@@ -216,12 +217,6 @@ class Starts:
             raise SweepLost(f"executor: has ended before the sweep: {error_text(error)}") from error
         # The job's result cannot be sent, or its worker cannot run it.
         return Ended(job, _failed(error_text(error)), starts)
-
-
-def _death(error: WorkerDied, starts: int) -> Outcome:
-    """Return the outcome of a job whose worker has ended."""
-    times = f", {starts} times" if starts > 1 else ""
-    return _failed(f"{type(error).__name__}: {error}{times}")
 
 
 def _failed(error: str) -> Outcome:

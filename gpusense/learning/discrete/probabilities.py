@@ -94,9 +94,10 @@ def shared_causes(
     total = math.fsum((z_hit, z_short, z_max, z_rand))
     with np.errstate(divide="ignore", invalid="ignore"):
         hit, short, none, rand = (np.log(weight / total) for weight in (z_hit, z_short, z_max, z_rand))
+        reached = np.minimum(rows + 1, bins)[:, None]
         mass = np.stack([
             hit + _log_hits(bins, width, sigma_hit, rows),
-            short + _log_decay(bins, lambda_short * width, rows),
+            short + ShortDensity(lambda_short * width).log_mass(np.arange(bins), 1, reached),
             np.full((len(rows), bins), rand + RandomDensity(bins).log_peak(1.0)),
         ])  # fmt: skip
         left = _tails(np.logaddexp.reduce(mass, axis=0), np.full((len(rows), 1), none))
@@ -168,11 +169,6 @@ def _log_h(x: Floats) -> Floats:
     far = t * (1 - 3 * t * (1 - 5 * t * (1 - 7 * t * (1 - 9 * t * (1 - 11 * t * (1 - 13 * t))))))
     log_h: Floats = -0.5 * x * x - _LOG_ROOT_2PI + np.log(np.where(x > _FAR, far, near))
     return log_h
-
-
-def _log_decay(bins: int, decay: float, rows: Integers) -> Floats:
-    """Return (rows, bins) log masses of an exponential up to the expected step; each row sums to 1."""
-    return ShortDensity(decay).log_mass(np.arange(bins), 1, np.minimum(rows + 1, bins)[:, None])
 
 
 def _tails(log_mass: Floats, log_none: Floats) -> Floats:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from gpusense._util.typing import Floats, Integers
+from gpusense._util.typing import Integers
 from gpusense.learning.fitted import PointFit, Q
 from gpusense.learning.information import errors_of, scatter_of
 from gpusense.learning.point.problem import Climb, Problem
@@ -64,15 +64,13 @@ def _errors(problem: Problem, end: Climb, blocks: Integers | None) -> dict[str, 
     """Return the standard errors by name; NaN for parameters that depend only on coordinates at bounds."""
     free = end.free
     rows = problem.jacobian(end.theta)[:, free]
-    scatter = None if blocks is None else _scatter(problem.log_p(end.theta)[1][:, free], blocks)
+    scatter = None
+    if blocks is not None:
+        size, gradients = int(blocks.max()) + 1, problem.log_p(end.theta)[1][:, free]
+        scatter = scatter_of(np.stack([np.bincount(blocks, column, size) for column in gradients.T], axis=1))
     errors = errors_of(-problem.hessian(end.theta, free), rows, scatter)
     errors[~rows.any(axis=1)] = math.nan
     return dict(zip(problem.values(end.theta), errors.tolist(), strict=True))
-
-
-def _scatter(gradients: Floats, blocks: Integers) -> Floats:
-    size = int(blocks.max()) + 1
-    return scatter_of(np.stack([np.bincount(blocks, column, size) for column in gradients.T], axis=1))
 
 
 def _blocks_of(problem: Problem, end: Climb, blocks: Integers | None) -> dict[str, int]:

@@ -19,7 +19,7 @@ from gpusense.features.doors import find_doors
 from gpusense.features.lines import find_hallways, find_lines, scores_of, straight
 from gpusense.features.poles import find_poles
 from gpusense.features.result import KINDS, Features, Found, check_kinds, features_of, joined, nothing
-from gpusense.features.segments import Segments, beams_of, find_segments
+from gpusense.features.segments import NEIGHBOURS, Segments, beams_of, by_bearing, find_segments
 from gpusense.matching.match import readings
 from gpusense.matching.noise import ASSUMED_NOISE, whole_noise
 from gpusense.matching.points import scan_points
@@ -29,8 +29,6 @@ from gpusense.world.scanner import Scanner, classify_ranges
 _LEAST_NOISE, _LARGEST_NOISE = 3e-3, 0.1
 # Most readings per pass.
 _READINGS = 1 << 22
-# Largest step between the bearings of neighbouring beams [usual steps].
-_NEIGHBOURS = 1.5
 # Standard deviation of the common error of a reflector's ranges [m]: bright echoes arrive early or late.
 _TOGETHER = 0.01
 
@@ -199,11 +197,7 @@ _LEAST_BEAMS, _WIDEST, _STEP = 2, 0.4, 0.2
 
 def find_reflectors(ranges: np.ndarray, intensities: np.ndarray, scanner: Scanner, noise: np.ndarray) -> Found:
     """Return the reflectors of (S, K) readings: centre and radius, half the width of the bright front."""
-    angle = np.mod(scanner.bearings + scanner.mount[2], 2 * math.pi)
-    order = np.argsort(angle, kind="stable")
-    bearing = angle[order]
-    steps = np.mod(np.roll(bearing, -1) - bearing, 2 * math.pi)
-    step = float(np.median(steps)) if len(steps) else 0.0
+    order, bearing, steps, step = by_bearing(scanner)
     hit = classify_ranges(ranges, scanner.range_min, scanner.range_max)[0][:, order] & (ranges[:, order] > 0)
     bright = np.where(hit & np.isfinite(intensities[:, order]), intensities[:, order], 0.0)
     rows: list[list[float]] = []
@@ -221,7 +215,7 @@ def _runs(bright: np.ndarray, r: np.ndarray, steps: np.ndarray, step: float) -> 
     count = len(bright)
     # Only bright beams have finite ranges.
     r = np.where(bright, r, 0.0)
-    linked = bright & np.roll(bright, -1) & (steps <= _NEIGHBOURS * step) & (np.abs(np.roll(r, -1) - r) < _STEP)
+    linked = bright & np.roll(bright, -1) & (steps <= NEIGHBOURS * step) & (np.abs(np.roll(r, -1) - r) < _STEP)
     first = np.flatnonzero(bright & ~np.roll(linked, 1))
     last = np.flatnonzero(bright & ~linked)
     if not len(first):

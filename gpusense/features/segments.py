@@ -19,7 +19,7 @@ _PRIOR = 20.0
 # Least standard deviation of ranges in a covariance [m].
 LEAST_NOISE = 2e-4
 # Largest step between the bearings of neighbouring beams [usual steps].
-_NEIGHBOURS = 1.5
+NEIGHBOURS = 1.5
 
 
 @dataclass(frozen=True)
@@ -225,18 +225,22 @@ class Beams:
         return result
 
 
-def beams_of(ranges: np.ndarray, scanner: Scanner, points: ScanPoints) -> Beams:
-    """Return the beams of (S, K) readings with these points."""
+def by_bearing(scanner: Scanner) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return the order of the beams by bearing, their bearings, steps to the next ones, and usual step [rad]."""
     angle = np.mod(scanner.bearings + scanner.mount[2], _FULL_TURN)
     order = np.argsort(angle, kind="stable")
+    bearing = angle[order]
+    steps = np.mod(np.roll(bearing, -1) - bearing, _FULL_TURN)
+    return order, bearing, steps, float(np.median(steps)) if len(steps) else 0.0
+
+
+def beams_of(ranges: np.ndarray, scanner: Scanner, points: ScanPoints) -> Beams:
+    """Return the beams of (S, K) readings with these points."""
+    order, bearing, steps, usual = by_bearing(scanner)
     state = reading_classes(ranges, scanner.range_min, scanner.range_max)[:, order]
     scan = np.repeat(np.arange(len(ranges)), points.counts)
-    bearing = angle[order]
     beam = _beams_of_points(points, bearing, scan, state)
-    count = len(order)
-    steps = np.mod(np.roll(bearing, -1) - bearing, _FULL_TURN)
-    usual = float(np.median(steps)) if count else 0.0
-    beside = steps <= _NEIGHBOURS * usual + 1e-12
+    beside = steps <= NEIGHBOURS * usual + 1e-12
     is_max = state == Reading.MAX
     after = np.roll(is_max, -1, axis=1) & beside
     before = np.roll(is_max & beside, 1, axis=1)

@@ -157,29 +157,26 @@ class DaskExecutor(Terminable):
 
     def _watch(self) -> None:
         """Follow the workers of the cluster until it is lost; no call may wait for a watch that has failed."""
-        try:
-            self._follow()
-        except Exception as error:
-            _LOG.error("sweep: the workers could not be followed", exc_info=True)
-            self._lose(f"the workers could not be followed: {error_text(error)}")
-
-    def _follow(self) -> None:
         answered = present = time.monotonic()
         while not self._end.wait(_LOOK):
-            workers, now = self._workers() if self.alive else None, time.monotonic()
-            if not self.alive:
-                self._lose("the scheduler has ended")
-            elif workers is None:
-                if now - answered > self._patience:
-                    self._lose(f"the scheduler has not answered for {self._patience:g} s")
-            else:
-                before, self.slots, answered = self.slots, self._usable(workers), now
-                if self.slots:
-                    present = now
-                elif before:
-                    _LOG.warning("sweep: no worker is left, waiting %g s for one", self._patience)
-                elif now - present > self._patience:
-                    self._lose(f"no worker has been there for {self._patience:g} s")
+            try:
+                workers, now = self._workers() if self.alive else None, time.monotonic()
+                if not self.alive:
+                    self._lose("the scheduler has ended")
+                elif workers is None:
+                    if now - answered > self._patience:
+                        self._lose(f"the scheduler has not answered for {self._patience:g} s")
+                else:
+                    before, self.slots, answered = self.slots, self._usable(workers), now
+                    if self.slots:
+                        present = now
+                    elif before:
+                        _LOG.warning("sweep: no worker is left, waiting %g s for one", self._patience)
+                    elif now - present > self._patience:
+                        self._lose(f"no worker has been there for {self._patience:g} s")
+            except Exception as error:
+                _LOG.error("sweep: the workers could not be followed", exc_info=True)
+                self._lose(f"the workers could not be followed: {error_text(error)}")
 
     def _lose(self, reason: str) -> None:
         """End all calls, and accept no further ones."""
@@ -220,7 +217,8 @@ class DaskExecutor(Terminable):
         """Hand the end of a Dask task to the future of its call."""
         import distributed
 
-        error: BaseException
+        value: Any = None
+        error: BaseException | None = None
         try:
             value = result_of(remote.result(timeout=self._patience))
         except distributed.KilledWorker:
@@ -231,12 +229,8 @@ class DaskExecutor(Terminable):
             error = CancelledError("the scheduler has lost the job")
         except BaseException as problem:
             error = problem
-        else:
-            with contextlib.suppress(InvalidStateError):
-                future.set_result(value)
-            return
         with contextlib.suppress(InvalidStateError):
-            future.set_exception(error)
+            future.set_result(value) if error is None else future.set_exception(error)
 
     def _closed(self, future: Future[Any], remote: Any) -> None:
         """Forget a call, and end it if it was cancelled."""

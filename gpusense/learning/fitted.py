@@ -259,7 +259,7 @@ class PointFit(Fitted[Q]):
 
 
 def _offset(name: str, value: float, error: float, is_fitted: bool) -> FitRow:
-    """Return the row of an offset, which may be estimated beside the parameters."""
+    """Return the row of an offset; the parameters may exclude it."""
     return FitRow(name, value, error, "fitted" if is_fitted else "estimated, not in the parameters")
 
 

@@ -112,7 +112,7 @@ def _scan_topic(path: Path, topics: dict[str, list[str]], topic: str | None) -> 
 
 
 def _take(bag: Bag, message: Message, part: object) -> None:
-    """Record a message, or one of its transforms."""
+    """Record a message, or a transform of it."""
     if message.kind == TRANSFORMS:
         bag.transforms.add(part, static=_is_static(message))
     elif message.kind == SCAN:

@@ -192,7 +192,7 @@ def test_tls_keeps_others_out(tmp_path, capsys):
         files = ["--tls-ca", own[0], "--tls-cert", own[1], "--tls-key", own[2]]
         # The jobs fail for want of a map, but on the cluster.
         assert cli.main([*call, *files, "--table", str(tmp_path / "c.csv")]) == 1
-        assert "2 failed" in capsys.readouterr().out and "none.log" in (tmp_path / "c.csv").read_text()
+        assert "2 FAILED" in capsys.readouterr().out and "none.log" in (tmp_path / "c.csv").read_text()
         more = ["--table", str(tmp_path / "d.csv")]
         assert "security: must have certificates for TLS, got none for tls://" in error_of([*call, *more], capsys)
 

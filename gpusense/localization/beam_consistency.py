@@ -35,29 +35,17 @@ _STILL = np.zeros((3, 3))
 
 
 class BeamConsistency(NamedTuple):
-    """Judged beams of a scan.
+    """Judged beams of a scan."""
 
-    Attributes:
-        kind: (B,) class of each beam.
-        distance: (B,) range to the first mapped wall before the beam's end, inf without one [m].
-        bearing: (B,) bearing from the scanner [rad].
-        reading: (B,) its reading [m].
-        origin: Origin of the beams [m].
-        heading: Direction of bearing 0 in the world [rad].
-        near: Largest distance of close agreement [m].
-        inside: True if the pose is inside solid cells.
-        off: True if the pose is in unknown cells or off the map.
-    """
-
-    kind: Floats
-    distance: Floats
-    bearing: Floats
-    reading: Floats
-    origin: tuple[float, float]
-    heading: float
-    near: float
-    inside: bool
-    off: bool
+    kind: Floats  # (B,) class of each beam
+    distance: Floats  # (B,) range to the first mapped wall before the beam's end, inf without one [m]
+    bearing: Floats  # (B,) bearing from the scanner [rad]
+    reading: Floats  # (B,) its reading [m]
+    origin: tuple[float, float]  # origin of the beams [m]
+    heading: float  # direction of bearing 0 in the world [rad]
+    near: float  # largest distance of close agreement [m]
+    inside: bool  # true if the pose is inside solid cells
+    off: bool  # true if the pose is in unknown cells or off the map
 
     @property
     def wall(self) -> Floats:
@@ -79,13 +67,13 @@ class BeamConsistency(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """Counts of the beams of simultaneous scans, by their evidence; ``close`` ones also agree."""
+    """Counts of the beams of simultaneous scans, by their evidence."""
 
-    agree: int
-    close: int
-    through: int
-    short: int
-    nothing: int
+    agree: int  # agreeing beams
+    close: int  # beams in close agreement
+    through: int  # beams that pass through walls
+    short: int  # short beams
+    nothing: int  # beams without evidence
 
     @property
     def informative_count(self) -> int:

@@ -75,39 +75,23 @@ def correlation(way: float, turn: float) -> float:
 
 
 class Comparison(NamedTuple):
-    """Last comparison of the pose with other places; immutable.
+    """Last comparison of the pose with other places; immutable."""
 
-    Attributes:
-        ratio: Log-likelihood ratio of "wrong" against "right".
-        pose: Compared pose; None before.
-        chosen: True if scans choose the next pose among many.
-    """
-
-    ratio: float = 0.0
-    pose: tuple[float, float, float] | None = None
-    chosen: bool = False
+    ratio: float = 0.0  # log-likelihood ratio of "wrong" against "right"
+    pose: tuple[float, float, float] | None = None  # compared pose; None before
+    chosen: bool = False  # true if scans choose the next pose among many
 
 
 class Belief(NamedTuple):
-    """State of the model; immutable.
+    """State of the model; immutable."""
 
-    Attributes:
-        log_odds: Logarithm of the odds of "wrong".
-        ratio: Log-likelihood ratio of the last judged scan.
-        pose: Pose of that judgement; None before.
-        scans: Scans since then.
-        chosen: True if the next pose is one that scans choose among many.
-        alike: Share of "wrong" that looks like "right".
-        compared: Last comparison of the pose with other places.
-    """
-
-    log_odds: float = math.log(START / (1 - START))
-    ratio: float = 0.0
-    pose: tuple[float, float, float] | None = None
-    scans: int = 0
-    chosen: bool = False
-    alike: float = ALIKE
-    compared: Comparison = Comparison()
+    log_odds: float = math.log(START / (1 - START))  # logarithm of the odds of "wrong"
+    ratio: float = 0.0  # log-likelihood ratio of the last judged scan
+    pose: tuple[float, float, float] | None = None  # pose of that judgement; None before
+    scans: int = 0  # scans since then
+    chosen: bool = False  # true if the next pose is one that scans choose among many
+    alike: float = ALIKE  # share of "wrong" that looks like "right"
+    compared: Comparison = Comparison()  # last comparison of the pose with other places
 
     @property
     def wrong(self) -> float:

@@ -41,15 +41,10 @@ _VERSIONS = itertools.count(1)
 
 
 class Beams(NamedTuple):
-    """Judged beams of a scan.
+    """Judged beams of a scan."""
 
-    Attributes:
-        bearing: (B,) bearings [rad].
-        reading: (B,) readings [m].
-    """
-
-    bearing: Floats
-    reading: Floats
+    bearing: Floats  # (B,) bearings [rad]
+    reading: Floats  # (B,) readings [m]
 
 
 class _Setting(NamedTuple):

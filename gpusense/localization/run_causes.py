@@ -63,33 +63,20 @@ class Place(NamedTuple):
 
 
 class RunEvidence(NamedTuple):
-    """Evidence of a run.
+    """Evidence of a run."""
 
-    Attributes:
-        motion: Agreement of the scans' motion with the odometry.
-        windows: Number of windows that were judged.
-        at_poses: Share of them that fit at the judged poses.
-        at_last: True if the last window fits there.
-        short: Share of the beams of windows that end in free space, among those that fit.
-        as_is: Share of windows that fit somewhere on the map.
-        mirrored: Share that fits somewhere as a laser upside down sees it.
-        scaled: Share that fits somewhere on a map of another scale.
-        scale: This scale: the ratio of true lengths to lengths on the map.
-        moved: Common displacement of the places from the judged poses, in the map; None without one.
-        last: Place of the last window, if it fits.
-    """
-
-    motion: ScanMotion
-    windows: int = 0
-    at_poses: float = 0.0
-    at_last: bool = False
-    short: float = 0.0
-    as_is: float = 0.0
-    mirrored: float = 0.0
-    scaled: float = 0.0
-    scale: float = 1.0
+    motion: ScanMotion  # agreement of the scans' motion with the odometry
+    windows: int = 0  # number of windows that were judged
+    at_poses: float = 0.0  # share of them that fit at the judged poses
+    at_last: bool = False  # true if the last window fits there
+    short: float = 0.0  # share of the beams of windows that end in free space, among those that fit
+    as_is: float = 0.0  # share of windows that fit somewhere on the map
+    mirrored: float = 0.0  # share that fits somewhere as a laser upside down sees it
+    scaled: float = 0.0  # share that fits somewhere on a map of another scale
+    scale: float = 1.0  # this scale: the ratio of true lengths to lengths on the map
+    # Common displacement of the places from the judged poses, in the map; None without one.
     moved: tuple[float, float, float] | None = None
-    last: tuple[float, float, float] | None = None
+    last: tuple[float, float, float] | None = None  # place of the last window, if it fits
 
 
 def diagnose_run(models: Any, moments: Sequence[Moment], *, search: bool = True) -> Diagnosis:

@@ -51,59 +51,36 @@ _TURNS = np.radians(np.arange(-180, 180, 1.0))
 
 
 class Moment(NamedTuple):
-    """A scan of a run.
+    """A scan of a run."""
 
-    Attributes:
-        ranges: (K,) readings [m].
-        pose: (3,) pose that is judged [m, m, rad].
-        odometry: (3,) pose in the odometry frame; None without odometry.
-        time: Time of the scan [s]; NaN if unknown.
-        sensor: Index of its model.
-    """
-
-    ranges: Any
-    pose: Any
-    odometry: Any = None
-    time: float = math.nan
-    sensor: int = 0
+    ranges: Any  # (K,) readings [m]
+    pose: Any  # (3,) pose that is judged [m, m, rad]
+    odometry: Any = None  # (3,) pose in the odometry frame; None without odometry
+    time: float = math.nan  # time of the scan [s]; NaN if unknown
+    sensor: int = 0  # index of its model
 
 
 class Window(NamedTuple):
-    """A few scans of one laser in a row.
+    """A few scans of one laser in a row."""
 
-    Attributes:
-        moments: Their indices in the run.
-        relative: (L, 3) poses of the robot in its frame at the first scan, by matched scans; shorter than the window
-            where scans do not match.
-    """
-
-    moments: tuple[int, ...]
+    moments: tuple[int, ...]  # their indices in the run
+    # (L, 3) poses of the robot in its frame at the first scan, by matched scans; shorter than the window where scans
+    # do not match.
     relative: Floats
 
 
 class ScanMotion(NamedTuple):
-    """Agreement of the motion between scans with the odometry.
+    """Agreement of the motion between scans with the odometry."""
 
-    Attributes:
-        pairs: Number of pairs of scans that were matched.
-        matched: Number of pairs that match.
-        windows: The windows with their relative poses.
-        cause: "none", "odometry", "mount", "time", or "unknown" without odometry or enough matches.
-        way: Median distance between the two motions [m].
-        turn: Median turn between them [rad].
-        turned: Turn of the mount that explains the odometry [rad].
-        mirrored: True if a laser that is upside down explains it.
-        delay: Time of the fitting odometry less the time of its scan [s]; 0 if the times of scans are unknown.
-    """
-
-    pairs: int
-    matched: int
-    windows: list[Window]
-    cause: str = "unknown"
-    way: float = math.nan
-    turn: float = math.nan
-    turned: float = 0.0
-    mirrored: bool = False
+    pairs: int  # number of pairs of scans that were matched
+    matched: int  # number of pairs that match
+    windows: list[Window]  # the windows with their relative poses
+    cause: str = "unknown"  # "none", "odometry", "mount", "time", or "unknown" without odometry or enough matches
+    way: float = math.nan  # median distance between the two motions [m]
+    turn: float = math.nan  # median turn between them [rad]
+    turned: float = 0.0  # turn of the mount that explains the odometry [rad]
+    mirrored: bool = False  # true if a laser that is upside down explains it
+    # Time of the fitting odometry less the time of its scan [s]; 0 if the times of scans are unknown.
     delay: float = 0.0
 
 

@@ -42,27 +42,16 @@ _FEW = 0.4
 
 
 class VerdictState(NamedTuple):
-    """Memory of a verdict; immutable, saved and restored by assignment.
+    """Memory of a verdict; immutable, saved and restored by assignment."""
 
-    Attributes:
-        belief: Belief that the pose is wrong.
-        corrections: Corrections since the filter began.
-        judged: Corrections at the last judgement; -1 before.
-        explained: Share of explained beams then; NaN without beams.
-        gains: Gains of recent features by index of the sensor.
-        ratios: Ratios of features since the last judgement.
-        places: Number of places searched since the last confirmed place.
-        evidence: Evidence of the last judged readings, by the particles.
-    """
-
-    belief: Belief = Belief()
-    corrections: int = 0
-    judged: int = -1
-    explained: float = math.nan
-    gains: tuple[tuple[int, Gains], ...] = ()
-    ratios: tuple[float, ...] = ()
-    places: int = 0
-    evidence: float = -math.inf
+    belief: Belief = Belief()  # belief that the pose is wrong
+    corrections: int = 0  # corrections since the filter began
+    judged: int = -1  # corrections at the last judgement; -1 before
+    explained: float = math.nan  # share of explained beams then; NaN without beams
+    gains: tuple[tuple[int, Gains], ...] = ()  # gains of recent features by index of the sensor
+    ratios: tuple[float, ...] = ()  # ratios of features since the last judgement
+    places: int = 0  # number of places searched since the last confirmed place
+    evidence: float = -math.inf  # evidence of the last judged readings, by the particles
 
 
 class Verdict:

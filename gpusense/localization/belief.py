@@ -22,7 +22,7 @@ stayed:
     r_t + max(r_t - r_{t-1}, 0) rho / (1 + rho).
 
 Such a place looks like the right one (see below) with probability ``ALIKE (1 - rho)``, since near the last pose its
-scan must repeat the last scan as well.
+scan must also repeat the last scan.
 
 Some wrong places look like the right one: scans agree there equally, and are no evidence. ``ALIKE`` is the prior share
 of such places among wrong ones, and ``ALIKE_CHOSEN`` among places from a search, which prefers them. Places stop

@@ -248,3 +248,42 @@ def _check_result(
         raise ValueError(f"out: shape must be {shape_text(wanted)}, got {shape_text(shape)}")
     if not usable:
         raise ValueError("out: must be C-contiguous and writable, got one that is not")
+
+
+class Result:
+    """The memory of a result: the array ``out=``, or new memory where the poses are.
+
+    Args:
+        poses: The poses as the user passed them, which determine the library of the result.
+        out: The array for the result as the user passed it, or None.
+        shape: Its shape.
+        real: Its precision.
+        backend: The device.
+        on_device: True if the poses are on it.
+
+    Attributes:
+        flat: A flat NumPy array, or a buffer on the device.
+    """
+
+    def __init__(
+        self, poses: Any, out: Any, shape: tuple[int, ...], real: np.dtype, backend: Backend, *, on_device: bool
+    ) -> None:
+        self._poses, self._out, self._shape, self._real, self._backend = poses, out, shape, real, backend
+        self._on_device = on_device
+        if out is not None:
+            self.flat = check_out(out, shape, real, backend, device_poses=on_device)
+        elif on_device:
+            self.flat = backend.empty_external(math.prod(shape), real)
+        else:
+            self.flat = np.empty(shape, real) if backend.results is None else backend.results.empty(shape, real)
+        if not on_device:
+            self.flat = self.flat.reshape(-1)
+
+    def user_array(self) -> Any:
+        """Return ``out``, or the result as an array of the library of the poses."""
+        if self._out is not None:
+            return self._out
+        if self._on_device:
+            return wrapped(self._poses, self._backend, self.flat, self._shape, self._real)
+        result = self.flat.reshape(self._shape)
+        return result if type(self._poses) is np.ndarray else like(self._poses, result)

@@ -49,7 +49,7 @@ class Backend(ABC):
     info: BackendInfo  # the device behind this backend
     alignment: int = 1  # parts of buffers begin at multiples of this number of bytes
     # Memory of freed results on the host; None where a new array costs less.
-    _results: ResultMemory | None = None
+    results: ResultMemory | None = None
 
     # ---- buffers and copies
 
@@ -77,10 +77,6 @@ class Backend(ABC):
 
         If ``wait`` is false, the array must stay alive, and is not filled, until ``synchronize`` has returned.
         """
-
-    def empty_result(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-        """Return a new host array for a result; large arrays reuse the memory of earlier results that were freed."""
-        return np.empty(shape, dtype) if self._results is None else self._results.empty(shape, dtype)
 
     @abstractmethod
     def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:

@@ -13,7 +13,7 @@ device, and its first start of a program is an error (``Backend.check_process``)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable
 from typing import Any, Generic, TypeVar
 
 from gpusense.backends.base import Backend
@@ -48,31 +48,6 @@ class ProgramCache(Generic[T]):
     def clear(self) -> None:
         """Drop all programs."""
         self._kept.clear()
-
-
-class ChangingProgram:
-    """A program without the arguments that change from call to call.
-
-    Attributes:
-        flags: Flags of its launches.
-    """
-
-    def __init__(self, backend: Backend, program: Program, changing: Iterable[str]) -> None:
-        names = frozenset(changing)
-        self._backend, self.flags = backend, flags_of(program)
-        self._launches = [
-            (one.kernel, one.flags, one.size, one.without(names).arguments, one.places(names)) for one in program
-        ]
-
-    def __call__(self, changing: dict[str, Any]) -> None:
-        """Start it with the arguments of a call; a launch does not wait for the arguments of the next."""
-        compiled = self._backend.compile
-        for kernel, flags, size, fixed, places in self._launches:
-            arguments = list(fixed)
-            for place, name in places:
-                arguments[place] = changing[name]
-            # A backend that watches another backend sees each launch here.
-            compiled(kernel, flags)(size, *arguments)
 
 
 class RecordedProgram:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
-from gpusense.backends.programs import ChangingProgram, ProgramCache, RecordedProgram
-from gpusense.interface.launches import Program
+from gpusense.backends.programs import ProgramCache, RecordedProgram
+from gpusense.interface.launches import Program, flags_of
 
 T = TypeVar("T")
 
@@ -22,13 +22,38 @@ _ALIGNED = 64
 POSE_STATUS = ("pose_status", np.dtype(np.int32))
 
 
-class _Result:
-    """Context of the launches that write a part of a result, delivered at its end."""
+class ChangingProgram:
+    """A program without the arguments that change from call to call.
+
+    Attributes:
+        flags: Flags of its launches.
+    """
+
+    def __init__(self, backend: Backend, program: Program, changing: Iterable[str]) -> None:
+        names = frozenset(changing)
+        self._backend, self.flags = backend, flags_of(program)
+        self._launches = [
+            (one.kernel, one.flags, one.size, one.without(names).arguments, one.places(names)) for one in program
+        ]
+
+    def __call__(self, changing: dict[str, Any]) -> None:
+        """Start it with the arguments of a call; a launch does not wait for the arguments of the next."""
+        compiled = self._backend.compile
+        for kernel, flags, size, fixed, places in self._launches:
+            arguments = list(fixed)
+            for place, name in places:
+                arguments[place] = changing[name]
+            # A backend that watches another backend sees each launch here.
+            compiled(kernel, flags)(size, *arguments)
+
+
+class PartialResult:
+    """Context with the buffer in which launches write ``count`` numbers of a flat or external array."""
 
     def __init__(
-        self, space: Workspace, backend: Backend, name: str, target: np.ndarray | Buffer, first: int, count: int,
-        dtype: np.dtype,
-    ) -> None:  # fmt: skip
+        self, space: Workspace, name: str, target: np.ndarray | Buffer, first: int, count: int, dtype: np.dtype
+    ) -> None:
+        backend = space.backend
         self._space, self._backend, self._target, self._first, self._count = space, backend, target, first, count
         self._begin = begin = first * dtype.itemsize
         # Parts can begin only at aligned bytes.
@@ -57,7 +82,7 @@ class Workspace:
     """Named buffers that only grow, and programs that use them."""
 
     def __init__(self, backend: Backend) -> None:
-        self._backend = backend
+        self.backend = self._backend = backend
         self._buffers: dict[tuple[str, np.dtype], tuple[int, Buffer]] = {}
         # Host arrays that unfinished copies read or write.
         self._busy: list[np.ndarray] = []
@@ -210,10 +235,6 @@ class Workspace:
             ]
             self._parts[key] = parts
         return parts
-
-    def result(self, name: str, target: np.ndarray | Buffer, first: int, count: int, dtype: np.dtype) -> _Result:
-        """Return a context with the buffer in which launches write ``count`` numbers of a flat or external array."""
-        return _Result(self, self._backend, name, target, first, count, dtype)
 
     def download(self, buffer: Buffer, out: np.ndarray) -> None:
         """Start copying the beginning of a buffer into a C-contiguous array, filled after ``wait``."""

@@ -129,7 +129,7 @@ def density_grid(backend: Selection, precision: str) -> Densities:
         z = _grid_readings(p, expected, ulp)
         parts = device.empty(count * len(z), real)
         first = device.upload(np.array([0, len(z)], np.int32))
-        mixture = model._pipeline.mixture
+        mixture = model._beam_pipeline.mixture
         # Rays that are shared do not end behind a reading.
         scoring = launch(
             "score_beams", flags | (mixture.flags - {"STOPS"}), (count,), **casting, first=first,

@@ -23,7 +23,7 @@ from gpusense.interface.launches import Program, launch
 from gpusense.tables.reachable import MapState, ReachableMap
 from gpusense.tables.world_index import InWorlds, WorldIndex
 from gpusense.world.frames import Cells, Mount, frame_of, place_poses
-from gpusense.world.windows import Corners, Window
+from gpusense.world.windows import Corners, Window, extent
 
 _INT = np.dtype(np.int32)
 _SINGLE, _DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
@@ -199,6 +199,20 @@ class PlacedPoses(NamedTuple):
     def world_flags(self) -> frozenset[str]:
         """Flags of kernels that cast rays in worlds."""
         return _PLAIN if self.inside is None else self.inside.flags
+
+    def within(self, reach: float, ring: int = 0) -> bool:
+        """Return whether all cells within ``reach`` of the sensors are surely in the window and a ring around it."""
+        if self.corners is None or not (self.inside is None or self.inside.worlds.uniform):
+            return False
+        window, frame = self.frame.window, self.frame
+        left, right, low, high = extent(frame.cells, self.corners, frame.mount)
+        reach += 1
+        return (
+            left - reach >= window.col - ring
+            and right + reach <= window.col + window.cols + ring
+            and low - reach >= window.row - ring
+            and high + reach <= window.row + window.rows + ring
+        )
 
     @property
     def world(self) -> Buffer:

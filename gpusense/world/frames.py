@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -34,6 +34,19 @@ class Cells(Protocol):
     @property
     def shape(self) -> tuple[int, int]:
         """Numbers of rows and columns."""
+
+
+class PlainCells(NamedTuple):
+    """Cells with plain fields; see Cells."""
+
+    origin: tuple[float, float, float]
+    resolution: float
+    shape: tuple[int, int]
+
+
+def plain_cells(cells: Cells) -> PlainCells:
+    """Return cells with plain fields, for calls that read them again and again."""
+    return PlainCells(cells.origin, cells.resolution, cells.shape)
 
 
 _IN_TWO_PARTS = frozenset({"TWO_PART_POINTS"})

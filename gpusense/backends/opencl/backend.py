@@ -64,7 +64,7 @@ class OpenCLBackend(ProcessBound, Backend):
         self._context = cl.Context([device]) if queue is None else queue.context
         self._queue = cl.CommandQueue(self._context) if queue is None else queue
         self._shared = shares_memory(device)
-        self._results = ResultMemory() if info.kind == "gpu" else None
+        self.results = ResultMemory() if info.kind == "gpu" else None
         # Staged copies, only for the driver with which they were measured.
         staged = info.kind == "gpu" and not self._shared and "NVIDIA" in device.vendor
         self._staging = Staging(functools.partial(slots_of, self._queue)) if staged else None

@@ -13,9 +13,9 @@ from gpusense._util import checks
 from gpusense._util.html import card, split_options
 from gpusense._util.typing import Precision
 from gpusense.backends import BackendInfo, Selection, get_backend
+from gpusense.backends.arrays import Result
 from gpusense.backends.base import Backend, Buffer
-from gpusense.backends.results import Result
-from gpusense.backends.workspace import Workspace
+from gpusense.backends.workspace import PartialResult, Workspace
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, flags_of, launch
 from gpusense.interface.plan import ORDINARY_HEADINGS, Omission, Plan
@@ -150,7 +150,7 @@ class PointModel(Pickled):
         result = Result(poses, out, (count,), real, backend, on_device=on_device)
 
         def score(piece: Piece) -> None:
-            with space.result("log_p", result.flat, piece.begin, piece.count, real) as log_p:
+            with PartialResult(space, "log_p", result.flat, piece.begin, piece.count, real) as log_p:
                 if program is None:
                     # Poses that are not finite are refused even without a measurement.
                     _, launches = self._relative(checked, piece.part, "place_relative", ORIGIN)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray, CasterName, Compat, Precision, Space
 from gpusense.backends import Selection
-from gpusense.backends.results import Result
+from gpusense.backends.arrays import Result
 from gpusense.interface.plan import SceneNotes
 from gpusense.models.arguments import check_absent, check_discrete
 from gpusense.models.scan.beam_density import density_of
@@ -120,17 +120,13 @@ class BeamModel(ScanModel):
             context.backend, context.real, grid, scanner.mount, scanner.range_max, method, unknown=self.unknown,
             outside=self.outside, crop=specialize, obstacles_of=weights.obstacles,
         )  # fmt: skip
-        self._beam_pipeline = BeamPipeline(
+        self._stages = self._beam_pipeline = BeamPipeline(
             context, self._caster, cones_of(scanner, method, incidence=incidence is not None),
             mixture_on_device(
                 density, scanner.range_max, context.real, width=sensor_table, compat=weights.name, specialize=specialize
             ),
             max_evaluated=density.max_depends and density.table is None,
         )  # fmt: skip
-
-    @property
-    def _pipeline(self) -> BeamPipeline:
-        return self._beam_pipeline
 
     def _arguments(self) -> dict[str, Any]:
         options = dict(

@@ -21,7 +21,7 @@ from gpusense.models.scan.mixture import Mixture
 from gpusense.models.scan.pipeline import ScanLaunch, ScanPipeline, Tiles
 from gpusense.models.scan.readings import ReadingLayout, Readings
 from gpusense.models.scan.rules import ModelContext
-from gpusense.models.scan.tiles import all_within, stranded, sum_launch, tiles_of
+from gpusense.models.scan.tiles import stranded, sum_launch, tiles_of
 from gpusense.world.frames import ray_vectors
 
 
@@ -52,6 +52,7 @@ class BeamPipeline(ScanPipeline):
             FLOAT64=self.real == np.float64, ALL_READINGS=max_evaluated or not self.specialize
         )
         upload, cells = self.backend.upload, mixture.cells
+        self._cells = cells
         self._terms = upload(np.stack(mixture.terms, axis=1))
         self._constants = dict(
             terms=self._terms, masses=upload(mixture.masses), edges=upload(mixture.cosines.astype(self.real)),
@@ -63,7 +64,7 @@ class BeamPipeline(ScanPipeline):
     @property
     def _top(self) -> float:
         """Largest range of a table below a max reading: a range rounded to range_max remains a range."""
-        if not self.mixture.cells:
+        if not self._cells:
             return math.inf
         return float(np.nextafter(self.real.type(self.scanner.range_max), self.real.type(0)))
 
@@ -73,7 +74,7 @@ class BeamPipeline(ScanPipeline):
         """See ScanPipeline.upload; readings that share a ray are neighbours."""
         vectors = scans.rays if self.cones.rays == 1 else self.cone_vectors[scans.columns[scans.ray_offsets[:-1]]]
         values = scans.readings.astype(self.real)
-        if self.mixture.cells:
+        if self._cells:
             values = np.where(np.isfinite(scans.readings), np.minimum(values, self.real.type(self._top)), values)
         shared, several = scans.shared or not self.specialize, scans.scans > 1
         arrays = dict(ray=vectors.astype(self.real), reading=values)
@@ -115,7 +116,7 @@ class BeamPipeline(ScanPipeline):
             self.caster.flags
             | placed.world_flags
             | flags_if(
-                ORIGINS_OUTSIDE=not (self.specialize and all_within(placed, 0)),
+                ORIGINS_OUTSIDE=not (self.specialize and placed.within(0)),
                 ORDERED=tiles is not None and tiles.order is not None,
                 STRANDED=tiles is not None and not shared and stranded(readings.rays, tiles.spread),
             )

@@ -10,11 +10,10 @@ import numpy as np
 
 from gpusense._util import checks, masks
 from gpusense.backends import arrays
-from gpusense.backends.results import Result
+from gpusense.backends.arrays import Result
 from gpusense.models.scan.bound import BoundCall, RecordedCall
 from gpusense.models.scan.packed_call import LARGEST, MOST_CELLS, PackedCall, fits, host_task, is_short
-from gpusense.models.scan.pipeline import ScanPipeline
-from gpusense.models.scan.request import FLOATS
+from gpusense.models.scan.pipeline import FLOATS, ScanPipeline
 from gpusense.tables.world_index import WorldIndex
 from gpusense.tables.worlds import Worlds
 

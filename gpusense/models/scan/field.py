@@ -20,7 +20,7 @@ from gpusense.models.scan.differentiable import Differentiable
 from gpusense.models.scan.field_gradient import gradients, in_world
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.model import ScanModel
-from gpusense.models.scan.request import make_request
+from gpusense.models.scan.pipeline import make_request
 from gpusense.models.scan.rules import Beams
 from gpusense.peers.weights import Peer, check_weights, choose
 from gpusense.tables.world_map import check_no_worlds
@@ -94,7 +94,7 @@ class LikelihoodFieldModel(ScanModel):
             z_max=self.parameters.z_max, max_depends=False, constant_term=weights.field_constant,
             possible=self.parameters.z_hit > 0 or self.parameters.z_rand > 0,
         )  # fmt: skip
-        self._field_pipeline = FieldPipeline(
+        self._stages = self._field_pipeline = FieldPipeline(
             self._context, grid, self.parameters, unknown=self.unknown, outside=self.outside
         )
 

@@ -13,8 +13,8 @@ from gpusense.interface.structs import ScanBatch, Score
 from gpusense.models.chunking import Piece, chunk_of, run_pieces
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.field_pipeline import FieldPipeline
+from gpusense.models.scan.pipeline import Request
 from gpusense.models.scan.readings import Readings, placing_launches
-from gpusense.models.scan.request import Request
 
 # Flags of the mixture that have no meaning for the kernel.
 _OTHERS = {"LOG_TABLE", "CUBES"}

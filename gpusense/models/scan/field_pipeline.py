@@ -19,7 +19,7 @@ from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.pipeline import ScanLaunch, ScanPipeline, Tiles
 from gpusense.models.scan.readings import ReadingLayout, Readings
 from gpusense.models.scan.rules import ModelContext
-from gpusense.models.scan.tiles import ENOUGH_SHORT, all_within, spread_of, sum_launch
+from gpusense.models.scan.tiles import ENOUGH_SHORT, spread_of, sum_launch
 from gpusense.tables.field import RING, FieldTable
 from gpusense.tables.reachable import ReachableMap
 from gpusense.tables.world_map import WorldMap, check_worlds
@@ -172,8 +172,9 @@ class FieldPipeline(ScanPipeline):
             raise ValueError("shapes: must be assigned before a likelihood field is bound, got the first ones later")
         if placed.inside is not None and not self.quick:
             return placed.world_flags
-        inside = tiles is not None and self.quick and all_within(placed, readings.reach, RING)
-        return (_INSIDE if inside else _NONE) | placed.world_flags
+        inside = tiles is not None and self.quick and placed.within(readings.reach, RING)
+        flags = _INSIDE if inside else _NONE
+        return flags if placed.inside is None else flags | placed.world_flags
 
     def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
         flags = self.components | conditions

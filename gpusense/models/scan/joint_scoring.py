@@ -10,7 +10,7 @@ from gpusense._util import checks
 from gpusense.models.chunking import finish_all
 from gpusense.models.poses import Poses
 from gpusense.models.scan.model import ScanModel
-from gpusense.models.scan.request import make_request
+from gpusense.models.scan.pipeline import make_request
 
 
 def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out: Any = None) -> list[Any]:

@@ -10,9 +10,9 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.backends import Backend
+from gpusense.backends.arrays import Result
 from gpusense.backends.base import Buffer
-from gpusense.backends.results import Result
-from gpusense.backends.workspace import Workspace
+from gpusense.backends.workspace import PartialResult, Workspace
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
@@ -22,7 +22,7 @@ from gpusense.models.chunking import Piece, chunk_of, finish, run_pieces
 from gpusense.models.poses import Frame, PlacedPoses, Poses, place
 from gpusense.models.scan.cones import LASER, Cones
 from gpusense.models.scan.sampling import Drawing
-from gpusense.models.scan.tiles import Order, all_within, order_of, tiles_of
+from gpusense.models.scan.tiles import Order, order_of, tiles_of
 from gpusense.tables import casters
 from gpusense.tables.caster_base import Caster, CasterInput
 from gpusense.tables.lookup_files import describe, write_lookup
@@ -30,7 +30,7 @@ from gpusense.tables.reachable import MapState, ObstaclesOf, ReachableMap, Table
 from gpusense.tables.rectangles import rectangles_of_worlds
 from gpusense.tables.world_map import WorldMap, check_worlds, index_of
 from gpusense.tables.worlds import Worlds
-from gpusense.world.frames import Mount
+from gpusense.world.frames import Mount, plain_cells
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.windows import Window
 
@@ -89,6 +89,9 @@ class MapCaster:
         # Include the table's flags once it is made.
         self.flags = self._fixed_flags
         self._precision_flags = flags_if(FLOAT64=real == np.float64)
+        # The frame of the last state of the map.
+        self._framed: MapState | None = None
+        self._frame: Frame
         self._workspace = Workspace(backend)
         # Threads may share a caster: its buffers serve one call at a time.
         self._lock = threading.Lock()
@@ -196,7 +199,8 @@ class MapCaster:
         """
         rays = len(vectors)
         checked = Poses(poses, self.backend, late=rays > 0)
-        checked.inside = index_of(self.grid, world, ignore, checked.count, self.backend)
+        if self._worlds is not None or world is not None or ignore is not None:
+            checked.inside = index_of(self.grid, world, ignore, checked.count, self.backend)
         result = Result(poses, out, (checked.count, rays), self.real, self.backend, on_device=checked.on_device)
         if checked.count * rays:
             with self._lock, self._workspace:
@@ -234,7 +238,7 @@ class MapCaster:
         space, count, info = self._workspace, piece.count, self.backend.info
         placed, state = self._place(poses, piece)
         cosines = space.empty("cosines", count * rays if "INCIDENCE" in cones.flags else 1, self.real)
-        with space.result("ranges", flat, piece.begin * rays, count * rays, self.real) as result:
+        with PartialResult(space, "ranges", flat, piece.begin * rays, count * rays, self.real) as result:
             self._run(placed, state, ray, rays, cones, self._flags(placed, cones) | {"COSINES"}, result, cosines)
             if info.float64:
                 self.backend.run((drawing.launch(space, piece.begin, count, rays, result, cosines),))
@@ -247,20 +251,21 @@ class MapCaster:
     def _cast(self, poses: Poses, piece: Piece, ray: Buffer, rays: int, flat: Any, cones: Cones) -> None:
         space, count = self._workspace, piece.count
         placed, state = self._place(poses, piece)
-        with space.result("ranges", flat, piece.begin * rays, count * rays, self.real) as result:
+        with PartialResult(space, "ranges", flat, piece.begin * rays, count * rays, self.real) as result:
             other = space.empty("echoes", count * rays if "INCIDENCE" in cones.flags else 1, self.real)
             both = (other, result) if cones.incidence else (result, other)
             self._run(placed, state, ray, rays, cones, self._flags(placed, cones), *both)
 
     def _place(self, poses: Poses, piece: Piece) -> tuple[PlacedPoses, MapState]:
         """Place the poses of a piece in a window of the map; also return the map with its table."""
-        state = poses.ensure_table(self.map, piece.part, self.backend, self._workspace)
-        frame = Frame(state.window, state.grid, self.mount)
-        return place(poses, piece.part, frame, self.backend, self._workspace, self.real), state
+        state = self.map.ensure(poses.corners(piece.part, self.backend, self._workspace) or poses.hull)
+        if self._framed is not state:
+            self._framed, self._frame = state, Frame(state.window, plain_cells(state.grid), self.mount)
+        return place(poses, piece.part, self._frame, self.backend, self._workspace, self.real), state
 
     def _flags(self, placed: PlacedPoses, cones: Cones) -> frozenset[str]:
         """Return the flags that cast the rays of placed poses; the poses must have been placed."""
-        outside = flags_if(ORIGINS_OUTSIDE=not all_within(placed, 0))
+        outside = flags_if(ORIGINS_OUTSIDE=not placed.within(0))
         return self.flags | self._precision_flags | cones.flags | placed.world_flags | outside
 
     def _run(

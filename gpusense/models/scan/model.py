@@ -25,8 +25,7 @@ from gpusense.models.pickled import Pickled
 from gpusense.models.poses import Poses
 from gpusense.models.scan.differentiable import Differentiable, is_recorded, log_likelihood_of
 from gpusense.models.scan.explain import plan_of_call
-from gpusense.models.scan.pipeline import ScanPipeline
-from gpusense.models.scan.request import Request, make_request
+from gpusense.models.scan.pipeline import Request, ScanPipeline, make_request
 from gpusense.models.scan.rules import Beams, BeamSelection, ModelContext, check_beams
 from gpusense.models.scan.scoring import LastCall, ResidentPoses, run
 from gpusense.peers.weights import Peer, choose
@@ -45,6 +44,8 @@ _MOST_RESIDENT = 16
 
 class ScanModel(Pickled):
     """Base of the models of whole scans: the beam model and the likelihood field."""
+
+    _stages: ScanPipeline  # of a single map
 
     def __init__(
         self,
@@ -153,9 +154,9 @@ class ScanModel(Pickled):
         return ()
 
     @property
-    @abstractmethod
     def _pipeline(self) -> ScanPipeline:
-        """The stages of the model."""
+        """The stages of the model, which may change in worlds."""
+        return self._stages
 
     @property
     def grid(self) -> OccupancyGrid:
@@ -268,7 +269,7 @@ class ScanModel(Pickled):
             self._context, poses, ranges, out, per_beam=per_beam, worlds=self._worlds, world=world, ignore=ignore
         )
         with self._lock, self._workspace:
-            run(self._pipeline, request, self._workspace, self._last_call)
+            run(self._stages if self._worlds is None else self._pipeline, request, self._workspace, self._last_call)
             finish(self._workspace, request.poses.on_device)
         log_p = request.result.user_array()
         return (log_p, request.result_parts()) if per_beam else log_p

@@ -15,13 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpusense.backends import Backend, arrays
+from gpusense.backends.arrays import Result
 from gpusense.backends.programs import ProgramCache
-from gpusense.backends.results import Result
 from gpusense.backends.workspace import Workspace
 from gpusense.models.poses import corners_of
 from gpusense.models.scan.bound import RecordedCall
-from gpusense.models.scan.pipeline import ScanPipeline
-from gpusense.models.scan.request import FLOATS
+from gpusense.models.scan.pipeline import FLOATS, ScanPipeline
 from gpusense.models.scan.tiles import LEAST_ORDERED
 from gpusense.world.scanner import classify_ranges
 from gpusense.world.windows import Corners

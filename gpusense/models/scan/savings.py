@@ -12,8 +12,7 @@ from gpusense.backends.workspace import Workspace
 from gpusense.interface.plan import Plan
 from gpusense.models.chunking import finish
 from gpusense.models.scan.classed import ClassedScans
-from gpusense.models.scan.pipeline import ScanPipeline
-from gpusense.models.scan.request import Request
+from gpusense.models.scan.pipeline import Request, ScanPipeline
 from gpusense.models.scan.scoring import LastCall, run
 from gpusense.world.grid import OccupancyGrid
 

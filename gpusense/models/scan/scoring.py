@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from gpusense.backends.programs import ChangingProgram, RecordedProgram
-from gpusense.backends.workspace import Workspace
+from gpusense.backends.programs import RecordedProgram
+from gpusense.backends.workspace import ChangingProgram, PartialResult, Workspace
 from gpusense.models.chunking import Piece, chunk_of, run_pieces
 from gpusense.models.poses import Frame, Part, place
 from gpusense.models.scan.classed import ClassedScans
-from gpusense.models.scan.pipeline import ScanPipeline
+from gpusense.models.scan.pipeline import FLOATS, Request, ScanPipeline
 from gpusense.models.scan.readings import Readings
-from gpusense.models.scan.request import FLOATS, Request
 from gpusense.world.range_causes import NoReturn
 from gpusense.world.windows import whole
 
@@ -137,7 +136,8 @@ class _Scorer:
         scans = self._scans
         if last - first < scans.scans:
             scans = scans.part(first - self._first, last - self._first)
-        value = self._pipeline.value(scans)
+        depends = self._pipeline.context.possible and len(scans.readings)
+        value = None if depends else self._pipeline.value(scans)
         if value is None and (self._uploaded is None or self._uploaded[0] != piece.scans):
             self._uploaded = piece.scans, self._pipeline.upload(scans, self._space)
         if value is not None:
@@ -156,14 +156,15 @@ class _Scorer:
         """Score a piece; log-likelihoods of readings are complete on return."""
         pipeline, request, space = self._pipeline, self._request, self._space
         placed, state = pipeline.place(request.poses, piece.part, space)
-        with space.result("log_p", request.result.flat, piece.begin, piece.count, pipeline.real) as log_p:
+        with PartialResult(space, "log_p", request.result.flat, piece.begin, piece.count, pipeline.real) as log_p:
             scoring = pipeline.scoring(readings, placed, state.table, log_p, space, per_beam=request.per_beam)
             key = (scoring.flags, placed.key, readings.key)
             changing = dict(pipeline.numbers(scoring), poses=placed.source, log_p=log_p)
             if placed.inside is not None:
                 changing |= placed.changing()
             # As late as possible: a processor's threads are then awake for the launches that follow.
-            self._begin()
+            if self._before is not None:
+                self._begin()
             flags = space.run(
                 key, changing, lambda: pipeline.program(scoring), version=state.version,
             )  # fmt: skip
@@ -184,7 +185,7 @@ class _Scorer:
             frame = Frame(whole(pipeline.grid), pipeline.grid, pipeline.scanner.mount)
             placed = place(request.poses, piece.part, frame, pipeline.backend, space, pipeline.real)
             pipeline.backend.run(placed.launches())
-            with space.result("log_p", request.result.flat, piece.begin, piece.count, pipeline.real) as log_p:
+            with PartialResult(space, "log_p", request.result.flat, piece.begin, piece.count, pipeline.real) as log_p:
                 pipeline.backend.upload(np.full(piece.count, value, pipeline.real), log_p)
         else:
             # Poses that are not finite are refused whatever the readings.

@@ -13,7 +13,6 @@ from gpusense.interface.constants import ALL_BINS, BLOCK_TERMS, STRETCH, TILE, T
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Launch, Program, launch
 from gpusense.models.poses import PlacedPoses
-from gpusense.world.windows import extent
 
 _INT = np.dtype(np.int32)
 _UNBOUNDED = np.full(7, -(1 << 31), _INT)
@@ -23,21 +22,6 @@ LEAST_ORDERED = (1 << 22, 1 << 12)
 ENOUGH = 1 << 21
 # The same for the likelihood field: its short work-items have a relatively costly start.
 ENOUGH_SHORT = 1 << 19
-
-
-def all_within(placed: PlacedPoses, reach: float, ring: int = 0) -> bool:
-    """Return whether all cells within ``reach`` of the sensors are surely in the window and a ring around it."""
-    if placed.corners is None or not (placed.inside is None or placed.inside.worlds.uniform):
-        return False
-    window, frame = placed.frame.window, placed.frame
-    left, right, low, high = extent(frame.cells, placed.corners, frame.mount)
-    reach += 1
-    return bool(
-        left - reach >= window.col - ring
-        and right + reach <= window.col + window.cols + ring
-        and low - reach >= window.row - ring
-        and high + reach <= window.row + window.rows + ring
-    )
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from gpusense._util.progress import progress
 from gpusense.commands.arguments import add_backend, add_json, add_seed, check_writer, whole_number
 from gpusense.commands.fit_results import DOUBT, FitResult, PartialFit, is_doubtful, print_fit
 from gpusense.commands.output import print_report
-from gpusense.commands.scans import OPTIONS, add_choice, add_log, add_reference, log_options, options_named, read_scans
+from gpusense.commands.scans import OPTIONS, add_choice, add_log, add_reference, read_chosen_steps, read_scans
 
 if TYPE_CHECKING:
     from gpusense.evaluation.range_data import RangeData
@@ -186,17 +186,13 @@ def _fit(args: argparse.Namespace, data: RangeData, motion: MotionFit | None, pa
 
 def _motion(args: argparse.Namespace) -> MotionFit | None:
     """Learn the noise of the odometry from the chosen scans; None if it is not requested."""
-    from gpusense.evaluation.steps import read_steps, references_to_learn_from, with_references
+    from gpusense.evaluation.steps import references_to_learn_from, with_references
     from gpusense.evaluation.trajectory_files import read_tum
     from gpusense.localization.motion_fit import fit_odometry_motion
 
     if not args.fit_motion:
         return None
-    sensors = () if args.topic is None else (args.topic,)
-    with options_named():
-        steps = read_steps(
-            args.log, every=args.every, offset=args.offset, limit=args.limit, sensors=sensors, **log_options(args)
-        )
+    steps = read_chosen_steps(args)
     if args.reference is not None:
         steps = with_references(steps, *read_tum(args.reference))
     return fit_odometry_motion(*references_to_learn_from(steps))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import add_backend, add_json, output_path, positive_number
-from gpusense.commands.scans import add_choice, add_log, log_options, options_named
+from gpusense.commands.scans import add_choice, add_log, options_named, read_chosen_steps
 
 if TYPE_CHECKING:
     from gpusense.evaluation.steps import Step
@@ -78,16 +78,13 @@ def run(args: argparse.Namespace) -> int:
     from gpusense.commands.judge_report import report
     from gpusense.evaluation.judging import TrajectoryJudge
     from gpusense.evaluation.posed_scans import posed_scans
-    from gpusense.evaluation.steps import read_steps
     from gpusense.evaluation.trajectory_files import read_tum
     from gpusense.world.map_files import read_map
 
     grid = read_map(args.map)
     truth = None if args.truth is None else read_tum(args.truth)
+    steps = read_chosen_steps(args)
     with options_named():
-        steps = read_steps(
-            args.log, every=args.every, offset=args.offset, limit=args.limit, sensors=args.topic, **log_options(args)
-        )
         posed = posed_scans(args.log, steps, args.poses, map_frame=args.map_frame)
         judge = TrajectoryJudge(_models(args, grid, steps), risk=args.risk)
     try:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gpusense.commands.parameter_files import Localization, read_localization
-from gpusense.commands.scans import log_options, options_named
+from gpusense.commands.scans import options_named, read_chosen_steps
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.world.scanner import Scanner
 
@@ -37,13 +37,10 @@ def read_parameters(args: argparse.Namespace) -> Localization:
 
 def read_chosen(args: argparse.Namespace, read: Localization) -> list[Step]:
     """Read the chosen scans, with the poses of ``--reference`` if set."""
-    from gpusense.evaluation.steps import read_steps, with_references
+    from gpusense.evaluation.steps import with_references
     from gpusense.evaluation.trajectory_files import read_tum
 
-    with options_named():
-        steps = read_steps(
-            args.log, every=args.every, offset=args.offset, limit=args.limit, sensors=args.topic, **log_options(args)
-        )
+    steps = read_chosen_steps(args)
     if read.nav2 is not None:
         near, far = read.nav2.range_limits
         steps = _limited(steps, near, None if args.range_max is not None else far)

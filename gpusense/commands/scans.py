@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from gpusense.commands.arguments import finite_number, not_negative_number, range_number, whole_number
 
 if TYPE_CHECKING:
+    from gpusense.evaluation.steps import Step
     from gpusense.logs import Scan
     from gpusense.logs.reader import LogOptions
 
@@ -122,19 +123,25 @@ def read_scan(args: argparse.Namespace) -> Scan:
     raise ValueError(f"--scan: must be below the log's number of scans, {index}, got {wanted}")
 
 
-def read_scans_of_lasers(args: argparse.Namespace) -> tuple[list[tuple[int, Scan]], list[int]]:
-    """Read the chosen scans of all lasers of ``--topic`` by time, and the laser of each."""
+def read_chosen_steps(args: argparse.Namespace) -> list[Step]:
+    """Read the chosen scans of ``--log`` with raw odometry, of one laser or of several by time."""
     from gpusense.evaluation.steps import read_steps
 
+    sensors = [args.topic] if isinstance(args.topic, str) else args.topic or ()
+    with options_named():
+        return read_steps(
+            args.log, every=args.every, offset=args.offset, limit=args.limit, sensors=sensors, **log_options(args)
+        )
+
+
+def read_scans_of_lasers(args: argparse.Namespace) -> tuple[list[tuple[int, Scan]], list[int]]:
+    """Read the chosen scans of all lasers of ``--topic`` by time, and the laser of each."""
     if len(args.topic) < 2:
         # Scans of other scanners may lack poses.
         topic = args.topic[0] if args.topic else None
         scans = read_scans(argparse.Namespace(**{**vars(args), "topic": topic}), posed=False)
         return scans, [0] * len(scans)
-    with options_named():
-        steps = read_steps(
-            args.log, every=args.every, offset=args.offset, limit=args.limit, sensors=args.topic, **log_options(args)
-        )
+    steps = read_chosen_steps(args)
     chosen = list(enumerate(step.scan for step in steps))
     if args.reference is not None:
         chosen = _referenced(args, [scan for _, scan in chosen])

@@ -251,7 +251,7 @@ def test_methods_of_one_kind_of_cloud_are_on_the_interactive_page_alone(page: Mo
     own = {"points": points, "machine": {"processors": 2, "processor": "X"}, "commit": "abc", "date": "2026-01-01"}
     (tmp_path / "error_vs_time_x_models.json").write_text(json.dumps(made_report() | own | {"command": "python x"}))
     made = page.files(tmp_path)
-    assert "lookup" not in made[page.PAGE].split("## Localisation")[0].split("## Rays")[0]
+    assert "| lookup" not in made[page.PAGE].split("## Localisation")[0].split("## Rays")[0]
     assert '"method":"lookup"' in page.interactive(tmp_path) and "lookup" not in made[page.picture("beam model")]
 
 

@@ -229,6 +229,8 @@ def choices(points: Sequence[Mapping[str, Any]], wish: Wish) -> Iterator[Choice]
         wanted = [f"error at most {error_text(limit, unit)}"] if limit is not None else []
         wanted += [f"at most {time_text(wish.seconds)}"] if wish.seconds is not None else []
         best, found = choose(listed, limit, wish.seconds), "no method"
+        if not listed:
+            found = next((f"not measured: {p['reason']}" for p in points if _is_left_out(p, problem, backend)), found)
         if best is not None:
             found = f"{best.text}: {time_text(best.seconds)}, {error_text(best.error, unit)}"
         rows = [
@@ -236,6 +238,10 @@ def choices(points: Sequence[Mapping[str, Any]], wish: Wish) -> Iterator[Choice]
             for one in front(listed)
         ]
         yield Choice(backend, f"{problem} on {backend}, {size}, {', '.join(wanted)}: {found}", rows)
+
+
+def _is_left_out(point: Mapping[str, Any], problem: str, backend: str) -> bool:
+    return (point["problem"], point["backend"], point["status"]) == (problem, backend, "left out")
 
 
 def label(point: Mapping[str, Any]) -> str:

@@ -40,44 +40,24 @@ _TURNING = 0.5
 
 
 class Front:
-    """Matcher of a log's scans, group by group.
-
-    Args:
-        readings: (S, K) readings [m].
-        scanner: Their scanner.
-        odometry: (S, 3) poses of the odometer, or None.
-        times: (S,) times [s], or None.
-        options: The options.
-
-    Attributes:
-        jumps: (S,) whether the time jumps before a scan.
-        nodes: (M,) indices of the matched scans; the robot has moved before each.
-        steps: Motions from each node to the next.
-        keys: Numbers of the nodes that are key scans.
-        p_right: Probabilities of the steps' matches; 0 without a usable match.
-        lost: Numbers of open directions of these matches.
-        rivalled: True if a second motion explains the scans of a step about equally well.
-        bridged: True for a step without a match, taken from a spanning match.
-        spanned: Whether a match spans an unmatched step together with its neighbours.
-        unseen: (L, 3, 3) projections of steps onto their open directions.
-        links: The links between nodes.
-    """
+    """Matcher of the (S, K) readings [m] of a scanner, group by group, with (S, 3) odometry and (S,) times if known."""
 
     def __init__(
         self, readings: Floats, scanner: Scanner, odometry: Floats | None, times: Floats | None, options: ChainOptions
     ) -> None:
         self.matcher = Matcher(readings, scanner, options)
-        self.jumps = jumps_of(times, len(readings))
+        self.jumps = jumps_of(times, len(readings))  # (S,) whether the time jumps before a scan
         self._odometry, self._times, self._options = odometry, times, options
+        # (M,) indices of the matched scans; the robot has moved before each.
         self.nodes = moved_scans(odometry, readings, options.step)
-        self.steps = np.zeros((0, 3))
-        self.p_right = np.zeros(0)
-        self.lost = np.zeros(0, np.int64)
-        self.unseen = np.zeros((0, 3, 3))
-        self.rivalled = np.zeros(0, bool)
-        self.bridged = np.zeros(0, bool)
-        self.spanned = np.zeros(0, bool)
-        self.keys = [0]
+        self.steps = np.zeros((0, 3))  # motions from each node to the next
+        self.p_right = np.zeros(0)  # probabilities of the steps' matches; 0 without a usable match
+        self.lost = np.zeros(0, np.int64)  # numbers of open directions of these matches
+        self.unseen = np.zeros((0, 3, 3))  # projections of steps onto their open directions
+        self.rivalled = np.zeros(0, bool)  # whether a second motion explains the scans of a step as well
+        self.bridged = np.zeros(0, bool)  # steps without a match, taken from a spanning match
+        self.spanned = np.zeros(0, bool)  # unmatched steps that a match spans together with their neighbours
+        self.keys = [0]  # numbers of the nodes that are key scans
         self._parts: list[Links] = []
         self._last: Floats | None = None
         self._expected = np.zeros((0, 3))

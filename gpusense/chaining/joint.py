@@ -33,21 +33,8 @@ _OPEN = 1e-6
 class Joint:
     """The matched scans of several front ends.
 
-    Args:
-        fronts: The front ends.
-        rows: Indices in the log of the scans of each front end.
-        times: (S,) times of the poses at the scans of the log [s]; None: evenly.
-        scans: Number of used scans of the log.
-
-    Attributes:
-        nodes: (M,) indices of the matched scans in the log, ascending.
-        of: Numbers of each front end's nodes among all nodes.
-        owner: (M,) index of the front end of each node.
-        keys: (K,) numbers of nodes that are key scans.
-        failed: (M - 1,) whether no scanner determines the motion from a node to the next.
-        open: (M - 1,) whether the scanners that determine the motion leave a direction open.
-        contested: (M - 1,) whether a second motion explains the scans equally well.
-        poses: (M, 3) poses by the best match of each motion, chained from the first one.
+    ``rows`` are the indices in the log of each front end's scans, ``times`` (S,) the times of the poses at the scans of
+    the log [s], evenly if None. Only the first ``scans`` of the log count.
     """
 
     def __init__(self, fronts: Sequence[Front], rows: Sequence[Integers], times: Floats | None, scans: int) -> None:
@@ -56,10 +43,13 @@ class Joint:
         own = [nodes[nodes < scans] for nodes in own]
         whole, owner = np.concatenate(own), np.repeat(np.arange(len(own)), [len(nodes) for nodes in own])
         order = np.argsort(whole, kind="stable")
+        # (M,) ascending indices of the matched scans in the log, and the front end of each.
         self.nodes, self.owner = whole[order], owner[order]
-        self.of = [np.searchsorted(self.nodes, nodes) for nodes in own]
+        self.of = [np.searchsorted(self.nodes, nodes) for nodes in own]  # each front end's nodes among all
         self.keys = np.sort(np.concatenate([of[_below(front.keys, len(of))] for front, of in self._each()]))
         self._trust = np.stack([self._trust_of(front, of) for front, of in self._each()])
+        # (M - 1,) whether no scanner determines the motion from a node to the next, whether scanners that do leave a
+        # direction open, and whether a second motion explains the scans as well.
         self.failed: Flags = self._trust.max(axis=0) <= 0
         self.open = ~self.failed & self._open()
         self.contested = ~self.failed & self._contested()

@@ -91,30 +91,18 @@ def _parts_of(blocks: Any, order: Integers) -> list[tuple[int, int, Integers]]:
 class Tree:
     """Elimination tree of parts; parts of equal shape with finished children are eliminated as a group.
 
-    Args:
-        parts: First and end step of each part, and the common rows below.
-        count: Number of steps.
-
-    Attributes:
-        begin: (P,) first step of each part.
-        size: (P,) number of its steps.
-        below: (P,) number of its rows below.
-        parent: (P,) part of the first row below; -1 for a root.
-        home: (N,) part of each step.
-        groups: Parts of each group, children first.
-        number: (P,) number of each part in its group.
-        last_used: For each group, the groups needed only by it and by later groups on the way up.
+    A part is its first and end step, and its common rows below; the matrix has ``count`` = N steps.
     """
 
     def __init__(self, parts: list[tuple[int, int, Integers]], count: int) -> None:
-        self.begin = np.array([begin for begin, _, _ in parts])
-        self.size = np.array([end - begin for begin, end, _ in parts])
-        self.below = np.array([len(rows) for _, _, rows in parts])
-        self.home = np.repeat(np.arange(len(parts)), self.size)
+        self.begin = np.array([begin for begin, _, _ in parts])  # (P,) first step of each part
+        self.size = np.array([end - begin for begin, end, _ in parts])  # (P,) number of its steps
+        self.below = np.array([len(rows) for _, _, rows in parts])  # (P,) number of its rows below
+        self.home = np.repeat(np.arange(len(parts)), self.size)  # (N,) part of each step
         self._start = np.append(0, np.cumsum(self.below))
         rows = np.concatenate([rows for _, _, rows in parts]).astype(np.int64)
         self._count, self._keys = count, np.repeat(np.arange(len(parts)), self.below) * count + rows
-        self.parent = np.full(len(parts), -1)
+        self.parent = np.full(len(parts), -1)  # (P,) part of the first row below; -1 for a root
         inner = self.below > 0
         self.parent[inner] = self.home[rows[self._start[:-1][inner]]]
         self._at = self.place(np.repeat(self.parent, self.below), rows)
@@ -125,12 +113,13 @@ class Tree:
         shape = np.stack([self.below, self.size, level])
         order = np.lexsort(shape)
         ends = np.flatnonzero((np.diff(shape[:, order], axis=1) != 0).any(axis=0)) + 1
-        self.groups = np.split(order, ends)
+        self.groups = np.split(order, ends)  # parts of each group, children first
         self.number, self._group = np.empty(len(parts), np.int64), np.empty(len(parts), np.int64)
         for group, which in enumerate(self.groups):
             self.number[which], self._group[which] = np.arange(len(which)), group
         first = np.arange(len(self.groups))
         np.minimum.at(first, self._group[self.parent[inner]], self._group[inner])
+        # For each group, the groups needed only by it and by later groups on the way up.
         self.last_used = [np.flatnonzero(first == group).tolist() for group in range(len(first))]
 
     def place(self, part: Integers, row: Integers) -> Integers:

@@ -119,13 +119,9 @@ def _poses_of_beams(poses: np.ndarray, motion: np.ndarray, beams: int) -> np.nda
 class CellRays:
     """Rays that meet a window of a map, in cells of the window.
 
-    Attributes:
-        start_cell: (R, 2) int32 column and row of the start, relative to the window.
-        start_inside: (R, 2) int32 position of the start in its cell [1/4096 cell].
-        end_cell: (R, 2) int32 column and row of the end.
-        end_inside: (R, 2) int32 position of the end in its cell.
-        hit: (R,) int32, 1 where an obstacle is at the end.
-        ending: Number of rays that end, after clamping to the map, in the rows of the window.
+    Starts and ends have an int32 column and row (R, 2), relative to the window, and a position inside the cell [1/4096
+    cell]. ``hit`` (R,) is 1 where an obstacle is at the end. ``ending`` counts the rays that end, after clamping to the
+    map, in the rows of the window.
     """
 
     def __init__(self, ends: RayEnds, frame: GridFrame, window: Window, shape: tuple[int, int]) -> None:

@@ -153,14 +153,10 @@ class Transforms:
 
 
 def run(make: Callable[[], Any], args: Sequence[str] | None = None) -> int:
-    """Run a node until it is interrupted or terminated.
+    """Run a node until it is interrupted or terminated; return the exit code, 1 if the node could not start.
 
-    Args:
-        make: Makes the node; its optional method ``start`` returns whether the node can continue.
-        args: Arguments of the command line, with ``--ros-args``; ``sys.argv`` by default.
-
-    Returns:
-        The exit code: 0, or 1 if the node could not start.
+    The optional method ``start`` of the node that ``make`` makes returns whether it can continue. ``args`` includes
+    ``--ros-args``; ``sys.argv`` by default.
     """
     node = None
     try:

@@ -49,7 +49,7 @@ class Joint:
         self.keys = np.sort(np.concatenate([of[_below(front.keys, len(of))] for front, of in self._each()]))
         self._trust = np.stack([self._trust_of(front, of) for front, of in self._each()])
         # (M - 1,) whether no scanner determines the motion from a node to the next, whether scanners that do leave a
-        # direction open, and whether a second motion explains the scans as well.
+        # direction open, and whether a second motion fits the scans equally.
         self.failed: Flags = self._trust.max(axis=0) <= 0
         self.open = ~self.failed & self._open()
         self.contested = ~self.failed & self._contested()

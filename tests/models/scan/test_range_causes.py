@@ -19,7 +19,7 @@ from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.benchmark.accuracy import score_ranges
 from gpusense.evaluation.range_data import RangeData
 from gpusense.interface.structs import MixtureTerms
-from gpusense.learning.beam import blocks, growth, optimum
+from gpusense.learning.beam import growth, optimum, report
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.options import make_bounds
 from gpusense.learning.beam.pairs import make_pairs
@@ -101,7 +101,7 @@ def learned(at):
         "terms": np.array(learning_terms(at.parameters(), RANGE, device.real)[0]), "components": parts[..., 0],
         "density": log_p, "derivatives": gradient[:, 3:],
         "rate": optimum._next_rate(shares, z, expected, np.array([at.rate]), bounds),
-        "blocks": blocks._terms(pairs.reading, pairs.expected, device.causes(at)[:, 1:], at, RANGE)[5],
+        "blocks": report._terms(pairs.reading, pairs.expected, device.causes(at)[:, 1:], at, RANGE)[5],
         "objective": np.array(Problem(device, pairs, bounds, NO_PRIOR, False).value(at).log_likelihood),
     }  # fmt: skip
 

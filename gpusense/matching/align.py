@@ -33,17 +33,18 @@ def smoothed(occupied: np.ndarray, known: np.ndarray, sigma: float) -> tuple[np.
     offsets = np.arange(-math.ceil(_REACH * sigma), math.ceil(_REACH * sigma) + 1)
     weights = np.exp(-0.5 * (offsets / sigma) ** 2)
     weights /= weights.sum()
-    top, bottom = (_convolved(_convolved(image, weights).T, weights).T for image in (occupied & known, known))
+    top, bottom = (_convolved(_convolved(image, weights, 0), weights, 1) for image in (occupied & known, known))
     return np.divide(top, bottom, out=np.zeros_like(top), where=bottom > _KNOWN), bottom
 
 
-def _convolved(image: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return weighted sums over the rows near each row, with zeros beyond the image."""
+def _convolved(image: np.ndarray, weights: np.ndarray, axis: int) -> np.ndarray:
+    """Return weighted sums over cells near each cell along an axis, with zeros beyond the image."""
     reach = len(weights) // 2
-    padded = np.pad(image.astype(np.float64), ((reach, reach), (0, 0)))
-    total = np.zeros(image.shape)
+    padded = np.pad(image.astype(np.float64), [(reach, reach) if k == axis else (0, 0) for k in (0, 1)])
+    total, part = np.zeros(image.shape), np.empty(image.shape)
     for k, weight in enumerate(weights):
-        total += weight * padded[k : k + len(image)]
+        shifted = padded[k : k + len(image)] if axis == 0 else padded[:, k : k + image.shape[1]]
+        total += np.multiply(shifted, weight, out=part)
     return total
 
 
@@ -109,18 +110,20 @@ class Alignment:
         u, v = turned + (pose[:2] - self._corner - 0.5)[:, None]
         rows, cols = self._map.shape
         col, row = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
-        inside = np.flatnonzero((col >= 0) & (col + 1 < cols) & (row >= 0) & (row + 1 < rows))
-        nearest = np.floor(v[inside] + 0.5).astype(np.int64), np.floor(u[inside] + 0.5).astype(np.int64)
-        weight = self._known[nearest] * np.maximum(1 - np.abs(self._share[nearest] - self._shares[inside]) / _UNLIKE, 0)
-        weight, inside = weight[weight > 0], inside[weight > 0]
-        if len(inside) < 3:
+        a, b = u - col, v - row
+        inside = (col >= 0) & (col + 1 < cols) & (row >= 0) & (row + 1 < rows)
+        place = np.where(inside, row * cols + col, 0)
+        nearest = place + np.where(b < 0.5, 0, cols) + (a >= 0.5)
+        unlike = np.abs(self._share.take(nearest) - self._shares)
+        weight = np.where(inside & self._known.take(nearest), np.maximum(1 - unlike / _UNLIKE, 0), 0.0)
+        if np.count_nonzero(weight) < 3:
             return math.inf, np.zeros(3), np.zeros((3, 3))
-        col, row = col[inside], row[inside]
-        a, b = u[inside] - col, v[inside] - row
-        m00, m01, m10, m11 = (self._map[row + i, col + j] for i in (0, 1) for j in (0, 1))
-        error = (1 - b) * ((1 - a) * m00 + a * m01) + b * ((1 - a) * m10 + a * m11) - self._values[inside]
+        m00, m01, m10, m11 = (self._map.take(place + next_place) for next_place in (0, 1, cols, cols + 1))
+        error = (1 - b) * ((1 - a) * m00 + a * m01) + b * ((1 - a) * m10 + a * m11) - self._values
         along = (1 - b) * (m01 - m00) + b * (m11 - m10)
         up = (1 - a) * (m10 - m00) + a * (m11 - m01)
-        jacobian = np.stack([along, up, up * turned[0, inside] - along * turned[1, inside]], axis=1)
-        weighted, total = jacobian.T * weight, float(weight.sum())
-        return float(weight @ error**2) / total, weighted @ error / total, weighted @ jacobian / total
+        numbers = np.stack([along, up, up * turned[0] - along * turned[1], error])
+        # No product of matrices, whose last bits differ between processors.
+        sums = np.array([[(weighted * other).sum() for other in numbers] for weighted in weight * numbers])
+        sums /= weight.sum()
+        return float(sums[3, 3]), sums[:3, 3], sums[:3, :3]

@@ -246,17 +246,11 @@ def _result(
     poses = searched.poses(found, 1)
     chosen = _distinct(poses, grid.resolution)
     angle = float(np.diff(searched.headings[0]).max(initial=0.0))
-    # The pose itself comes first and wins ties.
-    steps = np.stack(np.meshgrid([0, -1, 1], [0, -1, 1], [0, -1, 1], indexing="ij"), axis=-1).reshape(-1, 3)
-    best = []
-    for pose in poses[chosen]:
-        near = pose + steps * [1, 1, angle]
-        measured = np.array([_correlation(local, grid, each) for each in near])
-        top = int(measured[:, 0].argmax())
-        best.append(near[top])
+    states = _states(grid)
+    best = [_best_near(local, states, pose, angle) for pose in poses[chosen]]
     alignment = Alignment(local_grid, local.xy, grid, np.array(best), _FARTHEST)
     best = [alignment.refined(pose, _FARTHEST * angle) for pose in best]
-    values, overlaps = np.array([_correlation(local, grid, pose) for pose in best]).T
+    values, overlaps = np.array([_correlations(local, states, pose, [(0, 0)])[0] for pose in best]).T
     order = np.argsort(-values, kind="stable")
     modes, correlations = _to_world(local, grid, np.array(best)[order]), values[order]
     rivals = correlations[1:] >= max(_RIVAL * correlations[0], least)
@@ -283,27 +277,53 @@ def _distinct(poses: np.ndarray, cell: float) -> list[int]:
     return chosen
 
 
-def _correlation(local: _Local, grid: OccupancyGrid, pose: np.ndarray) -> tuple[float, float]:
+def _states(grid: OccupancyGrid) -> np.ndarray:
+    """Return the cells with a margin of two: 0 for unknown, 1 for free, 2 for occupied."""
+    return np.pad((grid.cells >= 0).astype(np.int8) + grid.occupied, 2)
+
+
+def _best_near(local: _Local, states: np.ndarray, pose: np.ndarray, angle: float) -> np.ndarray:
+    """Return the pose with the largest correlation among a pose of the grid and its neighbours."""
+    shifts = [(row, col) for row in (0, -1, 1) for col in (0, -1, 1)]
+    # The pose itself comes first and wins ties, as do those of its heading.
+    turned = [pose + np.array([0.0, 0.0, turn * angle]) for turn in (0, -1, 1)]
+    measured = np.array([_correlations(local, states, each, shifts) for each in turned])[..., 0]
+    turn, shift = divmod(int(measured.argmax()), len(shifts))
+    row, col = shifts[shift]
+    near: np.ndarray = turned[turn] + np.array([col, row, 0.0])
+    return near
+
+
+def _correlations(
+    local: _Local, states: np.ndarray, pose: np.ndarray, shifts: list[tuple[int, int]]
+) -> list[tuple[float, float]]:
     """Return the correlation of both maps over cells known to both (book equation 6.26), and the share of these cells.
 
     With m 1 for occupied and 0 for free cells, and its mean over both maps, the correlation is the sum of (m - mean)
     (m_local - mean) over the root of the product of the sums of (m - mean)^2 and (m_local - mean)^2. Below the least
-    overlap it is -1.
+    overlap it is -1. There is a pair for each shift by rows and columns, of at most one cell.
     """
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     x, y = local.xy[:, 0], local.xy[:, 1]
-    col = np.floor(pose[0] + (cos * x - sin * y)).astype(np.int64)
-    row = np.floor(pose[1] + (sin * x + cos * y)).astype(np.int64)
-    inside = (col >= 0) & (col < grid.shape[1]) & (row >= 0) & (row < grid.shape[0])
-    known = grid.cells[row[inside], col[inside]] >= 0
-    overlap = np.count_nonzero(known) / len(x)
+    rows, cols = states.shape
+    col = np.clip(np.floor(pose[0] + (cos * x - sin * y)) + 2, 1, cols - 2).astype(np.int64)
+    place = np.clip(np.floor(pose[1] + (sin * x + cos * y)) + 2, 1, rows - 2).astype(np.int64) * cols + col
+    return [_correlation(states.ravel()[place + (row * cols + col)], local.occupied) for row, col in shifts]
+
+
+def _correlation(state: np.ndarray, occupied: np.ndarray) -> tuple[float, float]:
+    """Return the correlation of states of cells with the local map, and the share of the known cells."""
+    known = np.count_nonzero(state)
+    overlap = known / len(state)
     if overlap < _OVERLAP:
         return -1.0, overlap
-    m = grid.occupied[row[inside], col[inside]][known].astype(np.float64)
-    m_local = local.occupied[inside][known].astype(np.float64)
-    mean = (m.mean() + m_local.mean()) / 2
-    scale = math.sqrt(((m - mean) ** 2).sum() * ((m_local - mean) ** 2).sum())
-    return (float(((m - mean) * (m_local - mean)).sum() / scale) if scale > 0 else 0.0), overlap
+    ours = np.count_nonzero(np.where(occupied, state, 0))
+    full = state == 2
+    theirs, both = np.count_nonzero(full), np.count_nonzero(full & occupied)
+    mean = (theirs + ours) / (2 * known)
+    square, local_square = (count * (1 - 2 * mean) + known * mean**2 for count in (theirs, ours))
+    scale = math.sqrt(square * local_square)
+    return ((both - mean * (theirs + ours) + known * mean**2) / scale if scale > 0 else 0.0), overlap
 
 
 def _to_world(local: _Local, grid: OccupancyGrid, poses: np.ndarray) -> Floats:

@@ -325,13 +325,7 @@ class Way:
 
 
 def in_turns(ways: Sequence[Way], calls: int, turn: int = 1, seconds: float = 0.0) -> list[list[float]]:
-    """Time ways in turns, so that ratios are valid on a busy machine.
-
-    ``seconds``: The least time of all calls together [s].
-
-    Returns:
-        Seconds of each call, for each way.
-    """
+    """Time ways in turns for at least some calls and seconds; return the seconds of each call, for each way."""
     times: list[list[float]] = [[] for _ in ways]
     begin = time.perf_counter()
     while len(times[0]) < calls or time.perf_counter() - begin < seconds:

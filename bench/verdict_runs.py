@@ -84,15 +84,7 @@ def crowded(events, bearings, share, rng):
 
 
 def rearranged(grid, share, rng, *, shift=(0.3, 1.0), gone=0.0):
-    """Return a map in which a share of the occupied cells is elsewhere, in blocks of 1.5 m.
-
-    Args:
-        grid: The map.
-        share: Share of the blocks with occupied cells that move.
-        rng: Random generator.
-        shift: Least and largest distance [m].
-        gone: Share of these blocks whose walls vanish instead.
-    """
+    """Return a map with a share of its 1.5 m blocks moved by ``shift`` [m], and a share ``gone`` of these removed."""
     if not share:
         return grid
     side = max(round(1.5 / grid.resolution), 1)
@@ -147,17 +139,9 @@ def window(events, length, rng, *, kidnapped=False):
 def simulated(seed, *, scans=60, hidden=0.0, moved=0.0, glass=0.0, beams=180, around=False, step=0.2, case="own"):
     """Return a map, a scanner and events of a simulated robot.
 
-    Args:
-        seed: Seed of building, changes, path and readings.
-        scans: Number of scans.
-        hidden: Share of the beams that people hide.
-        moved: Share of the walls that have moved; a third as much furniture is new.
-        glass: Share of the walls that beams pass through.
-        beams: Beams of a scan.
-        around: Whether the scanner looks all around, or over half a turn.
-        step: Distance between two scans [m].
-        case: "own", the map is that of the world; "kidnapped", the robot is carried away once; "wrong", the map is
-            that of another building.
+    ``hidden``, ``moved`` and ``glass`` are shares of beams and walls; a third as much furniture as ``moved`` is new.
+    ``case``: "own", the map is that of the world; "kidnapped", the robot is carried away once; "wrong", the map shows
+    another building.
     """
     rng = np.random.default_rng(seed)
 
@@ -186,14 +170,7 @@ def add_shards(parser, raw):
 
 
 def run_shard(args, jobs, run, script):
-    """Run the jobs of a shard, and write their rows.
-
-    Args:
-        args: The options of ``add_shards``.
-        jobs: All jobs, each a tuple of plain values.
-        run: Function of a job that returns its rows and values to store with the job, or None to skip it.
-        script: The study, for its command line.
-    """
+    """Run the jobs of a shard, and write the rows and values that ``run`` returns for each; None skips a job."""
     first, count = args.shard
     chosen = jobs[first - 1 :: count]
     kept, rows, begin = [], [], time.time()

@@ -170,10 +170,7 @@ class Follower:
 
 
 def build(name: str, source: Path, include: Sequence[Path], folder: Path) -> Compiled:
-    """Compile a peer.
-
-    ``name``: ``"amcl"`` or ``"beluga"``.
-    """
+    """Compile a peer, ``"amcl"`` or ``"beluga"``."""
     library = folder / f"{name}.so"
     if name == "amcl":
         root = source / "nav2_amcl"

@@ -33,12 +33,7 @@ POINTS = 1001
 def rounded_polynomial(
     f: Function, weight: Function, low: mp.mpf, high: mp.mpf, count: int
 ) -> tuple[list[float], float]:
-    """Find the polynomial with the smallest maximal weighted error, and round its coefficients to float32.
-
-    Returns:
-        The coefficients, lowest power first, and the base-2 logarithm of the largest weighted error of the rounded
-        ones.
-    """
+    """Return the polynomial of ``remez`` rounded to float32, and log2 of its largest weighted error."""
     middle, reach = (low + high) / 2, (high - low) / 2
     grid = [middle - reach * mp.cos(mp.pi * (i + 0.5) / POINTS) for i in range(POINTS)]
     rounded = [float(np.float32(float(c))) for c in remez(f, weight, grid, count)]

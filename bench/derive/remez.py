@@ -18,11 +18,7 @@ def polynomial(powers: list, z: mp.mpf) -> mp.mpf:
 
 
 def remez(f: Function, weight: Function, grid: list[mp.mpf], count: int) -> list[mp.mpf]:
-    """Find the polynomial with the smallest maximal weighted error at the points of a grid.
-
-    Returns:
-        The coefficients, lowest power first.
-    """
+    """Return the polynomial with the smallest maximal weighted error on a grid, lowest power first."""
     targets, weights = [f(z) for z in grid], [weight(z) for z in grid]
     last = len(grid) - 1
     chosen = [round((1 - mp.cos(mp.pi * (i + 0.5) / (count + 1))) / 2 * last) for i in range(count + 1)]

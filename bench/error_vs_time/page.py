@@ -189,10 +189,7 @@ def _written(standing: Standing) -> str:
 
 
 def files(folder: Path = RESULTS, last: Standing | None = None) -> dict[Path, str]:
-    """Return all files of the page by their paths in the checkout.
-
-    ``last``: Answers of the last page; None: those of standing.csv.
-    """
+    """Return all files of the page by their paths in the checkout; ``last`` replaces the answers of standing.csv."""
     found = sources(folder)
     every = rows_of(found)
     # A table that took too long for all tracking clouds lacks the need's first measure of error.

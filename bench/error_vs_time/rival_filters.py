@@ -50,10 +50,7 @@ def thinned(scanner: gs.Scanner, beams: int) -> tuple[gs.Scanner, np.ndarray]:
 
 
 def rivals(run: Any, start: Sequence[float], settling: int) -> Iterator[Setting]:
-    """Yield the settings of both programs; note the reasons of those that cannot run.
-
-    ``start``: Standard deviations of the start around the true pose [m, m, rad].
-    """
+    """Yield the settings of both programs, started with deviations [m, m, rad]; note the reasons of absent ones."""
     scanner, chosen = thinned(run.scanner, BEAMS)
     for name, (_, package, _) in PEERS.items():
         compiled, version, missing = load(name)

@@ -38,18 +38,7 @@ SCANS, EVERYWHERE = 70, 5000
 
 
 def follow(places, events, start, *, backend, particles, kind, beams, seed):
-    """Return a row for each scan: errors, p_lost, verdict, ratio, deviation of the position, pose.
-
-    Args:
-        places: A map and a scanner for each laser.
-        events: Scans with odometry and references.
-        start: Pose to begin around, or None to begin anywhere.
-        backend: The device.
-        particles: Their number.
-        kind: "field", "beam" or "discrete".
-        beams: Beams of a scan that the filter uses.
-        seed: Seed of the filter.
-    """
+    """Return a row for each scan (errors, p_lost, verdict, ratio, deviation, pose); a start of None begins anywhere."""
     make = recordings.makers(kind, backend, beams)
     models = [make(grid, scanner) for grid, scanner in places]
     pf = gs.ParticleFilter(models, particles=particles, seed=seed)

@@ -168,12 +168,7 @@ def main() -> None:
 
 
 def fitted(each, compared):
-    """Return the tables of the fits, and their coefficients.
-
-    Args:
-        each: Rows of the scans of each run.
-        compared: Rows of all comparisons.
-    """
+    """Return the tables of the fits to the scans of each run and to all comparisons, and their coefficients."""
     rows = np.concatenate(each)
     wrong, (agree, close, through, short, nothing) = rows[:, 0] > 0, rows[:, 1:6].T
     informative_count = agree + through + short

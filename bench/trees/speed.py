@@ -96,11 +96,7 @@ class Tree:
 
 
 def pairs_of(trees: tuple[Tree, Tree], row: str, arguments: argparse.Namespace) -> tuple[list[list[float]], bool]:
-    """Time a row in turns.
-
-    Returns:
-        Seconds of the old and the new tree for each pair of turns, and whether results have the same bits.
-    """
+    """Time a row in turns; return old and new seconds of each pair of turns, and whether the bits are the same."""
     first = [tree.ask(row, 0) for tree in trees]
     longest = max(answer["seconds"] * answer["each"] for answer in first)
     calls = int(min(max(arguments.seconds / longest, 1), MOST_CALLS))

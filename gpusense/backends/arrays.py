@@ -79,11 +79,7 @@ def _adopt(array: Any, backend: Backend, name: str, *, in_place: bool = False) -
 def host_poses(array: object, name: str, scans: int | None = None, *, single: bool = False) -> np.ndarray:
     """Return (N, 3) poses in host memory, or the poses of S scans in sequence: C-contiguous float64 numbers.
 
-    Args:
-        array: The poses.
-        name: Their name in messages.
-        scans: S; None without scans.
-        single: Whether (N, 3) poses in float32 remain float32 numbers.
+    ``scans``: S; None without scans; ``single``: whether (N, 3) poses in float32 remain float32 numbers.
     """
     read = array if type(array) is np.ndarray else to_host(array, name)
     shape = ("N", 3) if scans is None else (scans, "N", 3)
@@ -253,13 +249,8 @@ def _check_result(
 class Result:
     """The memory of a result: the array ``out=``, or new memory where the poses are.
 
-    Args:
-        poses: The poses as the user passed them, which determine the library of the result.
-        out: The array for the result as the user passed it, or None.
-        shape: Its shape.
-        real: Its precision.
-        backend: The device.
-        on_device: True if the poses are on it.
+    ``poses``: the poses as the user passed them, which determine the library of the result; ``out``: the array for the
+    result as the user passed it, or None; ``on_device``: True if the poses are on it.
 
     Attributes:
         flat: A flat NumPy array, or a buffer on the device.

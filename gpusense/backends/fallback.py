@@ -88,9 +88,8 @@ def best_of(candidates: list[Device], failures: list[Failure] | None = None) -> 
     The rates were measured with the proofs. A device that is faster by less than ``NOTICED`` is not chosen, so that
     runs do not change between devices.
 
-    Args:
-        candidates: The devices; unusable ones are removed if ``failures`` is passed.
-        failures: Receives the devices that are not usable.
+    ``candidates``: the devices; unusable ones are removed if ``failures`` is passed; ``failures``: receives the devices
+    that are not usable.
     """
     for row in SPEED_CLASSES:
         best, most = None, 0.0

@@ -35,8 +35,7 @@ class Library(ABC):
     def no_device(self, install: str) -> str:
         """Return why there is no device, with the remedy.
 
-        Args:
-            install: The command that installs what is absent; empty where all is installed.
+        ``install``: the command that installs what is absent; empty where all is installed.
         """
         return f"no driver offers a device: {install or 'install or update the driver of its vendor'}"
 

@@ -86,9 +86,8 @@ def time_limit() -> float:
 def run(job: dict[str, Any]) -> Outcome:
     """Do a job in a child.
 
-    Args:
-        job: ``do`` names a function ``module:name``; it is called with the job and a function that reports a
-            dictionary; the rest belongs to the function.
+    ``job``: ``do`` names a function ``module:name``; it is called with the job and a function that reports a
+    dictionary; the rest belongs to the function.
     """
     path = [os.path.abspath(entry) for entry in sys.path]
     return run_text(["-P", "-W", "ignore", "-c", _START], {**job, "path": path})
@@ -97,11 +96,8 @@ def run(job: dict[str, Any]) -> Outcome:
 def run_text(arguments: list[str], job: dict[str, Any], variables: dict[str, str] | None = None) -> Outcome:
     """Run the interpreter in a child.
 
-    Args:
-        arguments: The interpreter's arguments.
-        job: The program reads it from standard input, as one line of JSON. Its last report must be ``{"done": token}``
-            with the ``token`` that is added to the job.
-        variables: Further variables of its environment.
+    ``job``: the program reads it from standard input, as one line of JSON. Its last report must be ``{"done": token}``
+    with the ``token`` that is added to the job.
     """
     import secrets
 

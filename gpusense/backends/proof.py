@@ -79,10 +79,8 @@ def unusable(reason: str, *, passing: bool = False) -> DeviceCheck:
 def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> DeviceCheck:
     """Return the verdict on a device: the cached verdict; without one, or with ``anew``, a child's.
 
-    Args:
-        info: The device.
-        setup: The preparation of the child; see ``library.Library.child_setup``.
-        anew: True if the cached verdict is dropped.
+    ``setup``: the preparation of the child; see ``library.Library.child_setup``. ``anew``: True if the cached verdict
+    is dropped.
     """
     if probe_process.is_off():
         return trust(info)

@@ -17,9 +17,8 @@ class Recording(ABC):
     def wait(self, *, elsewhere: bool = False) -> None:
         """Wait until all starts have ended.
 
-        Args:
-            elsewhere: Wait only for starts on streams other than the device's current one; copies on that one follow
-                its launches without a wait.
+        ``elsewhere``: wait only for starts on streams other than the device's current one; copies on that one follow
+        its launches without a wait.
         """
 
     @abstractmethod

@@ -37,8 +37,7 @@ _STALE = 600
 def scratch_folder(*, executable: bool = True) -> Path:
     """Return this process's folder.
 
-    Args:
-        executable: Whether the system must allow code from there to run; some drivers only read the files.
+    ``executable``: whether the system must allow code from there to run; some drivers only read the files.
     """
     if not executable:
         with contextlib.suppress(OSError):

@@ -51,8 +51,7 @@ class Slot(ABC):
 class Staging:
     """Slots of a device, which serve one copy at a time.
 
-    Args:
-        make: Allocates the slots, given their number and bytes, when they are needed first.
+    ``make``: allocates the slots, given their number and bytes, when they are needed first.
     """
 
     def __init__(self, make: Callable[[int, int], Sequence[Slot]]) -> None:

@@ -34,8 +34,7 @@ def kernel_root() -> Path:
 def opencl_source(name: str) -> str:
     """Return the text of ``opencl/<name>.cl``; each file is read once.
 
-    Args:
-        name: The file's name with its subfolder and without its suffix: ``"beam"``, ``"lanes/beam"``.
+    ``name``: the file's name with its subfolder and without its suffix: ``"beam"``, ``"lanes/beam"``.
     """
     folder = kernel_root() / "opencl"
     try:

@@ -51,10 +51,7 @@ def takes_scalar_text(text: str) -> bool:
 def written_in_lanes(text: str, file: str, sources: dict[str, str]) -> str:
     """Return a file's text with the functions that it takes from scalar files.
 
-    Args:
-        text: The text, with the branches that the flags select.
-        file: The file's name.
-        sources: Texts of the scalar file and of the required ones, by name, likewise.
+    ``sources``: texts of the scalar file and of the required ones, by name, likewise.
     """
     if not takes_scalar_text(text):
         return text

@@ -56,11 +56,7 @@ def with_lanes_flag(
 ) -> frozenset[str]:
     """Return the flags of a launch, with IN_LANES where device and kernel compute in lanes.
 
-    Args:
-        lanes: Lanes of the device.
-        kernel: The kernel.
-        flags: Its other flags.
-        float64: True if the device has float64, which some bodies in lanes need.
+    ``float64``: True if the device has float64, which some bodies in lanes need.
     """
     return _flagged(lanes, kernel, frozenset(flags), float64)
 
@@ -79,10 +75,7 @@ def _flagged(lanes: int, kernel: str, flags: frozenset[str], float64: bool) -> f
 def with_loops_flag(vector_loops: bool, kernel: str, flags: frozenset[str]) -> frozenset[str]:
     """Return the flags of a launch, with IN_LANES where the compiler makes vectors of the kernel's loops over readings.
 
-    Args:
-        vector_loops: As in ``BackendInfo``.
-        kernel: The kernel.
-        flags: Its other flags.
+    ``vector_loops``: as in ``BackendInfo``.
     """
     if not vector_loops or flags & _NO_LOOPS[kernel] or not _IN_LOOPS[kernel] <= flags:
         return flags
@@ -96,12 +89,7 @@ def with_teams_flags(
 
     A team is the smallest with a work-item for every two points, or the largest that the device holds.
 
-    Args:
-        kind: Kind of the device.
-        kernel: The kernel.
-        flags: Its other flags.
-        points: Points of an item.
-        largest_group: ``Backend.largest_group`` of the device.
+    ``largest_group``: ``Backend.largest_group`` of the device.
     """
     if kind != "gpu":
         return flags, 1

@@ -52,12 +52,8 @@ Program = tuple[Launch, ...]
 def launch(kernel: str, flags: Iterable[str], size: tuple[int, ...], /, **arguments: Any) -> Launch:
     """Bind the arguments of a kernel by name.
 
-    Args:
-        kernel: Its name in the signature table.
-        flags: Flags of its code.
-        size: Work-items along each axis.
-        **arguments: Arguments of the row, each a buffer, an integer, a real number or a struct. Those that the code of
-            the flags does not take are dropped.
+    ``arguments``: arguments of the row, each a buffer, an integer, a real number or a struct. Those that the code of
+    the flags does not take are dropped.
     """
     flags = frozenset(flags)
     row = _row(kernel, flags)

@@ -42,9 +42,7 @@ def prelude(*, float64: bool, doubles: bool = False) -> str:
     FUSES says whether the device has a fused multiply-add; elsewhere ``fma`` is a slow call. NVIDIA's driver does not
     define the macro for it.
 
-    Args:
-        float64: ``real`` is float64.
-        doubles: The program uses float64 even where ``real`` is float32.
+    ``float64``: ``real`` is float64; ``doubles``: the program uses float64 even where ``real`` is float32.
     """
     return _PRELUDE.format(
         extension="#pragma OPENCL EXTENSION cl_khr_fp64 : enable\n" if float64 or doubles else "",

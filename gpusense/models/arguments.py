@@ -49,9 +49,7 @@ def real_dtype(precision: str, backend: Backend) -> np.dtype:
 def check_absent(where: str, **options: object) -> None:
     """Refuse options that must be None.
 
-    Args:
-        where: When they must be, in words of the message.
-        **options: Their values.
+    ``where``: when they must be, in words of the message.
     """
     for name, value in options.items():
         if value is not None:

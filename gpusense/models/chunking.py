@@ -27,10 +27,7 @@ _ROUND = 256
 def chunk_of(backend: Backend, beams: int, itemsize: float = 0) -> int:
     """Return the largest number of particles of a launch.
 
-    Args:
-        backend: The device.
-        beams: Beams of each particle; 0 counts as 1.
-        itemsize: Bytes of a result per particle and beam.
+    ``beams``: beams of each particle; 0 counts as 1.
     """
     chunk, beams = CHUNK, max(beams, 1)
     if itemsize:
@@ -66,11 +63,8 @@ class Piece:
 def run_pieces(space: Workspace, whole: Piece, most: int, score: Callable[[Piece], None]) -> None:
     """Score particles in pieces; a piece that does not fit into memory is retried with half the particles.
 
-    Args:
-        space: Holds the buffers, freed before a second try.
-        whole: All particles, of whole scans that one program may score.
-        most: Most particles of a piece; a piece of several scans holds whole scans.
-        score: Runs the program of a piece.
+    ``space``: holds the buffers, freed before a second try; ``most``: most particles of a piece; a piece of several
+    scans holds whole scans.
 
     Raises:
         MemoryError: The smallest piece does not fit, or the map's table does not; the table is tried only once. The
@@ -119,9 +113,7 @@ def finish(space: Workspace, on_device: bool, name: str = "poses") -> None:
 def finish_all(spaces: Sequence[tuple[Workspace, bool]], name: str = "poses") -> None:
     """Wait for a call that used one workspace or several of a device to end.
 
-    Args:
-        spaces: Each workspace, and whether it had device poses.
-        name: Name of the poses in messages.
+    ``spaces``: each workspace, and whether it had device poses.
     """
     flag, dtype = POSE_STATUS
     states = [np.zeros(2, dtype) for _ in spaces]

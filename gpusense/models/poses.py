@@ -86,10 +86,8 @@ class Poses:
     def corners(self, part: Part, backend: Backend, space: Workspace | None = None) -> Corners | None:
         """Return four corners of the box of some poses, at 0 for no poses; None on the device.
 
-        Args:
-            part: The first of them and the one after the last.
-            backend: The device, which bounds them where they are many.
-            space: Holds them there; None where no launch follows.
+        ``part``: the first of them and the one after the last; ``backend``: the device, which bounds them where they
+        are many; ``space``: holds them there; None where no launch follows.
         """
         if self.host is None:
             return None
@@ -264,14 +262,7 @@ def place(
 ) -> PlacedPoses:
     """Upload some poses, and describe their placement in the frame of a window.
 
-    Args:
-        poses: The request's poses.
-        part: The first of them and the one after the last.
-        frame: The frame.
-        backend: The device.
-        space: Holds the buffers.
-        real: Precision of the placed poses.
-        careful: True if low parts are needed.
+    ``part``: the first of them and the one after the last; ``careful``: True if low parts are needed.
     """
     count, corners = part[1] - part[0], poses.corners(part, backend, space)
     flags = poses.flags(corners)
@@ -317,12 +308,8 @@ def bounds_poses(backend: Backend) -> bool:
 def bounds_on_device(backend: Backend, space: Workspace, poses: Buffer, count: int, *, single: bool = False) -> Bounds:
     """Return the least and the largest x, y and theta of poses, NaN for a column with NaN.
 
-    Args:
-        backend: The device.
-        space: Holds the results.
-        poses: ``count`` poses on the device.
-        count: Their number, not 0.
-        single: True if they are float32 numbers, not float64.
+    ``poses``: ``count`` poses on the device; ``count``: their number, not 0; ``single``: True if they are float32
+    numbers, not float64.
     """
     program: Program = ()
     flags = flags_if(POSES_FLOAT32=single)

@@ -84,11 +84,7 @@ NO_CROWD = Crowd(0, 0, 0, 0, 0.0)
 class CrowdTable:
     """The shapes of all worlds on a device, in the cells of their grids, in a precision each.
 
-    Args:
-        backend: The device.
-        frames: Frames of the worlds; see the kernel file ``worlds``.
-        resolution: Side of a cell [m].
-        worlds: Number of worlds.
+    ``frames``: frames of the worlds; see the kernel file ``worlds``; ``resolution``: side of a cell [m].
     """
 
     def __init__(self, backend: Backend, frames: Buffer, resolution: float, worlds: int) -> None:

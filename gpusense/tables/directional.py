@@ -14,11 +14,8 @@ _LIMIT = (1 << 31) - 1
 def directional_table(obstacles: np.ndarray, bins: int, *, pruned: bool, outside: bool) -> np.ndarray:
     """Build the table: for each angle bin, lines along its direction with sorted beginnings of obstacles.
 
-    Args:
-        obstacles: (rows, cols) bool.
-        bins: Angle bins of a full turn.
-        pruned: Whether to omit obstacles that begin inside another obstacle of the same line.
-        outside: True if space outside the grid is a wall.
+    ``pruned``: whether to omit obstacles that begin inside another obstacle of the same line; ``outside``: True if
+    space outside the grid is a wall.
 
     Returns:
         int32 table.

@@ -29,11 +29,8 @@ _BLOCK_ROWS = 32
 def squared_distances(backend: Backend, obstacles: np.ndarray, most: int = NO_OBSTACLE) -> Buffer:
     """Compute the exact squared distance from each cell's centre to the nearest obstacle's centre [cells^2].
 
-    Args:
-        backend: The device.
-        obstacles: (rows, cols) bool.
-        most: Largest squared distance that matters; larger distances may be any number above ``most``, for a shorter
-            search on GPUs.
+    ``most``: largest squared distance that matters; larger distances may be any number above ``most``, for a shorter
+    search on GPUs.
 
     Returns:
         (rows, cols) int32 on the device; 2^31 - 1 without obstacles.

@@ -122,11 +122,7 @@ class FieldTable:
     def refresh(self, backend: Backend, obstacles: np.ndarray, table: Buffer, changed: Window) -> bool:
         """Update ``table`` in place after obstacles changed, where clamped distances can differ.
 
-        Args:
-            backend: The device.
-            obstacles: (rows, cols) mask of the window after the change.
-            table: Its table before the change.
-            changed: Part of the window with all changed obstacles.
+        ``obstacles``: (rows, cols) mask of the window after the change; ``table``: its table before the change.
 
         Returns:
             False if rebuilding the table is faster.
@@ -183,14 +179,8 @@ class FieldTable:
     ) -> None:
         """Fill a part of a table.
 
-        Args:
-            backend: The device.
-            obstacles: (rows, cols) bool, with all obstacles within the clamp distance of the part.
-            density: Cell values by squared distance.
-            table: The table.
-            part: Part of ``obstacles`` to fill.
-            begin: Index in the table of the part's first cell.
-            stride: Cells per row of the table.
+        ``obstacles``: (rows, cols) bool, with all obstacles within the clamp distance of the part; ``part``: part of
+        ``obstacles`` to fill.
         """
         cap = len(density) - 1
         squared = squared_distances(backend, obstacles, cap - 1)

@@ -25,11 +25,7 @@ _OLD_FORMAT = "gpusense lookup 1"
 def describe(obstacles: np.ndarray, limit: float, outside: str, bins: int) -> dict[str, object]:
     """Describe the inputs of a table.
 
-    Args:
-        obstacles: (rows, cols) bool.
-        limit: Longest range [cells].
-        outside: ``"free"`` or ``"occupied"``: state of space outside the grid.
-        bins: Angle bins of a full turn.
+    ``limit``: longest range [cells]; ``outside``: ``"free"`` or ``"occupied"``: state of space outside the grid.
 
     Returns:
         The header of the file.

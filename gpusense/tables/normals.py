@@ -82,11 +82,8 @@ def surface_normals(grid: OccupancyGrid, *, unknown: Space = "free", outside: Sp
 def normal_table(obstacles: np.ndarray, window: Window, outside: str, real: np.dtype) -> np.ndarray:
     """Compute normals in a window of a map and a ring around it, in the layout of the kernel file ``echo``.
 
-    Args:
-        obstacles: (H, W) bool, the whole map.
-        window: A part of it.
-        outside: Treatment of space outside the map: ``"free"`` or ``"occupied"``.
-        real: Precision.
+    ``obstacles``: (H, W) bool, the whole map; ``outside``: treatment of space outside the map: ``"free"`` or
+    ``"occupied"``.
 
     Returns:
         (rows + 2, cols + 2, 2) in the grid's frame: 0 for free cells, NaN for occupied cells without a normal.
@@ -131,8 +128,7 @@ def _surrounded(obstacles: np.ndarray, part: Window, outside: bool) -> np.ndarra
 def _disc_normals(obstacles: np.ndarray) -> np.ndarray:
     """Compute unit normals of exposed cells: occupied cells that share a side with a free cell.
 
-    Args:
-        obstacles: (H + 2 RADIUS, W + 2 RADIUS) bool: a map and its surroundings.
+    ``obstacles``: (H + 2 RADIUS, W + 2 RADIUS) bool: a map and its surroundings.
 
     Returns:
         (H, W, 2) float64, x and y in the grid's frame, towards the side with fewer obstacles: 0 for free cells, NaN
@@ -168,9 +164,7 @@ def _replace_straight(normals: np.ndarray, obstacles: np.ndarray) -> None:
     A cell takes the side with the longest straight piece. At the corner of a block two sides are equally long, and the
     normal is between theirs.
 
-    Args:
-        normals: (H, W, 2) normals.
-        obstacles: (H + 2 MARGIN, W + 2 MARGIN) bool: the map and its surroundings.
+    ``normals``: (H, W, 2) normals; ``obstacles``: (H + 2 MARGIN, W + 2 MARGIN) bool: the map and its surroundings.
     """
     outlines = Outlines(obstacles)
     height, width = normals.shape[:2]

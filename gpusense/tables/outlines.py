@@ -123,9 +123,7 @@ class Outlines:
 def _fit_line(sums: np.ndarray, count: int) -> Line:
     """Fit lines to M windows.
 
-    Args:
-        sums: (7, M) moments from ``Outlines._moments``.
-        count: Sides of each window.
+    ``sums``: (7, M) moments from ``Outlines._moments``.
     """
     x, y, xx, xy, yy = sums[:5] / np.array([2, 2, 4, 4, 4])[:, None] / count
     xx, xy, yy = xx - x * x, xy - x * y, yy - y * y

@@ -119,8 +119,7 @@ class ReachableMap:
     def ensure(self, corners: Corners | None) -> MapState:
         """Return the map with its table; rebuild the table if a sensor can reach beyond its window.
 
-        Args:
-            corners: Corners of a box around all poses; None for poses anywhere.
+        ``corners``: corners of a box around all poses; None for poses anywhere.
 
         Raises:
             TableMemoryError: The device cannot hold the table.
@@ -146,9 +145,7 @@ class ReachableMap:
     def update(self, cells: object, place: object) -> OccupancyGrid:
         """Replace cells of the map; update the table now, or drop it so that the next call rebuilds it.
 
-        Args:
-            cells: (h, w) occupancies.
-            place: (row, col) of the cell that ``cells[0, 0]`` replaces.
+        ``place``: (row, col) of the cell that ``cells[0, 0]`` replaces.
 
         Returns:
             The new map.

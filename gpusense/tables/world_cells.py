@@ -86,11 +86,7 @@ def frames_of(
 ) -> np.ndarray:
     """Return the frames of worlds; see the kernel file ``worlds``.
 
-    Args:
-        origins: Poses of the outer corners of the first cells.
-        resolution: Side of a cell [m].
-        sizes: (M, 2) rows and columns.
-        place: (M,) first cells in tables.
+    ``resolution``: side of a cell [m]; ``sizes``: (M, 2) rows and columns; ``place``: (M,) first cells in tables.
     """
     frames = np.zeros((len(origins), 8))
     known: dict[tuple[float, float, float], tuple[float, ...]] = {}

@@ -39,12 +39,8 @@ class ManyWorlds(Protocol):
 class WorldIndex:
     """The world of each pose, and the shape that the pose does not see.
 
-    Args:
-        worlds: The worlds.
-        world: (N,) indices of worlds, or one for all poses; None with a single world.
-        ignore: (N,) indices of shapes, -1 for none, or one for all poses; None ignores none.
-        count: N.
-        backend: The device.
+    ``world``: (N,) indices of worlds, or one for all poses; None with a single world; ``ignore``: (N,) indices of
+    shapes, -1 for none, or one for all poses; None ignores none.
     """
 
     def __init__(self, worlds: ManyWorlds, world: Any, ignore: Any, count: int, backend: Backend) -> None:

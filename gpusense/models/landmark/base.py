@@ -56,10 +56,7 @@ def known_features(
 ) -> tuple[PreparedFeatures, np.ndarray, float]:
     """Return the features with a landmark, the places of their landmarks, and the constant term of the false positives.
 
-    Args:
-        prepared: The features.
-        partner: (K,) landmark of each, -1 for a false positive, equal at every pose.
-        buckets: The landmarks in buckets.
+    ``partner``: (K,) landmark of each, -1 for a false positive, equal at every pose.
     """
     known = partner >= 0
     constant = float(prepared.false[prepared.columns[~known]].sum())
@@ -74,15 +71,7 @@ class FeatureModel(PointModel):
 
     Subclasses make ``_buckets`` and ``_tables`` of their map.
 
-    Args:
-        name: Name of the map's argument in messages.
-        count: Number of landmarks or lines in the map.
-        backend: The device.
-        precision: ``"float32"`` or ``"float64"``.
-        association: The rule for features without a known landmark.
-        mount: The sensor's pose on the robot.
-        temperature: Multiplies the sum over features.
-        specialize: False leaves nothing out.
+    ``precision``: ``"float32"`` or ``"float64"``; ``specialize``: False leaves nothing out.
     """
 
     parameters: Any
@@ -128,9 +117,8 @@ class FeatureModel(PointModel):
 
         ``association="sum"`` gives the landmark or line with the largest part of the sum.
 
-        Args:
-            poses: (N, 3) robot poses in the world [m, m, rad], as in ``log_likelihood``.
-            features: As in ``log_likelihood``.
+        ``poses``: (N, 3) robot poses in the world [m, m, rad], as in ``log_likelihood``; ``features``: as in
+        ``log_likelihood``.
 
         Returns:
             (N, F) int32 indices in the map, -1 where a false positive is likelier or a feature is left out, and (N, F)

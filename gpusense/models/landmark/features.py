@@ -114,12 +114,8 @@ class Reach:
 def reach_of(p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarray, bound: float) -> Reach:
     """Return the disc outside which exponents are larger than ``bound``.
 
-    Args:
-        p: Deviations and limits.
-        sensor: Constants of the sensor.
-        z: The range; ignored if it was not measured.
-        measured: Whether range, bearing and signature were measured.
-        bound: Largest exponent that matters; infinite if all matter.
+    ``z``: the range; ignored if it was not measured; ``measured``: whether range, bearing and signature were measured;
+    ``bound``: largest exponent that matters; infinite if all matter.
     """
     if bound < 0:
         return Reach(0.0, -1.0, 0.0)
@@ -176,15 +172,8 @@ def prepare_features(
 ) -> PreparedFeatures:
     """Return the numbers of (F, 3) checked features.
 
-    Args:
-        features: Range, bearing and signature, NaN where not measured.
-        p: The parameters.
-        sensor: Constants of the sensor.
-        mount: The sensor's pose on the robot.
-        real: Precision of the numbers.
-        extent: Largest coordinate of the landmarks in their buckets' frame [m].
-        norm: Largest -log of the mass of a landmark's signature.
-        gated: Whether to bound the landmarks that can matter.
+    ``features``: range, bearing and signature, NaN where not measured; ``extent``: largest coordinate of the landmarks
+    in their buckets' frame [m]; ``gated``: whether to bound the landmarks that can matter.
     """
     is_measured = ~np.isnan(features)
     informative = is_measured.any(axis=1)
@@ -248,10 +237,8 @@ def _set_reaches(
 def in_two_parts(numbers: np.ndarray, real: np.dtype, low_parts: Sequence[tuple[int, int]]) -> np.ndarray:
     """Round numbers, and set columns of low parts to the rounding errors of other columns.
 
-    Args:
-        numbers: (K, FEATURE) float64 numbers.
-        real: Precision of the result.
-        low_parts: Pairs of a column of low parts and the column that it belongs to.
+    ``numbers``: (K, FEATURE) float64 numbers; ``low_parts``: pairs of a column of low parts and the column that it
+    belongs to.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         high, rest = split(numbers, real)

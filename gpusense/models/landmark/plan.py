@@ -54,13 +54,8 @@ def feature_omissions(
 ) -> list[Omission]:
     """Return the omissions by the features of a call.
 
-    Args:
-        prepared: Features that are evaluated.
-        buckets: The map.
-        name: "landmarks" or "lines".
-        total: Number of features of the call.
-        impossible: Number of features that the sensor cannot have measured.
-        known: True if the correspondences are known.
+    ``impossible``: number of features that the sensor cannot have measured; ``known``: True if the correspondences are
+    known.
     """
     omissions, count = [], len(buckets.index)
     silent = total - len(prepared.columns) - impossible

@@ -38,14 +38,8 @@ def draw_features(
 ) -> Floats:
     """Return features of landmarks at poses.
 
-    Args:
-        draws: Poses and their random numbers.
-        partners: (F,) landmark of each feature, -1 for a false positive.
-        landmarks: The map.
-        p: The sensor's parameters.
-        span: Smallest and largest signature.
-        mount: The sensor's pose on the robot.
-        every: True if every landmark is detected, even out of view.
+    ``partners``: (F,) landmark of each feature, -1 for a false positive; ``every``: True if every landmark is detected,
+    even out of view.
     """
     columns = 2 if p.sigma_signature is None else 3
     features = np.full((len(draws.poses), len(partners), columns), np.nan)
@@ -115,13 +109,8 @@ def draw_lines(
 ) -> Floats:  # fmt: skip
     """Return (N, F, 4) angle, distance and ends of lines at poses, all NaN for lines that are not visible.
 
-    Args:
-        draws: Poses and their random numbers.
-        partners: (F,) line of each feature, -1 for a false positive.
-        lines: The map.
-        p: The parameters.
-        mount: The sensor's pose on the robot.
-        every: True if every line is detected, also from behind.
+    ``partners``: (F,) line of each feature, -1 for a false positive; ``every``: True if every line is detected, also
+    from behind.
     """
     features = np.full((len(draws.poses), len(partners), 4), np.nan)
     place, none = mounted(draws.poses, mount), (np.zeros(1), np.zeros(1))

@@ -85,14 +85,7 @@ def within(
     For a mean outside the interval, the normaliser is taken at the nearest end, as in the models' densities; the rest
     of the mass is not observed and gives NaN.
 
-    Args:
-        u: (N,) numbers in (0, 1).
-        mean: (N,) means.
-        scale: Scale of the distribution, one or (N,).
-        low: Lower end.
-        high: Upper end.
-        cdf: Distribution function of scale 1 around 0.
-        quantile: Its inverse.
+    ``u``: (N,) numbers in (0, 1); ``mean``: (N,) means; ``scale``: scale of the distribution, one or (N,).
     """
     # The mean on the side of the upper end, so that the distribution function is not near 1 where mass is small.
     flip = mean < 0.5 * (low + high)

@@ -53,11 +53,8 @@ class BeamDensity:
 def density_of(parameters: object, default: BeamParameters, incidence: object, **options: object) -> BeamDensity:
     """Return the density that the arguments of a beam model choose.
 
-    Args:
-        parameters: The mixture, the table of a sensor, or None.
-        default: The mixture without ``parameters``.
-        incidence: Parameters by angle of incidence, or None.
-        **options: Options that must be None with ``incidence``.
+    ``parameters``: the mixture, the table of a sensor, or None; ``default``: the mixture without ``parameters``;
+    ``incidence``: parameters by angle of incidence, or None; ``options``: options that must be None with ``incidence``.
     """
     table = parameters if isinstance(parameters, SensorTable) else None
     # A table of a sensor replaces the mixture.

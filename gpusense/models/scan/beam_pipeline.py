@@ -28,12 +28,7 @@ from gpusense.world.frames import ray_vectors
 class BeamPipeline(ScanPipeline):
     """The stages of a beam model.
 
-    Args:
-        context: The device and the rules.
-        caster: Casts expected ranges.
-        cones: Cones of the sensor.
-        mixture: The mixture.
-        max_evaluated: True if max readings are evaluated by the mixture.
+    ``max_evaluated``: True if max readings are evaluated by the mixture.
     """
 
     orders = True

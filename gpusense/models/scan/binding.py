@@ -60,13 +60,8 @@ def bind(
 ) -> BoundCall:
     """Bind arrays; see ``ScanModel.bind``.
 
-    Args:
-        pipeline: The stages of the model.
-        lock: Held while the model's buffers are in use.
-        score: ``log_likelihood`` of the model.
-        poses: (N, 3) poses.
-        ranges: (K,) readings.
-        out: The array for the log-likelihoods, or None.
+    ``score``: ``log_likelihood`` of the model; ``poses``: (N, 3) poses; ``ranges``: (K,) readings; ``out``: the array
+    for the log-likelihoods, or None.
     """
     on_device = _check_bound(poses, ranges)
     backend, beams, obstacle = pipeline.backend, pipeline.scanner.count, host_task(pipeline)

@@ -54,12 +54,8 @@ def log_hit(
     Source: Johnson, Kotz and Balakrishnan, *Continuous Univariate Distributions* 1 (1994), section 13.10.1, for the
     distribution; Cody (1969) for erfc and its scaled form erfcx(x) = exp(x^2) erfc(x).
 
-    Args:
-        z: Readings [m].
-        expected: Expected ranges z*, any real numbers [m].
-        sigma: Standard deviations, or scales of another shape, > 0 [m].
-        range_max: Longest ranges Z, > 0 [m].
-        shape: The shape.
+    ``z``: readings [m]; ``expected``: expected ranges z*, any real numbers [m]; ``sigma``: standard deviations, or
+    scales of another shape, > 0 [m]; ``range_max``: longest ranges Z, > 0 [m].
 
     Returns:
         Natural logarithms of densities [1/m] in the broadcast shape; -inf outside [0, Z]. NaN for NaN arguments.
@@ -90,10 +86,8 @@ def log_short(z: ArrayLike, expected: ArrayLike, rate: ArrayLike) -> Any:
     See :meth:`gpusense.world.range_causes.ShortDensity.log_pdf` for its evaluation. Rate 0 is the uniform density
     1 / z*.
 
-    Args:
-        z: Readings [m].
-        expected: Expected ranges z* [m]; without a positive one there is no nearer obstacle.
-        rate: lambda_short, >= 0 [1/m].
+    ``z``: readings [m]; ``expected``: expected ranges z* [m]; without a positive one there is no nearer obstacle;
+    ``rate``: lambda_short, >= 0 [1/m].
 
     Returns:
         Natural logarithms of densities [1/m] in the broadcast shape; -inf outside [0, z*] and where z* <= 0.

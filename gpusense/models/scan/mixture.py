@@ -55,13 +55,8 @@ def mixture_on_device(
 ) -> Mixture:
     """Return a beam model's mixture as arguments of kernels.
 
-    Args:
-        density: The density.
-        range_max: Longest range [m].
-        real: Precision.
-        width: Width of the bins in which the mixture is tabulated [m]; None evaluates it.
-        compat: The program whose weights are reproduced, or None.
-        specialize: False leaves nothing out.
+    ``range_max``: longest range [m]; ``width``: width of the bins in which the mixture is tabulated [m]; None evaluates
+    it; ``compat``: the program whose weights are reproduced, or None; ``specialize``: False leaves nothing out.
     """
     mixtures, cosines = density.mixtures, density.cosines
     if compat is not None:

@@ -109,12 +109,7 @@ def device_readings(
 ) -> tuple[Placing, dict[str, Buffer]]:
     """Allocate places for readings that are on the device, and describe the launch that fills them.
 
-    Args:
-        sensing: The rules for readings.
-        ranges: (K,) readings.
-        dtype: Their type.
-        limits: The type to which the scanner's limits are rounded.
-        space: Holds the places.
+    ``ranges``: (K,) readings.
 
     Returns:
         The launch, and the buffers that it fills by name.
@@ -153,13 +148,7 @@ def device_scans(
 
     Every reading has a place; a missing one adds nothing.
 
-    Args:
-        sensing: The rules for readings.
-        ranges: (S, K) readings.
-        dtype: Their type.
-        scans: S.
-        resolution: Side of a cell [m].
-        space: Holds the places.
+    ``ranges``: (S, K) readings; ``resolution``: side of a cell [m].
 
     Returns:
         The launch, and the buffers that it fills by name.

@@ -39,11 +39,7 @@ class LastCall:
 def run(pipeline: ScanPipeline, request: Request, space: Workspace, last: LastCall) -> None:
     """Start all launches of a request; log-likelihoods of readings are complete on return.
 
-    Args:
-        pipeline: The stages of the model.
-        request: The checked arguments.
-        space: Holds the buffers.
-        last: Receives the facts that ``explain`` reports.
+    ``last``: receives the facts that ``explain`` reports.
     """
     last.together = 0
     for particles, scans in pipeline.groups(request):
@@ -68,11 +64,8 @@ def terms_of(pipeline: ScanPipeline, each: np.ndarray, scans: ClassedScans) -> n
 class ResidentPoses:
     """Poses in place on a processor, such as a filter's: only the readings of a scan change from call to call.
 
-    Args:
-        pipeline: The stages of the model.
-        request: A request of these poses; it keeps the arrays alive, so that their identities stay unique.
-        space: Holds the buffers.
-        last: Receives the facts that ``explain`` reports.
+    ``request``: A request of these poses; it keeps the arrays alive, so that their identities stay unique; ``last``:
+    receives the facts that ``explain`` reports.
     """
 
     def __init__(self, pipeline: ScanPipeline, request: Request, space: Workspace, last: LastCall) -> None:

@@ -65,10 +65,7 @@ def order_of(space: Workspace, placed: PlacedPoses, rays: int, real: np.dtype) -
 def spread_of(items: int, groups: int, enough: int) -> int:
     """Return log2 of the number of parts into which each of ``items`` work-items is split.
 
-    Args:
-        items: Work-items before the split.
-        groups: Groups of readings or rays of each, the largest number of parts.
-        enough: Work-items that fill the device.
+    ``items``: work-items before the split.
     """
     spread = 0
     while items << spread < enough and 1 << spread < groups:
@@ -100,11 +97,7 @@ class Parts(NamedTuple):
 def sum_launch(flags: frozenset[str], particles: int, parts: Parts, **arguments: Any) -> Launch:
     """Return the launch that sums the parts of each particle.
 
-    Args:
-        flags: Flags of its code.
-        particles: Particles of the launch.
-        parts: Their numbers.
-        **arguments: The other arguments of ``sum_parts``.
+    ``arguments``: the other arguments of ``sum_parts``.
     """
     return launch(
         "sum_parts", flags, (particles,), parts=parts.buffer, particles=particles, count=parts.count,

@@ -21,9 +21,8 @@ from typing import Any
 import numpy as np
 
 import gpusense as gs
-from gpusense.backends.base import Backend, Launcher
+from gpusense.backends.base import Backend, Launcher, Recording
 from gpusense.backends.proxy import Proxy
-from gpusense.backends.recording import Recording
 from gpusense.evaluation.benchmark.report import commit
 from gpusense.evaluation.machine import machine
 from gpusense.evaluation.scoring import chosen_scans, with_poses

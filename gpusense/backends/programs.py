@@ -16,8 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from typing import Any, Generic, TypeVar
 
-from gpusense.backends.base import Backend
-from gpusense.backends.recording import Recording
+from gpusense.backends.base import Backend, Recording
 from gpusense.interface.launches import Program, flags_of
 
 T = TypeVar("T")

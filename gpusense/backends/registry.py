@@ -53,7 +53,7 @@ ENTRIES = (
     Entry(
         name="numpy",
         package="numpy",
-        module="gpusense.backends.numpy.library",
+        module="gpusense.backends.numpy.backend",
         install="pip install numpy",
         selections=("numpy",),
         speed={"cpu": 4},

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, Self, cast
 
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.backends import Backend
+from gpusense.backends import Backend, Selection
 from gpusense.tables.worlds import Worlds
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.plausible import look_at_scene
@@ -62,3 +66,43 @@ def check_discrete(model: SensorTable, scanner: Scanner, compat: object, sensor_
     if isinstance(scanner, Scanner) and scanner.range_max != model.range_max:
         rule = f"must have the scanner's range_max = {scanner.range_max}"
         raise ValueError(f"parameters: {rule}, got a DiscreteBeamModel for {model.range_max}")
+
+
+# ---- copies and pickles of models: the constructor's arguments, without any state of a device
+
+
+class Pickled(ABC):
+    """Base of objects whose copies and pickles call the constructor again.
+
+    A pickle keeps the constructor's selection string, so "auto" may choose another device on another machine. A queue
+    is replaced by the selection string of its device. A copy is on the same device.
+    """
+
+    _selection: Selection
+
+    @property
+    @abstractmethod
+    def backend(self) -> Backend:
+        """The backend that holds the buffers."""
+
+    @abstractmethod
+    def _arguments(self) -> dict[str, Any]:
+        """Return the arguments of the constructor except ``backend`` by name, with the current map."""
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        asked = self._selection if isinstance(self._selection, str) else self.backend.info.selection
+        return _made, (type(self), self._arguments(), asked)
+
+    def __copy__(self) -> Self:
+        make: Any = type(self)
+        return cast(Self, make(**self._arguments(), backend=self.backend))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        make: Any = type(self)
+        made = memo[id(self)] = make(**copy.deepcopy(self._arguments(), memo), backend=self.backend)
+        return cast(Self, made)
+
+
+def _made(kind: Any, arguments: dict[str, Any], backend: str) -> Any:
+    """Make an object of a class from a pickle."""
+    return kind(**arguments, backend=backend)

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense.interface.constants import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
 from gpusense.interface.structs import FieldTerms
-from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
 from gpusense.world.hit_shapes import HitShape, shape_of
 from gpusense.world.parameters import LikelihoodFieldParameters
 from gpusense.world.range_causes import NoReturn, RandomDensity

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.interface.terms import log_weight
+from gpusense.interface.constants import log_weight
 
 Floats = NDArray[Any]
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from gpusense.backends import Backend, get_backend
+from gpusense.backends.base import Recording, pluralize
 from gpusense.backends.proxy import Proxy
-from gpusense.backends.recording import Recording, pluralize
 from gpusense.interface.launches import Launch
 
 INT, REAL = np.dtype(np.int32), np.dtype(np.float32)

@@ -13,9 +13,8 @@ from pathlib import Path
 import pytest
 from support.cache_folders import BLOCKED, blocked, contents, entries_in
 
-from gpusense.backends import BackendInfo, cache, folders, packing
-from gpusense.backends.cache import BinaryCache, discard_entry, load_entry, store_entry
-from gpusense.backends.packing import pack, unpack, write_files
+from gpusense.backends import BackendInfo, cache, folders
+from gpusense.backends.cache import BinaryCache, discard_entry, load_entry, pack, store_entry, unpack, write_files
 
 INFO = BackendInfo("opencl:0:0", "opencl", "Some device", "gpu", "Driver 1", 1 << 30, 1 << 28, True)
 needs_fifo = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no FIFOs")
@@ -287,7 +286,7 @@ def test_other_contents_are_no_packed_files(monkeypatch):
                 unpack(whole[:place] + bytes([value]) + whole[place + 1 :])
             except ValueError as error:
                 assert str(error).startswith("entry: must hold ")
-    monkeypatch.setattr(packing, "_MOST_BYTES", 1000)
+    monkeypatch.setattr(cache, "_MOST_BYTES", 1000)
     assert unpack(pack({"a": bytes(1000)})) == {"a": bytes(1000)}
     with pytest.raises(ValueError, match="must hold at most 1000 bytes of files"):
         unpack(pack({"a": bytes(600), "b": bytes(401)}))

@@ -15,9 +15,8 @@ from support.kernel_scenes import (
     window_of,
 )
 
-from gpusense.interface.constants import BLOCK_TERMS, TILE, TILE_PARTICLES
+from gpusense.interface.constants import BLOCK_TERMS, TILE, TILE_PARTICLES, rounding_error
 from gpusense.interface.structs import FieldTerms, MixtureTerms, packed
-from gpusense.interface.terms import rounding_error
 from gpusense.models.scan.field_pipeline import _GUARD
 from gpusense.world.frames import split
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from gpusense.backends.base import Backend, Launcher
 from gpusense.backends.info import BackendInfo
+from gpusense.backends.library import Library
 from gpusense.backends.processor import host_memory
 from gpusense.interface import structs
 from gpusense.interface.signatures import KERNELS, Argument
@@ -85,3 +86,19 @@ class NumpyBackend(Backend):
 
     def synchronize(self) -> None:
         """See Backend.synchronize."""
+
+
+# ---- NumPy as a library of the registry; its one device is the host
+
+
+class NumpyLibrary(Library):
+    """One device: the host."""
+
+    def list_devices(self) -> list[tuple[BackendInfo, None]]:
+        return [(describe(), None)]
+
+    def open(self, info: BackendInfo, handle: None) -> Backend:
+        return NumpyBackend(info)
+
+
+LIBRARY = NumpyLibrary()

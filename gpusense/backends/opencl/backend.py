@@ -22,9 +22,8 @@ from gpusense.backends.opencl import arrays, pocl, pocl_kernels
 from gpusense.backends.opencl.caches import new_kernel, without_caches
 from gpusense.backends.opencl.devices import group_multiple, shares_memory
 from gpusense.backends.opencl.launch import Launch, watch
-from gpusense.backends.opencl.memory import SHARED, DeviceBuffer, SharedBuffer, driver_errors, raise_clearly
+from gpusense.backends.opencl.memory import SHARED, DeviceBuffer, SharedBuffer, driver_errors, raise_clearly, slots_of
 from gpusense.backends.opencl.replay import OpenCLRecording
-from gpusense.backends.opencl.slots import slots_of
 from gpusense.backends.recycled import ResultMemory
 from gpusense.backends.staging import Staging
 from gpusense.interface.launches import Program

@@ -25,8 +25,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from gpusense._util.private import UnsafeFolderError, check_private
-from gpusense.backends.cache import load_entry, store_entry
-from gpusense.backends.packing import pack, unpack, write_files
+from gpusense.backends.cache import load_entry, pack, store_entry, unpack, write_files
 from gpusense.backends.scratch import scratch_folder
 
 # Files that PoCL reads again: programs, and kernels for a group size.

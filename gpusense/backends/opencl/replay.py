@@ -11,9 +11,9 @@ import pyopencl as cl
 
 from gpusense._util.checks import show
 from gpusense._util.interrupts import undisturbed
+from gpusense.backends.base import Recording, pluralize
 from gpusense.backends.opencl.arrays import check_in_order
 from gpusense.backends.opencl.memory import driver_errors, raise_clearly
-from gpusense.backends.recording import Recording, pluralize
 
 
 @dataclass(frozen=True)

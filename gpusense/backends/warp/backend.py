@@ -14,19 +14,17 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from gpusense.backends.base import Adopted, Backend
+from gpusense.backends.base import Adopted, Backend, Recording
 from gpusense.backends.info import BackendInfo, ProcessBound
-from gpusense.backends.recording import Recording
 from gpusense.backends.recycled import ResultMemory
 from gpusense.backends.staging import Staging
-from gpusense.backends.warp.arrays import adopted, has_protocol
+from gpusense.backends.warp.arrays import adopted, has_protocol, slots_of
 from gpusense.backends.warp.graphs import GraphCache
 from gpusense.backends.warp.launch import SCALARS, Launch, host_view
 from gpusense.backends.warp.pieces import SharedLaunch, shared
 from gpusense.backends.warp.queue import CallQueue
 from gpusense.backends.warp.recording import WarpRecording
 from gpusense.backends.warp.settings import LOCK, initialize, load, settings
-from gpusense.backends.warp.slots import slots_of
 from gpusense.interface.kernel_files import warp_module
 from gpusense.interface.launches import Program
 from gpusense.interface.signatures import KERNELS, Kernel, team_of

@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from gpusense.backends.recording import Recording
+from gpusense.backends.base import Recording
 from gpusense.backends.warp.graphs import FIRST, GraphCache
 from gpusense.backends.warp.steps import Step, as_graph, one_by_one, start_each
 

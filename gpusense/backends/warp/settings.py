@@ -15,8 +15,7 @@ import warp as wp
 
 from gpusense._util.files import unnamed_file
 from gpusense._version import __version__
-from gpusense.backends.cache import load_entry, store_entry
-from gpusense.backends.packing import pack, unpack, write_files
+from gpusense.backends.cache import load_entry, pack, store_entry, unpack, write_files
 from gpusense.backends.processor import fingerprint
 from gpusense.backends.scratch import scratch_folder
 

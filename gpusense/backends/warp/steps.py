@@ -7,7 +7,7 @@ from collections.abc import Hashable, Sequence
 
 import warp as wp
 
-from gpusense.backends.recording import pluralize
+from gpusense.backends.base import pluralize
 
 
 class Step(ABC):

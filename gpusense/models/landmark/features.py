@@ -10,8 +10,8 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.interface import feature_layout as at
-from gpusense.interface.terms import log_weight
-from gpusense.models.landmark.sensor import Sensor, full_circle
+from gpusense.interface.constants import log_weight
+from gpusense.models.landmark.tables import Sensor, full_circle
 from gpusense.world.frames import Mount, split
 from gpusense.world.parameters import LandmarkParameters
 from gpusense.world.plausible import look_at_bearings

@@ -9,7 +9,7 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.interface import feature_layout as at
-from gpusense.interface.terms import log_weight
+from gpusense.interface.constants import log_weight
 from gpusense.models.landmark.features import PreparedFeatures, in_two_parts
 from gpusense.world.frames import Mount
 from gpusense.world.sensor_parameters import LARGEST_ANGLE_DEVIATION, LineParameters

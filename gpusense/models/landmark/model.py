@@ -12,12 +12,12 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Association, Precision
 from gpusense.backends import Selection
 from gpusense.backends.base import Buffer
+from gpusense.interface.constants import log_weight
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.structs import Buckets, SensorView
-from gpusense.interface.terms import log_weight
 from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.landmark.features import (
     PreparedFeatures,
@@ -26,8 +26,7 @@ from gpusense.models.landmark.features import (
 )
 from gpusense.models.landmark.plan import parameter_omissions
 from gpusense.models.landmark.sampling import draw_features
-from gpusense.models.landmark.sensor import describe, full_circle
-from gpusense.models.landmark.tables import upload_tables
+from gpusense.models.landmark.tables import describe, full_circle, upload_tables
 from gpusense.models.point.sampling import draws_at
 from gpusense.models.poses import PlacedPoses
 from gpusense.world.landmarks import LandmarkMap, make_buckets

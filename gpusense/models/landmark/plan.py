@@ -6,7 +6,7 @@ import numpy as np
 
 from gpusense.interface.plan import Omission, share
 from gpusense.models.landmark.features import PreparedFeatures
-from gpusense.models.landmark.sensor import full_circle
+from gpusense.models.landmark.tables import full_circle
 from gpusense.world.frames import Mount
 from gpusense.world.landmarks import Buckets
 from gpusense.world.parameters import LandmarkParameters

@@ -13,15 +13,24 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Precision
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
-from gpusense.interface.constants import NEARBY, NEGLIGIBLE, SERIES, VON_MISES, WAVES, WRAPS
+from gpusense.interface.constants import NEARBY, NEGLIGIBLE, SERIES, VON_MISES, WAVES, WRAPS, log_weight
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.structs import HeadingTerms, PositionTerms, packed
-from gpusense.interface.terms import log_weight
-from gpusense.models.point.base import MISSING, PointModel, rand_omission, relative_omissions
-from gpusense.models.point.pairs import DIGITS, PI, exact, log_of, total, two_parts
+from gpusense.models.point.base import (
+    DIGITS,
+    MISSING,
+    PI,
+    PointModel,
+    exact,
+    log_of,
+    rand_omission,
+    relative_omissions,
+    total,
+    two_parts,
+)
 from gpusense.models.point.sampling import HEADING, POSITION, draws_at, mounted, standard_normal, von_mises
 from gpusense.models.poses import Part, Poses
 from gpusense.reference.relative import wrapped_difference

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from decimal import Decimal, localcontext
 from typing import Any, cast
 
 import numpy as np
@@ -19,9 +21,8 @@ from gpusense.backends.workspace import PartialResult, Workspace
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, flags_of, launch
 from gpusense.interface.plan import ORDINARY_HEADINGS, Omission, Plan
-from gpusense.models.arguments import real_dtype
+from gpusense.models.arguments import Pickled, real_dtype
 from gpusense.models.chunking import Piece, chunk_of, finish, run_pieces
-from gpusense.models.pickled import Pickled
 from gpusense.models.poses import Part, Poses, pose_status
 from gpusense.reference import relative
 
@@ -192,3 +193,38 @@ class PointModel(Pickled):
         result = space.empty(kernel, width * count, self._real)
         arguments = {"poses": source, name: result, "pose_status": pose_status(space), "particles": count}
         return result, (launch(kernel, self._flags | flags, (count,), **arguments, **numbers),)
+
+
+# ---- arguments of kernels to twice a model's precision: computed with 50 digits, split into high and low parts
+
+
+PI = Decimal("3.14159265358979323846264338327950288419716939937511")
+DIGITS = 50
+
+
+def exact(value: float) -> Decimal:
+    """Return a float without rounding."""
+    return Decimal(value)
+
+
+def log_of(value: Decimal | float) -> Decimal | float:
+    """Return the natural logarithm with 50 digits; -inf of 0."""
+    with localcontext(prec=DIGITS):
+        return Decimal(value).ln() if value > 0 else -math.inf
+
+
+def total(*values: Decimal | float) -> Decimal | float:
+    """Return a sum of logarithms; -inf if any term is -inf."""
+    with localcontext(prec=DIGITS):
+        return sum((Decimal(v) for v in values), Decimal(0)) if all(map(math.isfinite, values)) else -math.inf
+
+
+def two_parts(values: Iterable[Decimal | float], real: np.dtype) -> list[np.floating]:
+    """Return each number rounded, and its rounding error (low part), 0 for infinite ones."""
+    parts = []
+    with localcontext(prec=DIGITS):
+        for value in values:
+            high = real.type(float(value))
+            rest = Decimal(value) - Decimal(float(high)) if math.isfinite(value) else 0
+            parts += [high, real.type(float(rest))]
+    return parts

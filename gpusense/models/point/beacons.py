@@ -19,8 +19,17 @@ from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
 from gpusense.interface.structs import BeaconTerms, packed
-from gpusense.models.point.base import PointModel, rand_omission, relative_omissions
-from gpusense.models.point.pairs import DIGITS, PI, exact, log_of, total, two_parts
+from gpusense.models.point.base import (
+    DIGITS,
+    PI,
+    PointModel,
+    exact,
+    log_of,
+    rand_omission,
+    relative_omissions,
+    total,
+    two_parts,
+)
 from gpusense.models.point.sampling import BEACONS, draws_at, mounted, normal_within, within
 from gpusense.models.poses import Part, Poses
 from gpusense.world.range_causes import RandomDensity

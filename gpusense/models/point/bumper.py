@@ -20,8 +20,7 @@ from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
 from gpusense.interface.structs import ContactTerms, packed
 from gpusense.models.arguments import map_words
-from gpusense.models.point.base import PointModel
-from gpusense.models.point.pairs import DIGITS, exact, two_parts
+from gpusense.models.point.base import DIGITS, PointModel, exact, two_parts
 from gpusense.models.point.sampling import BUMPER, draws_at
 from gpusense.models.poses import Frame, Part, Poses, place
 from gpusense.tables.distances import squared_distances

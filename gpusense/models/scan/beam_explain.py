@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from gpusense.interface.constants import HIGH_PEAK
 from gpusense.interface.plan import (
     Note,
     Omission,
@@ -13,7 +14,6 @@ from gpusense.interface.plan import (
     precision_notes,
     share,
 )
-from gpusense.interface.terms import HIGH_PEAK
 from gpusense.models.scan.beam_density import BeamDensity
 from gpusense.models.scan.beam_pipeline import BeamPipeline
 from gpusense.models.scan.mixture import hit_peak

@@ -12,8 +12,7 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray, CasterName, Precision, Space
 from gpusense.backends import BackendInfo, Selection, get_backend
 from gpusense.backends.base import Backend
-from gpusense.models.arguments import check_scene, map_words, real_dtype
-from gpusense.models.pickled import Pickled
+from gpusense.models.arguments import Pickled, check_scene, map_words, real_dtype
 from gpusense.models.poses import Poses
 from gpusense.models.scan.cones import Cones, require_exact
 from gpusense.models.scan.map_caster import MapCaster

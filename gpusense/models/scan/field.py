@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Compat, Precision, Space
 from gpusense.backends import Selection
+from gpusense.interface.constants import HIGH_PEAK
 from gpusense.interface.plan import Note, Omission, SceneNotes, component_notes, launch_omissions, precision_notes
-from gpusense.interface.terms import HIGH_PEAK
 from gpusense.models.chunking import finish
 from gpusense.models.scan.differentiable import Differentiable
 from gpusense.models.scan.field_gradient import gradients, in_world

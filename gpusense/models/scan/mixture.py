@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gpusense._util import checks
+from gpusense.interface.constants import HIGH_PEAK, log_weight, rounded_terms, rounding_error, sums_linearly
 from gpusense.interface.flags import flags_if
 from gpusense.interface.structs import MixtureTerms, columns, packed
-from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, rounding_error, sums_linearly
 from gpusense.models.scan.beam_density import BeamDensity
 from gpusense.world.hit_shapes import shape_of
 from gpusense.world.hit_tables import mass_tables

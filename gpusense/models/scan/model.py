@@ -19,14 +19,13 @@ from gpusense.backends import Backend, BackendInfo, Selection, get_backend
 from gpusense.backends.programs import ProgramCache
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.plan import Plan, SceneNotes
-from gpusense.models.arguments import check_scene, map_words, real_dtype
+from gpusense.models.arguments import Pickled, check_scene, map_words, real_dtype
 from gpusense.models.chunking import finish
-from gpusense.models.pickled import Pickled
 from gpusense.models.poses import Poses
 from gpusense.models.scan.differentiable import Differentiable, is_recorded, log_likelihood_of
-from gpusense.models.scan.explain import plan_of_call
 from gpusense.models.scan.pipeline import Request, ScanPipeline, make_request
 from gpusense.models.scan.rules import Beams, BeamSelection, ModelContext, check_beams
+from gpusense.models.scan.savings import plan_of_call
 from gpusense.models.scan.scoring import LastCall, ResidentPoses, run
 from gpusense.peers.weights import Peer, choose
 from gpusense.tables.worlds import Worlds

@@ -1,4 +1,4 @@
-"""Measure the cost of the parts that a scene leaves out, and read the text of the kernels that score it."""
+"""Build the plan of a scan model, measure the cost of the parts that it leaves out, and read its kernels' text."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.backends.workspace import Workspace
-from gpusense.interface.plan import Plan
+from gpusense.interface.plan import Omission, Plan, SceneNotes, share
+from gpusense.interface.signatures import KERNELS
 from gpusense.models.chunking import finish
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.pipeline import Request, ScanPipeline
+from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.scoring import LastCall, run
 from gpusense.world.grid import OccupancyGrid
 
@@ -85,3 +87,53 @@ def _difference(pipeline: ScanPipeline, request: Request, with_part: tuple[froze
 def sources_of(backend: Backend, last: LastCall) -> dict[str, str]:
     """Return the text of the kernels of a last call, by their names."""
     return {kernel: backend.source(kernel, last.flags) for kernel in last.kernels}
+
+
+# ---- the plan of any scan model
+
+
+def plan_of_call(notes: SceneNotes, context: ModelContext, last: LastCall) -> Plan:
+    """Return the plan as of the last call."""
+    device = context.backend.info
+    title = f"{notes.title}, {device.selection} ({device.name})"
+    if not context.rules.specialize:
+        return Plan(f"{title}, specialize=False", last.flags, ())
+    omissions = (*notes.omissions, *_arguments(last), *_launches(last), *_readings(last, context.rules.scanner.count))
+    return Plan(title, last.flags, omissions, tuple(notes.kept), tuple(notes.could_go))
+
+
+def _arguments(last: LastCall) -> list[Omission]:
+    """Return the arguments that the kernels of the last call do not take."""
+    rows = [KERNELS[kernel] for kernel in last.kernels]
+    count = sum(len(row.arguments) for row in rows)
+    absent = count - sum(len(row.with_flags(last.flags).arguments) for row in rows)
+    if not absent:
+        return []
+    why = f"{absent} of {count} arguments belong to parts that are left out"
+    return [Omission("kernel arguments", why, "their setting for each launch")]
+
+
+def _launches(last: LastCall) -> list[Omission]:
+    """Return the launches that scans share."""
+    if last.together <= 1:
+        return []
+    saved = f"{last.together - 1} of {last.together} sets of launches"
+    return [Omission("launches of single scans", f"{last.together} scans are scored together", saved)]
+
+
+def _readings(last: LastCall, count: int) -> list[Omission]:
+    """Return the readings of the last scan of ``count`` beams that are not evaluated; none before a call."""
+    if last.scan is None:
+        return []
+    left_out = last.scan.left_out
+    classes = (
+        (left_out.missing, "missing readings", "say nothing"),
+        (left_out.ignored_max, "max readings", "say nothing while z_max = 0"),
+        (len(left_out.constant_max), "max readings", "have probability z_max at every pose"),
+        (left_out.thinned, "thinned beams", "are not among those that beams= chose"),
+    )
+    return [
+        Omission(what, f"{left} of {count} readings {why}", f"{share(left, count)} of the beams")
+        for left, what, why in classes
+        if left
+    ]

@@ -129,23 +129,23 @@ def _panel(chart: Chart, groups: Sequence[str], scales: tuple[tuple[int, int], t
         parts.append(f'<path class="f" d="M{x(best[0].error):.1f} {y(best[0].seconds):.1f}{steps}H{end}"/>')
     for mark in sorted(chart.marks, key=lambda mark: mark.best):
         parts.append(_symbol(groups, mark.group, x(mark.error), y(mark.seconds), 4.5 if mark.best else 3, mark.name))
-    return parts + _names(best, x, y, end)
+    return parts + _names(best, x, y)
 
 
-def _names(best: Sequence[Mark], x, y, end: float) -> list[str]:
-    """Label at most four marks of the front; skip labels that would overlap."""
+def _names(best: Sequence[Mark], x, y) -> list[str]:
+    """Label at most four marks of the front below and left of it, where no mark is; skip labels that would overlap."""
     last = len(best) - 1
     best = [best[k] for k in sorted({round(last * k / (LABELS - 1)) for k in range(LABELS)})] if best else []
     placed: list[tuple[float, float, float]] = []
     parts = []
     for mark in best:
         width = 5.6 * len(mark.name)
-        left = min(x(mark.error) + 7, end - width)
-        at = y(mark.seconds) - 7
-        if any(abs(at - other) < 12 and left < right and begin < left + width for begin, right, other in placed):
+        right = max(x(mark.error) - 7, LEFT + 4 + width)
+        left, at = right - width, y(mark.seconds) + 13
+        if any(abs(at - other) < 12 and left < till and begin < right for begin, till, other in placed):
             continue
-        placed.append((left, left + width, at))
-        parts.append(f'<text x="{left:.1f}" y="{at:.1f}" class="n">{escape(mark.name)}</text>')
+        placed.append((left, right, at))
+        parts.append(f'<text x="{right:.1f}" y="{at:.1f}" text-anchor="end" class="n">{escape(mark.name)}</text>')
     return parts
 
 

@@ -43,5 +43,5 @@ for pose, colour, name in ((truth, "#009e73", "true pose"), (off, "#d55e00", "of
     log_p = model.log_likelihood(pose[None], ranges)[0]
     right.plot(*ends(pose), "o", ms=3, color=colour, label=f"{name}: log p = {log_p:.0f}")
 right.set_title("likelihood field")
-right.legend(loc="lower right")
+gs.plots.add_legend(right, 2)
 plt.show()

@@ -46,7 +46,7 @@ for ax, pose, title in zip(panels, (guess, match.pose), ("at the guess", "matche
     ax.plot(*points(first), "o", ms=4, color="#0072b2", label="first scan")
     ax.plot(*points(second, pose), ".", ms=4, color="#d55e00", label="second scan")
     ax.set(title=title, xlabel="x [m]", ylabel="y [m]", aspect="equal", xlim=(-3, 8), ylim=(-5, 3))
-    ax.legend()
+    gs.plots.add_legend(ax)
 image = panels[2].pcolormesh(dx, dy, log_p.reshape(dx.shape) - log_p.max(), cmap=gs.plots.colours(), shading="nearest")
 panels[2].quiver(dx, dy, *gradient[:, :2].T, color="#d55e00", pivot="tail")
 panels[2].set(title="gradient in a map", xlabel="x from the truth [m]", ylabel="y from the truth [m]", aspect="equal")

@@ -41,5 +41,5 @@ ax.plot(*poses[:, :2].T, color="#56b4e9", lw=1.5, label="filter")
 for k, cloud in clouds.items():
     ax.plot(*cloud[:, :2].T, ".", ms=1.5, color="#009e73", label=f"particles before scan {k + 1}")
 ax.set_title(f"150 scans, a fifth of the beams hidden by people; median error {100 * np.median(errors):.1f} cm")
-ax.legend(loc="upper right")
+gs.plots.add_legend(ax, 5)
 plt.show()

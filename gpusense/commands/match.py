@@ -157,7 +157,7 @@ def _print(total: dict[str, Any]) -> None:
                    f"{degrees(total['guess_heading_median'])} degrees")  # fmt: skip
     for status, number in statuses.items():
         if status != "converged":
-            print_fact(str(number), f"{status}: {STATUSES[status]}")
+            print_fact("status", f"{number} {status}: {STATUSES[status]}")
 
 
 def _document(matches: LogMatches, total: dict[str, Any], chosen: int) -> dict[str, Any]:

@@ -91,7 +91,7 @@ def write_pages(folder: Path) -> None:
     intro = "Begin with these ten; the pages below list every public name, with shapes, units, errors and an example."
     roles = {name: "class" if inspect.isclass(getattr(gpusense, name)) else "func" for name in FIRST}
     first = "\n".join(f"- :{roles[name]}:`gpusense.{name}`: {meaning}" for name, meaning in FIRST.items())
-    pages["index"] = f"Reference\n=========\n\n{intro}\n\n{first}\n\n.. toctree::\n\n{listed}\n"
+    pages["index"] = f"Reference\n=========\n\n{intro}\n\n{first}\n\n.. toctree::\n   :maxdepth: 2\n\n{listed}\n"
     folder.mkdir(exist_ok=True)
     for name, text in pages.items():
         file = folder / f"{name}.rst"

@@ -7,6 +7,7 @@ worker.
 
 from __future__ import annotations
 
+import pickle
 import queue
 import threading
 from collections.abc import Callable, Sequence
@@ -15,7 +16,7 @@ from types import TracebackType
 from typing import Any
 
 from gpusense._util import checks
-from gpusense.sweeps.process import Worker, deafen, pickled, result_of
+from gpusense.sweeps.process import Worker, deafen, result_of
 
 
 class SerialExecutor(Executor):
@@ -99,7 +100,7 @@ class ProcessExecutor(Terminable):
         return self._threads.submit(self._run, fn, args, kwargs)
 
     def _run(self, fn: Callable[..., Any], args: Any, kwargs: Any) -> Any:
-        payload, worker = pickled(fn, args, kwargs), self._free.get()
+        payload, worker = pickle.dumps((fn, args, kwargs)), self._free.get()
         try:
             return result_of(worker.call(payload, self._seconds))
         finally:

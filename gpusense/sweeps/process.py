@@ -192,11 +192,6 @@ class Worker:
             pool.shutdown(cancel_futures=True)
 
 
-def pickled(function: Callable[..., Any], args: Any, kwargs: Any) -> bytes:
-    """Return the payload of a call to a module's function."""
-    return pickle.dumps((function, args, kwargs))
-
-
 def result_of(answer: bytes) -> Any:
     """Return the result of a call, or raise its error."""
     succeeded, value = pickle.loads(answer)

@@ -25,10 +25,7 @@ _MOST, _ITERATIONS, _SMALL = 20_000, 20, 1e-4
 def smoothed(occupied: np.ndarray, known: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the shares of occupied cells among the known ones around each cell, 0 where none is, and of known cells.
 
-    Args:
-        occupied: (H, W) bool.
-        known: (H, W) bool.
-        sigma: Deviation of the weights [cells].
+    Images are (H, W) bool, ``sigma`` is the deviation of the weights [cells].
     """
     offsets = np.arange(-math.ceil(_REACH * sigma), math.ceil(_REACH * sigma) + 1)
     weights = np.exp(-0.5 * (offsets / sigma) ** 2)
@@ -51,12 +48,8 @@ def _convolved(image: np.ndarray, weights: np.ndarray, axis: int) -> np.ndarray:
 class Alignment:
     """A local map that is aligned with a global one.
 
-    Args:
-        local: The local map.
-        xy: (M, 2) centres of the local map's known cells, row by row, around its middle [cells of the global map].
-        grid: The global map.
-        poses: (M, 3) poses of the local map's middle that will be refined [cells, cells, rad].
-        farthest: Largest distance from these [cells].
+    ``xy`` (M, 2) are the centres of its known cells, row by row, around its middle [cells of the global map]; ``poses``
+    (M, 3) of the middle will be refined [cells, cells, rad], by at most ``farthest`` [cells].
     """
 
     def __init__(
@@ -80,12 +73,7 @@ class Alignment:
         self._map, self._share = smoothed(occupied, self._known, _SIGMA)
 
     def refined(self, pose: np.ndarray, most: float) -> np.ndarray:
-        """Return the best pose near a start, or the start itself if the optimum is too far away.
-
-        Args:
-            pose: (3,) pose of the local map's middle in the global map's frame [cells, cells, rad].
-            most: Largest turn [rad].
-        """
+        """Return the best pose (3,) near a start, or the start if the optimum is too far or turned by too much."""
         at, damping = pose.astype(np.float64), 1e-3
         value, gradient, information = self._evaluated(at)
         for _ in range(_ITERATIONS):

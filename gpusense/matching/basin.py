@@ -30,16 +30,9 @@ def is_held(
     first: np.ndarray, second: np.ndarray, scanner: Scanner, match: ScanMatch, backend: Backend, precision: Precision,
     motions: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
 ) -> np.ndarray:  # fmt: skip
-    """Return (S,) whether starts along the lost directions of matches lead back to their poses.
+    """Return (S,) whether starts along the lost directions of matches of (S, K) readings lead back to their poses.
 
-    Args:
-        first: (S, K) readings of the reference scans [m].
-        second: (S, K) readings of the second scans.
-        scanner: The scanner of both.
-        match: S matches; starts are matched with their noise.
-        backend: The device.
-        precision: Precision.
-        motions: (S, 3) and (S, 3) motions during the reference scans and the second scans, or None.
+    Starts are matched with the matches' noise. ``motions`` are (S, 3) motions during both scans, or None.
     """
     count, real = len(second), np.dtype(precision)
     before, during = motions

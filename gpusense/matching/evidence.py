@@ -39,13 +39,10 @@ _MOST = 700.0
 
 
 def pair_evidence(result: np.ndarray, lost: Column, other: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Return the evidence (S, 9) of results of the kernel ``match_scans``, see :data:`NAMES`; the distance is 0.
+    """Return the evidence (S, 9) of results (S, 35) of ``match_scans``, see :data:`NAMES`; the distance is 0.
 
-    Args:
-        result: (S, 35) results.
-        lost: Number of lost directions.
-        other: (S, 3) offsets to poses that agree about as well, NaN without one.
-        noise: (S,) standard deviations of ranges [m].
+    ``other`` (S, 3) are offsets to poses that agree about as well, NaN without one; ``noise`` (S,) are
+    deviations of ranges [m].
     """
     numbers = columns_of(result)
     weights, squared, seen, through, unseen = numbers[19:24]

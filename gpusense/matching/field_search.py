@@ -61,15 +61,7 @@ class Candidates(NamedTuple):
 
 
 class FieldSearch:
-    """The tables of a model for searches.
-
-    Args:
-        model: A likelihood field.
-        stride: Cells between neighbouring positions.
-
-    Attributes:
-        free: Positions in free cells.
-    """
+    """Tables of a model to search positions that are ``stride`` cells apart; ``free`` has those in free cells."""
 
     def __init__(self, model: LikelihoodFieldModel, stride: int) -> None:
         self.lock = threading.Lock()
@@ -137,14 +129,10 @@ class FieldSearch:
         self, ranges: np.ndarray, points: Sequence[np.ndarray], searched: PoseGrid, allowed: np.ndarray | None,
         depth: float,
     ) -> list[Candidates]:  # fmt: skip
-        """Return the best poses of each scan by score, and the likeliest of them by the model.
+        """Return the poses of each scan down to ``depth`` below the best score, and the likeliest by the model.
 
-        Args:
-            ranges: (S, K) readings [m].
-            points: (M, 2) end points of the hits of each scan on the robot [m], at least one.
-            searched: The poses, the same for all scans.
-            allowed: Positions that may be found; None: all.
-            depth: Largest difference from the best score.
+        ``ranges`` are (S, K) readings [m], ``points`` (M, 2) end points of the hits of each scan on the robot [m], at
+        least one. ``allowed`` are the positions that may be found; None: all.
         """
         model = self._model()
         assert model is not None

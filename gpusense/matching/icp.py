@@ -58,11 +58,9 @@ def space_of(backend: Backend) -> tuple[threading.RLock, Workspace]:
 
 
 def line_rules(width: float, gap: float) -> dict[str, float]:
-    """Return the rules of lines by the names of the kernel's arguments.
+    """Return the rules of lines of half a length ``width`` [m] by the names of the kernel's arguments.
 
-    Args:
-        width: Half their length [m].
-        gap: Largest step between the bearings of two neighbours that hides nothing [rad].
+    ``gap`` is the largest step between the bearings of two neighbours that hides nothing [rad].
     """
     most = _MOST if width > WIDTH else _FEWER
     reach = 1 if gap > GAP * _SPARSE else REACH
@@ -77,21 +75,11 @@ def slack_of(noise: float) -> float:
 class PlacedPairs:
     """Pairs of scans whose points and lines are on a device.
 
-    Pairs whose ranges have equal noise form a level, with separate rules.
-
-    Args:
-        backend: The device.
-        real: Precision.
-        space: The workspace with the buffers ``match points``, ``match start`` and ``match lines``.
-        room: Points for which they have room.
-        points: (N,) points of each scan.
-        gap: Largest step between the bearings of two neighbours that hides nothing [rad].
-        pairs: (S, 3) reference, second scan and level of each pair.
-        levels: Noise of each level [m], ascending; a scan belongs to pairs of one level.
-
-    Attributes:
-        levels: Noise of each level.
-        level: (S,) level of each pair.
+    Pairs whose ranges have equal noise form a level, with separate rules: ``levels`` has its noise, ascending [m], and
+    ``level`` (S,) the level of each pair; a scan belongs to pairs of one level. ``pairs`` (S, 3) are reference, second
+    scan and level. The workspace has the buffers ``match points``, ``match start`` and ``match lines``, with room for
+    ``room`` points; ``points`` (N,) is their number in each scan. ``gap`` is the largest step between the bearings of
+    two neighbours that hides nothing [rad].
     """
 
     def __init__(
@@ -132,9 +120,7 @@ class PlacedPairs:
     def fit_lines(self, width: Callable[[float], float], pairs: np.ndarray | None = None) -> None:
         """Fit lines to the points of all scans, or of the scans of some pairs, from the next match on.
 
-        Args:
-            width: Half their length by the noise of ranges [m]; shorter where points are missing.
-            pairs: (P,) indices of pairs; lines of other pairs are kept.
+        ``width`` is half their length by the noise of ranges [m]; they are shorter where points are missing.
         """
         if not self._most:
             return
@@ -194,16 +180,9 @@ class PlacedPairs:
     def run_in_turns(
         self, guess: np.ndarray, rules: Sequence[MatchRules], far: float, far_turn: float
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Match a single pair, and again from its result if that is farther from the guess than a limit.
+        """Match a single pair, and again from its result if it is farther from the guess (1, 3) than a limit [m, rad].
 
-        Args:
-            guess: (1, 3) pose of the second scan in the reference's frame.
-            rules: Those of its level.
-            far: Limit along an axis [m].
-            far_turn: Limit of the turn [rad].
-
-        Returns:
-            (1, 35) both results; the second one is None where the match was not repeated.
+        Return both results (1, 35); the second one is None where the match was not repeated.
         """
         first, again = self._run(_FIRST_PAIR, guess[:, None], rules, (2, far, far_turn))[0, 0, :, None].astype(
             np.float64
@@ -250,15 +229,9 @@ class PlacedPairs:
 
 
 class IcpPairs(PlacedPairs):
-    """Pairs of scans whose points are copied to a device, with lines of the least length.
+    """Pairs (S, 2) of scans whose points are copied to a device, with lines of the least length.
 
-    Args:
-        backend: The device.
-        real: Precision.
-        points: The points of all scans.
-        pairs: (S, 2) numbers of the reference and of the second scan.
-        noise: (S,) standard deviations of ranges [m]; a scan belongs to pairs of one level.
-        space: The workspace of the buffers.
+    ``noise`` (S,) are standard deviations of ranges [m]; a scan belongs to pairs of one level.
     """
 
     def __init__(

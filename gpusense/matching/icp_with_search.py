@@ -48,18 +48,10 @@ def match_pairs(
     mount: tuple[float, float],
     noise: np.ndarray | None = None,
 ) -> ScanMatch:
-    """Match pairs of scans; ``judged`` adds the probability that they are right.
+    """Match pairs (S, 2) of scans from guesses (S, 3) of the second robot frame in the first one.
 
-    Args:
-        backend: The device.
-        real: Precision.
-        points: The points of all scans.
-        pairs: (S, 2) numbers of the reference and of the second scan.
-        guess: (S, 3) poses of the second robot frame in the first one.
-        method: ``"icp"`` or ``"auto"``.
-        options: Capture radius, noise and window.
-        mount: Place of the scanner on the robot [m].
-        noise: (S,) standard deviations of ranges [m]; None takes the options'.
+    ``judged`` adds the probability that they are right. ``mount`` is the place of the scanner on the robot [m];
+    ``noise`` (S,) are standard deviations of ranges [m], None takes the options'.
     """
     lock, space = space_of(backend)
     sensor = to_sensor(guess, mount)
@@ -92,17 +84,9 @@ def judged_pairs(
 ) -> tuple[Best, PairSums]:
     """Return the best results of pairs, and the information of their pairs of points.
 
-    Args:
-        device: The pairs.
-        guess: (S, 3) guesses in the sensors' frames.
-        result: (S, 35) results from the guesses, overwritten.
-        points: Points of the references, and of the second scans.
-        lever: (S,) root mean square ranges of the second scans [m].
-        method: ``"icp"`` or ``"auto"``.
-        options: Capture radius and window.
-        noise: (S,) standard deviations of ranges [m].
-        levels: Their levels.
-        again: (S, 35) results from ``result`` as guesses; None where they are not known.
+    ``guess`` (S, 3) is in the sensors' frames. ``result`` (S, 35) is overwritten. ``points`` are numbers of points of
+    the references, and of the second scans; ``lever`` (S,) root mean square ranges of the second scans [m]; ``again``
+    (S, 35) results from ``result`` as guesses, None where they are not known.
     """
     best, begun = Best(result, _NO_OTHER.repeat(len(result), axis=0)), result[:, :3].copy()
     if method == "auto":

@@ -19,18 +19,11 @@ _DEPTH, _NEAR, _TURNED = 0.06, 0.5, math.radians(15.0)
 
 
 def likely_poses(model: LikelihoodFieldModel, ranges: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Return distinct poses in free cells at which a scan is likeliest, by falling score.
+    """Return at most ``count`` distinct poses (M, 3) in free cells at which a scan (K,) is likeliest, best first.
 
-    Branch and bound, as in :func:`gpusense.matching.locate.locate_scan`, on a coarser grid of poses.
-
-    Args:
-        model: A likelihood field.
-        ranges: (K,) readings [m].
-        count: Most poses.
-
-    Returns:
-        (M, 3) poses, 0.5 m or 15 degrees apart; none for a scan without hits, on a map without free cells, or on one
-        whose cells are larger than the scan.
+    Branch and bound, as in :func:`gpusense.matching.locate.locate_scan`, on a coarser grid of poses. Poses are 0.5 m or
+    15 degrees apart; none for a scan without hits, on a map without free cells, or on one whose cells are larger than
+    the scan.
     """
     grid = model.grid
     stride = max(round(_RESOLUTION / grid.resolution), 1)

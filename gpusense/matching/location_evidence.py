@@ -33,12 +33,7 @@ _LEAST = (3e-3, 1e-2, 1e-2)
 
 
 def location_evidence(modes: Sequence[PoseMode], depth: float) -> np.ndarray:
-    """Return the evidence (5,) on the first mode, see :data:`NAMES`.
-
-    Args:
-        modes: The modes, at least one.
-        depth: Difference of scores to which modes are searched.
-    """
+    """Return the evidence (5,) on the first mode, see :data:`NAMES`; modes are searched down to ``depth``."""
     best = modes[0]
     rivals = [np.array([(best.score - mode.score) / depth, best.agreement - mode.agreement]) for mode in modes[1:]]
     strongest = min(rivals, key=rival_odds, default=np.array([math.inf, best.agreement]))

@@ -221,17 +221,9 @@ def match_log(
 ) -> ScanMatch:  # fmt: skip
     """Match L pairs of checked scans of a log as ``match_scan`` does; points and lines of each scan are made once.
 
-    Args:
-        readings: (S, K) readings [m].
-        scanner: The scanner.
-        first: (L,) indices of the reference scans.
-        second: (L,) indices of the second scans.
-        guess: (L, 3) poses of the second robot frames in the first ones [m, m, rad].
-        own: (S,) noise of the scans from ``scan_noise`` [m].
-        backend: The device.
-        precision: Precision.
-        window: Half widths of the search [m, rad].
-        motion: (S, 3) motions during the scans, or None.
+    ``readings`` are (S, K) [m], ``first`` and ``second`` (L,) indices of scans, ``guess`` (L, 3) poses of the second
+    robot frames in the first ones, ``own`` (S,) the noise from ``scan_noise`` [m], ``window`` half widths of the search
+    [m, rad] and ``motion`` (S, 3) motions during the scans, or None.
     """
     options, poses = check_options(ASSUMED_NOISE, 1.0, window), check_guess(guess, len(second))
     noise = match_noise(own[first], own[second])
@@ -264,13 +256,9 @@ def readings(name: str, ranges: object, scanner: Scanner, backend: Backend) -> n
 
 
 def scan_map(ranges: np.ndarray, scanner: Scanner, margin: float, cell: float) -> OccupancyGrid:
-    """Return the map of a scan in the robot's frame: cells of hits are occupied, the rest is unknown.
+    """Return the map of a scan (K,) in the robot's frame: cells of hits are occupied, the rest is unknown.
 
-    Args:
-        ranges: (K,) readings [m].
-        scanner: The scanner.
-        margin: Width of the space around the hits [m].
-        cell: Least side of a cell [m].
+    ``margin`` is the width of the space around the hits, ``cell`` the least side of a cell [m].
     """
     hits = classify_ranges(ranges, scanner.range_min, scanner.range_max)[0]
     vectors, middle = ray_vectors(scanner.bearings, scanner.mount)[hits], np.array(scanner.mount[:2])

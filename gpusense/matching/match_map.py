@@ -285,7 +285,7 @@ def _states(grid: OccupancyGrid) -> np.ndarray:
 def _best_near(local: _Local, states: np.ndarray, pose: np.ndarray, angle: float) -> np.ndarray:
     """Return the pose with the largest correlation among a pose of the grid and its neighbours."""
     shifts = [(row, col) for row in (0, -1, 1) for col in (0, -1, 1)]
-    # The pose itself comes first and wins ties, as do those of its heading.
+    # The pose itself comes first and wins ties, then come other positions at its heading.
     turned = [pose + np.array([0.0, 0.0, turn * angle]) for turn in (0, -1, 1)]
     measured = np.array([_correlations(local, states, each, shifts) for each in turned])[..., 0]
     turn, shift = divmod(int(measured.argmax()), len(shifts))

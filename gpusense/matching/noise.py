@@ -87,12 +87,7 @@ def neighbors(scanner: Scanner) -> tuple[tuple[slice, ...], np.ndarray, np.ndarr
 
 
 def match_noise(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the noise of matches (S,): the larger noise of both scans, rounded up to a step.
-
-    Args:
-        first: (S,) or (1,) noise of the reference scans [m]; NaN is unknown.
-        second: (S,) noise of the second scans.
-    """
+    """Return the noise of matches (S,): the larger noise of both scans [m], rounded up to a step; NaN is unknown."""
     both = column_of(np.fmax(first, second))
     # NaN differs from itself.
     both = smaller(larger(chosen(both == both, both, ASSUMED_NOISE), LEAST_NOISE), LARGEST_NOISE)

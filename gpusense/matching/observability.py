@@ -76,15 +76,11 @@ def observed_information(
     information: Triangle, spurious: Triangle, lever: Column, lines: Column | None, least: Column,
     unneeded: Column = False,
 ) -> Observed:  # fmt: skip
-    """Remove from the information of pairs the directions that they do not observe.
+    """Remove from the information of pairs, sums of w J J', the directions that they do not observe.
 
-    Args:
-        information: Sums of w J J'.
-        spurious: The expected part of it that is due to the variance of the points.
-        lever: Lengths that convert headings to distances [m].
-        lines: Lines of the scan without a common point; None for few.
-        least: Least pairs of an observed direction.
-        unneeded: Which matches need no information if they lose a direction; their number of these may then be 1.
+    ``spurious`` is the expected part due to the variance of the points; ``lever`` converts headings to distances [m];
+    ``lines`` of the scan have no common point, None for few; an observed direction has at least ``least`` pairs.
+    Matches in ``unneeded`` need no information if they lose a direction; their number of these may then be 1.
     """
     total = balanced(information, lever)
     made_up = _with_diagonal(balanced(spurious, lever), _SPURIOUS, _SPURIOUS)
@@ -122,11 +118,8 @@ def _partly_observed(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the observed part (L, 3, 3) of an information, and the number of lost directions (L,).
 
-    Args:
-        total: (L, 3, 3) information of x, y and ``lever`` times the heading.
-        made_up: (L, 3, 3) its part that is due to noise.
-        critical: (L,) least generalised eigenvalue of an observed direction.
-        least: (L,) least pairs of an observed direction.
+    ``total`` (L, 3, 3) is of x, y and ``lever`` times the heading, ``made_up`` its part that is due to noise.
+    ``critical`` (L,) is the least generalised eigenvalue of an observed direction, ``least`` (L,) its least pairs.
     """
     values, vectors = _generalised(total, made_up)
     lost = _is_lost(values, vectors, critical, least)
@@ -246,14 +239,9 @@ def covariance_of(
 ) -> np.ndarray:  # fmt: skip
     """Return the covariance (S, 3, 3) of an information: its inverse, infinite in every coordinate that is lost.
 
-    A coordinate is lost if positions along a lost direction within ``reach`` of each other differ in it by more than
-    its deviation; where they differ less, their difference is part of its variance.
-
-    Args:
-        information: (S, 3, 3), 0 along lost directions.
-        lever: Lengths that convert headings to distances [m].
-        reach: Farthest distance [m] and angle [rad] from the guess.
-        known_axes: The result of ``axes_of``, where it is known.
+    A coordinate is lost if positions along a lost direction within ``reach`` [m, rad] of each other differ in it by
+    more than its deviation; where they differ less, their difference is part of its variance. ``lever`` converts
+    headings to distances [m]; ``known_axes`` is the result of ``axes_of``.
     """
     values, vectors = axes_of(information, lever) if known_axes is None else known_axes
     # In ascending order, with lost ones first.

@@ -138,13 +138,7 @@ _of_numbers = functools.lru_cache(maxsize=16)(_checked)
 
 
 def check_guess(guess: object, matches: int | None, farthest: float = _FARTHEST) -> np.ndarray:
-    """Return the guesses of S matches, (S, 3), headings in [-pi, pi].
-
-    Args:
-        guess: (3,) or (S, 3).
-        matches: S, or None for a single match.
-        farthest: Largest coordinate.
-    """
+    """Return the guesses of S matches, (S, 3), headings in [-pi, pi]; ``matches`` is None for a single one."""
     if matches is None and type(guess) is np.ndarray and guess.shape == (3,) and guess.dtype == np.float64:
         # The other checks take longer than the rest.
         x, y, heading = guess.tolist()

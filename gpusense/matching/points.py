@@ -74,14 +74,10 @@ def dense_scanner(scanner: Scanner) -> Scanner:
 
 
 def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np.ndarray | None = None) -> ScanPoints:
-    """Return the points of the hits of (S, K) readings.
+    """Return the points of the hits of (S, K) readings [m]; the mount's yaw is added to bearings.
 
-    Args:
-        ranges: Readings [m].
-        scanner: The scanner; its mount's yaw is added to bearings.
-        real: Precision of the points.
-        motion: (S, 3) motions of the robot during the scans, see ``gpusense.world.deskew``; points are then in the
-            frames at the first beams. None: the robot is at rest.
+    With (S, 3) motions of the robot during the scans, see ``gpusense.world.deskew``, points are in the frames at the
+    first beams.
     """
     if motion is not None and motion.any():
         return _moved_points(ranges, scanner, real, motion)

@@ -29,12 +29,8 @@ class PoseGrid:
     def around(cls, poses: np.ndarray, reach: tuple[int, int], turns: int, angle: float, stride: int = 1) -> PoseGrid:
         """Return the poses around (S, 3) poses [cells, cells, rad] in the table's frame.
 
-        Args:
-            poses: The centres.
-            reach: Positions on either side, along y and along x.
-            turns: Headings on either side.
-            angle: Angle between neighbouring headings [rad].
-            stride: Cells between neighbouring positions.
+        ``reach`` are positions on either side, along y and along x, ``stride`` cells apart; ``turns`` are headings on
+        either side, ``angle`` [rad] apart.
         """
         rows, cols = reach
         start = poses[:, :2] - stride * np.array([cols, rows])
@@ -84,27 +80,16 @@ class Found:
 
 
 def end_places(points: np.ndarray, headings: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return (A, K, 2) places [cells] of the end points at each heading, at the position ``start``.
-
-    Args:
-        points: (K, 2) end points in the robot's frame [cells].
-        headings: (A,) [rad].
-        start: (2,) x and y [cells].
-    """
+    """Return (A, K, 2) places of (K, 2) end points on the robot at (A,) headings, at the position ``start`` [cells]."""
     cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
     x, y = points[:, 0], points[:, 1]
     return np.stack([start[0] + (cos * x - sin * y), start[1] + (sin * x + cos * y)], axis=-1)
 
 
 def distinct_poses(poses: np.ndarray, count: int, radius: float, angle: float, first: int = 0) -> list[int]:
-    """Return the indices of the best pose, and of poses that are far from all better ones.
+    """Return at most ``count`` indices of poses (M, 3) by falling score, each farther from better ones than a limit.
 
-    Args:
-        poses: (M, 3) poses, by falling score [m, m, rad].
-        count: Most indices.
-        radius: Poses within this distance [m] and ``angle`` of a better one are left out.
-        angle: See ``radius`` [rad].
-        first: Index of the best pose.
+    The best pose has the index ``first``. Poses within ``radius`` [m] and ``angle`` [rad] of a better one are left out.
     """
     chosen: list[int] = []
     left, following = np.ones(len(poses), bool), first

@@ -227,15 +227,9 @@ def refine_modes(
 ) -> tuple[Floats, Floats, float]:
     """Refine the best poses of a lattice between its positions and headings.
 
-    Args:
-        model: The model of the lattice.
-        ranges: (K,) readings [m].
-        likelihood: The lattice.
-        count: Number of poses to return; four times as many are refined.
-
-    Returns:
-        (M, 3) poses [m, m, rad] and (M,) log-likelihoods, the best first, and the gain of the best one over the lattice
-        [nats], large if the lattice is coarser than the peaks of the model.
+    Return ``count`` poses (M, 3) [m, m, rad] of four times as many that are refined, and their (M,) log-likelihoods,
+    the best first, and the gain of the best one over the lattice [nats], large if the lattice is coarser than the
+    model's peaks.
     """
     poses, log_p = likelihood.modes(4 * count)
     if not len(poses):

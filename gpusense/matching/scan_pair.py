@@ -69,18 +69,10 @@ def match_pair(
     backend: Backend, real: np.dtype, first: np.ndarray, second: np.ndarray, scanner: Scanner, guess: np.ndarray,
     method: str, options: MatchOptions, *, given: bool,
 ) -> ScanMatch:  # fmt: skip
-    """Match two scans of a robot at rest; ``judged`` adds the probability that the match is right.
+    """Match two scans (K,) of a robot at rest; ``judged`` adds the probability that the match is right.
 
-    Args:
-        backend: The device.
-        real: Precision.
-        first: (K,) readings of the reference [m].
-        second: (K,) readings of the second scan [m].
-        scanner: The scanner.
-        guess: (1, 3) pose of the second robot frame in the first one.
-        method: ``"icp"`` or ``"auto"``.
-        options: Capture radius, noise and window.
-        given: True if the options set the noise; otherwise it is estimated from the scans.
+    ``guess`` (1, 3) is the pose of the second robot frame in the first one. ``given`` is True if the options set the
+    noise; otherwise it is estimated from the scans.
     """
     mount = scanner.mount[:2]
     sensor = to_sensor(guess, mount)

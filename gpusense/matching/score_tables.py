@@ -62,19 +62,10 @@ class Folded(NamedTuple):
 
 
 class ScoreTables:
-    """Tables of integer scores of one size on a device.
+    """Tables (T, H, W) or (H, W) of integer scores on a device; row 0 and column 0 touch the tables' origin.
 
-    Args:
-        backend: The device.
-        scores: (T, H, W) or (H, W) uint8; row 0 and column 0 touch the tables' origin.
-        levels: Number of times that tables can be pooled: a pooled cell covers ``2^levels`` positions along each axis.
-        stride: Cells between neighbouring positions.
-        beyond: Score of every cell outside a table.
-
-    Attributes:
-        shape: Sizes of the tables, as kernels take them.
-        levels: Number of times that tables can be pooled.
-        stride: Cells between neighbouring positions.
+    They can be pooled ``levels`` times: a pooled cell covers ``2^levels`` positions along each axis, ``stride`` cells
+    apart. Cells outside a table have the score ``beyond``. ``shape`` are the sizes as kernels take them.
     """
 
     def __init__(

@@ -41,11 +41,7 @@ _MADE = ("point", "folded", "folded image")
 
 
 class Search:
-    """Searches in tables of scores; it keeps its buffers.
-
-    Args:
-        tables: The tables. Scan s is searched in table s, or all scans in the only one.
-    """
+    """Searches in tables of scores, scan s in table s, or all scans in the only one; it keeps its buffers."""
 
     def __init__(self, tables: ScoreTables) -> None:
         self.tables = tables
@@ -63,22 +59,15 @@ class Search:
         images: Sequence[np.ndarray] | None = None,
         floor: int = -1,
     ) -> Found:
-        """Return the best pose of each scan, and all poses whose scores are at most ``slack`` lower.
+        """Return the best pose of each scan, and all poses whose scores are at most ``slack`` or (S,) lower.
 
-        Args:
-            points: (K_s, 2) end points of each of S scans in the robot's frame [cells of the tables].
-            grid: The poses.
-            slack: Largest difference from the best score of the scan, or (S,) of each. At most 262 144 poses of a scan
-                are kept; of equal ones, the first by row, column and heading.
-            level: Blocks of ``2^level`` x ``2^level`` positions are bounded first; 0 is brute force. None: the
-                tables' last level, or the one before it if its bounds take few sums.
-            allowed: (height, width) bool: positions that may be found; it must not change while it is in use. None:
-                all.
-            images: (K_s,) table of each point, or (A, K_s) at each heading. None: the scans'.
-            floor: Least score of a pose that is found.
-
-        Returns:
-            The poses. A scan without points scores 0 everywhere. No pose is returned without an allowed position.
+        ``points`` (K_s, 2) are end points of each of S scans in the robot's frame [cells of the tables], ``images``
+        (K_s,) the table of each, or (A, K_s) at each heading; None: the scans'. Blocks of ``2^level`` x ``2^level``
+        positions are bounded first; 0 is brute force, None the tables' last level, or the one before it if its bounds
+        take few sums. ``allowed`` (height, width) are the positions that may be found; it must not change while it is
+        in use. Poses below ``floor`` are not found. At most 262 144 poses of a scan are kept; of equal ones, the first
+        by row, column and heading. A scan without points scores 0 everywhere. No pose is returned without an allowed
+        position.
         """
         level = self._first_level(points, grid) if level is None else level
         run = _Run(self, grid, slack, self.masks(grid, allowed), level, floor)

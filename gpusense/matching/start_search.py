@@ -121,16 +121,9 @@ def nearby(options: MatchOptions) -> MatchOptions:
 
 
 def distinct(poses: np.ndarray, score: np.ndarray, known: np.ndarray, capture: float) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the best poses that differ from each other and from a known pose.
+    """Choose the best of poses (S, M, 3) with scores (S, M) that differ from each other and from a known pose (S, 3).
 
-    Args:
-        poses: (S, M, 3) poses.
-        score: (S, M) their scores.
-        known: (S, 3) poses near which none is chosen.
-        capture: Capture radius [m].
-
-    Returns:
-        (C,) numbers of rows, ascending, and (C, 3) poses.
+    Return (C,) numbers of rows, ascending, and (C, 3) poses.
     """
     # Only starts that may be refined, row by row; each choice drops those that are near it.
     least = score.max(axis=1) - _PROMISING

@@ -53,16 +53,7 @@ _SEARCH_CELL, _LEVELS = 0.1, 4
 
 
 class MapMatcher:
-    """Fields of a map for one scanner.
-
-    Args:
-        grid: The map.
-        scanner: The scanner.
-        backend: The device.
-        precision: Precision of the fields.
-        options: Capture radius, noise and window.
-        caster: The caster of expected scans, an exact one.
-    """
+    """Fields of a map for one scanner, and an exact caster of expected scans."""
 
     def __init__(
         self, grid: OccupancyGrid, scanner: Scanner, backend: Backend, precision: str, options: MatchOptions,

@@ -118,8 +118,7 @@ def _rotated(
 ) -> tuple[float, float, float, float, Vector, Vector]:
     """Rotate two axes so that the nonzero number ``both`` of their row and column becomes 0.
 
-    Returns:
-        Their two numbers on the diagonal, their two numbers in the third row, and the vectors of both axes.
+    Return their two numbers on the diagonal, their two numbers in the third row, and the vectors of both axes.
     """
     half = (other - one) / (2 * both)
     tangent = math.copysign(1.0, half) / (abs(half) + math.sqrt(half * half + 1))

@@ -41,12 +41,8 @@ _SHORT = 0.5
 def noise_of(ratio: Column) -> tuple[Column, Column]:
     """Return the deviation of normal errors, and the factor of the covariance, from a weighted mean of squared errors.
 
-    Args:
-        ratio: (S,) sum of w e^2 over the sum of w, for errors in scales, and weights (1 / (1 + e^2))^2.
-
-    Returns:
-        (S,) deviations in scales, at most 2, and E[w] E[w^2 e^2] / E[d(w e)/de]^2, a factor of the inverse of the sum
-        of w J J'.
+    ``ratio`` (S,) is the sum of w e^2 over the sum of w, for errors in scales, and weights (1 / (1 + e^2))^2.
+    Deviations are at most 2; the factor of the inverse of the sum of w J J' is E[w] E[w^2 e^2] / E[d(w e)/de]^2.
     """
     if isinstance(ratio, np.ndarray):
         known, sigma, factor = _noise_table()
@@ -111,14 +107,9 @@ def variance_of(
 ) -> tuple[Column, Column]:
     """Return the variance of single errors [m^2], and the factor of the inverse information.
 
-    The three fitted numbers of a pose reduce the degrees of freedom, and the prior noise adds some.
-
-    Args:
-        squared: Weighted mean squared errors [m^2].
-        pairs: Sums of weights.
-        scale: Scales of the weights [m].
-        noise: Standard deviations of ranges [m].
-        inflation: Factors of the covariance because errors of neighbours are correlated.
+    The three fitted numbers of a pose reduce the degrees of freedom, and the prior noise adds some. ``squared`` are
+    weighted mean squared errors [m^2], ``pairs`` sums of weights, ``scale`` scales of the weights and ``noise``
+    deviations of ranges [m]. ``inflation`` are factors of the covariance because errors of neighbours are correlated.
     """
     square = scale * scale
     # Squares of tiny scales are 0.
@@ -133,15 +124,10 @@ def observed_pairs(
     information: Triangle, doubt: Triangle, variance: Column, lever: Column, lines: Column | None,
     unneeded: Column = False,
 ) -> Observed:  # fmt: skip
-    """Return the information that pairs of points and lines observe.
+    """Return the information that pairs of points and lines observe, of sums of w J J'.
 
-    Args:
-        information: Sums of w J J'.
-        doubt: The part of it that is due to a unit variance of the points.
-        variance: Variances of the points [m^2].
-        lever: Lengths that convert headings to distances [m].
-        lines: Lines without a common point; None for few.
-        unneeded: Which matches need no information if they lose a direction.
+    ``doubt`` is the part due to a unit variance of the points, ``variance`` their variance [m^2]; see
+    ``observability.observed_information`` for the rest.
     """
     spurious = [part * variance for part in doubt]
     return observed_information(information, spurious, lever, lines, LEAST_PAIRS, unneeded)
@@ -150,10 +136,7 @@ def observed_pairs(
 def statuses(result: np.ndarray, lost: Column, step: Column) -> np.ndarray:
     """Return the status of (S, 35) results of the kernel ``match_scans``.
 
-    Args:
-        result: The results.
-        lost: Number of lost directions.
-        step: Length of the last step in deviations of the pose, along observed directions.
+    ``step`` is the length of the last step in deviations of the pose, along observed directions.
     """
     numbers = columns_of(result)
     seen, through, unseen = numbers[21:24]
@@ -176,16 +159,8 @@ def observable_directions(
     """Return the information (S, 3, 3) on poses by the scans' lines, 0 along directions that they do not observe.
 
     Distances to a map ignore lines: the ends of a corridor's walls in the map, or gaps between cells, seem to constrain
-    the position along the corridor. A scan matched with itself has the information of its lines.
-
-    Args:
-        ranges: (S, K) readings [m].
-        pose: (S, 3) poses of the robot in the world.
-        variance: (S,) variance of the points' distances from the map [m^2].
-        scanner: The scanner.
-        backend: The device.
-        real: Precision.
-        options: Capture radius and noise.
+    the position along the corridor. A scan matched with itself has the information of its lines. ``ranges`` are (S, K)
+    readings [m], ``pose`` (S, 3) poses of the robot, ``variance`` (S,) variances of distances from the map [m^2].
     """
     points = scan_points(ranges, scanner, real)
     everything = np.arange(len(pose))

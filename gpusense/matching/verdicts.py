@@ -48,14 +48,9 @@ def tested(
 ) -> PairSums:  # fmt: skip
     """Return the directions that pairs observe, by the matches' lines or, where noise may turn these, by longer lines.
 
-    Args:
-        device: The pairs.
-        result: (S, 35) results of the matches.
-        gap: Largest step between the bearings of two neighbours that hides nothing [rad].
-        lever: (S,) root mean square ranges of the second scans [m].
-        noise: (S,) standard deviations of ranges [m].
-        levels: The options of each level of noise.
-        noisy: Whether noise turns the lines of pairs.
+    ``result`` (S, 35) are the matches; ``gap`` is the largest step between the bearings of two neighbours that hides
+    nothing [rad], ``lever`` (S,) the root mean square range of the second scan and ``noise`` (S,) the deviation of
+    ranges [m].
     """
     numbers, deviation = columns_of(result), column_of(noise)
     weights = larger(numbers[19], 1e-30)
@@ -95,19 +90,10 @@ def concluded(
 ) -> ScanMatch:  # fmt: skip
     """Return matches whose information is 0 where they failed, and spans both poses where there are two.
 
-    Args:
-        pose: (S, 3) poses.
-        information: Information on the poses.
-        factor: Factors that turn the information into a sum over pairs [m^2].
-        score: (S,) scores.
-        iterations: (S,) iterations.
-        status: (S,) statuses so far.
-        lever: (S,) root mean square ranges [m].
-        other: (S, 3) offsets to poses that agree about as well, NaN without one.
-        evidence: (S, E) numbers of ``evidence.NAMES``.
-        pairs: (S,) sums of weights.
-        noise: (S,) standard deviations of ranges [m].
-        window: Half widths of the search [m, rad].
+    ``factor`` turns the information into a sum over pairs [m^2]; ``lever`` (S,) are root mean square ranges and
+    ``noise`` (S,) deviations of ranges [m]; ``other`` (S, 3) offsets to poses that agree about as well, NaN without
+    one; ``evidence`` (S, E) numbers of ``evidence.NAMES``; ``pairs`` (S,) sums of weights; ``window`` half widths of
+    the search [m, rad].
     """
     usable, lever_column = is_usable(column_of(status)), column_of(lever)
     matrices, two = matrices_of(information), usable & has_rival(other)
@@ -133,13 +119,7 @@ def concluded(
 
 
 def judged(match: ScanMatch, guess: np.ndarray, options: MatchOptions) -> ScanMatch:
-    """Return S matches with their p_right; doubtful matches and matches beyond the window have failed.
-
-    Args:
-        match: Matches from ``concluded``.
-        guess: (S, 3) guesses of the poses.
-        options: The window.
-    """
+    """Return S matches of ``concluded`` with their p_right; doubtful ones and those beyond the window have failed."""
     offset = match.pose - guess
     evidence, (x, y, _) = match.evidence.copy(), columns_of(offset)
     evidence[:, -1] = np.hypot(x, y) / max(options.window[0], _LEAST_WINDOW)

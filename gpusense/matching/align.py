@@ -111,7 +111,7 @@ class Alignment:
         along = (1 - b) * (m01 - m00) + b * (m11 - m10)
         up = (1 - a) * (m10 - m00) + a * (m11 - m01)
         numbers = np.stack([along, up, up * turned[0] - along * turned[1], error])
-        # No product of matrices, whose last bits differ between processors.
+        # No matrix product: its last bits differ between processors.
         sums = np.array([[(weighted * other).sum() for other in numbers] for weighted in weight * numbers])
         sums /= weight.sum()
         return float(sums[3, 3]), sums[:3, 3], sums[:3, :3]

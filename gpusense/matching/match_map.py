@@ -15,6 +15,7 @@ from gpusense._util.angles import wrapped
 from gpusense._util.html import card
 from gpusense.backends import Backend, Selection, get_backend
 from gpusense.matching.align import Alignment
+from gpusense.matching.pose_grid import distinct_poses
 from gpusense.matching.score_tables import TOP, ScoreTables, field_scores
 from gpusense.matching.search import Found, PoseGrid, Search
 from gpusense.tables.distances import distance_transform
@@ -244,7 +245,7 @@ def _result(
 ) -> MapMatch:
     """Return the match among the poses of a search and their neighbours."""
     poses = searched.poses(found, 1)
-    chosen = _distinct(poses, grid.resolution)
+    chosen = distinct_poses(poses, _MODES, _MODE_RADIUS / grid.resolution, _MODE_ANGLE)
     angle = float(np.diff(searched.headings[0]).max(initial=0.0))
     states = _states(grid)
     best = [_best_near(local, states, pose, angle) for pose in poses[chosen]]
@@ -263,18 +264,6 @@ def _result(
         modes[0], float(correlations[0]), float(overlaps[order[0]]), float(found.score[chosen[order[0]]])
         / (TOP * len(local.points)), modes, correlations, status, searched.count, found.evaluated,
     )  # fmt: skip
-
-
-def _distinct(poses: np.ndarray, cell: float) -> list[int]:
-    """Return the indices of poses, in falling order of score, that are not near a better one."""
-    left = np.ones(len(poses), bool)
-    chosen: list[int] = []
-    while left.any() and len(chosen) < _MODES:
-        chosen.append(int(left.argmax()))
-        off = poses - poses[chosen[-1]]
-        turn = np.abs(wrapped(off[:, 2]))
-        left &= (np.hypot(off[:, 0], off[:, 1]) * cell > _MODE_RADIUS) | (turn > _MODE_ANGLE)
-    return chosen
 
 
 def _states(grid: OccupancyGrid) -> np.ndarray:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks, pictures
 from gpusense._util.angles import wrapped
+from gpusense.matching.pose_grid import distinct_poses
 from gpusense.models.scan.model import ScanModel
 from gpusense.tables.world_map import check_one_map
 from gpusense.world.grid import OccupancyGrid
@@ -244,12 +245,8 @@ def refine_modes(
         poses = tried.reshape(len(poses), -1, 3)[np.arange(len(poses)), chosen]
         log_p = values.max(axis=1)
     poses[:, 2] = -wrapped(-poses[:, 2])
-    kept: list[int] = []
-    for k in np.argsort(-log_p, kind="stable").tolist():
-        off = poses[kept] - poses[k]
-        if not ((np.hypot(off[:, 0], off[:, 1]) <= _NEAR) & (np.abs(wrapped(off[:, 2])) <= _TURN)).any():
-            kept.append(k)
-    kept = kept[:count]
+    order = np.argsort(-log_p, kind="stable")
+    kept = order[distinct_poses(poses[order], count, _NEAR, _TURN)]
     return poses[kept], log_p[kept], float(log_p[kept[0]] - best)
 
 

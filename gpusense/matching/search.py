@@ -72,10 +72,7 @@ class Search:
         level = self._first_level(points, grid) if level is None else level
         run = _Run(self, grid, slack, self.masks(grid, allowed), level, floor)
         run.place(points, images)
-        if level == 0:
-            run.keep_all()
-        else:
-            run.search()
+        run.search()
         return run.found()
 
     def _first_level(self, points: Sequence[np.ndarray], grid: PoseGrid) -> int:
@@ -108,8 +105,6 @@ class _Run:
         self._least = floor
         self._floor = np.full(scans, floor, np.int64)
         self._complete = np.ones(scans, bool)
-        # True if all kept poses of a scan have the best score.
-        self._full = np.zeros(scans, bool)
         self._kept: list[np.ndarray] = []
         self._evaluated = 0
         self._bounds_made: Buffer | None = None
@@ -177,17 +172,23 @@ class _Run:
         self._backend.compile("row_maxima", _NO_FLAGS)((rows,), self._bounds(), self._maxima, rows, self._width)
         best = np.empty((rows, 2), np.int32)
         self._space.read(self._maxima, best)
-        of_scan = best[:, 0].reshape(scans, -1)
-        most = min(_FOLLOWED, of_scan.shape[1])
-        least = np.maximum(np.partition(of_scan, -most, axis=1)[:, -most], 0)
-        flat = np.concatenate([
-            _thinned(np.flatnonzero(values >= low), _FOLLOWED) + scan * of_scan.shape[1]
-            for scan, (values, low) in enumerate(zip(of_scan, least, strict=True))
-        ])  # fmt: skip
-        item, row = np.divmod(flat, self._height)
-        blocks = np.stack([item, row << self._level, best[flat, 1] << self._level, best[flat, 0]], axis=1)
-        self._follow(self._space.upload("followed", blocks.astype(np.int32)), len(blocks))
+        item, row = np.divmod(np.arange(rows), self._height)
+        blocks = np.stack([item, row << self._level, best[:, 1] << self._level, best[:, 0]], axis=1, dtype=np.int32)
+        if self._level == 0:
+            self._raise(blocks)
+        else:
+            chosen = np.concatenate([self._most_promising(part) for part in np.split(blocks, scans)])
+            self._follow(self._space.upload("followed", chosen), len(chosen))
         self._descend(*self._choose(), self._level)
+
+    @staticmethod
+    def _most_promising(blocks: np.ndarray) -> np.ndarray:
+        """Return the best blocks of a scan, evenly spaced: many bounds are equal, most of all the largest."""
+        most = min(_FOLLOWED, len(blocks))
+        least = max(np.partition(blocks[:, 3], -most)[-most], 0)
+        promising = blocks[blocks[:, 3] >= least]
+        most = min(most, len(promising))
+        return promising[np.arange(most) * len(promising) // max(most, 1)]
 
     def _follow(self, blocks: Buffer, count: int) -> None:
         """Raise lower bounds: follow the best parts of blocks down to poses."""
@@ -225,15 +226,15 @@ class _Run:
 
     def _descend(self, blocks: Buffer, count: int, level: int) -> None:
         """Divide blocks of a level down to poses, and keep those that reach the floor."""
+        if level == 0:
+            poses = self._read(blocks, count)
+            self._raise(poses)
+            self._keep(poses)
+            return
         for begin in range(0, count, _MOST_BLOCKS):
-            part = self._backend.part(blocks, 4 * begin, 4 * min(_MOST_BLOCKS, count - begin), _INT)
-            made, some = self._divide(part, min(_MOST_BLOCKS, count - begin), level - 1)
-            if some and level > 1:
-                self._descend(made, some, level - 1)
-            elif some:
-                poses = self._read(made, some)
-                self._raise(poses)
-                self.keep(poses)
+            some = min(_MOST_BLOCKS, count - begin)
+            part = self._backend.part(blocks, 4 * begin, 4 * some, _INT)
+            self._descend(*self._divide(part, some, level - 1), level - 1)
 
     def _divide(self, blocks: Buffer, count: int, level: int) -> tuple[Buffer, int]:
         """Return the allowed quarters of blocks whose bounds reach the floor of their scan, and their number."""
@@ -274,26 +275,7 @@ class _Run:
         np.maximum.at(self._best, poses[:, 0] // self._turns, poses[:, 3])
         np.maximum(self._floor, np.where(self._best >= 0, self._best - self._slack, -1), out=self._floor)
 
-    def keep_all(self) -> None:
-        """Keep the best of all poses of each scan."""
-        height, width = self._height, self._width
-        scores = np.empty((self._grid.headings.size, height, width), np.int32)
-        self._space.read(self._bounds(), scores)
-        self._best = scores.reshape(len(self._best), -1).max(axis=1, initial=-1).astype(np.int64)
-        self._floor = np.maximum(np.where(self._best >= 0, self._best - self._slack, -1), self._least)
-        # In the order of equal poses: where most poses score alike, a few rows have enough of them.
-        rows = max(_MOST_KEPT // (self._turns * width), 1)
-        for scan in range(len(self._best)):
-            part = scores[scan * self._turns : (scan + 1) * self._turns]
-            for row in range(0, height, rows):
-                block = part[:, row : row + rows]
-                item, line, col = np.nonzero(block >= max(self._floor[scan], 0))
-                poses = np.stack([item + scan * self._turns, line + row, col, block[item, line, col]], axis=1)
-                self.keep(poses)
-                if self._full[scan]:
-                    break
-
-    def keep(self, poses: np.ndarray) -> None:
+    def _keep(self, poses: np.ndarray) -> None:
         """Keep poses that reach the floor; with too many of them, raise the floor."""
         self._kept.append(poses[poses[:, 3] >= self._floor[poses[:, 0] // self._turns]])
         if sum(map(len, self._kept)) > _MOST_KEPT * len(self._best):
@@ -306,7 +288,6 @@ class _Run:
         crowded = (_ranks(scan, score) == _MOST_KEPT) & (score >= self._floor[scan])
         np.maximum.at(self._floor, scan[crowded], np.minimum(score[crowded] + 1, self._best[scan[crowded]]))
         self._complete[scan[crowded]] = False
-        self._full[scan[crowded]] = score[crowded] == self._best[scan[crowded]]
         poses = self._ordered(poses)
         scan, score = poses[:, 0] // self._turns, poses[:, 3]
         self._kept = [poses[(score >= self._floor[scan]) & (_ranks(scan, score) < _MOST_KEPT)]]
@@ -329,11 +310,6 @@ def _filled(array: np.ndarray) -> np.ndarray:
     """Return a flat array of at least two numbers, since buffers are never empty."""
     flat = np.ascontiguousarray(array).reshape(-1)
     return flat if len(flat) else np.zeros(2, flat.dtype)
-
-
-def _thinned(index: np.ndarray, most: int) -> np.ndarray:
-    """Return at most ``most`` of the rows, evenly spaced: many bounds are equal, most of all the largest."""
-    return index if len(index) <= most else index[np.arange(most) * len(index) // most]
 
 
 def _ranks(scan: np.ndarray, score: np.ndarray) -> np.ndarray:

@@ -29,6 +29,7 @@ RESULTS = {
 }  # fmt: skip
 # Methods for the package's own use, of enumerations and exceptions, or that draw a picture.
 METHODS = {
+    "BeamModel.bind_terms", "LikelihoodFieldModel.bind_terms",
     "BeamModel.start_scoring", "LikelihoodFieldModel.start_scoring", "LikelihoodFieldModel.sample",
     "PoseLikelihood.plot", "RayCaster.save_table", "OdometryMotion.sampled", "OdometryMotion.sampled_turns",
     "OmniMotion.sampled", "VelocityMotion.sampled", "ScanMatch.changed", "ScanMatch.joined", "ScanMatch.moved",

@@ -27,7 +27,7 @@ _NO_FLAGS: frozenset[str] = frozenset()
 _FOLLOWED = 512
 # Sums of a scan's bounds that a level of smaller blocks may take.
 _MOST_SUMS = 1 << 29
-# Blocks for which a launch has room at first, most blocks of a launch that divides them, and most poses that are kept.
+# Room at first for chosen blocks of a scan, most blocks of a launch that divides them, and most poses that are kept.
 _ROOM, _MOST_BLOCKS, _MOST_KEPT = 1 << 17, 1 << 18, 1 << 18
 # Most items of one launch: some drivers allow 65535 groups along the last axis.
 _MOST_ITEMS = 1 << 15
@@ -206,7 +206,7 @@ class _Run:
 
     def _choose(self) -> tuple[Buffer, int]:
         """Return the blocks whose bounds reach the floor of their scan, and their number."""
-        space, rows, room = self._space, self._grid.headings.size * self._height, _ROOM
+        space, rows, room = self._space, self._grid.headings.size * self._height, _ROOM * len(self._best)
         while True:
             made, low = space.empty("blocks", 4 * room, _INT), space.upload("low", self._low())
             counter, slot = self._counter()

@@ -12,7 +12,7 @@
 // requires: score_cells
 
 // Points after which sums are compared.
-#define STEP 16
+#define STEP 48
 
 // Write the maximum of each cell and the cells up to reach rows and columns further. One work-item takes a cell.
 kernel void pool_scores(ARGUMENTS) {

@@ -20,7 +20,7 @@ from .score_cells import SHIFT_ROWS, TOP, ScoreTable, block_index, padded_lines,
 # Sums of neighbouring rows.
 Rows = wp.types.vector(length=SHIFT_ROWS, dtype=wp.int32)
 # Points after which sums are compared.
-STEP = 16
+STEP = 48
 
 
 @kernel()

@@ -103,12 +103,10 @@ kernel void shift_scores(ARGUMENTS) {
 kernel void row_maxima(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= rows) return;
+    // Two loops, since compilers make vector code of the first one.
     int most = -1, place = 0;
-    for (int col = 0; col < width; ++col)
-        if (score[n * width + col] > most) {
-            most = score[n * width + col];
-            place = col;
-        }
+    for (int col = 0; col < width; ++col) most = score[n * width + col] > most ? score[n * width + col] : most;
+    while (score[n * width + place] < most) ++place;
     best[2 * n] = most;
     best[2 * n + 1] = place;
 }

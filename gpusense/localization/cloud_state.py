@@ -8,28 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gpusense.interface.constants import (
-    DEGENERATE,
-    DEPTH,
-    EVIDENCE,
-    FARTHEST_THETA,
-    FARTHEST_X,
-    INJECTED,
-    JITTER,
-    LEFT,
-    LOWEST,
-    RESAMPLED,
-    RUNG,
-    SAMPLE_SIZE,
-    SHARE,
-    STAGE,
-    STATE,
-)
+from gpusense.interface import constants as c
 from gpusense.localization.particles import BufferSlots
 from gpusense.reference.tempering import left_of
 
 # Lowest depth of a ladder: distances of a million deviations differ by 2^-39 on its last rung.
-_DEEPEST = LOWEST**5
+_DEEPEST = c.LOWEST**5
 # Effective sample size below which a stage repeats its weighing on a deeper ladder.
 _FEWEST = 10.0
 # Jitter of a stage on a deeper ladder: the peak is beyond the particles, which must not contract before reaching it.
@@ -119,45 +103,45 @@ class Summary(NamedTuple):
     @property
     def evidence(self) -> float:
         """Log p(z | earlier readings); -inf if no particle was possible."""
-        return -math.inf if self.degenerate else float(self.numbers[EVIDENCE])
+        return -math.inf if self.degenerate else float(self.numbers[c.EVIDENCE])
 
 
 def summary_of(numbers: np.ndarray) -> Summary:
     """Return the summary of a state in the kernels' layout."""
     used, stage, distinct = 0.0, 0, math.inf
     while True:
-        own = numbers[stage * STAGE : (stage + 1) * STAGE]
-        used += float(own[RUNG])
-        if own[LEFT] == 0.0:
+        own = numbers[stage * c.STAGE : (stage + 1) * c.STAGE]
+        used += float(own[c.RUNG])
+        if own[c.LEFT] == 0.0:
             break
         # The difference of two other parents jitters each copy, so that m parents have at most m^3 distinct copies.
-        distinct = min(distinct, float(own[SAMPLE_SIZE]) ** 3)
+        distinct = min(distinct, float(own[c.SAMPLE_SIZE]) ** 3)
         stage += 1
-    size = min(float(own[SAMPLE_SIZE]), distinct)
-    return Summary(size, min(used, 1.0), bool(numbers[DEGENERATE]), stage + 1, numbers, bool(own[RESAMPLED]))
+    size = min(float(own[c.SAMPLE_SIZE]), distinct)
+    return Summary(size, min(used, 1.0), bool(numbers[c.DEGENERATE]), stage + 1, numbers, bool(own[c.RESAMPLED]))
 
 
 def is_starved(numbers: np.ndarray, settings: np.ndarray, stage: int, count: int) -> bool:
     """Return whether the tempering ladder is too shallow: its last rung leaves too few particles with weight."""
-    own = numbers[stage * STAGE : (stage + 1) * STAGE]
-    if not own[SAMPLE_SIZE] < min(settings[SHARE] * count, _FEWEST):
+    own = numbers[stage * c.STAGE : (stage + 1) * c.STAGE]
+    if not own[c.SAMPLE_SIZE] < min(settings[c.SHARE] * count, _FEWEST):
         return False
-    lowest = left_of(numbers, stage) * settings[DEPTH] * LOWEST
-    return bool(own[RUNG] == lowest > 0.0 and not own[DEGENERATE] and settings[DEPTH] > _DEEPEST)
+    lowest = left_of(numbers, stage) * settings[c.DEPTH] * c.LOWEST
+    return bool(own[c.RUNG] == lowest > 0.0 and not own[c.DEGENERATE] and settings[c.DEPTH] > _DEEPEST)
 
 
 def deeper(settings: np.ndarray) -> np.ndarray:
     """Return the settings of a step with a ladder below the last rung of the present one."""
     result = settings.copy()
-    result[DEPTH] *= LOWEST
-    result[JITTER], result[FARTHEST_X], result[FARTHEST_THETA] = _WIDE_JITTER, math.inf, math.pi
+    result[c.DEPTH] *= c.LOWEST
+    result[c.JITTER], result[c.FARTHEST_X], result[c.FARTHEST_THETA] = _WIDE_JITTER, math.inf, math.pi
     return result
 
 
 def meaningful(numbers: np.ndarray, averages: bool) -> np.ndarray:
     """Clear unused numbers of a state: stages that did not run, and averages that recovery does not follow."""
-    end, result = summary_of(numbers).stages * STAGE, np.zeros(STATE)
+    end, result = summary_of(numbers).stages * c.STAGE, np.zeros(c.STATE)
     result[:end] = numbers[:end]
     if averages:
-        result[EVIDENCE : INJECTED + 1] = numbers[EVIDENCE : INJECTED + 1]
+        result[c.EVIDENCE : c.INJECTED + 1] = numbers[c.EVIDENCE : c.INJECTED + 1]
     return result

@@ -10,37 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.interface.constants import (
-    DEPTH,
-    DEVIATION,
-    FARTHEST_THETA,
-    FARTHEST_X,
-    FAST_RATE,
-    INDEPENDENT,
-    JITTER,
-    MEAN,
-    MOST_INJECTED,
-    PER_BEAM_SCALE,
-    POOL,
-    RESIDUAL,
-    REVERSE,
-    SCALE,
-    SEED,
-    SETTINGS,
-    SHARE,
-    SLOW_RATE,
-    STEP,
-    STRATIFIED,
-    SYSTEMATIC,
-    TEMPERATURE,
-    THRESHOLD,
-)
+from gpusense.interface import constants as c
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.motion import SampledMotion, settings_of
 
 # Most particles.
 _MOST = 1 << 24
-_DRAWS = {"systematic": SYSTEMATIC, "stratified": INDEPENDENT, "residual": RESIDUAL}
+_DRAWS = {"systematic": c.SYSTEMATIC, "stratified": c.INDEPENDENT, "residual": c.RESIDUAL}
 
 
 class Options(NamedTuple):
@@ -107,8 +83,8 @@ def settings_of_step(
 ) -> np.ndarray:
     """Return the settings of a step, indexed by ``interface.constants``; sensors are temperatures and beams."""
     settings = _settings_of_run(options, count, pool, tuple(sensors), one_peak).copy()
-    settings[STEP] = step
-    settings[MEAN : DEVIATION + 4], settings[REVERSE] = settings_of(motion)
+    settings[c.STEP] = step
+    settings[c.MEAN : c.DEVIATION + 4], settings[c.REVERSE] = settings_of(motion)
     return settings
 
 
@@ -121,25 +97,25 @@ def _settings_of_run(
     one_peak: bool,
 ) -> np.ndarray:
     """Return the settings common to all steps; arguments as for ``settings_of_step``."""
-    s: list[float] = [0.0] * SETTINGS
-    s[SEED], s[SEED + 1] = options.words
-    s[JITTER], s[FARTHEST_X], s[FARTHEST_THETA] = DEFAULTS.jitter, DEFAULTS.farthest, DEFAULTS.farthest_turn
-    s[POOL], s[POOL + 1 : POOL + 4] = pool
-    s[SHARE] = min(DEFAULTS.share, DEFAULTS.enough / count) if one_peak else DEFAULTS.share_apart
-    s[THRESHOLD] = options.threshold
-    s[DEPTH] = 1.0
-    s[STRATIFIED] = _DRAWS[options.resampling]
+    s: list[float] = [0.0] * c.SETTINGS
+    s[c.SEED], s[c.SEED + 1] = options.words
+    s[c.JITTER], s[c.FARTHEST_X], s[c.FARTHEST_THETA] = DEFAULTS.jitter, DEFAULTS.farthest, DEFAULTS.farthest_turn
+    s[c.POOL], s[c.POOL + 1 : c.POOL + 4] = pool
+    s[c.SHARE] = min(DEFAULTS.share, DEFAULTS.enough / count) if one_peak else DEFAULTS.share_apart
+    s[c.THRESHOLD] = options.threshold
+    s[c.DEPTH] = 1.0
+    s[c.STRATIFIED] = _DRAWS[options.resampling]
     # Sums of weights stay below 2^53: a weight is 1 on average, and its square at most 1 / threshold. An effective
     # sample size of one particle exceeds any lower threshold.
     threshold = max(options.threshold, 1 / _MOST)
     spare = math.ceil(math.log2(max(count, 2))) + math.ceil(-math.log2(threshold)) + 2
-    s[SCALE] = 2.0 ** (52 - spare)
+    s[c.SCALE] = 2.0 ** (52 - spare)
     if options.recovery == "augmented":
-        s[SLOW_RATE], s[FAST_RATE] = DEFAULTS.slow, DEFAULTS.fast
-        s[MOST_INJECTED] = DEFAULTS.most_injected
+        s[c.SLOW_RATE], s[c.FAST_RATE] = DEFAULTS.slow, DEFAULTS.fast
+        s[c.MOST_INJECTED] = DEFAULTS.most_injected
     total = 0.0
     for place, (temperature, beams) in enumerate(sensors):
-        s[TEMPERATURE + place] = temperature
+        s[c.TEMPERATURE + place] = temperature
         total += temperature * max(beams, 1)
-    s[PER_BEAM_SCALE] = 1 / total if total > 0 else 0.0
+    s[c.PER_BEAM_SCALE] = 1 / total if total > 0 else 0.0
     return np.array(s, np.float64)

@@ -10,7 +10,7 @@ import sys
 import pytest
 from support import fake_driver
 
-from gpusense.backends import Device, chain, default_failures, get_backend, listing, notices, selection
+from gpusense.backends import Device, default_failures, fallback, get_backend, listing, notices, selection
 from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.backends.proof import DeviceCheck
 
@@ -46,7 +46,7 @@ def machine(monkeypatch):
             "present",
             lambda entry: tuple([d for d in rows if d.backend == entry.name] for rows in ([*devices, NUMPY], parts)),
         )
-        monkeypatch.setattr(chain, "_verdict_of", verdict_of)
+        monkeypatch.setattr(fallback, "_verdict_of", verdict_of)
         monkeypatch.setattr(selection, "_open", open_one)
         monkeypatch.setattr(selection, "_looks", ((), {}))
         monkeypatch.setattr(selection, "_passed_over", [])
@@ -109,7 +109,7 @@ def test_a_verdict_is_reported_by_the_process_that_makes_it(machine, caplog):
     machine([GPU, WARP], {"opencl:0:0": KEPT})
     assert get_backend("auto").info.selection == "warp:cpu" and caplog.messages == []
     text = "opencl:0:0 (A GPU, Driver 1) is unusable: scalar kernels hang; update the driver"
-    made = chain.FallbackOrder([chain.Failure("opencl:0:0", "", text, True)])
+    made = fallback.FallbackOrder([fallback.Failure("opencl:0:0", "", text, True)])
     held = ["another warning", text]
     made.report(WARP, held)
     assert held == ["another warning", f"'auto' is warp:cpu (CPU): {text}"]

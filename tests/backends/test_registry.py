@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 
 import gpusense as gs
-from gpusense.backends import BackendInfo, chain, get_backend, listing, registry, selection
+from gpusense.backends import BackendInfo, fallback, get_backend, listing, registry, selection
 from gpusense.backends.library import Absent, Library
 from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.backends.proof import DeviceCheck
@@ -57,10 +57,10 @@ def metal(monkeypatch):
     library.LIBRARY, package.Array = Metal(), type("Array", (), {})
     package.__spec__ = sys.__spec__
     entries = (*ENTRIES, METAL)
-    for module in (registry, listing, selection, chain):
+    for module in (registry, listing, selection, fallback):
         monkeypatch.setattr(module, "ENTRIES", entries)
         monkeypatch.setattr(module, "BY_NAME", {entry.name: entry for entry in entries})
-    monkeypatch.setattr(chain, "SPEED_CLASSES", (("metal", "gpu"), *SPEED_CLASSES))
+    monkeypatch.setattr(fallback, "SPEED_CLASSES", (("metal", "gpu"), *SPEED_CLASSES))
     monkeypatch.setitem(sys.modules, "metal_library", library)
     monkeypatch.setitem(sys.modules, "metalpy", package)
     monkeypatch.setattr(listing.proof, "verdict_on", lambda info, **options: DeviceCheck(True, 4, info.float64))

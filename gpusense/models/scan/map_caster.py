@@ -90,7 +90,7 @@ class MapCaster:
         self.flags = self._fixed_flags
         self._precision_flags = flags_if(FLOAT64=real == np.float64)
         # The frame of the last state of the map.
-        self._framed: MapState | None = None
+        self._framed: tuple[object, object] = (None, None)
         self._frame: Frame
         self._workspace = Workspace(backend)
         # Threads may share a caster: its buffers serve one call at a time.
@@ -259,8 +259,10 @@ class MapCaster:
     def _place(self, poses: Poses, piece: Piece) -> tuple[PlacedPoses, MapState]:
         """Place the poses of a piece in a window of the map; also return the map with its table."""
         state = self.map.ensure(poses.corners(piece.part, self.backend, self._workspace) or poses.hull)
-        if self._framed is not state:
-            self._framed, self._frame = state, Frame(state.window, plain_cells(state.grid), self.mount)
+        # Not the state itself, which keeps its table alive.
+        if self._framed[0] is not state.grid or self._framed[1] is not state.window:
+            self._framed = state.grid, state.window
+            self._frame = Frame(state.window, plain_cells(state.grid), self.mount)
         return place(poses, piece.part, self._frame, self.backend, self._workspace, self.real), state
 
     def _flags(self, placed: PlacedPoses, cones: Cones) -> frozenset[str]:

@@ -184,7 +184,7 @@ class ScanPipeline(ABC):
         # Flags, keyed by everything on which they depend.
         self._flags: dict[Hashable, frozenset[str]] = {}
         # The frame of the last state of the map.
-        self._framed: MapState | None = None
+        self._framed: tuple[object, object] = (None, None)
         self._frame: Frame
         # Flags to add and to remove while omissions are measured.
         self.trial: tuple[frozenset[str], frozenset[str]] | None = None
@@ -288,8 +288,10 @@ class ScanPipeline(ABC):
     def place(self, poses: Poses, part: Part, space: Workspace) -> tuple[PlacedPoses, MapState]:
         """Place some poses in a window of the map; also return the map with its table."""
         state = self.map.ensure(poses.corners(part, self.backend, space) or poses.hull)
-        if self._framed is not state:
-            self._framed, self._frame = state, Frame(state.window, plain_cells(state.grid), self._mount)
+        # Not the state itself, which keeps its table alive.
+        if self._framed[0] is not state.grid or self._framed[1] is not state.window:
+            self._framed = state.grid, state.window
+            self._frame = Frame(state.window, plain_cells(state.grid), self._mount)
         return place(poses, part, self._frame, self.backend, space, self.real, careful=self.careful), state
 
     # ---- program

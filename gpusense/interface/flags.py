@@ -47,6 +47,7 @@ FLAGS = {
     "SCANS": "several scans are scored together, each with readings and particles of its own",
     "WORLDS": "each particle is in one of several maps",
     "SHAPES": "worlds have moving shapes",
+    "SEES": "poses cast rays, each of which tests only the shapes near its direction",
     "PER_BEAM": "the log-likelihood of each reading is wanted",
     "BILINEAR": "the field is interpolated",
     "LOG_TABLE": "the field's table holds log densities, not distances",

@@ -58,13 +58,17 @@ class RangeScale(NamedTuple):
 
 
 class Crowd(NamedTuple):
-    """Moving shapes of each world, the numbers of all its shapes, and the side of a cell [m]; see ``shapes``."""
+    """Moving shapes of each world, the numbers of all its shapes, and the side of a cell [m]; pairs of numbers of a
+    sight, and the first of them; see ``shapes``.
+    """
 
     discs: int
     boxes: int
     segments: int
     stride: int
     side: real
+    pairs: int = 0
+    begin: int = 0
 
 
 class Cone(NamedTuple):

@@ -116,6 +116,11 @@ class Poses:
         """Return the map with a table for some poses."""
         return reachable.ensure(self.corners(part, backend, space) or self.hull)
 
+    @property
+    def sights(self) -> int:
+        """Numbers of the sights of each pose."""
+        return 0 if self.inside is None else self.inside.sights
+
     def flags(self, corners: Corners | None) -> frozenset[str]:
         """Return the flags of kernels that place poses with these corners."""
         huge = corners is None or max(-corners[0][2], corners[3][2]) > LARGEST_HEADING
@@ -190,7 +195,7 @@ class PlacedPoses(NamedTuple):
     def key(self) -> Hashable:
         """All values on which the launches depend, except buffers."""
         inside = self.inside
-        where = None if inside is None else (inside.crowd, inside.wide, inside.wide_ignore)
+        where = None if inside is None else (inside.crowd, inside.sights, inside.wide, inside.wide_ignore)
         return self.flags, self.count, self.frame.window, where
 
     @property
@@ -214,8 +219,9 @@ class PlacedPoses(NamedTuple):
 
     @property
     def world(self) -> Buffer:
-        """Two pairs of numbers of each pose; see the kernel file ``shapes``."""
-        return self.space.empty("world", 4 * self.count, _INT)
+        """Two pairs of numbers of each pose, and its sights; see the kernel file ``shapes``."""
+        assert self.inside is not None
+        return self.space.empty("world", (4 + self.inside.sights) * self.count, _INT)
 
     def changing(self) -> dict[str, object]:
         """Return the arguments of ``place_in_worlds`` that change from call to call, by name."""
@@ -226,7 +232,7 @@ class PlacedPoses(NamedTuple):
         if self.inside is None:
             return {}
         table = self.inside.worlds.crowd.table(self.real)
-        return dict(world=self.world, shapes=table, crowd=self.inside.crowd)
+        return dict(world=self.world, shapes=table, crowd=self.inside.crowd_of(self.count))
 
     def arguments(self) -> dict[str, object]:
         """Return the arguments of ``place_poses`` by name."""
@@ -243,11 +249,12 @@ class PlacedPoses(NamedTuple):
         if self.inside is not None:
             inside, arguments = self.inside, self.arguments()
             del arguments["window"]
+            flags = self.flags | inside.flags | flags_if(SEES=inside.sights > 0)
             return (
                 launch(
-                    "place_in_worlds", self.flags | inside.flags, (self.count,), **arguments, index=inside.index,
-                    ignore=inside.ignore, frames=inside.worlds.frames, world=self.world, worlds=len(inside.worlds),
-                    wide=inside.wide, wide_ignore=inside.wide_ignore,
+                    "place_in_worlds", flags, (self.count,), **arguments, **self.places(), index=inside.index,
+                    ignore=inside.ignore, frames=inside.worlds.frames, worlds=len(inside.worlds), wide=inside.wide,
+                    wide_ignore=inside.wide_ignore,
                 ),
             )  # fmt: skip
         return (
@@ -258,16 +265,18 @@ class PlacedPoses(NamedTuple):
 
 
 def place(
-    poses: Poses, part: Part, frame: Frame, backend: Backend, space: Workspace, real: np.dtype, *, careful: bool = False
-) -> PlacedPoses:
+    poses: Poses, part: Part, frame: Frame, backend: Backend, space: Workspace, real: np.dtype, *, careful: bool = False,
+    sees: bool = False,
+) -> PlacedPoses:  # fmt: skip
     """Upload some poses, and describe their placement in the frame of a window.
 
-    ``part``: the first of them and the one after the last; ``careful``: True if low parts are needed.
+    ``part``: the first of them and the one after the last; ``careful``: True if low parts are needed; ``sees``: True if they
+    cast rays, which need the sights of poses in worlds with shapes.
     """
     count, corners = part[1] - part[0], poses.corners(part, backend, space)
     flags = poses.flags(corners)
     source, lows = poses.buffer(backend, space, part), 4 * count if careful else 4
-    inside = None if poses.inside is None else poses.inside.buffers(backend, space, part)
+    inside = None if poses.inside is None else poses.inside.buffers(backend, space, part, sees=sees)
     if source is None:
         if inside is not None:
             raise ValueError(f"grid: must be a single map on {backend.info.name}, which has no float64, got Worlds")

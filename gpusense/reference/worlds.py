@@ -70,10 +70,11 @@ def frame_in(frames: np.ndarray, index: int, frame: structs.Frame) -> structs.Fr
 
 def place_in_worlds(
     flags: frozenset[str], poses: np.ndarray, index: np.ndarray, ignore: np.ndarray, frames: np.ndarray,
-    pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray, world: np.ndarray, pose_status: np.ndarray,
-    frame: structs.Frame, particles: int, worlds: int, wide: int, wide_ignore: int,
+    shapes: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray, world: np.ndarray,
+    pose_status: np.ndarray, frame: structs.Frame, particles: int, worlds: int, wide: int, wide_ignore: int,
+    crowd: structs.Crowd,
 ) -> None:  # fmt: skip
-    """Place poses in their worlds; see ``place_pose``.
+    """Place poses in their worlds; see ``place_pose``. The reference makes no sights: its rays test every shape.
 
     An index of no world sets the second bit of ``pose_status``, and the pose sees nothing.
     """

@@ -46,18 +46,18 @@ def _collide(
     space, backend = worlds.space, worlds.backend
     cell, pose = space.empty("cell", 2 * count, _INT), space.empty("pose", 4 * count, _SINGLE)
     placed, status = space.empty("placed", 4 * count, _INT), backend.upload(np.zeros(2, _INT))
+    crowd = dict(shapes=worlds.crowd.table(_SINGLE), crowd=inside.crowd)
     flags = inside.flags | flags_if(POSES_FLOAT32=single, HUGE_HEADINGS=True)
     backend.run((
         launch(
             "place_in_worlds", flags, (count,), poses=poses, index=inside.index, ignore=inside.ignore,
             frames=worlds.frames, pose_cell=cell, pose=pose, pose_low=space.empty("low", 4, _SINGLE), world=placed,
             pose_status=status, frame=Frame(0.0, 0.0, worlds.resolution, 0.0, 0.0, 1.0, 0.0), particles=count,
-            worlds=len(worlds), wide=inside.wide, wide_ignore=inside.wide_ignore,
+            worlds=len(worlds), wide=inside.wide, wide_ignore=inside.wide_ignore, **crowd,
         ),
         launch(
-            "find_collisions", inside.flags, (count,), store=worlds.store, world=placed,
-            shapes=worlds.crowd.table(_SINGLE), pose_cell=cell, pose=pose, hit=hit, particles=count, radius=radius,
-            crowd=inside.crowd, threshold=worlds.threshold, unknown=int(unknown),
+            "find_collisions", inside.flags, (count,), store=worlds.store, world=placed, **crowd, pose_cell=cell,
+            pose=pose, hit=hit, particles=count, radius=radius, threshold=worlds.threshold, unknown=int(unknown),
         ),
     ))  # fmt: skip
     state = backend.download(status, np.zeros(2, _INT))

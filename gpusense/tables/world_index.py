@@ -15,6 +15,8 @@ from gpusense.interface.structs import Crowd
 from gpusense.tables.crowd import CrowdTable
 
 _INT = np.dtype(np.int32)
+# The kernel file ``shapes`` has the same number.
+SIGHTS = 64
 _ON_DEVICE = ("int32", "int64")
 
 
@@ -60,15 +62,20 @@ class WorldIndex:
                 setattr(self, name, backend.view(backend.upload(value), value.shape, value.dtype))
         return self
 
-    def buffers(self, backend: Backend, space: Workspace, part: tuple[int, int]) -> InWorlds:
-        """Return the indices of some poses on the device."""
+    @property
+    def sights(self) -> int:
+        """Numbers of the sights of a pose that casts rays; see the kernel file ``shapes``."""
+        return 2 * SIGHTS * self.worlds.crowd.crowd.pairs
+
+    def buffers(self, backend: Backend, space: Workspace, part: tuple[int, int], *, sees: bool = False) -> InWorlds:
+        """Return the indices of some poses on the device, which need sights if they cast rays."""
         worlds, crowd = self.worlds, self.worlds.crowd.crowd
         index, wide = _buffer("world", self._world, backend, space, part)
         ignore, wide_ignore = index, wide
         if crowd.stride:
             ignored = np.full(part[1], -1, _INT) if self._ignore is None else self._ignore
             ignore, wide_ignore = _buffer("ignore", ignored, backend, space, part)
-        return InWorlds(worlds, index, ignore, wide, wide_ignore)
+        return InWorlds(worlds, index, ignore, wide, wide_ignore, self.sights if sees else 0)
 
 
 class InWorlds(NamedTuple):
@@ -79,11 +86,16 @@ class InWorlds(NamedTuple):
     ignore: Buffer  # index of the shape that each pose does not see; not read without shapes
     wide: int  # numbers of 32 bits of each index of a world
     wide_ignore: int  # the same of each index of a shape
+    sights: int = 0  # numbers of the sights of each pose
 
     @property
     def crowd(self) -> Crowd:
         """The numbers of shapes."""
         return self.worlds.crowd.crowd
+
+    def crowd_of(self, count: int) -> Crowd:
+        """Return the numbers of shapes for launches of ``count`` poses, whose sights follow their worlds."""
+        return self.crowd._replace(begin=2 * count)
 
     @property
     def flags(self) -> frozenset[str]:

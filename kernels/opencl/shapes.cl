@@ -3,7 +3,9 @@
 // radius around it, and one not used. A segment has 4: its ends. A shape whose numbers are NaN is met by no ray.
 // WORLDS: world has two pairs of numbers for each particle: the first cell of its world among all worlds and the
 // world's size, rows times 2^16 plus columns; the world's index and the index of the shape that it does not see.
-// requires: ray
+// SHAPES: behind them, from pair crowd.begin on, it has the sights of each particle: for each of SIGHTS ranges of
+// directions a bit for each shape that a ray in this range may meet, 64 shapes a pair. A ray tests only these shapes.
+// requires: bits ray
 
 // Return the part of the grid that a particle's world fills.
 Window world_window(global const int2 *world, const int n) {
@@ -19,8 +21,79 @@ long world_begin(global const int2 *world, const int n, const int each) { return
 #define DISC 4
 #define BOX 8
 #define SEGMENT 4
+// Ranges of directions of a particle's sights.
+#define SIGHTS 64
+// Widening of a shape's range of directions, which covers rounding, as a sine and in ranges.
+#define WIDER (real)1e-5
+#define APART (real)2e-3
 
 #if SHAPES
+// Return the place of a direction among the ranges of sights, from 0 to SIGHTS. It grows with the angle, at a rate that
+// varies.
+real sight_of(const real x, const real y) {
+    const real part = y / (fabs(x) + fabs(y));
+    return (x >= 0 ? 1 + part : 3 - part) * (SIGHTS / 4);
+}
+
+// Return the first range of directions in which a shape is seen and the one after the last. From the origin, low and
+// high are the directions of its ends against the clock; a shape all around is seen in all.
+int2 sights_between(const real2 low, const real2 high, const int around) {
+    if (around) return (int2)(0, SIGHTS);
+    const int first = (int)floor(sight_of(low.x, low.y) - APART), last = (int)floor(sight_of(high.x, high.y) + APART);
+    return (int2)(first, (last < first ? last + SIGHTS : last) + 1);
+}
+
+// Return the ranges of directions in which a disc, or a circle around a shape, is seen.
+int2 sights_of_disc(const real x, const real y, const real radius) {
+    const real sine = radius / sqrt(x * x + y * y) + WIDER, cosine = sqrt((1 - sine) * (1 + sine));
+    return sights_between((real2)(x * cosine + y * sine, y * cosine - x * sine),
+                          (real2)(x * cosine - y * sine, y * cosine + x * sine), !(sine < (real)0.99));
+}
+
+// Return the ranges of directions in which a segment is seen.
+int2 sights_of_segment(const real x, const real y, const real end_x, const real end_y) {
+    const real turn = x * end_y - y * end_x, along = x * end_x + y * end_y;
+    const int between = fabs(turn) <= (real)-1e-3 * along || (x == 0 && y == 0) || (end_x == 0 && end_y == 0);
+    const real2 one = (real2)(x, y), other = (real2)(end_x, end_y);
+    return turn >= 0 ? sights_between(one, other, between) : sights_between(other, one, between);
+}
+
+// Find the sights of a particle.
+void find_sights(global const real *shapes, global int2 *world, const Crowd crowd, const int n, const int2 cell,
+                 const real4 pose) {
+    const int2 seen = world[2 * n + 1];
+    global const real *one = shapes + (long)seen.x * crowd.stride;
+    global int *sights = (global int *)(world + crowd.begin + (long)n * SIGHTS * crowd.pairs);
+    for (int k = 0; k < 2 * SIGHTS * crowd.pairs; ++k) sights[k] = 0;
+    const int boxes = crowd.discs + crowd.boxes;
+    for (int i = 0; i < boxes + crowd.segments; ++i) {
+        const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
+        int2 range;
+        if (i < boxes) {
+            range = sights_of_disc(x, y, i < crowd.discs ? one[2] : one[6]);
+            one += i < crowd.discs ? DISC : BOX;
+        } else {
+            range = sights_of_segment(x, y, (one[2] - cell.x) - pose.x, (one[3] - cell.y) - pose.y);
+            one += SEGMENT;
+        }
+        if (i == seen.y || !(x - x == 0)) continue;
+        for (int k = range.x; k < range.y; ++k)
+            sights[2 * crowd.pairs * (k & (SIGHTS - 1)) + i / 32] |= (int)(1u << (i % 32));
+    }
+}
+
+// Return the index of the first pair of numbers that hold the shapes which a particle may see in a direction.
+int sight_at(const Crowd crowd, const int n, const real2 direction) {
+    const int sight = (int)sight_of(direction.x, direction.y) & (SIGHTS - 1);
+    return crowd.begin + (n * SIGHTS + sight) * crowd.pairs;
+}
+
+// Return the index of a shape's first number.
+int shape_at(const Crowd crowd, const int i) {
+    const int boxes = max(i - crowd.discs, 0), segments = max(boxes - crowd.boxes, 0);
+    return DISC * (i - boxes) + BOX * (boxes - segments) + SEGMENT * segments;
+}
+
 // Return the distance along a ray to a disc, infinite where it is not met, and the cosine of the angle of incidence;
 // inside the disc 0 and 1. Places are relative to the ray's origin.
 real2 meet_disc(const real dx, const real dy, const real x, const real y, const real radius) {
@@ -70,29 +143,27 @@ real2 meet_segment(const real dx, const real dy, const real x, const real y, con
 real2 nearest_shape(global const real *shapes, global const int2 *world, const Crowd crowd, const int n,
                     const int2 cell, const real4 pose, const real2 ray, const real t) {
     const real2 direction = ray_direction(pose, ray);
-    const int2 seen = world[2 * n + 1];
-    global const real *one = shapes + (long)seen.x * crowd.stride;
+    global const real *first = shapes + (long)world[2 * n + 1].x * crowd.stride;
+    global const int *sights = (global const int *)(world + sight_at(crowd, n, direction));
     real2 nearest = (real2)(t, 2);
-    int i = 0;
-    for (; i < crowd.discs; ++i, one += DISC) {
-        const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
-        if (!(fabs(direction.x * y - direction.y * x) <= one[2])) continue;
-        const real2 met = meet_disc(direction.x, direction.y, x, y, one[2]);
-        if (met.x < nearest.x && i != seen.y) nearest = met;
-    }
-    for (; i < crowd.discs + crowd.boxes; ++i, one += BOX) {
-        const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
-        if (!(fabs(direction.x * y - direction.y * x) <= one[6])) continue;
-        const real2 met = meet_box(direction.x, direction.y, x, y, one[2], one[3], one[4], one[5]);
-        if (met.x < nearest.x && i != seen.y) nearest = met;
-    }
-    for (; i < crowd.discs + crowd.boxes + crowd.segments; ++i, one += SEGMENT) {
-        const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
-        const real end_x = (one[2] - cell.x) - pose.x, end_y = (one[3] - cell.y) - pose.y;
-        const real aside = direction.x * y - direction.y * x, end_aside = direction.x * end_y - direction.y * end_x;
-        if ((aside > 0 && end_aside > 0) || (aside < 0 && end_aside < 0)) continue;
-        const real2 met = meet_segment(direction.x, direction.y, x, y, end_x, end_y);
-        if (met.x < nearest.x && i != seen.y) nearest = met;
+    for (int k = 0; k < 2 * crowd.pairs; ++k) {
+        for (uint left = (uint)sights[k]; left != 0; left &= left - 1) {
+            const int i = 32 * k + lowest_bit(left);
+            global const real *one = first + shape_at(crowd, i);
+            const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
+            const real aside = direction.x * y - direction.y * x;
+            real2 met = (real2)(INFINITY, 2);
+            if (i < crowd.discs) {
+                if (fabs(aside) <= one[2]) met = meet_disc(direction.x, direction.y, x, y, one[2]);
+            } else if (i < crowd.discs + crowd.boxes) {
+                if (fabs(aside) <= one[6])
+                    met = meet_box(direction.x, direction.y, x, y, one[2], one[3], one[4], one[5]);
+            } else {
+                const real end_x = (one[2] - cell.x) - pose.x, end_y = (one[3] - cell.y) - pose.y;
+                met = meet_segment(direction.x, direction.y, x, y, end_x, end_y);
+            }
+            if (met.x < nearest.x) nearest = met;
+        }
     }
     return nearest;
 }

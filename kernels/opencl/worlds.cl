@@ -61,7 +61,7 @@ Frame frame_in(global const double *frames, const int index, const Frame frame) 
 }
 
 // Place poses in their worlds; see place_pose. An index of no world sets the second bit of pose_status, and the pose
-// sees nothing. One work-item takes a particle.
+// sees nothing. With SEES its sights follow; see the file shapes. One work-item takes a particle.
 kernel void place_in_worlds(ARGUMENTS) {
     const int particle = get_global_id(0);
     if (particle >= particles) return;
@@ -78,6 +78,9 @@ kernel void place_in_worlds(ARGUMENTS) {
     world[2 * particle] = (int2)((int)numbers[6], window.rows << 16 | window.cols);
 #if SHAPES
     world[2 * particle + 1] = (int2)(w, ignore[wide_ignore * particle]);
+#if SEES
+    find_sights(shapes, world, crowd, particle, pose_cell[particle], pose[particle]);
+#endif
 #else
     world[2 * particle + 1] = (int2)(w, -1);
 #endif

@@ -4,7 +4,9 @@ A disc has 4 numbers: centre and radius, and one that is not used. A box has 8: 
 direction, half its length and width, radius around it, and one not used. A segment has 4: its ends. A shape whose
 numbers are NaN is met by no ray. WORLDS: world has two pairs of numbers for each particle: the first cell of its world
 among all worlds and the world's size, rows times 2^16 plus columns; the world's index and the index of the shape that
-it does not see.
+it does not see. SHAPES: behind them, from pair crowd.begin on, it has the sights of each particle: for each of SIGHTS
+ranges of directions a bit for each shape that a ray in this range may meet, 64 shapes a pair. A ray tests only these
+shapes.
 """
 
 import functools
@@ -14,9 +16,12 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import ray as ray_file
+from .bits import lowest_bit
 from .prelude import Window, precision, reader
 
 DISC, BOX, SEGMENT = wp.constant(4), wp.constant(8), wp.constant(4)
+# Ranges of directions of a particle's sights.
+SIGHTS = wp.constant(64)
 cell_at = reader(wp.vec2i)
 
 
@@ -45,6 +50,95 @@ def functions(flags):
     number_at, four_at = reader(real), reader(real, 4)
     ZERO, ONE, TWO, MINUS_ONE = real(0.0), real(1.0), real(2.0), real(-1.0)
     TINY, NEVER, ALWAYS, UNKNOWN = real(1e-30), real(math.inf), real(-math.inf), real(math.nan)
+    # Widening of a shape's range of directions, which covers rounding, as a sine and in ranges.
+    WIDER, APART = real(1e-5), real(2e-3)
+    THREE, QUARTER, NEAR, OPPOSITE = real(3.0), real(SIGHTS / 4), real(0.99), real(-1e-3)
+
+    @wp.func
+    def sight_of(x: real, y: real):
+        """Return the place of a direction among the ranges of sights, from 0 to SIGHTS. It grows with the angle, at a rate
+        that varies.
+        """
+        part = y / (wp.abs(x) + wp.abs(y))
+        return wp.where(x >= ZERO, ONE + part, THREE - part) * QUARTER
+
+    @wp.func
+    def sights_between(low: vec2, high: vec2, around: wp.bool):
+        """Return the first range of directions in which a shape is seen and the one after the last. From the origin, low
+        and high are the directions of its ends against the clock; a shape all around is seen in all.
+        """
+        if around:
+            return wp.vec2i(0, SIGHTS)
+        begin = int(wp.floor(sight_of(low.x, low.y) - APART))
+        last = int(wp.floor(sight_of(high.x, high.y) + APART))
+        return wp.vec2i(begin, wp.where(last < begin, last + SIGHTS, last) + 1)
+
+    @wp.func
+    def sights_of_disc(x: real, y: real, radius: real):
+        """Return the ranges of directions in which a disc, or a circle around a shape, is seen."""
+        sine = radius / wp.sqrt(x * x + y * y) + WIDER
+        cosine = wp.sqrt((ONE - sine) * (ONE + sine))
+        low = vec2(x * cosine + y * sine, y * cosine - x * sine)
+        high = vec2(x * cosine - y * sine, y * cosine + x * sine)
+        return sights_between(low, high, not (sine < NEAR))
+
+    @wp.func
+    def sights_of_segment(x: real, y: real, end_x: real, end_y: real):
+        """Return the ranges of directions in which a segment is seen."""
+        turn = x * end_y - y * end_x
+        along = x * end_x + y * end_y
+        at_end = (x == ZERO and y == ZERO) or (end_x == ZERO and end_y == ZERO)
+        between = wp.abs(turn) <= OPPOSITE * along or at_end
+        one = vec2(x, y)
+        other = vec2(end_x, end_y)
+        if turn >= ZERO:
+            return sights_between(one, other, between)
+        return sights_between(other, one, between)
+
+    @wp.func
+    def find_sights(
+        shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32, cell: wp.vec2i,
+        pose: vec4,
+    ):  # fmt: skip
+        """Find the sights of a particle."""
+        seen = world[2 * n + 1]
+        one = seen.x * crowd.stride
+        sights = crowd.begin + n * SIGHTS * crowd.pairs
+        for k in range(SIGHTS * crowd.pairs):
+            world[sights + k] = wp.vec2i(0, 0)
+        boxes = crowd.discs + crowd.boxes
+        for i in range(boxes + crowd.segments):
+            x = (number_at(shapes, one) - real(cell.x)) - pose.x
+            y = (number_at(shapes, one + 1) - real(cell.y)) - pose.y
+            directions = wp.vec2i(0, 0)
+            if i < boxes:
+                radius = number_at(shapes, one + wp.where(i < crowd.discs, 2, 6))
+                directions = sights_of_disc(x, y, radius)
+                one += wp.where(i < crowd.discs, DISC, BOX)
+            else:
+                end_x = (number_at(shapes, one + 2) - real(cell.x)) - pose.x
+                end_y = (number_at(shapes, one + 3) - real(cell.y)) - pose.y
+                directions = sights_of_segment(x, y, end_x, end_y)
+                one += SEGMENT
+            if i != seen.y and x - x == ZERO:
+                bit = int(wp.uint32(1) << wp.uint32(i & 31))
+                both = wp.where((i & 32) == 0, wp.vec2i(bit, 0), wp.vec2i(0, bit))
+                for k in range(directions.x, directions.y):
+                    at = sights + (k & (SIGHTS - 1)) * crowd.pairs + (i >> 6)
+                    world[at] = wp.vec2i(world[at].x | both.x, world[at].y | both.y)
+
+    @wp.func
+    def sight_at(crowd: types.Crowd, n: wp.int32, direction: vec2):
+        """Return the index of the first pair of numbers that hold the shapes which a particle may see in a direction."""
+        sight = int(sight_of(direction.x, direction.y)) & (SIGHTS - 1)
+        return crowd.begin + (n * SIGHTS + sight) * crowd.pairs
+
+    @wp.func
+    def shape_at(crowd: types.Crowd, i: wp.int32):
+        """Return the index of a shape's first number."""
+        boxes = wp.max(i - crowd.discs, 0)
+        segments = wp.max(boxes - crowd.boxes, 0)
+        return DISC * (i - boxes) + BOX * (boxes - segments) + SEGMENT * segments
 
     @wp.func
     def meet_disc(dx: real, dy: real, x: real, y: real, radius: real):
@@ -116,38 +210,36 @@ def functions(flags):
         distance in cells, and the cosine of the angle of incidence, 2 where no shape is nearer than t.
         """
         direction = ray_direction(pose, ray)
-        seen = cell_at(world, 2 * n + 1)
-        one = seen.x * crowd.stride
+        shape = cell_at(world, 2 * n + 1).x * crowd.stride
+        sights = sight_at(crowd, n, direction)
         nearest = vec2(t, TWO)
-        i = int(0)
-        while i < crowd.discs + crowd.boxes + crowd.segments:
-            four = four_at(shapes, one)
-            x = (four[0] - real(cell.x)) - pose.x
-            y = (four[1] - real(cell.y)) - pose.y
-            a = four[2]
-            b = four[3]
-            aside = wp.abs(direction.x * y - direction.y * x)
-            met = vec2(NEVER, TWO)
-            if i < crowd.discs:
-                if aside <= a:
-                    met = meet_disc(direction.x, direction.y, x, y, a)
-                one += DISC
-            elif i < crowd.discs + crowd.boxes:
-                rest = four_at(shapes, one + 4)
-                if aside <= rest[2]:
-                    met = meet_box(direction.x, direction.y, x, y, a, b, rest[0], rest[1])
-                one += BOX
-            else:
-                end_x = (a - real(cell.x)) - pose.x
-                end_y = (b - real(cell.y)) - pose.y
-                before = direction.x * y - direction.y * x
-                behind = direction.x * end_y - direction.y * end_x
-                if not ((before > ZERO and behind > ZERO) or (before < ZERO and behind < ZERO)):
+        for k in range(2 * crowd.pairs):
+            both = cell_at(world, sights + (k >> 1))
+            left = wp.uint32(wp.where((k & 1) == 0, both.x, both.y))
+            while left != wp.uint32(0):
+                i = 32 * k + lowest_bit(left)
+                left = left & (left - wp.uint32(1))
+                one = shape + shape_at(crowd, i)
+                four = four_at(shapes, one)
+                x = (four[0] - real(cell.x)) - pose.x
+                y = (four[1] - real(cell.y)) - pose.y
+                a = four[2]
+                b = four[3]
+                aside = wp.abs(direction.x * y - direction.y * x)
+                met = vec2(NEVER, TWO)
+                if i < crowd.discs:
+                    if aside <= a:
+                        met = meet_disc(direction.x, direction.y, x, y, a)
+                elif i < crowd.discs + crowd.boxes:
+                    rest = four_at(shapes, one + 4)
+                    if aside <= rest[2]:
+                        met = meet_box(direction.x, direction.y, x, y, a, b, rest[0], rest[1])
+                else:
+                    end_x = (a - real(cell.x)) - pose.x
+                    end_y = (b - real(cell.y)) - pose.y
                     met = meet_segment(direction.x, direction.y, x, y, end_x, end_y)
-                one += SEGMENT
-            if met.x < nearest.x and i != seen.y:
-                nearest = met
-            i += 1
+                if met.x < nearest.x:
+                    nearest = met
         return nearest
 
     @wp.func

@@ -72,7 +72,8 @@ def make(name, flags):
     coordinate = wp.float32 if "POSES_FLOAT32" in flags else wp.float64
     place_pose = placement.functions(flags).place_pose
     cos_sin = heading.functions(flags & {"HUGE_HEADINGS"}).cos_sin
-    SHAPES = "SHAPES" in flags
+    SHAPES, SEES = "SHAPES" in flags, "SEES" in flags
+    find_sights = shapes_file.functions(flags).find_sights
     shape_distance = shapes_file.functions(flags).shape_distance
     NUMBER_ZERO, NUMBER_ONE = real(0.0), real(1.0)
     NEVER, NONE, TWO = real(math.inf), real(math.nan), wp.float64(2.0)
@@ -113,13 +114,13 @@ def make(name, flags):
 
     @kernel(flags)
     def place_in_worlds(
-        poses, index, ignore, frames, pose_cell, pose, pose_low, world, pose_status, frame, particles, worlds,
-        wide, wide_ignore,
+        poses, index, ignore, frames, shapes, pose_cell, pose, pose_low, world, pose_status, frame, particles, worlds,
+        wide, wide_ignore, crowd,
     ):  # fmt: skip
         """Place poses in their worlds; see place_pose.
 
-        An index of no world sets the second bit of pose_status, and the pose sees nothing. One work-item takes a
-        particle.
+        An index of no world sets the second bit of pose_status, and the pose sees nothing. With SEES its sights follow;
+        see the file shapes. One work-item takes a particle.
         """
         particle = work_item(wp.tid())
         if particle >= particles:
@@ -141,6 +142,8 @@ def make(name, flags):
         world[2 * particle] = wp.vec2i(int(frames[first + 6]), (window.rows << 16) | window.cols)
         if SHAPES:
             world[2 * particle + 1] = wp.vec2i(w, ignore[wide_ignore * particle])
+            if SEES:
+                find_sights(shapes, world, crowd, particle, pose_cell[particle], pose[particle])
         else:
             world[2 * particle + 1] = wp.vec2i(w, -1)
 

@@ -82,6 +82,10 @@ ON_PURPOSE = [
     Purpose("ranges", "cast_in_worlds", REFERENCE_ONLY, WORLD_BY_WORLD),
     Purpose("raycast", "sectors_of", REFERENCE_ONLY, "SECTORS is a constant of the kernels"),
     Purpose("shapes", "particles_of_worlds", REFERENCE_ONLY, WORLD_BY_WORLD),
+    Purpose(
+        "shapes", "sight_of sights_between sights_of_disc sights_of_segment find_sights sight_at shape_at", KERNELS_ONLY,
+        "a ray tests the shapes near its direction; in the reference it tests every shape",
+    ),
     Purpose("icp_step", "add_to_blocks close_blocks", KERNELS_ONLY, "points come one after another"),
     Purpose("icp_step", "cooperates", (WARP,), "OpenCL's processors have teams as well"),
     Purpose("icp_step", "log_share add_over_team add_joint_blocks", KERNELS_ONLY, TEAMS),

@@ -135,8 +135,8 @@ class RecordedCall(BoundCall):
             self._readings = self._placed_readings(adopted, adopted.dtype if limits is None else limits)
         # Pieces begin where parts of buffers can.
         whole = max(backend.alignment // _INT.itemsize, 1)
-        rays = self._readings.readings * pipeline.rays_each
-        chunk = chunk_of(backend, rays, pipeline.kept_bytes(per_beam=per_beam))
+        each = pipeline.numbers_each(self._readings.readings, self._poses)
+        chunk = chunk_of(backend, each, pipeline.kept_bytes(per_beam=per_beam))
         self._chunk = -(-chunk // whole) * whole
         # The program for the current map, by the version of the map's table.
         self._programs = ProgramCache[RecordedProgram](1)

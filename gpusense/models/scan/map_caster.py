@@ -205,7 +205,7 @@ class MapCaster:
         if checked.count * rays:
             with self._lock, self._workspace:
                 ray = self._workspace.upload("ray", vectors.astype(self.real))
-                chunk = chunk_of(self.backend, rays * cones.rays, self.real.itemsize)
+                chunk = chunk_of(self.backend, rays * cones.rays + checked.sights, self.real.itemsize)
                 run_pieces(
                     self._workspace, Piece(0, checked.count, checked.count), chunk,
                     lambda piece: self._cast(checked, piece, ray, rays, result.flat, cones),
@@ -223,7 +223,7 @@ class MapCaster:
             return
         with self._lock, self._workspace as space:
             ray = space.upload("ray", vectors.astype(self.real))
-            chunk = chunk_of(self.backend, rays * cones.rays, 2 * self.real.itemsize)
+            chunk = chunk_of(self.backend, rays * cones.rays + poses.sights, 2 * self.real.itemsize)
             # Random numbers depend on the index of a particle among all, so scans may be split.
             run_pieces(
                 space, Piece(0, poses.count, poses.count), chunk,
@@ -263,7 +263,7 @@ class MapCaster:
         if self._framed[0] is not state.grid or self._framed[1] is not state.window:
             self._framed = state.grid, state.window
             self._frame = Frame(state.window, plain_cells(state.grid), self.mount)
-        return place(poses, piece.part, self._frame, self.backend, self._workspace, self.real), state
+        return place(poses, piece.part, self._frame, self.backend, self._workspace, self.real, sees=True), state
 
     def _flags(self, placed: PlacedPoses, cones: Cones) -> frozenset[str]:
         """Return the flags that cast the rays of placed poses; the poses must have been placed."""

@@ -266,6 +266,10 @@ class ScanPipeline(ABC):
         kept = 1.0 if per_beam else self.kept_parts if self.backend.info.kind == "gpu" else 0.0
         return self.real.itemsize * kept
 
+    def numbers_each(self, readings: int, poses: Poses) -> int:
+        """Return the rays of each particle and the numbers of its sights, which limit the particles of a launch."""
+        return readings * self.rays_each + (0 if self.end_points else poses.sights)
+
     # ---- readings
 
     def classed(self, ranges: np.ndarray) -> ClassedScans:
@@ -292,7 +296,8 @@ class ScanPipeline(ABC):
         if self._framed[0] is not state.grid or self._framed[1] is not state.window:
             self._framed = state.grid, state.window
             self._frame = Frame(state.window, plain_cells(state.grid), self._mount)
-        return place(poses, part, self._frame, self.backend, space, self.real, careful=self.careful), state
+        sees = not self.end_points
+        return place(poses, part, self._frame, self.backend, space, self.real, careful=self.careful, sees=sees), state
 
     # ---- program
 

@@ -46,8 +46,8 @@ def run(pipeline: ScanPipeline, request: Request, space: Workspace, last: LastCa
         last.scans = scans
         if not particles.count:
             continue
-        rays, kept = scans.most_readings * pipeline.rays_each, pipeline.kept_bytes(per_beam=request.per_beam)
-        most = chunk_of(pipeline.backend, rays, kept)
+        each = pipeline.numbers_each(scans.most_readings, request.poses)
+        most = chunk_of(pipeline.backend, each, pipeline.kept_bytes(per_beam=request.per_beam))
         run_pieces(space, particles, most, _Scorer(pipeline, request, particles, scans, space, last))
         if len(request.ranges) > 1:
             space.submit()

@@ -9,28 +9,33 @@ LanePair nearest_shape_lanes(global const real *shapes, global const int2 *world
                              const int2 cell, const real4 pose, const lanes ray_x, const lanes ray_y, const lanes t) {
     lanes dx, dy;
     direct_lanes(pose, ray_x, ray_y, &dx, &dy);
-    const int2 seen = world[2 * n + 1];
-    global const real *one = shapes + (long)seen.x * crowd.stride;
+    global const real *first = shapes + (long)world[2 * n + 1].x * crowd.stride;
+    real dx_of[LANES], dy_of[LANES];
+    store_lanes(dx, 0, dx_of);
+    store_lanes(dy, 0, dy_of);
+    int at[LANES];
+    for (int i = 0; i < LANES; ++i) at[i] = sight_at(crowd, n, (real2)(dx_of[i], dy_of[i]));
     LanePair nearest = {t, 2};
-    const int boxes = crowd.discs + crowd.boxes;
-    for (int i = 0; i < boxes + crowd.segments; ++i) {
-        const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
-        LanePair met;
-        if (i < crowd.discs) {
-            met = meet_disc_lanes(dx, dy, x, y, one[2]);
-            one += DISC;
-        } else if (i < boxes) {
-            met = meet_box_lanes(dx, dy, x, y, one[2], one[3], one[4], one[5]);
-            one += BOX;
-        } else {
-            const real end_x = (one[2] - cell.x) - pose.x, end_y = (one[3] - cell.y) - pose.y;
-            met = meet_segment_lanes(dx, dy, x, y, end_x, end_y);
-            one += SEGMENT;
+    for (int k = 0; k < 2 * crowd.pairs; ++k) {
+        uint left = 0;
+        for (int i = 0; i < LANES; ++i) left |= (uint)((global const int *)(world + at[i]))[k];
+        for (; left != 0; left &= left - 1) {
+            const int i = 32 * k + lowest_bit(left);
+            global const real *one = first + shape_at(crowd, i);
+            const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
+            LanePair met;
+            if (i < crowd.discs) {
+                met = meet_disc_lanes(dx, dy, x, y, one[2]);
+            } else if (i < crowd.discs + crowd.boxes) {
+                met = meet_box_lanes(dx, dy, x, y, one[2], one[3], one[4], one[5]);
+            } else {
+                const real end_x = (one[2] - cell.x) - pose.x, end_y = (one[3] - cell.y) - pose.y;
+                met = meet_segment_lanes(dx, dy, x, y, end_x, end_y);
+            }
+            const ilanes nearer = met.hi < nearest.hi;
+            nearest.hi = nearer ? met.hi : nearest.hi;
+            nearest.lo = nearer ? met.lo : nearest.lo;
         }
-        if (i == seen.y) continue;
-        const ilanes nearer = met.hi < nearest.hi;
-        nearest.hi = nearer ? met.hi : nearest.hi;
-        nearest.lo = nearer ? met.lo : nearest.lo;
     }
     return nearest;
 }

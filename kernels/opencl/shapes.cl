@@ -82,10 +82,9 @@ void find_sights(global const real *shapes, global int2 *world, const Crowd crow
     }
 }
 
-// Return the index of the first pair of numbers that hold the shapes which a particle may see in a direction.
-int sight_at(const Crowd crowd, const int n, const real2 direction) {
-    const int sight = (int)sight_of(direction.x, direction.y) & (SIGHTS - 1);
-    return crowd.begin + (n * SIGHTS + sight) * crowd.pairs;
+// Return the index of the first pair of numbers that hold the shapes which a particle may see in a range of directions.
+int sight_at(const Crowd crowd, const int n, const int sight) {
+    return crowd.begin + (n * SIGHTS + (sight & (SIGHTS - 1))) * crowd.pairs;
 }
 
 // Return the index of a shape's first number.
@@ -144,7 +143,8 @@ real2 nearest_shape(global const real *shapes, global const int2 *world, const C
                     const int2 cell, const real4 pose, const real2 ray, const real t) {
     const real2 direction = ray_direction(pose, ray);
     global const real *first = shapes + (long)world[2 * n + 1].x * crowd.stride;
-    global const int *sights = (global const int *)(world + sight_at(crowd, n, direction));
+    const int sight = (int)sight_of(direction.x, direction.y);
+    global const int *sights = (global const int *)(world + sight_at(crowd, n, sight));
     real2 nearest = (real2)(t, 2);
     for (int k = 0; k < 2 * crowd.pairs; ++k) {
         for (uint left = (uint)sights[k]; left != 0; left &= left - 1) {

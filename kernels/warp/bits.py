@@ -8,48 +8,26 @@ NONE = wp.constant(0x7FFFFFFF)
 ALL_BITS = wp.constant(wp.uint32(0xFFFFFFFF))
 
 
-@wp.func
-def lowest_bit(word: wp.uint32):
-    """Return the index of the lowest 1 of a word that is not 0."""
-    rest = word
-    place = int(0)
-    if rest & wp.uint32(0xFFFF) == wp.uint32(0):
-        rest = rest >> wp.uint32(16)
-        place += 16
-    if rest & wp.uint32(0xFF) == wp.uint32(0):
-        rest = rest >> wp.uint32(8)
-        place += 8
-    if rest & wp.uint32(0xF) == wp.uint32(0):
-        rest = rest >> wp.uint32(4)
-        place += 4
-    if rest & wp.uint32(0x3) == wp.uint32(0):
-        rest = rest >> wp.uint32(2)
-        place += 2
-    if rest & wp.uint32(0x1) == wp.uint32(0):
-        place += 1
-    return place
+# Return the index of the lowest 1 of a word that is not 0.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return __ffs(word) - 1;
+#else
+return __builtin_ctz(word);
+#endif
+""")
+def lowest_bit(word: wp.uint32) -> wp.int32: ...
 
 
-@wp.func
-def highest_bit(word: wp.uint32):
-    """Return the index of the highest 1 of a word that is not 0."""
-    rest = word
-    place = int(0)
-    if rest >> wp.uint32(16) != wp.uint32(0):
-        rest = rest >> wp.uint32(16)
-        place += 16
-    if rest >> wp.uint32(8) != wp.uint32(0):
-        rest = rest >> wp.uint32(8)
-        place += 8
-    if rest >> wp.uint32(4) != wp.uint32(0):
-        rest = rest >> wp.uint32(4)
-        place += 4
-    if rest >> wp.uint32(2) != wp.uint32(0):
-        rest = rest >> wp.uint32(2)
-        place += 2
-    if rest >> wp.uint32(1) != wp.uint32(0):
-        place += 1
-    return place
+# Return the index of the highest 1 of a word that is not 0.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return 31 - __clz(word);
+#else
+return 31 - __builtin_clz(word);
+#endif
+""")
+def highest_bit(word: wp.uint32) -> wp.int32: ...
 
 
 @wp.func

@@ -128,10 +128,11 @@ def functions(flags):
                     world[at] = wp.vec2i(world[at].x | both.x, world[at].y | both.y)
 
     @wp.func
-    def sight_at(crowd: types.Crowd, n: wp.int32, direction: vec2):
-        """Return the index of the first pair of numbers that hold the shapes which a particle may see in a direction."""
-        sight = int(sight_of(direction.x, direction.y)) & (SIGHTS - 1)
-        return crowd.begin + (n * SIGHTS + sight) * crowd.pairs
+    def sight_at(crowd: types.Crowd, n: wp.int32, sight: wp.int32):
+        """Return the index of the first pair of numbers that hold the shapes which a particle may see in a range of
+        directions.
+        """
+        return crowd.begin + (n * SIGHTS + (sight & (SIGHTS - 1))) * crowd.pairs
 
     @wp.func
     def shape_at(crowd: types.Crowd, i: wp.int32):
@@ -211,7 +212,7 @@ def functions(flags):
         """
         direction = ray_direction(pose, ray)
         shape = cell_at(world, 2 * n + 1).x * crowd.stride
-        sights = sight_at(crowd, n, direction)
+        sights = sight_at(crowd, n, int(sight_of(direction.x, direction.y)))
         nearest = vec2(t, TWO)
         for k in range(2 * crowd.pairs):
             both = cell_at(world, sights + (k >> 1))

@@ -2,7 +2,7 @@
 // requires: shapes lanes/rays lanes/error_free
 
 #if SHAPES
-// in lanes: meet_disc meet_box meet_segment
+// in lanes: sight_of meet_disc meet_box meet_segment
 
 // Return the nearest of the shapes that a particle sees along rays and of obstacles at distances t.
 LanePair nearest_shape_lanes(global const real *shapes, global const int2 *world, const Crowd crowd, const int n,
@@ -10,11 +10,10 @@ LanePair nearest_shape_lanes(global const real *shapes, global const int2 *world
     lanes dx, dy;
     direct_lanes(pose, ray_x, ray_y, &dx, &dy);
     global const real *first = shapes + (long)world[2 * n + 1].x * crowd.stride;
-    real dx_of[LANES], dy_of[LANES];
-    store_lanes(dx, 0, dx_of);
-    store_lanes(dy, 0, dy_of);
+    lane_int sight[LANES];
+    store_lanes(to_ilanes(sight_of_lanes(dx, dy)), 0, sight);
     int at[LANES];
-    for (int i = 0; i < LANES; ++i) at[i] = sight_at(crowd, n, (real2)(dx_of[i], dy_of[i]));
+    for (int i = 0; i < LANES; ++i) at[i] = sight_at(crowd, n, (int)sight[i]);
     LanePair nearest = {t, 2};
     for (int k = 0; k < 2 * crowd.pairs; ++k) {
         uint left = 0;

@@ -58,8 +58,9 @@ class RangeScale(NamedTuple):
 
 
 class Crowd(NamedTuple):
-    """Moving shapes of each world, the numbers of all its shapes, and the side of a cell [m]; pairs of numbers of a
-    sight, and the first of them; see ``shapes``.
+    """Moving shapes of each world, the numbers of all its shapes, and the side of a cell [m]; see ``shapes``.
+
+    ``pairs`` are the pairs of numbers of a sight, ``begin`` is the first pair.
     """
 
     discs: int

@@ -265,13 +265,13 @@ class PlacedPoses(NamedTuple):
 
 
 def place(
-    poses: Poses, part: Part, frame: Frame, backend: Backend, space: Workspace, real: np.dtype, *, careful: bool = False,
-    sees: bool = False,
+    poses: Poses, part: Part, frame: Frame, backend: Backend, space: Workspace, real: np.dtype, *,
+    careful: bool = False, sees: bool = False,
 ) -> PlacedPoses:  # fmt: skip
     """Upload some poses, and describe their placement in the frame of a window.
 
-    ``part``: the first of them and the one after the last; ``careful``: True if low parts are needed; ``sees``: True if they
-    cast rays, which need the sights of poses in worlds with shapes.
+    ``part``: the first of them and the one after the last; ``careful``: True if low parts are needed; ``sees``:
+    True if they cast rays, which need the sights of poses in worlds with shapes.
     """
     count, corners = part[1] - part[0], poses.corners(part, backend, space)
     flags = poses.flags(corners)

@@ -56,16 +56,16 @@ def functions(flags):
 
     @wp.func
     def sight_of(x: real, y: real):
-        """Return the place of a direction among the ranges of sights, from 0 to SIGHTS. It grows with the angle, at a rate
-        that varies.
+        """Return the place of a direction among the ranges of sights, from 0 to SIGHTS. It grows with the angle, at a
+        rate that varies.
         """
         part = y / (wp.abs(x) + wp.abs(y))
         return wp.where(x >= ZERO, ONE + part, THREE - part) * QUARTER
 
     @wp.func
     def sights_between(low: vec2, high: vec2, around: wp.bool):
-        """Return the first range of directions in which a shape is seen and the one after the last. From the origin, low
-        and high are the directions of its ends against the clock; a shape all around is seen in all.
+        """Return the first range of directions in which a shape is seen and the one after the last. From the origin,
+        low and high are the directions of its ends against the clock; a shape all around is seen in all.
         """
         if around:
             return wp.vec2i(0, SIGHTS)

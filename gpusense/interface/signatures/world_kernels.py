@@ -25,7 +25,8 @@ KERNELS: dict[str, Kernel] = {
     "place_in_worlds": kernel(
         "worlds", "particle", "coordinate poses [particles * 3]", "int index [wide * particles]",
         "int ignore [wide_ignore * particles]",
-        _FRAMES, "real shapes [crowd.stride]", "out int2 pose_cell [particles]", "out real4 pose [particles]", "out real4 pose_low [particles]",
+        _FRAMES, "real shapes [crowd.stride]", "out int2 pose_cell [particles]", "out real4 pose [particles]",
+        "out real4 pose_low [particles]",
         "out int2 world [2 * particles]", "out int pose_status [2]", "Frame frame", "int particles", "int worlds",
         "int wide", "int wide_ignore", "Crowd crowd",
     ),

@@ -16,6 +16,7 @@ from support.interrupts import Line, executed_lines, interrupt
 from support.tracking_scene import field
 
 import gpusense as gs
+from gpusense.backends.programs import RecordedProgram
 from gpusense.localization import journal, starts
 
 # Rooms with lines to interrupt: lower rooms do not use filters.
@@ -144,8 +145,9 @@ def test_a_model_that_fails_in_any_call_changes_nothing(backend, monkeypatch):
     pf.correct(readings(pf, 3))
     after = everything(pf)
     model, count = pf.models[0], [0]
-    for name in ("start_scoring", "log_likelihood"):
-        inner = getattr(model, name)
+    # GPUs score in a recorded program.
+    for owner, name in ((model, "start_scoring"), (model, "log_likelihood"), (RecordedProgram, "start")):
+        inner = getattr(owner, name)
 
         def failing(*arguments, inner=inner, **options):
             count[0] -= 1
@@ -153,7 +155,7 @@ def test_a_model_that_fails_in_any_call_changes_nothing(backend, monkeypatch):
                 raise FailingError
             return inner(*arguments, **options)
 
-        monkeypatch.setattr(model, name, failing)
+        monkeypatch.setattr(owner, name, failing)
     for fails in range(1, 10):
         pf.restore(start)
         count[0] = fails

@@ -229,7 +229,9 @@ def _truth(launch: Launch, parameters: Any) -> Floats:
     if launch.expected is None:
         return replay(launch)[1]
     z, top = launch.values["reading"].astype(np.float64), float(launch.values["scale"].range_max)
-    expected = np.repeat(launch.expected.astype(np.float64), np.diff(launch.values["first"]), axis=1)
+    expected, first = launch.expected.astype(np.float64), launch.values["first"]
+    if first is not None:
+        expected = np.repeat(expected, np.diff(first), axis=1)
     # A reading below range_max may round to range_max in the launch's precision, and is still a hit.
     z = np.where(z == top, np.nextafter(top, 0), z)
     return np.where(np.isnan(z), 0.0, log_mixture(z, expected, range_max=top, **parameters.to_dict()))

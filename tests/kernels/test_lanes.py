@@ -41,7 +41,7 @@ def results(device, particles: int, beams: int, outside: str):
     grid, scanner, poses, z = scene(particles, beams)
     options = dict(backend=device, outside=outside)
     beam = gs.BeamModel(grid, scanner, gs.BeamParameters(0.6, 0.1, 0.1, 0.2, 0.1, 0.3), **options)
-    field = gs.LikelihoodFieldModel(grid, scanner, **options)
+    field = gs.LikelihoodFieldModel(grid, scanner, gs.LikelihoodFieldParameters(), **options)
     found = {"ranges": gs.RayCaster(grid, RANGE, **options).cast(poses, scanner.bearings)}
     smooth = gs.LikelihoodFieldModel(grid, scanner, gs.LikelihoodFieldParameters(interpolation="bilinear"), **options)
     for name, model in (("beam", beam), ("field", field), ("smooth field", smooth)):

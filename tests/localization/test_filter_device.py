@@ -104,7 +104,7 @@ def test_corrections_judge_the_pose_that_each_step_asks_for(backend, monkeypatch
 @pytest.mark.long
 def test_a_gpu_has_the_particles_of_a_processor(needs, monkeypatch):
     def run():
-        model = gs.LikelihoodFieldModel(GRID, SCANNER, backend="opencl")
+        model = gs.LikelihoodFieldModel(GRID, SCANNER, gs.LikelihoodFieldParameters(), backend="opencl")
         pf = gs.ParticleFilter(model, particles=(100, 2000), seed=5, temperature=0.2)
         pf.initialize(mean=(3.0, 2.5, 0.4), covariance=np.diag([0.1, 0.1, 0.03]))
         ranges = gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast([[3.0, 2.5, 0.4]], SCANNER.bearings)[0]

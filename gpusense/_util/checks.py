@@ -186,12 +186,14 @@ def _first(values: NDArray[Any], bad: NDArray[np.bool]) -> str:
     return show(values[index]) + ("" if values.ndim == 0 else f" at index {_index_text(index)}")
 
 
-def indices(name: str, value: object, size: int, shape: Sequence[int | str] | None = None) -> NDArray[np.int64]:
-    """Return ``value`` as an array of indices from 0 to ``size`` - 1."""
+def indices(
+    name: str, value: object, size: int, shape: Sequence[int | str] | None = None, *, low: int = 0
+) -> NDArray[np.int64]:
+    """Return ``value`` as an array of indices from ``low`` to ``size`` - 1."""
     found = array(name, value, shape, dtype=np.int64)
-    bad = (found < 0) | (found >= size)
+    bad = (found < low) | (found >= size)
     if bad.any():
-        raise ValueError(f"{name}: every index must be in [0, {size}), got {_first(found, bad)}")
+        raise ValueError(f"{name}: every index must be in [{low}, {size}), got {_first(found, bad)}")
     return found
 
 

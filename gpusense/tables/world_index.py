@@ -51,8 +51,10 @@ class WorldIndex:
             if len(worlds) > 1:
                 raise ValueError(f"world: must be an index of one of {len(worlds)} worlds for each pose, got None")
             world = 0
-        self._world = _indices("world", world, count, backend, len(worlds))
-        self._ignore = None if ignore is None else _indices("ignore", ignore, count, backend, None)
+        self._world = _indices("world", world, count, backend, 0, len(worlds))
+        crowd = worlds.crowd.crowd
+        shapes = crowd.discs + crowd.boxes + crowd.segments
+        self._ignore = None if ignore is None else _indices("ignore", ignore, count, backend, -1, shapes)
 
     def resident(self, backend: Backend) -> WorldIndex:
         """Return the same indices on the device, for calls that repeat them."""
@@ -103,8 +105,8 @@ class InWorlds(NamedTuple):
         return flags_if(WORLDS=True, SHAPES=self.crowd.stride > 0)
 
 
-def _indices(name: str, value: Any, count: int, backend: Backend, worlds: int | None) -> Any:
-    """Return (N,) indices as int32 in host memory, or as an array on the device."""
+def _indices(name: str, value: Any, count: int, backend: Backend, low: int, size: int) -> Any:
+    """Return (N,) indices from ``low`` to ``size`` - 1 as int32 in host memory, or as an array on the device."""
     if type(value) is not np.ndarray and arrays.on_device(value):
         adopted = arrays.adopt_integers(value, backend, name, _ON_DEVICE)
         if adopted.shape != (count,):
@@ -119,10 +121,7 @@ def _indices(name: str, value: Any, count: int, backend: Backend, worlds: int | 
     shape = () if read.ndim == 0 else (count,)
     if read.shape != shape:
         raise ValueError(f"{name}: shape must be ({count},), got {checks.shape_text(read.shape)}")
-    if worlds is not None:
-        checks.indices(name, np.atleast_1d(read), worlds)
-    # No shape has a number that 32 bits do not hold.
-    read = np.maximum(np.minimum(read, np.iinfo(_INT).max).astype(np.int64), -1)
+    read = checks.indices(name, np.atleast_1d(read), size, low=low)
     return np.ascontiguousarray(np.broadcast_to(read, (count,)), _INT)
 
 

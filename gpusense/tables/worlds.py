@@ -267,7 +267,8 @@ class Worlds:
             poses: (N, 3) poses (x, y, theta) in the world [m, m, rad], an array as ``RayCaster.cast`` takes it.
             radius: Radius of the discs [m], >= 0.
             world: (N,) indices of the poses' worlds, or one for all; optional with a single world.
-            ignore: (N,) index of the shape that each disc ignores, or one for all; -1 for none.
+            ignore: (N,) index of the shape that each disc ignores, or one for all; -1 for none. Arrays on the device
+                are not inspected.
             unknown: Treatment of unknown cells: ``"free"`` or ``"occupied"``.
 
         Returns:

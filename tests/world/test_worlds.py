@@ -231,12 +231,24 @@ def test_grids_replace_grids_of_the_same_frame() -> None:
     assert worlds.grid(1) == full
 
 
-def test_large_indices_of_shapes_ignore_none_and_empty_lists_are_indices() -> None:
-    worlds = gs.Worlds(CELLS, 1.0, backend="numpy")
-    worlds.shapes = gs.Shapes(discs=np.tile([1.0, 1.0, 0.5], (2, 1, 1)))
-    assert not worlds.collides([(1.0, 1.0, 0.0)], 0.1, world=0, ignore=0).any()
-    for none in (-1, 1, 1 << 32, -(1 << 32), np.uint64(1 << 63)):
-        assert worlds.collides([(1.0, 1.0, 0.0)], 0.1, world=0, ignore=none).all()
+def test_indices_of_shapes_are_checked_and_empty_lists_are_indices() -> None:
+    worlds, pose = gs.Worlds(CELLS, 1.0, backend="numpy"), [(1.0, 1.0, 0.0)]
+    caster = gs.RayCaster(worlds, 3.0, backend="numpy")
+    model = gs.BeamModel(worlds, gs.Scanner([0.0], range_max=3.0), backend="numpy")
+    with pytest.raises(ValueError, match=r"^ignore: every index must be in \[-1, 0\), got"):
+        worlds.collides(pose, 0.1, world=0, ignore=0)
+    worlds.shapes = gs.Shapes(discs=np.tile([1.0, 1.0, 0.5], (2, 1, 1)), segments=np.full((2, 1, 4), np.nan))
+    assert not worlds.collides(pose, 0.1, world=0, ignore=0).any()
+    for none in (-1, 1, [np.int8(-1)]):
+        assert worlds.collides(pose, 0.1, world=0, ignore=none).all()
+    for wrong in (2, [-2], 1 << 32, -(1 << 32), [1 << 32], np.uint64(1 << 63)):
+        for call in (
+            lambda ignore: worlds.collides(pose, 0.1, world=0, ignore=ignore),
+            lambda ignore: caster.cast(pose, [0.0], world=0, ignore=ignore),
+            lambda ignore: model.log_likelihood(pose, [1.0], world=0, ignore=ignore),
+        ):
+            with pytest.raises(ValueError, match=r"^ignore: .*must be"):
+                call(wrong)
     assert worlds.collides(np.empty((0, 3)), 0.1, world=[]).shape == (0,)
 
 

@@ -184,10 +184,9 @@ class PlacedPairs:
 
         Return both results (1, 35); the second one is None where the match was not repeated.
         """
-        first, again = self._run(_FIRST_PAIR, guess[:, None], rules, (2, far, far_turn))[0, 0, :, None].astype(
-            np.float64
-        )
-        return first, again if again[0, 4] > 0 else None
+        first, again = self._run(_FIRST_PAIR, guess[:, None], rules, (2, far, far_turn))[0, 0, :, None]
+        # A second turn that did not run writes its number of iterations, 0, alone.
+        return first.astype(np.float64), again.astype(np.float64) if again[0, 4] > 0 else None
 
     def pairs_of_launch(self, starts: int) -> int:
         """Return the most pairs of a launch of some starts each."""

@@ -95,8 +95,10 @@ def match_pair(
         device = PlacedPairs(backend, real, space, 2 * scanner.count, points, gap, _PAIR, [level])
         levels = Levels([options.at_noise(level)], [(int(one), int(other))], gap)
         lever = np.array([max(math.sqrt(squares / max(other, 1.0)), 1e-3)])
-        result = numbers.astype(np.float64)
-        again = result[1:] if turns > 1 and result[1, 4] > 0 else None
+        # A second turn that did not run writes its number of iterations, 0, alone.
+        ran = 2 if turns > 1 and numbers[1, 4] > 0 else 1
+        result = numbers[:ran].astype(np.float64)
+        again = result[1:] if ran > 1 else None
         best, sums = judged_pairs(
             device, sensor, result[:1], (one, other), lever, method, options, noise, levels, again
         )

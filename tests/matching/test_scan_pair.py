@@ -12,6 +12,8 @@ from support.matching_scenes import CORRIDOR, FRONT, RING, ROOM, random_pairs, s
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.constants import MATCH_RESULT
+from gpusense.matching.icp import space_of
 from gpusense.matching.noise import match_noise, noise_levels, scan_noise
 from gpusense.matching.options import check_options
 from gpusense.matching.points import scan_points
@@ -89,6 +91,20 @@ def test_a_single_match_is_that_of_several(device, case, precision, noise, guess
     # Two pairs, repeated by another launch.
     among = gs.match_scan(*(np.stack([scan, scan]) for scan in (first, second)), scanner, guess, **options)[1]
     assert_same(alone, among)
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_memory_of_a_turn_that_did_not_run_is_not_converted(device, backwards):
+    """Numbers of former calls may be signalling NaN, whose conversion warns, and warnings are errors here."""
+    scanner, pair = CASES["a centimetre"]
+    if backwards:
+        scanner, pair = gs.Scanner(scanner.bearings[::-1].copy(), scanner.range_max), tuple(one[::-1] for one in pair)
+    options = {"backend": device, "precision": "float32"}
+    gs.match_scan(*pair, scanner, (0.1, -0.05, 0.05), **options)
+    lock, space = space_of(get_backend(device))
+    with lock, space:
+        space.upload("match result", np.full(2 * MATCH_RESULT, 0x7F800001, np.uint32).view(np.float32))
+    assert np.isfinite(gs.match_scan(*pair, scanner, (0.1, -0.05, 0.05), **options).pose).all()
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])

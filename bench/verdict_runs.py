@@ -140,7 +140,7 @@ def simulated(seed, *, scans=60, hidden=0.0, moved=0.0, glass=0.0, beams=180, ar
     """Return a map, a scanner and events of a simulated robot.
 
     ``hidden``, ``moved`` and ``glass`` are shares of beams and walls; a third as much furniture as ``moved`` is new.
-    ``case``: "own", the map is that of the world; "kidnapped", the robot is carried away once; "wrong", the map shows
+    ``case``: "own", the map shows the world; "kidnapped", the robot is carried away once; "wrong", the map shows
     another building.
     """
     rng = np.random.default_rng(seed)

@@ -143,7 +143,7 @@ def _figures(row: Row, measure: str) -> str:
 
 
 def answers(rows: Sequence[Row], devices: Sequence[str], wishes: Sequence[Wish], standing: Standing) -> list[str]:
-    """Return the tables of wishes: one for all wishes that the same devices have been measured for."""
+    """Return a table of answers for each set of devices; a wish belongs to the devices that were measured for it."""
     tables: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
     for wish in wishes:
         said = {device: answer(rows, wish, device, standing.get((device, wish.words), "")) for device in devices}

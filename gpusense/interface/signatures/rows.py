@@ -124,7 +124,7 @@ class Kernel:
         return row
 
     def passed(self, flags: frozenset[str], values: Sequence[Any]) -> list[Any]:
-        """Return those of the values of all arguments that the code of a set of flags takes."""
+        """Select the values that the code of a set of flags takes from the values of all arguments."""
         pairs = zip(self.arguments, values, strict=True)
         return [value for argument, value in pairs if argument.flag in ("", *flags)]
 

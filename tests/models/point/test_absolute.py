@@ -245,7 +245,7 @@ def test_parameters_are_values() -> None:
             p.sigma = 1.0
 
 
-@pytest.mark.parametrize(("action", "kind", "message"), [case[1:] for case in CASES], ids=[c[0] for c in CASES])
+@pytest.mark.parametrize(("action", "kind", "message"), CASES)
 def test_bad_input(action, kind, message) -> None:
     with pytest.raises(kind) as caught:
         action()

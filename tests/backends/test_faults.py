@@ -12,7 +12,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from support.full_device import full_device
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -29,39 +28,6 @@ def room() -> tuple[gs.OccupancyGrid, gs.Scanner, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(1)
     poses = rng.uniform((0.2, 0.2, -3), (5.8, 3.8, 3), (2000, 3))
     return grid, scanner, poses, gs.RayCaster(grid, 5.0, backend="numpy").cast(poses[:1], scanner.bearings)[0]
-
-
-@pytest.mark.parametrize("model_type", [gs.BeamModel, gs.LikelihoodFieldModel])
-def test_out_of_memory_halves_the_batch_and_changes_no_bit(backend, model_type):
-    grid, scanner, poses, ranges = room()
-    model = model_type(grid, scanner, backend=backend)
-    whole = model.log_likelihood(poses, ranges)
-    device = get_backend(backend)
-    # For 2000 particles; GPUs store 41 numbers for each of 256 particles of a beam model before summing them.
-    room_for = 11_000 if device.info.kind == "gpu" and model_type is gs.BeamModel else 2500
-
-    model._workspace.release()
-    with full_device(device, room_for) as asked:
-        pieces = model.log_likelihood(poses, ranges)
-        assert max(asked) > room_for
-    np.testing.assert_array_equal(pieces, whole)
-    np.testing.assert_array_equal(model.log_likelihood(poses, ranges), whole)
-
-
-def test_a_device_without_memory_is_an_error_and_the_model_recovers(backend, monkeypatch):
-    grid, scanner, poses, ranges = room()
-    model = gs.BeamModel(grid, scanner, backend=backend)
-    before = model.log_likelihood(poses, ranges)
-    model._workspace.release()
-
-    def full(self, count, dtype, *, zero=False):
-        raise MemoryError("the device is full")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(type(get_backend(backend)), "empty", full)
-        with pytest.raises(MemoryError, match="the device is full"):
-            model.log_likelihood(poses, ranges)
-    np.testing.assert_array_equal(model.log_likelihood(poses, ranges), before)
 
 
 def test_a_kernel_that_does_not_compile_names_file_line_and_log(needs, monkeypatch):

@@ -10,16 +10,12 @@ from dataclasses import replace
 import mpmath as mp
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from support.oracles import Mixture
 from support.paths import ROOT
 
-import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation import stiff
 from gpusense.evaluation.tolerances import TOLERANCES
-from gpusense.models.scan.densities import log_mixture
 
 PRECISIONS = ("float32", "float64")
 PAGE = ROOT / "docs" / "numerics.md"
@@ -125,117 +121,8 @@ def test_rows_can_fail(monkeypatch):
     }
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize(
-    "name",
-    [
-        "cells of 1 mm",
-        "cells of 100 m",
-        "edges and corners, axes and 45 degrees",
-        "origin at 5e6 m, turned",
-        "theta of 1e6 rad",
-    ],
-)
-def test_ranges_in_an_empty_room_are_those_of_plain_geometry(name, precision, backend):
-    case = next(case for case in stiff.cases() if case.name == name)
-    scanner, (rows, cols), cell = case.scanner, case.grid.shape, case.grid.resolution
-    theta, bearing = case.local[:, 2:], scanner.bearings
-    dx = np.cos(theta) * np.cos(bearing) - np.sin(theta) * np.sin(bearing)
-    dy = np.sin(theta) * np.cos(bearing) + np.cos(theta) * np.sin(bearing)
-    with np.errstate(divide="ignore"):
-        x = np.abs((np.where(dx > 0, cols - 1, 1) - case.local[:, :1]) / dx)
-        y = np.abs((np.where(dy > 0, rows - 1, 1) - case.local[:, 1:2]) / dy)
-    known = np.minimum(np.minimum(x, y), scanner.range_max / cell)
-    found = gs.RayCaster(case.grid, scanner.range_max, backend=backend, precision=precision).cast(
-        case.poses, scanner.bearings
-    )
-    bound = TOLERANCES["float32 ranges to float64"].value if precision == "float32" else 1e-11
-    # World coordinates of 5e6 m are already rounded in float64.
-    bound += 64 * np.spacing(np.abs(case.grid.origin).max()) / cell
-    np.testing.assert_allclose(found / cell, known, rtol=0, atol=bound)
-
-
-def weigh(selection: str, beams: int, particles: int) -> None:
-    """Check that log-weights are finite and sum to 1 although the product of likelihoods is 0 for every particle."""
-    cells = np.pad(np.zeros((98, 98), np.int8), 1, constant_values=100)
-    grid = gs.OccupancyGrid(cells, 0.1)
-    scanner = gs.Scanner(np.linspace(-math.pi, math.pi, beams, endpoint=False), 20.0)
-    pose = np.array([[4.0, 5.0, 0.3]])
-    ranges = gs.RayCaster(grid, 20.0, backend=selection).cast(pose, scanner.bearings)[0]
-    rng = np.random.default_rng(7)
-    poses = pose + rng.normal(0, (0.1, 0.1, 0.02), (particles, 3))
-    p = gs.LikelihoodFieldParameters(0.5, 0.0, 0.5, sigma_hit=1.0)
-    log_p = gs.LikelihoodFieldModel(grid, scanner, p, backend=selection).log_likelihood(poses, ranges)
-    assert log_p.shape == (particles,)
-    assert np.isfinite(log_p).all()
-    assert (np.exp(log_p.astype(np.float64)) == 0).all()
-    made = gs.normalize_weights(log_p)
-    assert not made.degenerate
-    assert np.isfinite(made.weights).all()
-    assert made.weights.sum() == pytest.approx(1, abs=1e-6)
-    assert 1 <= made.effective_sample_size <= particles
-
-
-@pytest.mark.parametrize(("beams", "particles"), [(100_000, 1000), (1000, 100_000), (1000, 1_000_000)])
-def test_weights_of_very_long_scans_and_very_many_particles(beams, particles, needs):
-    selection = needs("opencl")
-    if particles > 100_000 and get_backend(selection).info.kind != "gpu":
-        pytest.skip("a million particles are for a GPU")
-    weigh(selection, beams, particles)
-
-
-powers = st.integers(-8, 6) | st.floats(-8, 6)
-
-
-@st.composite
-def questions(draw):
-    """Draw parameters over the stiff ranges, and expected ranges and readings as shares of range_max."""
-    weights = draw(
-        st.sampled_from([(1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1), (0.5, 0.25, 0.0, 0.25), (0.5, 0.5, 0, 0)])
-    )
-    sigma, rate = 10.0 ** draw(powers), draw(st.sampled_from([0.0, 1e-300, 1e-12, 1.0, 1e6]) | st.floats(0, 100))
-    columns = draw(
-        st.lists(st.floats(0, 1) | st.sampled_from([0.0, 2.0**-24, 0.5, 1 - 2.0**-24]), min_size=4, max_size=4)
-    )
-    readings = draw(st.lists(st.floats(0, 1) | st.sampled_from([0.0, 1 - 2.0**-24, 1e-30]), min_size=4, max_size=4))
-    return weights, sigma, rate, columns, readings, draw(st.sampled_from([0.01, 1.0, 80.0, 1e4]))
-
-
-@pytest.mark.long
-@given(question=questions(), precision=st.sampled_from(PRECISIONS))
-@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_any_stiff_question(backend, question, precision):
-    weights, sigma, rate, columns, readings, top = question
-    real = np.dtype(precision).type
-    top = float(real(top))
-    sigma, rate = float(real(sigma * top)), float(real(rate / top))
-    p = gs.BeamParameters(*weights, sigma_hit=sigma, lambda_short=rate)
-    grid = gs.OccupancyGrid([[0] * 20 + [100]], top / 16)
-    poses = np.array([((4 + 17 * column) * grid.resolution, grid.resolution / 2, 0.0) for column in columns])
-    scanner = gs.Scanner(np.zeros(4), top)
-    model = gs.BeamModel(grid, scanner, p, backend=backend, precision=precision, specialize=False)
-    expected = model.expected_ranges(poses)
-    z = np.minimum(np.array(readings) * top, np.nextafter(real(top), real(0))).astype(real)
-    log_p, parts = model.log_likelihood(poses, z, per_beam=True)
-    truth = log_mixture(z.astype(float), expected.astype(float), range_max=top, **p.to_dict())
-    errors = stiff.error_in_eps(parts, truth, precision)
-    # Where large logarithms cancel, errors are relative to them.
-    peak = abs(math.log(sigma)) if weights[0] else 0.0
-    allowed = BOUND[precision] * (1 + 2 * peak / (1 + np.abs(np.where(np.isinf(truth), 0, truth))))
-    assert (errors <= allowed).all(), (parts, truth, expected, z)
-    assert not np.isnan(log_p).any()
-    np.testing.assert_array_equal(np.isneginf(log_p), np.isneginf(truth).any(axis=1))
-
-
 def test_the_page_has_every_tolerance_with_its_reason():
     rows = re.findall(r"^\| (.+?) \| (.+?) \| (.+?) \| (.+?) \|$", PAGE.read_text(encoding="utf-8"), re.M)
     listed = {tuple(cell.replace("\\|", "|") for cell in row) for row in rows}
     for t in TOLERANCES.values():
         assert (t.name, f"{t.value:g}", t.unit, t.reason) in listed
-
-
-def test_the_pages_pictures_exist():
-    text = PAGE.read_text(encoding="utf-8")
-    pictures = re.findall(r"\]\((img/[\w.-]+\.png)\)", text)
-    assert pictures
-    assert all((PAGE.parent / picture).is_file() for picture in pictures)

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import numpy as np
 import pytest
-from support.bench_scripts import BENCH, run_script
+from support.bench_scripts import BENCH
 
 import gpusense as gs
-from gpusense.chaining.links import CLOSURE, Links
 
 pytestmark = pytest.mark.long
-
-ROWS = 6
 
 
 @pytest.fixture
@@ -24,18 +20,6 @@ def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """Import the script as a module."""
     monkeypatch.syspath_prepend(str(BENCH))
     return importlib.import_module("accuracy.chaining")
-
-
-@pytest.mark.slow
-def test_chains_are_measured(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
-    arguments = ["--data", str(data_dir), "--log", "olin", "--backend", needs("opencl")]
-    report = run_script("accuracy/chaining.py", *arguments, output=tmp_path / "chaining")
-    rows = {row["method"]: row for row in report["rows"] if not row["method"].startswith("KISS")}
-    assert len(rows) == ROWS
-    closed, plain = rows["chain, with odometry, closures"], rows["scan to scan"]
-    assert closed["error_m"] < 0.5 * plain["error_m"]
-    assert closed["contradicted"] == 0 == closed["fit_better"] < closed["closures"]
-    assert report["maps"][0]["chain"][0] > 95
 
 
 def test_errors_and_drifts_are_those_of_closed_forms(script: ModuleType) -> None:
@@ -58,16 +42,3 @@ def test_closures_are_compared_with_references_by_end_points(script: ModuleType,
     assert at_closure > 0.6 > 2 * at_reference
     wrong = gs.pose_difference(moved[96], moved[104])
     assert script.fits(log, log.truth, log.truth, 96, 104, wrong) == (at_reference, at_closure)
-
-
-def test_groups_of_matches_are_judged_by_references(script: ModuleType) -> None:
-    truth = np.stack([np.tile(0.8 * np.arange(12), 2), np.zeros(24), np.zeros(24)], axis=1)
-    at = np.arange(8)
-    pose = gs.pose_difference(truth[at], truth[at + 12])
-    pose[4:] += (2.0, 0.0, 0.0)
-    matches = Links.of(CLOSURE, at, at + 12, pose, np.tile(np.eye(3), (8, 1, 1)), 0.99)
-    loops = SimpleNamespace(matches=matches, solution=SimpleNamespace(poses=truth), nodes=np.arange(24))
-    known = truth.copy()
-    known[2] = np.nan
-    groups = script.judged_groups(loops, known)
-    assert sorted((g["compared"], g["right"]) for g in groups) == [(3, 3), (4, 0)]

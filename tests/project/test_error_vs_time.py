@@ -7,18 +7,14 @@ import importlib
 import json
 import math
 import re
-import shutil
-import subprocess
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
-from support.bench_world import made_point, made_report
+from support.bench_world import made_point
 from support.browser import CHROMIUM, in_browser
 from support.paths import ROOT
-
-from gpusense.evaluation.benchmark.rows import titles_of
 
 DEVICE, WISH = "2 cores of an X, PoCL", "localisation to 2 cm"
 
@@ -90,46 +86,6 @@ def test_a_report_is_stored_as_a_table(reports: ModuleType, tmp_path: Path) -> N
     assert sum(file.stat().st_size for file in reports.RESULTS.iterdir()) < 1.2e6
 
 
-# ---- commits
-
-
-@pytest.fixture
-def history(tmp_path: Path) -> Path:
-    """Make a repository of five commits, two with changed kernels, and a side branch."""
-
-    def git(*words: str) -> None:
-        own = ["-c", "user.name=a", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false"]
-        subprocess.run(["git", "-C", str(tmp_path), *own, *words], check=True, capture_output=True)
-
-    git("init", "-b", "main")
-    (tmp_path / "kernels").mkdir()
-    for number, name in enumerate(("README", "kernels/a.cl", "README", "kernels/a.cl", "README")):
-        (tmp_path / name).write_text(str(number))
-        git("add", ".")
-        git("commit", "-m", f"{number}")
-        git("tag", f"c{number}")
-    git("checkout", "-b", "aside", "c0")
-    (tmp_path / "other").write_text("x")
-    git("add", ".")
-    git("commit", "-m", "aside")
-    git("checkout", "main")
-    return tmp_path
-
-
-def test_commits_that_are_old_unknown_or_unclean_are_refused(reports: ModuleType, history: Path) -> None:
-    assert reports.has_history(history) and not reports.has_history(history / "kernels")
-    hashes = {name: reports.git("rev-parse", name, root=history) for name in ("c0", "c2", "c4", "aside")}
-
-    def trouble(commit: str, limit: int) -> str:
-        return reports.commit_trouble(commit, root=history, limit=limit, folders=["kernels"])
-
-    assert trouble(hashes["c4"], 0) == trouble(hashes["c2"], 1) == trouble(hashes["c0"], 2) == ""
-    assert "2 commits to kernels ago, more than 1" in trouble(hashes["c0"], 1)
-    assert "which is no commit of this history" in trouble(hashes["aside"], 9)
-    assert "which is no commit of this history" in trouble("0123456789ab", 9)
-    assert "uncommitted changes" in trouble(hashes["c4"] + "+", 9) and "uncommitted" in trouble("", 9)
-
-
 # ---- reports of two methods
 
 
@@ -148,17 +104,6 @@ def test_the_doubt_of_an_error_by_hand(reports: ModuleType) -> None:
     assert reports.doubt(task("beam", "", 1, 1) | runs) == pytest.approx(1 + math.sqrt(0.02 / 3))
     assert reports.doubt(task("beam", "", 1, 1, runs=1)) == pytest.approx(1.3)
     assert reports.doubt(task("icp", "", 1, 1, need="matching")) == 1.0
-
-
-def test_codes_of_older_reports_name_map_and_laser(reports: ModuleType) -> None:
-    given = {
-        "gs.ParticleFilter(gs.BeamModel(gs.BeamParameters, beams=8), particles=9)":
-            "gs.ParticleFilter(gs.BeamModel(grid, scanner, beams=8), particles=9)",
-        "gs.LikelihoodFieldModel(beams=8)": "gs.LikelihoodFieldModel(grid, scanner, beams=8)",
-        "gs.BeamModel(gs.DiscreteBeamModel, beams=8)": f"gs.BeamModel(grid, scanner, {reports.DISCRETE}, beams=8)",
-    }  # fmt: skip
-    for old, new in given.items():
-        assert reports.code_of(old) == reports.code_of(new) == new
 
 
 def write_tasks(folder: Path, rows: list[dict[str, Any]], commit: str = "abc") -> None:
@@ -190,19 +135,6 @@ def test_the_answers_by_hand(page: ModuleType, tmp_path: Path) -> None:
     assert "beam model, at most 1 ms" not in text
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_noise_of_times_gives_the_same_answers(page: ModuleType, tmp_path: Path, seed: int) -> None:
-    """Times of two runs differ by up to a tenth, and each answer names the same method."""
-    import random
-
-    noise, found = random.Random(seed), []
-    for rows in (ROWS, [one | {"processor_s": one["processor_s"] * noise.uniform(0.9, 1.1)} for one in ROWS]):
-        write_tasks(tmp_path, rows)
-        text = page.files(tmp_path)[page.PAGE]
-        found.append(re.findall(r"^\| (?:10 000|1000|localisation).*?\*\*(.*?)\*\*", text, re.MULTILINE))
-    assert found[0] == found[1] and len(found[0]) == 3
-
-
 def test_answers_of_the_last_page_stand(page: ModuleType, tmp_path: Path) -> None:
     """The beam model is slower than the field by less than the noise of two days, then by more."""
     found = []
@@ -217,42 +149,12 @@ def test_answers_of_the_last_page_stand(page: ModuleType, tmp_path: Path) -> Non
     assert found == ["beam, 500 x 60", "field, 1000 x 60"]
 
 
-def test_a_variant_of_a_device_stands_behind_it(reports: ModuleType) -> None:
-    names = [f"error_vs_time_{name}.json" for name in ("cpu_avx2_models", "cpu_tasks", "h200_models", "cpu_models")]
-    titles = {name: ("NVIDIA H200" if "h200" in name else "X",) for name in names}
-    found = [reports.Source(one, one[:-5].rsplit("_", 1)[1], {}, titles[one]) for one in names]
-    assert [one.name[14:-5] for one in sorted(found, key=reports._place)] == [
-        "cpu_models", "cpu_tasks", "cpu_avx2_models", "h200_models",
-    ]  # fmt: skip
-
-
 def test_reports_of_uncommitted_changes_are_refused(page: ModuleType, tmp_path: Path) -> None:
     write_tasks(tmp_path, ROWS, commit="abc+")
     with pytest.raises(ValueError, match="uncommitted changes: abc\\+"):
         page.files(tmp_path)
     with pytest.raises(ValueError, match="must have reports"):
         page.files(tmp_path / "none")
-
-
-def test_two_reports_of_a_device_are_refused(page: ModuleType, tmp_path: Path) -> None:
-    write_tasks(tmp_path, ROWS)
-    shutil.copy(tmp_path / "error_vs_time_x_tasks.json", tmp_path / "error_vs_time_y_tasks.json")
-    with pytest.raises(ValueError, match="each device must have one of a kind"):
-        page.files(tmp_path)
-
-
-def test_methods_of_one_kind_of_cloud_are_on_the_interactive_page_alone(page: ModuleType, tmp_path: Path) -> None:
-    """A table omitted for tracking clouds has no error there, and is in no table of the page."""
-    points = [
-        made_point(problem="beam", cloud=cloud, method=method, status="left out" if alone else "ok")
-        for method, cloud, alone in (("exact", "global", False), ("exact", "tracking", False),
-                                     ("lookup", "global", False), ("lookup", "tracking", True))
-    ]  # fmt: skip
-    own = {"points": points, "machine": {"processors": 2, "processor": "X"}, "commit": "abc", "date": "2026-01-01"}
-    (tmp_path / "error_vs_time_x_models.json").write_text(json.dumps(made_report() | own | {"command": "python x"}))
-    made = page.files(tmp_path)
-    assert "| lookup" not in made[page.PAGE].split("## Localisation")[0].split("## Rays")[0]
-    assert '"method":"lookup"' in page.interactive(tmp_path) and "lookup" not in made[page.picture("beam model")]
 
 
 def test_devices_and_other_matchers_have_their_places(page: ModuleType, tmp_path: Path) -> None:
@@ -273,15 +175,6 @@ def test_devices_and_other_matchers_have_their_places(page: ModuleType, tmp_path
     assert re.findall(r"^\| (\w+) \| 180 beams \| (.*?) \| (.*?) \| (.*?) \|", text, re.MULTILINE) == [
         ("icp", "gpusense", "300 us", "600 us"), ("csm", "csm 1, 1 thread", "1 ms", "2 ms"),
     ]  # fmt: skip
-
-
-def test_one_processor_with_and_without_its_widest_vectors() -> None:
-    """PoCL's target distinguishes the columns."""
-    titles = {target: titles_of([made_point(backend="opencl:0:0", device="pthread-X", kind="cpu")],
-                                     {"processors": 2, "processor": "X"},
-                                     [{"selection": "opencl:0:0", "driver": "PoCL", "target": target}])["opencl:0:0"]
-              for target in ("skylake-avx512", "haswell")}  # fmt: skip
-    assert titles == {"skylake-avx512": DEVICE, "haswell": f"{DEVICE}, AVX2 only"}
 
 
 # ---- the interactive page

@@ -74,42 +74,10 @@ def stiff_density(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("accuracy.stiff_density")
 
 
-def test_tables_are_written_between_their_marks(stiff_density: ModuleType, tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    page.write_text("a\n<!-- made: one -->\nold\n<!-- end -->\nb\n<!-- made: two -->\nold\n<!-- end -->\nc\n")
-    stiff_density.write_tables(page, {"two": "new", "one": "first"})
-    text = "a\n<!-- made: one -->\nfirst\n<!-- end -->\nb\n<!-- made: two -->\nnew\n<!-- end -->\nc\n"
-    assert page.read_text() == text
-    with pytest.raises(ValueError, match="must have the mark <!-- made: three -->"):
-        stiff_density.write_tables(page, {"three": ""})
-
-
 def test_tables_of_extreme_sizes_are_those_of_the_reports(stiff_density: ModuleType) -> None:
     page = (ROOT / "docs" / "numerics.md").read_text(encoding="utf-8")
     for name, lines in importlib.import_module("accuracy.extreme_tables").tables().items():
         assert f"<!-- made: {name} -->\n{lines}\n<!-- end -->" in page, "run bench/accuracy/extreme_tables.py"
-
-
-def test_the_picture_shows_broken_bounds(stiff_density: ModuleType) -> None:
-    """A family within its bound is blue, one beyond it orange, and results that are not finite are named."""
-    column = {"backend": "b", "precision": "float32", "worst": 1.0, "case": "c"}
-    rows = [
-        column | {"family": name, "share": share, "not_finite": lost}
-        for name, share, lost in (("kept", 0.5, 0), ("broken", 1.5, 0), ("lost", 0.0, 3))
-    ]
-    drawn = stiff_density.picture(rows)
-    assert drawn.count("#d55e00") == 2 and ">50 %<" in drawn and ">1.5e+02 %<" in drawn and ">not finite<" in drawn
-
-
-def test_families_of_quantities(stiff_density: ModuleType) -> None:
-    """Units differ between precisions, families do not."""
-    names = {
-        "ranges, relative": "ranges", "beam model, 1 + |log p_k|": "beam model, a beam",
-        "field, nearest, eps (1 + |log p_k|)": "field, nearest, a beam",
-        "field, bilinear, scans, share of their bound": "field, bilinear, a scan",
-        "beam model, sum of the weights": "sum of the weights", "textbook formulas, share above 16 eps": "",
-    }  # fmt: skip
-    assert {name: stiff_density.family_of(name) for name in names} == names
 
 
 def test_reports_stay_few() -> None:

@@ -85,29 +85,6 @@ def test_mixture_on_a_stiff_grid(weights, precision, backend):
     assert worst[0] <= BOUND, worst
 
 
-@pytest.mark.sampled(0.5)
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("weights", WEIGHTS)
-def test_reference_mixture_on_a_dense_grid(weights, precision):
-    """The reference's density is correct for every expected range from 0 to range_max."""
-    real = np.dtype(precision)
-    eps, grid = np.finfo(real).eps, gs.OccupancyGrid([[0]], 1.0)
-    for range_max, sigma, rate in itertools.product((10.0,), SIGMAS, RATES):
-        p = parameters(precision, range_max, sigma, rate, WEIGHTS[weights])
-        model = gs.BeamModel(grid, gs.Scanner([0.0], range_max), p, backend="numpy", precision=precision)
-        for share in (0.0, 1e-9, 0.37, 1.0):
-            expected = real.type(share * range_max)
-            z = readings_around(float(expected), p, range_max, real)
-            with np.errstate(all="ignore"):
-                found = log_density(
-                    model._pipeline.mixture.flags, z, np.full(len(z), expected), model._pipeline.mixture.terms
-                )
-            mixture = Mixture.of(p, range_max)
-            errors = [error_in_eps(f, mixture, x, expected, eps) for f, x in zip(found, z, strict=True)]
-            worst = int(np.argmax(errors))
-            assert errors[worst] <= BOUND, (p, z[worst], expected, found[worst], errors[worst])
-
-
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_where_the_logarithm_cancels(precision):
     """Bound the error of a log density near 0, a difference of large terms, relative to these terms."""
@@ -128,29 +105,3 @@ def test_where_the_logarithm_cancels(precision):
         for f, x in zip(found, z, strict=True):
             truth = exact_log_density(mixture, float(x), float(expected))
             assert abs(mp.mpf(float(f)) - truth) <= BOUND * eps * (1 + abs(truth) + 2 * peak), (p, x, expected, f)
-
-
-@pytest.mark.parametrize("share", [0.0, 1e-6, 0.3, 0.999, 1.0])
-@pytest.mark.parametrize("sigma", [1e-3, 0.1, 5.0, 1e5])
-@pytest.mark.parametrize("rate", [0.0, 1e-9, 0.5, 200.0])
-def test_continuous_part_and_atom_sum_to_one(share, sigma, rate):
-    """Gauss-Legendre quadrature of the float64 density; the mass of p_short at z* = 0 is lost, as in the book."""
-    range_max = 8.0
-    p = gs.BeamParameters(0.5, 0.2, 0.1, 0.2, sigma_hit=sigma, lambda_short=rate)
-    scanner = gs.Scanner([0.0], range_max)
-    model = gs.BeamModel(gs.OccupancyGrid([[0]], 1.0), scanner, p, backend="numpy", precision="float64")
-    expected = share * range_max
-    around = np.concatenate([[0.0], np.geomspace(0.1, 1e4, 60)])
-    edges = np.concatenate(
-        [expected - sigma * around, expected + sigma * around, around / max(rate, 1e-3), [range_max]]
-    )
-    edges = np.unique(np.clip(edges, 0, range_max))
-    nodes, weights = np.polynomial.legendre.leggauss(30)
-    half = np.diff(edges) / 2
-    z = ((edges[:-1] + edges[1:]) / 2)[:, None] + half[:, None] * nodes
-    with np.errstate(all="ignore"):
-        density = np.exp(
-            log_density(model._pipeline.mixture.flags, z, np.full(z.shape, expected), model._pipeline.mixture.terms)
-        )
-    total = (density * weights * half[:, None]).sum() + p.z_max
-    assert total == pytest.approx(1.0 - (p.z_short if expected == 0 else 0.0), abs=1e-9)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import threading
 from typing import Any
 
 import numpy as np
@@ -151,35 +150,6 @@ def test_nothing_is_allocated_compiled_or_copied(batching, monkeypatch):
     for _ in range(5):
         call()
     assert len(started) == before + 5
-
-
-def test_without_graphs_launches_are_started_one_by_one(batching, monkeypatch):
-    """Graphs are absent if a driver refuses them or other threads run, since Warp cannot wait while it records."""
-    import warp as wp
-
-    device, started = batching
-    model = FIELD(GRID, NEAR, backend=device)
-    poses, ranges = to_device(cloud(1)), to_device(mixed(1))
-    expected = model.log_likelihood(poses, ranges.numpy()).numpy()
-    call, done = model.bind(poses, ranges), threading.Event()
-    waiting = threading.Thread(target=done.wait)
-    waiting.start()
-    for _ in range(3):
-        assert differing(call().numpy(), expected) == 0
-    assert not started
-    done.set()
-    waiting.join()
-    assert differing(call().numpy(), expected) == 0
-    assert len(started) == 1
-
-    def refuse(*arguments, **options):
-        raise RuntimeError("no graphs here")
-
-    monkeypatch.setattr(wp, "capture_begin", refuse)
-    other = model.bind(poses, ranges)
-    for _ in range(3):
-        assert differing(other().numpy(), expected) == 0
-    assert "no graphs here" in other.explain() and len(started) == 1
 
 
 WRONG = {

@@ -217,16 +217,3 @@ def test_bound_calls_copy_the_arrays_of_the_host_alone(kind, batching):
     for _ in range(2):
         with pytest.raises(ValueError, match="poses: must be finite, got a pose on the device"):
             call()
-
-
-def test_weights_for_which_the_host_prepares_readings_take_the_ordinary_path(batching):
-    model = FIELD(GRID, NEAR, backend=batching[0], compat="amcl")
-    poses, ranges = to_device(cloud(1)), to_device(mixed(1))
-    pairs = [(poses, mixed(1)), (cloud(1), ranges), (poses, ranges)]
-    expected = model.log_likelihood(cloud(1), mixed(1))
-    for some, readings in pairs:
-        call = model.bind(some, readings)
-        for _ in range(2):
-            found = call()
-            assert call.waits and type(found) is type(some)
-            assert differing(np.asarray(found.numpy() if some is poses else found), expected) == 0

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gpusense as gs
-from gpusense.models.scan import densities
 from gpusense.models.scan.densities import log_hit, log_mixture, log_rand, log_short, naive_log_hit, naive_log_short
 
 PRECISIONS = ("float64", "float32")
@@ -173,8 +172,3 @@ def test_mixture_is_the_mixture_of_the_kernels():
     np.testing.assert_allclose(
         ours, log_density(model._pipeline.mixture.flags, z, expected, model._pipeline.mixture.terms), rtol=0, atol=1e-12
     )
-
-
-def test_names_of_the_textbooks_forms_say_so():
-    naive = {name for name in vars(densities) if "naive" in name}
-    assert naive == {"naive_log_hit", "naive_log_short", "naive_log_mixture"}

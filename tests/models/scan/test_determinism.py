@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import TOLERANCES, beam_tolerance, scan_tolerance
 from gpusense.world import windows
 
@@ -146,37 +145,6 @@ def test_any_order(call):
     for order in (np.arange(COUNT)[::-1], np.random.default_rng(9).permutation(COUNT)):
         same_bits(call(cloud()[order]), whole[order])
     same_bits(call(np.repeat(cloud()[:3], 50, axis=0)), np.repeat(whole[:3], 50, axis=0))
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_after_running_out_of_memory(kind, precision, backend):
-    """Pieces are halved until they fit; a piece of 256 particles must."""
-    # This file also runs as a script, without the helpers.
-    from support.full_device import full_device
-
-    owner, call = shared(kind, precision, backend)
-    poses = cloud(3000)
-    whole, device, most = call(poses), get_backend(backend), 256 * len(BEARINGS) + 1
-    owner._workspace.release()
-    with full_device(device, most) as asked:
-        same_bits(call(poses), whole)
-    assert max(asked) > most
-    same_bits(call(poses), whole)
-
-
-@pytest.mark.sampled(0.5)
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("kind", KINDS[1:])
-def test_several_scans_or_one_by_one(kind, precision, backend):
-    scored = shared(kind, precision, backend)[0]
-    clouds = cloud(500).reshape(len(scans()), 100, 3)
-    log_p, parts = scored.log_likelihood(clouds, scans(), per_beam=True)
-    same_bits(scored.log_likelihood(clouds, scans()), log_p)
-    for s, z in enumerate(scans()):
-        alone, each = scored.log_likelihood(clouds[s], z, per_beam=True)
-        same_bits(alone, log_p[s])
-        same_bits(each, parts[s])
 
 
 def real_devices() -> list[str]:

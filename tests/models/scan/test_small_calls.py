@@ -7,7 +7,7 @@ import threading
 
 import numpy as np
 import pytest
-from support.array_libraries import Array, to_device
+from support.array_libraries import to_device
 from support.scan_calls import BEAMS, COUNT, GRID, MODELS, RANGE, SCANNER, cloud, scan
 
 import gpusense as gs
@@ -117,31 +117,6 @@ def test_graphs_change_no_bit(kind, batching, monkeypatch):
         expected = plainly(device, monkeypatch, lambda anew=anew: anew.log_likelihood(cloud(9), scan(9)))
         for _ in range(3):
             assert differing(model.log_likelihood(cloud(9), scan(9)), expected) == 0
-
-
-@pytest.mark.parametrize("kind", MODELS)
-def test_graphs_with_arrays_on_the_device(kind, batching, monkeypatch):
-    device, started = batching
-    model = kind(GRID, SCANNER, backend=device)
-    poses, out = to_device(cloud(0)), to_device(np.zeros(COUNT, np.float32))
-    for seed in range(5):
-        poses.assign(cloud(seed))
-        expected = plainly(device, monkeypatch, lambda s=seed: model.log_likelihood(cloud(s), scan(s)))
-        assert model.log_likelihood(poses, scan(seed), out=out) is out
-        assert differing(out.numpy(), expected) == 0
-        assert differing(model.log_likelihood(Array(poses), scan(seed)).held.numpy(), expected) == 0
-    assert len(started) >= 3
-    bad = cloud(1)
-    bad[3, 0] = np.nan
-    for some in (bad, cloud(2)):
-        poses.assign(some)
-        if some is bad:
-            with pytest.raises(ValueError, match="poses: must be finite"):
-                model.log_likelihood(poses, scan(2), out=out)
-        else:
-            model.log_likelihood(poses, scan(2), out=out)
-    expected = plainly(device, monkeypatch, lambda: model.log_likelihood(cloud(2), scan(2)))
-    assert differing(out.numpy(), expected) == 0
 
 
 def test_scans_and_pieces_are_batched_in_their_order(batching, monkeypatch):

@@ -82,7 +82,9 @@ def beam_options(scene: Scene, scanner: gs.Scanner) -> Iterator[Option]:
     yield option("60 of the beams", 0.3, beams=60)
     yield option("look-up, 54 bins", 1.05, caster=gs.casters.Lookup(54))
     yield option("every bearing twice", 1.05)
+    yield option('compat="amcl"', 4.0, None, compat="amcl")
     yield option('compat="amcl", exact', 1.3, None, compat="amcl", caster="exact")
+    yield option('compat="beluga"', 4.0, None, compat="beluga")
     yield option('compat="beluga", exact', 1.3, None, compat="beluga", caster="exact")
 
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.interface import structs
 from gpusense.tables.caster_base import Caster, CasterInput, Table
-from gpusense.tables.cells import check_size
+from gpusense.tables.cells import chebyshev_distances, check_size
 from gpusense.tables.directional import directional_table
 from gpusense.tables.distances import NO_OBSTACLE, squared_distances
 from gpusense.tables.lookup_files import read_lookup
@@ -28,6 +28,8 @@ __all__ = ["CASTERS", "Bresenham", "Caster", "Cddt", "Dda", "Exact", "Lookup", "
 _BYTE, _SHORT, _SINGLE = (np.dtype(name) for name in (np.uint8, np.uint16, np.float32))
 # Rays per launch when filling a look-up table, for launches of about a second.
 _TILE = {"cpu": 1 << 22, "gpu": 1 << 30}
+# Entry of a ring outside of which a line meets nothing; the kernel file ``bresenham`` has the same number.
+_EDGE = 255
 # Flags of other programs' lines.
 _LINES = {"amcl": "AMCL_LINES", "beluga": "BELUGA_LINES"}
 
@@ -63,12 +65,14 @@ class Dda(Caster):
     precomputation = "none"
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
-        return _padded_cells(backend, inputs)
+        check_size(*inputs.obstacles.shape)
+        cells = np.pad(inputs.obstacles.astype(_BYTE), 1, constant_values=2)
+        return Table(backend.upload(cells), cells.nbytes)
 
 
 @dataclass(frozen=True)
 class Bresenham(Caster):
-    """Bresenham's line from cell to cell.
+    """Bresenham's line, which leaps by the Chebyshev distance to the next obstacle.
 
     Args:
         lines: None; ``"amcl"`` for lines that extend one cell beyond the ray's end and may exceed range_max; or
@@ -81,7 +85,7 @@ class Bresenham(Caster):
     stops = False
     error = "about a cell, from centre to centre; lines slip between walls that touch at a corner"
     memory = "1 byte per cell of the reachable map"
-    precomputation = "none"
+    precomputation = "Chebyshev distances (on the host)"
     knobs = "lines (None, 'amcl', 'beluga')"
 
     def __post_init__(self) -> None:
@@ -96,8 +100,12 @@ class Bresenham(Caster):
         return 2 if self.lines == "amcl" else 0
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
-        table = _padded_cells(backend, inputs)
-        return table if self.lines is None else replace(table, flags=frozenset({_LINES[self.lines]}))
+        check_size(*inputs.obstacles.shape)
+        leaps = chebyshev_distances(np.pad(inputs.obstacles, 1, constant_values=True), _EDGE - 1)
+        if inputs.outside == "free":
+            leaps[[0, -1]] = leaps[:, [0, -1]] = _EDGE
+        flags = frozenset() if self.lines is None else frozenset({_LINES[self.lines]})
+        return Table(backend.upload(leaps), leaps.nbytes, flags)
 
 
 @dataclass(frozen=True)
@@ -223,13 +231,6 @@ class Lookup(Caster):
 
     def struct(self) -> structs.Caster:
         return structs.Caster(self.bins, 0.0, 0.0)
-
-
-def _padded_cells(backend: Backend, inputs: CasterInput) -> Table:
-    """Upload byte 1 for each occupied cell, inside a ring of twos."""
-    check_size(*inputs.obstacles.shape)
-    cells = np.pad(inputs.obstacles.astype(_BYTE), 1, constant_values=2)
-    return Table(backend.upload(cells), cells.nbytes)
 
 
 _ALL: tuple[type[Caster], ...] = (Exact, Dda, March, Bresenham, Cddt, Lookup)

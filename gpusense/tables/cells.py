@@ -1,6 +1,8 @@
-"""Convert occupied cells to the kernels' layouts, bytes or packed bits, and limit their number."""
+"""Convert occupied cells to the kernels' layouts: bytes, packed bits or distances; and limit their number."""
 
 from __future__ import annotations
+
+import itertools
 
 import numpy as np
 
@@ -30,3 +32,23 @@ def packed(obstacles: np.ndarray) -> np.ndarray:
         bits = np.zeros((rows, -(-cols // 32) * 4), _BYTE)
         bits[:, : -(-cols // 8)] = np.packbits(obstacles, axis=1, bitorder="little")
     return bits.view("<i4").astype(_INT, copy=False)
+
+
+def chebyshev_distances(blocked: np.ndarray, longest: int) -> np.ndarray:
+    """Return the Chebyshev distance from each cell to the nearest blocked cell, or ``longest``, at most 254: uint8."""
+    distances = np.where(blocked, _BYTE.type(0), _BYTE.type(longest))
+    # The nearest cell is at most as far across as along, either by rows or by columns.
+    return np.minimum(_within_columns(distances), _within_columns(distances.T).T)
+
+
+def _within_columns(distances: np.ndarray) -> np.ndarray:
+    """Spread distances from row to row, down and up at once, by at most a column for each row."""
+    both = np.stack([distances, distances[::-1]], axis=1)
+    near = np.empty_like(both[0])
+    for before, here in itertools.pairwise(both):
+        near[:] = before
+        np.minimum(near[:, 1:], before[:, :-1], out=near[:, 1:])
+        np.minimum(near[:, :-1], before[:, 1:], out=near[:, :-1])
+        near += 1
+        np.minimum(here, near, out=here)
+    return np.minimum(both[:, 0], both[::-1, 1])

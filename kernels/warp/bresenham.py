@@ -1,10 +1,12 @@
 """Expected range by Bresenham's line (1965) from the origin's cell to the cell at the ray's end.
 
 nav2_amcl and Beluga cast rays by it. Distances are from cell centre to cell centre, and a line may pass between two
-cells that touch at a corner. The table holds 1 for occupied cells in a ring of twos.
+cells that touch at a corner. A line midway between two cells steps diagonally, with BELUGA_LINES straight ahead. With
+AMCL_LINES a line goes on for a cell beyond its end.
 
-A line midway between two cells steps diagonally, with BELUGA_LINES straight ahead. With AMCL_LINES a line goes on
-for a cell beyond its end.
+The table holds the Chebyshev distance to the next occupied cell or to the ring around the grid: a line leaps over that
+many cells at once. n cells along a line of l cells that ends s cells aside, it is (2 n s + l) / (2 l) cells aside,
+rounded down; straight ahead (2 n s + l - 1) / (2 l).
 """
 
 import functools
@@ -18,6 +20,8 @@ from .ray import off_grid
 from .rectangles import padded
 
 ENTRY = wp.uint8
+# The entry of the ring where a line meets nothing outside the grid; cells at which lines end have 0.
+EDGE = wp.constant(255)
 
 
 @functools.cache
@@ -57,34 +61,34 @@ def functions(flags):
         end_row = cell.y + int(wp.floor(pose.y + limit * r.direction.y))
         far_x = wp.abs(end_col - col)
         far_y = wp.abs(end_row - row)
-        longer = wp.max(far_x, far_y)
-        shorter = wp.min(far_x, far_y)
+        far = wp.max(far_x, far_y)
+        # A line of a single cell goes on diagonally.
+        longer = wp.max(far, 1)
+        shorter = wp.where(far == 0, 1, wp.min(far_x, far_y))
         right = wp.where(end_col > col, 1, -1)
         up = wp.where(end_row > row, 1, -1)
-        last = longer
+        last = far
         if AMCL_LINES:
-            last = longer + 1
+            last = far + 1
         along = int(0)
         aside = int(0)
-        error = int(0)
-        while along <= last:
+        x = int(0)
+        y = int(0)
+        steps = int(map_table[padded(row, col, window.cols)])
+        rest = int(longer)
+        if BELUGA_LINES:
+            rest = longer - 1
+        # A leap beyond the line's end still ends in the table. Ranges are at most 2^20 cells, so sums stay below 2^31.
+        while steps != 0 and steps != EDGE and along <= last:
+            along += steps
+            rest += 2 * shorter * steps
+            aside += rest / (2 * longer)
+            rest = rest % (2 * longer)
             x = wp.where(far_x >= far_y, along, aside)
             y = wp.where(far_x >= far_y, aside, along)
-            state = int(map_table[padded(row + up * y, col + right * x, window.cols)])
-            if state != 0:
-                if OUTSIDE_OCCUPIED:
-                    state = 1
-                if state == 2:
-                    return limit
-                return start.t + wp.sqrt(real(x) * real(x) + real(y) * real(y))
-            error += shorter
-            over = 2 * error >= longer
-            if BELUGA_LINES:
-                over = 2 * error > longer
-            if over:
-                aside += 1
-                error -= longer
-            along += 1
-        return limit
+            steps = int(map_table[padded(row + up * y, col + right * x, window.cols)])
+        if steps != 0 or along > last:
+            return limit
+        return start.t + wp.sqrt(real(x) * real(x) + real(y) * real(y))
 
     return SimpleNamespace(**locals())

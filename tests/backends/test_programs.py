@@ -113,6 +113,13 @@ def test_a_model_takes_its_programs_along(kind, backend, without_collector):
     model = kind(GRID, SCANNER, backend=backend)
     for count in (1, 2, 1):
         model.log_likelihood(POSES[:count], RANGES)
+    # Poses in place, such as a filter's.
+    device, real = model.backend, np.dtype(model.precision)
+    poses = device.view(device.upload(POSES[:2].reshape(-1)), (2, 3), np.dtype(np.float64))
+    out = device.view(device.empty(2, real), (2,), real)
+    for _ in range(3):
+        model.start_scoring(poses, RANGES, out=out)
+        model.finish_scoring()
     kept = programs_of(model._workspace)
     assert kept and all(one() is not None for one in kept)
     del model

@@ -33,7 +33,7 @@ class Copy(Step):
 
     def __init__(self, target: wp.array, source: wp.array, count: int) -> None:
         self._arguments = (target, source, count)
-        self.key = (target.ptr, source.ptr, count)
+        self.key = (target.ptr, source.ptr, count, target.dtype)
 
     def start(self, stream: wp.Stream | None) -> None:
         target, source, count = self._arguments

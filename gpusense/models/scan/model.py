@@ -108,8 +108,7 @@ class ScanModel(Pickled):
         """The last call; a short one is repeated as one of any size, since only those report what they leave out."""
         call = None if self._short is None else self._short.last
         if call is not None:
-            poses, ranges = (array.copy() if type(array) is np.ndarray else array for array in call.arrays)
-            request = make_request(self._context, poses, ranges)
+            request = make_request(self._context, *call.arrays)
             with self._lock, self._workspace:
                 self._run(request)
                 finish(self._workspace, request.poses.on_device)
@@ -259,11 +258,13 @@ class ScanModel(Pickled):
             calls = self._differentiable(ranges)
             if calls is not None:
                 return cast(np.ndarray, log_likelihood_of(poses, ranges, calls))
-        if self._short is not None and not per_beam:
+        short = self._short
+        if short is not None:
             with self._lock:
-                result = self._short.score(poses, ranges, out)
-            if result is not None:
-                return result
+                result = None if per_beam else short.score(poses, ranges, out)
+                if result is not None:
+                    return result
+                short.last = None
         request = make_request(
             self._context, poses, ranges, out, per_beam=per_beam, worlds=self._worlds, world=world, ignore=ignore
         )
@@ -370,14 +371,15 @@ class ScanModel(Pickled):
         Returns:
             The title, the flags of the code, and the parts that are left out, kept, and could go.
         """
-        plan = plan_of_call(self._notes(), self._context, self._last)
+        notes, last = self._notes(), self._last
+        plan = plan_of_call(notes, self._context, last)
         if not checks.boolean("measure", measure):
             return plan
         from gpusense.models.scan.savings import measured_savings
 
         with self._lock:
             requests = functools.partial(make_request, self._context)
-            savings = measured_savings(requests, self._pipeline, self._last, plan, self.scanner.count)
+            savings = measured_savings(requests, self._pipeline, last, plan, self.scanner.count)
         return dataclasses.replace(plan, measured=savings)
 
     def sources(self) -> dict[str, str]:

@@ -88,9 +88,6 @@ class PackedCall:
         out: The (N,) log-likelihoods.
         limits: The type of the readings; None for the type of readings on the device.
         corners: Corners of the box of the first poses; None for the table of the whole map.
-
-    Attributes:
-        arrays: The poses and the readings of the last call.
     """
 
     def __init__(
@@ -119,7 +116,7 @@ class PackedCall:
                 self._slots.append(None)
                 there.append(kind)
             shown.append(self._slots[-1] if kind is None else there[-1])
-        self.arrays = tuple(shown)
+        self._shown, self._limits = shown, limits
         log_p, status = self._outputs.parts
         self._result, self._in_host = None, out is None
         if isinstance(out, np.dtype):
@@ -165,6 +162,13 @@ class PackedCall:
         status[...] = 0
         backend.upload(status, outputs.parts[1])
         return False
+
+    @property
+    def arrays(self) -> tuple[Any, Any]:
+        """The poses and the readings of the last call; arrays of the host are copies, readings in their type."""
+        poses, ranges = self._shown
+        poses = poses.copy() if type(poses) is np.ndarray else poses
+        return poses, ranges.astype(self._limits) if type(ranges) is np.ndarray else ranges
 
     def explain(self) -> str:
         """Return in one line how the launches are started."""
@@ -241,7 +245,7 @@ class PackedCallCache:
                 result_type = None if there is None else pipeline.real
                 call = PackedCall(pipeline, self._lock, count, inputs.kinds, result_type, inputs.limits, corners)
                 self._calls.keep(key, call)
-            if not call.score(*inputs.arrays, target, corners) and not in_host:
+            if not call.score(*inputs.arrays, target, corners):
                 return None
         except MemoryError:
             # The buffers of both kinds of calls may not fit the device at once.

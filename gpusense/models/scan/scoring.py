@@ -41,7 +41,7 @@ def run(pipeline: ScanPipeline, request: Request, space: Workspace, last: LastCa
 
     ``last``: receives the facts that ``explain`` reports.
     """
-    last.together = 0
+    last.flags, last.kernels, last.together = frozenset(), (), 0
     for particles, scans in pipeline.groups(request):
         last.scans = scans
         if not particles.count:
@@ -70,6 +70,8 @@ class ResidentPoses:
 
     def __init__(self, pipeline: ScanPipeline, request: Request, space: Workspace, last: LastCall) -> None:
         self._pipeline, self._space, self._last = pipeline, space, last
+        # The workspace keeps programs by this key: nothing in it refers to itself.
+        self._key = object()
         # Without the function of its owner, which the model must not keep alive.
         self._request = request._replace(before=None)
         self._log_p = pipeline.backend.part(request.result.flat, 0, request.poses.count, pipeline.real)
@@ -91,15 +93,15 @@ class ResidentPoses:
         if pipeline.value(scans) is not None:
             return False
         readings = pipeline.upload(scans, space)
-        kept = space.kept(self, pipeline.map.version)
+        kept = space.kept(self._key, pipeline.map.version)
         if kept is None:
             # The map's table or a buffer is new.
             placed, state = pipeline.place(self._request.poses, (0, self._request.poses.count), space)
-            kept = placed, state, RecordedProgram(pipeline.backend, placed.launches())
-            space.keep(self, kept, state.version)
+            kept = placed._replace(space=None), state, RecordedProgram(pipeline.backend, placed.launches())
+            space.keep(self._key, kept, state.version)
         placed, state, placing = kept
-        scoring = pipeline.scoring(readings, placed, state.table, self._log_p, space)
-        key, numbers = (self, scoring.flags, readings.key), pipeline.numbers(scoring)
+        scoring = pipeline.scoring(readings, placed._replace(space=space), state.table, self._log_p, space)
+        key, numbers = (self._key, scoring.flags, readings.key), pipeline.numbers(scoring)
         program = space.kept(key, state.version)
         if program is None:
             made = ChangingProgram(pipeline.backend, pipeline.score_launches(scoring), numbers)

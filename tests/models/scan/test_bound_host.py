@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,8 @@ from support.scan_calls import BEAM, BEAMS, CASES, COUNT, FIELD, GRID, MODELS, N
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing
-from gpusense.models.scan import binding, packed_call
+from gpusense.models.scan import binding, packed_call, savings
+from gpusense.models.scan import model as model_module
 
 
 @pytest.mark.sampled(0.25)
@@ -217,3 +219,62 @@ def test_bound_calls_copy_the_arrays_of_the_host_alone(kind, batching):
     for _ in range(2):
         with pytest.raises(ValueError, match="poses: must be finite, got a pose on the device"):
             call()
+
+
+# ---- reports of calls, and calls that are not recorded after all
+
+
+@pytest.mark.parametrize("last", ["readings", "no range", "limit"])
+@pytest.mark.parametrize("kind", MODELS)
+def test_reports_are_of_the_last_call_and_not_of_the_last_recorded_one(kind, last, batching):
+    parameters = {BEAM: gs.BeamParameters(), FIELD: gs.LikelihoodFieldParameters(0.7, 0.2, 0.1)}[kind]
+    model, fresh = (kind(GRID, ROUNDED, parameters, backend=batching[0]) for _ in range(2))
+    short, poses = mixed(1).astype(np.float32), cloud(1)
+    for _ in range(3):
+        model.log_likelihood(poses, short)
+    assert model._short.last is not None
+    if last == "limit":
+        # A max reading in float32; the same number in float64 is a range.
+        short[:5] = 5.6
+        model.log_likelihood(poses, short)
+        fresh.log_likelihood(poses, short)
+    else:
+        readings = mixed(2) if last == "readings" else np.full(BEAMS, np.nan)
+        for one in (model, fresh):
+            one.log_likelihood(poses, readings, per_beam=True)
+    assert model.explain() == fresh.explain() and model.sources() == fresh.sources()
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_a_recorded_call_that_reports_a_bad_pose_is_repeated_by_the_ordinary_one(kind, batching, monkeypatch):
+    """The flag may be an interrupted call's, or a thread may have changed the poses."""
+    model, plain = (kind(GRID, NEAR, backend=batching[0]) for _ in range(2))
+    for seed in range(3):
+        model.log_likelihood(cloud(seed), mixed(seed))
+    assert model._short.last is not None
+    monkeypatch.setattr(packed_call.PackedCall, "score", lambda *arguments: False)
+    for out in (None, np.full(COUNT, 7, np.float32)):
+        assert (
+            differing(model.log_likelihood(cloud(4), mixed(4), out=out), plain.log_likelihood(cloud(4), mixed(4))) == 0
+        )
+
+
+def test_measured_savings_beside_another_thread_that_scores(batching, monkeypatch):
+    """The thread's recorded call comes after the plan, and must not be waited for under the model's lock."""
+    model, plan_of_call = FIELD(GRID, NEAR, backend=batching[0]), model_module.plan_of_call
+
+    def planned(*arguments: Any) -> Any:
+        plan = plan_of_call(*arguments)
+        for _ in range(3):
+            model.log_likelihood(cloud(1), mixed(1))
+        assert model._short.last is not None
+        return plan
+
+    model.log_likelihood(cloud(1), mixed(1))
+    monkeypatch.setattr(model_module, "plan_of_call", planned)
+    monkeypatch.setattr(savings, "TURN", 1e-9)
+    plans: list[Any] = []
+    thread = threading.Thread(target=lambda: plans.append(model.plan(measure=True)), daemon=True)
+    thread.start()
+    thread.join(60)
+    assert plans and plans[0].measured is not None

@@ -235,6 +235,24 @@ def test_threads_have_batches_of_their_own(batching, monkeypatch):
     assert started
 
 
+def test_graphs_of_copies_differ_by_the_type_of_their_numbers(batching):
+    """Memory of a freed buffer may come back with numbers of another type."""
+    device, started = batching
+    double, single = np.dtype(np.float64), np.dtype(np.float32)
+    memory = device.empty(8, double)
+    for real in (single, double):
+        halves = [device.part(memory, byte // real.itemsize, 4, real) for byte in (0, 32)]
+        for turn in range(3):
+            numbers = np.arange(4.0) + turn, np.arange(4.0) - turn
+            with Workspace(device):
+                for half, values in zip(halves, numbers, strict=True):
+                    device.upload(values.astype(real), half, wait=False)
+                device.synchronize()
+            for half, values in zip(halves, numbers, strict=True):
+                assert (device.download(half, np.empty(4, real)) == values).all()
+    assert started
+
+
 def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(batching, monkeypatch):
     import warp as wp
 

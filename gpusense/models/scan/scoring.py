@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -97,7 +97,7 @@ class ResidentPoses:
         if kept is None:
             # The map's table or a buffer is new.
             placed, state = pipeline.place(self._request.poses, (0, self._request.poses.count), space)
-            kept = placed._replace(space=None), state, RecordedProgram(pipeline.backend, placed.launches())
+            kept = placed._replace(space=cast(Any, None)), state, RecordedProgram(pipeline.backend, placed.launches())
             space.keep(self._key, kept, state.version)
         placed, state, placing = kept
         scoring = pipeline.scoring(readings, placed._replace(space=space), state.table, self._log_p, space)

@@ -1,6 +1,7 @@
 """Compute empty rectangles of a map on a device for the exact caster, and refresh them after changes.
 
-Processors run few long work-items, one per row. GPUs run one work-item per cell, on bits that the host packs.
+Processors run few long work-items, one per row. GPUs run a work-item for each sector of 64
+cells of a column, on bits that the host packs.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ _NO_FLAGS: frozenset[str] = frozenset()
 # The kernel file ``rectangles`` has the same numbers.
 RECTANGLE_REACH = 254
 _STACK = 1024
+_TALL = 64
 # Rows of a group.
 ROWS = 8
 # Largest maps on GPUs with planes of single rows, and with four sectors [cells].
@@ -154,7 +156,7 @@ def _make(
         columns: The first column of runs and the one after the last.
         worlds: Number of worlds.
     """
-    rows, cols, _, _, band, top, left, bottom, right = changed_part
+    rows, cols, sectors, _, band, top, left, bottom, right = changed_part
     begin, end = columns
     runs = space.empty("runs", 2 * band * cols * worlds, _BYTE)
     if backend.info.kind == "cpu":
@@ -169,6 +171,7 @@ def _make(
         return
     words, lines = -(-cols // 32), band * worlds
     backend.compile("free_rows", _NO_FLAGS)((end - begin, lines), marked, runs, lines, cols, words, begin, end)
-    size = (min(right - left + RECTANGLE_REACH, cols), min(bottom - top + RECTANGLE_REACH, rows), 4 * worlds)
+    tiles = -(-min(bottom - top + RECTANGLE_REACH, rows) // _TALL)
+    size = (min(right - left + RECTANGLE_REACH, cols), tiles * sectors, 4 * worlds)
     scan = backend.compile("rectangles_scan", _NO_FLAGS)
     scan(size, runs, place, rectangles, *changed_part, worlds, planes.lines(rows), planes.group)

@@ -22,6 +22,8 @@
 #define RECTANGLE_REACH 254
 // Capacity of the stack of columns that may bound a rectangle.
 #define STACK 256
+// Cells of a column that a work-item of a GPU takes.
+#define TALL 64
 
 // Return the index of a cell in a padded plane.
 int padded(const int row, const int col, const int cols) { return (row + 1) * (cols + 2) + col + 1; }
@@ -114,41 +116,46 @@ kernel void free_rows(ARGUMENTS) {
     runs[(long)band * cols + cell] = (uchar)min(left, LONGEST);
 }
 
-// Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a cell and
-// quadrant; the first work-item of a quadrant takes the first of its cells.
+// Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a sector of TALL
+// cells of a column in a quadrant, from the far end on. height and width are the sides of the highest rectangle of
+// sufficient width, narrower is the width of a rectangle that is one row higher, and bound is the number of rows to the
+// nearest row with this width. From one cell to the next the height grows by one at most, and its rows without the new
+// row allow every smaller height. So the next cell's sides need no other row, unless the row that bounds the width has
+// left the rectangle.
 kernel void rectangles_scan(ARGUMENTS) {
     const int quadrant = get_global_id(2) & 3, w = get_global_id(2) >> 2;
     const int dx = quadrant & 1 ? -1 : 1, dy = quadrant & 2 ? -1 : 1;
-    const int col = reach_begin(dx, left) + get_global_id(0), row = reach_begin(dy, top) + get_global_id(1);
-    if (col >= reach_end(dx, right, cols) || row >= reach_end(dy, bottom, rows) || w >= worlds) return;
-    global const uchar *run =
-        runs + (long)(quadrant & 1) * band * worlds * cols + ((long)(row - first) * worlds + w) * cols + col;
-    const long plane = (long)lines * (cols + 2);
-    global ushort *out = rectangles + (long)place[w] * 4 * sectors + quadrant * sectors * plane;
-    out += padded_in_groups(row, col, cols, group);
-    const int room = min(dy > 0 ? rows - row : row + 1, LONGEST);
+    const int sector = get_global_id(1) % sectors, tile = get_global_id(1) / sectors;
+    const int col = reach_begin(dx, left) + get_global_id(0), begin = reach_begin(dy, top) + TALL * tile;
+    const int end = min(begin + TALL, reach_end(dy, bottom, rows));
+    if (col >= reach_end(dx, right, cols) || w >= worlds) return;
+    global const uchar *column = runs + ((long)(quadrant & 1) * band * worlds + w) * cols + col;
+    global ushort *out = rectangles + (long)place[w] * 4 * sectors;
+    out += (long)(quadrant * sectors + sector) * lines * (cols + 2);
+    const int2 middle = slope(sectors, sector);
     const long step = (long)dy * worlds * cols;
-    int width = LONGEST, sector = 0, height = 1;
-    int2 middle = slope(sectors, 0);
-    while (sector < sectors) {
-        // While no sector can end, read four rows between two decisions, so that reads do not wait for each other.
-        if (height + 3 <= room) {
-            global const uchar *next = run + (height - 1) * step;
-            const int four = min(min((int)next[0], (int)next[step]), min((int)next[2 * step], (int)next[3 * step]));
-            if (min(width, four) * middle.x >= (height + 3) * middle.y) {
-                width = min(width, four);
-                height += 4;
-                continue;
+    int height = 0, width = LONGEST, narrower = 0, bound = 0;
+    for (int i = 0; i < end - begin; ++i) {
+        const int row = dy > 0 ? end - 1 - i : begin + i, room = min(dy > 0 ? rows - row : row + 1, LONGEST);
+        global const uchar *run = column + (long)(row - first) * worlds * cols;
+        const int here = run[0], least = min(here, width), higher = height < room && least * middle.x >= (height + 1) * middle.y;
+        bound = here <= width ? 0 : bound + 1;
+        if (i > 0 && (higher || here <= width || bound < height)) {
+            height = higher ? height + 1 : min(height, here * middle.x / middle.y);
+            narrower = height == room ? 0 : higher ? min(here, narrower) : least;
+            width = height > 0 ? least : LONGEST;
+        } else {
+            height = 0, width = LONGEST, bound = 0;
+            for (;;) {
+                narrower = height < room ? min(width, (int)run[height * step]) : 0;
+                if (narrower * middle.x < (height + 1) * middle.y) break;
+                bound = narrower < width ? height : bound;
+                width = narrower;
+                ++height;
             }
         }
-        const int narrower = height > room ? 0 : min(width, (int)run[(height - 1) * step]);
-        while (sector < sectors && narrower * middle.x < height * middle.y) {
-            const int higher = narrower * middle.x > (height - 1) * middle.y;
-            const int sides = higher ? narrower + 256 * height : height > 1 ? width + 256 * (height - 1) : OCCUPIED;
-            out[sector * plane] = (ushort)sides;
-            middle = slope(sectors, ++sector);
-        }
-        width = narrower;
-        ++height;
+        const int best = narrower * middle.x > height * middle.y;
+        const int sides = best ? narrower + 256 * (height + 1) : height > 0 ? width + 256 * height : OCCUPIED;
+        out[padded_in_groups(row, col, cols, group)] = (ushort)sides;
     }
 }

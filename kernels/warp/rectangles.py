@@ -31,6 +31,8 @@ OCCUPIED = wp.constant(1)
 RECTANGLE_REACH = wp.constant(254)
 # Capacity of the stack of columns that may bound a rectangle.
 STACK = wp.constant(256)
+# Cells of a column that a work-item of a GPU takes.
+TALL = wp.constant(64)
 behind_of = behind(wp.uint16)
 
 
@@ -181,50 +183,68 @@ def rectangles_scan(
 ):  # fmt: skip
     """Find the rectangles along columns: the higher a rectangle, the narrower.
 
-    For GPUs: one work-item takes a cell and quadrant; the first work-item of a quadrant takes the first of its cells.
+    For GPUs: one work-item takes a sector of TALL cells of a column in a quadrant, from the far end on. height and
+    width are the sides of the highest rectangle of sufficient width, narrower is the width of a rectangle that is one
+    row higher, and bound is the number of rows to the nearest row with this width. From one cell to the next the height
+    grows by one at most, and its rows without the new row allow every smaller height. So the next cell's sides need no
+    other row, unless the row that bounds the width has left the rectangle.
     """
-    way, row_item, col_item = wp.tid()
+    way, tile_item, col_item = wp.tid()
     quadrant = way & 3
     w = way >> 2
     dx = wp.where((quadrant & 1) != 0, -1, 1)
     dy = wp.where((quadrant & 2) != 0, -1, 1)
+    sector = tile_item % sectors
     col = reach_begin(dx, left) + col_item
-    row = reach_begin(dy, top) + row_item
-    if col >= reach_end(dx, right, cols) or row >= reach_end(dy, bottom, rows) or w >= worlds:
+    begin = reach_begin(dy, top) + TALL * (tile_item // sectors)
+    end = wp.min(begin + TALL, reach_end(dy, bottom, rows))
+    if col >= reach_end(dx, right, cols) or w >= worlds:
         return
     planes = behind_of(rectangles, wp.int64(place[w]) * wp.int64(4 * sectors))
-    run = (quadrant & 1) * band * worlds * cols + ((row - first) * worlds + w) * cols + col
-    plane = lines * (cols + 2)
-    out = quadrant * sectors * plane + padded_in_groups(row, col, cols, group)
-    room = wp.min(wp.where(dy > 0, rows - row, row + 1), LONGEST)
-    width = int(LONGEST)
-    height = int(1)
-    sector = int(0)
-    middle = slope(sectors, 0)
+    column = ((quadrant & 1) * band * worlds + w) * cols + col
+    out = (quadrant * sectors + sector) * lines * (cols + 2)
+    middle = slope(sectors, sector)
     step = dy * worlds * cols
-    while sector < sectors:
-        # While no sector can end, read four rows between two decisions, so that reads do not wait for each other.
-        if height + 3 <= room:
-            first_of = run + (height - 1) * step
-            a = wp.min(int(runs[first_of]), int(runs[first_of + step]))
-            b = wp.min(int(runs[first_of + 2 * step]), int(runs[first_of + 3 * step]))
-            four = wp.min(width, wp.min(a, b))
-            if four * middle[0] >= (height + 3) * middle[1]:
-                width = four
-                height += 4
-                continue
-        narrower = int(0)
-        if height <= room:
-            narrower = wp.min(width, int(runs[run + (height - 1) * step]))
-        while sector < sectors and narrower * middle[0] < height * middle[1]:
-            sides = wp.where(height > 1, width + 256 * (height - 1), OCCUPIED)
-            if narrower * middle[0] > (height - 1) * middle[1]:
-                sides = narrower + 256 * height
-            planes[out + sector * plane] = wp.uint16(sides)
-            sector += 1
-            middle = slope(sectors, sector)
-        width = narrower
-        height += 1
+    height = int(0)
+    width = int(LONGEST)
+    narrower = int(0)
+    bound = int(0)
+    for i in range(end - begin):
+        row = wp.where(dy > 0, end - 1 - i, begin + i)
+        room = wp.min(wp.where(dy > 0, rows - row, row + 1), LONGEST)
+        run = column + (row - first) * worlds * cols
+        here = int(runs[run])
+        least = wp.min(here, width)
+        higher = height < room and least * middle[0] >= (height + 1) * middle[1]
+        bound = wp.where(here <= width, 0, bound + 1)
+        if i > 0 and (higher or here <= width or bound < height):
+            if higher:
+                height += 1
+                narrower = wp.min(here, narrower)
+            else:
+                height = wp.min(height, here * middle[0] // middle[1])
+                narrower = least
+            if height == room:
+                narrower = int(0)
+            width = wp.where(height > 0, least, LONGEST)
+        else:
+            height = int(0)
+            width = int(LONGEST)
+            bound = int(0)
+            fits = bool(True)
+            while fits:
+                narrower = int(0)
+                if height < room:
+                    narrower = wp.min(width, int(runs[run + height * step]))
+                fits = narrower * middle[0] >= (height + 1) * middle[1]
+                if fits:
+                    bound = wp.where(narrower < width, height, bound)
+                    width = narrower
+                    height += 1
+        sides = wp.where(height > 0, width + 256 * height, OCCUPIED)
+        if narrower * middle[0] > height * middle[1]:
+            sides = narrower + 256 * (height + 1)
+        planes[out + padded_in_groups(row, col, cols, group)] = wp.uint16(sides)
 
 
 def make(name, flags):

@@ -43,7 +43,7 @@ KERNELS: dict[str, Kernel] = {
         "int words", "int begin", "int end",
     ),
     "rectangles_scan": kernel(
-        "rectangles", "col row quadrant", "uchar runs [2 * band * cols * worlds]", "int place [worlds]",
+        "rectangles", "col tile quadrant", "uchar runs [2 * band * cols * worlds]", "int place [worlds]",
         "out ushort rectangles [4 * sectors * lines * (cols + 2)]", *_CHANGED, "int lines", "int group",
     ),
     "fill_lookup": kernel(

@@ -37,13 +37,15 @@ def stops_beam(cell: np.ndarray, threshold: int, unknown: int) -> np.ndarray:
 
 def mark_obstacles(
     flags: frozenset[str], store: np.ndarray, place: np.ndarray, occupied: np.ndarray, bits: np.ndarray, rows: int,
-    cols: int, worlds: int, words: int, margin: int, threshold: int, unknown: int,
+    cols: int, worlds: int, words: int, margin: int, threshold: int, unknown: int, as_bits: int,
 ) -> None:  # fmt: skip
-    """Mark the obstacles of worlds as bytes and as bits, with a margin of obstacles around each world."""
+    """Mark the obstacles of worlds as bytes or as bits, with a margin of obstacles around each world."""
     cells = np.stack([store[place[w] : place[w] + rows * cols].reshape(rows, cols) for w in range(worlds)], axis=1)
     ring = ((margin, margin), (0, 0), (margin, margin))
     marked = np.pad(stops_beam(cells, threshold, unknown), ring, constant_values=True)
-    occupied[: marked.size] = marked.reshape(-1)
+    if not as_bits:
+        occupied[: marked.size] = marked.reshape(-1)
+        return
     packed = np.zeros((rows + 2 * margin, worlds, 4 * words), np.uint8)
     packed[:, :, : -(-marked.shape[2] // 8)] = np.packbits(marked, axis=2, bitorder="little")
     bits[: packed.size // 4] = packed.reshape(-1).view("<i4")

@@ -41,46 +41,37 @@ def squared_distances(backend: Backend, obstacles: np.ndarray, most: int = NO_OB
         raise ValueError(
             f"grid: the part in use must have at most {LONGEST_SIDE} rows and columns, got {rows} x {cols}"
         )
-    squared = backend.empty(rows * cols, _INT)
-    (_by_lines if backend.info.kind == "cpu" else _by_cells)(backend, obstacles, squared, most)
+    marked = backend.upload((as_bytes if backend.info.kind == "cpu" else packed)(obstacles))
+    squared = squared_of_stack(backend, Workspace(backend), marked, (rows, cols), 1, most)
     backend.synchronize()
     return squared
 
 
-def _by_lines(backend: Backend, obstacles: np.ndarray, squared: Buffer, most: int) -> None:
-    """Run one work-item per line: first columns, then rows, contiguous in memory."""
-    rows, cols = obstacles.shape
-    occupied = backend.upload(as_bytes(obstacles))
-    along, starts = (backend.empty(rows * cols, _INT) for _ in range(2))
-    backend.compile("distance_lines", _NO_FLAGS)((cols,), occupied, along, cols, rows, 1, cols)
-    backend.compile("distance_envelope", _NO_FLAGS)((rows,), along, starts, squared, rows, cols, cols, 1)
+def squared_of_stack(
+    backend: Backend, space: Workspace, marked: Buffer, shape: tuple[int, int], worlds: int, most: int = NO_OBSTACLE
+) -> Buffer:
+    """Start computing squared distances [cells^2] in several maps of one size, whose rows are interleaved.
 
-
-def squared_of_stack(backend: Backend, space: Workspace, occupied: Buffer, rows: int, cols: int, worlds: int) -> Buffer:
-    """Start computing squared distances [cells^2] in several maps of one size with interleaved rows.
+    ``marked``: obstacles as bytes on a processor, else as bits; ``most``: see ``squared_distances``.
 
     Returns:
         (rows, worlds, cols) int32.
     """
-    count, width = rows * worlds * cols, worlds * cols
-    along, starts, squared = (space.empty(name, count, _INT) for name in ("along", "starts", "squared"))
-    backend.compile("distance_lines", _NO_FLAGS)((width,), occupied, along, width, rows, 1, width)
-    envelope = backend.compile("distance_envelope", _NO_FLAGS)
-    envelope((rows * worlds,), along, starts, squared, rows * worlds, cols, cols, 1)
+    (rows, cols), compiled = shape, lambda name: backend.compile(name, _NO_FLAGS)
+    # Along columns, the columns of all maps are those of one map.
+    lines, width = rows * worlds, worlds * cols
+    squared = space.empty("squared", rows * width, _INT)
+    if backend.info.kind == "cpu":
+        along, starts = (space.empty(name, rows * width, _INT) for name in ("along", "starts"))
+        compiled("distance_lines")((width,), marked, along, width, rows, 1, width)
+        compiled("distance_envelope")((lines,), along, starts, squared, lines, cols, cols, 1)
+        return squared
+    words, blocks, reach = -(-cols // 32), -(-rows // _BLOCK_ROWS), min(math.isqrt(most), LONGEST_SIDE)
+    nearest, least = space.empty("nearest", rows * width, _SHORT), space.empty("least", blocks * width, _SHORT)
+    compiled("distance_bits")((cols, lines), marked, nearest, lines, cols, words, reach)
+    compiled("distance_blocks")((width, blocks), nearest, least, rows, width, blocks)
+    compiled("distance_search")((width, rows), nearest, least, squared, rows, width, blocks, most)
     return squared
-
-
-def _by_cells(backend: Backend, obstacles: np.ndarray, squared: Buffer, most: int) -> None:
-    """Run one work-item per cell."""
-    rows, cols = obstacles.shape
-    words, blocks = -(-cols // 32), -(-rows // _BLOCK_ROWS)
-    bits = backend.upload(packed(obstacles))
-    nearest, least = backend.empty(rows * cols, _SHORT), backend.empty(blocks * cols, _SHORT)
-    reach = min(math.isqrt(most), LONGEST_SIDE)
-    backend.compile("distance_bits", _NO_FLAGS)((cols, rows), bits, nearest, rows, cols, words, reach)
-    backend.compile("distance_blocks", _NO_FLAGS)((cols, blocks), nearest, least, rows, cols, blocks)
-    search = backend.compile("distance_search", _NO_FLAGS)
-    search((cols, rows), nearest, least, squared, rows, cols, blocks, most)
 
 
 def distance_transform(

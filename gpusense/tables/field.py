@@ -101,9 +101,8 @@ class FieldTable:
                 rule = f"must be at most {math.isqrt(_LONGEST_DENSITY) - 1} cells in Worlds of this size"
                 raise ValueError(f"max_distance: {rule}, got {self._parameters.max_distance} m")
             backend, cap = worlds.backend, len(density) - 1
-            occupied, _ = worlds.marked(stack, unknown, margin)
-            rows, cols = stack.rows + 2 * margin, stack.cols + 2 * margin
-            squared = squared_of_stack(backend, stack.space, occupied, rows, cols, stack.worlds)
+            marked, shape = worlds.marked(stack, unknown, margin)
+            squared = squared_of_stack(backend, stack.space, marked, shape, stack.worlds, cap - 1)
             size = (stack.cols + 2 * RING, (stack.rows + 2 * RING) * stack.worlds)
             backend.run((
                 launch(

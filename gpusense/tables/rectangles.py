@@ -1,7 +1,7 @@
 """Compute empty rectangles of a map on a device for the exact caster, and refresh them after changes.
 
-Processors run few long work-items, one per row. GPUs run a work-item for each sector of 64
-cells of a column, on bits that the host packs.
+Processors run few long work-items, one per row. GPUs run a work-item for each sector of 64 cells of a column, on bits
+that the host packs.
 """
 
 from __future__ import annotations
@@ -100,10 +100,7 @@ def empty_rectangles(
     band = len(near)
     space, place = Workspace(backend), backend.empty(1, _INT, zero=True)
     changed_part = (rows, cols, planes.sectors, first, band, top, left, bottom, right)
-    if backend.info.kind == "cpu":
-        marked = backend.upload(as_bytes(near))
-    else:
-        marked = backend.upload(packed(near))
+    marked = backend.upload((as_bytes if backend.info.kind == "cpu" else packed)(near))
     _make(backend, space, marked, place, rectangles, planes, changed_part, (begin, end), 1)
     backend.synchronize()
     return rectangles
@@ -120,9 +117,8 @@ def rectangles_of_worlds(worlds: Worlds, unknown: str) -> tuple[Table, frozenset
     planes = Planes(sectors, chosen.group)
 
     def fill(stack: Stack, table: Buffer) -> None:
-        occupied, bits = worlds.marked(stack, unknown)
+        marked, _ = worlds.marked(stack, unknown)
         whole = (stack.rows, stack.cols, planes.sectors, 0, stack.rows, 0, 0, stack.rows, stack.cols)
-        marked = occupied if backend.info.kind == "cpu" else bits
         _make(backend, stack.space, marked, stack.place, table, planes, whole, (0, stack.cols), stack.worlds)
 
     def make() -> Table:

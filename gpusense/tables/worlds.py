@@ -341,27 +341,30 @@ class Worlds:
 
     def stacks(self, indices: np.ndarray) -> Iterator[Stack]:
         """Yield stacks of worlds of one size, of as many cells as are made at once."""
-        sizes, groups = np.unique(self._sizes[indices], axis=0, return_inverse=True)
-        for number, (rows, cols) in enumerate(sizes.tolist()):
-            members = indices[groups.reshape(-1) == number]
+        sizes = self._sizes[indices]
+        for rows, cols in sorted(set(map(tuple, sizes.tolist()))):
+            members = indices[(sizes == (rows, cols)).all(axis=1)]
             each = max(_TOGETHER[self.backend.info.kind] // (rows * cols), 1)
             for first in range(0, len(members), each):
                 part = members[first : first + each]
                 place = self.backend.upload(self._place[part])
                 yield Stack(part, rows, cols, place, self.space)
 
-    def marked(self, stack: Stack, unknown: str, margin: int = 0) -> tuple[Buffer, Buffer]:
-        """Return the obstacles of a stack as bytes and as bits, with a margin of obstacles around each world."""
-        rows, cols = stack.rows + 2 * margin, stack.cols + 2 * margin
+    def marked(self, stack: Stack, unknown: str, margin: int = 0) -> tuple[Buffer, tuple[int, int]]:
+        """Return the obstacles of a stack, with a margin of obstacles around each world, and the size of each.
+
+        They are bytes on a processor, else bits.
+        """
+        rows, cols, as_bits = stack.rows + 2 * margin, stack.cols + 2 * margin, self.device.kind == "gpu"
         lines, words = rows * stack.worlds, -(-cols // 32)
-        occupied = stack.space.empty("occupied", lines * cols, _BYTE)
-        bits = stack.space.empty("bits", lines * words, _INT)
+        occupied = stack.space.empty("occupied", 1 if as_bits else lines * cols, _BYTE)
+        bits = stack.space.empty("bits", lines * words if as_bits else 1, _INT)
         self._run(
             "mark_obstacles", (words, lines), store=self.store, place=stack.place, occupied=occupied, bits=bits,
             rows=stack.rows, cols=stack.cols, worlds=stack.worlds, words=words, margin=margin,
-            threshold=self.threshold, unknown=int(unknown == "occupied"),
+            threshold=self.threshold, unknown=int(unknown == "occupied"), as_bits=int(as_bits),
         )  # fmt: skip
-        return occupied, bits
+        return bits if as_bits else occupied, (rows, cols)
 
     def put(self, index: int, table: Buffer, numbers: np.ndarray, each: int) -> None:
         """Copy numbers from host memory to a world's part of a table with ``each`` numbers of a cell."""
@@ -393,7 +396,8 @@ class Worlds:
                 "put_cells", (count, len(part)), cells=cells, place=place, store=self.store, count=count,
                 worlds=len(part),
             )  # fmt: skip
-            self.backend.synchronize()
+            if first + step < len(indices):
+                self.backend.synchronize()
 
     def _run(self, kernel: str, size: tuple[int, ...], **arguments: Any) -> None:
         self.backend.run((launch(kernel, _NO_FLAGS, size, **arguments),))

@@ -138,7 +138,8 @@ kernel void rectangles_scan(ARGUMENTS) {
     for (int i = 0; i < end - begin; ++i) {
         const int row = dy > 0 ? end - 1 - i : begin + i, room = min(dy > 0 ? rows - row : row + 1, LONGEST);
         global const uchar *run = column + (long)(row - first) * worlds * cols;
-        const int here = run[0], least = min(here, width), higher = height < room && least * middle.x >= (height + 1) * middle.y;
+        const int here = run[0], least = min(here, width);
+        const int higher = height < room && least * middle.x >= (height + 1) * middle.y;
         bound = here <= width ? 0 : bound + 1;
         if (i > 0 && (higher || here <= width || bound < height)) {
             height = higher ? height + 1 : min(height, here * middle.x / middle.y);

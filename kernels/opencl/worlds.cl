@@ -23,8 +23,8 @@ int stops_beam(const int cell, const int threshold, const int unknown) {
     return cell > MOST_KNOWN ? unknown : cell >= threshold;
 }
 
-// Mark the obstacles of worlds as bytes and as bits, with a margin of obstacles around each world. One work-item takes
-// 32 cells of a line.
+// Mark the obstacles of worlds as bytes or as bits, with a margin of obstacles around each world. One work-item takes 32
+// cells of a line.
 kernel void mark_obstacles(ARGUMENTS) {
     const int word = get_global_id(0), line = get_global_id(1), width = cols + 2 * margin;
     if (word >= words || line >= (rows + 2 * margin) * worlds) return;
@@ -34,10 +34,10 @@ kernel void mark_obstacles(ARGUMENTS) {
         const int col = 32 * word + i - margin;
         const int inside = col >= 0 && col < cols && row >= 0 && row < rows;
         const int stops = inside ? stops_beam(store[place[w] + (long)row * cols + col], threshold, unknown) : 1;
-        occupied[(long)line * width + 32 * word + i] = (uchar)stops;
+        if (!as_bits) occupied[(long)line * width + 32 * word + i] = (uchar)stops;
         marked |= (uint)stops << i;
     }
-    bits[(long)line * words + word] = (int)marked;
+    if (as_bits) bits[(long)line * words + word] = (int)marked;
 }
 
 // Fill the likelihood fields of worlds from squared distances, which include a margin. One work-item takes a cell.

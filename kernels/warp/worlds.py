@@ -40,8 +40,8 @@ def stops_beam(cell: wp.int32, threshold: wp.int32, unknown: wp.int32):
 
 
 @kernel()
-def mark_obstacles(store, place, occupied, bits, rows, cols, worlds, words, margin, threshold, unknown):
-    """Mark the obstacles of worlds as bytes and as bits, with a margin of obstacles around each world.
+def mark_obstacles(store, place, occupied, bits, rows, cols, worlds, words, margin, threshold, unknown, as_bits):
+    """Mark the obstacles of worlds as bytes or as bits, with a margin of obstacles around each world.
 
     One work-item takes 32 cells of a line.
     """
@@ -57,9 +57,11 @@ def mark_obstacles(store, place, occupied, bits, rows, cols, worlds, words, marg
         stops = int(1)
         if col >= 0 and col < cols and row >= 0 and row < rows:
             stops = stops_beam(int(store[place[w] + row * cols + col]), threshold, unknown)
-        occupied[line * width + 32 * word + i] = wp.uint8(stops)
+        if as_bits == 0:
+            occupied[line * width + 32 * word + i] = wp.uint8(stops)
         marked = marked | (wp.uint32(stops) << wp.uint32(i))
-    bits[line * words + word] = wp.int32(marked)
+    if as_bits != 0:
+        bits[line * words + word] = wp.int32(marked)
 
 
 @functools.cache

@@ -16,7 +16,7 @@ KERNELS: dict[str, Kernel] = {
     ),
     "mark_obstacles": kernel(
         "worlds", "word line", "uchar store [map]", _PLACE, "out uchar occupied [map]", "out int bits [map]", *_SIZE,
-        "int words", "int margin", *_RULES,
+        "int words", "int margin", *_RULES, "int as_bits",
     ),
     "fill_worlds": kernel(
         "worlds", "col line", "int squared [map]", "real density [cap + 1]", _PLACE, "out real table [map]", *_SIZE,

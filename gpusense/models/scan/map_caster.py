@@ -20,9 +20,9 @@ from gpusense.interface.plan import Omission
 from gpusense.interface.structs import RangeScale
 from gpusense.models.chunking import Piece, chunk_of, finish, run_pieces
 from gpusense.models.poses import Frame, PlacedPoses, Poses, place
+from gpusense.models.scan import tiles
 from gpusense.models.scan.cones import LASER, Cones
 from gpusense.models.scan.sampling import Drawing
-from gpusense.models.scan.tiles import Order, order_of, tiles_of
 from gpusense.tables import casters
 from gpusense.tables.caster_base import Caster, CasterInput
 from gpusense.tables.lookup_files import describe, write_lookup
@@ -280,7 +280,7 @@ class MapCaster:
         changing |= placed.changing()
         gpu = self.backend.info.kind == "gpu" and "CONES" not in flags
         # Each run uploads the order's initial bounds.
-        order = order_of(self._workspace, placed, rays, self.real) if gpu else None
+        order = tiles.order_of(self._workspace, placed, rays, self.real) if gpu else None
         self._workspace.run(
             (flags, placed.key, rays, cones), changing,
             lambda: (*placed.launches(), *self._program(placed, state.table, ray, rays, cones, flags, changing, order)),
@@ -289,7 +289,7 @@ class MapCaster:
 
     def _program(
         self, placed: PlacedPoses, table: Buffer, ray: Buffer, rays: int, cones: Cones, flags: frozenset[str],
-        results: dict[str, Buffer], order: Order | None,
+        results: dict[str, Buffer], order: tiles.Order | None,
     ) -> Program:  # fmt: skip
         """Return the launches that cast the rays of placed poses."""
         count, ranges = placed.count, results["ranges"]
@@ -302,9 +302,9 @@ class MapCaster:
             heard = dict(normals=results["normals"], incidence=results["incidence"], cone=cones.struct)
             return (launch("cast_echoes", flags, (rays, count), **common, **heard),)
         flags -= {"COSINES"}
-        if self.backend.info.kind == "gpu":
+        if self.backend.info.kind == "gpu" and not (self._worlds is not None and rays >= tiles.LEAST_OF_ONE_POSE):
             flags |= flags_if(ORDERED=order is not None)
-            items, spread = tiles_of(count, rays)
+            items, spread = tiles.tiles_of(count, rays)
             if order is None:
                 return (launch("cast_tiles", flags, (items,), **common, spread=spread),)
             return (

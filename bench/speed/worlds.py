@@ -1,15 +1,17 @@
 """Compare rays in many worlds at once with rays in one map; measure moving shapes and replaced worlds.
 
     python bench/speed/worlds.py --backend opencl --worlds 64,1024
-    python bench/speed/worlds.py --backend warp:cuda:0 --worlds 256,1024,4096,8192 --shapes 64
+    python bench/speed/worlds.py --backend warp:cuda:0 --worlds 256,1024,4096,8192 --shapes 64 --kernels
 
-Every world is a room of 256 x 256 cells with boxes in it, each with 16 robots of 360 beams. One map has as many robots
-and as many cells as the largest number of worlds, up to 4096 x 4096. Rates are of whole calls with poses and indices in
-host memory, on CUDA on the device.
+Every world is a room of 256 x 256 cells with boxes in it, each with 16 robots of 360 beams. A single map has as many
+robots as the largest number of worlds, and either the size of a room or as many cells as all rooms, up to 4096 x 4096.
+Rates are of whole calls with poses and indices in host memory, on CUDA on the device. --kernels adds the time of each
+launch by the device's clock, and --tiles casts rays of worlds in tiles of poses and rays, as rays of one map.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 from collections.abc import Callable
@@ -20,14 +22,26 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import get_backend
+from gpusense.models.scan import tiles
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import add_repeats, make_parser, note, parse, publish, table
+from common import Recorder, add_repeats, make_parser, note, parse, publish, table
+from launches import least_by_events
 
 SIDE, ROBOTS, RESOLUTION, RANGE_MAX = 256, 16, 0.05, 10.0
 BEARINGS = np.linspace(-np.pi, np.pi, 360, endpoint=False)
-COLUMNS = ("worlds", "shapes", "M rays/s", "of one map", "made [ms]", "replaced [ms]", "bytes a cell")
+COLUMNS = (
+    "worlds",
+    "shapes",
+    "M rays/s",
+    "of one room",
+    "of one map",
+    "made [ms]",
+    "replaced [ms]",
+    "bytes a cell",
+    "launches",
+)
 
 
 def rooms(count: int, rng: np.random.Generator, side: int = SIDE) -> np.ndarray:
@@ -86,49 +100,72 @@ def shapes_of(worlds: int, count: int, rng: np.random.Generator) -> gs.Shapes:
     return gs.Shapes(discs=discs, boxes=boxes, segments=np.concatenate([begin, begin + 0.5], axis=2))
 
 
-def measure(name: str, numbers: list[int], shapes: int, repeats: int, seconds: float) -> list[dict[str, Any]]:
-    """Measure one map, then each number of worlds."""
-    backend, rng, rows = get_backend(name), np.random.default_rng(0), []
-    most = max(numbers)
-    side = min(SIDE * int(np.sqrt(most)), 4096)
-    few = min(most, 4096)
-    grid = gs.OccupancyGrid(rooms(1, rng, side)[0], RESOLUTION)
-    caster = gs.RayCaster(grid, RANGE_MAX, backend=backend)
-    (poses,) = on_device(backend, poses_in(few, rng, side))
-    one = len(poses) * len(BEARINGS) / least(lambda: caster.cast(poses, BEARINGS), backend, repeats, seconds)
-    rows.append(dict(worlds=1, shapes=0, rate=one, ratio=1.0, made=None, replaced=None, bytes=None))
-    note(f"one map of {side} x {side}: {one / 1e6:.0f} M rays/s")
+def rate_of_one(backend: Any, side: int, worlds: int, repeats: int, seconds: float) -> float:
+    """Return the rate of the robots of some worlds in a single map [rays/s]."""
+    rng = np.random.default_rng(0)
+    caster = gs.RayCaster(gs.OccupancyGrid(rooms(1, rng, side)[0], RESOLUTION), RANGE_MAX, backend=backend)
+    (poses,) = on_device(backend, poses_in(worlds, rng, side))
+    rate = len(poses) * len(BEARINGS) / least(lambda: caster.cast(poses, BEARINGS), backend, repeats, seconds)
+    note(f"one map of {side} x {side}: {rate / 1e6:.0f} M rays/s")
+    return rate
+
+
+def timed(recorder: Any, run: Callable[[], Any]) -> str:
+    """Return the least time of each launch of a call by the device's clock, where a recorder records launches."""
+    if not isinstance(recorder, Recorder):
+        return ""
+    each = least_by_events(recorder.watched, recorder.launches_of(run), 5)
+    return "; ".join(f"{name} {seconds * 1e6:.0f} us" for name, seconds in each)
+
+
+def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """Measure single maps, then each number of worlds."""
+    backend, rng, rows = get_backend(arguments.backend), np.random.default_rng(0), []
+    numbers = [int(number) for number in arguments.worlds.split(",")]
+    repeats, seconds, few = arguments.repeats, arguments.seconds, min(max(numbers), 4096)
+    room = rate_of_one(backend, SIDE, few, repeats, seconds)
+    one = rate_of_one(backend, min(SIDE * int(np.sqrt(max(numbers))), 4096), few, repeats, seconds)
     for count in numbers:
+        recorder = Recorder(backend) if arguments.kernels else backend
         kinds = rooms(min(count, 256), rng)
         cells = np.resize(kinds, (count, SIDE, SIDE))
         begin = time.perf_counter()
-        worlds = gs.Worlds(cells, RESOLUTION, backend=backend)
-        in_worlds = gs.RayCaster(worlds, RANGE_MAX, backend=backend)
+        worlds = gs.Worlds(cells, RESOLUTION, backend=recorder)
+        caster = gs.RayCaster(worlds, RANGE_MAX, backend=recorder)
         index = np.arange(count, dtype=np.int32).repeat(ROBOTS)
         poses, where = on_device(backend, poses_in(count, rng), index)
-        in_worlds.cast(poses, BEARINGS, world=where)
-        backend.synchronize()
-        made = time.perf_counter() - begin
-        rays = count * ROBOTS * len(BEARINGS)
+        (new,) = on_device(backend, kinds)
 
-        def cast(caster: Any = in_worlds, poses: Any = poses, where: Any = where) -> None:
+        def cast(caster: Any = caster, poses: Any = poses, where: Any = where) -> None:
             caster.cast(poses, BEARINGS, world=where)
 
-        rate = rays / least(cast, backend, repeats, seconds)
-        changed = np.arange(min(256, count))
-        (new,) = on_device(backend, kinds[: len(changed)])
-        replaced = least(lambda w=worlds, c=changed, n=new: w.replace(c, n), backend, repeats, seconds)
-        row = dict(worlds=count, shapes=0, rate=rate, ratio=rate / one, made=made, replaced=replaced,
-                   bytes=worlds.nbytes / (count * SIDE * SIDE))  # fmt: skip
-        rows.append(row)
-        note(f"{count} worlds: {rate / 1e6:.0f} M rays/s, {row['ratio']:.2f} of one map, {1e3 * replaced:.2f} ms")
-        if shapes:
-            worlds.shapes = shapes_of(count, shapes, rng)
-            with_shapes = rays / least(cast, backend, repeats, seconds)
-            rows.append({**row, "shapes": shapes, "rate": with_shapes, "ratio": with_shapes / one})
-            note(f"{count} worlds, {shapes} shapes each: {with_shapes / 1e6:.0f} M rays/s, {rate / with_shapes:.2f} x")
-        del worlds, in_worlds, cast
+        def replace(worlds: Any = worlds, changed: Any = np.arange(len(kinds)), new: Any = new) -> None:
+            worlds.replace(changed, new)
+
+        cast()
+        backend.synchronize()
+        made, rays = time.perf_counter() - begin, count * ROBOTS * len(BEARINGS)
+        for shapes in sorted({0, arguments.shapes}):
+            if shapes:
+                worlds.shapes = shapes_of(count, shapes, rng)
+            rate, replaced = rays / least(cast, backend, repeats, seconds), least(replace, backend, repeats, seconds)
+            rows.append(dict(
+                worlds=count, shapes=shapes, rate=rate, of_room=rate / room, of_map=rate / one, made=made,
+                replaced=replaced, bytes=worlds.nbytes / (count * SIDE * SIDE),
+                launches="; ".join(timed(recorder, run) for run in (cast, replace)),
+            ))  # fmt: skip
+            note(" | ".join(line_of(rows[-1])))
+        del worlds, caster, cast, replace
     return rows
+
+
+def line_of(row: dict[str, Any]) -> list[str]:
+    """Return the cells of a row."""
+    return [
+        str(row["worlds"]), str(row["shapes"]), f"{row['rate'] / 1e6:.0f}", f"{row['of_room']:.2f}",
+        f"{row['of_map']:.2f}", f"{1e3 * row['made']:.2f}", f"{1e3 * row['replaced']:.2f}", f"{row['bytes']:.1f}",
+        row["launches"],
+    ]  # fmt: skip
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -136,19 +173,14 @@ def main(argv: list[str] | None = None) -> None:
     parser = make_parser(__doc__, backend="opencl", seed=False)
     parser.add_argument("--worlds", default="64,1024", help="numbers of worlds, with commas (default: 64,1024)")
     parser.add_argument("--shapes", type=int, default=0, help="moving shapes of each world (default: 0)")
+    parser.add_argument("--kernels", action="store_true", help="measure each launch by the device's clock")
+    parser.add_argument("--tiles", action="store_true", help="cast rays of worlds in tiles of poses and rays")
     add_repeats(parser, 20, 5.0)
     arguments = parse(parser, argv)
-    numbers = [int(number) for number in arguments.worlds.split(",")]
-    rows = measure(arguments.backend, numbers, arguments.shapes, arguments.repeats, arguments.seconds)
-    lines = [
-        (
-            row["worlds"], row["shapes"], f"{row['rate'] / 1e6:.0f}", f"{row['ratio']:.2f}",
-            *(f"{1e3 * row[key]:.2f}" if row[key] is not None else "" for key in ("made", "replaced")),
-            f"{row['bytes']:.1f}" if row["bytes"] is not None else "",
-        )
-        for row in rows
-    ]  # fmt: skip
-    publish(__file__, arguments, table(COLUMNS, lines), {"rows": rows})
+    if arguments.tiles:
+        tiles.LEAST_OF_ONE_POSE = len(BEARINGS) + 1
+    rows = measure(arguments)
+    publish(__file__, arguments, table(COLUMNS, map(line_of, rows)), {"rows": rows})
 
 
 if __name__ == "__main__":

@@ -134,12 +134,12 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         caster = gs.RayCaster(worlds, RANGE_MAX, backend=recorder)
         index = np.arange(count, dtype=np.int32).repeat(ROBOTS)
         poses, where = on_device(backend, poses_in(count, rng), index)
-        (new,) = on_device(backend, kinds)
+        (new,), changed = on_device(backend, kinds), np.arange(len(kinds))
 
         def cast(caster: Any = caster, poses: Any = poses, where: Any = where) -> None:
             caster.cast(poses, BEARINGS, world=where)
 
-        def replace(worlds: Any = worlds, changed: Any = np.arange(len(kinds)), new: Any = new) -> None:
+        def replace(worlds: Any = worlds, new: Any = new, changed: Any = changed) -> None:
             worlds.replace(changed, new)
 
         cast()

@@ -18,8 +18,8 @@ _INT = np.dtype(np.int32)
 _UNBOUNDED = np.full(7, -(1 << 31), _INT)
 # Least particle-beams, and least particles, for which sorting saves more time than it takes.
 LEAST_ORDERED = (1 << 22, 1 << 12)
-# Least rays of a pose in worlds for which a warp takes neighbouring rays of one pose instead of a tile: particles are in
-# no order, and their rays meet other shapes.
+# Least rays of a pose in worlds for which a warp takes rays of one pose instead of a tile: the poses are not
+# sorted, and their rays meet other shapes.
 LEAST_OF_ONE_POSE = 32
 # Number of work-items that fill any device.
 ENOUGH = 1 << 21

@@ -6,6 +6,7 @@ seven eighths of the transfer.
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -57,7 +58,7 @@ def squared_of_stack(
     Returns:
         (rows, worlds, cols) int32.
     """
-    (rows, cols), compiled = shape, lambda name: backend.compile(name, _NO_FLAGS)
+    (rows, cols), compiled = shape, functools.partial(backend.compile, flags=_NO_FLAGS)
     # Along columns, the columns of all maps are those of one map.
     lines, width = rows * worlds, worlds * cols
     squared = space.empty("squared", rows * width, _INT)

@@ -71,11 +71,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     beyond_brief: dict[tuple[str, str], list[pytest.Item]] = defaultdict(list)
     left: dict[tuple[str, str], list[pytest.Item]] = defaultdict(list)
     for item in items:
-        sampled = item.get_closest_marker("sampled")
+        sampled, long_on = item.get_closest_marker("sampled"), item.get_closest_marker("long_on")
+        params = item.callspec.params if hasattr(item, "callspec") else {}
+        selection = str(params.get("backend", params.get("device", "")))
+        if long_on is not None and selection.startswith(long_on.args):
+            item.add_marker("long")
         if sampled is not None:
             function = item.nodeid.split("[")[0]
-            params = item.callspec.params
-            where = function, params.get("backend", params.get("device", ""))
+            where = function, selection
             if where[1] == sampled.kwargs.get("without"):
                 item.add_marker("slow")
                 continue

@@ -29,6 +29,7 @@ def settings() -> Iterator[ParameterSet]:
         )  # fmt: skip
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize(("names", "real", "form"), list(settings()))
 @each_grid

@@ -101,6 +101,7 @@ def test_readings_are_placed_as_the_host_prepares_them(
                 assert found["guard"][block] == real.type(GUARD * (longest + 2))
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize(("precision", "single"), [(np.float32, True), (np.float32, False), (np.float64, False)])
 @pytest.mark.parametrize(("end_points", "each"), [(True, 1), (False, 3)], ids=["end points", "rays"])
 def test_a_scan_of_each_robot_is_placed_like_a_single_one(
@@ -144,6 +145,7 @@ def test_readings_that_keep_their_places(device: Backend) -> None:
     assert differing(found["point"], vectors.astype(np.float32).ravel()) == 0
 
 
+@pytest.mark.long_on("warp")
 def test_a_range_where_none_is_possible_is_reported(device: Backend) -> None:
     ranges = np.array([1.0, np.inf, np.nan, np.inf])
     vectors = np.ones((4, 1, 2))

@@ -89,6 +89,7 @@ def test_tiles_of_ranges_in_float64(spread: int, device: Backend) -> None:
     assert differing(found, expected) == 0
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("form", [*PLANES, GROUPED], ids=repr)
 def test_tiles_of_ranges_in_every_form_of_planes(form: Planes, device: Backend) -> None:
     real, count, rays = np.float32, 777, 53

@@ -46,6 +46,7 @@ def test_right_poses_are_tracked_and_wrong_ones_lost(model):
     assert "wrong start" in told.text and monitor.diagnose(search=False).elsewhere is None
 
 
+@pytest.mark.sampled(1)
 def test_wrong_maps_and_wrong_mounts_are_distinguished(model):
     blocks = np.zeros((80, 80), int)
     for row, column in np.ndindex(4, 4):

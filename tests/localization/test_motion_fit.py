@@ -110,6 +110,7 @@ def test_motion_noise_that_repeats_from_step_to_step_is_inflated(repeated):
     assert np.mean(inflation) == pytest.approx((1 + repeated) / (1 - repeated), rel=0.2)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("jitter", [0.0, 0.0005, 0.003])
 def test_motion_noise_of_a_robot_that_stands_stays_near_the_default(jitter):
     rng, moves = np.random.default_rng(0), 10

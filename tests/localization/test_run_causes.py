@@ -29,7 +29,7 @@ def run(grid):
 
 
 def simulated(grid, scanner=SCANNER, **options):
-    return gs.worlds.simulate_run(grid, scanner, scans=70, seed=3, **options)
+    return gs.worlds.simulate_run(grid, scanner, scans=56, seed=3, **options)
 
 
 def diagnosed(backend, grid, run, *, ranges=None, odometry=None, poses=None, search=True):
@@ -52,6 +52,7 @@ def test_a_right_run_has_no_cause(backend, grid, run) -> None:
     assert "likely cause" not in found.text
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", ["stands", "runs twice as fast", "turns"])
 def test_scans_that_match_contradict_a_wrong_odometry(backend, grid, run, kind) -> None:
     steps = gs.pose_difference(run.odometry[:-1], run.odometry[1:])
@@ -101,6 +102,7 @@ def test_wrong_maps_are_told_from_wrong_scales(backend, grid, run) -> None:
     assert diagnosed(backend, gs.OccupancyGrid(blocks, 0.1), run).cause == "map"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [0.9, 1.1])
 def test_the_scale_of_a_real_map_is_measured(backend, data_dir, scale) -> None:
     fr079 = gs.read_map(data_dir / "carmen_logs" / "derived_maps" / "freiburg-079_even_05cm.yaml")

@@ -98,6 +98,7 @@ def test_the_map_may_lie_anywhere_and_be_turned(origin):
     assert kinds(place, scan_at(POSE), grid) == kinds(POSE, scan_at(POSE))
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("gpu", [False, True], ids=["processor", "GPU"])
 def test_every_device_judges_beams_alike(backend, as_gpu, gpu):
     as_gpu(gpu)

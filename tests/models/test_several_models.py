@@ -61,6 +61,7 @@ def test_results_are_those_of_each_model(backend):
         assert all(differing(one, wanted) == 0 for one, wanted in zip(found, expected, strict=True))
 
 
+@pytest.mark.long_on("warp")
 def test_arrays_are_for_all_models(backend):
     models = [*models_of(backend)[:2], gs.BeamModel(grid(2, 70), SCANNERS[0], backend=backend, precision="float64")]
     for shape in ((50,), (3, 40)):

@@ -60,6 +60,7 @@ def test_fifty_scenes_from_mild_to_stiff(needs) -> None:
     assert 0.75 < np.sqrt(np.mean(off**2)) < 1.25
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.4)
 @pytest.mark.parametrize(("truth", "span"), [(TYPICAL, (0.1, 0.9)), (FAR, (0.8, 1.0))], ids=["typical", "far"])
 def test_every_backend_finds_the_same_optimum(truth: gs.BeamParameters, span, backend: str) -> None:

@@ -106,6 +106,7 @@ def assert_close(log_p: np.ndarray, truth: list[Fraction]) -> None:
         assert abs(found - log) <= 64 * 2.2e-16 * (1 + abs(log)), (found, log)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("bins", [1, 2, 7])
 @pytest.mark.parametrize("name", CAUSES)
 def test_separate_causes_are_those_of_exact_arithmetic(name, bins):
@@ -116,6 +117,7 @@ def test_separate_causes_are_those_of_exact_arithmetic(name, bins):
         assert_close(table.log_probabilities[j], truth)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("bins", [1, 2, 7])
 @pytest.mark.parametrize("name", MIXTURES)
 def test_shared_causes_are_those_of_exact_arithmetic(name, bins):

@@ -103,6 +103,7 @@ def test_cones_are_looked_up_too(selection, needs):
     np.testing.assert_array_equal(parts, looked_up(TABLES["separate"], [1.3, INF, 3.9], one.expected_ranges(poses)))
 
 
+@pytest.mark.long_on("warp")
 def test_impossible_readings_are_minus_infinity(backend):
     """Zero noise and no random triggers exclude readings behind the wall and "no return"."""
     _, scanner, poses = scene()

@@ -44,6 +44,7 @@ GATED = {
 SUMMED = ("range and bearing", "exact")
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.5)
 @on_every_backend(
     on_warp=lambda case: case[0] == "range and bearing",
@@ -71,6 +72,7 @@ def test_the_gate_leaves_out_nothing_that_matters(backend, case):
     assert left_out == (p.z_false > 0)
 
 
+@pytest.mark.long_on("warp")
 @on_every_backend(on_warp=lambda how: how == "nearest", how=("nearest", "sum", "joint"))
 def test_specialize_false_has_the_same_numbers(backend, how):
     own, poses, features = scenes.model("everything", backend, association=how)

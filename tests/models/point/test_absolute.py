@@ -60,6 +60,7 @@ BUMPERS = {
 }
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.25)
 @each_precision
 @pytest.mark.parametrize("scene", SCENES)
@@ -153,6 +154,7 @@ def test_one_missing_reading_of_several(backend: str) -> None:
     np.testing.assert_array_equal(beacons.log_likelihood(poses, [NAN, 4.0]), beacons.log_likelihood(poses, [4.0], [1]))
 
 
+@pytest.mark.long_on("warp")
 @each_precision
 def test_batches_order_and_repetition_change_no_bit(backend: str, precision: str, monkeypatch) -> None:
     poses = poses_around(GRID)
@@ -182,6 +184,7 @@ def test_poses_that_the_host_places_have_the_same_bits(backend: str) -> None:
         device.info = before
 
 
+@pytest.mark.long_on("warp")
 @each_precision
 def test_extreme_poses_are_never_nan(backend: str, precision: str) -> None:
     huge = np.array([0.0, 1e-300, 1.0, 1e9, 1e18, 1e30, 1e200, -1e308, 1.7e308])

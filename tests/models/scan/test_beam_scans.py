@@ -130,6 +130,7 @@ def test_thinning_counts_informative_beams_only(backend):
     np.testing.assert_array_equal(log_p, model_of(backend).log_likelihood(poses, scan))
 
 
+@pytest.mark.long_on("warp")
 def test_several_scans_at_once(backend):
     _, poses = room()
     scans = np.array([SCANS["hits"], SCANS["mixed"], SCANS["all missing"]], float)
@@ -169,6 +170,7 @@ def test_no_scans_beam_by_beam(backend):
     assert log_p.shape == (0, 4) and parts.shape == (0, 4, 10)
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("shared", [True, False])

@@ -18,7 +18,7 @@ from gpusense.models import chunking
 from gpusense.models.scan import tiles
 
 
-@pytest.mark.sampled(0.25)
+@pytest.mark.sampled(0.1)
 @pytest.mark.parametrize("case", CASES)
 def test_a_bound_call_has_the_bits_of_an_ordinary_one(case, batching):
     """Poses and readings are on the device, half of them float32, and their contents change."""

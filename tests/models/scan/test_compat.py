@@ -48,6 +48,7 @@ def close(precision: str) -> dict[str, float]:
     return {"rel": 3e-6, "abs": 3e-7} if precision == "float32" else {"rel": 1e-12, "abs": 1e-13}
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.12)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize(
@@ -88,6 +89,7 @@ def test_a_literal_of_each_peer():
         assert field.log_likelihood(POSE, [4.0])[0] == pytest.approx(math.log1p(density**3), rel=1e-9)
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("peer", ["amcl", "beluga"])
 def test_field_weights_by_hand(peer, precision, backend):

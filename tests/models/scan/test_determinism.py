@@ -129,6 +129,7 @@ def test_any_batches(call):
         same_bits(call(cloud()[i : i + 1]), whole[i : i + 1])
 
 
+@pytest.mark.long_on("warp")
 def test_any_batches_of_a_cropped_map(kind, call, backend, monkeypatch):
     """Each batch of neighbouring particles uses another window of the map."""
     whole, along = call(cloud()), np.argsort(cloud()[:, 0])

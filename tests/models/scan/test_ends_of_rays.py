@@ -35,6 +35,7 @@ def scene(count: int) -> tuple[gs.OccupancyGrid, gs.Scanner, np.ndarray, np.ndar
     return grid, scanner, rng.uniform((-1, -1, -3), (18, 16, 3), (count, 3)), z
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.12)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("name", PARAMETERS)

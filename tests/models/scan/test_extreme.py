@@ -145,6 +145,7 @@ def test_denormal_direction_components_are_zero(backend, precision):
     assert differing(found, cast(backend, flushed=True)) == 0
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_tiny_headings_bearings_and_places(backend, precision):
     tiny = np.array([sign * t for t in (0.0, *TINY, 1e-29, 1e-20, 1e-8) for sign in (1, -1)])

@@ -56,6 +56,7 @@ def exact_log_hit(z: float, expected: float, sigma: float, dof: float) -> mp.mpf
     return peak - (n + 1) / 2 * mp.log1p(u * u / n) - mp.log(mass)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("dof", [1.0, 1.5, 4.0, 59.0, 61.0, 300.0])
 def test_densities_are_those_of_40_digits(dof):
     places = (-200.0, -3.0, -1e-3, 0.0, 1e-9, 2.0, 7.999, 8.0, 8.1, 30.0)
@@ -170,6 +171,7 @@ def test_the_field_is_that_of_scipy_and_its_gradient_that_of_differences():
         assert np.median(np.abs(slope - gradient[:, axis]) / (1 + np.abs(slope))) < 1e-6
 
 
+@pytest.mark.long_on("warp")
 def test_readings_are_drawn_from_the_density_with_equal_bits(backend):
     room = gs.OccupancyGrid(np.pad(np.zeros((40, 60), int), 1, constant_values=100), resolution=0.1)
     alone = gs.BeamParameters(1.0, 0.0, 0.0, 0.0, 0.2, hit="student", hit_dof=2.5)
@@ -269,6 +271,7 @@ BEAM = gs.BeamParameters(sigma_hit=0.3)
 FIELD = gs.LikelihoodFieldParameters(sigma_hit=0.2)
 
 
+@pytest.mark.long_on("warp")
 def test_a_made_up_shape_is_followed_on_every_backend(backend, monkeypatch):
     monkeypatch.setitem(SHAPES, "made-up", MadeUpHit)
     for real in ("float32", "float64") if backend == "numpy" else ("float32",):

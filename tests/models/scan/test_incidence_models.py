@@ -48,6 +48,7 @@ def brute_force(model: gs.BeamModel, poses: np.ndarray, z: np.ndarray) -> np.nda
     return found
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.4)
 @pytest.mark.parametrize("no_surface", [None, P(0.05, 0.05, 0.8, 0.1, 0.3, 0.2)])
 def test_every_beam_has_the_parameters_of_its_angle(no_surface, backend):

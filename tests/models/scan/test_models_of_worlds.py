@@ -60,6 +60,7 @@ def compare(name: str, found: np.ndarray, wanted: np.ndarray) -> None:
         assert found.tobytes() == wanted.tobytes()
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("name", MODELS)
 def test_scores_are_those_of_single_maps(name: str, scene: dict[str, Any], backend: str) -> None:
     kind, options = MODELS[name]
@@ -76,6 +77,7 @@ def test_scores_are_those_of_single_maps(name: str, scene: dict[str, Any], backe
     assert re.search(r"^- moving shapes +no world has shapes", model.explain(), re.MULTILINE)
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("name", ["beam", "field"])
 def test_gpus_score_by_the_same_bits(name: str, scene: dict[str, Any], as_gpu: Any) -> None:
     kind, options = MODELS[name]
@@ -87,6 +89,7 @@ def test_gpus_score_by_the_same_bits(name: str, scene: dict[str, Any], as_gpu: A
     compare(name, model.log_likelihood(poses, ranges[0], world=world), one)
 
 
+@pytest.mark.long_on("warp")
 def test_expected_ranges_incidence_and_samples_are_those_of_single_maps(scene: dict[str, Any], backend: str) -> None:
     world, poses = scene["world"], scene["poses"]
     model = gs.BeamModel(gs.Worlds(scene["grids"], backend=backend), SCANNER, backend=backend)
@@ -127,6 +130,7 @@ def test_bound_calls_read_arrays_anew(scene: dict[str, Any], backend: str) -> No
     assert call().tobytes() == model.log_likelihood(poses, ranges, world=world).tobytes()
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("wide", [np.int32, np.int64])
 @pytest.mark.parametrize("name", MODELS)
 def test_bound_calls_on_a_gpu_are_recorded(

@@ -39,6 +39,7 @@ def model_of(score: dict, grid: gs.OccupancyGrid, scanner: gs.Scanner, backend: 
     return gs.LikelihoodFieldModel(grid, scanner, weights, compat=compat, backend=backend, precision=precision)
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("peer", ["amcl", "beluga"])
 @pytest.mark.parametrize("scene", SCENES, ids=["building", "corridor", "short"])

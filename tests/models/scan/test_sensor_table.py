@@ -53,6 +53,7 @@ def test_one_reading_by_hand(backend):
         np.testing.assert_allclose(parts[0], exact, rtol=4 * np.finfo(precision).eps)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("width", [1.0, 0.3, 0.01])
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_a_table_holds_the_mixture_at_the_centres_of_bins(width, precision):
@@ -132,6 +133,7 @@ def test_impossible_scans_are_minus_infinity_and_no_others(backend):
             assert (tabulated.log_likelihood(poses, z)[~impossible.any(axis=1)] == log_p[np.isfinite(log_p)]).all()
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("weights", WEIGHTS)

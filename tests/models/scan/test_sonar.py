@@ -78,6 +78,7 @@ def test_a_sonar_hears_the_nearest_ray_that_returns(name, backend):
         assert 0.001 < np.mean(found == RANGE) < 0.95
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.5)
 @on_every_backend(
     on_warp=lambda caster: caster in ("bresenham", "lookup"), caster=[name for name in CASTERS if name != "exact"]
@@ -95,6 +96,7 @@ def a_scan() -> np.ndarray:
     return np.array([1.0, 2.5, np.nan, 0.3, np.inf, 4.0, 3.1, 1.7])
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("incidence", [None, INCIDENCE], ids=["plain", "by incidence"])
 def test_scores_are_the_mixture_at_what_a_sonar_hears(incidence, backend):
     grid, poses, _ = place()

@@ -67,6 +67,7 @@ def assert_same_numbers(kind: str, backend: str, precision: str, scene: dict[str
     assert (np.abs(parts[finite] - plain_parts[finite]) <= each[finite]).all()
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("kind", KINDS)
 @on_every_backend(precision=["float32", "float64"], on_warp=lambda precision: precision == "float32")
@@ -75,6 +76,7 @@ def test_leaving_out_changes_no_number(kind, precision, scene, backend):
     assert_same_numbers(kind, backend, precision, SCENES[scene], None)
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("weights", BEAM_WEIGHTS)
 def test_leaving_out_components_of_the_beam_model(weights, backend):

@@ -20,7 +20,7 @@ from gpusense.localization.options import Options
 from gpusense.localization.pose_algebra import compose_poses, wrap_angle
 from gpusense.localization.protection import Distances, margins_of
 from gpusense.localization.rival import Recovery
-from gpusense.localization.scoring import FilterCloud, readings_of
+from gpusense.localization.scoring import FilterCloud, copied, readings_of
 from gpusense.localization.sensors import Sensor, grid_of
 from gpusense.localization.spread import share_off, share_off_of, spread_of, verdict_label
 from gpusense.localization.tracker import Tracker, is_together
@@ -122,7 +122,7 @@ class FilterCore:
         judged = verdict.expected(everything, tracker.progress.motion)
         tracker.weigh(used, judged=judged, meanwhile=self._learn)
         # The caller may reuse the arrays for the next readings.
-        self.last = {index: tuple(map(_copied, reading)) for index, reading in everything.items()}
+        self.last = {index: tuple(map(copied, reading)) for index, reading in everything.items()}
         verdict.corrected()
         tracker.learn(used, self.recovery.is_doubted)
         self.recovery.corrected(used, self.last)
@@ -205,8 +205,3 @@ class FilterCore:
             set_state(sensor, values)
         self.recovery.restore(memory["recovery"])
         self.last = {index: tuple(map(copy.copy, reading)) for index, reading in memory["readings"].items()}
-
-
-def _copied(reading: Any) -> Any:
-    """Return a copy of a NumPy array, and any other object unchanged."""
-    return reading.copy() if isinstance(reading, np.ndarray) else reading

@@ -13,7 +13,7 @@ from gpusense._util.typing import AnyArray
 from gpusense.localization import starts
 from gpusense.localization.diagnosis import Diagnosis, diagnose
 from gpusense.localization.protection import Distances, distances_by_scan, margins_of, protection_level
-from gpusense.localization.scoring import readings_of
+from gpusense.localization.scoring import copied, readings_of
 from gpusense.localization.sensors import sensors_of
 from gpusense.localization.spread import LOST, Word, share_off, spread_of, verdict_label
 from gpusense.localization.verdict import Verdict, VerdictState
@@ -132,9 +132,10 @@ class PoseMonitor:
         Raises:
             TypeError, ValueError: an argument breaks its rule.
         """
-        place = checks.array("pose", pose, (3,))
-        spread = np.zeros((3, 3)) if covariance is None else _checked(covariance)
-        readings = dict(readings_of(ranges, self._sensors))
+        # Copies, since the verdict and diagnose read the arrays later, when the caller may have reused them.
+        place = checks.array("pose", pose, (3,)).copy()
+        spread = np.zeros((3, 3)) if covariance is None else _checked(covariance).copy()
+        readings = {index: tuple(map(copied, reading)) for index, reading in readings_of(ranges, self._sensors)}
         for index, reading in readings.items():
             if self._sensors[index].calibrates:
                 scanner = self._sensors[index].model.scanner

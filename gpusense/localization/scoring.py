@@ -54,6 +54,11 @@ def _is_several(value: Any) -> bool:
     return isinstance(value, tuple) and len(value) > 0 and (isinstance(value[0], list) or np.ndim(value[0]) > 0)
 
 
+def copied(part: Any) -> Any:
+    """Return a copy of a NumPy array, and any other part of a reading unchanged."""
+    return part.copy() if isinstance(part, np.ndarray) else part
+
+
 class FilterCloud(Cloud):
     """Particles of a filter on the device of its sensors.
 

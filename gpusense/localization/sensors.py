@@ -134,7 +134,8 @@ class Sensor:
             return self.parts(poses, reading)
         self._send(poses, around)
         call()
-        return functools.partial(self._read_terms, call, self._values)
+        # The terms that were read stay: a repeated correction reads them again, after the buffers have changed.
+        return functools.cache(functools.partial(self._read_terms, call, self._values))
 
     def _read_terms(self, call: RecordedCall, ranges: np.ndarray | None) -> np.ndarray:
         """Wait for the terms of a scan's readings, and return them."""

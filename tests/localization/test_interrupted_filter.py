@@ -17,7 +17,7 @@ from support.tracking_scene import field
 
 import gpusense as gs
 from gpusense.backends.programs import RecordedProgram
-from gpusense.localization import journal, starts
+from gpusense.localization import journal, sensors, starts
 
 # Rooms with lines to interrupt: lower rooms do not use filters.
 ROOMS = ("localization", "sweeps")
@@ -172,6 +172,35 @@ def test_a_model_that_fails_in_any_call_changes_nothing(backend, monkeypatch):
         assert everything(pf) == after
     else:
         pytest.fail("no correction without the failure")
+
+
+@pytest.mark.parametrize("late", ["corrected", "begin_lesson"])
+def test_a_repeated_correction_learns_from_the_same_lesson(backend, monkeypatch, late):
+    """The interrupted correction has begun its lesson, or an upload for it, in the buffers of the last one."""
+    owner = type(begun(FILTERS["field"](backend), 0)._parts.recovery) if late == "corrected" else sensors.Sensor
+    inner, fails = getattr(owner, late), [False]
+
+    def failing(*arguments):
+        if late == "begin_lesson":
+            inner(*arguments)
+        if fails[0]:
+            raise KeyboardInterrupt
+        if late == "corrected":
+            inner(*arguments)
+
+    monkeypatch.setattr(owner, late, failing)
+    found = []
+    for interrupted in (False, True):
+        pf = begun(FILTERS["field"](backend), 4)
+        pf.predict(*odometry(4))
+        fails[0] = interrupted
+        if interrupted:
+            with pytest.raises(KeyboardInterrupt):
+                pf.correct(readings(pf, 4))
+        fails[0] = False
+        pf.correct(readings(pf, 4))
+        found.append(everything(pf))
+    assert found[0] == found[1]
 
 
 def test_an_interrupt_of_the_way_back_is_made_good_by_the_next_call(monkeypatch):

@@ -109,6 +109,19 @@ def test_state_and_reset(model):
         gs.PoseMonitor(model).diagnose()
 
 
+def test_arrays_may_be_overwritten_after_an_update(model):
+    pose, ranges, covariance = POSES[0].copy(), scan_at(POSES[0]), np.diag([0.01, 0.01, 0.001])
+    arrays = pose, ranges, covariance
+    for given in (arrays, arrays[:2]):
+        _, (kept,) = watched(model, [POSES[0]], [ranges.copy()], *(one.copy() for one in given[2:]))
+        monitor, (found,) = watched(model, [pose], [ranges], *given[2:])
+        for array in given:
+            array *= 0.5
+        assert found.protection_level(0.05) == kept.protection_level(0.05) and monitor.diagnose().cause == "none"
+        for array in given:
+            array *= 2
+
+
 def test_missing_readings_give_no_evidence(model):
     monitor = gs.PoseMonitor(model)
     for _ in range(5):

@@ -19,7 +19,7 @@ from gpusense.backends.programs import ProgramCache, RecordedProgram, RepeatedPr
 from gpusense.interface.constants import ESTIMATE, FAR_SHARE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
 from gpusense.localization.cloud_state import Contents, Summary, deeper, is_starved, meaningful, summary_of
-from gpusense.localization.map_judge import JUDGED, MapJudge
+from gpusense.localization.map_judge import MapJudge
 from gpusense.localization.particles import BufferSlots, Particles, Stage
 
 _DOUBLE = np.dtype(np.float64)
@@ -55,9 +55,9 @@ class Cloud(Particles):
     """Particles with recorded steps."""
 
     def __init__(
-        self, backend: Backend, capacity: int, sensors: int, precision: np.dtype, *, residual: bool = False
+        self, backend: Backend, capacity: int, readings: Sequence[int], precision: np.dtype, *, residual: bool = False
     ) -> None:
-        super().__init__(backend, capacity, sensors, precision, residual=residual)
+        super().__init__(backend, capacity, readings, precision, residual=residual)
         self._recordings = ProgramCache[RecordedProgram](_MOST_RECORDED)
         self._estimates, self._stages = RepeatedPrograms(backend, 8), RepeatedPrograms(backend, _MOST_STAGES)
         self._uploads: list[np.ndarray] = []
@@ -72,8 +72,13 @@ class Cloud(Particles):
         # whether the present stage computes the estimate.
         self._asked, self._was_asked, self._last_stage, self._estimates_too = 0, False, 0, False
         # Function that prepares judges of scans; judges of the last correction until they receive the result.
-        self._prepared: Callable[[], list[MapJudge]] | None = None
+        self._prepared: Callable[[], list[tuple[MapJudge, np.ndarray]]] | None = None
         self._judges: Sequence[MapJudge] = ()
+        # Inputs of a recorded correction that are not yet on the device, and readings of other arrays of the device;
+        # work of the host while the device runs a stage.
+        self._given: np.ndarray | None = None
+        self._adopted: Sequence[tuple[Buffer, Buffer, int]] = ()
+        self._meanwhile: Callable[[], None] | None = None
 
     def place(self, poses: np.ndarray) -> None:
         """Replace all particles by (N, 3) poses of equal weight, and reset the state of corrections."""
@@ -110,7 +115,7 @@ class Cloud(Particles):
     def _begin_change(self) -> None:
         """Invalidate the results on the host, and save the particles that the change may overwrite."""
         self._results = self._known = self._estimated_of = self._far = None
-        self._judges, self._prepared = (), None
+        self._judges, self._prepared, self._given, self._adopted = (), None, None, ()
         for one in self._snapshots:
             snapshot = one()
             if snapshot is not None and snapshot.places.free() != self.kept.free():
@@ -132,7 +137,8 @@ class Cloud(Particles):
 
     def run_stages(
         self, settings: np.ndarray, stages: list[Stage], drawn: int, sensors: int, score: Callable[[Stage], None],
-        judges: Callable[[], list[MapJudge]] | None = None, meanwhile: Callable[[], None] | None = None,
+        judges: Callable[[], list[tuple[MapJudge, np.ndarray]]] | None = None,
+        meanwhile: Callable[[], None] | None = None, given: Callable[[], None] | None = None,
     ) -> None:  # fmt: skip
         """Run a correction: stages until the temperature is used up.
 
@@ -142,14 +148,19 @@ class Cloud(Particles):
             drawn: Particles of the next step.
             sensors: Number of sensors, the first ones of ``log_p``.
             score: Runs a stage: motion if it is the first one, log-likelihoods, and weighing.
-            judges: Prepares and returns the judges of scans at the estimated pose; called if the pose is estimated.
+            judges: Prepares and returns the judges of scans at the estimated pose, with their scans; called if the pose
+                is estimated.
             meanwhile: Called while the device works on the first stage.
+            given: Sets the inputs of a recorded correction, which its first stage copies to the device.
         """
         self.use(sensors)
         self._begin_change()
-        self._prepared = judges
+        self._prepared, self._meanwhile = judges, meanwhile
         self._asked, self._was_asked = self._asked + 1 if self._was_asked else 0, False
-        self.upload_settings(settings)
+        if given is None:
+            self.upload_settings(settings)
+        else:
+            given()
         if settings[SLOW_RATE] > 0:
             # Keep the averages of the likelihood.
             self._copy_state(self.places.state, stages[0].state)
@@ -158,9 +169,7 @@ class Cloud(Particles):
             self._estimates_too = self._asked >= _ASKED and stage.number >= self._last_stage
             self._results = None
             score(stage)
-            if meanwhile is not None:
-                meanwhile()
-                meanwhile = None
+            self._use_wait()
             if not last:
                 numbers, deep = self._deepen(stage, settings)
                 last = numbers[stage.number * STAGE + LEFT] == 0.0
@@ -194,16 +203,29 @@ class Cloud(Particles):
 
     def _judging(self) -> Program:
         """Return the launches for judging scans at the estimate."""
-        pairs = zip(self._judges, self.judged, strict=False)
-        return tuple(one for judge, judged in pairs for one in judge.launches(self.estimated, judged))
+        triples = zip(self._judges, self.scans, self.judged, strict=False)
+        return tuple(one for judge, *buffers in triples for one in judge.launches(self.estimated, *buffers))
 
     def _prepare_judges(self) -> Hashable:
         """Prepare the judges of a correction that estimates the pose; return the key of their launches."""
         if not self._estimates_too:
             return ()
         if self._prepared is not None:
-            self._judges, self._prepared = self._prepared(), None
+            prepared, self._prepared = self._prepared(), None
+            for place, (_, scan) in enumerate(prepared):
+                if self._given is None:
+                    self._uploads.append(scan)
+                    self.backend.refill(scan, self.scans[place])
+                else:
+                    self._given[self.inputs.spans[1 + len(self.readings) + place]] = scan
+            self._judges = [judge for judge, _ in prepared]
         return tuple([judge.version for judge in self._judges])
+
+    def _use_wait(self) -> None:
+        """Do the host's work of a correction while the device runs its first stage."""
+        meanwhile, self._meanwhile = self._meanwhile, None
+        if meanwhile is not None:
+            meanwhile()
 
     def _estimating(self, places: BufferSlots, count: int, second_pass: int) -> Program:
         """Return the launches of a pass of the estimate."""
@@ -243,7 +265,28 @@ class Cloud(Particles):
             program, owners = scoring(stage.source)
             program = move + program + self._weighing(stage) + self._judging()
             recorded = self._recordings.keep(whole, RecordedProgram(self.backend, program, owners))
-        recorded.start()
+        self._start(recorded, read=stage.most > 1 or self._estimates_too)
+
+    def _start(self, recorded: RecordedProgram, *, read: bool) -> None:
+        """Start a stage with the copy of a correction's inputs, and that of its results: one graph of a CUDA device."""
+        backend = self.backend
+        backend.begin_batch()
+        try:
+            if self._given is not None:
+                self._uploads.append(self._given)
+                backend.upload(self._given, self.inputs.buffer, wait=False)
+                for source, target, size in self._adopted:
+                    backend.copy(source, target, size)
+                self._given = None
+            recorded({})
+            if read and backend.in_batch:
+                results = backend.download(self.results.buffer, np.empty(self.results.size), wait=False)
+                backend.submit()
+                self._use_wait()
+                backend.synchronize()
+                self._results = results
+        finally:
+            backend.end_batch()
 
     def explain(self) -> str:
         """Describe how the last recorded step starts."""
@@ -323,22 +366,21 @@ class Cloud(Particles):
             self._estimates.run(
                 (places.shown, places.weight, count, second_pass), lambda: self._estimating(places, count, second_pass)
             )
-        numbers, begins = self._read_results(), self.result_begins[2:]
-        estimate = numbers[begins[0] : begins[0] + ESTIMATE]
-        for judge, begin in zip(self._judges, begins[1:], strict=False):
-            judge.receive(estimate, numbers[begin : begin + JUDGED])
+        numbers, (first, *spans) = self._read_results(), self.results.spans[2:]
+        estimate = numbers[first]
+        for judge, span in zip(self._judges, spans, strict=False):
+            judge.receive(estimate, numbers[span])
         self._judges = ()
         return estimate
 
     def _state_of(self, index: int) -> np.ndarray:
         """Return a state."""
-        begin = self.result_begins[index]
-        return self._read_results()[begin : begin + STATE]
+        return self._read_results()[self.results.spans[index]]
 
     def _read_results(self) -> np.ndarray:
         """Return states and estimate, copied once after each change."""
         if self._results is None:
-            self._results = self._read(self.results, self.result_begins[-1])
+            self._results = self._read(self.results.buffer, self.results.size)
         return self._results
 
     def host_poses(self, index: int, count: int) -> np.ndarray:

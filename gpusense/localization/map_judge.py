@@ -138,41 +138,36 @@ class MapJudge:
         changing = dict(
             cells=self._cells, frame=setting.frame, rules=setting.rules, rows=bottom - top, cols=right - left
         )
-        space.run(count, changing, lambda: self._launches(setting, self._estimate, judged, count), version=0)
+        space.run(
+            count, changing, lambda: self._launches(setting, self._estimate, self._scan, judged, count), version=0
+        )
         space.read(judged, result)
         return beams, result
 
-    def expects(self, scanner: Scanner, ranges: Floats) -> bool:
-        """Prepare for judging a scan in a correction at its estimated pose, after previous judgements.
+    def expects(self, scanner: Scanner, ranges: Floats) -> Floats | None:
+        """Prepare for judging a scan (K,) in a correction at its estimated pose, after previous judgements.
 
-        Args:
-            scanner: The scanner.
-            ranges: (K,) readings [m].
-
-        Returns:
-            True if there are beams, and cells of the map on the device.
+        Return the scan for ``launches``; None without beams, or without cells of the map on the device.
         """
         self._expected = self._known = None
         if self._cells is None:
-            return False
+            return None
         beams, turn = chosen_beams(scanner, ranges), self._set(scanner).turn
         count = len(beams.bearing)
         if not count:
-            return False
+            return None
         # NaN marks unused beams.
         scan = np.full(JUDGED, np.nan)
         np.add(beams.bearing, turn, out=scan[:count])
         scan[BEAMS : BEAMS + count] = beams.reading
-        self._uploaded = scan
-        self._backend.refill(scan, self._scan)
         self._expected = _Expected(scanner, ranges.tobytes(), beams, self.version)
-        return True
+        return scan
 
-    def launches(self, estimate: Buffer, judged: Buffer) -> Program:
+    def launches(self, estimate: Buffer, scan: Buffer, judged: Buffer) -> Program:
         """Return the launch that judges the expected scan at an estimate; ``version`` is its key."""
         if self._expected is None:
             raise RuntimeError("launches: needs a scan that is expected")
-        return self._launches(self._set(self._expected.scanner), estimate, judged, BEAMS)
+        return self._launches(self._set(self._expected.scanner), estimate, scan, judged, BEAMS)
 
     def receive(self, estimate: Floats, judged: Floats) -> None:
         """Keep the judgement of the expected scan.
@@ -192,13 +187,13 @@ class MapJudge:
         same = expected.scanner is scanner and expected.version == self.version
         return same and expected.ranges == ranges.tobytes()
 
-    def _launches(self, setting: _Setting, estimate: Buffer, judged: Buffer, beams: int) -> Program:
+    def _launches(self, setting: _Setting, estimate: Buffer, scan: Buffer, judged: Buffer, beams: int) -> Program:
         (top, bottom), (left, right) = self._part
         info, steps = self._backend.info, int(setting.rules.limit / setting.frame.resolution / STEP)
         flags, team = with_teams_flags(info.kind, "judge_beams", _PLAIN, steps, self._backend.largest_group)
         return (
             launch(
-                "judge_beams", flags, (team * beams,), cells=self._cells, estimate=estimate, scan=self._scan,
+                "judge_beams", flags, (team * beams,), cells=self._cells, estimate=estimate, scan=scan,
                 judged=judged, frame=setting.frame, rules=setting.rules, rows=bottom - top, cols=right - left,
                 beams=beams,
             ),

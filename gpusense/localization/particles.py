@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -111,6 +112,26 @@ class Stage(NamedTuple):
         return BufferSlots(self.source, self.source ^ 1, self.weight, self.weight + 1, self.state)
 
 
+class Packed:
+    """Arrays of float64 numbers in one buffer, which one copy reads or writes.
+
+    Attributes:
+        buffer: The buffer.
+        parts: The arrays on the device.
+        spans: Places of the arrays among the numbers of the buffer, which are ``size``.
+    """
+
+    def __init__(self, backend: Backend, sizes: Sequence[int]) -> None:
+        align = max(backend.alignment // _DOUBLE.itemsize, 1)
+        begins = (0, *itertools.accumulate(-(-max(size, 1) // align) * align for size in sizes))
+        self.spans = [slice(begin, begin + size) for begin, size in zip(begins, sizes, strict=False)]
+        self.size = begins[-1]
+        # Other libraries get no memory that a processor shares with the host.
+        make = backend.empty_external if backend.info.kind == "gpu" else backend.empty
+        self.buffer = backend.upload(np.zeros(self.size), make(self.size, _DOUBLE))
+        self.parts = [backend.part(self.buffer, one.start, max(one.stop - one.start, 1), _DOUBLE) for one in self.spans]
+
+
 class Particles:
     """Particles and weights on a device, and their launches.
 
@@ -119,34 +140,32 @@ class Particles:
         places: Buffers of the particles.
         kept: Buffers at the beginning of a call of the filter, which steps never overwrite.
         pool_size: Number of poses for recovery to inject.
-        results: Two states of corrections, the estimate, and the judged beams of each sensor, at ``result_begins``.
+        inputs: Settings of a step, and of each sensor the readings and the scan to judge.
+        results: Two states of corrections, the estimate, and the judged beams of each sensor.
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("count", "block", "places", "pool", "pool_size")
     PARTS: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
-        self, backend: Backend, capacity: int, sensors: int, precision: np.dtype, *, residual: bool = False
+        self, backend: Backend, capacity: int, readings: Sequence[int], precision: np.dtype, *, residual: bool = False
     ) -> None:
-        self.backend, self.capacity, self.precision, self._sensors = backend, capacity, precision, sensors
+        self.backend, self.capacity, self.precision, self._sensors = backend, capacity, precision, len(readings)
         self.count, self.places, self.kept = capacity, BufferSlots(), BufferSlots()
         self.block = weight_block(backend, capacity)
         # Other libraries get no memory that a processor shares with the host.
         make = backend.empty_external if backend.info.kind == "gpu" else backend.empty
         self.poses = [make(3 * capacity, _DOUBLE) for _ in range(4)]
         self.weights = [make(capacity, _DOUBLE) for _ in range(4)]
-        self.log_p = [make(capacity, precision) for _ in range(sensors)]
+        self.log_p = [make(capacity, precision) for _ in readings]
         self.score, self.ends = backend.empty(capacity, _DOUBLE), backend.empty(capacity, _DOUBLE)
-        self.sums, self.settings = Sums(backend, capacity), backend.empty(SETTINGS, _DOUBLE)
-        # One copy reads all results.
-        align = max(backend.alignment // _DOUBLE.itemsize, 1)
-        sizes = STATE, STATE, ESTIMATE, *(JUDGED for _ in range(sensors))
-        self.result_begins = (0, *itertools.accumulate(-(-size // align) * align for size in sizes))
-        self.results = backend.upload(np.zeros(self.result_begins[-1]))
-        parts = zip(self.result_begins, sizes, strict=False)
-        first, second, self.estimated, *self.judged = (
-            backend.part(self.results, begin, size, _DOUBLE) for begin, size in parts
-        )
+        self.sums, count = Sums(backend, capacity), len(readings)
+        # One copy writes all inputs of a step, and one reads all results.
+        self.inputs = Packed(backend, (SETTINGS, *readings, *[JUDGED] * count))
+        self.settings, *more = self.inputs.parts
+        self.readings, self.scans = more[:count], more[count:]
+        self.results = Packed(backend, (STATE, STATE, ESTIMATE, *[JUDGED] * count))
+        first, second, self.estimated, *self.judged = self.results.parts
         self.states = [first, second]
         self.pool, self.pool_size = backend.upload(np.zeros(3)), 0
         # Cumulative numbers of certain copies.

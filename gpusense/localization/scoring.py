@@ -67,7 +67,8 @@ class FilterCloud(Cloud):
     """
 
     def __init__(self, sensors: Sequence[Sensor], capacity: int, *, residual: bool = False) -> None:
-        super().__init__(sensors[0].backend, capacity, len(sensors), sensors[0].precision, residual=residual)
+        readings = [sensor.readings for sensor in sensors]
+        super().__init__(sensors[0].backend, capacity, readings, sensors[0].precision, residual=residual)
         self._scored, self._timed = sensors, False
         self._programs = ProgramCache[tuple[Program, object]](_MOST_PROGRAMS)
         # Views of buffers for models, by the number of particles.
@@ -75,21 +76,35 @@ class FilterCloud(Cloud):
 
     def correct(self, step: Step) -> None:
         """Run a correction."""
-        gpu, readings = self.backend.info.kind == "gpu", step.readings
+        gpu, readings, given = self.backend.info.kind == "gpu", step.readings, None
         if gpu and all(self._scored[index].records(reading) for index, reading in readings):
-            for index, reading in readings:
-                self._scored[index].upload(reading)
-            score = functools.partial(self._replay, readings)
+            given, score = functools.partial(self._give, step), functools.partial(self._replay, readings)
         else:
             score = functools.partial(self._call, readings)
         stages = self.places.stages(self.kept, step.stages, step.drawn, step.kind, same=step.drawn == self.count)
         judges = functools.partial(self._judges_of, step.judged) if step.judged else None
-        self.run_stages(step.settings, stages, step.drawn, len(readings), score, judges, step.meanwhile)
+        self.run_stages(step.settings, stages, step.drawn, len(readings), score, judges, step.meanwhile, given)
 
-    def _judges_of(self, judged: Sequence[SensorReadings]) -> list[MapJudge]:
-        """Prepare and return the judges of scans."""
-        sensors = ((self._scored[index], reading[0]) for index, reading in judged)
-        return [judge for sensor, ranges in sensors if (judge := sensor.judge()).expects(sensor.model.scanner, ranges)]
+    def _give(self, step: Step) -> None:
+        """Set the inputs of a recorded correction."""
+        self._given, adopted = np.empty(self.inputs.size), []
+        self._given[self.inputs.spans[0]] = step.settings
+        for index, reading in step.readings:
+            target = self.readings[index]
+            source = self._scored[index].place(reading, self._given[self.inputs.spans[1 + index]], target)
+            if source is not None:
+                adopted.append((source, target, self._scored[index].readings * _DOUBLE.itemsize))
+        self._adopted = adopted
+
+    def _judges_of(self, judged: Sequence[SensorReadings]) -> list[tuple[MapJudge, np.ndarray]]:
+        """Prepare and return the judges of scans, with their scans."""
+        result = []
+        for index, (ranges, *_) in judged:
+            judge = self._scored[index].judge()
+            scan = judge.expects(self._scored[index].model.scanner, ranges)
+            if scan is not None:
+                result.append((judge, scan))
+        return result
 
     def _call(self, readings: Sequence[SensorReadings], stage: Stage) -> None:
         """Start the log-likelihoods of a stage call by call, and weigh."""
@@ -115,7 +130,7 @@ class FilterCloud(Cloud):
         poses = self._poses(source)
         for place, (index, _) in enumerate(readings):
             out = self._log_p(place)
-            launches, owner = self._scored[index].program(poses, out)
+            launches, owner = self._scored[index].program(poses, self.readings[index], out)
             program += launches
             owners.append((poses, out, owner))
         return self._programs.keep((key, source), (program, owners))

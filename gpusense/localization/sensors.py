@@ -53,6 +53,7 @@ class Sensor:
 
     Attributes:
         beams: Used beams of a scan; 0 for other models.
+        readings: All beams of a scan; 0 for other models.
         seconds: Time of all calls of ``score``.
         calibrates: Whether temperature="auto" learns from this sensor.
         ambiguous: True if its likelihood may have several peaks among concentrated particles, for example exchangeable
@@ -71,18 +72,19 @@ class Sensor:
         self.backend: Backend = model.backend
         self.precision = np.dtype(model.precision)
         self.beams = model.used_beams if isinstance(model, ScanModel) else 0
+        self.readings = model.scanner.count if isinstance(model, ScanModel) else 0
         self._correlation = BeamCorrelation()
         # A temperature and its correlation; learning replaces the correlation.
         self._known: tuple[BeamCorrelation, float] | None = None
         self._seen, self._learned = 0, -1
         self._lesson: Lesson | None = None
-        # The poses and the call that scores readings around an estimate, or no call; the reading on the
-        # device, and its values if they came from the host.
-        self._terms: tuple[Any, RecordedCall | None] | None = None
+        # The readings, the poses and the call that scores the readings around an estimate, or no call; the reading
+        # on the device, its buffer, and its values if they came from the host.
+        self._terms: tuple[Buffer, Buffer, RecordedCall | None] | None = None
         self._uploaded: object = None
+        self._ranges: Buffer = None
         self._values: np.ndarray | None = None
         self._sent: list[np.ndarray] = []
-        self._ranges: Any = None
         self._judge: MapJudge | None = None
         self.seconds, self._started = 0.0, 0
 
@@ -121,26 +123,31 @@ class Sensor:
         """Return (7, K) terms of a scan's readings, or the function that waits for terms that the device computes."""
         if not self.records(reading):
             return self.parts(poses, reading)
+        backend = self.backend
         if self._uploaded is not reading:
-            self.upload(reading)
-        if self._terms is None:
-            backend, count = self.backend, len(poses)
-            around = backend.empty_external(poses.size, _DOUBLE)
-            ranges = backend.view(self._ranges, (self.model.scanner.count,), _DOUBLE)
+            self._upload(reading)
+        if self._terms is None or self._terms[0] is not self._ranges:
+            around, count = backend.empty_external(poses.size, _DOUBLE), len(poses)
+            ranges = backend.view(self._ranges, (self.readings,), _DOUBLE)
             out = backend.view(backend.empty_external(count, self.precision), (count,), self.precision)
-            self._terms = around, self.model.bind_terms(backend.view(around, poses.shape, _DOUBLE), ranges, out)
-        around, call = self._terms
+            call = self.model.bind_terms(backend.view(around, poses.shape, _DOUBLE), ranges, out)
+            self._terms = self._ranges, around, call
+        _, around, call = self._terms
         if call is None:
             return self.parts(poses, reading)
-        self._send(poses, around)
-        call()
+        backend.begin_batch()
+        try:
+            self._send(poses, around)
+            call.begin()
+        finally:
+            backend.end_batch()
         # The terms that were read stay: a repeated correction reads them again, after the buffers have changed.
         return functools.cache(functools.partial(self._read_terms, call, self._values))
 
     def _read_terms(self, call: RecordedCall, ranges: np.ndarray | None) -> np.ndarray:
         """Wait for the terms of a scan's readings, and return them."""
         if ranges is None:
-            ranges = self.backend.download(self._ranges, np.empty(self.model.scanner.count))
+            ranges = self.backend.download(self._ranges, np.empty(self.readings))
         return call.terms(ranges)
 
     def receive(self) -> None:
@@ -216,22 +223,32 @@ class Sensor:
         """Version of the map's table, a key of recorded programs."""
         return self.model.table_version if self.calibrates else 0
 
-    def upload(self, reading: tuple[Any, ...]) -> None:
-        """Copy the ranges of a scan to the array for recorded programs."""
-        ranges, self._uploaded, self._values = reading[0], reading, None
-        count = self.model.scanner.count
-        if self._ranges is None:
-            self._ranges = self.backend.empty_external(count, _DOUBLE)
-        if type(ranges) is not np.ndarray and arrays.on_device(ranges) and self.backend.reads(ranges):
-            adopted = self.backend.adopt(ranges, "ranges")
-            if adopted.dtype == _DOUBLE and adopted.shape == (count,) and adopted.contiguous:
-                self.backend.copy(adopted.buffer, self._ranges, count * _DOUBLE.itemsize)
-                return
+    def place(self, reading: tuple[Any, ...], values: np.ndarray, buffer: Buffer) -> Buffer | None:
+        """Write the ranges of a scan to ``values``, which the caller copies to ``buffer``.
+
+        Float64 ranges on the device are returned instead, and the caller copies them to ``buffer``.
+        """
+        ranges, self._uploaded, self._ranges, self._values = reading[0], reading, buffer, None
         if type(ranges) is not np.ndarray:
+            if arrays.on_device(ranges) and self.backend.reads(ranges):
+                adopted = self.backend.adopt(ranges, "ranges")
+                if adopted.dtype == _DOUBLE and adopted.shape == (self.readings,) and adopted.contiguous:
+                    return adopted.buffer
             ranges = arrays.copied_to_host(ranges, self.backend, "ranges")
-        values = checks.array("ranges", ranges, (count,), finite=False, dtype=None)
-        self._values = np.array(float64_readings(values, self.model.scanner))
-        self._send(self._values, self._ranges)
+        checked = checks.array("ranges", ranges, (self.readings,), finite=False, dtype=None)
+        values[...] = float64_readings(checked, self.model.scanner)
+        self._values = values
+        return None
+
+    def _upload(self, reading: tuple[Any, ...]) -> None:
+        """Copy the ranges of a scan to the device outside of a recorded correction."""
+        buffer = self.backend.empty_external(self.readings, _DOUBLE) if self._ranges is None else self._ranges
+        values = np.empty(self.readings)
+        source = self.place(reading, values, buffer)
+        if source is None:
+            self._send(values, buffer)
+        else:
+            self.backend.copy(source, buffer, values.nbytes)
 
     def _send(self, array: np.ndarray, buffer: Buffer) -> None:
         """Start copying an array that does not change, and keep it alive until the device has read it."""
@@ -241,9 +258,9 @@ class Sensor:
         self._sent.append(array)
         self.backend.upload(array, buffer, wait=False)
 
-    def program(self, poses: Any, out: Any) -> tuple[Program, object]:
-        """Return the launches for scoring poses on the device, and the owner of their memory."""
-        ranges = self.backend.view(self._ranges, (self.model.scanner.count,), _DOUBLE)
+    def program(self, poses: Any, buffer: Buffer, out: Any) -> tuple[Program, object]:
+        """Return the launches for scoring poses by readings on the device, and the owner of their memory."""
+        ranges = self.backend.view(buffer, (self.readings,), _DOUBLE)
         call = self.model.bind(poses, ranges, out=out)
         if not isinstance(call, RecordedCall):
             raise RuntimeError(f"the model's call cannot be recorded: {call.explain()}")

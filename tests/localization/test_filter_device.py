@@ -43,6 +43,48 @@ def test_a_stage_on_a_gpu_is_one_recorded_program(warp_as_gpu):
         assert stages == 1 or "8 launches" in found[1]
 
 
+def test_a_correction_is_one_graph_with_a_copy_of_its_inputs_and_one_of_its_results(warp_as_gpu, monkeypatch):
+    expected, _ = tracked(2)
+    monkeypatch.setattr(warp_as_gpu, "info", dataclasses.replace(warp_as_gpu.info, graphs=True))
+    copies: list[str] = []
+    for name in ("upload", "download"):
+        inner = getattr(type(warp_as_gpu), name)
+        monkeypatch.setattr(
+            type(warp_as_gpu), name, lambda *a, _i=inner, _n=name, **k: (copies.append(_n), _i(*a, **k))[1]
+        )
+    pf, pose = tracked(2)
+    assert np.array_equal(pf.host_particles(), expected.host_particles())
+    ranges = gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast(pose[None], SCANNER.bearings)[0].astype(float)
+    for step in range(12):
+        copies.clear()
+        pf.predict((0, 0, 0), (0.01, 0, 0))
+        pf.correct(ranges)
+        pf.estimate()
+        if step > 4 and pf._cloud.summary().stages == 1:
+            assert copies == ["upload", "download"]
+            assert pf.explain().endswith("launches and 2 copies")
+
+
+@pytest.mark.parametrize("graphs", [False, True])
+def test_scans_of_host_and_device_have_the_same_bits(warp_as_gpu, monkeypatch, graphs):
+    import warp as wp
+
+    monkeypatch.setattr(warp_as_gpu, "info", dataclasses.replace(warp_as_gpu.info, graphs=graphs))
+    models = [gs.LikelihoodFieldModel(GRID, SCANNER, backend="warp:cpu") for _ in range(2)]
+    scans = gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast([POSE, POSE], SCANNER.bearings).astype(float)
+
+    def run(*on_device):
+        pf = gs.ParticleFilter(models, particles=200, seed=5)
+        pf.initialize(mean=POSE, covariance=np.diag([0.01, 0.01, 0.003]))
+        for _ in range(8):
+            pf.predict((0, 0, 0), (0.001, 0, 0))
+            given = [wp.array(one, device="cpu") if there else one for one, there in zip(scans, on_device, strict=True)]
+            pf.correct(dict(zip(models, given, strict=True)))
+        return *pf.temperatures, pf.host_particles().tobytes()
+
+    assert run(False, False) == run(True, False) == run(False, True) == run(True, True)
+
+
 def test_corrections_compute_an_estimate_that_each_step_asks_for(backend, monkeypatch):
     ranges = gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast([[3.0, 2.5, 0.4]], SCANNER.bearings)[0]
 

@@ -267,7 +267,7 @@ def test_estimates_are_the_moments_of_the_cloud(backend, name):
     poses[:, 2] = (poses[:, 2] + np.pi) % (2 * np.pi) - np.pi
     weights = rng.exponential(size=len(poses))
     weights[0] = 1e-6
-    cloud = Cloud(get_backend(backend), len(poses), 0, np.dtype(np.float32))
+    cloud = Cloud(get_backend(backend), len(poses), (), np.dtype(np.float32))
     cloud.restore(Contents(poses, weights, None, None, np.zeros(c.STATE), None))
     for _ in range(3):
         # The third one is a recording.

@@ -69,6 +69,7 @@ def test_density_grid_against_60_digits(backend, precision):
     assert stiff.error_in_eps(grid.truth(), truth, "float64").max() <= 16
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_density_grid_covers_its_ranges(precision):
     grid, real = density_grid("numpy", precision), np.dtype(precision).type

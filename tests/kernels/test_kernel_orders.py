@@ -48,6 +48,7 @@ def ordered(device: Backend, cell: np.ndarray, heading: np.ndarray, real: type) 
     return each | {"order": device.download(order, np.empty(count, np.int32))}
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("real", PRECISIONS)
 @pytest.mark.parametrize("name", CLOUDS)
 def test_an_order_is_a_permutation_grouped_by_bins(name: str, real: type, device: Backend) -> None:

@@ -81,6 +81,7 @@ def pretend_gpu(device, monkeypatch, limit=1024) -> list[tuple[int, ...]]:
     return sizes
 
 
+@pytest.mark.long
 def test_items_of_few_points_have_small_teams(device, monkeypatch):
     sizes = pretend_gpu(device, monkeypatch)
     guesses = random_pairs(4, RING, seed=3)[2][:, None] + np.zeros((4, 3, 3))
@@ -90,6 +91,7 @@ def test_items_of_few_points_have_small_teams(device, monkeypatch):
     assert sizes == [(4 * 3 * 32,)]
 
 
+@pytest.mark.long_on("warp")
 def test_pairs_of_different_noise_share_a_launch_and_keep_their_rules(device):
     guesses = random_pairs(4, RING, seed=3)[2][:, None] + 0.05
     levels = [RULES, RULES._replace(stride=5, capture=0.6, near=0.2), RULES._replace(iterations=3)]

@@ -144,6 +144,7 @@ def test_bad_arguments_are_named():
         gs.pose_likelihood(model, ranges, resolution=0.2, headings=1 << 22)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("headings", [36, 60])
 def test_modes_are_refined_between_positions_and_headings(headings):
     """The refined pose of a narrow beam model is the true one, far likelier than the best of a coarse lattice."""

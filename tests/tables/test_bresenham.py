@@ -43,6 +43,7 @@ def test_bresenham_slips_between_walls_that_touch_at_a_corner(backend):
     assert found["exact"] == found["dda"] == np.float32(math.sqrt(0.5))
 
 
+@pytest.mark.long_on("warp")
 def test_bresenham_is_the_same_in_eight_directions(backend):
     rng = np.random.default_rng(3)
     cells, angles = np.where(rng.random((21, 21)) < 0.05, 100, 0), rng.uniform(-np.pi, np.pi, 200)

@@ -87,6 +87,7 @@ def recorded_maps(folder):
     return [file for file in files if "image:" in file.read_text()]
 
 
+@pytest.mark.long
 def test_every_recorded_map_opens(data_dir):
     files = recorded_maps(data_dir)
     assert len(files) >= 24

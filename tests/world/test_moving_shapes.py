@@ -92,6 +92,7 @@ def compare(found: np.ndarray, wanted: np.ndarray) -> None:
     assert off.mean() < 0.002, np.argwhere(off)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_ranges_are_those_of_the_nearest_shape(precision: Any, backend: str) -> None:
     rng = np.random.default_rng(1)
@@ -204,6 +205,7 @@ def test_walls_hide_shapes_and_shapes_hide_walls(backend: str) -> None:
     assert angles[0, 0] == pytest.approx(math.asin(0.25 / 0.5), abs=1e-5)
 
 
+@pytest.mark.long_on("warp")
 def test_models_see_shapes(backend: str) -> None:
     scanner = gs.Scanner(np.linspace(-1, 1, 9), range_max=6.0)
     cells = np.zeros((2, 40, 60), np.int8)
@@ -228,6 +230,7 @@ def test_models_see_shapes(backend: str) -> None:
     assert (after >= before).all() and (after > before).any()
 
 
+@pytest.mark.long_on("warp")
 def test_fields_measure_the_distance_to_the_nearest_of_walls_and_shapes(backend: str) -> None:
     parameters = gs.LikelihoodFieldParameters(z_hit=0.9, z_rand=0.1, sigma_hit=0.3, max_distance=2.0)
     scanner = gs.Scanner([0.0], range_max=6.0)
@@ -244,6 +247,7 @@ def test_fields_measure_the_distance_to_the_nearest_of_walls_and_shapes(backend:
             assert found == pytest.approx(math.log(density), abs=2e-4), (interpolation, z)
 
 
+@pytest.mark.long_on("warp")
 def test_collisions(backend: str) -> None:
     cells = np.zeros((2, 10, 10), np.int8)
     cells[0, 5, 5], cells[1, 2, 2] = 100, -1

@@ -55,6 +55,7 @@ def cells_of(place, free: float, occupied: float, mode: str, negate: bool) -> np
         return read_map(file).cells[0]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("negate", [False, True])
 @pytest.mark.parametrize("mode", ["trinary", "scale"])
 def test_thresholds_of_every_grey(place, mode, negate):
@@ -73,6 +74,7 @@ def test_scale_of_any_thresholds(place):
             np.testing.assert_array_equal(found, [cell(g, free, occupied, "scale", negate) for g in LEVELS])
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("steps", "apart", "digest"),
     [

@@ -96,6 +96,7 @@ def test_joint_association_tries_all(backend, name, precision):
     assert_within(parts[possible].sum(axis=1, dtype=parts.dtype), expected[possible], terms=len(features))
 
 
+@pytest.mark.long_on("warp")
 @on_every_backend(on_warp=lambda precision: precision == "float32", precision=PRECISIONS)
 def test_features_as_the_caller_gave_them(backend, precision):
     """The bound includes rounding of positions, directions and readings: float32 keeps them in two numbers."""

@@ -38,8 +38,8 @@ from gpusense.world.scanner import classify_ranges
 _BLOCK, _MOST_LEVELS = 0.8, 5
 # Tiles along a side of a cell for bilinear fields, if this many table cells suffice.
 _TILES, _MOST_TABLE_CELLS = (4, 2, 1), 1 << 25
-# Most poses of scans that are searched together.
-_MOST_POSES = 1 << 33
+# Most blocks of poses that are bounded together, by kind of device.
+_MOST_BLOCKS = {"cpu": 1 << 25, "gpu": 1 << 27}
 # Rounding of a log-likelihood, in steps for each hit.
 _ROUNDING = 2e-3
 
@@ -143,7 +143,9 @@ class FieldSearch:
                 self._find_between(model, scan, part, searched, allowed, slack)
                 for scan, part, slack in zip(ranges, cells, most, strict=True)
             ]
-        each = max(_MOST_POSES // searched.count, 1)
+        level = self._search.first_level(cells, searched)
+        most_blocks = _MOST_BLOCKS[self._search.tables.backend.info.kind]
+        each = max(most_blocks // max(searched.count >> 2 * level, 1), 1)
         parts = [slice(begin, begin + each) for begin in range(0, len(points), each)]
         return [
             one

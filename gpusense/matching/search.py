@@ -7,6 +7,7 @@ best score so far (Hess et al., Real-time loop closure in 2D lidar SLAM, ICRA 20
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,27 +18,28 @@ from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.matching.pose_grid import Found, PoseGrid
-from gpusense.matching.score_tables import SHIFT_ROWS, ScoreTables
+from gpusense.matching.score_tables import SHIFT_ROWS, TOP, ScoreTables
 
 __all__ = ["Found", "PoseGrid", "Search"]
 
 _INT = np.dtype(np.int32)
 _NO_FLAGS: frozenset[str] = frozenset()
+# Numbers that count the rows of a scan by their scores, as in the kernel file.
+BINS = 512
 # Blocks of a scan that are followed down to poses for its first lower bound.
 _FOLLOWED = 512
 # Sums of a scan's bounds that a level of smaller blocks may take.
 _MOST_SUMS = 1 << 29
-# Room at first for chosen blocks of a scan, most blocks of a launch that divides them, and most poses that are kept.
-_ROOM, _MOST_BLOCKS, _MOST_KEPT = 1 << 17, 1 << 18, 1 << 18
+# Room at first for chosen blocks of a scan, room for their parts on each level, and most poses that are kept of a scan.
+_ROOM, _PARTS, _MOST_KEPT = 1 << 17, 1 << 18, 1 << 18
 # Most items of one launch: some drivers allow 65535 groups along the last axis.
 _MOST_ITEMS = 1 << 15
-# Counts between two uploads of zeros.
-_COUNTS = 64
+# Poses of a scan that are read together with their number, and work-items that divide blocks, by kind of device.
+_READ, _WORKERS = 512, {"gpu": 1 << 17, "cpu": 1 << 12}
 # Turn of the circle between points that are summed in turns, so that few of them tell about all directions.
 _TURN = (5**0.5 - 1) / 2
-# Arrays that place end points, and arrays of placed points.
+# Arrays that place end points.
 _GIVEN = ("end", "heading", "start", "first", "image")
-_MADE = ("point", "folded", "folded image")
 
 
 class Search:
@@ -46,6 +48,7 @@ class Search:
     def __init__(self, tables: ScoreTables) -> None:
         self.tables = tables
         self.space = Workspace(tables.backend)
+        self.room = 0
         self._masks: tuple[np.ndarray | None, tuple[int, ...], list[Buffer]] = (None, (), [])
 
     def find(
@@ -69,13 +72,14 @@ class Search:
         by row, column and heading. A scan without points scores 0 everywhere. No pose is returned without an allowed
         position.
         """
-        level = self._first_level(points, grid) if level is None else level
+        level = self.first_level(points, grid) if level is None else level
         run = _Run(self, grid, slack, self.masks(grid, allowed), level, floor)
-        run.place(points, images)
-        run.search()
+        with self.space:
+            run.place(points, images)
+            run.search()
         return run.found()
 
-    def _first_level(self, points: Sequence[np.ndarray], grid: PoseGrid) -> int:
+    def first_level(self, points: Sequence[np.ndarray], grid: PoseGrid) -> int:
         """Return the level whose blocks are bounded first."""
         level = self.tables.levels
         sums = max(map(len, points)) * grid.headings.shape[1] * grid.height * grid.width
@@ -91,184 +95,181 @@ class Search:
 
 
 class _Run:
-    """One search: its items, the lower bounds of scans, and the poses so far."""
+    """One search: its items, the lower bounds of scans, and the poses so far.
+
+    The device bounds, follows, chooses and divides blocks without the host, which reads their numbers and the poses at
+    the end. Where parts exceed their room, fewer blocks are divided at once.
+    """
 
     def __init__(
         self, search: Search, grid: PoseGrid, slack: int | np.ndarray, allowed: list[Buffer], level: int, floor: int
     ) -> None:
         self._tables, self._backend, self._space = search.tables, search.tables.backend, search.space
-        self._grid, self._slack, self._level, self._allowed = grid, slack, level, allowed
+        self._search, self._grid, self._level, self._allowed = search, grid, level, allowed
         scans, self._turns = grid.headings.shape
+        self._items = grid.headings.size
         self._height, self._width = (-(-size >> level) for size in (grid.height, grid.width))
+        self._slack = np.full(scans, slack, np.int32)
         self._best = np.full(scans, -1, np.int64)
         # Poses with lower scores are dropped.
-        self._least = floor
         self._floor = np.full(scans, floor, np.int64)
         self._complete = np.ones(scans, bool)
         self._kept: list[np.ndarray] = []
+        self._parts = _PARTS + _PARTS // 16 * scans
         self._evaluated = 0
-        self._bounds_made: Buffer | None = None
-        self._counts, self._slot = None, -1
+
+    def _launch(self, kernel: str, size: tuple[int, ...], *arguments: Any, flags: frozenset[str] = _NO_FLAGS) -> None:
+        self._backend.compile(kernel, flags)(size, *arguments)
 
     def place(self, points: Sequence[np.ndarray], images: Sequence[np.ndarray] | None) -> None:
         """Place the end points of all scans at all headings on the device."""
         grid, space, folded = self._grid, self._space, self._tables.folded(self._level)
-        counts = np.repeat([len(part) for part in points], self._turns)
-        first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-        if images is None:
-            several = self._tables.shape.tables > 1
-            images = [np.full(len(part), scan if several else 0) for scan, part in enumerate(points)]
-        orders = [np.argsort(np.arange(len(part)) * _TURN % 1) for part in points]
-        each = [
-            np.tile(part[order], self._turns) if part.ndim == 1 else part[:, order].reshape(-1)
-            for part, order in zip(images, orders, strict=True)
-        ]
+        each = [len(part) for part in points]
+        orders = [*map(_order, each)]
+        first = np.concatenate([[0], np.cumsum(np.repeat(each, self._turns))]).astype(np.int32)
+        # Buffers are never empty.
+        self._most, total = max(*each, 1), max(int(first[-1]), 1)
+        ends = np.concatenate([*(part[order] for part, order in zip(points, orders, strict=True)), np.zeros((1, 2))])
         turned = np.stack([np.cos(grid.headings), np.sin(grid.headings)], axis=-1)
-        ends = [part[order] for part, order in zip(points, orders, strict=True)]
-        given: tuple[np.ndarray, ...] = (
-            _filled(np.concatenate([*ends, np.empty((0, 2))])), turned.reshape(-1), grid.start.astype(np.float64),
-            first, _filled(np.concatenate(each).astype(np.int32)),
-        )  # fmt: skip
-        total = max(int(first[-1]), 1)
-        sizes = 2 * total, 2 * total, total
+        given = [ends.reshape(-1), turned.reshape(-1), grid.start.astype(np.float64).reshape(-1), first]
+        if images is not None or self._tables.shape.tables > 1:
+            images = [np.full(count, scan) for scan, count in enumerate(each)] if images is None else images
+            named = [np.broadcast_to(part, (self._turns, count))[:, order].reshape(-1)
+                     for part, count, order in zip(images, each, orders, strict=True)]  # fmt: skip
+            given.append(np.concatenate([*named, [0]]).astype(np.int32))
+        elif not self._backend.info.float64:
+            given.append(np.zeros(total, np.int32))
+        sizes = {"point": 2 * total, "folded": 2 * total, "folded image": total}
         made: list[Any]
-        uploaded: list[Any]
+        there: list[Any]
         if self._backend.info.float64:
-            uploaded = [space.upload(name, array) for name, array in zip(_GIVEN, given, strict=True)]
-            made = [space.empty(name, size, _INT) for name, size in zip(_MADE, sizes, strict=True)]
+            there = [space.upload(name, array) for name, array in zip(_GIVEN, given, strict=False)]
+            there = there if len(there) == len(_GIVEN) else [*there, space.empty("table 0", total, _INT, zero=True)]
+            made = [space.empty(name, size, _INT) for name, size in sizes.items()]
             place = self._backend.compile("place_ends", _NO_FLAGS)
         else:
-            uploaded = [array.reshape(-1) for array in given]
-            made = [np.zeros(size, np.int32) for size in sizes]
+            there, made = given, [np.zeros(size, np.int32) for size in sizes.values()]
             place = get_backend("numpy").compile("place_ends", _NO_FLAGS)
-        place((len(counts),), *uploaded, *made, len(counts), self._turns, folded.period, folded.step, folded.offset)
+        place((self._most, self._items), *there, *made, self._items, self._turns, self._tables.stride,
+              self._level, self._tables.step(self._level).bit_length() - 1, folded.offset)  # fmt: skip
         if not self._backend.info.float64:
-            uploaded = [space.upload(name, array) for name, array in zip(_GIVEN, given, strict=True)]
-            made = [space.upload(name, array) for name, array in zip(_MADE, made, strict=True)]
-        first_there, images_there = uploaded[-2:]
-        self._ends, self._folded_ends = (made[0], images_there, first_there), (made[1], made[2], first_there)
-
-    def _bounds(self) -> Buffer:
-        """Start bounding all blocks, and return their scores (S * A, rows, cols) on the device; others have -1."""
-        if self._bounds_made is None:
-            folded, items = self._tables.folded(self._level), self._grid.headings.size
-            score = self._space.empty("bounds", items * self._height * self._width, _INT)
-            flags = with_lanes_flag(self._backend.info.lanes, "shift_scores", _NO_FLAGS)
-            shift = self._backend.compile("shift_scores", flags)
-            for begin in range(0, items, _MOST_ITEMS):
-                end = min(begin + _MOST_ITEMS, items)
-                shift(
-                    (self._width, -(-self._height // SHIFT_ROWS), end - begin), folded.table, *self._folded_ends,
-                    self._allowed[self._level], score, folded.shape, begin, end, self._height, self._width, folded.unit,
-                )  # fmt: skip
-            self._evaluated += items * self._height * self._width
-            self._bounds_made = score
-        return self._bounds_made
+            there = [space.upload(name, array) for name, array in zip(_GIVEN, given, strict=True)]
+            made = [space.upload(name, array) for name, array in zip(sizes, made, strict=True)]
+        self._ends, self._folded_ends = (made[0], there[4], there[3]), (made[1], made[2], there[3])
 
     def search(self) -> None:
         """Find first lower bounds, then divide all blocks whose bounds reach them."""
-        rows, scans = self._grid.headings.size * self._height, len(self._best)
-        self._maxima = self._space.empty("row maxima", 2 * rows, _INT)
-        self._backend.compile("row_maxima", _NO_FLAGS)((rows,), self._bounds(), self._maxima, rows, self._width)
-        best = np.empty((rows, 2), np.int32)
-        self._space.read(self._maxima, best)
-        item, row = np.divmod(np.arange(rows), self._height)
-        blocks = np.stack([item, row << self._level, best[:, 1] << self._level, best[:, 0]], axis=1, dtype=np.int32)
-        if self._level == 0:
-            self._raise(blocks)
-        else:
-            chosen = np.concatenate([self._most_promising(part) for part in np.split(blocks, scans)])
-            self._follow(self._space.upload("followed", chosen), len(chosen))
-        self._descend(*self._choose(), self._level)
-
-    @staticmethod
-    def _most_promising(blocks: np.ndarray) -> np.ndarray:
-        """Return the best blocks of a scan, evenly spaced: many bounds are equal, most of all the largest."""
-        most = min(_FOLLOWED, len(blocks))
-        least = max(np.partition(blocks[:, 3], -most)[-most], 0)
-        promising = blocks[blocks[:, 3] >= least]
-        most = min(most, len(promising))
-        return promising[np.arange(most) * len(promising) // max(most, 1)]
-
-    def _follow(self, blocks: Buffer, count: int) -> None:
-        """Raise lower bounds: follow the best parts of blocks down to poses."""
-        for level in range(self._level - 1, -1, -1):
-            top = level == self._level - 1
-            self._backend.compile("follow_blocks", _NO_FLAGS)(
-                (count,), self._tables.quarters(level, top=top), *self._ends, self._allowed[level], blocks,
-                self._tables.shape, count, self._grid.height, self._grid.width, -(-self._grid.width >> level), level,
-                self._tables.stride, int(top),
-            )  # fmt: skip
-        self._evaluated += 4 * self._level * count
-        poses = np.empty((count, 4), np.int32)
-        self._space.read(blocks, poses)
-        self._raise(poses)
-
-    def _choose(self) -> tuple[Buffer, int]:
-        """Return the blocks whose bounds reach the floor of their scan, and their number."""
-        space, rows, room = self._space, self._grid.headings.size * self._height, _ROOM * len(self._best)
+        self._bound()
+        self._low = self._space.upload("low", np.maximum(self._floor, 0).astype(np.int32))
+        self._follow()
+        begin, some = 0, 1 << 30
+        self._choose()
         while True:
-            made, low = space.empty("blocks", 4 * room, _INT), space.upload("low", self._low())
-            counter, slot = self._counter()
-            self._backend.compile("choose_blocks", _NO_FLAGS)(
-                (rows,), self._bounds(), self._maxima, low, made, counter, rows, self._height, self._width,
-                self._turns, self._level, room, slot,
+            self._divide(begin, some)
+            counts, poses = self._read()
+            chosen = int(counts[-1])
+            if chosen > self._room:
+                self._search.room = chosen
+                self._choose()
+                continue
+            if counts[:-1].max(initial=0) > self._parts:
+                # A block alone has at most 4^level parts.
+                some = max(min(some, chosen - begin) // 4, 1)
+            else:
+                self._evaluated += 4 * (min(some, chosen - begin) + int(counts[1:-1].sum())) if self._level else 0
+                self._raise(poses)
+                self._keep(poses)
+                begin += some
+                if begin >= chosen:
+                    return
+                self._raise_low()
+            counts[:-1] = 0
+            self._counts = self._space.upload("count", counts)
+
+    def _bound(self) -> None:
+        """Bound all blocks: scores (S * A, rows, cols), -1 where none is allowed, and the best of each row."""
+        folded, items, rows = self._tables.folded(self._level), self._items, self._items * self._height
+        self._score = self._space.empty("bounds", rows * self._width, _INT)
+        flags = with_lanes_flag(self._backend.info.lanes, "shift_scores", _NO_FLAGS)
+        for begin in range(0, items, _MOST_ITEMS):
+            end = min(begin + _MOST_ITEMS, items)
+            self._launch(
+                "shift_scores", (self._width, -(-self._height // SHIFT_ROWS), end - begin), folded.table,
+                *self._folded_ends, self._allowed[self._level], self._score, folded.shape, begin, end, self._height,
+                self._width, folded.unit, flags=flags,
             )  # fmt: skip
-            count = self._counted()
-            if count <= room:
-                return made, count
-            room = count
-
-    def _low(self) -> np.ndarray:
-        """Return the least scores of blocks that are divided; blocks without an allowed position have -1."""
-        low: np.ndarray = np.maximum(self._floor, 0).astype(np.int32)
-        return low
-
-    def _descend(self, blocks: Buffer, count: int, level: int) -> None:
-        """Divide blocks of a level down to poses, and keep those that reach the floor."""
-        if level == 0:
-            poses = self._read(blocks, count)
-            self._raise(poses)
-            self._keep(poses)
-            return
-        for begin in range(0, count, _MOST_BLOCKS):
-            some = min(_MOST_BLOCKS, count - begin)
-            part = self._backend.part(blocks, 4 * begin, 4 * some, _INT)
-            self._descend(*self._divide(part, some, level - 1), level - 1)
-
-    def _divide(self, blocks: Buffer, count: int, level: int) -> tuple[Buffer, int]:
-        """Return the allowed quarters of blocks whose bounds reach the floor of their scan, and their number."""
-        made, low = self._space.empty(f"parts {level}", 16 * count, _INT), self._space.upload("low", self._low())
-        counter, slot = self._counter()
-        top = level == self._level - 1
-        self._backend.compile("divide_blocks", _NO_FLAGS)(
-            (count,), self._tables.quarters(level, top=top), *self._ends, self._allowed[level], blocks, low, made,
-            counter, self._tables.shape, count, self._grid.height, self._grid.width, -(-self._grid.width >> level),
-            self._turns, level, self._tables.stride, int(top), slot,
+        self._evaluated += rows * self._width
+        self._maxima = self._space.empty("row maxima", 2 * rows, _INT)
+        self._histogram = self._space.upload("histogram", np.zeros(len(self._best) * BINS, np.int32))
+        self._shift = max((TOP * self._most).bit_length() - BINS.bit_length() + 1, 0)
+        self._launch(
+            "row_maxima", (rows,), self._score, self._maxima, self._histogram, rows, self._width, self._height,
+            self._turns, self._shift,
         )  # fmt: skip
-        self._evaluated += 4 * count
-        return made, self._counted()
 
-    def _counter(self) -> tuple[Buffer, int]:
-        """Return the buffer of counts, and the index of one that is 0."""
-        self._slot = (self._slot + 1) % _COUNTS
-        if self._slot == 0:
-            self._counts = self._space.upload("count", np.zeros(_COUNTS, np.int32))
-        return self._counts, self._slot
+    def _follow(self) -> None:
+        """Raise lower bounds: follow the best parts of promising blocks down to poses."""
+        most = min(_FOLLOWED, self._turns * self._height)
+        count = most * len(self._best)
+        number, blocks = self._space.empty("number", self._items, _INT), self._space.empty("followed", 4 * count, _INT)
+        numbers = self._items, self._height, self._turns
+        self._launch("count_promising", (self._items,), self._maxima, self._histogram, number, *numbers, self._shift,
+                     most)  # fmt: skip
+        self._launch("pick_blocks", (self._items,), self._maxima, self._histogram, number, blocks, *numbers,
+                     self._level, self._shift, most)  # fmt: skip
+        for level in reversed(range(self._level)):
+            top = level == self._level - 1
+            self._launch(
+                "follow_blocks", (count,), self._tables.quarters(level, top=top), *self._ends, self._allowed[level],
+                blocks, self._tables.shape, count, self._grid.height, self._grid.width, -(-self._grid.width >> level),
+                level, self._tables.stride, int(top),
+            )  # fmt: skip
+        self._launch("raise_low", (count,), blocks, self._space.upload("slack", self._slack), self._low, count, most)
+        self._evaluated += 4 * self._level * count
 
-    def _counted(self) -> int:
-        """Wait, and return the last count."""
-        counts = np.empty(self._slot + 1, np.int32)
-        self._space.read(self._counts, counts)
-        return int(counts[-1])
+    def _choose(self) -> None:
+        """Collect the blocks whose bounds reach the lower bound of their scan."""
+        rows = self._items * self._height
+        self._room = max(self._search.room, _ROOM * len(self._best))
+        self._chosen = self._space.empty("chosen", 4 * self._room, _INT)
+        self._counts = self._space.upload("count", np.zeros(self._level + 1, np.int32))
+        self._launch(
+            "choose_blocks", (rows,), self._score, self._maxima, self._low, self._chosen, self._counts, rows,
+            self._height, self._width, self._turns, self._level, self._room,
+        )  # fmt: skip
 
-    def _read(self, blocks: Buffer, count: int) -> np.ndarray:
-        """Return blocks (M, 4), items, rows, columns and scores, by item, row and column."""
-        host = np.empty((count, 4), np.int32)
-        self._space.read(blocks, host)
-        order = np.lexsort((host[:, 2], host[:, 1], host[:, 0]))
-        ordered: np.ndarray = host[order]
-        return ordered
+    def _divide(self, begin: int, some: int) -> None:
+        """Divide chosen blocks from ``begin`` on, but at most ``some``, down to poses."""
+        workers, blocks = _WORKERS[self._backend.info.kind], self._chosen
+        for level in reversed(range(self._level)):
+            top, parts = level == self._level - 1, self._space.empty(f"parts {level}", 4 * self._parts, _INT)
+            self._launch(
+                "divide_blocks", (workers,), self._tables.quarters(level, top=top), *self._ends, self._allowed[level],
+                blocks, self._low, parts, self._counts, self._tables.shape, begin if top else 0,
+                min(some, self._room) if top else self._parts, self._parts, workers, self._grid.height,
+                self._grid.width, -(-self._grid.width >> level), self._turns, level, self._tables.stride, int(top),
+            )  # fmt: skip
+            blocks = parts
+        self._poses = blocks
+
+    def _read(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the numbers of blocks of each level, and poses (M, 4): items, rows, columns and scores."""
+        room = self._parts if self._level else self._room
+        counts, few = np.empty(self._level + 1, np.int32), min(_READ * len(self._best), room)
+        poses = np.empty((few, 4), np.int32)
+        self._space.download(self._counts, counts)
+        self._space.download(self._poses, poses)
+        self._space.wait()
+        if few < (count := int(counts[0])) <= room:
+            poses = np.empty((count, 4), np.int32)
+            self._space.read(self._poses, poses)
+        return counts, poses[: counts[0]]
+
+    def _raise_low(self) -> None:
+        """Raise the lower bounds on the device."""
+        low = np.empty(len(self._best), np.int32)
+        self._space.read(self._low, low)
+        self._low = self._space.upload("low", np.maximum(low, self._floor).astype(np.int32))
 
     def _raise(self, poses: np.ndarray) -> None:
         """Raise the lower bounds of scans."""
@@ -306,10 +307,10 @@ class _Run:
         return Found(scan, poses[:, 1], poses[:, 2], heading, poses[:, 3], self._evaluated, self._complete)
 
 
-def _filled(array: np.ndarray) -> np.ndarray:
-    """Return a flat array of at least two numbers, since buffers are never empty."""
-    flat = np.ascontiguousarray(array).reshape(-1)
-    return flat if len(flat) else np.zeros(2, flat.dtype)
+@functools.lru_cache(maxsize=64)
+def _order(count: int) -> np.ndarray:
+    """Return the order in which points are summed."""
+    return np.argsort(np.arange(count) * _TURN % 1)
 
 
 def _ranks(scan: np.ndarray, score: np.ndarray) -> np.ndarray:

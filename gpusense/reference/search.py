@@ -21,6 +21,8 @@ from gpusense.reference.score_cells import TOP, cell_index, padded_lines, padded
 
 # Sums of a block of candidates.
 _BLOCK = 1 << 22
+# Numbers that count the rows of a scan by their scores.
+BINS = 512
 
 
 def pool_scores(flags: frozenset[str], table: np.ndarray, pooled: np.ndarray, scores: ScoreTable, reach: int) -> None:
@@ -109,17 +111,64 @@ def shift_scores(
     total[:, allowed[: height * width].reshape(height, width) == 0] = -1
 
 
-def row_maxima(flags: frozenset[str], score: np.ndarray, best: np.ndarray, rows: int, width: int) -> None:
-    """Find the largest score of each row of shifts, and its first column."""
+def row_maxima(
+    flags: frozenset[str], score: np.ndarray, best: np.ndarray, histogram: np.ndarray, rows: int, width: int,
+    height: int, turns: int, shift: int,
+) -> None:  # fmt: skip
+    """Find the largest score of each row of shifts and its first column, and count the rows of scans by scores."""
     values = score[: rows * width].reshape(rows, width)
     place = values.argmax(axis=1)
-    best[: 2 * rows : 2] = values[np.arange(rows), place]
-    best[1 : 2 * rows : 2] = place
+    most = values[np.arange(rows), place]
+    best[: 2 * rows : 2], best[1 : 2 * rows : 2] = most, place
+    some = np.flatnonzero(most >= 0)
+    np.add.at(histogram, some // (height * turns) * BINS + (most[some] >> shift), 1)
+
+
+def promising(best: np.ndarray, histogram: np.ndarray, rows: int, scan: int, shift: int, most: int) -> np.ndarray:
+    """Return which of a scan's rows have its ``most`` largest scores, or others as good."""
+    above = np.cumsum(histogram[scan * BINS : (scan + 1) * BINS][::-1])
+    least = max(BINS - 1 - int(np.searchsorted(above, most)), 0) << shift
+    chosen: np.ndarray = best[2 * scan * rows : 2 * (scan + 1) * rows : 2] >= least
+    return chosen
+
+
+def count_promising(
+    flags: frozenset[str], best: np.ndarray, histogram: np.ndarray, number: np.ndarray, items: int, height: int,
+    turns: int, shift: int, most: int,
+) -> None:  # fmt: skip
+    """Count the promising rows of each item."""
+    for scan in range(items // turns):
+        chosen = promising(best, histogram, height * turns, scan, shift, most)
+        number[scan * turns : (scan + 1) * turns] = chosen.reshape(turns, height).sum(axis=1)
+
+
+def pick_blocks(
+    flags: frozenset[str], best: np.ndarray, histogram: np.ndarray, number: np.ndarray, block: np.ndarray, items: int,
+    height: int, turns: int, level: int, shift: int, most: int,
+) -> None:  # fmt: skip
+    """Take most of the promising rows of each scan, evenly spaced, as blocks; missing blocks have the score -1."""
+    rows = height * turns
+    made = block[: 4 * most * (items // turns)].reshape(-1, most, 4)
+    for scan in range(len(made)):
+        chosen = np.flatnonzero(promising(best, histogram, rows, scan, shift, most))
+        taken = min(len(chosen), most)
+        row = chosen[np.arange(taken) * len(chosen) // max(taken, 1)] + scan * rows
+        columns = row // height, row % height << level, best[2 * row + 1] << level, best[2 * row]
+        made[scan, :taken], made[scan, taken:, 3] = np.stack(columns, axis=1), -1
+
+
+def raise_low(
+    flags: frozenset[str], block: np.ndarray, slack: np.ndarray, low: np.ndarray, blocks: int, most: int
+) -> None:
+    """Raise the least scores of scans to the scores of poses less their slack."""
+    score = block[: 4 * blocks].reshape(-1, most, 4)[:, :, 3].max(axis=1)
+    scans = len(score)
+    low[:scans] = np.where(score >= 0, np.maximum(low[:scans], score - slack[:scans]), low[:scans])
 
 
 def choose_blocks(
     flags: frozenset[str], score: np.ndarray, best: np.ndarray, low: np.ndarray, block: np.ndarray, count: np.ndarray,
-    rows: int, height: int, width: int, turns: int, level: int, room: int, slot: int,
+    rows: int, height: int, width: int, turns: int, level: int, room: int,
 ) -> None:  # fmt: skip
     """Collect the shifts whose scores are at least low of their scan."""
     values = score[: rows * width].reshape(-1, height, width)
@@ -127,7 +176,7 @@ def choose_blocks(
     item, row, col = np.nonzero(values >= low[scan][:, None, None])
     chosen = np.stack([item, row << level, col << level, values[item, row, col]], axis=1)[:room]
     block[: chosen.size] = chosen.ravel()
-    count[slot] += len(item)
+    count[level] += len(item)
 
 
 def follow_blocks(
@@ -151,17 +200,19 @@ def follow_blocks(
 def divide_blocks(
     flags: frozenset[str], quarters: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray,
     allowed: np.ndarray, block: np.ndarray, low: np.ndarray, part: np.ndarray, count: np.ndarray, scores: ScoreTable,
-    blocks: int, height: int, width: int, columns: int, turns: int, level: int, spacing: int, top: int, slot: int,
+    begin: int, some: int, room: int, workers: int, height: int, width: int, columns: int, turns: int, level: int,
+    spacing: int, top: int,
 ) -> None:  # fmt: skip
     """Divide blocks into quarters of 2^level x 2^level, and collect the allowed ones that reach low of their scan."""
-    here = block[: 4 * blocks].reshape(blocks, 4)
+    blocks = min(int(count[level + 1]) - begin, some)
+    here = block[4 * begin : 4 * (begin + blocks)].reshape(blocks, 4)
     total = divided(quarters, point, image, first, here, scores, spacing, top)
     parts, within = _quarters_of(here, allowed, height, width, columns, level)
     number, which = np.nonzero(within & (total >= low[here[:, 0] // turns, None]))
     made = np.column_stack([here[number, 0], parts[number, which], total[number, which]])
-    begin = 4 * int(count[slot])
-    part[begin : begin + made.size] = made.ravel()
-    count[slot] += len(made)
+    kept = made[: max(room - int(count[level]), 0)]
+    part[4 * int(count[level]) :][: kept.size] = kept.ravel()
+    count[level] += len(made)
 
 
 def _quarters_of(

@@ -8,10 +8,10 @@ import numpy as np
 def place_ends(
     flags: frozenset[str], end: np.ndarray, heading: np.ndarray, start: np.ndarray, first: np.ndarray,
     image: np.ndarray, point: np.ndarray, folded: np.ndarray, folded_image: np.ndarray, items: int, turns: int,
-    period: int, step: int, offset: int,
+    stride: int, level: int, step_level: int, offset: int,
 ) -> None:  # fmt: skip
     """Place the end points of scans at headings in cells of the tables, and in cells and images of a folded table."""
-    side = period // step
+    period, side = stride << level, stride << (level - step_level)
     for scan in range(items // turns):
         begin, last = int(first[scan * turns]), int(first[(scan + 1) * turns])
         count = (last - begin) // turns
@@ -22,5 +22,5 @@ def place_ends(
         cells = np.floor(places).astype(np.int32).reshape(-1, 2)
         point[begin:last] = cells
         folded[begin:last] = (cells + offset) // period
-        phase = (cells + offset - folded[begin:last] * period) // step
+        phase = (cells + offset - folded[begin:last] * period) >> step_level
         folded_image[begin:last] = (image[begin:last] * side + phase[:, 1]) * side + phase[:, 0]

@@ -13,6 +13,8 @@
 
 // Points after which sums are compared.
 #define STEP 48
+// Numbers that count the rows of a scan by their scores.
+#define BINS 512
 
 // Write the maximum of each cell and the cells up to reach rows and columns further. One work-item takes a cell.
 kernel void pool_scores(ARGUMENTS) {
@@ -99,7 +101,8 @@ kernel void shift_scores(ARGUMENTS) {
     }
 }
 
-// Find the largest score of each row of shifts, and its first column. One work-item takes a row of an item.
+// Find the largest score of each row of shifts and its first column, and count the rows of each scan by their scores,
+// divided by 2^shift. The caller clears the counts. One work-item takes a row of an item.
 kernel void row_maxima(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= rows) return;
@@ -109,10 +112,66 @@ kernel void row_maxima(ARGUMENTS) {
     while (score[n * width + place] < most) ++place;
     best[2 * n] = most;
     best[2 * n + 1] = place;
+    if (most >= 0) atomic_add(&histogram[n / (height * turns) * BINS + (most >> shift)], 1);
+}
+
+// Return the least score, divided by 2^shift, of a scan's most rows with the largest scores, and of others as good.
+int promising(global const int *histogram, const int most) {
+    int bin = BINS - 1;
+    for (int rows = histogram[bin]; rows < most && bin > 0; rows += histogram[--bin]);
+    return bin;
+}
+
+// Count the promising rows of each item. One work-item takes an item.
+kernel void count_promising(ARGUMENTS) {
+    const int item = get_global_id(0);
+    if (item >= items) return;
+    const int least = promising(histogram + item / turns * BINS, most) << shift;
+    int rows = 0;
+    for (int row = 0; row < height; ++row) rows += best[2 * (item * height + row)] >= least;
+    number[item] = rows;
+}
+
+// Take most of the promising rows of each scan, evenly spaced: many bounds are equal, most of all the largest. Their best
+// blocks follow each other as item, first row and column, and score; blocks that are missing have the score -1. One
+// work-item takes an item.
+kernel void pick_blocks(ARGUMENTS) {
+    const int item = get_global_id(0);
+    if (item >= items) return;
+    const int scan = item / turns, least = promising(histogram + scan * BINS, most) << shift;
+    int before = 0, total = 0;
+    for (int other = scan * turns; other < (scan + 1) * turns; ++other) {
+        before += other < item ? number[other] : 0;
+        total += number[other];
+    }
+    const long taken = min(total, most);
+    for (int i = item % turns; i < most; i += turns)
+        if (i >= taken) block[4 * (scan * most + i) + 3] = -1;
+    for (int row = 0; row < height; ++row) {
+        const int value = best[2 * (item * height + row)];
+        if (value < least) continue;
+        const int i = (int)((before * taken + total - 1) / total);
+        if (i < taken && i * (long)total / taken == before) {
+            global int *out = block + 4 * (scan * most + i);
+            out[0] = item;
+            out[1] = row << level;
+            out[2] = best[2 * (item * height + row) + 1] << level;
+            out[3] = value;
+        }
+        ++before;
+    }
+}
+
+// Raise the least scores of scans to the scores of poses less their slack. One work-item takes a pose.
+kernel void raise_low(ARGUMENTS) {
+    const int n = get_global_id(0);
+    if (n >= blocks || block[4 * n + 3] < 0) return;
+    const int scan = n / most;
+    atomic_max(&low[scan], block[4 * n + 3] - slack[scan]);
 }
 
 // Collect the shifts whose scores are at least low of their scan, in no certain order: item, first row and column of each
-// block, and score. count[slot], which the caller clears, may exceed room: then some are left out. best is the result of
+// block, and score. count[level], which the caller clears, may exceed room: then some are left out. best is the result of
 // row_maxima. One work-item takes a row of an item.
 kernel void choose_blocks(ARGUMENTS) {
     const int k = get_global_id(0);
@@ -122,7 +181,7 @@ kernel void choose_blocks(ARGUMENTS) {
     for (int col = 0; col < width; ++col) {
         const int value = score[k * width + col];
         if (value < least) continue;
-        const int n = atomic_add(&count[slot], 1);
+        const int n = atomic_add(&count[level], 1);
         if (n >= room) continue;
         block[4 * n] = item;
         block[4 * n + 1] = k % height << level;
@@ -153,25 +212,28 @@ kernel void follow_blocks(ARGUMENTS) {
     block[4 * n + 3] = most;
 }
 
-// Divide blocks of positions into quarters of 2^level x 2^level, and collect the allowed ones whose scores are at least low
-// of their scan, in no certain order. The caller clears count[slot]. One work-item takes a block.
+// Divide count[level + 1] blocks of positions, but at most some from begin on, into quarters of 2^level x 2^level, and
+// collect the allowed ones whose scores are at least low of their scan, in no certain order. count[level], which the caller
+// clears, may exceed room: then some are left out. One of workers work-items takes each of workers neighbouring blocks.
 kernel void divide_blocks(ARGUMENTS) {
-    const int n = get_global_id(0);
-    if (n >= blocks) return;
-    const int item = block[4 * n], row = block[4 * n + 1], col = block[4 * n + 2], quarter = 1 << level;
-    const int begin = first[item], end = first[item + 1], least = low[item / turns];
-    const int score = top ? TOP * (end - begin) : block[4 * n + 3];
-    const int4 sums =
-        divided(quarters, point, image, scores, begin, end, spacing * row, spacing * col, score, least);
-    const int total[4] = {sums.x, sums.y, sums.z, sums.w};
-    for (int i = 0; i < 4; ++i) {
-        const int part_row = row + i / 2 * quarter, part_col = col + i % 2 * quarter;
-        if (part_row >= height || part_col >= width || total[i] < least) continue;
-        if (!allowed[(part_row >> level) * columns + (part_col >> level)]) continue;
-        const int m = atomic_add(&count[slot], 1);
-        part[4 * m] = item;
-        part[4 * m + 1] = part_row;
-        part[4 * m + 2] = part_col;
-        part[4 * m + 3] = total[i];
+    const int left = count[level + 1] - begin, blocks = left < some ? left : some, quarter = 1 << level;
+    for (int n = get_global_id(0); n < blocks; n += workers) {
+        global const int *here = block + 4 * (begin + n);
+        const int item = here[0], row = here[1], col = here[2], least = low[item / turns];
+        const int score = top ? TOP * (first[item + 1] - first[item]) : here[3];
+        const int4 sums = divided(quarters, point, image, scores, first[item], first[item + 1], spacing * row,
+                                  spacing * col, score, least);
+        const int total[4] = {sums.x, sums.y, sums.z, sums.w};
+        for (int i = 0; i < 4; ++i) {
+            const int part_row = row + i / 2 * quarter, part_col = col + i % 2 * quarter;
+            if (part_row >= height || part_col >= width || total[i] < least) continue;
+            if (!allowed[(part_row >> level) * columns + (part_col >> level)]) continue;
+            const int m = atomic_add(&count[level], 1);
+            if (m >= room) continue;
+            part[4 * m] = item;
+            part[4 * m + 1] = part_row;
+            part[4 * m + 2] = part_col;
+            part[4 * m + 3] = total[i];
+        }
     }
 }

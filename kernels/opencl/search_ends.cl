@@ -1,28 +1,30 @@
 // End points of scans at all headings, as cells of tables of scores; see search.cl.
 
-// Return the quotient of integers, rounded down.
-int floored(const int number, const int divisor) {
-    const int quotient = number / divisor;
-    return quotient * divisor > number ? quotient - 1 : quotient;
+// Return a cell divided by stride * 2^level, rounded down.
+int periods(const int cell, const int stride, const int level) {
+    const int number = cell >> level, quotient = stride == 1 ? number : number / stride;
+    return quotient * stride > number ? quotient - 1 : quotient;
+}
+
+// Return the cell of a place. PoCL compiles floor as a call.
+int cell_of(const double place) {
+    const int cell = (int)place;
+    return cell > place ? cell - 1 : cell;
 }
 
 // Place the end points of a scan at a heading in cells of the tables, and in cells and images of a folded table. One
-// work-item takes an item.
+// work-item takes a point of an item.
 kernel void place_ends(ARGUMENTS) {
-    const int item = get_global_id(0);
-    if (item >= items) return;
-    const int scan = item / turns, begin = first[item], last = first[item + 1], side = period / step;
-    const int ends = first[scan * turns] / turns;
+    const int n = get_global_id(0), item = get_global_id(1);
+    if (item >= items || n >= first[item + 1] - first[item]) return;
+    const int scan = item / turns, side = stride << (level - step_level), k = first[item] + n, m = 2 * (first[scan * turns] / turns + n);
     const double cosine = heading[2 * item], sine = heading[2 * item + 1];
-    const double start_x = start[2 * scan], start_y = start[2 * scan + 1];
-    for (int k = begin; k < last; ++k) {
-        const double x = end[2 * (ends + k - begin)], y = end[2 * (ends + k - begin) + 1];
-        const double across = cosine * x - sine * y, along = sine * x + cosine * y;
-        const int2 cell = (int2)((int)floor(start_x + across), (int)floor(start_y + along));
-        const int2 whole = (int2)(floored(cell.x + offset, period), floored(cell.y + offset, period));
-        const int col = (cell.x + offset - whole.x * period) / step, row = (cell.y + offset - whole.y * period) / step;
-        point[k] = cell;
-        folded[k] = whole;
-        folded_image[k] = (image[k] * side + row) * side + col;
-    }
+    const double across = cosine * end[m] - sine * end[m + 1], along = sine * end[m] + cosine * end[m + 1];
+    const int2 cell = (int2)(cell_of(start[2 * scan] + across), cell_of(start[2 * scan + 1] + along));
+    const int x = cell.x + offset, y = cell.y + offset, period = stride << level;
+    const int2 whole = (int2)(periods(x, stride, level), periods(y, stride, level));
+    const int col = (x - whole.x * period) >> step_level, row = (y - whole.y * period) >> step_level;
+    point[k] = cell;
+    folded[k] = whole;
+    folded_image[k] = (image[k] * side + row) * side + col;
 }

@@ -21,6 +21,8 @@ from .score_cells import SHIFT_ROWS, TOP, ScoreTable, block_index, padded_lines,
 Rows = wp.types.vector(length=SHIFT_ROWS, dtype=wp.int32)
 # Points after which sums are compared.
 STEP = 48
+# Numbers that count the rows of a scan by their scores.
+BINS = 512
 
 
 @kernel()
@@ -149,8 +151,10 @@ def shift_scores(table, point, image, first, allowed, score, scores, begin, item
 
 
 @kernel()
-def row_maxima(score, best, rows, width):
-    """Find the largest score of each row of shifts, and its first column. One work-item takes a row of an item."""
+def row_maxima(score, best, histogram, rows, width, height, turns, shift):
+    """Find the largest score of each row of shifts and its first column, and count the rows of each scan by their
+    scores, divided by 2^shift. The caller clears the counts. One work-item takes a row of an item.
+    """
     n = wp.tid()
     if n >= rows:
         return
@@ -162,12 +166,85 @@ def row_maxima(score, best, rows, width):
             place = col
     best[2 * n] = most
     best[2 * n + 1] = place
+    if most >= 0:
+        wp.atomic_add(histogram, n // (height * turns) * BINS + (most >> shift), 1)
+
+
+@wp.func
+def promising(histogram: wp.array(dtype=wp.int32), scan: wp.int32, most: wp.int32):
+    """Return the least score, divided by 2^shift, of a scan's most rows with the largest scores, and of others as
+    good.
+    """
+    bin = int(BINS - 1)
+    rows = histogram[scan * BINS + bin]
+    while rows < most and bin > 0:
+        bin = bin - 1
+        rows = rows + histogram[scan * BINS + bin]
+    return bin
 
 
 @kernel()
-def choose_blocks(score, best, low, block, count, rows, height, width, turns, level, room, slot):
+def count_promising(best, histogram, number, items, height, turns, shift, most):
+    """Count the promising rows of each item. One work-item takes an item."""
+    item = wp.tid()
+    if item >= items:
+        return
+    least = promising(histogram, item // turns, most) << shift
+    rows = int(0)
+    for row in range(height):
+        if best[2 * (item * height + row)] >= least:
+            rows = rows + 1
+    number[item] = rows
+
+
+@kernel()
+def pick_blocks(best, histogram, number, block, items, height, turns, level, shift, most):
+    """Take most of the promising rows of each scan, evenly spaced: many bounds are equal, most of all the largest.
+    Their best blocks follow each other as item, first row and column, and score; blocks that are missing have the
+    score -1. One work-item takes an item.
+    """
+    item = wp.tid()
+    if item >= items:
+        return
+    scan = item // turns
+    least = promising(histogram, scan, most) << shift
+    before = int(0)
+    total = int(0)
+    for other in range(scan * turns, (scan + 1) * turns):
+        if other < item:
+            before = before + number[other]
+        total = total + number[other]
+    taken = wp.int64(wp.min(total, most))
+    for i in range(item % turns, most, turns):
+        if wp.int64(i) >= taken:
+            block[4 * (scan * most + i) + 3] = -1
+    for row in range(height):
+        value = best[2 * (item * height + row)]
+        if value >= least:
+            place = (wp.int64(before) * taken + wp.int64(total - 1)) // wp.int64(total)
+            if place < taken and place * wp.int64(total) // taken == wp.int64(before):
+                out = 4 * (scan * most + int(place))
+                block[out] = item
+                block[out + 1] = row << level
+                block[out + 2] = best[2 * (item * height + row) + 1] << level
+                block[out + 3] = value
+            before = before + 1
+
+
+@kernel()
+def raise_low(block, slack, low, blocks, most):
+    """Raise the least scores of scans to the scores of poses less their slack. One work-item takes a pose."""
+    n = wp.tid()
+    if n >= blocks:
+        return
+    if block[4 * n + 3] >= 0:
+        wp.atomic_max(low, n // most, block[4 * n + 3] - slack[n // most])
+
+
+@kernel()
+def choose_blocks(score, best, low, block, count, rows, height, width, turns, level, room):
     """Collect the shifts whose scores are at least low of their scan, in no certain order: item, first row and column
-    of each block, and score. count[slot], which the caller clears, may exceed room: then some are left out. best is
+    of each block, and score. count[level], which the caller clears, may exceed room: then some are left out. best is
     the result of row_maxima. One work-item takes a row of an item.
     """
     k = wp.tid()
@@ -180,7 +257,7 @@ def choose_blocks(score, best, low, block, count, rows, height, width, turns, le
     for col in range(width):
         value = score[k * width + col]
         if value >= least:
-            n = wp.atomic_add(count, slot, 1)
+            n = wp.atomic_add(count, level, 1)
             if n < room:
                 block[4 * n] = item
                 block[4 * n + 1] = (k % height) << level
@@ -223,35 +300,41 @@ def follow_blocks(
 
 @kernel()
 def divide_blocks(
-    quarters, point, image, first, allowed, block, low, part, count, scores, blocks, height, width, columns, turns,
-    level, spacing, top, slot,
+    quarters, point, image, first, allowed, block, low, part, count, scores, begin, some, room, workers, height, width,
+    columns, turns, level, spacing, top,
 ):  # fmt: skip
-    """Divide blocks of positions into quarters of 2^level x 2^level, and collect the allowed ones whose scores are at
-    least low of their scan, in no certain order. The caller clears count[slot]. One work-item takes a block.
+    """Divide count[level + 1] blocks of positions, but at most some from begin on, into quarters of 2^level x 2^level,
+    and collect the allowed ones whose scores are at least low of their scan, in no certain order. count[level], which
+    the caller clears, may exceed room: then some are left out. One of workers work-items takes each of workers
+    neighbouring blocks.
     """
-    n = wp.tid()
-    if n >= blocks:
-        return
-    item = block[4 * n]
-    row = block[4 * n + 1]
-    col = block[4 * n + 2]
-    begin = first[item]
-    end = first[item + 1]
-    least = low[item // turns]
-    score = block[4 * n + 3]
-    if top != 0:
-        score = TOP * (end - begin)
-    total = divided(quarters, point, image, scores, begin, end, spacing * row, spacing * col, score, least)
-    for i in range(4):
-        part_row = row + ((i // 2) << level)
-        part_col = col + ((i % 2) << level)
-        if part_row < height and part_col < width and total[i] >= least:
-            if allowed[(part_row >> level) * columns + (part_col >> level)] > wp.uint8(0):
-                m = wp.atomic_add(count, slot, 1)
-                part[4 * m] = item
-                part[4 * m + 1] = part_row
-                part[4 * m + 2] = part_col
-                part[4 * m + 3] = total[i]
+    worker = wp.tid()
+    blocks = wp.min(count[level + 1] - begin, some)
+    n = int(worker)
+    while n < blocks:
+        here = 4 * (begin + n)
+        item = block[here]
+        row = block[here + 1]
+        col = block[here + 2]
+        least = low[item // turns]
+        score = block[here + 3]
+        if top != 0:
+            score = TOP * (first[item + 1] - first[item])
+        total = divided(
+            quarters, point, image, scores, first[item], first[item + 1], spacing * row, spacing * col, score, least
+        )
+        for i in range(4):
+            part_row = row + ((i // 2) << level)
+            part_col = col + ((i % 2) << level)
+            if part_row < height and part_col < width and total[i] >= least:
+                if allowed[(part_row >> level) * columns + (part_col >> level)] > wp.uint8(0):
+                    m = wp.atomic_add(count, level, 1)
+                    if m < room:
+                        part[4 * m] = item
+                        part[4 * m + 1] = part_row
+                        part[4 * m + 2] = part_col
+                        part[4 * m + 3] = total[i]
+        n = n + workers
 
 
 def make(name, flags):

@@ -6,44 +6,46 @@ from .prelude import kernel
 
 
 @wp.func
-def floored(number: wp.int32, divisor: wp.int32):
-    """Return the quotient of integers, rounded down."""
-    quotient = number // divisor
-    if quotient * divisor > number:
+def periods(cell: wp.int32, stride: wp.int32, level: wp.int32):
+    """Return a cell divided by stride * 2^level, rounded down."""
+    number = cell >> level
+    quotient = number // stride
+    if quotient * stride > number:
         quotient = quotient - 1
     return quotient
 
 
 @kernel()
 def place_ends(
-    end, heading, start, first, image, point, folded, folded_image, items, turns, period, step, offset
+    end, heading, start, first, image, point, folded, folded_image, items, turns, stride, level, step_level,
+    offset,
 ):  # fmt: skip
     """Place the end points of a scan at a heading in cells of the tables, and in cells and images of a folded table.
-    One work-item takes an item.
+    One work-item takes a point of an item.
     """
-    item = wp.tid()
+    item, n = wp.tid()
     if item >= items:
         return
+    k = first[item] + n
+    if k >= first[item + 1]:
+        return
     scan = item // turns
-    begin = first[item]
-    side = period // step
-    ends = first[scan * turns] // turns
+    side = stride << (level - step_level)
+    period = stride << level
+    m = 2 * (first[scan * turns] // turns + n)
     cosine = heading[2 * item]
     sine = heading[2 * item + 1]
-    start_x = start[2 * scan]
-    start_y = start[2 * scan + 1]
-    for k in range(begin, first[item + 1]):
-        x = end[2 * (ends + k - begin)]
-        y = end[2 * (ends + k - begin) + 1]
-        across = cosine * x - sine * y
-        along = sine * x + cosine * y
-        cell = wp.vec2i(int(wp.floor(start_x + across)), int(wp.floor(start_y + along)))
-        whole = wp.vec2i(floored(cell.x + offset, period), floored(cell.y + offset, period))
-        col = (cell.x + offset - whole.x * period) // step
-        row = (cell.y + offset - whole.y * period) // step
-        point[k] = cell
-        folded[k] = whole
-        folded_image[k] = (image[k] * side + row) * side + col
+    across = cosine * end[m] - sine * end[m + 1]
+    along = sine * end[m] + cosine * end[m + 1]
+    cell = wp.vec2i(int(wp.floor(start[2 * scan] + across)), int(wp.floor(start[2 * scan + 1] + along)))
+    x = cell.x + offset
+    y = cell.y + offset
+    whole = wp.vec2i(periods(x, stride, level), periods(y, stride, level))
+    col = (x - whole.x * period) >> step_level
+    row = (y - whole.y * period) >> step_level
+    point[k] = cell
+    folded[k] = whole
+    folded_image[k] = (image[k] * side + row) * side + col
 
 
 def make(name, flags):

@@ -94,24 +94,34 @@ def test_kernels_have_the_sums_of_the_reference(name, needs):
     ends = np.array([0, 20, 40, 60, 70, 80, 90], np.int32)
     made = [np.zeros(180, np.int32), np.zeros(180, np.int32), np.zeros(90, np.int32)]
     counts = np.array([7, 0], np.int32)
+    best = np.column_stack([rng.integers(-1, 40, 66), rng.integers(0, 21, 66)]).astype(np.int32)
+    histogram = np.stack([np.bincount(part[part >= 0] >> 2, minlength=512) for part in best[:, 0].reshape(2, 33)])
+    histogram = histogram.astype(np.int32)
+    # The least scores of at least 9 and 40 rows of a scan, in steps of 4.
+    least = np.array([4 * (np.sort(part)[-9] >> 2) for part in best[:, 0].reshape(2, 33)]).repeat(3)[:, None]
+    number, every = ((best[:, 0].reshape(6, 11) >= limit).sum(axis=1).astype(np.int32) for limit in (least, 0))
     blocks = (shape, 200, 12, 22, 11)
     calls = [
         ("pool_scores", (63, 52, 2), table, np.zeros_like(table), shape, 4),
         ("fold_scores", (48, 45, 8), table, np.zeros(8 * 45 * 48, np.uint8), shape, folded, 4, 2, 9, 8),
         ("pack_quarters", (63, 52, 2), table, np.zeros_like(quarters), shape, 4, 0),
         ("pack_quarters", (63, 52, 2), table, np.zeros_like(quarters), shape, 4, 1),
-        ("place_ends", (6,), end, heading, start, ends, image[:90], *made, 6, 3, 8, 4, 18),
+        ("place_ends", (20, 6), end, heading, start, ends, image[:90], *made, 6, 3, 3, 2, 1, 18),
         ("shift_scores", (21, 2, 3), losses, point, image, first, allowed, np.zeros(3 * 11 * 21, np.int32), shape,
          0, 3, 11, 21, 8),
         ("shift_scores", (21, 2, 3), table, point, image, first, allowed, np.zeros(3 * 11 * 21, np.int32), shape,
          0, 3, 11, 21, 1),
-        ("row_maxima", (33,), bounds, np.zeros(66, np.int32), 33, 21),
+        ("row_maxima", (33,), bounds, np.zeros(66, np.int32), np.zeros(512, np.int32), 33, 21, 11, 3, 2),
+        ("count_promising", (6,), best, histogram, np.zeros(6, np.int32), 6, 11, 3, 2, 9),
+        ("pick_blocks", (6,), best, histogram, number, np.zeros(72, np.int32), 6, 11, 3, 1, 2, 9),
+        ("pick_blocks", (6,), best, histogram, every, np.zeros(320, np.int32), 6, 11, 3, 1, 2, 40),
+        ("raise_low", (200,), block, np.array([9, 3], np.int32), np.array([5, 399_000], np.int32), 200, 100),
         ("choose_blocks", (33,), bounds, bounds.max(axis=2).repeat(2), low, np.zeros(4 * 693, np.int32), counts,
-         33, 11, 21, 3, 1, 693, 1),
+         33, 11, 21, 3, 1, 693),
         ("follow_blocks", (200,), quarters, point, image, first, mask, block, *blocks, 1, 2, 0),
         ("follow_blocks", (200,), quarters, point, image, first, mask, block, *blocks, 1, 2, 1),
-        ("divide_blocks", (200,), quarters, point, image, first, mask, block, low, np.zeros(16 * 200, np.int32),
-         counts, *blocks, 3, 1, 2, 0, 1),
+        ("divide_blocks", (64,), quarters, point, image, first, mask, block, low, np.zeros(16 * 200, np.int32),
+         np.array([0, 0, 190], np.int32), shape, 10, 150, 800, 64, 12, 22, 11, 3, 1, 2, 0),
     ]  # fmt: skip
     device = get_backend(needs(name))
     for kernel, size, *values in calls:
@@ -179,12 +189,16 @@ def test_of_equal_poses_beyond_the_memory_the_first_are_kept(monkeypatch, level)
     assert list(zip(found.row, found.col, found.heading, strict=True)) == ties
 
 
-def test_bounds_are_the_same_in_several_launches(monkeypatch):
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("limits", [{"_MOST_ITEMS": 4}, {"_ROOM": 3, "_READ": 2}, {"_PARTS": 16}])
+def test_the_poses_are_the_same_in_several_launches(name, limits, monkeypatch, needs):
     scores, points, grid = scene(3)
-    search = Search(ScoreTables(get_backend("numpy"), scores, levels=2))
-    whole = search.find(points, grid, slack=20)
-    monkeypatch.setattr("gpusense.matching.search._MOST_ITEMS", 4)
-    parts = search.find(points, grid, slack=20)
+    tables = ScoreTables(get_backend(needs(name)), scores, levels=2)
+    whole = Search(tables).find(points, grid, slack=400)
+    for limit, value in limits.items():
+        monkeypatch.setattr(f"gpusense.matching.search.{limit}", value)
+    parts = Search(tables).find(points, grid, slack=400)
+    assert len(whole.scan) > 40
     for name in ("scan", "row", "col", "heading", "score"):
         np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
 

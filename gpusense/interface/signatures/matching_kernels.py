@@ -53,9 +53,10 @@ KERNELS: dict[str, Kernel] = {
         "search", "col line image", _CELLS, f"out {_QUARTERS}", "ScoreTable scores", "int reach", "int top",
     ),
     "place_ends": kernel(
-        "search_ends", "item", "double end [2 * ends]", "double heading [2 * items]", "double start [2 * scans]",
+        "search_ends", "point item", "double end [2 * ends]", "double heading [2 * items]", "double start [2 * scans]",
         "int first [items + 1]", "int image [points]", "out int2 point [points]", "out int2 folded [points]",
-        "out int folded_image [points]", "int items", "int turns", "int period", "int step", "int offset",
+        "out int folded_image [points]", "int items", "int turns", "int stride", "int level", "int step_level",
+        "int offset",
     ),
     "shift_scores": kernel(
         "search", "col rows item", _CELLS, *_ENDS, "uchar allowed [height * width]",
@@ -63,12 +64,25 @@ KERNELS: dict[str, Kernel] = {
         "int width", "int unit", in_lanes=True,
     ),
     "row_maxima": kernel(
-        "search", "row", "int score [rows * width]", "out int best [2 * rows]", "int rows", "int width",
+        "search", "row", "int score [rows * width]", "out int best [2 * rows]", "out int histogram [bins]",
+        "int rows", "int width", "int height", "int turns", "int shift",
+    ),
+    "count_promising": kernel(
+        "search", "item", "int best [2 * items * height]", "int histogram [bins]", "out int number [items]",
+        "int items", "int height", "int turns", "int shift", "int most",
+    ),
+    "pick_blocks": kernel(
+        "search", "item", "int best [2 * items * height]", "int histogram [bins]", "int number [items]",
+        "out int block [4 * followed]", "int items", "int height", "int turns", "int level", "int shift", "int most",
+    ),
+    "raise_low": kernel(
+        "search", "pose", "int block [4 * blocks]", "int slack [scans]", "out int low [scans]", "int blocks",
+        "int most",
     ),
     "choose_blocks": kernel(
         "search", "row", "int score [rows * width]", "int best [2 * rows]", "int low [scans]",
-        "out int block [4 * room]", "out int count [counts]", "int rows", "int height", "int width", "int turns",
-        "int level", "int room", "int slot",
+        "out int block [4 * room]", "out int count [levels]", "int rows", "int height", "int width", "int turns",
+        "int level", "int room",
     ),
     "follow_blocks": kernel(
         "search", "block", _QUARTERS, *_ENDS, "uchar allowed [rows * columns]", "out int block [4 * blocks]",
@@ -76,8 +90,9 @@ KERNELS: dict[str, Kernel] = {
         "int top",
     ),
     "divide_blocks": kernel(
-        "search", "block", _QUARTERS, *_ENDS, "uchar allowed [rows * columns]", "int block [4 * blocks]",
-        "int low [scans]", "out int part [16 * blocks]", "out int count [counts]", "ScoreTable scores", "int blocks",
-        "int height", "int width", "int columns", "int turns", "int level", "int spacing", "int top", "int slot",
+        "search", "worker", _QUARTERS, *_ENDS, "uchar allowed [rows * columns]", "int block [4 * (begin + some)]",
+        "int low [scans]", "out int part [4 * room]", "out int count [levels]", "ScoreTable scores", "int begin",
+        "int some", "int room", "int workers", "int height", "int width", "int columns", "int turns", "int level",
+        "int spacing", "int top",
     ),
 }  # fmt: skip

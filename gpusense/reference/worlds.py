@@ -20,6 +20,8 @@ FRAME_NUMBERS = 8
 RING = 2
 # Largest number of a shape.
 LARGEST_SHAPE = 1e6
+# Distance from a world to which its segments and boxes reach [cells].
+BEYOND = 16384
 
 
 def put_cells(
@@ -113,13 +115,21 @@ def point_in(points: np.ndarray, here: structs.Frame) -> np.ndarray:
     return np.stack([within_reach(u / here.resolution), within_reach(v / here.resolution)], axis=1)
 
 
+def part_near(low: np.ndarray, high: np.ndarray, at: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the parts of intervals within reach of numbers, or an interval where its part is empty."""
+    begin, end = np.maximum(low, at - reach), np.minimum(high, at + reach)
+    return np.where(begin < end, begin, low), np.where(begin < end, end, high)
+
+
 def place_shapes(
     flags: frozenset[str], raw: np.ndarray, frames: np.ndarray, shapes: np.ndarray, frame: structs.Frame, count: int,
     numbers: int, begin: int, stride: int, worlds: int,
 ) -> None:  # fmt: skip
     """Place moving shapes of one kind, with 3 (discs), 5 (boxes) or 4 numbers (segments), in the cells of their worlds.
 
-    A shape with a number that is not finite or beyond LARGEST_SHAPE, or with a negative size, is none.
+    A shape with a number that is not finite or beyond LARGEST_SHAPE, or with a negative size, is none. Segments and
+    boxes lose what is farther than BEYOND from their world: float32 does not hold where they pass if their ends are
+    very far.
     """
     every = raw.reshape(-1)[: worlds * count * numbers].reshape(worlds, count, numbers).astype(np.float64)
     each = BOX if numbers == 5 else DISC
@@ -127,21 +137,34 @@ def place_shapes(
     for w in range(worlds):
         here, rows = frame_in(frames, w, frame), every[w]
         placed = np.zeros((count, each))
-        placed[:, :2] = point_in(rows[:, :2], here)
         none = ~(np.abs(rows) <= LARGEST_SHAPE).all(axis=1)
         rows = np.where(none[:, None], 0.0, rows)
         sizes = {3: rows[:, 2:3], 5: rows[:, 3:5]}.get(numbers)
+        centre = point_in(rows[:, :2], here)
+        reach = frames[w * FRAME_NUMBERS + 4] + frames[w * FRAME_NUMBERS + 5] + BEYOND
         if sizes is None:
-            placed[:, 2:4] = point_in(rows[:, 2:4], here)
+            other = point_in(rows[:, 2:4], here)
+            way = other - centre
+            whole = np.sqrt(way[:, 0] * way[:, 0] + way[:, 1] * way[:, 1])[:, None]
+            with np.errstate(invalid="ignore"):
+                at = -(way[:, :1] * centre[:, :1] + way[:, 1:] * centre[:, 1:]) / whole
+                first, last = part_near(np.zeros_like(whole), whole, at, reach)
+                placed[:, 2:4] = np.where(last < whole, centre + way * (last / whole), other)
+                centre = np.where(first > 0, centre + way * (first / whole), centre)
         elif numbers == 3:
             placed[:, 2:3] = sizes / here.resolution
         else:
             cosine, sine = cos_sin(np.where(none, 0.0, rows[:, 2]))
             if here.yaw_sin != 0:
                 cosine, sine = cosine * here.yaw_cos + sine * here.yaw_sin, sine * here.yaw_cos - cosine * here.yaw_sin
+            (u, v), (x, y) = (sizes / here.resolution / 2).T, centre.T
+            parts = part_near(-u, u, -(cosine * x + sine * y), reach), part_near(-v, v, sine * x - cosine * y, reach)
+            (by_u, half_length), (by_v, half_width) = (((low + high) / 2, (high - low) / 2) for low, high in parts)
+            centre = np.stack([x + (cosine * by_u - sine * by_v), y + (sine * by_u + cosine * by_v)], axis=1)
             # The radius of a circle around the box, with a margin for rounding.
-            placed[:, 6] = np.hypot(sizes[:, 0], sizes[:, 1]) / here.resolution / 2 * 1.00001 + 0.001
-            placed[:, 2], placed[:, 3], placed[:, 4:6] = cosine, sine, sizes / here.resolution / 2
+            placed[:, 6] = np.sqrt(half_length * half_length + half_width * half_width) * 1.00001 + 0.001
+            placed[:, 2], placed[:, 3], placed[:, 4], placed[:, 5] = cosine, sine, half_length, half_width
+        placed[:, :2] = centre
         if sizes is not None:
             none |= (sizes < 0).any(axis=1)
         placed[none] = np.nan

@@ -10,6 +10,8 @@
 #define RING 2
 // Largest number of a shape.
 #define LARGEST_SHAPE 1e6
+// Distance from a world to which its segments and boxes reach [cells].
+#define BEYOND 16384
 
 // Copy the cells of some worlds to their places. One work-item takes a cell.
 kernel void put_cells(ARGUMENTS) {
@@ -97,8 +99,16 @@ double2 point_in(const double x, const double y, const Frame here) {
     return (double2)(within_reach(u / here.resolution), within_reach(v / here.resolution));
 }
 
+// Return the part of an interval within reach of a number, or the interval where that part is empty.
+double2 part_near(const double low, const double high, const double at, const double reach) {
+    const double begin = fmax(low, at - reach), end = fmin(high, at + reach);
+    return begin < end ? (double2)(begin, end) : (double2)(low, high);
+}
+
 // Place moving shapes of one kind, with 3 (discs), 5 (boxes) or 4 numbers (segments), in the cells of their worlds. A
-// shape with a number that is not finite or beyond LARGEST_SHAPE, or with a negative size, is none. One work-item takes a shape.
+// shape with a number that is not finite or beyond LARGEST_SHAPE, or with a negative size, is none. Segments and boxes
+// lose what is farther than BEYOND from their world: float32 does not hold where they pass if their ends are very far.
+// One work-item takes a shape.
 kernel void place_shapes(ARGUMENTS) {
     const int i = get_global_id(0), w = get_global_id(1);
     if (i >= count || w >= worlds) return;
@@ -113,14 +123,17 @@ kernel void place_shapes(ARGUMENTS) {
         for (int k = 0; k < each; ++k) to[k] = NAN;
         return;
     }
-    const double2 centre = point_in(from[0], from[1], here);
-    to[0] = (real)centre.x;
-    to[1] = (real)centre.y;
+    double2 centre = point_in(from[0], from[1], here);
+    const double reach = frames[(long)w * FRAME_NUMBERS + 4] + frames[(long)w * FRAME_NUMBERS + 5] + BEYOND;
     if (numbers == 3) {
         to[2] = (real)(length / here.resolution);
         to[3] = 0;
     } else if (numbers == 4) {
-        const double2 other = point_in(from[2], length, here);
+        double2 other = point_in(from[2], length, here);
+        const double x = other.x - centre.x, y = other.y - centre.y, whole = sqrt(x * x + y * y);
+        const double2 part = part_near(0, whole, -(x * centre.x + y * centre.y) / whole, reach);
+        if (part.y < whole) other = (double2)(centre.x + x * (part.y / whole), centre.y + y * (part.y / whole));
+        if (part.x > 0) centre = (double2)(centre.x + x * (part.x / whole), centre.y + y * (part.x / whole));
         to[2] = (real)other.x;
         to[3] = (real)other.y;
     } else {
@@ -129,14 +142,23 @@ kernel void place_shapes(ARGUMENTS) {
             turned = (double2)(turned.x * here.yaw_cos + turned.y * here.yaw_sin,
                                turned.y * here.yaw_cos - turned.x * here.yaw_sin);
         }
+        const double u = length / here.resolution / 2, v = from[4] / here.resolution / 2;
+        const double2 along = part_near(-u, u, -(turned.x * centre.x + turned.y * centre.y), reach);
+        const double2 aside = part_near(-v, v, turned.y * centre.x - turned.x * centre.y, reach);
+        const double by_u = (along.x + along.y) / 2, by_v = (aside.x + aside.y) / 2;
+        centre.x += turned.x * by_u - turned.y * by_v;
+        centre.y += turned.y * by_u + turned.x * by_v;
+        const double half_length = (along.y - along.x) / 2, half_width = (aside.y - aside.x) / 2;
         to[2] = (real)turned.x;
         to[3] = (real)turned.y;
-        to[4] = (real)(length / here.resolution / 2);
-        to[5] = (real)(from[4] / here.resolution / 2);
+        to[4] = (real)half_length;
+        to[5] = (real)half_width;
         // The radius of a circle around the box, with a margin for rounding.
-        to[6] = (real)(sqrt(length * length + (double)from[4] * from[4]) / here.resolution / 2 * 1.00001 + 0.001);
+        to[6] = (real)(sqrt(half_length * half_length + half_width * half_width) * 1.00001 + 0.001);
         to[7] = 0;
     }
+    to[0] = (real)centre.x;
+    to[1] = (real)centre.y;
 }
 
 // Tell which discs about poses, with a radius in cells, meet an obstacle or a shape. One work-item takes a particle.

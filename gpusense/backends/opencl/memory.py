@@ -11,6 +11,7 @@ import numpy as np
 import pyopencl as cl
 
 from gpusense._util.interrupts import undisturbed
+from gpusense._util.memory import prefer_large_pages
 from gpusense.backends.staging import Slot
 
 _LOST = ("DEVICE_NOT_AVAILABLE", "INVALID_COMMAND_QUEUE", "INVALID_CONTEXT", "INVALID_DEVICE")
@@ -34,6 +35,7 @@ class SharedBuffer(cl.SVMAllocation):
     def __init__(self, context: cl.Context, size: int, settle: Callable[[], None]) -> None:
         flags = cl.svm_mem_flags.READ_WRITE | cl.svm_mem_flags.SVM_FINE_GRAIN_BUFFER
         super().__init__(context, size, _ALIGNMENT, flags)
+        prefer_large_pages(self.svm_ptr, size)
         # By address: an attribute that is a view of this object would be a cycle.
         self.bytes: np.ndarray = np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(self.svm_ptr))
         self.view = self.bytes.data

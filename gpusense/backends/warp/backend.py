@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from gpusense._util.memory import prefer_large_pages
 from gpusense.backends.base import Adopted, Backend, Recording
 from gpusense.backends.info import BackendInfo, ProcessBound
 from gpusense.backends.recycled import ResultMemory
@@ -83,9 +84,13 @@ class WarpBackend(ProcessBound, Backend):
                 f"{self.info.name} cannot hold a buffer of {size} bytes: its largest is {self.info.max_buffer} bytes "
                 f"and {_MOST_NUMBERS} numbers"
             )
-        make = wp.zeros if zero else wp.empty
         try:
-            return make(count, dtype=SCALARS[dtype], device=self._device)
+            made = wp.empty(count, dtype=SCALARS[dtype], device=self._device)
+            if self._device.is_cpu:
+                prefer_large_pages(made.ptr, size)
+            if zero:
+                made.zero_()
+            return made
         except RuntimeError as error:
             if "Failed to allocate" in str(error):
                 raise MemoryError(f"{self.info.name} is out of memory: {error}") from error

@@ -40,7 +40,7 @@ def prefer_large_pages(address: int, size: int) -> None:
     """
     begin, end = -(-address // _LARGE_PAGE) * _LARGE_PAGE, (address + size) // _LARGE_PAGE * _LARGE_PAGE
     if end - begin >= _LARGE_PAGE and (advise := _advise()) is not None:
-        advise(begin, end - begin, mmap.MADV_HUGEPAGE)  # type: ignore[attr-defined]
+        advise(begin, end - begin, mmap.MADV_HUGEPAGE)
 
 
 @functools.cache

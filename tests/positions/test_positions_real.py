@@ -90,39 +90,3 @@ def cylinders(ranges):
         elif active and seen[k]:
             inside.append(k)
     return np.array(found).reshape(-1, 2).T
-
-
-def test_cylinders_of_the_lego_robot(data_dir):
-    """Compare fixes by three and more cylinders in a lidar's scan with the overhead camera's position.
-
-    The camera identifies the cylinders: ranges must agree within 12 cm, and bearings, at the heading that explains most
-    of them, within 0.06 rad. The axis is 9 cm behind the mean of the found points.
-    """
-    folder = data_dir / "brenner_lego"
-    landmarks = np.loadtxt(folder / "robot_arena_landmarks.txt", usecols=(2, 3)) / 1000
-    positions = np.loadtxt(folder / "robot4_reference.txt", usecols=(2, 3)) / 1000
-    with gzip.open(folder / "robot4_scan.txt.gz", "rt") as stream:
-        scans = np.array([line.split()[3:] for line in stream], float) / 1000
-    headings = np.linspace(-np.pi, np.pi, 721)[:, None, None]
-    fixes, truths, statuses = {"ranges": [], "bearings": [], "both": []}, [], []
-    for ranges, truth in zip(scans, positions, strict=True):
-        b, r = cylinders(ranges)
-        r = r + 0.09
-        offset = landmarks - truth
-        turn = b[:, None] - np.arctan2(offset[:, 1], offset[:, 0]) + headings
-        match = (np.abs(r[:, None] - np.hypot(*offset.T)) < 0.12) & (np.abs(np.angle(np.exp(1j * turn))) < 0.06)
-        i, j = np.nonzero(match[np.argmax(match.any(axis=2).sum(axis=1))])
-        if len(i) < 3 or len(set(i)) < len(i) or len(set(j)) < len(j):
-            continue
-        xy, r, b = landmarks[j], r[i], b[i]
-        by_angle = gs.triangulate(xy, b, sigma=0.02)
-        statuses.append(by_angle.status)
-        if len(by_angle):
-            fixes["bearings"].append(by_angle)
-            fixes["ranges"].append(gs.trilaterate(xy, r, sigma=0.05))
-            fixes["both"].append(gs.locate(xy, r, b, sigma_range=0.05, sigma_bearing=0.02))
-            truths.append(truth)
-    assert len(truths) > 130 and statuses.count("unique") > 0.95 * len(statuses)
-    for name, median, most in (("ranges", 0.09, 0.11), ("bearings", 0.09, 0.25), ("both", 0.08, 0.1)):
-        found = quantiles(errors(fixes[name], truths))
-        assert found[0] < median and found[1] < most, (name, found)

@@ -9,7 +9,6 @@ from fractions import Fraction
 from typing import Any
 
 import mpmath as mp
-import numpy as np
 from support.oracles import as_fraction, placed
 
 Number = int | float | Fraction
@@ -39,40 +38,6 @@ def _gone(index: int, step: int, size: int) -> bool:
     return (index < 0 and step < 0) or (index >= size and step > 0)
 
 
-def fraction_walk(occupied: np.ndarray, ray: Ray, outside_occupied: bool = False) -> Fraction | None:
-    """Return the distance to the first occupied cell by Amanatides and Woo's walk in fractions, or None.
-
-    Cells are half-open. At a tie, where the ray passes a corner, the step in x comes first. The limit is checked before
-    the cell. The distance is in units of the direction's length, 1 up to rounding.
-    """
-    rows, cols = occupied.shape
-    x, y = ray.cell
-    dx, dy = map(Fraction, ray.direction)
-    step_x, step_y = (1 if dx >= 0 else -1), (1 if dy >= 0 else -1)
-    fx, fy = map(Fraction, ray.frac)
-    to_x, to_y = (1 - fx if dx >= 0 else fx), (1 - fy if dy >= 0 else fy)
-    crossed_x = crossed_y = 0
-    t = Fraction(0)
-    while True:
-        if 0 <= x < cols and 0 <= y < rows:
-            if occupied[y, x]:
-                return t
-        elif outside_occupied:
-            return t
-        elif _gone(x, step_x, cols) or _gone(y, step_y, rows):
-            return None
-        when_x = (crossed_x + to_x) / abs(dx) if dx else None
-        when_y = (crossed_y + to_y) / abs(dy) if dy else None
-        if when_x is None and when_y is None:
-            return None
-        if when_y is None or (when_x is not None and when_x <= when_y):
-            t, x, crossed_x = when_x, x + step_x, crossed_x + 1
-        else:
-            t, y, crossed_y = when_y, y + step_y, crossed_y + 1
-        if t >= Fraction(ray.limit):
-            return None
-
-
 @dataclass(frozen=True)
 class Hit:
     """End of a walk: the correctly rounded distance, and the face: cell and axis of the last step."""
@@ -82,10 +47,11 @@ class Hit:
 
 
 def walk(occupied: Sequence[Sequence[bool]], ray: Ray, outside_occupied: bool = False) -> Hit:
-    """Return the end of an equally exact walk in integers, ten times as fast; a test compares it with
-    ``fraction_walk``.
+    """Return the end of Amanatides and Woo's walk in integers, so that no operation rounds.
 
-    For fractions a / one and directions d / unit, boundary k is at (k * one + a) * unit / (one * d).
+    Cells are half-open. At a tie, where the ray passes a corner, the step in x comes first. The limit is checked before
+    the cell. The distance is in units of the direction's length, 1 up to rounding. For fractions a / one and
+    directions d / unit, boundary k is at (k * one + a) * unit / (one * d).
     """
     rows, cols = len(occupied), len(occupied[0])
     x, y = ray.cell

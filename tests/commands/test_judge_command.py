@@ -29,6 +29,7 @@ def wrong_rows(document):
     return [k for k, word in zip(document["index"], document["verdicts"], strict=True) if word == "lost"]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("source", "kind"), [("covariance", "mcap"), ("stamped", "ros1"), ("odometry", "sqlite3"), ("tf", "mcap")]
 )

@@ -64,6 +64,7 @@ def test_dead_reckoning_of_an_arc():
     np.testing.assert_allclose(track[-1], [np.pi, 0, 4, np.pi], atol=1e-5)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", ["--known", "--unknown"])
 def test_command_localises(capsys, folder, kind):
     # Later scans have so few readings that a filter without known landmarks gets lost, and reports it.

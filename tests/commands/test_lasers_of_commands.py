@@ -57,6 +57,7 @@ def command(place, name, log="run", *more):
     return [name, "--log", str(place / log), "--backend", "numpy", *options, *out.get(name, []), *more]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", READERS)
 def test_each_command_takes_a_topic(place, capsys, name):
     message = error_of(command(place, name), capsys)
@@ -75,6 +76,7 @@ def test_help_names_bags_and_lasers(capsys, name):
         assert part in text, part
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", READERS)
 def test_a_bag_without_transforms_warns_of_the_mount(place, capsys, name):
     argv = command(place, name, "run.bag", *(["--fit-motion"] if name == "fit" else []))

@@ -73,6 +73,7 @@ def test_the_same_options_make_the_same_files(office, capsys):
     assert gs.read_map(office / "world.yaml") != gs.read_map(office / "office.yaml")
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", ["ros1", "ros2"])
 def test_bags_have_mount_odometry_and_scans(office, kind, capsys):
     pytest.importorskip("rosbags")

@@ -50,12 +50,14 @@ class Candidates(NamedTuple):
     Attributes:
         poses: (M, 3) in the world.
         score: (M,) from 0 to 1, the mean of the end points.
+        log_p: (M,) log-likelihoods by the model, NaN where they were not computed.
         best: Index of the likeliest.
         evaluated: Poses and blocks of poses that were evaluated, on average over the scans of a search.
     """
 
     poses: np.ndarray
     score: np.ndarray
+    log_p: np.ndarray
     best: int
     evaluated: int
 
@@ -170,9 +172,12 @@ class FieldSearch:
             for begin, end, count in zip(first[:-1], first[1:], hits, strict=True)
         ]
         log_p = log_likelihoods_of(model, [poses[rows] for rows in near], ranges)
+        known = np.full(len(poses), np.nan)
+        for rows, values in zip(near, log_p, strict=True):
+            known[rows] = values
         return [
             Candidates(
-                poses[begin:end], found.score[begin:end] / (TOP * count),
+                poses[begin:end], found.score[begin:end] / (TOP * count), known[begin:end],
                 int(rows[_first_of_largest(values, found, rows)] - begin), found.evaluated // scans,
             )
             for begin, end, count, rows, values in zip(first[:-1], first[1:], hits, near, log_p, strict=True)
@@ -213,7 +218,7 @@ class FieldSearch:
         score = self._steps(model, ranges, len(cells), poses)
         order = np.lexsort((heading, col, row, -score))
         order = order[score[order] >= score.max() - most]
-        return Candidates(poses[order], score[order] / (TOP * len(cells)), 0, evaluated)
+        return Candidates(poses[order], score[order] / (TOP * len(cells)), np.full(len(order), np.nan), 0, evaluated)
 
     def _steps(self, model: LikelihoodFieldModel, ranges: np.ndarray, hits: int, poses: np.ndarray) -> np.ndarray:
         """Return the log-likelihoods of the hits at poses as scores."""

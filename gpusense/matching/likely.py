@@ -27,7 +27,7 @@ def likely_poses(model: LikelihoodFieldModel, ranges: NDArray[np.float64], count
     """
     grid = model.grid
     stride = max(round(_RESOLUTION / grid.resolution), 1)
-    points = end_points_of(model, ranges)[1]
+    points = end_points_of(model, ranges[None])[1][0]
     search = field_search(model, stride)
     # Within a single cell no end point depends on the heading, and all free cells far from walls are alike.
     if not len(points) or not search.free.any() or grid.resolution > np.hypot(*points.T).max():

@@ -136,7 +136,7 @@ def locate_scan(
     rows, cols = (-(-size // stride) for size in model.grid.shape)
     headings = 2 * math.pi / turns * np.arange(turns)[None]
     searched = PoseGrid(np.array([[0.5, 0.5]]), headings, rows, cols)
-    hits, points = zip(*(end_points_of(model, scan) for scan in values), strict=True) if len(values) else ((), ())
+    hits, points = end_points_of(model, values)
     options = dict(resolution=stride * cell, angle=2 * math.pi / turns, poses=searched.count)
     located: list[Location] = [_nothing(options)] * len(values)
     chosen = [number for number, part in enumerate(points) if len(part)]
@@ -174,13 +174,17 @@ def _location(
     )  # fmt: skip
 
 
-def end_points_of(model: LikelihoodFieldModel, ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices of the hits that the model uses, and their (M, 2) end points on the robot [m]."""
+def end_points_of(model: LikelihoodFieldModel, ranges: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return the indices of the hits of (S, K) readings that the model uses, and their (M, 2) end points on the robot.
+
+    Points are in metres.
+    """
     scanner = model.scanner
     scanner._first_scans.look_at("ranges", ranges, math.hypot(model.grid.width, model.grid.height))
-    hits = np.flatnonzero(BeamChoice.of(model.beams, scanner.count).used(classify(ranges, scanner) == Reading.HIT))
-    vectors = ray_vectors(scanner.bearings, scanner.mount)
-    return hits, ranges[hits, None] * vectors[hits] + np.array(scanner.mount[:2])
+    choice, vectors = BeamChoice.of(model.beams, scanner.count), ray_vectors(scanner.bearings, scanner.mount)
+    mount = np.array(scanner.mount[:2])
+    hits = [np.flatnonzero(choice.used(hit)) for hit in classify(ranges, scanner) == Reading.HIT]
+    return hits, [scan[hit, None] * vectors[hit] + mount for scan, hit in zip(ranges, hits, strict=True)]
 
 
 def _modes(
@@ -191,7 +195,9 @@ def _modes(
     radius = max(_MODE_RADIUS, 2 * search.stride * search.grid.resolution)
     chosen = [distinct_poses(one.poses, most, radius, _MODE_ANGLE, one.best) for one in found]
     poses = [one.poses[rows] for one, rows in zip(found, chosen, strict=True)]
-    log_p = log_likelihoods_of(model, poses, ranges)
+    log_p = [one.log_p[rows] for one, rows in zip(found, chosen, strict=True)]
+    if any(np.isnan(values).any() for values in log_p):
+        log_p = log_likelihoods_of(model, poses, ranges)
     shares = _shares(model, ranges, hits, search.caster, poses)
     return [
         tuple(
@@ -222,16 +228,16 @@ def _shares(
     everywhere = np.concatenate(poses)
     cos, sin = np.cos(everywhere[:, 2]), np.sin(everywhere[:, 2])
     sensors = everywhere + np.stack([cos * x - sin * y, sin * x + cos * y, np.full(len(cos), yaw)], axis=1)
-    used = np.unique(np.concatenate(hits))
-    expected = caster.cast(sensors, model.scanner.bearings[used])
+    each = [len(part) for part in poses]
+    scan, used = np.arange(len(poses)).repeat(each), np.unique(np.concatenate(hits))
+    is_hit = np.zeros((len(poses), ranges.shape[1]), bool)
+    is_hit[np.arange(len(hits)).repeat([*map(len, hits)]), np.concatenate(hits)] = True
+    off = ranges[:, used][scan] - caster.cast(sensors, model.scanner.bearings[used])
     tolerance = max(_AGREE_SIGMAS * model.parameters.sigma_hit, _AGREE_CELLS * model.grid.resolution)
-    shares = []
-    ends = np.cumsum([len(part) for part in poses])
-    for scan, hit, rays in zip(ranges, hits, np.split(expected, ends[:-1]), strict=True):
-        off = scan[hit] - rays[:, np.searchsorted(used, hit)]
-        longer, shorter = (off > tolerance).mean(axis=1), (off < -tolerance).mean(axis=1)
-        shares.append(np.stack([1 - longer - shorter, longer, shorter], axis=1))
-    return shares
+    is_hit = is_hit[:, used][scan]
+    longer, shorter = (np.count_nonzero(far & is_hit, axis=1) / np.count_nonzero(is_hit, axis=1)
+                       for far in (off > tolerance, off < -tolerance))  # fmt: skip
+    return np.split(np.stack([1 - longer - shorter, longer, shorter], axis=1), np.cumsum(each)[:-1])
 
 
 def _said(modes: tuple[PoseMode, ...], least: float) -> tuple[float, np.ndarray, Status]:

@@ -19,28 +19,31 @@ def climb(
     """Maximise the log-likelihoods of (S, K) readings from (S, 3) poses by Levenberg's damped Gauss-Newton steps."""
     scans = len(pose)
     damping, count, calm = np.full(scans, 1e-3), np.zeros(scans), np.zeros(scans, bool)
-    value, gradient, information = _evaluated(model, ranges, pose)
-    for _ in range(_ITERATIONS):
-        moving = ~calm
-        if not moving.any():
-            break
-        rows = np.flatnonzero(moving)
-        step = np.linalg.solve(information + damping_of(information, damping), gradient[..., None])[..., 0]
-        length = np.hypot(step[:, 0], step[:, 1])
-        step *= (1 / np.maximum(1, np.maximum(length / 0.5, np.abs(step[:, 2]) / 0.3)))[:, None]
-        step[~moving] = 0
-        trial = pose + step
-        new_value, new_gradient, new_information = value.copy(), gradient.copy(), information.copy()
-        new_value[rows], new_gradient[rows], new_information[rows] = _evaluated(model, ranges[rows], trial[rows])
-        better = moving & (new_value >= value)
-        pose = np.where(better[:, None], trial, pose)
-        value = np.where(better, new_value, value)
-        gradient = np.where(better[:, None], new_gradient, gradient)
-        information = np.where(better[:, None, None], new_information, information)
-        count += moving
-        damping = np.clip(np.where(better, damping / 5, damping * 8), 1e-6, 1e6)
-        largest = np.maximum(np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2]))
-        calm |= moving & (largest < (_SMALL if model.precision == "float64" else 3 * _SMALL))
+    with model._gradients(ranges) as gradients:
+
+        def evaluated(poses: np.ndarray) -> list[np.ndarray]:
+            return [numbers[:, 0].astype(np.float64) for numbers in gradients(poses[:, None])]
+
+        value, gradient, information = evaluated(pose)
+        for _ in range(_ITERATIONS):
+            moving = ~calm
+            if not moving.any():
+                break
+            step = np.linalg.solve(information + damping_of(information, damping), gradient[..., None])[..., 0]
+            length = np.hypot(step[:, 0], step[:, 1])
+            step *= (1 / np.maximum(1, np.maximum(length / 0.5, np.abs(step[:, 2]) / 0.3)))[:, None]
+            step[calm] = 0
+            trial = pose + step
+            new_value, new_gradient, new_information = evaluated(trial)
+            better = moving & (new_value >= value)
+            pose = np.where(better[:, None], trial, pose)
+            value = np.where(better, new_value, value)
+            gradient = np.where(better[:, None], new_gradient, gradient)
+            information = np.where(better[:, None, None], new_information, information)
+            count += moving
+            damping = np.clip(np.where(better, damping / 5, damping * 8), 1e-6, 1e6)
+            largest = np.maximum(np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2]))
+            calm |= moving & (largest < (_SMALL if model.precision == "float64" else 3 * _SMALL))
     return pose, count, calm
 
 
@@ -49,11 +52,3 @@ def damping_of(information: np.ndarray, damping: np.ndarray, least: float = 1e-6
     diagonal = np.einsum("sii->si", information).copy()
     diagonal[:, :2] = diagonal[:, :2].mean(axis=1, keepdims=True)
     return np.eye(3) * (damping[:, None] * diagonal + least * (1 + diagonal.max(axis=1))[:, None])[:, None]
-
-
-def _evaluated(
-    model: LikelihoodFieldModel, ranges: np.ndarray, pose: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return log p (S,), gradient and information of one pose for each scan."""
-    log_p, gradient, information = model.gradient(pose[:, None], ranges)
-    return log_p[:, 0].astype(np.float64), gradient[:, 0].astype(np.float64), information[:, 0].astype(np.float64)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -17,7 +18,7 @@ from gpusense.interface.constants import HIGH_PEAK
 from gpusense.interface.plan import Note, Omission, SceneNotes, component_notes, launch_omissions, precision_notes
 from gpusense.models.chunking import finish
 from gpusense.models.scan.differentiable import Differentiable
-from gpusense.models.scan.field_gradient import gradients, in_world
+from gpusense.models.scan.field_gradient import Gradients, in_world
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.model import ScanModel
 from gpusense.models.scan.pipeline import make_request
@@ -138,6 +139,12 @@ class LikelihoodFieldModel(ScanModel):
             ValueError: A wrong shape, a pose that is not finite, or a field that is not interpolated.
             MemoryError: The device cannot hold the map's table, or even a few particles.
         """
+        with self._gradients(ranges) as gradient:
+            return gradient(poses)
+
+    @contextlib.contextmanager
+    def _gradients(self, ranges: AnyArray) -> Iterator[Callable[[AnyArray], tuple[np.ndarray, np.ndarray, np.ndarray]]]:
+        """Yield a function of poses, with the results of ``gradient`` for the same readings; it holds the model."""
         if self.parameters.interpolation != "bilinear":
             raise ValueError(
                 "interpolation: must be 'bilinear' for gradients, got a field with 'nearest': pass "
@@ -145,13 +152,19 @@ class LikelihoodFieldModel(ScanModel):
             )
         if self._worlds is not None:
             raise ValueError(f"grid: must be a single map for gradients, got {self._worlds}")
-        request = make_request(self._context, poses, ranges)
-        with self._lock, self._workspace:
-            numbers = gradients(self._field_pipeline, request, self._workspace)
-            finish(self._workspace, request.poses.on_device)
-        log_p, gradient, information = in_world(numbers, self.grid.origin[2])
-        shape = request.shape
-        return log_p.reshape(shape), gradient.reshape(*shape, 3), information.reshape(*shape, 3, 3)
+        space = self._workspace
+        gradients = Gradients(self._field_pipeline, space)
+
+        def gradient(poses: AnyArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            request = make_request(self._context, poses, ranges)
+            numbers = gradients(request)
+            finish(space, request.poses.on_device)
+            log_p, slope, information = in_world(numbers, self.grid.origin[2])
+            shape = request.shape
+            return log_p.reshape(shape), slope.reshape(*shape, 3), information.reshape(*shape, 3, 3)
+
+        with self._lock, space:
+            yield gradient
 
     def _differentiable(self, ranges: AnyArray) -> Differentiable | None:
         if self.parameters.interpolation != "bilinear" or self._worlds is not None:

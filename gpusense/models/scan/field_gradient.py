@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
+
 import numpy as np
 
 from gpusense.backends.workspace import Workspace
@@ -11,6 +14,7 @@ from gpusense.interface.launches import launch
 from gpusense.interface.signatures.rows import LANES
 from gpusense.interface.structs import ScanBatch, Score
 from gpusense.models.chunking import Piece, chunk_of, run_pieces
+from gpusense.models.poses import Poses
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.pipeline import Request
@@ -20,38 +24,45 @@ from gpusense.models.scan.readings import Readings, placing_launches
 _OTHERS = {"LOG_TABLE", "CUBES"}
 
 
-def gradients(pipeline: FieldPipeline, request: Request, space: Workspace) -> np.ndarray:
-    """Return log p, its gradient (3) and the information (9) of the S N poses, (S N, 13) in the grid's frame."""
-    result = np.zeros((request.scans * request.per_scan, GRADIENT_NUMBERS), pipeline.real)
-    for particles, scans in pipeline.groups(request):
-        if particles.count:
+class Gradients:
+    """Log p, its gradient (3) and the information (9) of S scans at poses, (S N, 13) in the grid's frame.
+
+    The scans of all calls are equal: they are classed once, and copied once if one program evaluates them.
+    """
+
+    def __init__(self, pipeline: FieldPipeline, space: Workspace) -> None:
+        self._pipeline, self._space = pipeline, space
+        self._groups: Sequence[tuple[Piece, ClassedScans]] | None = None
+        # The piece whose readings are on the device.
+        self._copied: tuple[tuple[int, int] | None, Readings | None] = None, None
+
+    def __call__(self, request: Request) -> np.ndarray:
+        pipeline = self._pipeline
+        result = np.zeros((request.scans * request.per_scan, GRADIENT_NUMBERS), pipeline.real)
+        if self._groups is None:
+            self._groups = [group for group in pipeline.groups(request) if group[0].count]
+        for particles, scans in self._groups:
             most = chunk_of(pipeline.backend, 4 * scans.most_readings, pipeline.kept_bytes())
-            run_pieces(space, particles, most, _Gradient(pipeline, request, particles, scans, space, result))
-    return result
+            run_pieces(self._space, particles, most, partial(self._score, request, particles, scans, result))
+        return result
 
-
-class _Gradient:
-    """Run the programs of one group of scans."""
-
-    def __init__(
-        self, pipeline: FieldPipeline, request: Request, particles: Piece, scans: ClassedScans, space: Workspace,
-        result: np.ndarray,
-    ) -> None:  # fmt: skip
-        self._pipeline, self._request, self._space, self._result = pipeline, request, space, result
-        self._first, self._scans = particles.scans[0], scans
-
-    def __call__(self, piece: Piece) -> None:
-        first, last = piece.scans
-        scans = self._scans.part(first - self._first, last - self._first)
-        rows = self._result[piece.begin : piece.end]
+    def _score(self, request: Request, particles: Piece, scans: ClassedScans, result: np.ndarray, piece: Piece) -> None:
+        """Run the program of some scans of a group."""
+        (first, last), ahead = piece.scans, particles.scans[0]
+        scans, rows = scans.part(first - ahead, last - ahead), result[piece.begin : piece.end]
         if (value := self._pipeline.value(scans)) is not None:
             rows[:, 0] = value
             return
-        self._run(piece, self._pipeline.upload(scans, self._space), rows)
+        part, readings = self._copied
+        if readings is None or part != piece.part:
+            self._copied = None, None
+            readings = self._pipeline.upload(scans, self._space)
+            self._copied = piece.part, readings
+        self._run(request.poses, piece, readings, rows)
 
-    def _run(self, piece: Piece, readings: Readings, rows: np.ndarray) -> None:
+    def _run(self, poses: Poses, piece: Piece, readings: Readings, rows: np.ndarray) -> None:
         pipeline, space, backend = self._pipeline, self._space, self._pipeline.backend
-        placed, state = pipeline.place(self._request.poses, piece.part, space)
+        placed, state = pipeline.place(poses, piece.part, space)
         numbers = space.empty("gradient", GRADIENT_NUMBERS * piece.count, pipeline.real)
         resolution = pipeline.grid.resolution
         mount_x, mount_y = (value / resolution for value in pipeline.scanner.mount[:2])

@@ -174,6 +174,8 @@ def array(
 
 def _limited(name: str, values: NDArray[Any], largest: float) -> NDArray[Any]:
     """Return ``values`` after checking that no finite one is larger in magnitude than ``largest``."""
+    if np.logical_and.reduce(np.abs(values) <= largest, axis=None):
+        return values
     beyond = np.isfinite(values) & ((values > largest) | (values < -largest))
     if beyond.any():
         raise ValueError(f"{name}: every value must be from -{largest:g} to {largest:g}, got {_first(values, beyond)}")

@@ -105,7 +105,7 @@ class Belief(NamedTuple):
 
     def counted(self) -> Belief:
         """Return the belief after counting a scan."""
-        return self._replace(scans=self.scans + 1)
+        return Belief(self.log_odds, self.ratio, self.pose, self.scans + 1, *self[4:])
 
     def widened(self) -> Belief:
         """Return the belief after scans without a tracked pose: the next pose may be anywhere."""

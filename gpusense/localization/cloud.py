@@ -64,6 +64,7 @@ class Cloud(Particles):
         # Results on the host while they are valid; buffers and number of particles behind the estimate on the device,
         # and behind the final estimate on the host.
         self._results: np.ndarray | None = None
+        self._summary: tuple[np.ndarray, int, Summary] | None = None
         self._estimated_of: Hashable = None
         self._known: tuple[Hashable, np.ndarray] | None = None
         self._far: tuple[Hashable, float] | None = None
@@ -297,7 +298,10 @@ class Cloud(Particles):
 
     def summary(self) -> Summary:
         """Return the state after the last correction."""
-        return summary_of(self._state_of(self.places.state))
+        results, index = self._read_results(), self.places.state
+        if self._summary is None or self._summary[0] is not results or self._summary[1] != index:
+            self._summary = results, index, summary_of(self._state_of(index))
+        return self._summary[2]
 
     def shares(self, count: int) -> Any:
         """Return the normalised weights of the shown particles: on a GPU an array of the device's library."""

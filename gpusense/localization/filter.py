@@ -115,7 +115,8 @@ class ParticleFilter(Transactional):
     def _moved(self) -> Tracker:
         """Return the particles after the motion of the last ``predict``."""
         self._parts.check_started()
-        self.flush()
+        if self._parts.tracker.progress.motion is not None:
+            self._move()
         return self._parts.tracker
 
     # ---- starts

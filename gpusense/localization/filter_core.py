@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -46,6 +47,7 @@ class FilterCore:
         self.verdict = Verdict(sensors, self.tracker.random_poses, seed=options.seed)
         self.recovery = Recovery(self.tracker, self.verdict)
         self.last: dict[int, tuple[Any, ...]] = {}
+        self._margins = margins_of(sensors)
 
     def keep(self) -> None:
         """Record the buffers that the present call must not overwrite."""
@@ -120,18 +122,18 @@ class FilterCore:
         for sensor in self.sensors:
             sensor.receive()
         judged = verdict.expected(everything, tracker.progress.motion)
-        tracker.weigh(used, judged=judged, meanwhile=self._learn)
-        # The caller may reuse the arrays for the next readings.
-        self.last = {index: tuple(map(copied, reading)) for index, reading in everything.items()}
-        verdict.corrected()
+        tracker.weigh(used, judged=judged, meanwhile=functools.partial(self._use_wait, everything))
         tracker.learn(used, self.recovery.is_doubted)
         self.recovery.corrected(used, self.last)
 
-    def _learn(self) -> None:
-        """Learn from the scans of the last correction, unless they contradict the pose."""
+    def _use_wait(self, readings: Mapping[int, tuple[Any, ...]]) -> None:
+        """Learn from the scans of the last correction, unless they contradict the pose, and count this one."""
         doubted = self.recovery.is_doubted()
         for sensor in self.sensors:
             sensor.learn(doubted=doubted)
+        # The caller may reuse the arrays for the next readings.
+        self.last = {index: tuple(map(copied, reading)) for index, reading in readings.items()}
+        self.verdict.corrected()
 
     def reset(self) -> None:
         """Replace half of the particles by poses that make the last readings likely, moved by all later motion."""
@@ -149,8 +151,7 @@ class FilterCore:
         tracker, verdict, rival = self.tracker, self.verdict, self.recovery.rival
         cloud, shown = tracker.cloud, tracker.shown
         mean, covariance = tracker.mean_and_covariance()
-        pose, about = mean, covariance
-        summary = cloud.summary()
+        pose, about, summary = mean, covariance, cloud.summary()
         if method == "best":
             pose = tracker.host_particles()[int(np.argmax(cloud.host_weights(shown)))]
         elif method == "cluster":
@@ -159,18 +160,20 @@ class FilterCore:
             offset = pose - mean
             offset[2] = wrap_angle(offset[2])
             about = about + np.outer(offset, offset)
-        share, distances = share_off(about), None
-        if not spread_of(about).narrow:
+        spread = spread_of(covariance)
+        if (spread if method == "mean" else spread_of(about)).narrow:
+            share, distances = share_off(about), None
+        else:
             particles = cloud.snapshot(shown)
             share = cloud.far_share(shown) if method == "mean" else share_off_of(*particles(), pose)
             distances = Distances(particles, pose)
         if rival is not None:
             share = 1 - (1 - share) * (1 - rival.probability(pose))
         wrong = verdict.wrong
-        p_lost, spread = wrong + (1 - wrong) * share, spread_of(covariance)
+        p_lost = wrong + (1 - wrong) * share
         word = verdict_label(p_lost, wrong, wide=spread.wide, apart=spread.apart)
         temperature = tracker.sensors[0].temperature(tracker.options.temperature)
-        margins = margins_of(tracker.sensors) if verdict.informed and verdict.state.corrections else (1.0, 0.0)
+        margins = self._margins if verdict.informed and verdict.state.corrections else (1.0, 0.0)
         return Estimate(
             pose, covariance, tracker.sample_size(), p_lost, word, verdict.state.explained, temperature,
             summary.temperature, summary.degenerate, shown, *margins,

@@ -149,7 +149,7 @@ class Tracker:
         self.move()
         now = self.progress
         moved = motion.after(now.moved or (0.0, 0.0, 0.0))
-        self.progress = now._replace(step=now.step + 1, motion=motion, moved=moved)
+        self.progress = Progress(now.step + 1, motion, moved, now.copies)
 
     def move(self) -> None:
         """Run a postponed motion."""

@@ -26,6 +26,8 @@ long world_begin(global const int2 *world, const int n, const int each) { return
 // Widening of a shape's range of directions, which covers rounding, as a sine and in ranges.
 #define WIDER (real)1e-5
 #define APART (real)2e-3
+// Factor that covers rounding where a shape is behind what is nearest so far.
+#define FARTHER (real)1.00001
 
 #if SHAPES
 // Return the place of a direction among the ranges of sights, from 0 to SIGHTS. It grows with the angle, at a rate that
@@ -137,31 +139,45 @@ real2 meet_segment(const real dx, const real dy, const real x, const real y, con
     return (real2)((aside <= 0) & (end_aside >= 0) | (aside >= 0) & (end_aside <= 0) ? met : (real)INFINITY, straight);
 }
 
+// Return a word whose lowest n bits are 1.
+uint lowest_bits(const int n) { return n >= 32 ? 0xffffffffu : n > 0 ? (1u << n) - 1 : 0; }
+
 // Return the nearest of the shapes that a particle sees along a ray and of an obstacle at a distance t: the distance in
-// cells, and the cosine of the angle of incidence, 2 where no shape is nearer than t.
+// cells, and the cosine of the angle of incidence, 2 where no shape is nearer than t. A kind follows the other, so that
+// work-items of a GPU run the same code. Most shapes are beside the ray, or behind what is nearest so far.
 real2 nearest_shape(global const real *shapes, global const int2 *world, const Crowd crowd, const int n,
                     const int2 cell, const real4 pose, const real2 ray, const real t) {
     const real2 direction = ray_direction(pose, ray);
+    const real dx = direction.x, dy = direction.y;
     global const real *first = shapes + (long)world[2 * n + 1].x * crowd.stride;
-    const int sight = (int)sight_of(direction.x, direction.y);
-    global const int *sights = (global const int *)(world + sight_at(crowd, n, sight));
+    global const int *sights = (global const int *)(world + sight_at(crowd, n, (int)sight_of(dx, dy)));
     real2 nearest = (real2)(t, 2);
     for (int k = 0; k < 2 * crowd.pairs; ++k) {
-        for (uint left = (uint)sights[k]; left != 0; left &= left - 1) {
-            const int i = 32 * k + lowest_bit(left);
-            global const real *one = first + shape_at(crowd, i);
+        const uint seen = (uint)sights[k], discs = lowest_bits(crowd.discs - 32 * k);
+        const uint boxes = lowest_bits(crowd.discs + crowd.boxes - 32 * k);
+        for (uint left = seen & discs; left != 0; left &= left - 1) {
+            global const real *one = first + shape_at(crowd, 32 * k + lowest_bit(left));
             const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
-            const real aside = direction.x * y - direction.y * x;
-            real2 met = (real2)(INFINITY, 2);
-            if (i < crowd.discs) {
-                if (fabs(aside) <= one[2]) met = meet_disc(direction.x, direction.y, x, y, one[2]);
-            } else if (i < crowd.discs + crowd.boxes) {
-                if (fabs(aside) <= one[6])
-                    met = meet_box(direction.x, direction.y, x, y, one[2], one[3], one[4], one[5]);
-            } else {
-                const real end_x = (one[2] - cell.x) - pose.x, end_y = (one[3] - cell.y) - pose.y;
-                met = meet_segment(direction.x, direction.y, x, y, end_x, end_y);
-            }
+            if (!(fabs(dx * y - dy * x) <= one[2]) || dx * x + dy * y - FARTHER * one[2] >= nearest.x) continue;
+            const real2 met = meet_disc(dx, dy, x, y, one[2]);
+            if (met.x < nearest.x) nearest = met;
+        }
+        for (uint left = seen & boxes & ~discs; left != 0; left &= left - 1) {
+            global const real *one = first + shape_at(crowd, 32 * k + lowest_bit(left));
+            const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
+            const real along = dx * x + dy * y;
+            if (!(fabs(dx * y - dy * x) <= one[6]) || along - (FARTHER - 1) * along - one[6] >= nearest.x) continue;
+            const real2 met = meet_box(dx, dy, x, y, one[2], one[3], one[4], one[5]);
+            if (met.x < nearest.x) nearest = met;
+        }
+        for (uint left = seen & ~boxes; left != 0; left &= left - 1) {
+            global const real *one = first + shape_at(crowd, 32 * k + lowest_bit(left));
+            const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
+            const real end_x = (one[2] - cell.x) - pose.x, end_y = (one[3] - cell.y) - pose.y;
+            const real aside = dx * y - dy * x, end_aside = dx * end_y - dy * end_x;
+            if ((aside > 0 && end_aside > 0) || (aside < 0 && end_aside < 0)) continue;
+            if (dx * x + dy * y >= nearest.x && dx * end_x + dy * end_y >= nearest.x) continue;
+            const real2 met = meet_segment(dx, dy, x, y, end_x, end_y);
             if (met.x < nearest.x) nearest = met;
         }
     }

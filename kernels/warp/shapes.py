@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import ray as ray_file
-from .bits import lowest_bit
+from .bits import ALL_BITS, lowest_bit
 from .prelude import Window, precision, reader
 
 DISC, BOX, SEGMENT = wp.constant(4), wp.constant(8), wp.constant(4)
@@ -52,6 +52,8 @@ def functions(flags):
     TINY, NEVER, ALWAYS, UNKNOWN = real(1e-30), real(math.inf), real(-math.inf), real(math.nan)
     # Widening of a shape's range of directions, which covers rounding, as a sine and in ranges.
     WIDER, APART = real(1e-5), real(2e-3)
+    # Factor that covers rounding where a shape is behind what is nearest so far.
+    FARTHER = real(1.00001)
     THREE, QUARTER, NEAR, OPPOSITE = real(3.0), real(SIGHTS / 4), real(0.99), real(-1e-3)
 
     @wp.func
@@ -203,44 +205,73 @@ def functions(flags):
         return vec2(wp.where(meets and t >= ZERO, t, NEVER), straight)
 
     @wp.func
+    def lowest_bits(n: wp.int32):
+        """Return a word whose lowest n bits are 1."""
+        bits = ALL_BITS
+        if n < 32:
+            bits = (wp.uint32(1) << wp.uint32(wp.max(n, 0))) - wp.uint32(1)
+        return bits
+
+    @wp.func
     def nearest_shape(
         shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32, cell: wp.vec2i,
         pose: vec4, ray: vec2, t: real,
     ):  # fmt: skip
         """Return the nearest of the shapes that a particle sees along a ray and of an obstacle at a distance t: the
-        distance in cells, and the cosine of the angle of incidence, 2 where no shape is nearer than t.
+        distance in cells, and the cosine of the angle of incidence, 2 where no shape is nearer than t. A kind follows
+        the other, so that work-items of a GPU run the same code. Most shapes are beside the ray, or behind what is
+        nearest so far.
         """
         direction = ray_direction(pose, ray)
+        dx = direction.x
+        dy = direction.y
         shape = cell_at(world, 2 * n + 1).x * crowd.stride
-        sights = sight_at(crowd, n, int(sight_of(direction.x, direction.y)))
+        sights = sight_at(crowd, n, int(sight_of(dx, dy)))
         nearest = vec2(t, TWO)
         for k in range(2 * crowd.pairs):
             both = cell_at(world, sights + (k >> 1))
-            left = wp.uint32(wp.where((k & 1) == 0, both.x, both.y))
+            seen = wp.uint32(wp.where((k & 1) == 0, both.x, both.y))
+            discs = lowest_bits(crowd.discs - 32 * k)
+            boxes = lowest_bits(crowd.discs + crowd.boxes - 32 * k)
+            left = seen & discs
             while left != wp.uint32(0):
-                i = 32 * k + lowest_bit(left)
+                four = four_at(shapes, shape + shape_at(crowd, 32 * k + lowest_bit(left)))
                 left = left & (left - wp.uint32(1))
-                one = shape + shape_at(crowd, i)
-                four = four_at(shapes, one)
                 x = (four[0] - real(cell.x)) - pose.x
                 y = (four[1] - real(cell.y)) - pose.y
-                a = four[2]
-                b = four[3]
-                aside = wp.abs(direction.x * y - direction.y * x)
-                met = vec2(NEVER, TWO)
-                if i < crowd.discs:
-                    if aside <= a:
-                        met = meet_disc(direction.x, direction.y, x, y, a)
-                elif i < crowd.discs + crowd.boxes:
-                    rest = four_at(shapes, one + 4)
-                    if aside <= rest[2]:
-                        met = meet_box(direction.x, direction.y, x, y, a, b, rest[0], rest[1])
-                else:
-                    end_x = (a - real(cell.x)) - pose.x
-                    end_y = (b - real(cell.y)) - pose.y
-                    met = meet_segment(direction.x, direction.y, x, y, end_x, end_y)
-                if met.x < nearest.x:
-                    nearest = met
+                if wp.abs(dx * y - dy * x) <= four[2] and dx * x + dy * y - FARTHER * four[2] < nearest.x:
+                    met = meet_disc(dx, dy, x, y, four[2])
+                    if met.x < nearest.x:
+                        nearest = met
+            left = seen & boxes & (discs ^ ALL_BITS)
+            while left != wp.uint32(0):
+                one = shape + shape_at(crowd, 32 * k + lowest_bit(left))
+                left = left & (left - wp.uint32(1))
+                four = four_at(shapes, one)
+                rest = four_at(shapes, one + 4)
+                x = (four[0] - real(cell.x)) - pose.x
+                y = (four[1] - real(cell.y)) - pose.y
+                along = dx * x + dy * y
+                if wp.abs(dx * y - dy * x) <= rest[2] and along - (FARTHER - ONE) * along - rest[2] < nearest.x:
+                    met = meet_box(dx, dy, x, y, four[2], four[3], rest[0], rest[1])
+                    if met.x < nearest.x:
+                        nearest = met
+            left = seen & (boxes ^ ALL_BITS)
+            while left != wp.uint32(0):
+                four = four_at(shapes, shape + shape_at(crowd, 32 * k + lowest_bit(left)))
+                left = left & (left - wp.uint32(1))
+                x = (four[0] - real(cell.x)) - pose.x
+                y = (four[1] - real(cell.y)) - pose.y
+                end_x = (four[2] - real(cell.x)) - pose.x
+                end_y = (four[3] - real(cell.y)) - pose.y
+                aside = dx * y - dy * x
+                end_aside = dx * end_y - dy * end_x
+                beside = (aside > ZERO and end_aside > ZERO) or (aside < ZERO and end_aside < ZERO)
+                behind = dx * x + dy * y >= nearest.x and dx * end_x + dy * end_y >= nearest.x
+                if not beside and not behind:
+                    met = meet_segment(dx, dy, x, y, end_x, end_y)
+                    if met.x < nearest.x:
+                        nearest = met
         return nearest
 
     @wp.func

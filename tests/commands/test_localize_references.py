@@ -113,7 +113,7 @@ def test_without_returns_there_is_no_verdict(place, capsys):
     assert "NO VERDICT: no scan at the end has a reading" in capsys.readouterr().out
 
 
-def test_the_verdict_names_the_share_that_decides(place, capsys, tmp_path):
+def test_the_verdict_names_the_share_that_decides(place, capsys, tmp_path, needs):
     # The robot is carried away after the first half.
     lines = (place / "raw.log").read_text().splitlines()
     caster = gs.RayCaster(gs.read_map(place / "map.yaml"), range_max=20.0, backend="numpy")
@@ -124,7 +124,7 @@ def test_the_verdict_names_the_share_that_decides(place, capsys, tmp_path):
             row[2:183] = [f"{value:.3f}" for value in elsewhere]
         row[-1] = row[-3] = f"{step}.0"
     (tmp_path / "carried.log").write_text("\n".join(" ".join(row) for row in words))
-    arguments = call(place, "--start", "3", "1.5", "3", "--json")
+    arguments = call(place, "--start", "3", "1.5", "3", "--json", "--backend", needs("opencl"))
     arguments[arguments.index("--log") + 1] = str(tmp_path / "carried.log")
     code = cli.main(arguments)
     document = json.loads(capsys.readouterr().out)

@@ -31,6 +31,7 @@ def test_a_lost_stretch_has_its_place(model):
     assert gs.judge_trajectory(model, scans(), truth(), searches=0).duration("tracking") == found.duration()
 
 
+@pytest.mark.long
 def test_other_models_judge_as_well():
     model = gs.BeamModel(room(), SCANNER, gs.BeamParameters(sigma_hit=0.07), backend="numpy")
     found = gs.judge_trajectory(model, scans(), carried(), searches=0)

@@ -142,6 +142,7 @@ def test_lines_are_those_of_least_squares_on_the_true_points():
     assert np.median(compared) < 0.02 and np.mean(np.array(compared) < 0.5) > 0.9
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize(("beams", "noise"), [(360, 0.0), (180, 0.05), (1081, 0.02)])
 def test_devices_agree_with_the_reference(device, beams, noise):

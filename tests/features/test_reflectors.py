@@ -74,6 +74,7 @@ def test_bad_intensities_are_named():
         gs.extract_features(ranges, SCANNER, intensities=["bright"] * 1440)
 
 
+@pytest.mark.long
 def test_reflectors_of_a_recording(data_dir):
     """Most scans show the six reflectors of jarvis_lab's AGV at their positions on its map."""
     folder = data_dir / "jarvis_lab"

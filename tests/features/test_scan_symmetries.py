@@ -54,6 +54,7 @@ def assert_same(found: gs.Features, first: gs.Features, turn: float = 0.0, mirro
         np.testing.assert_array_less(off.min(axis=1), 2e-3 if kind == "pole" else 1e-5)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("beams", "noise"), [(360, 0.0), (720, 0.01), (541, 0.02), (180, 0.03)])
 def test_features_turn_and_mirror_with_their_scans(backend, beams, noise):
     bearings = bearings_of(beams)

@@ -138,6 +138,7 @@ def beams(names: tuple[str, ...]) -> tuple[frozenset[str], list[Any], np.ndarray
     return scene_flags(REAL, "ORIGINS_OUTSIDE", "SCANS", *flags, *names), arrays, counts, most
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("names", [(), ("SHARED_RAYS",)])
 def test_beams_of_scans(names: tuple[str, ...], device: Backend) -> None:
     flags, arrays, counts, most = beams(names)
@@ -157,6 +158,7 @@ def test_beams_of_scans(names: tuple[str, ...], device: Backend) -> None:
         assert np.ptp(expected) > 10 and counts.min() == 0
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("names", [("ORDERED",), ("ORDERED", "SHARED_RAYS"), ("ORDERED", "STRANDED")])
 def test_tiles_of_beams_of_scans(names: tuple[str, ...], device: Backend) -> None:
     flags, arrays, counts, most = beams(names)

@@ -260,6 +260,7 @@ def test_blocks_of_fields(names: tuple[str, ...], device: Backend) -> None:
         assert differing(found, expected) == 0
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("readings", [16, 53])
 def test_blocks_of_end_points_inside(readings: int, device: Backend) -> None:
     rng = np.random.default_rng(31)

@@ -150,6 +150,7 @@ def test_random_looks_leave_the_bits_of_the_belief_in_recorded_steps(seed, warp_
     check(seed, "warp:cpu")
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("name, options", [("landmarks", {}), ("beam", {"beam_skip": 0.3}), ("position", {})])
 def test_the_sample_size_is_that_of_the_weights_after_a_motion(name, options, backend):
     pf = gs.ParticleFilter(SENSORS[name](backend), particles=200, stages=1, **options)

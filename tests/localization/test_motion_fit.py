@@ -62,6 +62,7 @@ def _drive(motion, steps, rng):
     return np.array(odometry), np.array(truth)
 
 
+@pytest.mark.long
 def test_motion_noise_is_learned_from_references_at_some_steps():
     motion = gs.OdometryMotion((0.03, 0.01, 0.02, 0.005), reverse=0, sideways=0.01, systematic=(0.02, -0.03, 0.02))
     odometry, truth = _drive(motion, 6000, np.random.default_rng(3))

@@ -150,6 +150,7 @@ def test_reading_is_lazy(log):
         next(records)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "scans", "beams", "range_max"),
     [

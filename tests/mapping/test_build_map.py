@@ -253,6 +253,7 @@ def world_of_scans(count=30, beams=40, side=20.0):
     return rng.uniform(0.5, 9, (count, beams)), poses, scanner
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("yaw", [0.0, 0.7])
 def test_bands_of_rows_make_the_same_map(backend, yaw):
     scans, poses, scanner = world_of_scans()

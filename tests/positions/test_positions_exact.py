@@ -90,6 +90,7 @@ def exact_pose(xy, bearings, start):
     return root[0] + m[0].real, root[1] + m[0].imag, root[2]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("origin", FAR, ids=["near", "UTM"])
 @pytest.mark.parametrize("shape", ["any", "in line", "near the circle", "on a side"])
 def test_three_bearings(origin, shape):

@@ -179,6 +179,7 @@ EXTREMES = [
 ]  # fmt: skip
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("bins", [1, 100, 1000])
 def test_rows_sum_to_1_and_no_logarithm_is_nan(bins):
     for causes in EXTREMES if bins <= 100 else EXTREMES[::7]:

@@ -56,6 +56,7 @@ def scored(name: str, backend: str, precision: str, how: str) -> tuple[np.ndarra
     return model.log_likelihood(poses, features), model.associate(poses, features)[1]
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.25)
 @on_every_backend(
     on_warp=lambda name, precision, how: name == "everything" and (precision, how) != ("float64", "sum"),

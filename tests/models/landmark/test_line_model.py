@@ -33,6 +33,7 @@ def assert_within(found, expected, precision, *, terms=1, slack=0.0):
     assert (apart <= bound).all(), f"{(apart / bound).max():.3g} times the bound"
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.25)
 @on_every_backend(
     on_warp=lambda name, precision, how: name == "mounted" and (precision, how) != ("float64", "sum"),

@@ -74,6 +74,7 @@ def model_of(backend: str, precision: str = "float64", specialize: bool = True, 
     return gs.BeamModel(grid, scanner, p, backend=backend, precision=precision, specialize=specialize, **options)
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("specialize", [True, False])
 # The other options are host code.

@@ -65,6 +65,7 @@ def test_information_is_the_curvature_at_a_perfect_fit():
     assert abs(information[0, 1]).max() == 0
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("specialize", [True, False])

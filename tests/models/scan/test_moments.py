@@ -88,6 +88,8 @@ def test_models_have_the_densities_on_every_backend(shape, real, backend):
     names = list(MIXTURES)
     if backend.startswith("warp"):
         names = ["book" if real == "float32" else "sharp without rand"]
+    elif backend != "numpy":
+        names = names[real == "float64" :: 2]
     cases = list(itertools.product(names, (False, True)))
     if backend != "numpy":
         # With and without code for causes of weight 0, in turn.

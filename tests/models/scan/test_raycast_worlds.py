@@ -59,6 +59,7 @@ def world(name: str, unknown: str, outside: str) -> World:
     return World(grid, poses, bearings, stops.tolist(), rays, exact)
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.4)
 @pytest.mark.parametrize("name", WORLDS)
 @pytest.mark.parametrize(("unknown", "outside"), [("free", "free"), ("occupied", "free"), ("free", "occupied")])

@@ -113,6 +113,7 @@ def assert_as_one_by_one(model: Any, poses: np.ndarray, z: np.ndarray) -> None:
 
 
 # Warp's kernels have the other models' flags in the same places.
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.05)
 @on_every_backend(name=MODELS, gpu=(False, True), on_warp=lambda name, gpu: MODELS[name][1])
 def test_bits_are_those_of_single_calls(name, gpu, as_gpu, monkeypatch):

@@ -48,7 +48,7 @@ def recorded(tmp_path_factory):
 
 
 def run(capsys, *arguments):
-    code = main(["fit", *map(str, arguments), "--backend", "numpy"])
+    code = main(["fit", *map(str, arguments)])
     captured = capsys.readouterr()
     return code, captured.out, captured.err
 

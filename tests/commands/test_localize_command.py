@@ -54,7 +54,7 @@ def place(tmp_path_factory):
 
 
 def call(place, *more, grid="map.yaml", log="run.log"):
-    common = ["--particles", "300", "--backend", "numpy", "--range-max", "20", "--beams", "60"]
+    common = ["--particles", "300", "--range-max", "20", "--beams", "60"]
     return ["localize", "--map", str(place / grid), "--log", str(place / log), *common, *more]
 
 

@@ -45,7 +45,7 @@ def centres(grid):
 
 
 def call(place, *more):
-    common = ["--particles", "300", "--backend", "numpy", "--range-max", "20", "--beams", "60"]
+    common = ["--particles", "300", "--range-max", "20", "--beams", "60"]
     return ["localize", "--map", str(place / "map.yaml"), "--log", str(place / "raw.log"), *common, *more]
 
 

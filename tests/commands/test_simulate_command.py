@@ -28,7 +28,7 @@ def office(tmp_path, monkeypatch, capsys):
 @pytest.mark.long
 def test_the_log_runs_through_the_other_commands(office, capsys):
     log = ["--map", "office.yaml", "--log", "run.log"]
-    rest = ["--json", "--backend", "numpy"]
+    rest = ["--json"]
     assert main(["localize", *log, *rest, "--particles", "300", "--beams", "30"]) == 0
     assert json.loads(capsys.readouterr().out)["summary"]["error_median"] < 0.2
     assert main(["score", *log, *rest, "--every", "10", "--particles", "500"]) == 0
@@ -86,7 +86,7 @@ def test_bags_have_mount_odometry_and_scans(office, kind, capsys):
     np.testing.assert_allclose(scans[0].scanner.mount, (0.2, 0.1, 0.3), atol=1e-6)
     capsys.readouterr()
     assert main(["localize", "--map", "office.yaml", "--log", name, "--reference", "bag.tum", "--particles", "300",
-                 "--backend", "numpy", "--json"]) == 0  # fmt: skip
+                 "--json"]) == 0  # fmt: skip
     assert json.loads(capsys.readouterr().out)["summary"]["error_median"] < 0.2
     if kind == "ros2":
         assert "must not exist, got a folder" in error_of(command, capsys)

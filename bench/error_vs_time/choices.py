@@ -130,11 +130,28 @@ def lead(rows: Sequence[Row], devices: Sequence[str], standing: Standing) -> lis
         row, kept = chosen(rows, FIRST[0], device, standing.get((device, FIRST[0].words), ""))
         if row is None:
             continue
-        lines.append(f"- {device}: {answer(rows, FIRST[0], device, standing.get((device, FIRST[0].words), ''))}")
+        measure = SHOWN[FIRST[0].need][0]
+        shown = _elapsed(row, measure)
+        text = f"**{row.text}**: {shown}" if kept else f"none; nearest: {row.text}, {shown}"
+        fewer, able = chosen(rows, FIRST[1], device, standing.get((device, FIRST[1].words), ""))
+        if fewer is not None and able and _beams(fewer) > _beams(row) and fewer.errors[measure] < row.errors[measure]:
+            text += f"; fewer particles with more beams: **{fewer.text}**: {_elapsed(fewer, measure)}"
+        lines.append(f"- {device}: {text}")
         if kept:
             codes.setdefault("gpu" if "NVIDIA" in device else "processor", row.code)
     code = [f"{name} = {code}" for name, code in codes.items()]
     return [f"**{FIRST[0].words}:**", "", *lines, "", "```python", *code, "```"] if lines else []
+
+
+def _beams(row: Row) -> int:
+    """Return the beams of a setting such as "10000 x 8"."""
+    return int(row.setting.split(",")[0].split(" x ")[1])
+
+
+def _elapsed(row: Row, measure: str) -> str:
+    """Return time and error; on a processor, the median of the elapsed time is in parentheses."""
+    elapsed = "" if "NVIDIA" in row.device else f" ({time_text(row.quartiles[1])} elapsed)"
+    return f"{time_text(row.seconds)}{elapsed}, {value(row.errors[measure], row.units[measure])}"
 
 
 def _figures(row: Row, measure: str) -> str:

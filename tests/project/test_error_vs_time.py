@@ -126,13 +126,28 @@ def test_the_answers_by_hand(page: ModuleType, tmp_path: Path) -> None:
     text = page.files(tmp_path)[page.PAGE]
     assert f"| to do | {DEVICE} |" in text
     assert "| 10 000 particles at 100 Hz | **field, 10000 x 60**: 8 ms, 1.8 cm |" in text
-    first = f"**10 000 particles at 100 Hz:**\n\n- {DEVICE}: **field, 10000 x 60**: 8 ms, 1.8 cm\n\n"
+    first = f"**10 000 particles at 100 Hz:**\n\n- {DEVICE}: **field, 10000 x 60**: 8 ms (16 ms elapsed), 1.8 cm\n\n"
     assert f"{first}```python\nprocessor = make(field)\n```\n" in text
     assert "| 1000 particles at 100 Hz | **beam, 1000 x 60**: 9 ms, 6 mm |" in text
     # A temperature of 1 is not the default: it is right only in simulations.
     assert "| localisation to 2 cm | **field, 1000 x 60**: 2 ms, 1.7 cm |" in text
     # Nothing measured a beam model alone.
     assert "beam model, at most 1 ms" not in text
+
+
+def test_the_first_answer_names_fewer_particles_that_leave_time_for_more_beams(
+    page: ModuleType, tmp_path: Path
+) -> None:
+    hint = "; fewer particles with more beams: **beam, 1000 x 60**: 9 ms (18 ms elapsed), 6 mm"
+    for setting, error, hinted in (
+        ("10000 x 8", 0.018, True),
+        ("10000 x 60", 0.018, False),
+        ("10000 x 8", 5e-3, False),
+    ):
+        write_tasks(tmp_path, [task("field", setting, 0.008, error), *ROWS[1:]])
+        text = page.files(tmp_path)[page.PAGE]
+        line = next(line for line in text.splitlines() if line.startswith(f"- {DEVICE}: "))
+        assert (hint in line) == hinted and line.startswith(f"- {DEVICE}: **field, {setting}**: 8 ms (16 ms elapsed), ")
 
 
 def test_answers_of_the_last_page_stand(page: ModuleType, tmp_path: Path) -> None:

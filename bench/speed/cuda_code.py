@@ -61,7 +61,7 @@ def main() -> int:
     """Count and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kernel", choices=sorted(KERNELS))
-    parser.add_argument("--flags", default="", help="with commas between them, of gpusense/interface/signatures.py")
+    parser.add_argument("--flags", default="", help="with commas between them, of gpusense/interface/flags.py")
     parser.add_argument("--arch", type=int, default=90, help="compute capability without its point")
     parser.add_argument("--terms", type=int, default=1, help="readings that the longest stretch computes")
     parser.add_argument("--nvdisasm", default=shutil.which("nvdisasm"), help="the program's path")

@@ -58,8 +58,10 @@ or CDDT serves both clouds of a scene.
 examples:
   gpusense bench --quick --html bench.html
   gpusense bench --output results --backend opencl --backend warp:cpu
-  gpusense bench --scene basement --method exact --method lookup --problem ranges
-  gpusense bench --map office.yaml --particles 10000 --beams 60 --max-error "0.01 nats" --max-time "1 ms\""""
+  gpusense bench --scene basement --method exact --method lookup \\
+      --problem ranges
+  gpusense bench --map office.yaml --particles 10000 --beams 60 \\
+      --max-error "0.01 nats" --max-time "1 ms\""""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

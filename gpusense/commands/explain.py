@@ -44,7 +44,8 @@ Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
 examples:
   gpusense explain
-  gpusense explain --map map.yaml --log run.log.gz --parameters fitted/parameters.yaml --measure
+  gpusense explain --map map.yaml --log run.log.gz \\
+      --parameters fitted/parameters.yaml --measure
   gpusense explain --model field --z-rand 0 --z-hit 1 --sources"""
 
 

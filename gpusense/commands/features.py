@@ -37,7 +37,8 @@ Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
 examples:
   gpusense features --log run.log.gz --limit 300 --plot scan.png
-  gpusense features --log run.log.gz --map-out landmarks.csv --map-plot landmarks.png
+  gpusense features --log run.log.gz --map-out landmarks.csv \\
+      --map-plot landmarks.png
   gpusense features --map-in map.yaml --map-out landmarks.csv"""
 
 

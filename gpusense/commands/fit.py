@@ -50,7 +50,8 @@ Ctrl-C ends the fit and prints the best parameters so far.
 Exit codes: 0 success, 1 the fit did not converge, 2 bad input, 130 interrupted, 143 terminated.
 
 examples:
-  gpusense fit --map map.yaml --log run.log.gz --every 2 --offset 1 --holdout --fit-motion --out fitted
+  gpusense fit --map map.yaml --log run.log.gz --every 2 --offset 1 --holdout \\
+      --fit-motion --out fitted
   gpusense fit --pairs readings.csv --range-max 8 --range-bias"""
 
 UNFINISHED = 1

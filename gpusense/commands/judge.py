@@ -44,9 +44,12 @@ Exit codes: 0 the poses were not lost, 1 they were, or no scan had a reading to 
 
 examples:
   gpusense judge --map map.yaml --log run.bag
-  gpusense judge --map map.yaml --log run.mcap --poses /amcl_pose --plot judged.png
-  gpusense judge --map map.yaml --log run.log.gz --poses run.tum --csv judged.csv
-  gpusense judge --map map.yaml --log run.bag --truth true.tum --risk 0.01 --alert-limit 0.5"""
+  gpusense judge --map map.yaml --log run.mcap --poses /amcl_pose \\
+      --plot judged.png
+  gpusense judge --map map.yaml --log run.log.gz --poses run.tum \\
+      --csv judged.csv
+  gpusense judge --map map.yaml --log run.bag --truth true.tum --risk 0.01 \\
+      --alert-limit 0.5"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -57,7 +57,8 @@ Exit codes: 0 success, 1 lost at the end, 2 bad input.
 
 examples:
   gpusense landmarks --folder MRCLAM_Dataset1 --robot 1
-  gpusense landmarks --folder MRCLAM_Dataset1 --robot 2 --unknown --particles 5000"""
+  gpusense landmarks --folder MRCLAM_Dataset1 --robot 2 --unknown \\
+      --particles 5000"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -43,8 +43,10 @@ Ctrl-C ends the run; the picture then shows the positions so far.
 Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
 examples:
-  gpusense likelihood-map --map map.yaml --log run.log.gz --scan 101 --out likelihood.png
-  gpusense likelihood-map --map map.yaml --log run.log.gz --model beam --temperature 0.1 --out beam.pdf"""
+  gpusense likelihood-map --map map.yaml --log run.log.gz --scan 101 \\
+      --out likelihood.png
+  gpusense likelihood-map --map map.yaml --log run.log.gz --model beam \\
+      --temperature 0.1 --out beam.pdf"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -58,11 +58,14 @@ Exit codes: 0 the verdict is 'tracking', 1 uncertain or lost at the end, or no r
 
 examples:
   gpusense localize --map map.yaml --log run.log.gz
-  gpusense localize --map map.yaml --log run.log.gz --global --particles 20000 --tum run.tum --plot run.png
+  gpusense localize --map map.yaml --log run.log.gz --global \\
+      --particles 20000 --tum run.tum --plot run.png
   gpusense localize --map map.yaml --log run.bag --global --animate run.gif
-  gpusense localize --map map.yaml --log run.bag --topic /front --start 1.5 -2 0.3
+  gpusense localize --map map.yaml --log run.bag --topic /front \\
+      --start 1.5 -2 0.3
   gpusense localize --map map.yaml --log run.mcap --parameters nav2_params.yaml
-  gpusense localize --map map.yaml --log run.log.gz --every 2 --offset 1 --parameters fitted/parameters.yaml"""
+  gpusense localize --map map.yaml --log run.log.gz --every 2 --offset 1 \\
+      --parameters fitted/parameters.yaml"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

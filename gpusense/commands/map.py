@@ -64,7 +64,8 @@ examples:
   gpusense localize --map map.yaml --log run.bag --start 0 0 0
   gpusense map --log run.bag --topic /front /rear --out map.yaml
   gpusense map --log run.log.gz --chain --range-limit 20 --out map.yaml
-  gpusense map --log run.log.gz --every 2 --range-limit 20 --resolution 0.1 --out even.yaml
+  gpusense map --log run.log.gz --every 2 --range-limit 20 --resolution 0.1 \\
+      --out even.yaml
   gpusense map --log run.bag --reference run.tum --out map.yaml"""
 
 

@@ -53,7 +53,8 @@ examples:
   gpusense match --log run.log.gz --limit 300
   gpusense match --log run.log.gz --guess identity --plot worst.png
   gpusense match --log run.bag --topic /scan --noise 0.03 --tum run.tum
-  gpusense match --log run.log.gz --map map.yaml --shift 0.5 --turn 10 --out poses.csv"""
+  gpusense match --log run.log.gz --map map.yaml --shift 0.5 --turn 10 \\
+      --out poses.csv"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -32,7 +32,8 @@ Exit codes: 0 interrupted or terminated, 1 the node could not start (its log has
 examples:
   gpusense ros --map map.yaml --params-file nav2_params.yaml
   gpusense ros --map map.yaml --start 1 2 0 --ros-args -p use_sim_time:=true
-  gpusense ros --global --ros-args -r __ns:=/robot1 -r /tf:=tf -r /tf_static:=tf_static
+  gpusense ros --global --ros-args -r __ns:=/robot1 -r /tf:=tf \\
+      -r /tf_static:=tf_static
   gpusense ros --odom-topic odom --mount 0.2 0 0
   gpusense ros watch --base-frame base_link"""
 

@@ -68,8 +68,10 @@ differently by more than rounding explains, 2 bad input, 130 interrupted, 143 te
 
 examples:
   gpusense score --map map.yaml --log run.log.gz --model field --particles 20000
-  gpusense score --map map.yaml --log run.log.gz --parameters fitted/parameters.yaml
-  gpusense score --map map.yaml --log run.log.gz --every 2 --offset 1 --backend opencl --backend numpy --limit 3"""
+  gpusense score --map map.yaml --log run.log.gz \\
+      --parameters fitted/parameters.yaml
+  gpusense score --map map.yaml --log run.log.gz --every 2 --offset 1 \\
+      --backend opencl --backend numpy --limit 3"""
 
 # Columns of the table, and their widths.
 _COLUMNS = {

@@ -45,8 +45,10 @@ Exit codes: 0 success, 2 bad input.
 examples:
   gpusense simulate --world office --map-out office.yaml --log-out run.log
   gpusense localize --map office.yaml --log run.log
-  gpusense simulate --map office.yaml --log-out crowded.log.gz --hidden 0.3 --moved 0.1 --seed 7
-  gpusense simulate --map office.yaml --log-out run.bag --mount 0.2 0 0 --tum truth.tum"""
+  gpusense simulate --map office.yaml --log-out crowded.log.gz --hidden 0.3 \\
+      --moved 0.1 --seed 7
+  gpusense simulate --map office.yaml --log-out run.bag --mount 0.2 0 0 \\
+      --tum truth.tum"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -47,11 +47,13 @@ execute code there: use a trusted network or TLS. Maps and logs are sent to the 
 Exit codes: 0 success, 1 some jobs failed, 2 bad input, or the cluster ended, 130 interrupted, 143 terminated.
 
 examples:
-  gpusense sweep examples/sweep_logs.yaml --root data --table sweep.csv --processes 2 --plot sweep.png
+  gpusense sweep examples/sweep_logs.yaml --root data --table sweep.csv \\
+      --processes 2 --plot sweep.png
   gpusense sweep plan.yaml --device warp:cuda:0 --device warp:cuda:1
   gpusense sweep plan.yaml --processes 8 --job-timeout 600
   gpusense sweep plan.yaml --dask tcp://10.0.0.1:8786 --resume
-  gpusense sweep plan.yaml --dask tls://10.0.0.1:8786 --tls-ca ca.pem --tls-cert cert.pem --tls-key key.pem"""
+  gpusense sweep plan.yaml --dask tls://10.0.0.1:8786 --tls-ca ca.pem \\
+      --tls-cert cert.pem --tls-key key.pem"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

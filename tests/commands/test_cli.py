@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from support.command_line import SMALL, error_of, script
+from support.paths import ROOT
 
 import gpusense
 from gpusense.commands import cli, devices
@@ -48,6 +49,19 @@ def test_command_help_has_an_example(name, capsys):
     assert out.startswith(f"usage: gpusense {name} ")
     assert "example" in out and f"  gpusense {name}" in out
     assert "--json" in out or name == "ros"  # a node has no result
+
+
+def test_options_of_a_page_belong_to_a_command_that_it_names():
+    commands = cli._build(cli.COMMANDS)._commands()
+    options = {
+        name: {text for one in parser._actions for text in one.option_strings} for name, parser in commands.items()
+    }
+    every, gone = set().union(*options.values()), []
+    for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        known = set().union(*(options[name] for name in options if re.search(rf"gpusense {name}\b", text)))
+        gone += [(page.name, one) for one in re.findall(r"`(--[a-z][a-z-]*)", text) if one in every - known]
+    assert gone == []
 
 
 @pytest.mark.parametrize("name", cli.COMMANDS)
@@ -214,7 +228,7 @@ def test_help_begins_with_the_most_used_options(name, capsys):
     assert lines[0].startswith(f"usage: gpusense {name} ") and lines[0].endswith("[options]")
     first, rest = lines.index("most used:"), lines.index("further options:")
     assert first < rest and "--" in "".join(lines[first:rest]) and "--help" in "".join(lines[rest:])
-    assert max(len(line) for line in lines if "gpusense " not in line) <= 80
+    assert max(map(len, lines)) <= 80
 
 
 def test_options_are_completed(tmp_path):

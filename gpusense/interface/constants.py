@@ -43,6 +43,8 @@ RAY_BITS = 12
 MATCH_RESULT, MATCH_RULES = 35, 14
 # Kernel file field_gradient: numbers of a particle, log p, its gradient (3) and the information (9).
 GRADIENT_NUMBERS = 13
+# Kernel file field_climb: numbers of a climb.
+CLIMB = 19
 # Kernel files segments and circles: numbers of a line and of a circle.
 LINE_NUMBERS, CIRCLE_NUMBERS = 6, 10
 

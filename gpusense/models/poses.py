@@ -65,6 +65,8 @@ class Poses:
         self.host: np.ndarray | None = None
         self._name, self._scans = name, scans
         self._last_corners: tuple[Part, Corners] | None = None
+        # Distance by which launches may move poses [m].
+        self.reach = 0.0
         # Poses that a workspace has on the device before they are placed.
         self._ahead: tuple[Part, Workspace, Buffer] | None = None
         self.on_device = type(poses) is not np.ndarray and arrays.on_device(poses)
@@ -108,7 +110,9 @@ class Poses:
         # The bounds, which calls need anyway, reveal NaN and infinities.
         if not all(map(math.isfinite, (*bounds[0], *bounds[1]))):
             arrays.refuse_poses(self.host, self._name, self._scans)
-        self._last_corners = part, corners_of(bounds)
+        (x, y, turn), (far_x, far_y, far_turn), reach = *bounds, self.reach
+        wide = (x - reach, y - reach, turn - 4 * reach), (far_x + reach, far_y + reach, far_turn + 4 * reach)
+        self._last_corners = part, corners_of(wide if reach else bounds)
 
     def ensure_table(
         self, reachable: ReachableMap, part: Part, backend: Backend, space: Workspace | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gpusense.interface.constants import GRADIENT_NUMBERS, MATCH_RESULT, MATCH_RULES
+from gpusense.interface.constants import CLIMB, GRADIENT_NUMBERS, MATCH_RESULT, MATCH_RULES
 from gpusense.interface.signatures.rows import PLACED, WINDOW, Kernel, kernel
 
 # Points of all scans, sorted by bearing in each scan: x, y [m], bearing in [0, 2 pi), range [m].
@@ -20,6 +20,11 @@ KERNELS: dict[str, Kernel] = {
         f"out real gradient [{GRADIENT_NUMBERS} * particles]", WINDOW,
         "int particles", "int readings", "real guard", "real mount_x", "real mount_y", "real resolution",
         "Score score", "ScanBatch batch if SCANS", in_lanes=True,
+    ),
+    "climb_step": kernel(
+        "field_climb", "scan", f"real gradient [{GRADIENT_NUMBERS} * scans]", "out double poses [3 * scans]",
+        f"out double climb [{CLIMB} * scans]", "int scans", "int most", "double small", "double yaw_cos",
+        "double yaw_sin",
     ),
     "fit_lines": kernel(
         "lines", "beam scan", *_POINTS, "int which [chosen]", "out real4 line [points]", "int scans", "int points",

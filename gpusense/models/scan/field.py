@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -18,7 +17,7 @@ from gpusense.interface.constants import HIGH_PEAK
 from gpusense.interface.plan import Note, Omission, SceneNotes, component_notes, launch_omissions, precision_notes
 from gpusense.models.chunking import finish
 from gpusense.models.scan.differentiable import Differentiable
-from gpusense.models.scan.field_gradient import Gradients, in_world
+from gpusense.models.scan.field_gradient import Climbs, Gradients, in_world
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.model import ScanModel
 from gpusense.models.scan.pipeline import make_request
@@ -139,12 +138,26 @@ class LikelihoodFieldModel(ScanModel):
             ValueError: A wrong shape, a pose that is not finite, or a field that is not interpolated.
             MemoryError: The device cannot hold the map's table, or even a few particles.
         """
-        with self._gradients(ranges) as gradient:
-            return gradient(poses)
+        self._check_gradients()
+        request = make_request(self._context, poses, ranges)
+        with self._lock, self._workspace:
+            numbers = Gradients(self._field_pipeline, self._workspace)(request)
+            finish(self._workspace, request.poses.on_device)
+        log_p, gradient, information = in_world(numbers, self.grid.origin[2])
+        shape = request.shape
+        return log_p.reshape(shape), gradient.reshape(*shape, 3), information.reshape(*shape, 3, 3)
 
-    @contextlib.contextmanager
-    def _gradients(self, ranges: AnyArray) -> Iterator[Callable[[AnyArray], tuple[np.ndarray, np.ndarray, np.ndarray]]]:
-        """Yield a function of poses, with the results of ``gradient`` for the same readings; it holds the model."""
+    def _climb(self, poses: np.ndarray, ranges: np.ndarray, small: float) -> np.ndarray:
+        """Climb from (S, 3) poses to maxima of the log-likelihoods of (S, K) readings; return numbers of climbs."""
+        self._check_gradients()
+        request = make_request(self._context, poses[:, None], ranges)
+        with self._lock, self._workspace:
+            climbs = Climbs(self._field_pipeline, self._workspace, small, poses)
+            climbs(request)
+            finish(self._workspace, False)
+        return climbs.end
+
+    def _check_gradients(self) -> None:
         if self.parameters.interpolation != "bilinear":
             raise ValueError(
                 "interpolation: must be 'bilinear' for gradients, got a field with 'nearest': pass "
@@ -152,19 +165,6 @@ class LikelihoodFieldModel(ScanModel):
             )
         if self._worlds is not None:
             raise ValueError(f"grid: must be a single map for gradients, got {self._worlds}")
-        space = self._workspace
-        gradients = Gradients(self._field_pipeline, space)
-
-        def gradient(poses: AnyArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            request = make_request(self._context, poses, ranges)
-            numbers = gradients(request)
-            finish(space, request.poses.on_device)
-            log_p, slope, information = in_world(numbers, self.grid.origin[2])
-            shape = request.shape
-            return log_p.reshape(shape), slope.reshape(*shape, 3), information.reshape(*shape, 3, 3)
-
-        with self._lock, space:
-            yield gradient
 
     def _differentiable(self, ranges: AnyArray) -> Differentiable | None:
         if self.parameters.interpolation != "bilinear" or self._worlds is not None:

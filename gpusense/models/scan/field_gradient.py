@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
 
+from gpusense.backends import get_backend
+from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
-from gpusense.interface.constants import GRADIENT_NUMBERS
+from gpusense.interface.constants import CLIMB, GRADIENT_NUMBERS
 from gpusense.interface.lanes import with_lanes_flag
-from gpusense.interface.launches import launch
+from gpusense.interface.launches import Program, launch
 from gpusense.interface.signatures.rows import LANES
 from gpusense.interface.structs import ScanBatch, Score
 from gpusense.models.chunking import Piece, chunk_of, run_pieces
-from gpusense.models.poses import Poses
+from gpusense.models.poses import PlacedPoses, Poses
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.pipeline import Request
 from gpusense.models.scan.readings import Readings, placing_launches
+from gpusense.reference.field_climb import CALM, DAMPING, ENDED, START, STEPS
 
 # Flags of the mixture that have no meaning for the kernel.
 _OTHERS = {"LOG_TABLE", "CUBES"}
+# Steps of a climb at most, steps between two reads, and how far a climb leads from its start, and a little more [m].
+_MOST_STEPS, _STEPS_AT_ONCE, _FARTHEST = 50, 4, 5.5
 
 
 class Gradients:
@@ -61,14 +67,22 @@ class Gradients:
         self._run(request.poses, piece, readings, rows)
 
     def _run(self, poses: Poses, piece: Piece, readings: Readings, rows: np.ndarray) -> None:
-        pipeline, space, backend = self._pipeline, self._space, self._pipeline.backend
+        """Evaluate the poses of a piece."""
+        program, numbers, _ = self._program(poses, piece, readings)
+        self._pipeline.backend.run(program)
+        self._space.download(numbers, rows)
+
+    def _program(self, poses: Poses, piece: Piece, readings: Readings) -> tuple[Program, Buffer, PlacedPoses]:
+        """Return the launches for the poses of a piece, the buffer of their results, and the placed poses."""
+        pipeline, space = self._pipeline, self._space
         placed, state = pipeline.place(poses, piece.part, space)
         numbers = space.empty("gradient", GRADIENT_NUMBERS * piece.count, pipeline.real)
         resolution = pipeline.grid.resolution
         mount_x, mount_y = (value / resolution for value in pipeline.scanner.mount[:2])
         flags = (pipeline.components | readings.flags) - _OTHERS
-        flags, per_scan = with_lanes_flag(backend.info.lanes, "field_gradient", flags), piece.count // readings.scans
+        flags = with_lanes_flag(pipeline.backend.info.lanes, "field_gradient", flags)
         # The particles of a work-item's lanes belong to one scan.
+        per_scan = piece.count // readings.scans
         size = readings.scans * -(-per_scan // LANES) * LANES if "IN_LANES" in flags else piece.count
         gradient = launch(
             "field_gradient", flags, (size,), table=state.table, pose_cell=placed.cell, pose=placed.pose,
@@ -77,8 +91,50 @@ class Gradients:
             score=Score(readings.constant_term, pipeline.context.temperature), batch=ScanBatch(per_scan, 0),
             **readings.arguments | readings.constants | dict(guard=pipeline.guard * readings.reach),
         )  # fmt: skip
-        backend.run((*placing_launches(placed, readings.placing), gradient))
-        space.download(numbers, rows)
+        return (*placing_launches(placed, readings.placing), gradient), numbers, placed
+
+
+class Climbs(Gradients):
+    """Climbs of S poses, one of each scan, to maxima of the likelihood; see the kernel file ``field_climb``.
+
+    Attributes:
+        end: (S, ``CLIMB``) numbers of climbs.
+    """
+
+    def __init__(self, pipeline: FieldPipeline, space: Workspace, small: float, poses: np.ndarray) -> None:
+        super().__init__(pipeline, space)
+        self._small, yaw = small, pipeline.grid.origin[2]
+        self._turn = math.cos(yaw), math.sin(yaw)
+        self.end = np.zeros((len(poses), CLIMB))
+        self.end[:, :3], self.end[:, START : START + 2] = poses, poses[:, :2]
+        # A scan without readings has one step of length 0.
+        self.end[:, DAMPING], self.end[:, STEPS], self.end[:, CALM] = 1e-3, 1, 1
+
+    def _run(self, poses: Poses, piece: Piece, readings: Readings, rows: np.ndarray) -> None:
+        """Climb from the poses of a piece, several steps at once where the device has float64."""
+        backend, space, end = self._pipeline.backend, self._space, self.end[piece.begin : piece.end]
+        flags, numbers = frozenset({"FLOAT64"}) & self._pipeline.components, (piece.count, _MOST_STEPS, self._small)
+        end[:, STEPS], end[:, CALM], poses.reach = -1, 0, _FARTHEST
+        if backend.info.float64:
+            program, gradient, placed = self._program(poses, piece, readings)
+            there = space.upload("climb", end)
+            step = launch(
+                "climb_step", flags, (piece.count,), gradient=gradient, poses=placed.source, climb=there,
+                scans=piece.count, most=_MOST_STEPS, small=self._small, yaw_cos=self._turn[0], yaw_sin=self._turn[1],
+            )  # fmt: skip
+            while not end[:, ENDED].all():
+                backend.run((*program, step) * _STEPS_AT_ONCE)
+                space.read(there, end)
+            return
+        pose = np.array(poses.host[piece.begin : piece.end] if poses.host is not None else [])
+        climb_step = get_backend("numpy").compile("climb_step", flags)
+        while not end[:, ENDED].all():
+            moved = Poses(pose, backend, scans=None, late=True)
+            moved.reach = _FARTHEST
+            program, gradient, _ = self._program(moved, Piece(0, piece.count, piece.per_scan), readings)
+            backend.run(program)
+            space.read(gradient, rows)
+            climb_step((piece.count,), rows.reshape(-1), pose.reshape(-1), end.reshape(-1), *numbers, *self._turn)
 
 
 def in_world(numbers: np.ndarray, yaw: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

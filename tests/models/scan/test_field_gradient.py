@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
+from support.kernel_scenes import run
 
 import gpusense as gs
+from gpusense.backends import get_backend
+from gpusense.matching.refine_on_field import climb
 
 SCANNER = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.05, count=80, range_max=6.0, mount=(0.3, -0.1, 0.4))
 PARAMETERS = {
@@ -101,6 +106,52 @@ def test_vectors_hold_particles_of_one_scan(device):
         )
         for one, other in zip(found, expected, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4 * np.abs(other).max())
+
+
+@pytest.mark.parametrize("name", ["opencl", "warp"])
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+def test_steps_of_climbs_are_those_of_the_reference(name, real, needs):
+    rng = np.random.default_rng(1)
+    slope = rng.normal(size=(40, 3, 3))
+    numbers = np.column_stack(
+        [rng.normal(size=40), rng.normal(size=(40, 3)), (slope @ slope.swapaxes(1, 2)).reshape(40, 9)]
+    )
+    poses, climbs = rng.uniform(-1, 1, (40, 3)), rng.uniform(0.1, 1, (40, 19))
+    climbs[:, 7], climbs[:, 10], climbs[:, 12] = 3, 4, 5
+    # Climbs that begin, continue, lead too far, and have ended.
+    climbs[:, 16], climbs[:10, 16], climbs[:, 17:] = 7, -1, 0
+    climbs[10:15, 13], climbs[15:20, 18], climbs[20:25, :3] = 6, 1, poses[20:25] + 1e-5
+    flags = frozenset({"FLOAT64"}) if real is np.float64 else frozenset()
+    call = (
+        "climb_step",
+        flags,
+        (40,),
+        numbers.astype(real).ravel(),
+        poses.ravel(),
+        climbs.ravel(),
+        40,
+        9,
+        1e-4,
+        0.8,
+        0.6,
+    )
+    expected, got = run(get_backend("numpy"), *call), run(get_backend(needs(name)), *call)
+    assert np.isin(expected["climb"].reshape(40, 19)[:, 17], [0, 1]).all()
+    for output, values in expected.items():
+        np.testing.assert_allclose(got[output], values, rtol=1e-9, atol=1e-12)
+
+
+def test_climbs_have_the_same_ends_without_float64(backend, monkeypatch):
+    grid, poses, _ = scene((3.0, 1.0, 0.4))
+    model = field(grid, backend, precision="float32")
+    ranges = gs.RayCaster(grid, 6.0, backend="numpy").cast(poses, SCANNER.bearings)
+    # A scan without readings stays.
+    ranges[1] = np.nan
+    ends, steps, calm = climb(model, ranges, poses)
+    info = dataclasses.replace(model._context.backend.info, float64=False)
+    monkeypatch.setattr(model._context.backend, "info", info)
+    np.testing.assert_allclose(climb(model, ranges, poses)[0], ends, atol=1e-5)
+    assert calm.mean() > 0.7 and steps[1] == 1 and (ends[1] == poses[1]).all()
 
 
 def test_gradients_need_interpolation():

@@ -1,0 +1,77 @@
+// Steps of damped Gauss-Newton (Levenberg) from poses to maxima of an interpolated likelihood field. Damping and the
+// stopping rule are the same in all directions, so that ends turn with the map.
+
+// Numbers of a climb: the best pose (3), its log-likelihood, gradient (3) and information (6), the pose to start from (2),
+// damping, steps, whether the last step was small, and whether the climb has ended.
+#define CLIMB 19
+#define VALUE 3
+#define SLOPE 4
+#define MATRIX 7
+#define START 13
+#define DAMPING 15
+#define STEPS 16
+#define CALM 17
+#define ENDED 18
+// Numbers of a pose that field_gradient writes.
+#define GRADIENT_NUMBERS 13
+// Longest and largest step [m, rad], and the farthest that a climb leads from its start [m].
+#define LONGEST 0.5
+#define LARGEST 0.3
+#define FARTHEST_CLIMB 5.0
+// Damping of a direction without information, relative to the largest information.
+#define LEAST 1e-6
+
+// Solve for the step that damping allows, of at most the longest length and turn.
+void damped_step(global const double *climb, double *step) {
+    global const double *i = climb + MATRIX, *g = climb + SLOPE;
+    const double mean = 0.5 * (i[0] + i[3]), most = mean > i[5] ? mean : i[5];
+    const double damping = climb[DAMPING], least = LEAST * (1 + most);
+    const double a = i[0] + damping * mean + least, d = i[3] + damping * mean + least, f = i[5] + damping * i[5] + least;
+    const double b = i[1], c = i[2], e = i[4];
+    const double xx = d * f - e * e, xy = c * e - b * f, xt = b * e - c * d;
+    const double determinant = a * xx + b * xy + c * xt;
+    step[0] = (xx * g[0] + xy * g[1] + xt * g[2]) / determinant;
+    step[1] = (xy * g[0] + (a * f - c * c) * g[1] + (b * c - a * e) * g[2]) / determinant;
+    step[2] = (xt * g[0] + (b * c - a * e) * g[1] + (a * d - b * b) * g[2]) / determinant;
+    const double length = sqrt(step[0] * step[0] + step[1] * step[1]) / LONGEST, turn = fabs(step[2]) / LARGEST;
+    const double over = length > turn ? length : turn;
+    for (int k = 0; k < 3; ++k) step[k] = over > 1 ? step[k] / over : step[k];
+}
+
+// Judge the poses that were evaluated, numbers in the grid's frame, and take the next step of each climb. Poses of climbs
+// that have ended stay. One work-item takes a scan.
+kernel void climb_step(ARGUMENTS) {
+    const int n = get_global_id(0);
+    if (n >= scans || climb[CLIMB * n + ENDED] != 0) return;
+    global double *at = climb + CLIMB * n, *pose = poses + 3 * n;
+    global const real *numbers = gradient + GRADIENT_NUMBERS * n;
+    const double off_x = pose[0] - at[0], off_y = pose[1] - at[1], turn = fabs(pose[2] - at[2]);
+    const double far_x = pose[0] - at[START], far_y = pose[1] - at[START + 1];
+    const bool first = at[STEPS] < 0, within = far_x * far_x + far_y * far_y <= FARTHEST_CLIMB * FARTHEST_CLIMB;
+    const bool better = first || (numbers[0] >= at[VALUE] && within);
+    if (better) {
+        const double c = yaw_cos, s = yaw_sin, x = numbers[1], y = numbers[2];
+        const double xx = numbers[4], xy = numbers[5], yy = numbers[8], xt = numbers[6], yt = numbers[9];
+        for (int k = 0; k < 3; ++k) at[k] = pose[k];
+        at[VALUE] = numbers[0];
+        at[SLOPE] = c * x - s * y;
+        at[SLOPE + 1] = s * x + c * y;
+        at[SLOPE + 2] = numbers[3];
+        at[MATRIX] = c * c * xx - 2 * c * s * xy + s * s * yy;
+        at[MATRIX + 1] = c * s * (xx - yy) + (c * c - s * s) * xy;
+        at[MATRIX + 2] = c * xt - s * yt;
+        at[MATRIX + 3] = s * s * xx + 2 * c * s * xy + c * c * yy;
+        at[MATRIX + 4] = s * xt + c * yt;
+        at[MATRIX + 5] = numbers[12];
+    }
+    if (!first) {
+        const double damping = better ? at[DAMPING] / 5 : at[DAMPING] * 8;
+        at[DAMPING] = damping < 1e-6 ? 1e-6 : damping > 1e6 ? 1e6 : damping;
+        at[CALM] = off_x * off_x + off_y * off_y < small * small && turn < small;
+    }
+    at[STEPS] += 1;
+    at[ENDED] = at[CALM] != 0 || at[STEPS] >= most;
+    double step[3] = {0, 0, 0};
+    if (at[ENDED] == 0) damped_step(at, step);
+    for (int k = 0; k < 3; ++k) pose[k] = at[k] + step[k];
+}

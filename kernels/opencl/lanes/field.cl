@@ -39,19 +39,11 @@ kernel void score_field(ARGUMENTS) {
             set_particle(&all[v], i, pose_cell[n], pose[n], pose_low[n]);
         }
     }
-    real most[BLOCK_TERMS];
     for (int from = 0; from < all_readings; from += BLOCK_TERMS) {
         const int size = all_readings - from < BLOCK_TERMS ? all_readings - from : BLOCK_TERMS;
 #if TWO_PART_POINTS
 #if !BILINEAR
-        // Rounding errors of an end point are at most 2.5 eps times its reading in cells, plus 0.7 eps.
-        real least = 0.5f;
-        for (int k = 0; k < size; ++k) {
-            const real2 to = point[from + k];
-            const real near = 3.6e-7f * ((to.x < 0 ? -to.x : to.x) + (to.y < 0 ? -to.y : to.y) + 1);
-            most[k] = 0.5f - (near < guard ? near : guard);
-            least = most[k] < least ? most[k] : least;
-        }
+        const real margin = place_margin(point + from, size);
 #endif
 #endif
         for (int v = 0; v * LANES < count; ++v) {
@@ -67,9 +59,9 @@ kernel void score_field(ARGUMENTS) {
             find_cells(&ends, &all[v], point + from, size, window);
 #else
             EndPoints ends;
-            if (find_cells(&ends, &all[v], point + from, size, window, least))
-                refine_cells(&ends, most, first, used, pose_cell, pose, pose_low, point + from, point_low + from, size,
-                             window, guard);
+            if (find_cells(&ends, &all[v], point + from, size, window, margin))
+                refine_cells(&ends, &all[v], margin, first, used, pose_cell, pose, pose_low, point + from,
+                             point_low + from, size, window, guard);
 #pragma unroll 4
 #endif
             for (int k = 0; k < size; ++k) {

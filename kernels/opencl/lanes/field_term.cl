@@ -3,10 +3,6 @@
 // bit.
 // requires: lanes/end_point lanes/math lanes/hit_shape
 
-// Adding and subtracting ROUND_INT rounds to nearest; the bits of the sum, less ROUND_BITS, are the integer.
-#define ROUND_INT 12582912.0f
-#define ROUND_BITS 0x4b400000
-
 #if BILINEAR
 // Return log p of end points, from the squares of their distances to the nearest obstacles over 2 sigma^2: log_field of
 // field_term.cl.
@@ -217,8 +213,12 @@ void find_squares(LanePair *square, const EndPoints *ends, global const real *ta
 }
 #endif
 #else
-// Poses of LANES particles: cells of the padded table, fractions of a cell, and directions. Half a cell is subtracted from
-// those of float32, since rounding to nearest must give the cell.
+// Whole cells of the scaled places of end points below.
+#define SCALE_BITS 17
+#define FRACTION ((1 << SCALE_BITS) - 1)
+
+// Poses of LANES particles: cells of the padded table, fractions of a cell, and directions; in float32 the latter two are
+// scaled by 2^SCALE_BITS.
 typedef struct {
     ilanes col, row;
     lanes x, y, cos, sin;
@@ -226,17 +226,17 @@ typedef struct {
 
 // Set the pose of a lane.
 void set_particle(Particles *particle, const int lane, const int2 cell, const real4 pose, const real4 pose_low) {
+#if FLOAT64
+    const real scale = 1;
+#else
+    const real scale = 1 << SCALE_BITS;
+#endif
     ((lane_int *)&particle->col)[lane] = cell.x + FIELD_RING;
     ((lane_int *)&particle->row)[lane] = cell.y + FIELD_RING;
-#if FLOAT64
-    ((real *)&particle->x)[lane] = pose.x;
-    ((real *)&particle->y)[lane] = pose.y;
-#else
-    ((real *)&particle->x)[lane] = pose.x - 0.5f;
-    ((real *)&particle->y)[lane] = pose.y - 0.5f;
-#endif
-    ((real *)&particle->cos)[lane] = pose.z;
-    ((real *)&particle->sin)[lane] = pose.w;
+    ((real *)&particle->x)[lane] = pose.x * scale;
+    ((real *)&particle->y)[lane] = pose.y * scale;
+    ((real *)&particle->cos)[lane] = pose.z * scale;
+    ((real *)&particle->sin)[lane] = pose.w * scale;
 }
 
 #if FLOAT64
@@ -273,45 +273,63 @@ void find_cells(EndPoints *ends, const Particles *particle, global const real2 *
     }
 }
 #else
-// End points of a block of beams: nearest cells, and the distances from the centres of these cells.
+// Cells of a block's end points.
 typedef struct {
-    ilanes cell[BLOCK_TERMS], off[BLOCK_TERMS];
+    ilanes cell[BLOCK_TERMS];
 } EndPoints;
 
-// Find the cells of a block's end points by rounding; return whether a distance from a centre exceeds least.
-int find_cells(EndPoints *ends, const Particles *particle, global const real2 *point, const int size,
-               const Window window, const real least) {
-    const int stride = window.cols + 2 * FIELD_RING;
-    const lanes x = particle->x, y = particle->y, cos = particle->cos, sin = particle->sin;
-    const ilanes col = particle->col, row = particle->row;
-    global const real *to = (global const real *)point;
-    ilanes worst = 0;
+// Return the bound of the rounding errors of scaled places: 2.5 eps of the longest reading in cells plus 0.7 eps, and one
+// for truncation.
+real place_margin(global const real2 *point, const int size) {
+    real longest = 0;
     for (int k = 0; k < size; ++k) {
-        const lanes at_x = x + (cos * to[2 * k] - sin * to[2 * k + 1]), near_x = at_x + ROUND_INT;
-        const lanes at_y = y + (sin * to[2 * k] + cos * to[2 * k + 1]), near_y = at_y + ROUND_INT;
-        const ilanes off_x = size_bits(at_x - (near_x - ROUND_INT));
-        const ilanes off_y = size_bits(at_y - (near_y - ROUND_INT));
-        const ilanes off = off_x > off_y ? off_x : off_y;
-        const ilanes c = within_lanes(as_ilanes(near_x) - ROUND_BITS + col, stride - 1);
-        const ilanes r = within_lanes(as_ilanes(near_y) - ROUND_BITS + row, window.rows + 2 * FIELD_RING - 1);
-        ends->cell[k] = r * stride + c;
-        ends->off[k] = off;
-        worst = worst > off ? worst : off;
+        const real length = (point[k].x < 0 ? -point[k].x : point[k].x) + (point[k].y < 0 ? -point[k].y : point[k].y);
+        longest = length > longest ? length : longest;
     }
-    return any_lane(worst > as_int(least));
+    // Longer readings are not scaled to 32 bits: all their cells are recomputed.
+    return longest < (1 << (30 - SCALE_BITS)) ? (int)((1 << SCALE_BITS) * 3.6e-7f * (longest + 1)) + 2 : 1 << SCALE_BITS;
 }
 
-// Recompute the cells of end points whose distance from the centre exceeds most, with twice the digits.
-__attribute__((noinline)) void refine_cells(EndPoints *ends, const real *most, const int first, const int count,
-                                            global const int2 *pose_cell, global const real4 *pose,
-                                            global const real4 *pose_low, global const real2 *point,
-                                            global const real2 *point_low, const int size, const Window window,
-                                            const real guard) {
+// Find the scaled places of an end point, larger by margin than its coordinates.
+void scaled_places(const Particles *particle, const real2 to, const real margin, ilanes *x, ilanes *y) {
+    const lanes cos = particle->cos, sin = particle->sin, to_x = to.x, to_y = to.y;
+    *x = to_ilanes(multiply_add_lanes(cos, to_x, multiply_add_lanes(-sin, to_y, particle->x + margin)));
+    *y = to_ilanes(multiply_add_lanes(sin, to_x, multiply_add_lanes(cos, to_y, particle->y + margin)));
+}
+
+// Find the cells of a block's end points; return whether an end point may be within margin of a cell's edge.
+int find_cells(EndPoints *ends, const Particles *particle, global const real2 *point, const int size,
+               const Window window, const real margin) {
+    const uint stride = window.cols + 2 * FIELD_RING;
+    const uint16 last_col = stride - 1, last_row = window.rows + 2 * FIELD_RING - 1;
+    const ilanes col = particle->col, row = particle->row;
+    ilanes least = FRACTION;
     for (int k = 0; k < size; ++k) {
-        if (!any_lane(ends->off[k] > as_int(most[k]))) continue;
-        int *cell = (int *)&ends->cell[k], *off = (int *)&ends->off[k];
+        ilanes x, y;
+        scaled_places(particle, point[k], margin, &x, &y);
+        const ilanes past_x = x & FRACTION, past_y = y & FRACTION, past = past_x < past_y ? past_x : past_y;
+        // All cells of the ring hold the same value.
+        const uint16 c = as_uint16((x >> SCALE_BITS) + col), r = as_uint16((y >> SCALE_BITS) + row);
+        ends->cell[k] = as_int16((r < last_row ? r : last_row) * stride + (c < last_col ? c : last_col));
+        least = least < past ? least : past;
+    }
+    return any_lane(least <= 2 * (int)margin);
+}
+
+// Recompute the cells of end points that may be within margin of a cell's edge, with twice the digits.
+__attribute__((noinline)) void refine_cells(EndPoints *ends, const Particles *particle, const real margin,
+                                            const int first, const int count, global const int2 *pose_cell,
+                                            global const real4 *pose, global const real4 *pose_low,
+                                            global const real2 *point, global const real2 *point_low, const int size,
+                                            const Window window, const real guard) {
+    for (int k = 0; k < size; ++k) {
+        ilanes x, y;
+        scaled_places(particle, point[k], margin, &x, &y);
+        const ilanes close = ((x & FRACTION) <= 2 * (int)margin) | ((y & FRACTION) <= 2 * (int)margin);
+        if (!any_lane(close)) continue;
+        int *cell = (int *)&ends->cell[k];
         for (int i = 0; i < count; ++i) {
-            if (off[i] <= as_int(most[k])) continue;
+            if (!((const int *)&close)[i]) continue;
             const int n = first + i;
             const EndPoint end = end_point(pose[n], pose_low[n], point[k], point_low[k], 0, guard);
             cell[i] = field_cell(pose_cell[n].x + end.cell.x, pose_cell[n].y + end.cell.y, window);

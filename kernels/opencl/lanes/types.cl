@@ -61,10 +61,11 @@ typedef int lane_int;
 #define GATHER(type, table, i)                                                                                           \
     ((type)(table[i.s0], table[i.s1], table[i.s2], table[i.s3], table[i.s4], table[i.s5], table[i.s6], table[i.s7],      \
             table[i.s8], table[i.s9], table[i.sa], table[i.sb], table[i.sc], table[i.sd], table[i.se], table[i.sf]))
-// GATHER with indices in memory: faster where they were computed well before.
+// GATHER with indices in memory that are not negative, two by each load: faster where they were computed well before.
+#define TWO_AT(table, i, n) table[(uint)((const ulong *)(i))[n]], table[((const ulong *)(i))[n] >> 32]
 #define GATHER_AT(type, table, i)                                                                                        \
-    ((type)(table[i[0]], table[i[1]], table[i[2]], table[i[3]], table[i[4]], table[i[5]], table[i[6]], table[i[7]],      \
-            table[i[8]], table[i[9]], table[i[10]], table[i[11]], table[i[12]], table[i[13]], table[i[14]], table[i[15]]))
+    ((type)(TWO_AT(table, i, 0), TWO_AT(table, i, 1), TWO_AT(table, i, 2), TWO_AT(table, i, 3), TWO_AT(table, i, 4),     \
+            TWO_AT(table, i, 5), TWO_AT(table, i, 6), TWO_AT(table, i, 7)))
 // Number and next one at half of the places, each pair by one load.
 #define PAIR(table, at) as_long(vload2(0, table + at))
 #define PAIRS(table, i)                                                                                                  \

@@ -69,7 +69,7 @@ kernel void score_field(ARGUMENTS) {
                 const lanes term = log_square_lanes(square[k], terms);
 #else
                 const int *at = (const int *)&ends.cell[k];
-                const lanes term = GATHER_AT(lanes, table, at);
+                const lanes term = GATHER_BY_TWO(lanes, table, at);
 #endif
 #if PER_BEAM
                 for (int i = 0; i < used; ++i)

@@ -168,7 +168,7 @@ def differing_cells(grid, poses, ranges, bearings, left: tuple[str, str], right:
 
 
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (-3.7, 2.2, 0.3), (4e5, 5e6, 1.0)])
-@pytest.mark.parametrize("longest", [5.0, 900.0])
+@pytest.mark.parametrize("longest", [5.0, 405.0, 900.0])
 def test_float32_look_ups_hit_the_cells_of_float64(origin, longest, backend):
     """Of 40 000 random end points, some hundreds are nearer to an edge than float32 resolves."""
     rng = np.random.default_rng(6)

@@ -6,13 +6,16 @@
 Every world is a room of 256 x 256 cells with boxes in it, each with 16 robots of 360 beams. A single map has as many
 robots as the largest number of worlds, and either the size of a room or as many cells as all rooms, up to 4096 x 4096.
 Rates are of whole calls with poses and indices in host memory, on CUDA on the device. --kernels adds the time of each
-launch by the device's clock, and --tiles casts rays of worlds in tiles of poses and rays, as rays of one map.
+launch by the device's clock, and --tiles casts rays of worlds in tiles of poses and rays, as rays of one map. --peers
+casts the lidars of robots among discs in worlds without walls, beside VMAS and ir-sim where they are installed.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -159,6 +162,83 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     return rows
 
 
+def peers(arguments: argparse.Namespace) -> list[tuple[str, ...]]:
+    """Measure a lidar of 64 beams in each world, among 12 discs, and compare the ranges."""
+    rng, count, rays, longest = np.random.default_rng(0), int(arguments.worlds.split(",")[0]), 64, 10.0
+    away, angle = rng.uniform(0.8, 9, (count, 12)), rng.uniform(-np.pi, np.pi, (count, 12))
+    poses = np.column_stack([rng.uniform(-3, 3, (count, 2)), rng.uniform(-3, 3, count)])
+    centres = poses[:, None, :2] + away[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=2)
+    discs = np.concatenate([centres, np.full((count, 12, 1), 0.3)], axis=2)
+    backend = get_backend(arguments.backend)
+    worlds = gs.Worlds(np.zeros((count, 8, 8), np.int8), 5.0, (-20.0, -20.0, 0.0), backend=backend)
+    worlds.shapes = gs.Shapes(discs=discs)
+    caster, index = gs.RayCaster(worlds, longest, backend=backend), np.arange(count)
+    turn = np.linspace(0, 2 * np.pi, rays, endpoint=False)
+    ours = least(lambda: caster.cast(poses, turn, world=index), backend, arguments.repeats, arguments.seconds)
+    lines = [(f"gpusense, {backend.info.selection}", str(count), f"{1e3 * ours:.3g}", f"{count / ours:.3g}", "")]
+    for name, lidars in (("vmas", vmas_lidars), ("irsim", ir_sim_lidars)):
+        if importlib.util.find_spec(name) is None:
+            note(f"{name} is not installed")
+            continue
+        measure, bearings = lidars(poses, discs, rays, longest)
+        found = measure()
+        seconds = least(measure, backend, arguments.repeats, arguments.seconds)
+        off = np.abs(found - caster.cast(poses, bearings, world=index)[: len(found)])
+        wrong = f"{np.quantile(off, 0.99):.1g} m (99 % of rays), {off.max():.1g} m"
+        lines.append((name, str(len(found)), f"{1e3 * seconds:.3g}", f"{len(found) / seconds:.3g}", wrong))
+    return lines
+
+
+def vmas_lidars(
+    poses: np.ndarray, discs: np.ndarray, rays: int, longest: float
+) -> tuple[Callable[[], np.ndarray], np.ndarray]:
+    """Return a function that measures VMAS's lidars, and their bearings [rad]."""
+    import torch
+    from vmas.simulator.core import Agent, Landmark, Sphere, World
+    from vmas.simulator.sensors import Lidar
+
+    world = World(batch_dim=len(poses), device="cpu")
+    lidar = Lidar(world, n_rays=rays, max_range=longest)
+    robot = Agent("robot", shape=Sphere(0.2), sensors=[lidar])
+    world.add_agent(robot)
+    for number in range(discs.shape[1]):
+        disc = Landmark(f"disc {number}", collide=True, shape=Sphere(discs[0, number, 2]))
+        world.add_landmark(disc)
+        disc.set_pos(torch.tensor(discs[:, number, :2], dtype=torch.float32), batch_index=None)
+    robot.set_pos(torch.tensor(poses[:, :2], dtype=torch.float32), batch_index=None)
+    robot.set_rot(torch.tensor(poses[:, 2:], dtype=torch.float32), batch_index=None)
+    return lambda: lidar.measure().numpy(), np.linspace(0, 2 * np.pi, rays, endpoint=False)
+
+
+def ir_sim_lidars(
+    poses: np.ndarray, discs: np.ndarray, rays: int, longest: float
+) -> tuple[Callable[[], np.ndarray], np.ndarray]:
+    """Return a function that measures the lidars of ir-sim in the first 16 worlds, and their bearings [rad]."""
+    import irsim
+
+    robots = []
+    for (x, y, theta), each in zip(poses[:16].tolist(), discs.tolist(), strict=False):
+        circles = "\n".join(f"  - {{shape: {{name: circle, radius: {r}}}, state: [{u}, {v}, 0]}}" for u, v, r in each)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "scene.yaml")
+            path.write_text(f"""
+world: {{height: 40, width: 40, offset: [-20, -20]}}
+robot:
+  - {{kinematics: {{name: diff}}, shape: {{name: circle, radius: 0.2}}, state: [{x}, {y}, {theta}], sensors: [
+     {{name: lidar2d, range_min: 0, range_max: {longest}, angle_range: {2 * np.pi}, number: {rays}}}]}}
+obstacle:
+{circles}
+""")
+            robots.append(irsim.make(str(path), display=False, save_ani=False).robot_list[0])
+
+    def measure() -> np.ndarray:
+        for robot in robots:
+            robot.lidar.step(robot.state)
+        return np.array([robot.lidar.range_data for robot in robots])
+
+    return measure, robots[0].lidar.angle_list
+
+
 def line_of(row: dict[str, Any]) -> list[str]:
     """Return the cells of a row."""
     return [
@@ -174,11 +254,17 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--worlds", default="64,1024", help="numbers of worlds, with commas (default: 64,1024)")
     parser.add_argument("--shapes", type=int, default=0, help="moving shapes of each world (default: 0)")
     parser.add_argument("--kernels", action="store_true", help="measure each launch by the device's clock")
+    parser.add_argument("--peers", action="store_true", help="compare a lidar among discs with those of peers")
     parser.add_argument("--tiles", action="store_true", help="cast rays of worlds in tiles of poses and rays")
     add_repeats(parser, 20, 5.0)
     arguments = parse(parser, argv)
     if arguments.tiles:
         tiles.LEAST_OF_ONE_POSE = len(BEARINGS) + 1
+    if arguments.peers:
+        lines = peers(arguments)
+        columns = ("program", "lidars of 64 beams", "ms", "lidars/s", "differs from gpusense by at most")
+        publish(__file__, arguments, table(columns, lines), {"rows": lines})
+        return
     rows = measure(arguments)
     publish(__file__, arguments, table(COLUMNS, map(line_of, rows)), {"rows": rows})
 

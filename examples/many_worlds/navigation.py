@@ -6,13 +6,15 @@
 Each room has one robot that must reach a goal, and discs that wander and bounce off the walls. An action is the forward
 speed and the turn rate, both in [-1, 1]. An observation has the ranges of the lidar as parts of its longest range, then
 the distance to the goal and the cosine and sine of its bearing. Rays, collisions and new rooms are computed on the
-device in one call for all rooms. Rooms in which an episode ends get new walls at the same step.
+device in one call for all rooms. Rooms in which an episode ends get new walls at the same step. Actions are an array of
+any library with DLPack, and ``wrap=torch.from_dlpack`` gives results as PyTorch's arrays.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import gymnasium
@@ -30,7 +32,11 @@ class Navigation(gymnasium.vector.VectorEnv):
 
     metadata: ClassVar = {"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}
 
-    def __init__(self, rooms: int = 64, beams: int = 60, obstacles: int = 6, longest: int = 200, backend: str = "auto"):
+    def __init__(
+        self, rooms: int = 64, beams: int = 60, obstacles: int = 6, longest: int = 200, backend: str = "auto",
+        wrap: Callable[[np.ndarray], Any] = np.asarray,
+    ):  # fmt: skip
+        self.wrap = wrap
         self.num_envs, self.beams, self.obstacles, self.longest = rooms, beams, obstacles, longest
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (beams + 3,), np.float32)
@@ -75,18 +81,19 @@ class Navigation(gymnasium.vector.VectorEnv):
         goal = np.column_stack([np.hypot(*ahead.T), np.cos(bearing), np.sin(bearing)])
         return np.concatenate([ranges, goal], axis=1, dtype=np.float32, casting="same_kind")
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
         """Begin an episode in every room."""
         if seed is not None:
             self.random = np.random.default_rng(seed)
         self.worlds.replace(self.index, self.new_cells(self.num_envs))
         self.begin(self.index)
         self.worlds.shapes = gs.Shapes(discs=self.discs)
-        return self.observe(), {}
+        return self.wrap(self.observe()), {}
 
-    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict]:
         """Move robots and obstacles; begin anew where an episode ends."""
-        speed, turn = np.clip(np.asarray(actions, float), -1, 1).T
+        given = np.from_dlpack(actions) if hasattr(actions, "__dlpack__") else np.asarray(actions)
+        speed, turn = np.clip(given.astype(float), -1, 1).T
         before = np.hypot(*(self.goals - self.poses[:, :2]).T)
         self.poses[:, 2] += STEP * 2.0 * turn
         self.poses[:, :2] += (
@@ -104,12 +111,13 @@ class Navigation(gymnasium.vector.VectorEnv):
         over = np.flatnonzero(arrived | crashed | late)
         information: dict[str, Any] = {}
         if len(over):
-            information["final_obs"] = self.observe()
+            information["final_obs"] = self.wrap(self.observe())
             self.worlds.replace(over, self.new_cells(len(over)))
             self.begin(over)
             self.worlds.shapes = gs.Shapes(discs=self.discs)
         terminated = arrived | crashed
-        return self.observe(), reward.astype(np.float32), terminated, late & ~terminated, information
+        results = self.observe(), reward.astype(np.float32), terminated, late & ~terminated
+        return (*map(self.wrap, results), information)
 
 
 def main() -> None:

@@ -35,7 +35,7 @@ def collisions(worlds: ManyWorlds, poses: Any, radius: object, world: Any, ignor
         _collide(worlds, buffer, count, inside, hit, cells, single=single, unknown=unknown == "occupied")
     if there:
         return arrays.wrapped(poses, backend, hit, (count,), _BYTE)
-    return backend.download(hit, np.empty(count, np.uint8)).view(bool)
+    return arrays.like(poses, backend.download(hit, np.empty(count, np.uint8)).view(bool))
 
 
 def _collide(

@@ -272,7 +272,7 @@ class Worlds:
             unknown: Treatment of unknown cells: ``"free"`` or ``"occupied"``.
 
         Returns:
-            (N,) bool; for poses on the device an array of the same library with 0 and 1.
+            (N,) bool, an array of the library of the poses; for poses on the device it holds 0 and 1.
 
         Raises:
             TypeError, ValueError: An argument breaks a rule above, or a pose is not finite.

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import copy
 import pickle
+import runpy
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from support.array_libraries import installed
 
 import gpusense as gs
 
@@ -31,7 +35,7 @@ def poses_in(rng: np.random.Generator, grid: gs.OccupancyGrid, count: int) -> np
 
 
 def same_bits(found: np.ndarray, wanted: np.ndarray) -> None:
-    """Compare arrays of floats bit by bit."""
+    """Compare arrays bit by bit."""
     assert found.dtype == wanted.dtype
     assert found.tobytes() == wanted.tobytes()
 
@@ -262,3 +266,45 @@ def test_functions_of_a_single_map_refuse_worlds() -> None:
     ):  # fmt: skip
         with pytest.raises(ValueError, match=r"^models?: must be of a single map"):
             call()
+
+
+@pytest.mark.parametrize("library", ["fakelib", "torch"])
+def test_arrays_of_other_libraries_come_back_in_them(
+    library: str, backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cells, poses, indices and shapes arrive by DLPack."""
+    installed(monkeypatch)
+    made = sys.modules["fakelib"] if library == "fakelib" else pytest.importorskip(library)
+    rng = np.random.default_rng(9)
+    cells, index, results = some_cells(rng, 3, 20, 30), np.arange(3).repeat(3), []
+    poses = rng.uniform(0, 2, (9, 3))
+    discs = np.concatenate([rng.uniform(0, 2, (3, 4, 2)), np.full((3, 4, 1), 0.1)], axis=2)
+    for to in (np.asarray, made.from_dlpack):
+        worlds = gs.Worlds(to(cells), 0.1, backend=backend)
+        worlds.shapes = gs.Shapes(discs=to(discs))
+        caster = gs.RayCaster(worlds, RANGE, backend=backend)
+        seen = caster.cast(to(poses), BEARINGS, world=to(index), ignore=to(0 * index))
+        hit = worlds.collides(to(poses), 0.2, world=to(index))
+        worlds.replace(to(np.array([1])), to(cells[:1]))
+        results.append((seen, hit, caster.cast(to(poses), BEARINGS, world=to(index))))
+    for given, found in zip(*results, strict=True):
+        assert type(found) is type(made.from_dlpack(given))
+        same_bits(np.from_dlpack(found), given)
+
+
+def test_a_vector_environment_takes_and_gives_arrays_of_a_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("gymnasium")
+    installed(monkeypatch)
+    made = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "many_worlds" / "navigation.py"))["Navigation"]
+    wrap = sys.modules["fakelib"].from_dlpack
+    plain, wrapped = (
+        made(rooms=4, beams=9, longest=3, backend="numpy"),
+        made(rooms=4, beams=9, longest=3, backend="numpy", wrap=wrap),
+    )
+    same_bits(np.from_dlpack(wrapped.reset(seed=1)[0]), plain.reset(seed=1)[0])
+    for _ in range(4):
+        actions = plain.random.uniform(-1, 1, (4, 2)).astype(np.float32)
+        wrapped.random.uniform(-1, 1, (4, 2))
+        for found, given in zip(wrapped.step(wrap(actions))[:4], plain.step(actions)[:4], strict=True):
+            assert type(found).__name__ == "Array"
+            same_bits(np.from_dlpack(found), given)

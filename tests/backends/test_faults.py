@@ -99,24 +99,6 @@ def test_threads_may_share_a_model(backend):
     assert all(all(same) for same in results.values())
 
 
-def test_threads_may_use_models_of_their_own_on_one_device(backend):
-    grid, scanner, poses, ranges = room()
-    expected = gs.LikelihoodFieldModel(grid, scanner, backend=backend).log_likelihood(poses, ranges)
-    results = []
-
-    def work() -> None:
-        model = gs.LikelihoodFieldModel(grid, scanner, backend=backend)
-        results.extend(np.array_equal(model.log_likelihood(poses, ranges), expected) for _ in range(5))
-
-    threads = [threading.Thread(target=work) for _ in range(6)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(results) == 30
-    assert all(results)
-
-
 _FORK = """
 import multiprocessing, os, sys
 import numpy as np, gpusense as gs
@@ -148,32 +130,6 @@ def test_a_forked_child_is_refused_and_a_spawned_one_works(needs, family, tmp_pa
     forked, spawned = run.stdout.splitlines()
     assert "does not survive a fork: start workers with multiprocessing.get_context('spawn')" in forked
     assert spawned == "3.5", run.stderr
-
-
-_COLD = """
-import numpy as np, gpusense as gs
-cells = np.zeros((20, 20), int); cells[5] = 100
-grid = gs.OccupancyGrid(cells, 1.0)
-print(gs.RayCaster(grid, 10.0, backend={backend!r}).cast([[2.5, 1.5, 1.5707963267948966]], [0.0])[0, 0])
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("family", ["opencl", "warp"])
-def test_two_processes_may_start_with_a_cold_cache_at_once(needs, family, tmp_path):
-    places = ("GPUSENSE_CACHE_DIR", "POCL_CACHE_DIR", "XDG_CACHE_HOME", "WARP_CACHE_PATH")
-    # With proofs: see test_cache.
-    environment = os.environ | {place: str(tmp_path / place) for place in places} | {"GPUSENSE_PROOF": "off"}
-    for place in places:
-        (tmp_path / place).mkdir()
-    command = [sys.executable, "-W", "ignore", "-c", _COLD.format(backend=needs(family))]
-    started = [
-        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        for _ in range(2)
-    ]
-    for process in started:
-        output, errors = process.communicate(timeout=300)
-        assert output.strip() == "3.5", errors
 
 
 _LONG = """

@@ -333,17 +333,6 @@ def test_a_filter_that_never_draws_keeps_what_it_knows(backend):
     assert 100 < found.effective_sample_size < 1000
 
 
-@pytest.mark.parametrize("turn", [-40.0, 20.0])
-def test_headings_stay_in_half_a_turn_after_several_turns(backend, turn):
-    motion = gs.VelocityMotion(alpha=(0,) * 6, least=(0.0, 0.0))
-    pf = gs.ParticleFilter(gps(backend), motion=motion, particles=10)
-    pf.initialize(mean=(0, 0, 0), covariance=np.zeros((3, 3)))
-    pf.predict((1.0, turn / 2), 2.0)
-    radius = 2.0 / turn
-    expected = radius * np.sin(turn), radius * (1 - np.cos(turn)), gs.wrap_angle(turn)
-    np.testing.assert_allclose(pf.host_particles(), np.tile(expected, (10, 1)), atol=1e-12)
-
-
 def test_a_fix_at_particles_without_weight_changes_nothing(backend):
     pf = gs.ParticleFilter(gps(backend), particles=200, seed=1, threshold=0.4)
     far = np.zeros((200, 3))

@@ -115,25 +115,6 @@ def test_other_ends_of_a_worker_are_rows(tmp_path):
     check(tmp_path, ends, jobs, ended, table, attempts=1)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("engine", ENGINES)
-def test_of_16_jobs_the_same_8_fail_on_a_loaded_machine(tmp_path, engine):
-    ends = ["segmentation fault", "exit code 7", "kill", "terminate", "fork", "SystemExit", "abort", "exit code 0"]
-    load = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2 * (os.cpu_count() or 1))]
-    try:
-        for turn in range(3):
-            folder = tmp_path / str(turn)
-            folder.mkdir()
-            jobs = endings(folder, ends, 16)
-            with engine(3, **LIMITS) as executor:
-                ended, table = swept(jobs, folder / "t.csv", executor, attempts=2)
-            check(folder, ends, jobs, ended, table)
-    finally:
-        for one in load:
-            one.kill()
-            one.wait()
-
-
 def test_system_exit_of_a_job_is_a_row_in_this_process_too(tmp_path):
     ended, table = swept(endings(tmp_path, ["SystemExit"], 2), tmp_path / "t.csv")
     assert (ended.done, ended.failed) == (1, 1) and table["error"] == ["SystemExit: enough", None]

@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
-import time
 from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
 from support.room_log import write_room
@@ -138,45 +133,6 @@ def test_a_killed_worker_loses_nothing(tmp_path, name, request):
     assert (tmp_path / "killed").exists() and ended.done == 6, table["error"]
     assert table["seed"] == list(range(6))
     assert table["value"] == [(seed + 1) / 3 for seed in range(6)]
-
-
-def test_a_job_that_kills_its_workers_fails_alone(tmp_path, processes):
-    jobs = made("deadly", 6, folder=str(tmp_path), always=True)
-    ended, table = swept(jobs, tmp_path / "t.csv", processes, attempts=2)
-    # Seed 3 kills its worker where seed 4 has not done so before.
-    assert (ended.done, ended.failed, ended.repeated) == (5, 1, sum(table["attempts"]) - 6)
-    assert table["error"][4] == "WorkerDied: the worker ended by SIGKILL, 2 times" and table["attempts"][4] == 2
-    assert table["attempts"] in ([1, 1, 1, 2, 2, 1], [1, 1, 1, 1, 2, 1])
-
-
-def alive(process):
-    """Return whether a process runs; zombies do not."""
-    try:
-        os.kill(process, 0)
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except ProcessLookupError:
-        return False
-    except FileNotFoundError:
-        return Path("/proc/self").exists() is False
-
-
-def test_workers_end_with_a_parent_that_is_killed(tmp_path):
-    code = "\n".join([
-        "import gpusense as gs, os, sys, time", "if __name__ == '__main__':",
-        "    ex = gs.sweep.ProcessExecutor(1)", "    print(ex.submit(os.getpid).result(), flush=True)",
-        "    time.sleep(60)",
-    ])  # fmt: skip
-    (tmp_path / "main.py").write_text(code)
-    path = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    with subprocess.Popen([sys.executable, str(tmp_path / "main.py")], stdout=subprocess.PIPE, env=path) as parent:
-        worker = int(parent.stdout.readline())
-        parent.kill()
-    end = time.monotonic() + 20
-    while alive(worker):
-        if time.monotonic() > end:
-            os.kill(worker, 9)
-            pytest.fail("the worker outlived its parent")
-        time.sleep(0.05)
 
 
 @dask

@@ -78,16 +78,6 @@ def test_several_scans(kind, share, queue, there, monkeypatch):
         assert model.log_likelihood(among, scans, out=out) is out and differing(out.get(), expected) == 0
 
 
-def test_pieces_of_calls(queue, there, monkeypatch):
-    """Pieces become multiples of 256 particles where the device could not begin a sub-buffer."""
-    monkeypatch.setattr(chunking, "CHUNK", 300)
-    poses = cloud(3, 1000)
-    for kind in MODELS:
-        model = kind(GRID, SCANNER, backend=queue)
-        assert differing(model.log_likelihood(there(poses), scan(1)).get(), model.log_likelihood(poses, scan(1))) == 0
-    assert differing(model.log_likelihood(there(poses[:0]), scan(1)).get(), np.zeros(0, np.float32)) == 0
-
-
 @pytest.mark.parametrize("kind", MODELS)
 def test_pieces_with_which_the_device_cannot_begin(kind, as_gpu, queue, there, monkeypatch):
     """Such pieces are written elsewhere and copied; bound calls copy nothing and use larger pieces."""

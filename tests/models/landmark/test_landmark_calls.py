@@ -9,7 +9,6 @@ import pytest
 from support import landmark_scenes as scenes
 from support.absolute_scenes import GRID, models, poses_around
 from support.array_libraries import Array, installed, to_device
-from support.frameworks import each_framework, framework
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing
@@ -111,19 +110,6 @@ def test_associations_of_poses_on_the_device(warp_as_gpu):
     for found, expected in zip(there, here, strict=True):
         assert isinstance(found, np.ndarray)
         np.testing.assert_array_equal(found, expected)
-
-
-@each_framework
-@pytest.mark.parametrize("sensor", SENSORS)
-def test_frameworks(sensor, name):
-    cuda, there, back, _ = framework(name)
-    call, given = calls(cuda)[sensor], there(POSES)
-    found = call(given)
-    assert type(found) is type(given) and differing(back(found), call(POSES)) == 0
-    bad = POSES.copy()
-    bad[5, 2] = np.inf
-    with pytest.raises(ValueError, match="poses: must be finite"):
-        call(there(bad))
 
 
 @pytest.mark.parametrize("name", SENSORS)

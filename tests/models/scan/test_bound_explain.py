@@ -112,15 +112,6 @@ def test_failures_in_a_row_end_all_captures_and_the_reason_is_kept(batching, mon
     assert len(started) == count + 1 and before.explain() == "one CUDA graph of 3 launches"
 
 
-def test_a_refusal_shows_in_calls_of_numpy_arrays(batching, monkeypatch):
-    call = FIELD(GRID, NEAR, backend=batching[0]).bind(cloud(1), mixed(1))
-    tries = refusing(monkeypatch)
-    for _ in range(4):
-        call()
-    assert len(tries) == 1
-    assert call.explain().endswith("3 launches and 2 copies one by one: the driver captured no graph: no graphs here")
-
-
 def test_a_call_in_many_pieces(batching, monkeypatch):
     """A recording of any length is one graph; with copies around it, it counts as one step."""
     from gpusense.models import chunking

@@ -1,4 +1,4 @@
-"""``RayCaster.cast`` in worlds of every kind against walks in rational arithmetic and against shapely."""
+"""``RayCaster.cast`` in worlds of every kind against walks in rational arithmetic."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-import shapely
 from support.ray_oracles import Hit, Ray, backward_error_is_small, walk, world_ray
 from support.raycast_scenes import (
     FLOAT32_CELLS,
@@ -132,31 +131,3 @@ def test_a_ray_along_an_edge_stays_in_its_row(backend, heading):
         if edge is not None:
             found = gs.RayCaster(grid, 20.0, backend=backend, precision=precision).cast([[*edge, heading]], [0.0])
             assert found[0, 0] == 2.5
-
-
-@functools.cache
-def shapely_casts() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a map, 20 000 poses, and the distances to the union of the occupied squares."""
-    rng = np.random.default_rng(11)
-    occupied = rng.random((40, 40)) < 0.04
-    rows, cols = np.nonzero(occupied)
-    walls = shapely.union_all(shapely.box(cols, rows, cols + 1, rows + 1))
-    shapely.prepare(walls)
-    starts = rng.uniform(-3, 43, (20_000, 2))
-    angles = rng.uniform(-np.pi, np.pi, 20_000)
-    ends = starts + 50.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    cut = shapely.intersection(shapely.linestrings(np.stack([starts, ends], axis=1)), walls)
-    distance = np.nan_to_num(shapely.distance(shapely.points(starts), cut), nan=50.0)
-    return occupied, np.column_stack([starts, angles]), np.minimum(distance, 50.0)
-
-
-def test_against_shapely(backend):
-    occupied, poses, expected = shapely_casts()
-    caster = gs.RayCaster(gs.OccupancyGrid(occupied * 100, 1.0), 50.0, backend=backend, precision="float64")
-    found = caster.cast(poses, [0.0])[:, 0]
-    wrong = np.flatnonzero(np.abs(found - expected) > 1e-9)
-    for i in wrong:
-        ray = world_ray(poses[i], 0.0, origin=(0, 0, 0), resolution=1.0, range_max=50.0)
-        for r in (found[i], expected[i]):
-            assert backward_error_is_small(occupied.tolist(), ray, r, move=1e-9, turn=1e-12, tolerance=1e-9)
-    assert len(wrong) <= 2

@@ -140,20 +140,6 @@ def test_every_cell_of_an_updated_field_is_that_of_a_new_one(outside, device):
     assert model._pipeline.map.preparations == 1
 
 
-@pytest.mark.parametrize("compat", ["amcl", "beluga"])
-def test_models_with_the_weights_of_others_follow(compat):
-    rng = np.random.default_rng(4)
-    shape, ranges = (40, 50), rng.uniform(0, RANGE_MAX, len(BEARINGS))
-    poses = poses_in(rng, shape)
-    for kind in (gs.BeamModel, gs.LikelihoodFieldModel):
-        check_edits(
-            lambda grid, kind=kind: kind(grid, SCANNER, backend="numpy", compat=compat),
-            lambda model: model.log_likelihood(poses, ranges),
-            gs.OccupancyGrid(cells_of(rng, shape), RESOLUTION),
-            rng,
-        )
-
-
 def tables(model, ranges):
     """Return functions that find a model's table and score poses."""
     if isinstance(model, gs.RayCaster):

@@ -3,18 +3,39 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import numpy as np
 import pytest
 from support.array_calls import METHODS, result_call
 from support.array_libraries import Array, to_device
-from support.frameworks import each_framework, framework
+from support.selection import skip_or_fail
 
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
 from gpusense.models import chunking
+
+
+def framework(name: str) -> tuple[Any, ...]:
+    """Return a GPU's backend, and functions that make an array there, copy it back, and return its address."""
+    module = pytest.importorskip(name)
+    cuda = next((d.selection for d in gs.devices() if d.available and d.selection.startswith("warp:cuda")), None)
+    if cuda is None:
+        skip_or_fail("cuda", "there is no CUDA device")
+    if name == "torch":
+        return (cuda, lambda array: module.from_numpy(array.copy()).to(cuda.removeprefix("warp:")),
+                lambda array: array.cpu().numpy(), lambda array: array.data_ptr())  # fmt: skip
+    if name == "cupy":
+        return cuda, module.asarray, module.asnumpy, lambda array: array.data.ptr
+    module.config.update("jax_enable_x64", True)
+    return (cuda, lambda array: module.device_put(array, module.devices("gpu")[0]), np.asarray,
+            lambda array: array.unsafe_buffer_pointer())  # fmt: skip
+
+
+each_framework = pytest.mark.parametrize("name", ["torch", "cupy", "jax"])
+
 
 BEAMS, COUNT, RANGE = 21, 300, 5.0
 RNG = np.random.default_rng(12)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from mpmath import mp
 from scipy import stats
-from support.made_up_hit import FACTOR, MadeUpHit, made_up, same
 
 import gpusense as gs
 from gpusense.evaluation.held_out import log_densities
@@ -19,6 +18,66 @@ from gpusense.models.scan.densities import log_hit, log_mixture
 from gpusense.plots import fits
 from gpusense.world.hit_shapes import NORMAL, SHAPES, HitShape, StudentHit
 from gpusense.world.hit_tables import looked_up, mass_table, quantile_table
+
+FACTOR, DOF = 1.7, 3.0
+
+
+class MadeUpHit(StudentHit):
+    """The shape; kernels get only its numbers."""
+
+    fitted = ()
+    limits = ()
+    starts = ((0.3,), (1.0,))
+
+    @classmethod
+    def of(cls, parameters):
+        return cls(DOF)
+
+    @classmethod
+    def at(cls, coordinates):
+        return cls(DOF)
+
+    @property
+    def coordinates(self):
+        return np.zeros(0)
+
+    def values(self):
+        return {}
+
+    @property
+    def log_width(self):
+        return super().log_width + math.log(FACTOR)
+
+    @property
+    def numbers(self):
+        power, rate = super().numbers
+        return power, rate / FACTOR**2
+
+    def exponent(self, u):
+        return super().exponent(u / FACTOR)
+
+    def slope(self, u):
+        return super().slope(u / FACTOR) / FACTOR
+
+    def reach(self, exponent):
+        return FACTOR * super().reach(exponent)
+
+    def half_mass(self, u):
+        return super().half_mass(np.asarray(u) / FACTOR)
+
+    def quantile(self, level):
+        return FACTOR * super().quantile(level)
+
+
+def made_up(parameters, name="made-up"):
+    """Return parameters with hits of the made-up shape."""
+    return parameters.replace(hit=name)
+
+
+def same(parameters):
+    """Return parameters of the same density by Student's t."""
+    return parameters.replace(hit="student", hit_dof=DOF, sigma_hit=FACTOR * parameters.sigma_hit)
+
 
 RANGE = 8.0
 RNG = np.random.default_rng(3)

@@ -273,7 +273,7 @@ def searchable(model: M) -> M:
 def field_search(model: LikelihoodFieldModel, stride: int) -> FieldSearch:
     """Return the search of a model at a stride, rebuilt after a change of its map."""
     kept = _SEARCHES.setdefault(model, {})
-    for other in [other for other, search in kept.items() if search.grid is not model.grid]:
+    for other in [other for other, search in list(kept.items()) if search.grid is not model.grid]:
         kept.pop(other, None)
     search = kept.get(stride)
     if search is None:

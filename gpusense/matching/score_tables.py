@@ -76,8 +76,15 @@ class ScoreTables:
         self.backend, self.levels, self.stride, self._beyond = backend, levels, stride, beyond
         # The margin holds all pooled cells that a table's cells reach, and a run of cells beyond them.
         self.shape = ScoreTable(tables, rows, cols, ((1 << levels) - 1) * stride + self.step(levels) - 1 + RUN)
-        if self._cells(self.shape) > _MOST_CELLS:
+        cells, info = self._cells(self.shape), backend.info
+        if cells > _MOST_CELLS:
             raise ValueError(f"scores: must have at most {_MOST_CELLS} cells with margins, got {stack.shape}")
+        # Scores, one table of larger blocks, and the losses of four blocks at each level.
+        if (needed := (2 + 4 * levels) * cells) > info.memory:
+            raise MemoryError(
+                f"grid: a search of {tables * rows * cols} cells takes {needed / 1e9:.2g} GB of tables, "
+                f"but {info.name} has {info.memory / 1e9:.2g} GB; use a map with larger cells, or a part of it"
+            )
         padded = np.full((tables, rows + 2 * self.shape.margin, cols + 2 * self.shape.margin), beyond, _BYTE)
         inside = slice(self.shape.margin, -self.shape.margin)
         padded[:, inside, inside] = stack
@@ -93,12 +100,6 @@ class ScoreTables:
     def _size(self) -> tuple[int, int, int]:
         return self.shape.cols + 2 * self.shape.margin, self.shape.rows + 2 * self.shape.margin, self.shape.tables
 
-    @property
-    def table_bytes(self) -> int:
-        """Bytes of all tables made on the device so far."""
-        folded = sum(self._cells(one.shape) for one in self._folded.values())
-        return (len(self._levels) + 4 * len(self._quarters)) * self._cells(self.shape) + folded
-
     @staticmethod
     def step(level: int) -> int:
         """Return the cells between neighbouring first cells of the folded tables of a level."""
@@ -109,6 +110,10 @@ class ScoreTables:
         while len(self._levels) <= level:
             self._levels.append(self._pooled(self._levels[-1], (1 << (len(self._levels) - 1)) * self.stride))
         return self._levels[level]
+
+    def drop_levels(self) -> None:
+        """Free the tables from which others were made."""
+        del self._levels[1:]
 
     def _pooled(self, table: Buffer, reach: int) -> Buffer:
         """Return tables of the largest score of each cell and the cells up to ``reach`` further."""

@@ -77,6 +77,7 @@ class Search:
         with self.space:
             run.place(points, images)
             run.search()
+        self.tables.drop_levels()
         return run.found()
 
     def first_level(self, points: Sequence[np.ndarray], grid: PoseGrid) -> int:

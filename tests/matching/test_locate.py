@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import gpusense as gs
+from gpusense.backends import get_backend
 from gpusense.matching.locate import _refined
 
 PARAMETERS = gs.LikelihoodFieldParameters(sigma_hit=0.15, max_distance=1.0)
@@ -230,6 +231,16 @@ def test_a_default_model_is_searched_with_the_wide_field():
     model.update_map(np.full((40, 1), 100), (4, 25))
     after = gs.locate_scan(model, ranges, resolution=0.2, angle=0.1)
     assert (found.status, after.status) == ("found", "no match")
+
+
+def test_maps_too_large_for_the_device_are_refused_before_their_tables_are_made(monkeypatch):
+    grid, device = house(), get_backend("numpy")
+    model = gs.LikelihoodFieldModel(grid, SCANNER, PARAMETERS, backend="numpy")
+    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, memory=50_000))
+    with pytest.raises(
+        MemoryError, match=r"^grid: a search of 3264 cells takes .* of tables, but .* has 5e-05 GB"
+    ):
+        gs.locate_scan(model, np.ones(SCANNER.count), resolution=0.1, angle=0.1)
 
 
 def test_bad_arguments_are_named():

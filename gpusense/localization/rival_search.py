@@ -1,6 +1,6 @@
 """Find initial poses of a rival of a filter's particles: candidates for the last readings on the whole map.
 
-Branch and bound searches the whole map for scans (:func:`gpusense.matching.likely.likely_poses`) without missing any
+Branch and bound searches the whole map for scans (:func:`gpusense.matching.locate.likely_poses`) without missing any
 place: once with all beams, and once with the longer half, since people shorten beams. People make the likelihood prefer
 places with many walls, so candidates are also weighed by the beams that meet walls
 (:mod:`gpusense.localization.scan_evidence`). A better fit of the scan at another place than at the estimate is evidence
@@ -23,7 +23,7 @@ from gpusense.localization.scan_evidence import ratio_of_places, ratio_of_scan
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.spread import FAR, FAR_TURN, deviations
 from gpusense.localization.verdict import sightings
-from gpusense.matching.likely import likely_poses
+from gpusense.matching.locate import likely_poses
 from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.world.parameters import LikelihoodFieldParameters

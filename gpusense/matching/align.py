@@ -11,7 +11,6 @@ import math
 
 import numpy as np
 
-from gpusense.matching.refine_on_field import damping_of
 from gpusense.world.grid import OccupancyGrid
 
 # Deviation of the smoothing [cells of the global map], its reach in deviations, and least share of known cells.
@@ -77,7 +76,9 @@ class Alignment:
         at, damping = pose.astype(np.float64), 1e-3
         value, gradient, information = self._evaluated(at)
         for _ in range(_ITERATIONS):
-            damped = information + damping_of(information[None], np.array([damping]), 1e-9)[0]
+            # As much damping along x as along y, so that ends turn with the map.
+            diagonal = np.append(np.full(2, information.trace() - information[2, 2]) / 2, information[2, 2])
+            damped = information + np.diag(damping * diagonal + 1e-9 * (1 + diagonal.max()))
             step = np.linalg.solve(damped, -gradient)
             trial = at + step
             new = self._evaluated(trial)

@@ -15,7 +15,6 @@ from gpusense.matching.field_search import Candidates, FieldSearch, field_search
 from gpusense.matching.location import Location, PoseMode, Status
 from gpusense.matching.location_evidence import NAMES, location_evidence, probability_right
 from gpusense.matching.pose_grid import PoseGrid, distinct_poses
-from gpusense.matching.refine_on_field import climb
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.models.scan.rules import BeamChoice
@@ -23,14 +22,15 @@ from gpusense.tables.world_map import check_one_map
 from gpusense.world.frames import ray_vectors
 from gpusense.world.scanner import Reading, classify, float64_readings
 
-# Side of the largest block with one bound, relative to the field's max_distance, and most levels.
-_BLOCK, _MOST_LEVELS = 0.8, 5
 # Modes are searched down to this share of the largest score below the best pose.
 _DEPTH = 0.0125
 # Poses nearer than this to a better pose belong to its mode [m, rad].
 _MODE_RADIUS, _MODE_ANGLE = 0.5, math.radians(15)
 # A range agrees with the map within this many sigma_hit, or cells, of the expected range.
 _AGREE_SIGMAS, _AGREE_CELLS = 1.5, 3
+# Distance and angle between neighbours of likely poses [m, rad], of which a cloud of particles covers half, and the
+# depth to which they are searched.
+_COARSE, _COARSE_ANGLE, _LIKELY_DEPTH = 0.1, math.radians(3.0), 0.06
 
 
 @overload
@@ -213,7 +213,7 @@ def _refined(
     smooth: LikelihoodFieldModel, ranges: np.ndarray, poses: np.ndarray, farthest: float, most: float
 ) -> np.ndarray:
     """Return (S, 3) poses of maximal likelihood near starts, or starts that are too far from the maximum [m, rad]."""
-    near: np.ndarray = climb(smooth, ranges, poses)[0]
+    near: np.ndarray = smooth._climb(poses, ranges)[0]
     near[:, 2] = [math.remainder(heading, 2 * math.pi) for heading in near[:, 2]]
     off = near - poses
     kept = (np.hypot(off[:, 0], off[:, 1]) <= farthest) & (np.abs(wrapped(off[:, 2])) <= most)
@@ -250,3 +250,24 @@ def _said(modes: tuple[PoseMode, ...], least: float) -> tuple[float, np.ndarray,
     # Evaluate the pose as if it had no rival.
     alone = probability_right(location_evidence(modes[:1], _DEPTH))
     return p_right, evidence, "ambiguous" if alone >= least else "no match"
+
+
+def likely_poses(model: LikelihoodFieldModel, ranges: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Return at most ``count`` distinct poses (M, 3) in free cells at which a scan (K,) is likeliest, best first.
+
+    Branch and bound, as in :func:`locate_scan`, on a coarser grid of poses. Poses are 0.5 m or 15 degrees apart; none
+    for a scan without hits, on a map without free cells, or on one whose cells are larger than the scan.
+    """
+    grid = model.grid
+    stride = max(round(_COARSE / grid.resolution), 1)
+    points = end_points_of(model, ranges[None])[1][0]
+    search = field_search(model, stride)
+    # Within a single cell no end point depends on the heading, and all free cells far from walls are alike.
+    if not len(points) or not search.free.any() or grid.resolution > np.hypot(*points.T).max():
+        return np.empty((0, 3))
+    turns = 4 * math.ceil(math.pi / 2 / _COARSE_ANGLE)
+    rows, columns = (-(-size // stride) for size in grid.shape)
+    searched = PoseGrid(np.array([[0.5, 0.5]]), 2 * math.pi / turns * np.arange(turns)[None], rows, columns)
+    with search.lock:
+        poses = search.find(ranges[None], [points], searched, search.free, _LIKELY_DEPTH)[0].poses
+    return poses[distinct_poses(poses, count, _MODE_RADIUS, _MODE_ANGLE)]

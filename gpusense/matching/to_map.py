@@ -22,7 +22,6 @@ from gpusense.matching.icp_with_search import DOUBTFUL, match_pairs
 from gpusense.matching.observability import axes_of, balance_of, observed_information, orthonormal
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints, dense_scanner, scan_points
-from gpusense.matching.refine_on_field import climb
 from gpusense.matching.result import ScanMatch
 from gpusense.matching.score_tables import ScoreTables, field_scores
 from gpusense.matching.search import PoseGrid, Search
@@ -176,7 +175,7 @@ class MapMatcher:
         pose, count = guess.copy(), np.zeros(len(guess))
         calm = np.zeros(len(guess), bool)
         for model in self._models[-1:] if finest else self._models:
-            pose, iterations, calm = climb(model, ranges, pose)
+            pose, iterations, calm = model._climb(pose, ranges)
             count += iterations
         pose[:, 2] = wrapped(pose[:, 2])
         return pose, count, calm

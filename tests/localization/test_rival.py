@@ -15,7 +15,7 @@ from gpusense.localization import rival
 from gpusense.localization.rival_search import RivalSearch, are_apart, drawn
 from gpusense.localization.scan_evidence import IS_FOUND, ratio_of_places
 from gpusense.localization.sensors import Sensor
-from gpusense.matching.likely import likely_poses
+from gpusense.matching.locate import likely_poses
 
 # A building of four rooms of different sizes along a corridor, with doors.
 CELLS = np.zeros((120, 200), np.int8)

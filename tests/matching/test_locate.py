@@ -237,9 +237,7 @@ def test_maps_too_large_for_the_device_are_refused_before_their_tables_are_made(
     grid, device = house(), get_backend("numpy")
     model = gs.LikelihoodFieldModel(grid, SCANNER, PARAMETERS, backend="numpy")
     monkeypatch.setattr(device, "info", dataclasses.replace(device.info, memory=50_000))
-    with pytest.raises(
-        MemoryError, match=r"^grid: a search of 3264 cells takes .* of tables, but .* has 5e-05 GB"
-    ):
+    with pytest.raises(MemoryError, match=r"^grid: a search of 3264 cells takes .* of tables, but .* has 5e-05 GB"):
         gs.locate_scan(model, np.ones(SCANNER.count), resolution=0.1, angle=0.1)
 
 

@@ -147,15 +147,18 @@ class LikelihoodFieldModel(ScanModel):
         shape = request.shape
         return log_p.reshape(shape), gradient.reshape(*shape, 3), information.reshape(*shape, 3, 3)
 
-    def _climb(self, poses: np.ndarray, ranges: np.ndarray, small: float) -> np.ndarray:
-        """Climb from (S, 3) poses to maxima of the log-likelihoods of (S, K) readings; return numbers of climbs."""
+    def _climb(self, poses: np.ndarray, ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Climb from (S, 3) poses to maxima of the log-likelihoods of (S, K) readings.
+
+        Return the ends (S, 3), numbers of steps, and whether the last step was small.
+        """
         self._check_gradients()
         request = make_request(self._context, poses[:, None], ranges)
         with self._lock, self._workspace:
-            climbs = Climbs(self._field_pipeline, self._workspace, small, poses)
+            climbs = Climbs(self._field_pipeline, self._workspace, poses)
             climbs(request)
             finish(self._workspace, False)
-        return climbs.end
+        return climbs.ends
 
     def _check_gradients(self) -> None:
         if self.parameters.interpolation != "bilinear":

@@ -28,6 +28,8 @@ from gpusense.reference.field_climb import CALM, DAMPING, ENDED, START, STEPS
 _OTHERS = {"LOG_TABLE", "CUBES"}
 # Steps of a climb at most, steps between two reads, and how far a climb leads from its start, and a little more [m].
 _MOST_STEPS, _STEPS_AT_ONCE, _FARTHEST = 50, 4, 5.5
+# Length and turn of a step that end a climb [m, rad], by the bytes of a number.
+_SMALL = {4: 3e-4, 8: 1e-4}
 
 
 class Gradients:
@@ -95,24 +97,25 @@ class Gradients:
 
 
 class Climbs(Gradients):
-    """Climbs of S poses, one of each scan, to maxima of the likelihood; see the kernel file ``field_climb``.
+    """Climbs of S poses, one of each scan, to maxima of the likelihood; see the kernel file ``field_climb``."""
 
-    Attributes:
-        end: (S, ``CLIMB``) numbers of climbs.
-    """
-
-    def __init__(self, pipeline: FieldPipeline, space: Workspace, small: float, poses: np.ndarray) -> None:
+    def __init__(self, pipeline: FieldPipeline, space: Workspace, poses: np.ndarray) -> None:
         super().__init__(pipeline, space)
-        self._small, yaw = small, pipeline.grid.origin[2]
+        self._small, yaw = _SMALL[pipeline.real.itemsize], pipeline.grid.origin[2]
         self._turn = math.cos(yaw), math.sin(yaw)
-        self.end = np.zeros((len(poses), CLIMB))
-        self.end[:, :3], self.end[:, START : START + 2] = poses, poses[:, :2]
+        self._end = np.zeros((len(poses), CLIMB))
+        self._end[:, :3], self._end[:, START : START + 2] = poses, poses[:, :2]
         # A scan without readings has one step of length 0.
-        self.end[:, DAMPING], self.end[:, STEPS], self.end[:, CALM] = 1e-3, 1, 1
+        self._end[:, DAMPING], self._end[:, STEPS], self._end[:, CALM] = 1e-3, 1, 1
+
+    @property
+    def ends(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The poses (S, 3), the numbers of steps, and whether the last step was small."""
+        return self._end[:, :3], self._end[:, STEPS], self._end[:, CALM] > 0
 
     def _run(self, poses: Poses, piece: Piece, readings: Readings, rows: np.ndarray) -> None:
         """Climb from the poses of a piece, several steps at once where the device has float64."""
-        backend, space, end = self._pipeline.backend, self._space, self.end[piece.begin : piece.end]
+        backend, space, end = self._pipeline.backend, self._space, self._end[piece.begin : piece.end]
         flags, numbers = frozenset({"FLOAT64"}) & self._pipeline.components, (piece.count, _MOST_STEPS, self._small)
         end[:, STEPS], end[:, CALM], poses.reach = -1, 0, _FARTHEST
         if backend.info.float64:

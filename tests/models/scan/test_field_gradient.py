@@ -10,7 +10,6 @@ from support.kernel_scenes import run
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.matching.refine_on_field import climb
 
 SCANNER = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.05, count=80, range_max=6.0, mount=(0.3, -0.1, 0.4))
 PARAMETERS = {
@@ -147,10 +146,10 @@ def test_climbs_have_the_same_ends_without_float64(backend, monkeypatch):
     ranges = gs.RayCaster(grid, 6.0, backend="numpy").cast(poses, SCANNER.bearings)
     # A scan without readings stays.
     ranges[1] = np.nan
-    ends, steps, calm = climb(model, ranges, poses)
+    ends, steps, calm = model._climb(poses, ranges)
     info = dataclasses.replace(model._context.backend.info, float64=False)
     monkeypatch.setattr(model._context.backend, "info", info)
-    np.testing.assert_allclose(climb(model, ranges, poses)[0], ends, atol=1e-5)
+    np.testing.assert_allclose(model._climb(poses, ranges)[0], ends, atol=1e-5)
     assert calm.mean() > 0.7 and steps[1] == 1 and (ends[1] == poses[1]).all()
 
 

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.evaluation.tolerances import scan_tolerance
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.field import LikelihoodFieldModel
 
 Array = NDArray[Any]
-Floats = NDArray[np.float64]
 Model = BeamModel | LikelihoodFieldModel
 
 

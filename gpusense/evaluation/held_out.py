@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.evaluation.range_data import RangeData
 from gpusense.learning.beam.incidence import IncidenceFit
 from gpusense.peers.weights import Beluga
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.scanner import Reading
-
-Floats = NDArray[np.float64]
 
 # Number of readings that are scored at once.
 _BLOCK = 1 << 17

@@ -15,9 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util import checks
-from gpusense._util.typing import AnyArray
-
-Floats = NDArray[np.float64]
+from gpusense._util.typing import AnyArray, Floats
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util import checks
-from gpusense._util.typing import AnyArray
+from gpusense._util.typing import AnyArray, Floats
 from gpusense.evaluation.posed_scans import NEAR
 from gpusense.evaluation.tracking import RISK, Track
 from gpusense.evaluation.trajectory_files import nearest_index, poses_at
@@ -27,7 +27,6 @@ from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.models.scan.model import ScanModel
 from gpusense.world.scanner import Scanner
 
-Floats = NDArray[np.float64]
 # A stretch ends where no pose is judged for this time [s], and for this multiple of the median time between them.
 _GAP, _GAP_STEPS = 2.0, 5.0
 # Most stretches to search, lost ones first and then the longest; most lost stretches to diagnose as a whole.

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util import checks
+from gpusense._util.typing import Floats
 from gpusense.learning.fitted import LandmarkFit
 from gpusense.learning.landmark.fit import fit_landmark_parameters
 from gpusense.learning.landmark.suspicious import Suspicions, suspicious_landmarks
@@ -85,9 +86,6 @@ def run_motion(run: LandmarkRun, *, drift: tuple[float, float] | None = None, fi
         alpha, reverse = found.alpha, found.reverse
     return DriftingOdometry(alpha, reverse, *(drift or (DRIFT, max(heading_drift(run), LEAST_DRIFT_HEADING))))
 
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # Lower bound of z_false for a filter, since a fit of clean data gives 0, and the next feature may be a false positive.
 LEAST_FALSE = 0.01

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.evaluation.steps import Step
 from gpusense.evaluation.trajectory_files import nearest_index, poses_at, read_tum
 from gpusense.logs import Pose, Scan
 from gpusense.logs.bag_poses import PoseTrack, read_poses
 from gpusense.logs.reader import format_of
 
-Floats = NDArray[np.float64]
 NEAR = 0.05
 """Largest time from a scan to a pose that belongs to it [s]."""
 

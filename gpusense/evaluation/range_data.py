@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 
 from gpusense._util import checks
 from gpusense._util.lines import numbered_lines
+from gpusense._util.typing import Floats
 from gpusense.backends import Selection
 from gpusense.learning.beam.pairs import impossible_ranges
 from gpusense.logs import Scan
 from gpusense.models.scan.beam import BeamModel
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import reading_classes
-
-Floats = NDArray[np.float64]
 
 # Scans per call of the ray caster, and lines per read of a file.
 SCANS, _LINES = 256, 1 << 16

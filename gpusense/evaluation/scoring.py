@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util import checks
+from gpusense._util.typing import Floats
 from gpusense.backends import BackendInfo
 from gpusense.evaluation.agreement import Agreement, Model
 from gpusense.evaluation.worlds import cloud_around, cloud_uniform
@@ -32,7 +33,6 @@ from gpusense.world.scanner import Reading, classify
 from gpusense.world.sensor_table import SensorTable
 
 Array = NDArray[Any]
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.evaluation.trajectory_files import poses_at
 from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
 from gpusense.logs import Odometry, Pose, Scan
@@ -17,7 +17,6 @@ from gpusense.logs.reader import LogOptions, read_lasers
 from gpusense.logs.records import check_scanner
 from gpusense.world.scanner import Scanner
 
-Floats = NDArray[np.float64]
 # Logged poses count as copied odometry if no step differs by more than this [m, rad].
 _SAME = 1e-4
 _LEAST_KNOWN = 3

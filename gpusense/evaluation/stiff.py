@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from gpusense._util.typing import Reals
 from gpusense.backends import Backend, Selection, get_backend
 from gpusense.evaluation.replay import Launch, Recorder, replay
 from gpusense.evaluation.stiff_cases import Case, cases
@@ -32,8 +33,6 @@ from gpusense.tables.rectangles import Planes, empty_rectangles
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 from gpusense.world.scanner import Scanner
-
-Floats = NDArray[np.floating]
 
 # The density grid: range_max [m], in cells of 1 m; deviations over range_max; rates times range_max; and the least
 # share of the grid in which the textbook's formulas fail, below which the grid is not stiff.
@@ -80,17 +79,17 @@ class Densities:
         parameters: The fields of BeamParameters, by name.
     """
 
-    z: Floats
-    expected: Floats
-    parameters: Mapping[str, Floats]
-    log_p: Floats
+    z: Reals
+    expected: Reals
+    parameters: Mapping[str, Reals]
+    log_p: Reals
 
-    def truth(self) -> Floats:
+    def truth(self) -> Reals:
         """Compute log p by the float64 densities on the same rounded numbers."""
         z, expected = self.z.astype(np.float64), self.expected.astype(np.float64)
         return np.asarray(log_mixture(z, expected, range_max=RANGE_MAX, **self.parameters))
 
-    def naive(self) -> Floats:
+    def naive(self) -> Reals:
         """Compute log p by the textbook's formulas in the grid's precision."""
         return np.asarray(naive_log_mixture(self.z, self.expected, range_max=RANGE_MAX, **self.parameters))
 
@@ -152,7 +151,7 @@ def _grid_parameters(real: np.dtype) -> Iterator[BeamParameters]:
             yield BeamParameters(*weights, float(real.type(sigma * RANGE_MAX)), float(real.type(rate / RANGE_MAX)))
 
 
-def _grid_readings(p: BeamParameters, expected: Floats, ulp: float) -> Floats:
+def _grid_readings(p: BeamParameters, expected: Reals, ulp: float) -> Reals:
     """Return readings at the expected ranges and where the mixture changes its shape [m]."""
     rate, sigma, peak = p.lambda_short, p.sigma_hit, float(expected[4])
     decay = 5 / rate if rate > 1 / RANGE_MAX else 0.9 * RANGE_MAX
@@ -160,7 +159,7 @@ def _grid_readings(p: BeamParameters, expected: Floats, ulp: float) -> Floats:
     return np.clip(np.concatenate([expected, bends]), 0, RANGE_MAX - ulp).astype(expected.dtype)
 
 
-def error_in_eps(computed: ArrayLike, truth: ArrayLike, precision: str) -> Floats:
+def error_in_eps(computed: ArrayLike, truth: ArrayLike, precision: str) -> Reals:
     """Return errors in eps (1 + |log p|) of a precision; infinite if only one side is infinite or a side is NaN."""
     a, b = np.asarray(computed, np.float64), np.asarray(truth, np.float64)
     with np.errstate(all="ignore"):
@@ -224,7 +223,7 @@ def _case_rows(case: Case, device: Backend, precision: str) -> Iterator[Row]:
             yield _row(case.name, f"{name}, sum of the weights", error, 1e-6, result.weights, 0)
 
 
-def _truth(launch: Launch, parameters: Any) -> Floats:
+def _truth(launch: Launch, parameters: Any) -> Reals:
     """Compute log p of a launch's beams in float64, on its rounded readings and expected ranges."""
     if launch.expected is None:
         return replay(launch)[1]

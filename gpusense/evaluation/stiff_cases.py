@@ -8,13 +8,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Reals
 from gpusense.models.scan.caster import RayCaster
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
-
-Floats = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,7 @@ class Case:
 
     name: str
     grid: OccupancyGrid
-    local: Floats
+    local: Reals
     beams: int = 41
     readings: tuple[float, ...] | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -48,14 +46,14 @@ class Case:
         return Scanner(np.linspace(-math.pi, math.pi, self.beams, endpoint=False), 20 * self.grid.resolution)
 
     @property
-    def poses(self) -> Floats:
+    def poses(self) -> Reals:
         """Return (N, 3) poses in the world [m, m, rad]."""
         x, y, yaw = self.grid.origin
         (u, v), c, s = (self.local[:, :2] * self.grid.resolution).T, math.cos(yaw), math.sin(yaw)
         return np.stack([x + (c * u - s * v), y + (s * u + c * v), self.local[:, 2] + yaw], axis=1)
 
     @property
-    def ranges(self) -> Floats:
+    def ranges(self) -> Reals:
         """Return (K,) readings [m]."""
         if self.readings is not None:
             return np.asarray(np.resize(self.readings, self.beams) * self.grid.resolution)

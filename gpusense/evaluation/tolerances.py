@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike
 
+from gpusense._util.typing import Reals
 from gpusense.interface.constants import BLOCK_TERMS
-
-Floats = NDArray[np.floating]
 
 _EPS = float(np.finfo(np.float32).eps)
 _COUNTED = ("cells that differ", "values with other bits", "beams in another cell")
@@ -57,7 +56,7 @@ class Tolerance:
         apart = np.where(np.isnan(apart) | (np.isinf(a) != np.isinf(b)), np.inf, apart)
         return float(np.max(np.where(a == b, 0.0, apart), initial=0.0))
 
-    def _size(self, size: Floats) -> Floats:
+    def _size(self, size: Reals) -> Reals:
         """Return the tolerance's unit at each magnitude."""
         if self.unit == "relative":
             return size
@@ -187,7 +186,7 @@ def scan_tolerance(dtype: DTypeLike, beams: int) -> Tolerance:
     return TOLERANCES["float32 scan, K = 1000" if beams <= 1000 else "float32 scan, K = 10 000"]
 
 
-def per_beam(log_p: ArrayLike, dtype: DTypeLike) -> Floats:
+def per_beam(log_p: ArrayLike, dtype: DTypeLike) -> Reals:
     """Return the largest error allowed of each beam's log-likelihood [nats]; infinite ones must be exact."""
     tolerance = beam_tolerance(dtype)
     scale = tolerance.value * (_EPS if tolerance.unit.startswith("eps") else 1.0)
@@ -195,7 +194,7 @@ def per_beam(log_p: ArrayLike, dtype: DTypeLike) -> Floats:
     return np.where(np.isfinite(size), scale * (1 + size), 0.0)
 
 
-def per_scan(parts: ArrayLike, dtype: DTypeLike, *, fixed: float = 0.0, temperature: float = 1.0) -> Floats:
+def per_scan(parts: ArrayLike, dtype: DTypeLike, *, fixed: float = 0.0, temperature: float = 1.0) -> Reals:
     """Return the largest error of a scan's log-likelihood that follows from its beams' bounds and from the summation.
 
     BLOCK_TERMS terms are added plainly, with an error of (BLOCK_TERMS - 1) / 2 eps of the sum of their magnitudes.

@@ -9,15 +9,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.evaluation.steps import Step, repeats_odometry
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.filter import ParticleFilter
 from gpusense.localization.pose_algebra import pose_difference, wrap_angle
 from gpusense.localization.spread import WORDS, Word
 
-Floats = NDArray[np.float64]
 # Largest errors of the next scans of a converged track [m, rad].
 CONVERGED, CONVERGED_TURN, CONVERGED_SCANS = 1.0, math.radians(20), 5
 RISK = 0.05

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
-from gpusense._util.typing import Precision
+from gpusense._util.typing import Floats, Precision
 from gpusense.backends import Selection, get_backend
 from gpusense.evaluation.buildings import building
 from gpusense.models.scan.beam import BeamModel
@@ -21,7 +21,6 @@ from gpusense.world.parameters import BeamParameters
 from gpusense.world.range_causes import RandomDensity, ShortDensity
 from gpusense.world.scanner import Scanner
 
-Floats = NDArray[np.float64]
 Rng = np.random.Generator
 
 __all__ = ["building", "cloud_around", "cloud_uniform", "free_pose", "sample_readings", "simulate_scan"]

@@ -20,14 +20,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.interface.constants import AGREES, NOTHING, SHORT, THROUGH
 from gpusense.localization.map_judge import BESIDE, MapJudge, chosen_beams, judged_on_host
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
-
-Floats = NDArray[np.float64]
 
 # Largest distance of close agreement [m].
 _CLOSE = 0.1

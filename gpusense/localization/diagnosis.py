@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.interface.constants import THROUGH
 from gpusense.localization.beam_consistency import BeamConsistency, counts_of
 from gpusense.localization.scan_evidence import ratio_of_scan
@@ -17,7 +17,6 @@ from gpusense.localization.sensors import Sensor
 from gpusense.localization.verdict import sightings
 from gpusense.matching.field_search import searchable
 
-Floats = NDArray[np.float64]
 Cause = Literal["none", "people", "start", "moved", "mount", "map", "scale", "odometry", "time", "unknown"]
 
 # Number of poses tried elsewhere on the map, of refined best poses, and of refinements of each; largest displacement.

@@ -12,11 +12,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.models.landmark.base import FeatureModel
-
-Floats = NDArray[np.float64]
 
 # Gain at which right and wrong are equally likely [nats per feature]; scans in the average; number of poses anywhere,
 # and their margin around the landmarks [m].

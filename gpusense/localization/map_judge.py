@@ -11,8 +11,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import MOMENTS
@@ -23,8 +23,6 @@ from gpusense.reference.beam_consistency import STEP, judge_beams
 from gpusense.world.frames import frame_of
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner, classify_ranges
-
-Floats = NDArray[np.float64]
 
 # Most judged beams of a scan; longest walk [m]. Twice the middles of as many parts of a scan.
 BEAMS, _FARTHEST = 32, 20.0

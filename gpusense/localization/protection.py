@@ -21,13 +21,11 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpusense._util import checks
+from gpusense._util.typing import Floats
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.spread import FAR, FAR_TURN, deviations
-
-Floats = NDArray[np.float64]
 
 # Factor of the spread, least margin [m], and least risk that their calibration supports.
 WIDENING, MARGIN, LEAST_RISK = 1.25, 0.05, 0.01

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.localization.beam_consistency import counts_of
 from gpusense.localization.belief import motion_between
 from gpusense.localization.diagnosis import Diagnosis, evidence_of, explains
@@ -28,8 +29,6 @@ from gpusense.localization.sensors import Sensor, sensors_of
 from gpusense.localization.spread import FAR, FAR_TURN
 from gpusense.localization.verdict import sightings
 from gpusense.world.scanner import float64_readings
-
-Floats = NDArray[np.float64]
 
 CAUSES_OF_RUNS = ("odometry", "time", "mount", "scale", "moved")
 """Causes that one scan does not show."""

@@ -16,12 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.localization.belief import motion_between
 from gpusense.localization.pose_algebra import compose_poses, invert_poses, pose_difference, wrap_angle
 from gpusense.matching.match import match_scan
 from gpusense.world.scanner import Scanner, float64_readings
-
-Floats = NDArray[np.float64]
 
 # Most windows, and scans of one. Scans of a window are this far apart [m, rad], or that many scans.
 WINDOWS, LENGTH = 16, 6

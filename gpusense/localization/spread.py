@@ -6,12 +6,10 @@ import math
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.interface import constants
 from gpusense.localization.pose_algebra import wrap_angle
-
-Floats = NDArray[np.float64]
 
 Word = Literal["tracking", "uncertain", "lost"]
 WORDS: tuple[Word, ...] = ("tracking", "uncertain", "lost")

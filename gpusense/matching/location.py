@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gpusense._util.html import card
+from gpusense._util.typing import Floats
 
-Floats = NDArray[np.float64]
 Status = Literal["found", "ambiguous", "no match"]
 
 

@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense._util.angles import wrapped
 from gpusense._util.html import card
+from gpusense._util.typing import Floats
 from gpusense.backends import Backend, Selection, get_backend
 from gpusense.matching.align import Alignment
 from gpusense.matching.pose_grid import distinct_poses
@@ -20,8 +21,6 @@ from gpusense.matching.score_tables import TOP, ScoreTables, field_scores
 from gpusense.matching.search import Found, PoseGrid, Search
 from gpusense.tables.distances import distance_transform
 from gpusense.world.grid import OccupancyGrid
-
-Floats = NDArray[np.float64]
 
 # Occupied and free cells of the local map that the search sums; the correlation takes all.
 _OCCUPIED, _FREE = 400, 200

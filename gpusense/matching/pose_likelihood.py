@@ -13,12 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks, pictures
 from gpusense._util.angles import wrapped
+from gpusense._util.typing import Floats
 from gpusense.matching.pose_grid import distinct_poses
 from gpusense.models.scan.model import ScanModel
 from gpusense.tables.world_map import check_one_map
 from gpusense.world.grid import OccupancyGrid
-
-Floats = NDArray[np.float64]
 
 # Poses of one call of the model, and most poses of a map.
 _TILE, _MOST = 1 << 19, 1 << 30

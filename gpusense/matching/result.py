@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from gpusense._util.angles import wrapped
 from gpusense._util.html import card, pose_rows
+from gpusense._util.typing import Floats
 from gpusense.matching.observability import covariance_of
-
-Floats = NDArray[np.float64]
 
 STATUSES = {
     "converged": "the scans agree, and every direction of the pose is observed",

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense._util.typing import Floats
 from gpusense.plots.drawing import BEAM, FRAME, OCCUPIED, ROBOT, colours, draw_pose
 from gpusense.positions.fix import PositionFix
 from gpusense.positions.problem import Problem, make_problem
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
 
-Floats = NDArray[np.float64]
 
 # Root of the 95 % quantile of chi-squared with two degrees of freedom: semi-axes of an ellipse [sigmas].
 SIGMAS_95 = 2.4477468306808166

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense._util.typing import Floats
 from gpusense.world.frames import ray_vectors
 from gpusense.world.scanner import Scanner, classify_ranges, float64_readings
-
-Floats = NDArray[np.float64]
 
 # Neighbouring readings belong to one surface if their ranges differ by less than this share of a range plus this
 # length [m].

@@ -13,15 +13,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.interface.constants import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
 from gpusense.interface.structs import FieldTerms
 from gpusense.world.hit_shapes import HitShape, shape_of
 from gpusense.world.parameters import LikelihoodFieldParameters
 from gpusense.world.range_causes import NoReturn, RandomDensity
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.interface.constants import TABLE_CELLS, TABLE_PER_LOG, TABLE_POWERS
 from gpusense.world.hit_shapes import HitShape
-
-Floats = NDArray[np.float64]
 
 _ROOT_TWO = math.sqrt(2)
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util import checks
+from gpusense._util.typing import Integers
 from gpusense.world.scanner import Scanner
 
-Integers = NDArray[np.int64]
 Reader = Callable[[str, Any, Scanner], NDArray[Any]]
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.backends import SPEED_CLASSES, Backend, devices, get_backend
 from gpusense.evaluation.benchmark.scenes import Scene
 from gpusense.localization.weights import normalize_weights
@@ -26,8 +27,6 @@ from gpusense.reference.mixture import log_density
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.range_causes import NoReturn
 from gpusense.world.scanner import Reading, Scanner, classify
-
-Floats = NDArray[np.float64]
 
 SHARING = 0.1
 """Effective sample size of the tempered posterior, as a share of the particles."""

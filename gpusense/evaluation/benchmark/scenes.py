@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gpusense._util.typing import Precision
+from gpusense._util.typing import Floats, Precision
 from gpusense.backends import Backend
 from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, is_free, sample_readings
 from gpusense.models.scan.caster import RayCaster
@@ -22,8 +21,6 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.map_files import read_map
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 from gpusense.world.scanner import Reading, Scanner, classify
-
-Floats = NDArray[np.float64]
 
 CLOUDS = ("global", "tracking")
 """Uniform over the free cells and all headings; normal around the true pose, restricted to free space."""

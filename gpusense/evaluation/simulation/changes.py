@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense._util.typing import Flags
 from gpusense.world.grid import OccupancyGrid
 
-Bools = NDArray[np.bool]
 Rng = np.random.Generator
 # Side of the pieces of walls that move, and the least and largest distance of their move [m].
 _PIECE, _NEAREST, _FARTHEST = 1.0, 0.5, 2.0
@@ -80,7 +80,7 @@ def change_world(
     return OccupancyGrid(cells, grid.resolution, grid.origin, occupied_threshold=grid.occupied_threshold)
 
 
-def make_glass(grid: OccupancyGrid, share: float, rng: Rng) -> Bools:
+def make_glass(grid: OccupancyGrid, share: float, rng: Rng) -> Flags:
     """Choose the (H, W) occupied cells through which beams pass: pieces of walls with this share of the surface."""
     glass, surface, taken = np.zeros(grid.shape, bool), surface_of(grid), 0
     wanted = round(checks.real("glass", share, low=0, high=1) * np.count_nonzero(surface))
@@ -92,15 +92,15 @@ def make_glass(grid: OccupancyGrid, share: float, rng: Rng) -> Bools:
     return glass
 
 
-def surface_of(grid: OccupancyGrid) -> Bools:
+def surface_of(grid: OccupancyGrid) -> Flags:
     """Return the (H, W) occupied cells with a free neighbour."""
     free = np.pad(grid.free, 1)
     near = free[:-2, 1:-1] | free[2:, 1:-1] | free[1:-1, :-2] | free[1:-1, 2:]
-    surface: Bools = grid.occupied & near
+    surface: Flags = grid.occupied & near
     return surface
 
 
-def pieces_of(grid: OccupancyGrid, surface: Bools, rng: Rng) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+def pieces_of(grid: OccupancyGrid, surface: Flags, rng: Rng) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
     """Return the rows and columns of the occupied cells in each tile of 1 m with a surface, in random order."""
     side = max(round(_PIECE / grid.resolution), 1)
     rows, cols = np.nonzero(grid.occupied)
@@ -112,7 +112,7 @@ def pieces_of(grid: OccupancyGrid, surface: Bools, rng: Rng) -> list[tuple[NDArr
     return [pieces[k] for k in rng.permutation(len(pieces))]
 
 
-def _allowed(grid: OccupancyGrid, keep: ArrayLike, clearance: float) -> Bools:
+def _allowed(grid: OccupancyGrid, keep: ArrayLike, clearance: float) -> Flags:
     """Return the (H, W) free cells away from the positions to keep."""
     from scipy.ndimage import distance_transform_edt
 
@@ -133,7 +133,7 @@ def _allowed(grid: OccupancyGrid, keep: ArrayLike, clearance: float) -> Bools:
 
 
 def _move(
-    cells: NDArray[np.int8], allowed: Bools, piece: tuple[NDArray[np.intp], NDArray[np.intp]], side: float, rng: Rng
+    cells: NDArray[np.int8], allowed: Flags, piece: tuple[NDArray[np.intp], NDArray[np.intp]], side: float, rng: Rng
 ) -> None:
     """Draw a piece elsewhere with at least half of it on allowed cells, or nowhere if that fails."""
     for _ in range(_ATTEMPTS):
@@ -148,7 +148,7 @@ def _move(
             return
 
 
-def _furnish(cells: NDArray[np.int8], allowed: Bools, side: float, wanted: int, rng: Rng) -> None:
+def _furnish(cells: NDArray[np.int8], allowed: Flags, side: float, wanted: int, rng: Rng) -> None:
     """Draw boxes and discs on allowed cells until they have ``wanted`` surface cells."""
     rows, cols = np.nonzero(allowed)
     for _ in range(100 * wanted):

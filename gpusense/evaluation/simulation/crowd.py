@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from gpusense._util.typing import Floats
+
 Rng = np.random.Generator
 # Radii of bodies, and of legs; distance of a leg from the person's middle [m].
 BODY, LEG, STANCE = 0.22, 0.07, 0.13

@@ -7,10 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.typing import Flags, Floats
 from gpusense.world.grid import OccupancyGrid
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool]
 Rng = np.random.Generator
 # Distance between nodes of the lattice [m]; half side of the window around the start to which a larger map is cut [m].
 _SPACING, _HALF_WINDOW, _MOST_NODES = 0.1, 30.0, 300_000
@@ -26,12 +25,12 @@ class Roads:
         rng: Random generator, which chooses a part with probability proportional to the number of its nodes.
     """
 
-    def __init__(self, grid: OccupancyGrid, free: Bools, clearance: float, rng: Rng) -> None:
+    def __init__(self, grid: OccupancyGrid, free: Flags, clearance: float, rng: Rng) -> None:
         from scipy.ndimage import distance_transform_edt, label
 
         wanted = clearance / grid.resolution + math.sqrt(0.5)
         self._grid = grid
-        self._open: Bools = distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] >= wanted
+        self._open: Flags = distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] >= wanted
         self._stride = max(round(_SPACING / grid.resolution), 1)
         nodes = self._open[:: self._stride, :: self._stride]
         parts, _ = label(nodes)
@@ -101,7 +100,7 @@ class Roads:
         return bool(self._open[rows, cols].all())
 
 
-def _graph_of(chosen: Bools, nodes: NDArray[np.intp]) -> object:
+def _graph_of(chosen: Flags, nodes: NDArray[np.intp]) -> object:
     """Return the sparse matrix of distances between neighbouring nodes, diagonals included."""
     from scipy.sparse import csr_matrix
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense._util.typing import Flags, Floats
 from gpusense.backends import Selection
 from gpusense.evaluation.simulation.changes import change_world, make_glass
 from gpusense.evaluation.simulation.crowd import Crowd
@@ -24,8 +25,6 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.scanner import Scanner
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool]
 Rng = np.random.Generator
 
 READINGS = BeamParameters(z_hit=0.97, z_short=0.01, z_max=0.01, z_rand=0.01, sigma_hit=0.02, lambda_short=0.5)
@@ -64,8 +63,8 @@ class SimulatedRun:
     odometry: Floats
     scans: Floats
     expected: Floats
-    hidden: Bools
-    kidnapped: Bools
+    hidden: Flags
+    kidnapped: Flags
     people: tuple[Floats, ...]
 
     def __repr__(self) -> str:
@@ -193,7 +192,7 @@ def _planned(
     clearance: float,
     rates: tuple[float, float],
     rng: Rng,
-) -> tuple[Floats, Bools]:
+) -> tuple[Floats, Flags]:
     """Return true poses along planned paths, and whether the robot was carried to each."""
     roads = Roads(world, world.free & grid.free if same else world.free, clearance, rng)
     when = np.zeros(count, bool)
@@ -210,7 +209,7 @@ def _planned(
     return np.concatenate(parts), when
 
 
-def _given(path: Floats, jumps: int) -> tuple[Floats, Bools]:
+def _given(path: Floats, jumps: int) -> tuple[Floats, Flags]:
     """Return the poses of a path without kidnaps."""
     if not len(path):
         raise ValueError("path: must hold at least one pose, got shape (0, 3)")
@@ -239,8 +238,8 @@ def _cast(world: OccupancyGrid, scanner: Scanner, poses: Floats, backend: Select
 
 
 def _with_people(
-    walls: Floats, scanner: Scanner, poses: Floats, kidnapped: Bools, crowd: Crowd
-) -> tuple[Floats, Bools, list[Floats]]:
+    walls: Floats, scanner: Scanner, poses: Floats, kidnapped: Flags, crowd: Crowd
+) -> tuple[Floats, Flags, list[Floats]]:
     """Return ranges to the nearest wall or person, the beams that people hide, and the people's discs."""
     expected, hidden, discs = walls.copy(), np.zeros(walls.shape, bool), []
     lasers = compose_poses(poses, scanner.mount)

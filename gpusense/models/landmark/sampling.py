@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.typing import Floats
 from gpusense.models.landmark.features import wrapped
 from gpusense.models.point.sampling import (
     LANDMARKS,
@@ -22,7 +23,6 @@ from gpusense.world.line_map import LineMap
 from gpusense.world.parameters import LandmarkParameters
 from gpusense.world.sensor_parameters import LineParameters
 
-Floats = NDArray[np.float64]
 Span = tuple[float, float]
 
 

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util import checks
+from gpusense._util.typing import Floats
 from gpusense.backends import arrays
 from gpusense.backends.base import Backend
 from gpusense.reference.heading import cos_sin
 from gpusense.reference.philox import random_words
 from gpusense.reference.sampling import fine_uniform
 
-Floats = NDArray[np.float64]
 Distribution = Callable[[Floats], Floats]
 # Seeds are keys of Philox: two words of 32 bits.
 MOST_SEED, MOST_STEP = (1 << 64) - 1, (1 << 31) - 1

@@ -14,13 +14,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import erf, erfcx
 
+from gpusense._util.typing import Reals
 from gpusense.world.hit_shapes import NORMAL, SHAPES, HitShape, NormalHit
 from gpusense.world.range_causes import NoReturn, RandomDensity, ShortDensity
-
-Floats = NDArray[np.floating]
 
 _ROOT_HALF = math.sqrt(0.5)
 _ROOT_2PI = math.sqrt(2 * math.pi)
@@ -208,13 +207,13 @@ def naive_log_mixture(
         return _scalar(np.log(np.where(z >= range_max, top, p + rand / range_max)))
 
 
-def _moments(expected: Floats, bias: Floats, sigma: Floats, growth: Floats, range_max: Floats) -> tuple[Floats, Floats]:
+def _moments(expected: Reals, bias: Reals, sigma: Reals, growth: Reals, range_max: Reals) -> tuple[Reals, Reals]:
     """Return mean and standard deviation of a correct range; without an offset the mean may be any number."""
     mean = np.where(bias == 0, expected, np.clip(expected + bias, 0, range_max))
     return mean, sigma + growth * np.maximum(expected, 0)
 
 
-def _log_other_hit(z: Floats, expected: Floats, sigma: Floats, range_max: Floats, shape: HitShape) -> Floats:
+def _log_other_hit(z: Reals, expected: Reals, sigma: Reals, range_max: Reals, shape: HitShape) -> Reals:
     """Return the log density of a hit that is not normal; see log_hit."""
     real = z.dtype.type
     with np.errstate(all="ignore"):
@@ -232,7 +231,7 @@ def _log_other_hit(z: Floats, expected: Floats, sigma: Floats, range_max: Floats
     return np.where(np.isnan(z + expected), real(np.nan), np.where((z < 0) | (z > range_max), real(-np.inf), log_p))
 
 
-def _mass_beyond(begin: Floats, width: Floats, shape: HitShape) -> Floats:
+def _mass_beyond(begin: Reals, width: Reals, shape: HitShape) -> Reals:
     """Return the integral of exp(E(begin) - E(u)) from ``begin`` >= 0 over a width > 0."""
     real = begin.dtype.type
     # The first panel has the length over which the density falls, or bends at its top.
@@ -250,7 +249,7 @@ def _mass_beyond(begin: Floats, width: Floats, shape: HitShape) -> Floats:
     return total
 
 
-def _log_tail(u: Floats, a: Floats, w: Floats, sigma: Floats) -> Floats:
+def _log_tail(u: Reals, a: Reals, w: Reals, sigma: Reals) -> Reals:
     """Return ``-u (a + u / 2) - log(sigma I)`` for a >= 0; see log_hit."""
     real = u.dtype.type
     fall = w * (a + real(0.5) * w)
@@ -261,11 +260,11 @@ def _log_tail(u: Floats, a: Floats, w: Floats, sigma: Floats) -> Floats:
     ruled = np.zeros_like(w)
     for weight, v in zip(_WEIGHTS, nodes, strict=True):
         ruled += real(0.5 * weight) * w * np.exp(-v * (a + real(0.5) * v))
-    log_p: Floats = -u * (a + real(0.5) * u) - np.log(sigma * np.where(fall > 1, scaled, ruled))
+    log_p: Reals = -u * (a + real(0.5) * u) - np.log(sigma * np.where(fall > 1, scaled, ruled))
     return log_p
 
 
-def _arrays(*values: ArrayLike) -> tuple[Floats, ...]:
+def _arrays(*values: ArrayLike) -> tuple[Reals, ...]:
     """Broadcast arguments to one shape and dtype: float32 if the widest array is float32, else float64.
 
     Python numbers take the dtype of the arrays.
@@ -276,6 +275,6 @@ def _arrays(*values: ArrayLike) -> tuple[Floats, ...]:
     return tuple(np.broadcast_arrays(*(np.asarray(value, real) for value in arrays)))
 
 
-def _scalar(array: Floats) -> Any:
+def _scalar(array: Reals) -> Any:
     """Convert an array of shape () to a NumPy scalar."""
     return array[()]

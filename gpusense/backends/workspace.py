@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+import os
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any, TypeVar
 
@@ -16,8 +16,8 @@ T = TypeVar("T")
 
 # Number of programs of earlier calls that are kept.
 _MOST_KEPT = 64
-# Numbers between the beginnings of arrays that are uploaded as one: at least 256 bytes.
-_ALIGNED = 64
+# Alignment of arrays that are uploaded as one [bytes].
+_ALIGNED = 256
 # The non-finite flag of poses on the device.
 POSE_STATUS = ("pose_status", np.dtype(np.int32))
 
@@ -31,58 +31,57 @@ class ChangingProgram:
 
     def __init__(self, backend: Backend, program: Program, changing: Iterable[str]) -> None:
         names = frozenset(changing)
-        self._backend, self.flags = backend, flags_of(program)
+        self._backend, self._process, self.flags = backend, os.getpid(), flags_of(program)
         self._launches = [
-            (one.kernel, one.flags, one.size, one.without(names).arguments, one.places(names)) for one in program
+            (backend.compile(one.kernel, one.flags), one.size, one.without(names).arguments, one.places(names))
+            for one in program
         ]
 
     def __call__(self, changing: dict[str, Any]) -> None:
         """Start it with the arguments of a call; a launch does not wait for the arguments of the next."""
-        compiled = self._backend.compile
-        for kernel, flags, size, fixed, places in self._launches:
+        if os.getpid() != self._process:
+            self._backend.check_process()
+        for start, size, fixed, places in self._launches:
             arguments = list(fixed)
             for place, name in places:
                 arguments[place] = changing[name]
-            # A backend that watches another backend sees each launch here.
-            compiled(kernel, flags)(size, *arguments)
+            start(size, *arguments)
 
 
 class PartialResult:
-    """Context with the buffer in which launches write ``count`` numbers of a flat or external array."""
+    """``count`` numbers of a flat or external array.
+
+    Attributes:
+        buffer: The buffer in which launches write them.
+    """
 
     def __init__(
         self, space: Workspace, name: str, target: np.ndarray | Buffer, first: int, count: int, dtype: np.dtype
     ) -> None:
-        backend = space.backend
-        self._space, self._backend, self._target, self._first, self._count = space, backend, target, first, count
-        self._begin = begin = first * dtype.itemsize
+        self._space, self._target, self._part = space, target, slice(first, first + count)
+        self._begin, self._bytes = first * dtype.itemsize, count * dtype.itemsize
         # Parts can begin only at aligned bytes.
-        self._in_place = not isinstance(target, np.ndarray) and begin % backend.alignment == 0
+        in_place = not isinstance(target, np.ndarray) and self._begin % space.backend.alignment == 0
         if isinstance(target, np.ndarray):
-            self._buffer = space.empty(name, count, dtype)
-        elif self._in_place:
-            self._buffer = backend.part(target, first, count, dtype)
+            self.buffer = space.empty(name, count, dtype)
+        elif in_place:
+            self.buffer, self._target = space.backend.part(target, first, count, dtype), None
         else:
-            self._buffer = space.empty(f"{name} external", count, dtype, external=True)
-        self._bytes = count * dtype.itemsize
+            self.buffer = space.empty(f"{name} external", count, dtype, external=True)
 
-    def __enter__(self) -> Buffer:
-        return self._buffer
-
-    def __exit__(self, kind: object, *error: object) -> None:
-        if kind is not None or self._in_place:
-            return
+    def deliver(self) -> None:
+        """Start copying them to the array."""
         if isinstance(self._target, np.ndarray):
-            self._space.download(self._buffer, self._target[self._first : self._first + self._count])
-        else:
-            self._backend.copy(self._buffer, self._target, self._bytes, to=self._begin)
+            self._space.download(self.buffer, self._target[self._part])
+        elif self._target is not None:
+            self._space.backend.copy(self.buffer, self._target, self._bytes, to=self._begin)
 
 
 class Workspace:
     """Named buffers that only grow, and programs that use them."""
 
     def __init__(self, backend: Backend) -> None:
-        self.backend = self._backend = backend
+        self.backend = backend
         self._buffers: dict[tuple[str, np.dtype], tuple[int, Buffer]] = {}
         # Host arrays that unfinished copies read or write.
         self._busy: list[np.ndarray] = []
@@ -95,14 +94,14 @@ class Workspace:
 
     def __enter__(self) -> Workspace:
         """Begin a call; its launches and copies are a batch where the device has graphs."""
-        if self._backend.info.graphs:
-            self._backend.begin_batch()
+        if self.backend.info.graphs:
+            self.backend.begin_batch()
         return self
 
     def __exit__(self, kind: object, *error: object) -> None:
         try:
-            if self._backend.info.graphs:
-                self._backend.end_batch()
+            if self.backend.info.graphs:
+                self.backend.end_batch()
         except BaseException:
             self._held.clear()
             raise
@@ -120,7 +119,7 @@ class Workspace:
 
     def submit(self) -> None:
         """Start the work of the call that is deferred so far."""
-        self._backend.submit()
+        self.backend.submit()
 
     def run(
         self, key: Hashable, changing: dict[str, Any], make: Callable[[], Program], *, version: int
@@ -136,7 +135,7 @@ class Workspace:
         Returns:
             The flags of its launches.
         """
-        backend = self._backend
+        backend = self.backend
         records = backend.info.graphs and backend.in_batch
         if version != self._version:
             # In this order, so that an interrupt in between leaves no programs of the old table.
@@ -169,7 +168,7 @@ class Workspace:
 
     def _identity(self, value: Any) -> Hashable:
         """Return a number or struct unchanged, and a buffer by its address."""
-        return value if value is None or isinstance(value, (int, float, tuple)) else self._backend.address(value)
+        return value if value is None or isinstance(value, (int, float, tuple)) else self.backend.address(value)
 
     def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False, external: bool = False) -> Buffer:
         """Return a buffer of at least ``count`` numbers; its old contents are lost."""
@@ -180,9 +179,9 @@ class Workspace:
             capacity = max(count, capacity + capacity // 2, 1)
             buffer = None
             if external:
-                buffer = self._backend.empty_external(capacity, dtype)
+                buffer = self.backend.empty_external(capacity, dtype)
             else:
-                buffer = self._backend.empty(capacity, dtype, zero=zero)
+                buffer = self.backend.empty(capacity, dtype, zero=zero)
             self._buffers[name, dtype] = (capacity, buffer)
         return buffer
 
@@ -197,7 +196,7 @@ class Workspace:
         capacity, buffer = self._buffers.get((name, array.dtype), (0, None))
         if buffer is None or capacity < array.size:
             buffer = self.empty(name, array.size, array.dtype)
-        return self._backend.upload(array, buffer, wait=False)
+        return self.backend.upload(array, buffer, wait=False)
 
     def hold(self, name: str, key: Hashable, make: Callable[[], np.ndarray]) -> Buffer:
         """Return a buffer with an array that ``make`` returns; it is copied unless the last one had an equal key.
@@ -213,42 +212,38 @@ class Workspace:
         return buffer
 
     def upload_all(self, name: str, arrays: Sequence[np.ndarray]) -> list[Buffer]:
-        """Upload arrays of one dtype, none of them empty; a batch copies them as one."""
-        if not (self._backend.info.graphs and self._backend.in_batch):
-            return [*map(self.upload, _numbered(name, len(arrays)), arrays)]
-        sizes = tuple([array.size for array in arrays])
+        """Start copying arrays of one dtype, none of them empty, as one."""
+        sizes, dtype = tuple([array.size for array in arrays]), arrays[0].dtype
+        aligned = max(_ALIGNED, self.backend.alignment) // dtype.itemsize
         firsts, total = [], 0
         for size in sizes:
             firsts.append(total)
-            total += -(-size // _ALIGNED) * _ALIGNED
-        packed = np.empty(total, arrays[0].dtype)
+            total += -(-size // aligned) * aligned
+        packed = np.empty(total, dtype)
         for first, array in zip(firsts, arrays, strict=True):
             packed[first : first + array.size] = array.reshape(-1)
-        buffer = self.upload(name, packed)
-        key = (name, packed.dtype, sizes)
+        buffer, key = self.upload(name, packed), (name, dtype, sizes)
         parts = self._parts.get(key)
         if parts is None:
             if len(self._parts) >= _MOST_KEPT:
                 self._parts.clear()
-            parts = [
-                self._backend.part(buffer, first, size, packed.dtype) for first, size in zip(firsts, sizes, strict=True)
-            ]
+            parts = [self.backend.part(buffer, *part, dtype) for part in zip(firsts, sizes, strict=True)]
             self._parts[key] = parts
         return parts
 
     def download(self, buffer: Buffer, out: np.ndarray) -> None:
         """Start copying the beginning of a buffer into a C-contiguous array, filled after ``wait``."""
         self._busy.append(out)
-        self._backend.download(buffer, out, wait=False)
+        self.backend.download(buffer, out, wait=False)
 
     def read(self, buffer: Buffer, out: np.ndarray) -> None:
         """Copy the head of a buffer into a C-contiguous array, after all copies and launches, and wait for it."""
-        self._backend.download(buffer, out)
+        self.backend.download(buffer, out)
         self._busy.clear()
 
     def wait(self) -> None:
         """Wait for all copies and launches."""
-        self._backend.synchronize()
+        self.backend.synchronize()
         self._busy.clear()
 
     def _forget(self) -> None:
@@ -262,9 +257,3 @@ class Workspace:
         self._forget()
         self._held.clear()
         self._buffers = {key: kept for key, kept in self._buffers.items() if key[0] == keep}
-
-
-@functools.cache
-def _numbered(name: str, count: int) -> tuple[str, ...]:
-    """Return names of arrays that are uploaded together."""
-    return tuple(f"{name} {number}" for number in range(count))

@@ -22,8 +22,8 @@ from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.tables.reachable import MapState, ReachableMap
 from gpusense.tables.world_index import InWorlds, WorldIndex
-from gpusense.world.frames import Cells, Mount, frame_of, place_poses
-from gpusense.world.windows import Corners, Window, extent
+from gpusense.world.frames import frame_of, place_poses
+from gpusense.world.windows import Corners, Frame, extent
 
 _INT = np.dtype(np.int32)
 _SINGLE, _DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
@@ -152,14 +152,6 @@ class Poses:
         return copied
 
 
-class Frame(NamedTuple):
-    """The frame in which poses are placed."""
-
-    window: Window  # the part of the map that the table covers
-    cells: Cells  # the map's shape, resolution and origin
-    mount: Mount  # the sensor's pose on the robot; its yaw belongs to the bearings
-
-
 class PlacedPoses(NamedTuple):
     """Sensor poses in the frame of a window, on the device."""
 
@@ -229,7 +221,8 @@ class PlacedPoses(NamedTuple):
 
     def changing(self) -> dict[str, object]:
         """Return the arguments of ``place_in_worlds`` that change from call to call, by name."""
-        return {} if self.inside is None else dict(index=self.inside.index, ignore=self.inside.ignore)
+        assert self.inside is not None
+        return dict(index=self.inside.index, ignore=self.inside.ignore)
 
     def places(self) -> dict[str, object]:
         """Return the arguments of kernels that cast rays in worlds, by name."""
@@ -269,15 +262,16 @@ class PlacedPoses(NamedTuple):
 
 
 def place(
-    poses: Poses, part: Part, frame: Frame, backend: Backend, space: Workspace, real: np.dtype, *,
-    careful: bool = False, sees: bool = False,
+    poses: Poses, part: Part, frame: Frame, backend: Backend, space: Workspace, real: np.dtype,
+    corners: Corners | None = None, *, careful: bool = False, sees: bool = False,
 ) -> PlacedPoses:  # fmt: skip
     """Upload some poses, and describe their placement in the frame of a window.
 
-    ``part``: the first of them and the one after the last; ``careful``: True if low parts are needed; ``sees``:
-    True if they cast rays, which need the sights of poses in worlds with shapes.
+    ``part``: the first of them and the one after the last; ``corners``: corners of their box, if the caller has them;
+    ``careful``: True if low parts are needed; ``sees``: True if they cast rays, which need the sights of poses in
+    worlds with shapes.
     """
-    count, corners = part[1] - part[0], poses.corners(part, backend, space)
+    count, corners = part[1] - part[0], corners or poses.corners(part, backend, space)
     flags = poses.flags(corners)
     source, lows = poses.buffer(backend, space, part), 4 * count if careful else 4
     inside = None if poses.inside is None else poses.inside.buffers(backend, space, part, sees=sees)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -11,9 +12,9 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.interface.plan import Omission, share
 from gpusense.world import windows
-from gpusense.world.frames import Mount
+from gpusense.world.frames import Mount, plain_cells
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.windows import Corners, Window
+from gpusense.world.windows import Corners, Frame, Window
 
 ObstaclesOf = Callable[[OccupancyGrid, str], np.ndarray]
 """Function that returns an (H, W) mask from a grid and the state of unknown cells."""
@@ -36,12 +37,18 @@ class MapState:
     """Map and table; a single assignment replaces both, so that no interrupt can separate them."""
 
     grid: OccupancyGrid  # the map
+    mount: Mount  # the sensor's pose on the robot [m, m, rad]
     obstacles: np.ndarray | None = None  # (H, W) mask of the map; None if an interrupted update may have written to it
     shared: bool = True  # true if the array of obstacles belongs to the grid and is read-only
     table: Buffer = None  # the table, or None
     window: Window = _NOWHERE  # the table's window; empty without a table
     preparations: int = 0  # number of tables made
     version: int = 0  # counter of changes
+
+    @functools.cached_property
+    def frame(self) -> Frame:
+        """The frame of poses in the table's window."""
+        return Frame(self.window, plain_cells(self.grid), self.mount)
 
 
 class ReachableMap:
@@ -77,11 +84,11 @@ class ReachableMap:
         obstacles_of: ObstaclesOf = obstacles_of,
         neighbors: int = 0,
     ) -> None:
-        self._backend, self._mount, self._reach, self._crop = backend, mount, reach, crop
+        self._backend, self._reach, self._crop = backend, reach, crop
         self._prepare, self._refresh, self._unknown = prepare, refresh, unknown
         self._mask_of, self._neighbors = obstacles_of, neighbors
         self._whole = windows.whole(grid)
-        self._state = MapState(grid, self._obstacles_of(grid))
+        self._state = MapState(grid, mount, self._obstacles_of(grid))
 
     @property
     def grid(self) -> OccupancyGrid:
@@ -127,7 +134,7 @@ class ReachableMap:
         if self._state.window is self._whole and self._state.table is not None:
             return self._state
         if self._crop and corners is not None:
-            window = windows.choose(self.grid, self.window, corners, self._mount, self._reach)
+            window = windows.choose(self.grid, self.window, corners, self._state.mount, self._reach)
         else:
             window = self._whole
         window = self._whole if window == self._whole else window

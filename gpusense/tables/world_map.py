@@ -10,8 +10,9 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.tables.world_index import WorldIndex
 from gpusense.tables.worlds import Worlds
+from gpusense.world.frames import Mount, plain_cells
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.windows import Window
+from gpusense.world.windows import Frame, Window
 
 
 class WorldMap:
@@ -20,13 +21,15 @@ class WorldMap:
     Attributes:
         grid: The worlds.
         window: A window of the size of the largest world.
+        frame: The frame of poses in it.
         table: The table; None before it is made.
     """
 
-    def __init__(self, worlds: Worlds, make: Callable[[], Buffer]) -> None:
+    def __init__(self, worlds: Worlds, mount: Mount, make: Callable[[], Buffer]) -> None:
         self.grid, self._make, self.version, self.preparations = worlds, make, 0, 0
         self.table: Buffer = None
         self.window = Window(0, 0, *worlds.shape)
+        self.frame = Frame(self.window, plain_cells(worlds), mount)
         worlds.watch(self)
 
     def ensure(self, corners: object) -> WorldMap:

@@ -111,4 +111,6 @@ def place_poses(poses: np.ndarray, grid: Cells, mount: Mount, real: np.dtype) ->
 def ray_vectors(bearings: np.ndarray, mount: Mount) -> np.ndarray:
     """Return (K, 2) float64 cosines and sines of the bearings in the robot's frame, the mount's yaw included."""
     turned = bearings + mount[2] if mount[2] != 0.0 else bearings
-    return np.stack([np.cos(turned), np.sin(turned)], axis=-1)
+    vectors = np.empty((*turned.shape, 2))
+    vectors[..., 0], vectors[..., 1] = np.cos(turned), np.sin(turned)
+    return vectors

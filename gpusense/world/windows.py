@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -79,6 +80,14 @@ class Window(structs.Window):
     def cut(self, array: np.ndarray) -> np.ndarray:
         """Return the part of an (H, W) array in this window, as a view."""
         return array[self.row : self.row + self.rows, self.col : self.col + self.cols]
+
+
+class Frame(NamedTuple):
+    """The frame in which poses are placed."""
+
+    window: Window  # the part of the map that the table covers
+    cells: Cells  # the map's shape, resolution and origin
+    mount: Mount  # the sensor's pose on the robot; its yaw belongs to the bearings
 
 
 def box(cells: np.ndarray) -> Window | None:

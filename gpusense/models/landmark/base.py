@@ -23,9 +23,9 @@ from gpusense.models.landmark.features import PreparedFeatures, check_correspond
 from gpusense.models.landmark.plan import feature_omissions, looked_at
 from gpusense.models.landmark.tables import LandmarkTables
 from gpusense.models.point.base import PointModel
-from gpusense.models.poses import Frame, Part, PlacedPoses, Poses, place
+from gpusense.models.poses import Part, PlacedPoses, Poses, place
 from gpusense.world.landmarks import Buckets
-from gpusense.world.windows import Window
+from gpusense.world.windows import Frame, Window
 
 # Limits of the joint association, which tries every landmark with each of 2^features sets.
 JOINT_FEATURES = 8

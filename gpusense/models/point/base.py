@@ -151,16 +151,17 @@ class PointModel(Pickled):
         result = Result(poses, out, (count,), real, backend, on_device=on_device)
 
         def score(piece: Piece) -> None:
-            with PartialResult(space, "log_p", result.flat, piece.begin, piece.count, real) as log_p:
-                if program is None:
-                    # Poses that are not finite are refused even without a measurement.
-                    _, launches = self._relative(checked, piece.part, "place_relative", ORIGIN)
-                    backend.run(launches)
-                    backend.upload(np.zeros(piece.count, real), log_p)
-                else:
-                    launches = program(checked, piece.part, log_p)
-                    self._last_code = flags_of(launches)
-                    backend.run(launches)
+            log_p = PartialResult(space, "log_p", result.flat, piece.begin, piece.count, real)
+            if program is None:
+                # Poses that are not finite are refused even without a measurement.
+                _, launches = self._relative(checked, piece.part, "place_relative", ORIGIN)
+                backend.run(launches)
+                backend.upload(np.zeros(piece.count, real), log_p.buffer)
+            else:
+                launches = program(checked, piece.part, log_p.buffer)
+                self._last_code = flags_of(launches)
+                backend.run(launches)
+            log_p.deliver()
             after(piece.part)
 
         with self._lock, space:

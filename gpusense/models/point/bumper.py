@@ -22,12 +22,12 @@ from gpusense.interface.structs import ContactTerms, packed
 from gpusense.models.arguments import map_words
 from gpusense.models.point.base import DIGITS, PointModel, exact, two_parts
 from gpusense.models.point.sampling import BUMPER, draws_at
-from gpusense.models.poses import Frame, Part, Poses, place
+from gpusense.models.poses import Part, Poses, place
 from gpusense.tables.distances import squared_distances
 from gpusense.world.frames import split
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.sensor_parameters import BumperParameters
-from gpusense.world.windows import LONGEST_SIDE, Window
+from gpusense.world.windows import LONGEST_SIDE, Frame, Window
 
 # Margin around the map and the outline: this number of deviations, at most this number of cells.
 _DEVIATIONS, _MOST_MARGIN = 4, 64

@@ -20,7 +20,7 @@ from gpusense.backends.programs import ProgramCache, RecordedProgram
 from gpusense.backends.workspace import POSE_STATUS, Workspace
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.launches import Program
-from gpusense.models.chunking import chunk_of, finish
+from gpusense.models.chunking import finish
 from gpusense.models.poses import Poses
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.readings import Readings, device_readings, device_scans
@@ -135,8 +135,7 @@ class RecordedCall(BoundCall):
             self._readings = self._placed_readings(adopted, adopted.dtype if limits is None else limits)
         # Pieces begin where parts of buffers can.
         whole = max(backend.alignment // _INT.itemsize, 1)
-        each = pipeline.numbers_each(self._readings.readings, self._poses)
-        chunk = chunk_of(backend, each, pipeline.kept_bytes(per_beam=per_beam))
+        chunk = pipeline.most_particles(self._readings.readings, inside, per_beam=per_beam)
         self._chunk = -(-chunk // whole) * whole
         # The program for the current map, by the version of the map's table.
         self._programs = ProgramCache[RecordedProgram](1)

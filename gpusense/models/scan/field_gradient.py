@@ -16,7 +16,7 @@ from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.signatures.rows import LANES
 from gpusense.interface.structs import ScanBatch, Score
-from gpusense.models.chunking import Piece, chunk_of, run_pieces
+from gpusense.models.chunking import Piece, run_pieces
 from gpusense.models.poses import PlacedPoses, Poses
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.field_pipeline import FieldPipeline
@@ -50,7 +50,7 @@ class Gradients:
         if self._groups is None:
             self._groups = [group for group in pipeline.groups(request) if group[0].count]
         for particles, scans in self._groups:
-            most = chunk_of(pipeline.backend, 4 * scans.most_readings, pipeline.kept_bytes())
+            most = pipeline.most_particles(4 * scans.most_readings, None)
             run_pieces(self._space, particles, most, partial(self._score, request, particles, scans, result))
         return result
 

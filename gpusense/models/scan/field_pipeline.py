@@ -81,7 +81,8 @@ class FieldPipeline(ScanPipeline):
         self.worlds = grid if isinstance(grid, Worlds) else None
         if isinstance(grid, Worlds):
             worlds = check_worlds(grid, self.backend)
-            self.map = cast(ReachableMap, WorldMap(worlds, lambda: self.table.of_worlds(worlds, unknown)))
+            made = WorldMap(worlds, self.scanner.mount, lambda: self.table.of_worlds(worlds, unknown))
+            self.map = cast(ReachableMap, made)
             return
         self.map = ReachableMap(
             self.backend, grid, unknown, self.scanner.mount, reach, self.table.make, self.specialize,

@@ -19,7 +19,7 @@ from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.structs import RangeScale
 from gpusense.models.chunking import Piece, chunk_of, finish, run_pieces
-from gpusense.models.poses import Frame, PlacedPoses, Poses, place
+from gpusense.models.poses import PlacedPoses, Poses, place
 from gpusense.models.scan import tiles
 from gpusense.models.scan.cones import LASER, Cones
 from gpusense.models.scan.sampling import Drawing
@@ -30,7 +30,7 @@ from gpusense.tables.reachable import MapState, ObstaclesOf, ReachableMap, Table
 from gpusense.tables.rectangles import rectangles_of_worlds
 from gpusense.tables.world_map import WorldMap, check_worlds, index_of
 from gpusense.tables.worlds import Worlds
-from gpusense.world.frames import Mount, plain_cells
+from gpusense.world.frames import Mount
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.windows import Window
 
@@ -77,7 +77,7 @@ class MapCaster:
             if not isinstance(method, casters.Exact):
                 raise ValueError(f"caster: must be 'exact' in Worlds, got {method.name!r}")
             # The same interface, with the table of all worlds.
-            self.map = cast(ReachableMap, WorldMap(check_worlds(grid, backend), self._prepare_worlds))
+            self.map = cast(ReachableMap, WorldMap(check_worlds(grid, backend), mount, self._prepare_worlds))
         else:
             self.map = ReachableMap(
                 backend, grid, unknown, mount, self.limit + method.beyond, self._prepare, crop and not method.whole,
@@ -89,9 +89,6 @@ class MapCaster:
         # Include the table's flags once it is made.
         self.flags = self._fixed_flags
         self._precision_flags = flags_if(FLOAT64=real == np.float64)
-        # The frame of the last state of the map.
-        self._framed: tuple[object, object] = (None, None)
-        self._frame: Frame
         self._workspace = Workspace(backend)
         # Threads may share a caster: its buffers serve one call at a time.
         self._lock = threading.Lock()
@@ -238,10 +235,11 @@ class MapCaster:
         space, count, info = self._workspace, piece.count, self.backend.info
         placed, state = self._place(poses, piece)
         cosines = space.empty("cosines", count * rays if "INCIDENCE" in cones.flags else 1, self.real)
-        with PartialResult(space, "ranges", flat, piece.begin * rays, count * rays, self.real) as result:
-            self._run(placed, state, ray, rays, cones, self._flags(placed, cones) | {"COSINES"}, result, cosines)
-            if info.float64:
-                self.backend.run((drawing.launch(space, piece.begin, count, rays, result, cosines),))
+        result = PartialResult(space, "ranges", flat, piece.begin * rays, count * rays, self.real)
+        self._run(placed, state, ray, rays, cones, self._flags(placed, cones) | {"COSINES"}, result.buffer, cosines)
+        if info.float64:
+            self.backend.run((drawing.launch(space, piece.begin, count, rays, result.buffer, cosines),))
+        result.deliver()
         if not info.float64:
             incidence = np.zeros(count * rays if drawing.bins > 1 else 1, self.real)
             space.download(cosines, incidence)
@@ -251,19 +249,18 @@ class MapCaster:
     def _cast(self, poses: Poses, piece: Piece, ray: Buffer, rays: int, flat: Any, cones: Cones) -> None:
         space, count = self._workspace, piece.count
         placed, state = self._place(poses, piece)
-        with PartialResult(space, "ranges", flat, piece.begin * rays, count * rays, self.real) as result:
-            other = space.empty("echoes", count * rays if "INCIDENCE" in cones.flags else 1, self.real)
-            both = (other, result) if cones.incidence else (result, other)
-            self._run(placed, state, ray, rays, cones, self._flags(placed, cones), *both)
+        result = PartialResult(space, "ranges", flat, piece.begin * rays, count * rays, self.real)
+        other = space.empty("echoes", count * rays, self.real) if "INCIDENCE" in cones.flags else None
+        both = (other, result.buffer) if cones.incidence else (result.buffer, other)
+        self._run(placed, state, ray, rays, cones, self._flags(placed, cones), *both)
+        result.deliver()
 
     def _place(self, poses: Poses, piece: Piece) -> tuple[PlacedPoses, MapState]:
         """Place the poses of a piece in a window of the map; also return the map with its table."""
-        state = self.map.ensure(poses.corners(piece.part, self.backend, self._workspace) or poses.hull)
-        # Not the state itself, which keeps its table alive.
-        if self._framed[0] is not state.grid or self._framed[1] is not state.window:
-            self._framed = state.grid, state.window
-            self._frame = Frame(state.window, plain_cells(state.grid), self.mount)
-        return place(poses, piece.part, self._frame, self.backend, self._workspace, self.real, sees=True), state
+        space, backend = self._workspace, self.backend
+        corners = poses.corners(piece.part, backend, space)
+        state = self.map.ensure(corners or poses.hull)
+        return place(poses, piece.part, state.frame, backend, space, self.real, corners, sees=True), state
 
     def _flags(self, placed: PlacedPoses, cones: Cones) -> frozenset[str]:
         """Return the flags that cast the rays of placed poses; the poses must have been placed."""
@@ -277,7 +274,8 @@ class MapCaster:
         """Cast the rays of placed poses to ranges and, with INCIDENCE, angles of incidence; repeat kept programs."""
         normals = self.normals(state.window, cones.flags)
         changing = dict(poses=placed.source, ranges=ranges, incidence=incidence, normals=normals)
-        changing |= placed.changing()
+        if placed.inside is not None:
+            changing |= placed.changing()
         gpu = self.backend.info.kind == "gpu" and "CONES" not in flags
         # Each run uploads the order's initial bounds.
         order = tiles.order_of(self._workspace, placed, rays, self.real) if gpu else None

@@ -21,7 +21,7 @@ from gpusense.backends.workspace import Workspace
 from gpusense.interface.launches import Program
 from gpusense.interface.structs import ScanBatch, Score
 from gpusense.models.chunking import Piece, chunk_of
-from gpusense.models.poses import Frame, Part, PlacedPoses, Poses, place
+from gpusense.models.poses import Part, PlacedPoses, Poses, place
 from gpusense.models.scan.classed import ClassedScans, check_ranges, class_scans
 from gpusense.models.scan.readings import ReadingLayout, Readings, placing_launches
 from gpusense.models.scan.rules import ModelContext
@@ -29,7 +29,6 @@ from gpusense.models.scan.tiles import Order, Parts, order_of
 from gpusense.tables.reachable import MapState, ReachableMap
 from gpusense.tables.world_index import WorldIndex
 from gpusense.tables.worlds import Worlds
-from gpusense.world.frames import plain_cells
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.plausible import look_at_poses
 
@@ -179,13 +178,9 @@ class ScanPipeline(ABC):
         self.context = context
         self.backend, self.real, self.rules = context.backend, context.real, context.rules
         self.scanner, self.specialize = context.rules.scanner, context.rules.specialize
-        self._mount = self.scanner.mount
         self._converted = context.weights.readings if context.weights.is_peer else None
         # Flags, keyed by everything on which they depend.
         self._flags: dict[Hashable, frozenset[str]] = {}
-        # The frame of the last state of the map.
-        self._framed: tuple[object, object] = (None, None)
-        self._frame: Frame
         # Flags to add and to remove while omissions are measured.
         self.trial: tuple[frozenset[str], frozenset[str]] | None = None
 
@@ -257,18 +252,14 @@ class ScanPipeline(ABC):
         """Return whether several scans may be scored by one program."""
         if request.scans < 2 or request.per_beam or not self.context.possible:
             return False
-        rays = max(self.scanner.count * self.rays_each, 1)
-        most = min(TOGETHER[self.backend.info.kind] // rays, chunk_of(self.backend, rays, self.kept_bytes()))
-        return request.per_scan <= most
+        most = TOGETHER[self.backend.info.kind] // max(self.scanner.count * self.rays_each, 1)
+        return request.per_scan <= min(most, self.most_particles(self.scanner.count, None))
 
-    def kept_bytes(self, *, per_beam: bool = False) -> float:
-        """Return the bytes that a launch keeps for each particle and ray."""
+    def most_particles(self, readings: int, inside: WorldIndex | None, *, per_beam: bool = False) -> int:
+        """Return the largest number of particles of a launch, by its rays and the sights of poses in worlds."""
+        rays = readings * self.rays_each + (0 if inside is None or self.end_points else inside.sights)
         kept = 1.0 if per_beam else self.kept_parts if self.backend.info.kind == "gpu" else 0.0
-        return self.real.itemsize * kept
-
-    def numbers_each(self, readings: int, poses: Poses) -> int:
-        """Return the rays of each particle and the numbers of its sights, which limit the particles of a launch."""
-        return readings * self.rays_each + (0 if self.end_points else poses.sights)
+        return chunk_of(self.backend, rays, self.real.itemsize * kept)
 
     # ---- readings
 
@@ -291,13 +282,13 @@ class ScanPipeline(ABC):
 
     def place(self, poses: Poses, part: Part, space: Workspace) -> tuple[PlacedPoses, MapState]:
         """Place some poses in a window of the map; also return the map with its table."""
-        state = self.map.ensure(poses.corners(part, self.backend, space) or poses.hull)
-        # Not the state itself, which keeps its table alive.
-        if self._framed[0] is not state.grid or self._framed[1] is not state.window:
-            self._framed = state.grid, state.window
-            self._frame = Frame(state.window, plain_cells(state.grid), self._mount)
-        sees = not self.end_points
-        return place(poses, part, self._frame, self.backend, space, self.real, careful=self.careful, sees=sees), state
+        corners = poses.corners(part, self.backend, space)
+        state = self.map.ensure(corners or poses.hull)
+        placed = place(
+            poses, part, state.frame, self.backend, space, self.real, corners, careful=self.careful,
+            sees=not self.end_points,
+        )  # fmt: skip
+        return placed, state
 
     # ---- program
 

@@ -11,12 +11,12 @@ import numpy as np
 from gpusense.backends.programs import RecordedProgram
 from gpusense.backends.workspace import ChangingProgram, PartialResult, Workspace
 from gpusense.models.chunking import Piece, chunk_of, run_pieces
-from gpusense.models.poses import Frame, Part, place
+from gpusense.models.poses import Part, place
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.pipeline import FLOATS, Request, ScanPipeline
 from gpusense.models.scan.readings import Readings
 from gpusense.world.range_causes import NoReturn
-from gpusense.world.windows import whole
+from gpusense.world.windows import Frame, whole
 
 _IN_LANES = frozenset({"IN_LANES"})
 
@@ -46,8 +46,7 @@ def run(pipeline: ScanPipeline, request: Request, space: Workspace, last: LastCa
         last.scans = scans
         if not particles.count:
             continue
-        each = pipeline.numbers_each(scans.most_readings, request.poses)
-        most = chunk_of(pipeline.backend, each, pipeline.kept_bytes(per_beam=request.per_beam))
+        most = pipeline.most_particles(scans.most_readings, request.poses.inside, per_beam=request.per_beam)
         run_pieces(space, particles, most, _Scorer(pipeline, request, particles, scans, space, last))
         if len(request.ranges) > 1:
             space.submit()
@@ -151,18 +150,17 @@ class _Scorer:
         """Score a piece; log-likelihoods of readings are complete on return."""
         pipeline, request, space = self._pipeline, self._request, self._space
         placed, state = pipeline.place(request.poses, piece.part, space)
-        with PartialResult(space, "log_p", request.result.flat, piece.begin, piece.count, pipeline.real) as log_p:
-            scoring = pipeline.scoring(readings, placed, state.table, log_p, space, per_beam=request.per_beam)
-            key = (scoring.flags, placed.key, readings.key)
-            changing = dict(pipeline.numbers(scoring), poses=placed.source, log_p=log_p)
-            if placed.inside is not None:
-                changing |= placed.changing()
-            # As late as possible: a processor's threads are then awake for the launches that follow.
-            if self._before is not None:
-                self._begin()
-            flags = space.run(
-                key, changing, lambda: pipeline.program(scoring), version=state.version,
-            )  # fmt: skip
+        log_p = PartialResult(space, "log_p", request.result.flat, piece.begin, piece.count, pipeline.real)
+        scoring = pipeline.scoring(readings, placed, state.table, log_p.buffer, space, per_beam=request.per_beam)
+        key = (scoring.flags, placed.key, readings.key)
+        changing = dict(pipeline.numbers(scoring), poses=placed.source, log_p=log_p.buffer)
+        if placed.inside is not None:
+            changing |= placed.changing()
+        # As late as possible: a processor's threads are then awake for the launches that follow.
+        if self._before is not None:
+            self._begin()
+        flags = space.run(key, changing, lambda: pipeline.program(scoring), version=state.version)
+        log_p.deliver()
         self._last.kernels = pipeline.kernel_names[scoring.tiles is not None]
         # Poses are placed in lanes, whatever kernel scores them.
         self._last.flags = (flags - _IN_LANES) | (scoring.flags & _IN_LANES)
@@ -180,8 +178,9 @@ class _Scorer:
             frame = Frame(whole(pipeline.grid), pipeline.grid, pipeline.scanner.mount)
             placed = place(request.poses, piece.part, frame, pipeline.backend, space, pipeline.real)
             pipeline.backend.run(placed.launches())
-            with PartialResult(space, "log_p", request.result.flat, piece.begin, piece.count, pipeline.real) as log_p:
-                pipeline.backend.upload(np.full(piece.count, value, pipeline.real), log_p)
+            log_p = PartialResult(space, "log_p", request.result.flat, piece.begin, piece.count, pipeline.real)
+            pipeline.backend.upload(np.full(piece.count, value, pipeline.real), log_p.buffer)
+            log_p.deliver()
         else:
             # Poses that are not finite are refused whatever the readings.
             request.poses.corners(piece.part, pipeline.backend)

@@ -103,10 +103,9 @@ class Watch:
 
 
 def scan_uploads(device, size: int, *counts: int) -> list[int]:
-    """Return the bytes of a scan's arrays; a batch copies all at once, each at a multiple of 64."""
-    if device.info.graphs:
-        return [sum(size * -(-count // 64) * 64 for count in counts)]
-    return [size * count for count in counts]
+    """Return the bytes of a scan's arrays, which are copied as one, each at a multiple of some bytes."""
+    aligned = max(256, device.alignment)
+    return [sum(-(-size * count // aligned) * aligned for count in counts)]
 
 
 def call_of(what: str, device, precision: str):

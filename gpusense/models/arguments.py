@@ -11,7 +11,8 @@ from typing import Any, Self, cast
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.backends import Backend, Selection
+from gpusense._util.typing import Precision
+from gpusense.backends import Backend, BackendInfo, Selection
 from gpusense.tables.worlds import Worlds
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.plausible import look_at_scene
@@ -79,11 +80,31 @@ class Pickled(ABC):
     """
 
     _selection: Selection
+    _backend: Backend
+    _real: np.dtype
+
+    def __repr__(self) -> str:
+        parts = (*self._options(), f"precision={self.precision!r}", f"backend={self.device.selection!r}")
+        return f"{type(self).__name__}({', '.join(parts)})"
 
     @property
-    @abstractmethod
     def backend(self) -> Backend:
         """The backend that holds the buffers."""
+        return self._backend
+
+    @property
+    def device(self) -> BackendInfo:
+        """The device for which the kernels are compiled."""
+        return self._backend.info
+
+    @property
+    def precision(self) -> Precision:
+        """``"float32"`` or ``"float64"``."""
+        return cast(Precision, self._real.name)
+
+    def _options(self) -> tuple[str, ...]:
+        """Return the map and the options, except precision and backend, as ``repr`` shows them."""
+        return ()
 
     @abstractmethod
     def _arguments(self) -> dict[str, Any]:

@@ -7,16 +7,15 @@ import threading
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
 from decimal import Decimal, localcontext
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from gpusense._util import checks
 from gpusense._util.html import card, split_options
-from gpusense._util.typing import Precision
-from gpusense.backends import BackendInfo, Selection, get_backend
+from gpusense.backends import Selection, get_backend
 from gpusense.backends.arrays import Result
-from gpusense.backends.base import Backend, Buffer
+from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import PartialResult, Workspace
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, flags_of, launch
@@ -67,10 +66,6 @@ class PointModel(Pickled):
         self._last_code: frozenset[str] | None = None
         self._last_left_out: list[Omission] = []
 
-    def __repr__(self) -> str:
-        parts = (*self._options(), f"precision={self.precision!r}", f"backend={self.device.selection!r}")
-        return f"{type(self).__name__}({', '.join(parts)})"
-
     def _repr_html_(self) -> str:
         device = f"{self.device.selection} ({self.device.name}), {self.precision}"
         rows = [*split_options(self._options()), ("device", device)]
@@ -80,25 +75,6 @@ class PointModel(Pickled):
         """See Pickled; subclasses add their own."""
         names = ("parameters", "precision", "temperature")
         return {name: getattr(self, name) for name in names}
-
-    def _options(self) -> tuple[str, ...]:
-        """Return the map and the options that only this kind of model has, as ``repr`` shows them."""
-        return ()
-
-    @property
-    def device(self) -> BackendInfo:
-        """The device the model is compiled for."""
-        return self._backend.info
-
-    @property
-    def backend(self) -> Backend:
-        """The backend that holds the model's buffers."""
-        return self._backend
-
-    @property
-    def precision(self) -> Precision:
-        """``"float32"`` or ``"float64"``."""
-        return cast(Precision, self._real.name)
 
     def explain(self) -> str:
         """Report the parts left out by the readings and poses of the last call, with reasons and savings."""

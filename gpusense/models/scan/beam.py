@@ -135,7 +135,7 @@ class BeamModel(ScanModel):
         )  # fmt: skip
         return super()._arguments() | options
 
-    def _options(self) -> tuple[str, ...]:
+    def _kind_options(self) -> tuple[str, ...]:
         return (f"caster={self._caster.method}",)
 
     @property

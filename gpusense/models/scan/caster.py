@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray, CasterName, Precision, Space
-from gpusense.backends import BackendInfo, Selection, get_backend
-from gpusense.backends.base import Backend
+from gpusense.backends import Selection, get_backend
 from gpusense.models.arguments import Pickled, check_scene, map_words, real_dtype
 from gpusense.models.poses import Poses
 from gpusense.models.scan.cones import Cones, require_exact
@@ -76,17 +75,15 @@ class RayCaster(Pickled):
         self.outside = checks.choice("outside", outside, ("free", "occupied"))
         self._seen = False
         self._selection = backend
-        device = get_backend(backend)
-        real = real_dtype(precision, device)
+        self._backend = get_backend(backend)
+        self._real = real_dtype(precision, self._backend)
         self._caster = MapCaster(
-            device, real, grid, _NO_MOUNT, self.range_max, self.caster, unknown=unknown, outside=outside, crop=True
-        )
+            self._backend, self._real, grid, _NO_MOUNT, self.range_max, self.caster, unknown=unknown, outside=outside,
+            crop=True,
+        )  # fmt: skip
 
-    def __repr__(self) -> str:
-        return (
-            f"RayCaster({map_words(self.grid)}, range_max={self.range_max}, caster={self.caster}, "
-            f"precision={self.precision!r}, backend={self.device.selection!r})"
-        )
+    def _options(self) -> tuple[str, ...]:
+        return map_words(self.grid), f"range_max={self.range_max}", f"caster={self.caster}"
 
     @staticmethod
     def methods() -> tuple[type[Caster], ...]:
@@ -114,21 +111,6 @@ class RayCaster(Pickled):
         return {name: getattr(self, name) for name in names}
 
     @property
-    def backend(self) -> Backend:
-        """The backend that holds the caster's buffers."""
-        return self._caster.backend
-
-    @property
-    def device(self) -> BackendInfo:
-        """The device the caster is compiled for."""
-        return self._caster.backend.info
-
-    @property
-    def precision(self) -> Precision:
-        """``"float32"`` or ``"float64"``."""
-        return cast(Precision, self._caster.real.name)
-
-    @property
     def table_bytes(self) -> int:
         """Bytes of the map's table on the device; 0 before the first cast."""
         return self._caster.table_bytes
@@ -140,7 +122,7 @@ class RayCaster(Pickled):
             TypeError, ValueError: Poses that are not (N, 3) finite numbers.
             MemoryError: The device cannot hold the table.
         """
-        self._caster.prepare(Poses(poses, self._caster.backend))
+        self._caster.prepare(Poses(poses, self._backend))
 
     def update_map(self, cells: ArrayLike, region: Sequence[int]) -> None:
         """Replace cells of the map; a caster made with the changed grid would give the same ranges.

@@ -15,7 +15,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense._util.html import card, split_options
 from gpusense._util.typing import AnyArray, Compat, Precision
-from gpusense.backends import Backend, BackendInfo, Selection, get_backend
+from gpusense.backends import Selection, get_backend
 from gpusense.backends.programs import ProgramCache
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.plan import Plan, SceneNotes
@@ -78,14 +78,15 @@ class ScanModel(Pickled):
         self.beams = check_beams(beams, scanner.count)
         checks.boolean("specialize", specialize)
         self._selection = backend
-        device = get_backend(backend)
+        self._backend = device = get_backend(backend)
+        self._real = real_dtype(precision, device)
         rules = BeamSelection(
             scanner, ray_vectors(scanner.bearings, scanner.mount), 0.0 if weights.is_peer else z_max, self.beams,
             specialize, max_is_range=weights.is_peer, max_depends=max_depends,
             map_size=math.hypot(grid.width, grid.height),
         )  # fmt: skip
         self._context = ModelContext(
-            device, real_dtype(precision, device), rules, weights, cubes, self.temperature, constant_term,
+            device, self._real, rules, weights, cubes, self.temperature, constant_term,
             possible or cubes,
         )  # fmt: skip
         self._workspace = Workspace(device)
@@ -120,26 +121,10 @@ class ScanModel(Pickled):
             self._short.last = None
         run(self._pipeline, request, self._workspace, self._last_call)
 
-    def __repr__(self) -> str:
-        count, used = self.scanner.count, self._context.rules.choice.most
-        parts = [
-            map_words(self.grid),
-            f"beams={count}" if used == count else f"beams={used} of {count}",
-            *self._options(),
-        ]
-        parts += [] if self.compat is None else [f"compat={self.compat!r}"]
-        parts += [f"precision={self.precision!r}", f"backend={self.device.selection!r}"]
-        return f"{type(self).__name__}({', '.join(parts)})"
-
     def _repr_html_(self) -> str:
-        count, used = self.scanner.count, self._context.rules.choice.most
-        options = (*self._options(), *(() if self.compat is None else (f"compat={self.compat!r}",)))
-        rows = [
-            ("map", map_words(self.grid)),
-            ("beams", count if used == count else f"{used} of {count}"),
-            *split_options(options),
-            ("device", f"{self.device.selection} ({self.device.name}), {self.precision}"),
-        ]
+        words, *options = self._options()
+        device = f"{self.device.selection} ({self.device.name}), {self.precision}"
+        rows = [("map", words), *split_options(options), ("device", device)]
         return card(type(self).__name__, rows, detail=self.explain())
 
     def _arguments(self) -> dict[str, Any]:
@@ -148,6 +133,12 @@ class ScanModel(Pickled):
         return {name: getattr(self, name) for name in names} | {"specialize": self._context.rules.specialize}
 
     def _options(self) -> tuple[str, ...]:
+        count, used = self.scanner.count, self._context.rules.choice.most
+        beams = f"beams={count}" if used == count else f"beams={used} of {count}"
+        compat = () if self.compat is None else (f"compat={self.compat!r}",)
+        return map_words(self.grid), beams, *self._kind_options(), *compat
+
+    def _kind_options(self) -> tuple[str, ...]:
         """Return the options that only this kind of model has, as ``repr`` shows them."""
         return ()
 
@@ -162,16 +153,6 @@ class ScanModel(Pickled):
         return self._pipeline.grid
 
     @property
-    def device(self) -> BackendInfo:
-        """The device the model is compiled for."""
-        return self._context.backend.info
-
-    @property
-    def backend(self) -> Backend:
-        """The backend that holds the model's buffers."""
-        return self._context.backend
-
-    @property
     def used_beams(self) -> int:
         """Largest number of beams of a scan that the model evaluates."""
         return self._context.rules.choice.most
@@ -180,11 +161,6 @@ class ScanModel(Pickled):
     def table_version(self) -> int:
         """Number of the map's table on the device, which changes with the map."""
         return self._pipeline.map.version
-
-    @property
-    def precision(self) -> Precision:
-        """``"float32"`` or ``"float64"``."""
-        return cast(Precision, self._context.real.name)
 
     @overload
     def log_likelihood(

@@ -300,9 +300,9 @@ class ScanModel(Pickled):
         finite. NumPy arrays of few particles go to a GPU and back with one copy each way; elsewhere the bound call is
         the ordinary one, so that the same program runs on every backend.
 
-        Results have the bits of ``log_likelihood`` with the same poses on the device. Three cases agree only to
+        Results have the bits of ``log_likelihood`` with the same poses on the device. Four cases agree only to
         rounding: scans in which bearings repeat, scans of a temperature below 1 in which no range depends on the pose,
-        and ``beams=`` as a number with ``specialize=False``.
+        ``beams=`` as a number with ``specialize=False``, and (N, K) scans of worlds with missing or max readings.
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array as ``log_likelihood`` takes it.

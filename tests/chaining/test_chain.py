@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.chain_scenes import BLOCK, OTHER, around, drifting, errors, scans_of
-from support.matching_scenes import CORRIDOR, FRONT, RING, ROOM, relative, segments_scan
+from support.matching_scenes import CORRIDOR, FRONT, RING, ROOM, relative
 from support.selection import present
 
 import gpusense as gs
@@ -310,37 +310,6 @@ def test_two_lasers_of_a_robot_agree(needs) -> None:
         chains.append(gs.chain_scans(scans_of(ROOM, sensors, FRONT, seed=seed), scanner, backend=needs("opencl")))
         assert errors(chains[-1], poses).max() < 0.03
     assert np.abs(chains[0].poses - chains[1].poses).max() < 0.04
-
-
-def test_motion_during_scans_is_taken_out(needs) -> None:
-    # A scan of 0.25 s at 0.8 m/s and 1 rad/s; each beam starts at the robot's pose at its time.
-    rate, duration = 0.25, 0.249
-    times = rate * np.arange(24)
-    heading = times
-    poses = np.stack([0.8 * np.sin(heading), 0.8 * (1 - np.cos(heading)), heading], axis=1) - (0.5, 0.8, 0)
-    scans = []
-    for t in times:
-        now = t + duration * np.arange(RING.count) / (RING.count - 1)
-        at = np.stack([0.8 * np.sin(now) - 0.5, 0.8 * (1 - np.cos(now)) - 0.8, now], axis=1)
-        scans.append([
-            segments_scan(ROOM, tuple(pose), gs.Scanner([b], range_max=30.0))[0]
-            for pose, b in zip(at, RING.bearings, strict=True)
-        ])  # fmt: skip
-    moved = gs.chain_scans(scans, RING, times=times, duration=duration, backend=needs("opencl"))
-    assert moved.duration == duration
-    # Beams in reverse order.
-    back = gs.Scanner(RING.bearings[::-1], range_max=30.0)
-    turned = gs.chain_scans(np.array(scans)[:, ::-1], back, times=times, duration=duration, backend=needs("opencl"))
-    assert turned.duration == -duration
-    assert "in reverse" in turned.explain()
-    # These poses are at the end of the scans.
-    later = np.stack([0.8 * np.sin(times + duration), 0.8 * (1 - np.cos(times + duration)), times + duration], axis=1)
-    assert errors(turned, later)[2:-2].max() < 0.06
-    skewed = gs.chain_scans(scans, RING, times=times, backend=needs("opencl"))
-    assert moved.motions is not None
-    assert np.abs(moved.motions[3:-3, 2] - duration).max() < 0.01
-    assert errors(moved, poses)[2:-2].max() < 0.03
-    assert errors(moved, poses)[2:-2].max() < 0.6 * errors(skewed, poses)[2:-2].max()
 
 
 def test_a_run_that_is_interrupted_keeps_what_it_has(lap: tuple[np.ndarray, ...], needs, monkeypatch) -> None:

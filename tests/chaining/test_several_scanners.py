@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from support.chain_scenes import BLOCK, around, drifting, errors, scans_of
@@ -193,39 +191,6 @@ def test_an_interrupt_keeps_the_scans_of_all_lasers_so_far(lap: tuple, needs, mo
     part = chainer.chain()
     assert 70 < len(part.poses) == chainer.scans < len(scans)
     assert errors(part, truth[: chainer.scans]).max() < 0.3
-
-
-@pytest.mark.slow
-def test_two_lasers_of_a_recorded_run_are_better_than_the_worse_one(data_dir: Path, needs) -> None:
-    folder = data_dir / "jarvis_lab"
-    topics = ["/driver_laser_security/laser_scan", "/driver_laser_navigation/laser_scan"]
-    each = [list(gs.read_log(folder / "jarvis_complex_path_fast.bag", topic=topic))[:140] for topic in topics]
-    scans = sorted(((scan.time, one, scan) for one, part in enumerate(each) for scan in part), key=lambda k: k[:2])
-    track = np.load(folder / "jarvis_complex_path_fast.npz")["gt"]
-
-    def off(poses: np.ndarray, times: list[float]) -> float:
-        """Return the root mean square error after alignment, for the best clock [m]."""
-        found = []
-        for shift in np.arange(-0.1, 0.21, 0.03):
-            x, y = (np.interp(np.array(times) - shift, track[:, 0], track[:, k]) for k in (1, 2))
-            p, q = poses[:, :2] @ (1, 1j), x + 1j * y
-            p, q = p - p.mean(), q - q.mean()
-            turn = np.vdot(p, q)
-            found.append(np.sqrt(np.mean(np.abs(p * turn / abs(turn) - q) ** 2)))
-        return min(found)
-
-    both = gs.chain_scans(
-        [scan.ranges for _, _, scan in scans], [part[0].scanner for part in each],
-        [scan.odometry for _, _, scan in scans], sensor=[one for _, one, _ in scans],
-        times=[time for time, _, _ in scans], backend=needs("opencl"),
-    )  # fmt: skip
-    assert len(both.poses) == 280
-    security = gs.chain_scans(
-        [scan.ranges for scan in each[0]], each[0][0].scanner, [scan.odometry for scan in each[0]],
-        backend=needs("opencl"),
-    )  # fmt: skip
-    worse = off(security.poses, [scan.time for scan in each[0]])
-    assert off(both.poses, [time for time, _, _ in scans]) < min(worse, 0.03)
 
 
 @pytest.mark.parametrize(

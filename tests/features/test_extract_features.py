@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 from support.feature_scenes import Floor, floor_plan
 from support.feature_scores import Score, score_scan
 from support.feature_truth import truth_of
@@ -112,34 +111,6 @@ def test_covariances_are_those_of_errors(scores):
         assert 0.8 < by_kind["line"].nees < 1.35, (beams, noise)
         for kind in ("line", "corner", "pole"):
             assert 0.45 < np.median(by_kind[kind].squares) < 1.25, (beams, noise, kind)
-
-
-def test_lines_are_those_of_least_squares_on_the_true_points():
-    """SciPy's fit to the beams that meet a wall, by ranges, agrees within a fraction of a deviation."""
-    scanner, noise = front(), 0.02
-    ranges, truth = floor_scans(2, scanner, noise)
-    features = gs.extract_features(ranges, scanner, kinds="line")
-    compared = []
-    for k, one in enumerate(truth):
-        mine = features.of_scan(k)
-        for first, count, _ in one.runs:
-            if count < 40:
-                continue
-            b, z = scanner.bearings[first : first + count], ranges[k, first : first + count]
-            middle = b[count // 2]
-            guess = [middle, z.min()]
-            fit = least_squares(lambda p, b=b, z=z: p[1] / np.cos(b - p[0]) - z, guess, x_scale=(0.1, 1.0))
-            angle, distance = fit.x
-            # The line's error across it, at its midpoint, and the error of its angle.
-            off = np.cos(angle) * mine.pose[:, 0] + np.sin(angle) * mine.pose[:, 1] - distance
-            turn = np.mod(mine.pose[:, 2] - angle, math.pi) - math.pi / 2
-            place = np.arctan2(mine.pose[:, 1], mine.pose[:, 0])
-            near = (np.abs(off) < 0.1) & (np.abs(turn) < 0.1) & (place > b[0]) & (place < b[-1])
-            if near.sum() == 1:
-                error = np.array([off[near][0] * np.cos(angle), off[near][0] * np.sin(angle), turn[near][0]])
-                compared.append(error @ mine.information[near][0] @ error / 2)
-    assert len(compared) > 40
-    assert np.median(compared) < 0.02 and np.mean(np.array(compared) < 0.5) > 0.9
 
 
 @pytest.mark.long_on("warp")

@@ -153,46 +153,6 @@ def test_every_option_has_a_body_in_lanes(kind, option, precision, bearings, in_
         assert allowed.difference(found[LANES, "parts"][possible], found[1, "parts"][possible]) <= allowed.value
 
 
-def test_a_particle_does_not_depend_on_its_lane(in_lanes):
-    grid, scanner, poses, z = scene(140, 200)
-    smooth = gs.LikelihoodFieldParameters(interpolation="bilinear")
-    for make, *parameters in ((gs.BeamModel,), (gs.LikelihoodFieldModel,), (gs.LikelihoodFieldModel, smooth)):
-        model = make(grid, scanner, *parameters, backend=in_lanes(LANES))
-        together = model.log_likelihood(poses, z)
-        assert differing(model.log_likelihood(poses[::-1], z)[::-1], together) == 0
-        pieces = [model.log_likelihood(poses[i : i + 3], z) for i in range(0, len(poses), 3)]
-        assert differing(np.concatenate(pieces), together) == 0
-
-
-@pytest.mark.parametrize("resolution", [1e-4, 1e-3, 0.05, 3.0])
-def test_end_points_next_to_edges_and_far_away(resolution, in_lanes):
-    """Readings of up to 2^20 cells, mostly integers, at and near headings of quarter turns."""
-    rng = np.random.default_rng(5)
-    grid = gs.OccupancyGrid(rng.choice([0, 100], (90, 70), p=[0.9, 0.1]), resolution)
-    scanner = gs.Scanner(np.append(np.arange(32) * math.pi / 4, rng.uniform(-3, 3, 50)), (1 << 20) * resolution)
-    poses = rng.uniform((0, 0, -4), (70, 90, 4), (300, 3)) * (resolution, resolution, 1)
-    poses[::2] = np.round(poses[::2] / resolution) * resolution
-    poses[::2, 2] = rng.integers(-4, 5, 150) * math.pi / 4
-    poses[2::8] += rng.normal(0, 1e-9, 3)
-    z = np.concatenate([np.arange(32), rng.integers(0, 60, 20), rng.uniform(0, 1 << 20, 30)]) * resolution
-    for interpolation in ("nearest", "bilinear"):
-        parameters = gs.LikelihoodFieldParameters(
-            sigma_hit=2 * resolution, max_distance=6 * resolution, interpolation=interpolation
-        )
-        found = [
-            gs.LikelihoodFieldModel(grid, scanner, parameters, backend=in_lanes(lanes)).log_likelihood(
-                poses, z, per_beam=True
-            )
-            for lanes in (1, LANES)
-        ]
-        for one, wide in zip(*found, strict=True):
-            if interpolation == "nearest":
-                assert differing(wide, one) == 0
-            else:
-                allowed = beam_tolerance(np.float32).twice()
-                assert allowed.difference(wide, one) <= allowed.value
-
-
 def test_only_scenes_that_have_such_kernels_get_them():
     info = get_backend("numpy").info
     wide = dataclasses.replace(info, lanes=LANES)

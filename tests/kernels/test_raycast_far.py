@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from fractions import Fraction
 
 import numpy as np
@@ -23,7 +22,6 @@ from support.raycast_scenes import (
 
 from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import differing
-from gpusense.reference.ray import crossed
 from gpusense.tables.rectangles import Planes
 
 
@@ -46,45 +44,6 @@ def test_long_corridors(backend, precision):
 
 # The largest number of cells in a range.
 MOST = 1 << 20
-
-
-def rounded(value: Fraction, real: np.dtype) -> Fraction:
-    """Return the nearest number of a precision, ties to even; for 0 and positive normal numbers."""
-    if value == 0:
-        return value
-    exponent = math.floor(math.log2(value))
-    # Next to a power of two the logarithm may be off by one.
-    exponent += (value >= Fraction(2) ** (exponent + 1)) - (value < Fraction(2) ** exponent)
-    unit_in_last_place = Fraction(2) ** (exponent - np.finfo(real).nmant)
-    return round(value / unit_in_last_place) * unit_in_last_place
-
-
-@pytest.mark.long
-@pytest.mark.sampled(0.5)
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_counts_of_boundaries_near_the_longest_range(precision):
-    """Compare counts of boundaries at and next to their rounded distances with fractions."""
-    real, rng, count = np.dtype(precision), np.random.default_rng(17), 1500
-    speed = np.concatenate(
-        [rng.uniform(0.5, 1, count), np.sqrt(np.full(count, 0.5)), 2.0 ** rng.uniform(-20, 0, count)]
-    )
-    speed = speed.astype(real)
-    inv, size = 1 / speed, len(speed)
-    a = rng.choice([0, 2.0**-24, 0.25, 0.5, 1 - 2.0**-24, 1], size).astype(real)
-    a = np.where(rng.random(size) < 0.5, rng.random(size).astype(real), a)
-    most = np.minimum(np.floor(MOST * speed.astype(float)), MOST - 2)
-    k = np.maximum(most - rng.integers(0, 1000, size), 0).astype(real)
-    near = (k + a) * inv
-    for t in (near, np.nextafter(near, real.type(0)), np.nextafter(near, real.type(np.inf)), near + inv / 2):
-        t = np.minimum(np.maximum(t, 0), real.type(MOST))
-        found = [crossed(t, speed, a, inv, until) for until in (False, True)]
-        for i in range(size):
-            at, pace, first, inverse = (Fraction(float(v[i])) for v in (t, speed, a, inv))
-            low = max(math.floor(at * pace - first) - 2, 0)
-            far = [rounded(rounded(n + first, real) * inverse, real) for n in range(low, low + 6)]
-            assert far[-1] > at and (low == 0 or far[0] < at)
-            assert found[0][i] == low + sum(one < at for one in far)
-            assert found[1][i] == low + sum(one <= at for one in far)
 
 
 @pytest.mark.long

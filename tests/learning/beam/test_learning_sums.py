@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
-from collections.abc import Callable
 
 import mpmath as mp
 import numpy as np
@@ -14,7 +12,6 @@ from scipy.integrate import quad
 from support.kernel_scenes import PRECISIONS
 from support.learning_data import RANGE_MAX, TYPICAL, draw, point, problem_of
 
-from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import TOLERANCES, per_beam
 from gpusense.learning.beam.point import BIAS, FORM, SIGMA, Point
 from gpusense.learning.beam.problem import Prior
@@ -172,34 +169,6 @@ def test_sums_are_alike_on_every_backend(precision: type, name: str, backend: st
         at, information=precision is np.float64
     )
     assert alike(found, truth, precision)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("lanes", [1, 16])
-def test_lanes_of_pairs_sum_to_the_same(lanes: int, needs: Callable[[str], str]) -> None:
-    opencl = get_backend(needs("opencl"))
-    # Nothing near, range_max ahead, both ends and values just before, and ordinary pairs; not a multiple of 16.
-    z, expected = draw(TYPICAL, 1003, 8, low=0, high=1)
-    expected[:40:4], expected[1:40:4], z[2:40:4] = 0, RANGE_MAX, 0
-    z[3:40:4] = expected[3:40:4]
-    none = point(0.0, 0.7, 0.1, 0.2, sigma=0.3, rate=2.0)
-    impossible = point(0.0, 0.9, 0.1, 0.0, sigma=0.3, rate=2.0)
-    before = opencl.info
-    try:
-        opencl.info = dataclasses.replace(before, kind="cpu", lanes=lanes)
-        for precision in PRECISIONS:
-            # Both use the same rounded pairs.
-            pairs = z.astype(precision), expected.astype(precision)
-            # Squares of u at sigma = 0.01 carry the rounding of sigma to float32, beyond the tolerance.
-            known = [at for name, at in POINTS.items() if precision is np.float64 or name != "steep"]
-            for at in (*known, none):
-                truth = problem_of(*pairs).device.sums(at, information=True)
-                found = problem_of(*pairs, backend=opencl, real=precision).device.sums(at, information=True)
-                assert alike(found, truth, precision)
-            nothing = problem_of(*pairs, backend=opencl, real=precision).device.sums(impossible)
-            assert nothing[0] == -np.inf and np.isfinite(nothing[1:]).all()
-    finally:
-        opencl.info = before
 
 
 def test_log_likelihood_and_responsibilities_are_those_of_the_densities(backend: str) -> None:

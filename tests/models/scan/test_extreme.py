@@ -11,8 +11,6 @@ import pytest
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import differing, per_scan
-from gpusense.interface.structs import Caster, RangeScale, Window
-from gpusense.tables.rectangles import Planes, empty_rectangles
 
 PRECISIONS = ("float32", "float64")
 # Denormal in float32, denormal in both precisions, and on both sides of the limit that a ray rounds to 0.
@@ -102,47 +100,6 @@ def test_a_map_of_20_000_x_20_000_cells(needs):
         assert np.isfinite(log_p).all()
         np.testing.assert_allclose(log_p, small.log_likelihood(poses, ranges[0]), rtol=0, atol=4e-3)
         assert "of 20000 x 20000 cells" in model.explain()
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_denormal_direction_components_are_zero(backend, precision):
-    """The kernel rounds components of a direction below 1e-30 to 0, for both signs and axes."""
-    real, obstacles = np.dtype(precision), np.pad(np.zeros((6, 9), bool), 1, constant_values=True)
-    obstacles[4, 5] = True
-    turns = [(1.0, t) for t in (0.0, *TINY)] + [(1.0, -t) for t in TINY]
-    turns = np.array([*turns, *((-c, s) for c, s in turns)]).astype(real)
-    turns = np.concatenate([turns, turns[:, ::-1]])
-    quarter = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], real)
-    origins = list(itertools.product((0.0, 1e-40, 0.5), repeat=2))
-    headings = [(turn, ray) for turn, ray in itertools.product(turns, quarter)]
-    headings += [(ray, turn) for turn, ray in headings] + [(turns[4], turn) for turn in turns]
-
-    def cast(selection: str, flushed: bool) -> np.ndarray:
-        device = get_backend(selection)
-        table, cells = (
-            empty_rectangles(device, obstacles, Planes(1)),
-            np.tile(np.array([[5, 3]], np.int32), (len(origins), 1)),
-        )
-        found = []
-        for pose, ray in headings:
-            if flushed:
-                pose, ray = (np.where(np.abs(v) < 1e-30, 0, v).astype(real) for v in (pose, ray))
-            placed = np.concatenate([np.array(origins), np.tile(pose, (len(origins), 1))], axis=1).astype(real)
-            out = device.empty(len(origins), real)
-            device.compile("cast_ranges", frozenset({"FLOAT64"} if precision == "float64" else ()))(
-                (1, len(origins)), table,
-                device.upload(cells), device.upload(placed), device.upload(ray[None]), out,
-                Window(0, 0, *obstacles.shape), len(origins), 1, Caster(0, 0.0, 0.0), RangeScale(20.0, 1.0, 20.0),
-            )  # fmt: skip
-            found.append(device.download(out, np.empty(len(origins), real)))
-        return np.array(found)
-
-    found = cast(backend, flushed=False)
-    assert np.isfinite(found).all()
-    assert (found < 20).all()
-    assert differing(found, cast("numpy", flushed=False)) == 0
-    assert differing(found, cast(backend, flushed=True)) == 0
 
 
 @pytest.mark.long_on("warp")

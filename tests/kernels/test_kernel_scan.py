@@ -62,6 +62,7 @@ def placed(
     return reference
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize(("precision", "single"), [(np.float32, True), (np.float32, False), (np.float64, False)])
 @pytest.mark.parametrize("end_points", [True, False], ids=["end points", "rays"])
@@ -164,6 +165,7 @@ def test_an_even_choice_is_that_of_the_host() -> None:
         assert (is_chosen(np.arange(informative), informative, chosen) == expected).all()
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_poses_are_placed_along_with_readings(precision: type, device: Backend) -> None:
     """Poses equal those from place_poses for any number of preceding work-items for readings."""

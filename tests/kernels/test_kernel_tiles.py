@@ -142,6 +142,7 @@ def beam_tiles(
     return parts_at(found["parts"], count, each), parts_at(expected["parts"], count, each)
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("names", [(), ("ORDERED",)])
 def test_tiles_of_beams(names: tuple[str, ...], device: Backend) -> None:
     for count, rays, spread in itertools.product((1, 17), RAYS, SPREADS):

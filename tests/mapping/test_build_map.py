@@ -54,6 +54,7 @@ def rays():
     return start.astype(np.int32), end.astype(np.int32), rng.integers(0, 2, 150).astype(np.int32)
 
 
+@pytest.mark.long_on("warp")
 def test_counts_are_those_of_a_walk_in_fractions(backend):
     start, end, hit = rays()
     hits, misses = np.zeros((20, 30), np.int32), np.zeros((20, 30), np.int32)

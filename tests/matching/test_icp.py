@@ -33,6 +33,7 @@ def run(backend: str, precision: str, scanner, rules, guesses, noise=(0.01,) * 4
         return pairs.run(np.arange(4), guesses, rules if isinstance(rules, list) else [rules])
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.4)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("scanner", [RING, FRONT], ids=["ring", "front"])

@@ -74,6 +74,7 @@ def test_a_cropped_map_has_the_bits_of_the_whole_map(kind, outside, backend, mon
     assert cropped._caster.map.window == before and before.cells < grid.cells.size / 4
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("kind", each_caster(36), ids=by_name)
 def test_origins_far_off_the_map(kind, backend):
     """Origins reach the limits of places; rays that lead away, or end before the map, are exactly range_max."""
@@ -112,6 +113,7 @@ def kernel_cast(scene: Scene, kind: Caster, backend: str, precision: str) -> np.
     return device.download(result, np.empty(count, real))
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_dda_is_the_exact_caster_to_the_bit(family, backend):

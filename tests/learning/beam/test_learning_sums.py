@@ -159,6 +159,7 @@ def test_pseudo_readings_of_a_student_are_distributed_as_its_density() -> None:
     assert prior.of_hits(same) == (3.0, pytest.approx(3.0))
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("name", ["ordinary", "student"])
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_sums_are_alike_on_every_backend(precision: type, name: str, backend: str) -> None:

@@ -61,6 +61,7 @@ HEADINGS = {
 }
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.4)
 @each_precision
 def test_headings(backend: str, precision: str) -> None:

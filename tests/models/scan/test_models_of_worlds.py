@@ -60,6 +60,7 @@ def compare(name: str, found: np.ndarray, wanted: np.ndarray) -> None:
         assert found.tobytes() == wanted.tobytes()
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.long_on("warp")
 @pytest.mark.parametrize("name", MODELS)
 def test_scores_are_those_of_single_maps(name: str, scene: dict[str, Any], backend: str) -> None:
@@ -77,6 +78,7 @@ def test_scores_are_those_of_single_maps(name: str, scene: dict[str, Any], backe
     assert re.search(r"^- moving shapes +no world has shapes", model.explain(), re.MULTILINE)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.long_on("warp")
 @pytest.mark.parametrize("name", ["beam", "field"])
 def test_gpus_score_by_the_same_bits(name: str, scene: dict[str, Any], as_gpu: Any) -> None:

@@ -260,8 +260,8 @@ def test_a_device_without_room_for_an_update_makes_the_table_anew(make, monkeypa
 
 
 def test_only_cells_that_can_change_are_computed_again(monkeypatch):
-    """Count the bytes that reach the device after an edit of 5 x 5 cells of 2000 x 2000."""
-    grid = gs.OccupancyGrid(cells_of(np.random.default_rng(12), (2000, 2000)), RESOLUTION)
+    """Count the bytes that reach the device after an edit of 5 x 5 cells of 1000 x 1000."""
+    grid = gs.OccupancyGrid(cells_of(np.random.default_rng(12), (1000, 1000)), RESOLUTION)
     device = get_backend("numpy")
     parameters, sizes = gs.LikelihoodFieldParameters(max_distance=0.72), []
     # Patch the class: an undone patch of the device would hide the class's method from later tests.
@@ -276,10 +276,10 @@ def test_only_cells_that_can_change_are_computed_again(monkeypatch):
         gs.BeamModel(grid, SCANNER, backend=device, specialize=False),
         gs.LikelihoodFieldModel(grid, SCANNER, parameters, backend=device, specialize=False),
     ):
-        model.prepare([[100.0, 100.0, 0.0]])
+        model.prepare([[50.0, 50.0, 0.0]])
         sizes.clear()
-        model.update_map(np.full((5, 5), 100), (1000, 1000))
-        assert 0 < sum(sizes) < (2 * 254 + 5) * 2000 + 1
+        model.update_map(np.full((5, 5), 100), (500, 500))
+        assert 0 < sum(sizes) < (2 * 254 + 5) * 1000 + 1
 
 
 def test_a_look_up_table_from_a_file_cannot_follow(tmp_path):

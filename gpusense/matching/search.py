@@ -28,14 +28,16 @@ _NO_FLAGS: frozenset[str] = frozenset()
 BINS = 512
 # Blocks of a scan that are followed down to poses for its first lower bound.
 _FOLLOWED = 512
-# Sums of a scan's bounds that a level of smaller blocks may take.
-_MOST_SUMS = 1 << 29
-# Room at first for chosen blocks of a scan, room for their parts on each level, and most poses that are kept of a scan.
-_ROOM, _PARTS, _MOST_KEPT = 1 << 17, 1 << 18, 1 << 18
+# Sums of a scan's bounds that a level of smaller blocks may take, by kind of device.
+_MOST_SUMS = {"cpu": 1 << 29, "gpu": 1 << 32}
+# Room at first for chosen blocks of a scan, room for their parts on each level by kind of device, a sixteenth of which
+# each scan adds, and most poses that are kept of a scan.
+_ROOM, _PARTS, _MOST_KEPT = 1 << 17, {"cpu": 1 << 18, "gpu": 1 << 20}, 1 << 18
 # Most items of one launch: some drivers allow 65535 groups along the last axis.
 _MOST_ITEMS = 1 << 15
-# Poses of a scan that are read together with their number, and work-items that divide blocks, by kind of device.
-_READ, _WORKERS = 512, {"gpu": 1 << 17, "cpu": 1 << 12}
+# Poses of a scan that are read together with their number; by kind of device, work-items that divide blocks, and the
+# neighbouring blocks that each of them takes at a time.
+_READ, _WORKERS = 512, {"gpu": (1 << 17, 1), "cpu": (1 << 10, 64)}
 # Turn of the circle between points that are summed in turns, so that few of them tell about all directions.
 _TURN = (5**0.5 - 1) / 2
 # Arrays that place end points.
@@ -82,9 +84,9 @@ class Search:
 
     def first_level(self, points: Sequence[np.ndarray], grid: PoseGrid) -> int:
         """Return the level whose blocks are bounded first."""
-        level = self.tables.levels
+        level, most = self.tables.levels, _MOST_SUMS[self.tables.backend.info.kind]
         sums = max(map(len, points)) * grid.headings.shape[1] * grid.height * grid.width
-        return level - 1 if level > 1 and sums >> (2 * level - 2) <= _MOST_SUMS else level
+        return level - 1 if level > 1 and sums >> (2 * level - 2) <= most else level
 
     def masks(self, grid: PoseGrid, allowed: np.ndarray | None) -> list[Buffer]:
         """Return masks of each level on the device; the last ones are kept."""
@@ -116,7 +118,8 @@ class _Run:
         self._floor = np.full(scans, floor, np.int64)
         self._complete = np.ones(scans, bool)
         self._kept: list[np.ndarray] = []
-        self._parts = _PARTS + _PARTS // 16 * scans
+        room = _PARTS[self._backend.info.kind]
+        self._parts = room + room // 16 * scans
         self._evaluated = 0
 
     def _launch(self, kernel: str, size: tuple[int, ...], *arguments: Any, flags: frozenset[str] = _NO_FLAGS) -> None:
@@ -241,13 +244,13 @@ class _Run:
 
     def _divide(self, begin: int, some: int) -> None:
         """Divide chosen blocks from ``begin`` on, but at most ``some``, down to poses."""
-        workers, blocks = _WORKERS[self._backend.info.kind], self._chosen
+        (workers, run), blocks = _WORKERS[self._backend.info.kind], self._chosen
         for level in reversed(range(self._level)):
             top, parts = level == self._level - 1, self._space.empty(f"parts {level}", 4 * self._parts, _INT)
             self._launch(
                 "divide_blocks", (workers,), self._tables.quarters(level, top=top), *self._ends, self._allowed[level],
                 blocks, self._low, parts, self._counts, self._tables.shape, begin if top else 0,
-                min(some, self._room) if top else self._parts, self._parts, workers, self._grid.height,
+                min(some, self._room) if top else self._parts, self._parts, workers, run, self._grid.height,
                 self._grid.width, -(-self._grid.width >> level), self._turns, level, self._tables.stride, int(top),
             )  # fmt: skip
             blocks = parts

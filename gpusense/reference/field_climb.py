@@ -32,14 +32,14 @@ def damped_step(climb: np.ndarray) -> np.ndarray:
 
 
 def climb_step(
-    flags: frozenset[str], gradient: np.ndarray, poses: np.ndarray, climb: np.ndarray, scans: int, most: int,
-    small: float, yaw_cos: float, yaw_sin: float,
+    flags: frozenset[str], gradient: np.ndarray, poses: np.ndarray, climb: np.ndarray, scans: int, parts: int,
+    most: int, small: float, yaw_cos: float, yaw_sin: float,
 ) -> None:  # fmt: skip
     """Judge the poses that were evaluated, numbers in the grid's frame, and take the next step of each climb."""
-    everyone, pose = climb[: CLIMB * scans].reshape(scans, CLIMB), poses[: 3 * scans].reshape(scans, 3)
+    everyone, pose = climb[: CLIMB * scans].reshape(scans, CLIMB), poses[: 3 * parts * scans].reshape(scans, parts, 3)
     rows = np.flatnonzero(everyone[:, ENDED] == 0)
-    at, trial = everyone[rows], pose[rows]
-    numbers = gradient[: GRADIENT_NUMBERS * scans].reshape(scans, -1)[rows].astype(np.float64)
+    at, trial = everyone[rows], pose[rows, 0]
+    numbers = gradient[: GRADIENT_NUMBERS * parts * scans].reshape(scans, parts, -1)[rows].sum(axis=1, dtype=np.float64)
     off, far = trial - at[:, :3], trial[:, :2] - at[:, START : START + 2]
     first = at[:, STEPS] < 0
     better = first | ((numbers[:, 0] >= at[:, VALUE]) & (np.hypot(*far.T) <= _FARTHEST))
@@ -52,5 +52,5 @@ def climb_step(
     at[:, CALM] = ~first & (np.maximum(np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 2])) < small)
     at[:, STEPS] += 1
     at[:, ENDED] = (at[:, CALM] != 0) | (at[:, STEPS] >= most)
-    pose[rows] = at[:, :3] + np.where(at[:, ENDED, None] != 0, 0, damped_step(at))
+    pose[rows] = (at[:, :3] + np.where(at[:, ENDED, None] != 0, 0, damped_step(at)))[:, None]
     everyone[rows] = at

@@ -200,8 +200,8 @@ def follow_blocks(
 def divide_blocks(
     flags: frozenset[str], quarters: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray,
     allowed: np.ndarray, block: np.ndarray, low: np.ndarray, part: np.ndarray, count: np.ndarray, scores: ScoreTable,
-    begin: int, some: int, room: int, workers: int, height: int, width: int, columns: int, turns: int, level: int,
-    spacing: int, top: int,
+    begin: int, some: int, room: int, workers: int, run: int, height: int, width: int, columns: int, turns: int,
+    level: int, spacing: int, top: int,
 ) -> None:  # fmt: skip
     """Divide blocks into quarters of 2^level x 2^level, and collect the allowed ones that reach low of their scan."""
     blocks = min(int(count[level + 1]) - begin, some)

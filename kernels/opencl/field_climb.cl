@@ -38,13 +38,15 @@ void damped_step(global const double *climb, double *step) {
     for (int k = 0; k < 3; ++k) step[k] = over > 1 ? step[k] / over : step[k];
 }
 
-// Judge the poses that were evaluated, numbers in the grid's frame, and take the next step of each climb. Poses of climbs
-// that have ended stay. One work-item takes a scan.
+// Judge the poses that were evaluated, and take the next step of each climb. Each scan has parts neighbouring poses, all
+// equal, whose numbers in the grid's frame are added. Poses of climbs that have ended stay. One work-item takes a scan.
 kernel void climb_step(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= scans || climb[CLIMB * n + ENDED] != 0) return;
-    global double *at = climb + CLIMB * n, *pose = poses + 3 * n;
-    global const real *numbers = gradient + GRADIENT_NUMBERS * n;
+    global double *at = climb + CLIMB * n, *pose = poses + 3 * parts * n;
+    double numbers[GRADIENT_NUMBERS] = {0};
+    for (int part = 0; part < parts; ++part)
+        for (int k = 0; k < GRADIENT_NUMBERS; ++k) numbers[k] += gradient[GRADIENT_NUMBERS * (parts * n + part) + k];
     const double off_x = pose[0] - at[0], off_y = pose[1] - at[1], turn = fabs(pose[2] - at[2]);
     const double far_x = pose[0] - at[START], far_y = pose[1] - at[START + 1];
     const bool first = at[STEPS] < 0, within = far_x * far_x + far_y * far_y <= FARTHEST_CLIMB * FARTHEST_CLIMB;
@@ -73,5 +75,5 @@ kernel void climb_step(ARGUMENTS) {
     at[ENDED] = at[CALM] != 0 || at[STEPS] >= most;
     double step[3] = {0, 0, 0};
     if (at[ENDED] == 0) damped_step(at, step);
-    for (int k = 0; k < 3; ++k) pose[k] = at[k] + step[k];
+    for (int k = 0; k < 3 * parts; ++k) pose[k] = at[k % 3] + step[k % 3];
 }

@@ -214,10 +214,11 @@ kernel void follow_blocks(ARGUMENTS) {
 
 // Divide count[level + 1] blocks of positions, but at most some from begin on, into quarters of 2^level x 2^level, and
 // collect the allowed ones whose scores are at least low of their scan, in no certain order. count[level], which the caller
-// clears, may exceed room: then some are left out. One of workers work-items takes each of workers neighbouring blocks.
+// clears, may exceed room: then some are left out. Of workers work-items each takes run neighbouring blocks at a time.
 kernel void divide_blocks(ARGUMENTS) {
+    if (get_global_id(0) >= workers) return;
     const int left = count[level + 1] - begin, blocks = left < some ? left : some, quarter = 1 << level;
-    for (int n = get_global_id(0); n < blocks; n += workers) {
+    for (int n = run * get_global_id(0); n < blocks; n += n % run == run - 1 ? run * (workers - 1) + 1 : 1) {
         global const int *here = block + 4 * (begin + n);
         const int item = here[0], row = here[1], col = here[2], least = low[item / turns];
         const int score = top ? TOP * (first[item + 1] - first[item]) : here[3];

@@ -16,6 +16,7 @@ VALUE, SLOPE, MATRIX, START = wp.constant(3), wp.constant(4), wp.constant(7), wp
 DAMPING, STEPS, CALM, ENDED = wp.constant(15), wp.constant(16), wp.constant(17), wp.constant(18)
 # Numbers of a pose that field_gradient writes.
 GRADIENT_NUMBERS = wp.constant(13)
+Numbers = wp.types.vector(length=13, dtype=wp.float64)
 # Longest and largest step [m, rad], and the farthest that a climb leads from its start [m].
 LONGEST, LARGEST, FARTHEST_CLIMB = (
     wp.constant(wp.float64(0.5)),
@@ -56,9 +57,10 @@ def make(name, flags):
     """Make the kernel for a set of flags."""
 
     @kernel(flags)
-    def climb_step(gradient, poses, climb, scans, most, small, yaw_cos, yaw_sin):
-        """Judge the poses that were evaluated, numbers in the grid's frame, and take the next step of each climb.
-        Poses of climbs that have ended stay. One work-item takes a scan.
+    def climb_step(gradient, poses, climb, scans, parts, most, small, yaw_cos, yaw_sin):
+        """Judge the poses that were evaluated, and take the next step of each climb. Each scan has parts neighbouring
+        poses, all equal, whose numbers in the grid's frame are added. Poses of climbs that have ended stay. One
+        work-item takes a scan.
         """
         n = wp.tid()
         if n >= scans:
@@ -66,8 +68,11 @@ def make(name, flags):
         at = CLIMB * n
         if climb[at + ENDED] != ZERO:
             return
-        of = GRADIENT_NUMBERS * n
-        pose = 3 * n
+        numbers = Numbers()
+        for part in range(parts):
+            for k in range(13):
+                numbers[k] = numbers[k] + wp.float64(gradient[GRADIENT_NUMBERS * (parts * n + part) + k])
+        pose = 3 * parts * n
         off_x = poses[pose] - climb[at]
         off_y = poses[pose + 1] - climb[at + 1]
         turn = wp.abs(poses[pose + 2] - climb[at + 2])
@@ -75,25 +80,25 @@ def make(name, flags):
         far_y = poses[pose + 1] - climb[at + START + 1]
         first = climb[at + STEPS] < ZERO
         within = far_x * far_x + far_y * far_y <= FARTHEST_CLIMB * FARTHEST_CLIMB
-        better = first or (wp.float64(gradient[of]) >= climb[at + VALUE] and within)
+        better = first or (numbers[0] >= climb[at + VALUE] and within)
         if better:
             c = yaw_cos
             s = yaw_sin
-            x, y = wp.float64(gradient[of + 1]), wp.float64(gradient[of + 2])
-            xx, xy, xt = wp.float64(gradient[of + 4]), wp.float64(gradient[of + 5]), wp.float64(gradient[of + 6])
-            yy, yt = wp.float64(gradient[of + 8]), wp.float64(gradient[of + 9])
+            x, y = numbers[1], numbers[2]
+            xx, xy, xt = numbers[4], numbers[5], numbers[6]
+            yy, yt = numbers[8], numbers[9]
             for k in range(3):
                 climb[at + k] = poses[pose + k]
-            climb[at + VALUE] = wp.float64(gradient[of])
+            climb[at + VALUE] = numbers[0]
             climb[at + SLOPE] = c * x - s * y
             climb[at + SLOPE + 1] = s * x + c * y
-            climb[at + SLOPE + 2] = wp.float64(gradient[of + 3])
+            climb[at + SLOPE + 2] = numbers[3]
             climb[at + MATRIX] = c * c * xx - TWO * c * s * xy + s * s * yy
             climb[at + MATRIX + 1] = c * s * (xx - yy) + (c * c - s * s) * xy
             climb[at + MATRIX + 2] = c * xt - s * yt
             climb[at + MATRIX + 3] = s * s * xx + TWO * c * s * xy + c * c * yy
             climb[at + MATRIX + 4] = s * xt + c * yt
-            climb[at + MATRIX + 5] = wp.float64(gradient[of + 12])
+            climb[at + MATRIX + 5] = numbers[12]
         if not first:
             damping = climb[at + DAMPING] * EIGHT
             if better:
@@ -107,7 +112,8 @@ def make(name, flags):
             climb[at + ENDED] = ONE
         else:
             step = damped_step(climb, at)
-        for k in range(3):
-            poses[pose + k] = climb[at + k] + step[k]
+        for part in range(parts):
+            for k in range(3):
+                poses[pose + 3 * part + k] = climb[at + k] + step[k]
 
     return locals()[name]

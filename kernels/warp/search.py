@@ -300,17 +300,17 @@ def follow_blocks(
 
 @kernel()
 def divide_blocks(
-    quarters, point, image, first, allowed, block, low, part, count, scores, begin, some, room, workers, height, width,
-    columns, turns, level, spacing, top,
+    quarters, point, image, first, allowed, block, low, part, count, scores, begin, some, room, workers, run, height,
+    width, columns, turns, level, spacing, top,
 ):  # fmt: skip
     """Divide count[level + 1] blocks of positions, but at most some from begin on, into quarters of 2^level x 2^level,
     and collect the allowed ones whose scores are at least low of their scan, in no certain order. count[level], which
-    the caller clears, may exceed room: then some are left out. One of workers work-items takes each of workers
-    neighbouring blocks.
+    the caller clears, may exceed room: then some are left out. Of workers work-items each takes run neighbouring
+    blocks at a time.
     """
     worker = wp.tid()
     blocks = wp.min(count[level + 1] - begin, some)
-    n = int(worker)
+    n = run * worker
     while n < blocks:
         here = 4 * (begin + n)
         item = block[here]
@@ -334,7 +334,9 @@ def divide_blocks(
                         part[4 * m + 1] = part_row
                         part[4 * m + 2] = part_col
                         part[4 * m + 3] = total[i]
-        n = n + workers
+        if n % run == run - 1:
+            n = n + run * (workers - 1)
+        n = n + 1
 
 
 def make(name, flags):

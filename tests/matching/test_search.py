@@ -120,8 +120,8 @@ def test_kernels_have_the_sums_of_the_reference(name, needs):
          33, 11, 21, 3, 1, 693),
         ("follow_blocks", (200,), quarters, point, image, first, mask, block, *blocks, 1, 2, 0),
         ("follow_blocks", (200,), quarters, point, image, first, mask, block, *blocks, 1, 2, 1),
-        ("divide_blocks", (64,), quarters, point, image, first, mask, block, low, np.zeros(16 * 200, np.int32),
-         np.array([0, 0, 190], np.int32), shape, 10, 150, 800, 64, 12, 22, 11, 3, 1, 2, 0),
+        ("divide_blocks", (16,), quarters, point, image, first, mask, block, low, np.zeros(16 * 200, np.int32),
+         np.array([0, 0, 190], np.int32), shape, 10, 150, 800, 16, 3, 12, 22, 11, 3, 1, 2, 0),
     ]  # fmt: skip
     device = get_backend(needs(name))
     for kernel, size, *values in calls:
@@ -190,7 +190,7 @@ def test_of_equal_poses_beyond_the_memory_the_first_are_kept(monkeypatch, level)
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-@pytest.mark.parametrize("limits", [{"_MOST_ITEMS": 4}, {"_ROOM": 3, "_READ": 2}, {"_PARTS": 16}])
+@pytest.mark.parametrize("limits", [{"_MOST_ITEMS": 4}, {"_ROOM": 3, "_READ": 2}, {"_PARTS": {"cpu": 16}}])
 def test_the_poses_are_the_same_in_several_launches(name, limits, monkeypatch, needs):
     scores, points, grid = scene(3)
     tables = ScoreTables(get_backend(needs(name)), scores, levels=2)

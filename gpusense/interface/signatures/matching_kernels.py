@@ -22,8 +22,9 @@ KERNELS: dict[str, Kernel] = {
         "Score score", "ScanBatch batch if SCANS", in_lanes=True,
     ),
     "climb_step": kernel(
-        "field_climb", "scan", f"real gradient [{GRADIENT_NUMBERS} * scans]", "out double poses [3 * scans]",
-        f"out double climb [{CLIMB} * scans]", "int scans", "int most", "double small", "double yaw_cos",
+        "field_climb", "scan", f"real gradient [{GRADIENT_NUMBERS} * parts * scans]",
+        "out double poses [3 * parts * scans]", f"out double climb [{CLIMB} * scans]", "int scans", "int parts",
+        "int most", "double small", "double yaw_cos",
         "double yaw_sin",
     ),
     "fit_lines": kernel(
@@ -97,7 +98,7 @@ KERNELS: dict[str, Kernel] = {
     "divide_blocks": kernel(
         "search", "worker", _QUARTERS, *_ENDS, "uchar allowed [rows * columns]", "int block [4 * (begin + some)]",
         "int low [scans]", "out int part [4 * room]", "out int count [levels]", "ScoreTable scores", "int begin",
-        "int some", "int room", "int workers", "int height", "int width", "int columns", "int turns", "int level",
-        "int spacing", "int top",
+        "int some", "int room", "int workers", "int run", "int height", "int width", "int columns", "int turns",
+        "int level", "int spacing", "int top",
     ),
 }  # fmt: skip

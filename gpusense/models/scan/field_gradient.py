@@ -30,6 +30,8 @@ _OTHERS = {"LOG_TABLE", "CUBES"}
 _MOST_STEPS, _STEPS_AT_ONCE, _FARTHEST = 50, 4, 5.5
 # Length and turn of a step that end a climb [m, rad], by the bytes of a number.
 _SMALL = {4: 3e-4, 8: 1e-4}
+# Parts of a scan in a climb, by kind of device.
+_PARTS = {"gpu": 16, "cpu": 1}
 
 
 class Gradients:
@@ -64,9 +66,13 @@ class Gradients:
         part, readings = self._copied
         if readings is None or part != piece.part:
             self._copied = None, None
-            readings = self._pipeline.upload(scans, self._space)
+            readings = self._pipeline.upload(self._split(scans), self._space)
             self._copied = piece.part, readings
         self._run(request.poses, piece, readings, rows)
+
+    def _split(self, scans: ClassedScans) -> ClassedScans:
+        """Return scans as they are copied."""
+        return scans
 
     def _run(self, poses: Poses, piece: Piece, readings: Readings, rows: np.ndarray) -> None:
         """Evaluate the poses of a piece."""
@@ -97,12 +103,17 @@ class Gradients:
 
 
 class Climbs(Gradients):
-    """Climbs of S poses, one of each scan, to maxima of the likelihood; see the kernel file ``field_climb``."""
+    """Climbs of S poses, one of each scan, to maxima of the likelihood; see the kernel file ``field_climb``.
+
+    On GPUs a scan is split into parts, each with a pose, since a work-item evaluates a pose.
+    """
 
     def __init__(self, pipeline: FieldPipeline, space: Workspace, poses: np.ndarray) -> None:
         super().__init__(pipeline, space)
         self._small, yaw = _SMALL[pipeline.real.itemsize], pipeline.grid.origin[2]
         self._turn = math.cos(yaw), math.sin(yaw)
+        info = pipeline.backend.info
+        self._parts = _PARTS[info.kind] if info.float64 else 1
         self._end = np.zeros((len(poses), CLIMB))
         self._end[:, :3], self._end[:, START : START + 2] = poses, poses[:, :2]
         # A scan without readings has one step of length 0.
@@ -113,31 +124,47 @@ class Climbs(Gradients):
         """The poses (S, 3), the numbers of steps, and whether the last step was small."""
         return self._end[:, :3], self._end[:, STEPS], self._end[:, CALM] > 0
 
+    def _split(self, scans: ClassedScans) -> ClassedScans:
+        """See Gradients._split; the first part of a scan has its constant term."""
+        parts = self._parts
+        if parts == 1:
+            return scans
+        counts = ((scans.counts[:, None] + np.arange(parts)[::-1]) // parts).ravel()
+        constants = np.full((scans.scans, parts), -self._pipeline.context.constant_term)
+        constants[:, 0] = scans.constants
+        return ClassedScans(
+            scans.columns, scans.readings, scans.vectors, scans.rays, scans.ray_offsets, counts, counts,
+            constants.ravel(), scans.left_out,
+        )  # fmt: skip
+
     def _run(self, poses: Poses, piece: Piece, readings: Readings, rows: np.ndarray) -> None:
         """Climb from the poses of a piece, several steps at once where the device has float64."""
         backend, space, end = self._pipeline.backend, self._space, self._end[piece.begin : piece.end]
-        flags, numbers = frozenset({"FLOAT64"}) & self._pipeline.components, (piece.count, _MOST_STEPS, self._small)
-        end[:, STEPS], end[:, CALM], poses.reach = -1, 0, _FARTHEST
+        end[:, STEPS], end[:, CALM] = -1, 0
+        flags, parts, count = frozenset({"FLOAT64"}) & self._pipeline.components, self._parts, piece.count
+        pose = np.repeat(end[:, :3], parts, axis=0)
+        program, gradient, placed = self._placed(pose, readings)
+        numbers = dict(scans=count, parts=parts, most=_MOST_STEPS, small=self._small, yaw_cos=self._turn[0],
+                       yaw_sin=self._turn[1])  # fmt: skip
         if backend.info.float64:
-            program, gradient, placed = self._program(poses, piece, readings)
             there = space.upload("climb", end)
-            step = launch(
-                "climb_step", flags, (piece.count,), gradient=gradient, poses=placed.source, climb=there,
-                scans=piece.count, most=_MOST_STEPS, small=self._small, yaw_cos=self._turn[0], yaw_sin=self._turn[1],
-            )  # fmt: skip
+            step = launch("climb_step", flags, (count,), gradient=gradient, poses=placed.source, climb=there, **numbers)
             while not end[:, ENDED].all():
                 backend.run((*program, step) * _STEPS_AT_ONCE)
                 space.read(there, end)
             return
-        pose = np.array(poses.host[piece.begin : piece.end] if poses.host is not None else [])
         climb_step = get_backend("numpy").compile("climb_step", flags)
         while not end[:, ENDED].all():
-            moved = Poses(pose, backend, scans=None, late=True)
-            moved.reach = _FARTHEST
-            program, gradient, _ = self._program(moved, Piece(0, piece.count, piece.per_scan), readings)
             backend.run(program)
             space.read(gradient, rows)
-            climb_step((piece.count,), rows.reshape(-1), pose.reshape(-1), end.reshape(-1), *numbers, *self._turn)
+            climb_step((count,), rows.reshape(-1), pose.reshape(-1), end.reshape(-1), *numbers.values())
+            program = self._placed(pose, readings)[0]
+
+    def _placed(self, pose: np.ndarray, readings: Readings) -> tuple[Program, Buffer, PlacedPoses]:
+        """Return the launches for (M, 3) poses that will move; see ``_program``."""
+        poses = Poses(pose, self._pipeline.backend, late=True)
+        poses.reach = _FARTHEST
+        return self._program(poses, Piece(0, len(pose), 1), readings)
 
 
 def in_world(numbers: np.ndarray, yaw: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

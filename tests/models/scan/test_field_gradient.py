@@ -10,6 +10,7 @@ from support.kernel_scenes import run
 
 import gpusense as gs
 from gpusense.backends import get_backend
+from gpusense.models.scan import field_gradient
 
 SCANNER = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.05, count=80, range_max=6.0, mount=(0.3, -0.1, 0.4))
 PARAMETERS = {
@@ -118,35 +119,27 @@ def test_steps_of_climbs_are_those_of_the_reference(name, real, needs):
     poses, climbs = rng.uniform(-1, 1, (40, 3)), rng.uniform(0.1, 1, (40, 19))
     climbs[:, 7], climbs[:, 10], climbs[:, 12] = 3, 4, 5
     # Climbs that begin, continue, lead too far, and have ended.
-    climbs[:, 16], climbs[:10, 16], climbs[:, 17:] = 7, -1, 0
-    climbs[10:15, 13], climbs[15:20, 18], climbs[20:25, :3] = 6, 1, poses[20:25] + 1e-5
+    climbs[:, 16], climbs[:5, 16], climbs[:, 17:] = 7, -1, 0
+    climbs[5:8, 13], climbs[8:12, 18], climbs[12:15, :3] = 6, 1, poses[24:30:2] + 1e-5
     flags = frozenset({"FLOAT64"}) if real is np.float64 else frozenset()
-    call = (
-        "climb_step",
-        flags,
-        (40,),
-        numbers.astype(real).ravel(),
-        poses.ravel(),
-        climbs.ravel(),
-        40,
-        9,
-        1e-4,
-        0.8,
-        0.6,
-    )
+    call = ("climb_step", flags, (20,), numbers.astype(real).ravel(), poses.ravel(), climbs[:20].ravel(), 20, 2, 9)
+    call += (1e-4, 0.8, 0.6)
     expected, got = run(get_backend("numpy"), *call), run(get_backend(needs(name)), *call)
-    assert np.isin(expected["climb"].reshape(40, 19)[:, 17], [0, 1]).all()
+    assert np.isin(expected["climb"].reshape(20, 19)[:, 17], [0, 1]).all()
     for output, values in expected.items():
         np.testing.assert_allclose(got[output], values, rtol=1e-9, atol=1e-12)
 
 
-def test_climbs_have_the_same_ends_without_float64(backend, monkeypatch):
+def test_climbs_of_parts_of_scans_and_without_float64_have_the_same_ends(backend, monkeypatch):
     grid, poses, _ = scene((3.0, 1.0, 0.4))
     model = field(grid, backend, precision="float32")
     ranges = gs.RayCaster(grid, 6.0, backend="numpy").cast(poses, SCANNER.bearings)
     # A scan without readings stays.
     ranges[1] = np.nan
     ends, steps, calm = model._climb(poses, ranges)
+    # As on GPUs.
+    monkeypatch.setitem(field_gradient._PARTS, "cpu", 7)
+    np.testing.assert_allclose(model._climb(poses, ranges)[0], ends, atol=1e-5)
     info = dataclasses.replace(model._context.backend.info, float64=False)
     monkeypatch.setattr(model._context.backend, "info", info)
     np.testing.assert_allclose(model._climb(poses, ranges)[0], ends, atol=1e-5)

@@ -83,7 +83,7 @@ ON_PURPOSE = [
     Purpose("raycast", "sectors_of", REFERENCE_ONLY, "SECTORS is a constant of the kernels"),
     Purpose("shapes", "particles_of_worlds", REFERENCE_ONLY, WORLD_BY_WORLD),
     Purpose(
-        "shapes", "sight_of sights_between sights_of_disc sights_of_segment find_sights sight_at shape_at",
+        "shapes", "sight_of sights_between sights_of_disc sights_of_segment find_sights lowest_bits sight_at shape_at",
         KERNELS_ONLY,
         "a ray tests the shapes near its direction; in the reference it tests every shape",
     ),

@@ -2,7 +2,7 @@
 
 The logs of the data folder are split by name before any run: alternate ones are "tuning" and "held out"
 (``verdict_runs.TUNING``, ``HELD_OUT``). Constants of the verdict were chosen on simulated runs
-(``bench/studies/verdict_fit.py``) and inspected on the tuning half; the table has both halves side by side.
+(``bench/results/verdict.md``) and inspected on the tuning half; the table has both halves side by side.
 
 A false alarm is a scan with p_lost above 0.5 whose pose is within 1 m and 0.5 rad of the reference, because of a wide
 cloud or contradicting scans; the next column counts only those with the verdict "lost". A miss is a scan with p_lost of

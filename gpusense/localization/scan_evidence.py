@@ -11,7 +11,7 @@ off the map and are no evidence. Let n = A + S + T be the informative beams, S o
 within LIMITS, since another place may always look alike. A pose inside solid cells adds SOLID, a pose in unknown cells
 UNKNOWN. The coefficients come from a logistic regression on about 450 simulated runs with people, moved and new
 furniture, glass, wrong maps, 16 to 360 beams and kidnapping; right and wrong poses have equal weight. 200 other runs
-(``bench/studies/verdict_fit.py``) yield 2.83, 1.40, 0.62 and 0.40. BIAS is lower by CAUTION, since false alarms cost
+(``bench/results/verdict.md``) yield 2.83, 1.40, 0.62 and 0.40. BIAS is lower by CAUTION, since false alarms cost
 more; only CAUTION was chosen on the tuning half of the recorded logs.
 
 **Other places.** On a coarse or old map many beams contradict even the right pose, and a single scan cannot

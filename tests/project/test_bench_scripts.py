@@ -35,10 +35,6 @@ HERE: dict[str, tuple[str, Callable[[dict[str, Any]], object]]] = {
     "speed/limits.py": (
         f"--particles 120 --beams 8 --scan noisy --range-max 8 {SMALL}", every("rows", call_s=True, launch_s=True)
     ),
-    "speed/launches.py": (
-        "--particles 64 --beams 8 --repeats 2 --size 20 --power 3 --backend opencl",
-        every("rows", together_s=True, main_s=True),
-    ),
     "speed/point_models.py": (
         "--landmarks 30 --particles 60 --features 4 --beacons 3 --repeats 1 --seconds 0.01 --backend opencl",
         lambda report: all(row["rate"] > 0 and row["launch_rate"] > 0 and row["error"] < 16 for row in report["rows"]),
@@ -46,9 +42,6 @@ HERE: dict[str, tuple[str, Callable[[dict[str, Any]], object]]] = {
     "speed/small_calls.py": (
         "--particles 50 --beams 12 --scans 3 --calls 4 --models 2 --seconds 0.01 --size 20 --backend opencl",
         lambda report: every("rows", differing_bits=0)(report) and every("several", differing_bits=0)(report),
-    ),
-    "speed/field_gradient.py": (
-        "--particles 60 --beams 11 --repeats 1 --backend opencl", every("rows", lookups=True, call_ms=True)
     ),
     "accuracy/fuzz_rays.py": ("--backend opencl --rays 30000", every("rows", differing_rays=0)),
     "accuracy/calibration.py": (
@@ -87,18 +80,6 @@ APART: dict[str, tuple[str, Callable[[dict[str, Any]], object]]] = {
         "--pairs 4000 --numpy-pairs 1000 --scenes 1 --count 400 --starts 1 --repeats 2 --seconds 1 "
         "--precision float64 --backend numpy",
         lambda report: report["fall"] <= 1e-9 and every("rows", converged=1)(report),
-    ),
-    "speed/sweeps.py": (
-        "--workers 1 --jobs 2 --particles 20 --beams 11 --scans 2 --repeats 2",
-        lambda report: report["differing"] == [] and report["rows"][0]["efficiency"] == 1,
-    ),
-    "studies/fit_real.py": (
-        "--data data --backend opencl --scans 20 --block 2 --set sonar1 --set lidar_wall --discrete 0.3",
-        lambda report: all(row["fit"]["converged"] and row["discrete"]["converged"] for row in report["sets"]),
-    ),
-    "studies/landmarks_real.py": (
-        "--data data --backend opencl --set mrclam_2 --set lego --scans 600 --particles 300",
-        lambda report: [each["landmarks"] for each in report["sets"][0]["exchanged"]] == [[11, 17]],
     ),
 }  # fmt: skip
 

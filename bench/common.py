@@ -85,6 +85,8 @@ def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) ->
     arguments = parser.parse_args(argv)
     if getattr(arguments, "data", True) is None:
         parser.error("--data or GPUSENSE_DATA must name the folder of recorded data")
+    if getattr(arguments, "data", None) is not None:
+        os.environ["GPUSENSE_DATA"] = str(arguments.data)
     if getattr(arguments, "backend", True) is None:
         arguments.backend = present(numpy=arguments.numpy)
     return arguments

@@ -3,7 +3,7 @@
     python bench/accuracy/extreme.py --backend opencl --backend warp:cpu --output bench/results/extreme-cpu
     python bench/accuracy/extreme.py --full --part sizes               # sizes meant for a GPU; nothing is left out
 
-Parts: *sizes* has long scans and large clouds; *products* the weights of nav2 and Beluga for the same beams; *maps*
+Parts: *sizes* has long scans and large clouds; *products* weights without a shift, as of nav2 and Beluga; *maps*
 large grids with a local and a global cloud; *levels* log-likelihoods around -1e9. The script prints tables and writes
 JSON. The exit code is 1 if a log p is not finite, weights do not sum to 1 within 1e-6, an error exceeds its bound, or
 bits of ranges differ from NumPy's.
@@ -40,37 +40,12 @@ SIZES, LARGER = ((1_000, 100_000), (1_000_000, 1_000), (10_000_000, 4)), ((10_00
 PRODUCTS = (30, 360, 1_000, 100_000)
 # Rates that every processor exceeds [particle-beams / s] (beam model, field), and the longest run without --full [s].
 SPEED, LONGEST = {"opencl": (6e6, 6e7), "warp": (3e6, 3e7), "numpy": (4e5, 1.5e7)}, 200.0
-BEAM, FIELD, NAV2 = "beam model", "field", "field, nav2's density"
-# nav2 does not normalise the Gaussian: 0.5 exp(-d^2 / 2 s^2) + 0.5 / range_max is RATIO times our density with the
-# weights UNNORMALISED.
-SCALE = SIGMA * math.sqrt(2 * math.pi)
-RATIO, UNNORMALISED = (1 + SCALE) / 2, (SCALE / (1 + SCALE), 0.0, 1 / (1 + SCALE))
+BEAM, FIELD = "beam model", "field"
 MODELS: dict[str, tuple[Callable[..., Any], Any]] = {
     BEAM: (gs.BeamModel, gs.BeamParameters()),
     FIELD: (gs.LikelihoodFieldModel, gs.LikelihoodFieldParameters(0.5, 0.0, 0.5, SIGMA, FARTHEST)),
-    NAV2: (gs.LikelihoodFieldModel, gs.LikelihoodFieldParameters(*UNNORMALISED, SIGMA, FARTHEST)),
 }
 Row = dict[str, Any]
-
-
-def exp_of_sum(density: np.ndarray) -> np.ndarray:
-    """Return weights like nav2_amcl's likelihood_field_model_prob.cpp and Beluga's likelihood_field_prob_model.hpp."""
-    return np.exp(np.log(density).sum(axis=1))
-
-
-def product(density: np.ndarray) -> np.ndarray:
-    """Return weights by the book's table 6.3 to the letter: ``q = q * p``."""
-    return np.prod(density, axis=1)
-
-
-def nav2_weights(raw: np.ndarray) -> np.ndarray:
-    """Normalise like nav2_amcl's pf_update_sensor: weights are silently uniform if their total is 0."""
-    return raw / raw.sum() if raw.sum() > 0 else np.full(len(raw), 1 / len(raw))
-
-
-def beluga_weights(raw: np.ndarray) -> np.ndarray:
-    """Normalise like Beluga's actions/normalize.hpp, which divides by any total, 0 included."""
-    return raw / raw.sum()
 
 
 class Scene:
@@ -146,32 +121,19 @@ def sizes(backend: str, precision: str, arguments: argparse.Namespace) -> Iterat
 
 
 def products(backend: str, precision: str, arguments: argparse.Namespace) -> Iterator[Row]:
-    """Yield the weights of 1000 particles, by gpusense and by its peers from the same densities."""
+    """Yield how many of 1000 weights are exactly 0 as ``exp(sum of logs)``, the form of nav2_amcl and Beluga."""
     scene, particles = Scene(arguments.seed), 1_000
-    for beams in PRODUCTS:
+    for beams, (name, (kind, parameters)) in itertools.product(PRODUCTS, MODELS.items()):
         scanner, ranges, hits = scene.scan(beams)
-        chunk = max(10_000_000 // beams, 1)
-        for name, (kind, parameters) in MODELS.items():
-            model = kind(scene.grid, scanner, parameters, backend=backend, precision=precision)
-            ratio = np.where(np.isfinite(ranges), RATIO if name == NAV2 else 1.0, 1.0)
-            for cloud in ("tracking", "global"):
-                poses, pieces = scene.cloud(cloud, particles), []
-                for begin in range(0, particles, chunk):
-                    log_p, parts = model.log_likelihood(poses[begin : begin + chunk], ranges, per_beam=True)
-                    with np.errstate(all="ignore"):
-                        density = np.exp(parts.astype(np.float64)) * ratio
-                        pieces.append((log_p, exp_of_sum(density), product(density)))
-                log_p, raw, multiplied = (np.concatenate(column) for column in zip(*pieces, strict=True))
-                with np.errstate(all="ignore"):
-                    nav2, beluga = nav2_weights(raw), beluga_weights(raw)
-                    effective = float(1 / np.sum(nav2 * nav2))
-                row = {"model": name, "cloud": cloud, "particles": particles, "beams": beams, "hits": hits}
-                for form, values in (("exp_of_sum", raw), ("product", multiplied)):
-                    row[f"{form}_zero"] = int(np.count_nonzero(values == 0))
-                    row[f"{form}_inf"] = int(np.count_nonzero(np.isinf(values)))
-                row |= {"nav2_not_finite": int(np.count_nonzero(~np.isfinite(nav2))), "nav2_effective": effective}
-                row |= {"nav2_uniform": not raw.any(), "beluga_not_finite": int(np.count_nonzero(~np.isfinite(beluga)))}
-                yield {**row, **weighed(log_p)}
+        model, chunk = kind(scene.grid, scanner, parameters, backend=backend, precision=precision), 10_000_000 // beams
+        for cloud in ("tracking", "global"):
+            poses, pieces = scene.cloud(cloud, particles), []
+            for begin in range(0, particles, chunk):
+                log_p, parts = model.log_likelihood(poses[begin : begin + chunk], ranges, per_beam=True)
+                pieces.append((log_p, np.exp(parts.astype(np.float64).sum(axis=1))))
+            log_p, raw = (np.concatenate(column) for column in zip(*pieces, strict=True))
+            row = {"model": name, "cloud": cloud, "particles": particles, "beams": beams, "hits": hits}
+            yield {**row, "exp_of_sum_zero": int(np.count_nonzero(raw == 0)), **weighed(log_p)}
 
 
 def rooms(side: int, rng: np.random.Generator) -> np.ndarray:
@@ -203,7 +165,7 @@ def maps(backend: str, precision: str, arguments: argparse.Namespace) -> Iterato
         ranges = gs.RayCaster(cut(grid, place), RANGE_MAX, backend="numpy").cast(place[None], scanner.bearings)[0]
         local = cloud_around(place, 10_000, 0.3, 0.1, rng)
         everywhere = rng.uniform((0, 0, -math.pi), (metres, metres, math.pi), (10_000, 3))
-        for name, (kind, parameters) in list(MODELS.items())[:2]:
+        for name, (kind, parameters) in MODELS.items():
             model = kind(grid, scanner, parameters, backend=backend, precision=precision)
             for cloud, poses in (("local", local), ("global", everywhere)):
                 row = {"model": name, "cells": f"{side} x {side}", "cloud": cloud, "particles": len(poses), "beams": 60}
@@ -231,7 +193,7 @@ def levels(backend: str, precision: str, arguments: argparse.Namespace) -> Itera
     scanner, ranges, _ = scene.scan(1_000)
     narrow = cloud_around(scene.pose, 1_000, 1e-9, 1e-10, np.random.default_rng(scene.seed))
     clouds = {"tracking": scene.cloud("tracking", 1_000), "narrow": narrow}
-    for (name, (kind, parameters)), (cloud, poses) in itertools.product(list(MODELS.items())[:2], clouds.items()):
+    for (name, (kind, parameters)), (cloud, poses) in itertools.product(MODELS.items(), clouds.items()):
         others, sigma = {"z_short": 0, "z_max": 0} if name == BEAM else {}, 1e-3
         for _ in range(2):
             p = parameters.replace(z_hit=1, z_rand=0, sigma_hit=sigma, **others)
@@ -249,8 +211,7 @@ def levels(backend: str, precision: str, arguments: argparse.Namespace) -> Itera
 PARTS = {"sizes": sizes, "products": products, "maps": maps, "levels": levels}
 COLUMNS = {
     "sizes": "model particles beams hits seconds rate finite sum_apart effective error bound_share other_bits left_out",
-    "products": "model cloud beams hits effective zero_weights sum_apart exp_of_sum_zero exp_of_sum_inf product_zero "
-    "product_inf nav2_not_finite nav2_uniform nav2_effective beluga_not_finite",
+    "products": "model cloud beams hits effective zero_weights sum_apart exp_of_sum_zero",
     "maps": "model cells cloud outcome seconds finite sum_apart effective error other_bits",
     "levels": "model cloud sigma_hit median finite sum_apart effective spacing relative weight_moved exp_is_zero",
 }

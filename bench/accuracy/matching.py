@@ -61,7 +61,7 @@ def row(kind: str, name: str, guess: str, backend: str, truth: np.ndarray, call:
     wrong = (distance > WRONG) | (turn > WRONG_TURN)
     sure = np.isfinite(match.covariance).all(axis=(1, 2)) & ~wrong
     off = match.pose - truth
-    off[:, 2] = np.remainder(off[:, 2] + np.pi, 2 * np.pi) - np.pi
+    off[:, 2] = gs.wrap_angle(off[:, 2])
     squared = np.einsum("si,sij,sj->s", off[sure], np.linalg.inv(match.covariance[sure]), off[sure]) / 3
     # Wrong matches with a covariance that excludes the truth.
     deviation = np.sqrt(np.einsum("sii->si", match.covariance)[:, :2].max(axis=1))

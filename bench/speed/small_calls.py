@@ -123,10 +123,6 @@ class Bench:
                     self.run_calls(f"{name}, ", make, scans)
                 if rows & {"scans", "models"}:
                     self.run_several(f"{name}, ", make, scans)
-        graphs = getattr(self.device, "_graphs", None)
-        if graphs is not None and self.device.info.graphs:
-            refused = f"; {graphs.refusal}" if graphs.refusal else ""
-            note(f"{self.device.info.selection}: {len(graphs._graphs)} graphs are kept{refused}")
 
     # ---- one scan a call
 

@@ -14,8 +14,6 @@ circular correlation of ranges with rays from each position.
 from __future__ import annotations
 
 import functools
-import sqlite3
-import struct
 import sys
 import time
 from pathlib import Path
@@ -30,18 +28,18 @@ from gpusense.matching.search import PoseGrid, Search
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import recordings
 from common import best, make_parser, note, odd_scans, parse, publish, table
 
 PAIRS = (("intel", "intel"), ("csail", "csail"), ("intel", "csail"), ("csail", "intel"))
 # Errors of a pose that counts as right [m, degrees].
 RIGHT = (0.5, 5.0)
-OLIN = "olin_mac_bag/macfirst_floor_take_2/macfirst_floor_take_2_0.db3"
 
 
 def off(pose: np.ndarray, truth: Any) -> tuple[float, float]:
     """Return the errors of a pose [m, degrees]."""
-    turn = np.remainder(pose[2] - truth[2] + np.pi, 2 * np.pi) - np.pi
-    return float(np.hypot(pose[0] - truth[0], pose[1] - truth[1])), float(np.degrees(abs(turn)))
+    distance, turn = recordings.errors(pose, truth)
+    return distance, float(np.degrees(turn))
 
 
 def evenly(items: list[Any], count: int) -> list[Any]:
@@ -195,22 +193,6 @@ def match(backend: str, arguments: Any) -> list[dict[str, Any]]:
     return rows
 
 
-def bag_scans(path: Path) -> list[tuple[float, np.ndarray]]:
-    """Return stamps and ranges of the LaserScan messages of a ROS 2 bag (CDR, little-endian)."""
-    query = (
-        "select data from messages join topics on topics.id = topic_id where topics.name = '/scan' order by timestamp"
-    )
-    scans = []
-    with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as bag:
-        for (data,) in bag.execute(query):
-            seconds, nanoseconds, length = struct.unpack_from("<iII", data, 4)
-            # Seven float32 after the frame's name, at multiples of 4 bytes from the header of the encapsulation.
-            place = 16 + length + -length % 4 + 28
-            (count,) = struct.unpack_from("<I", data, place)
-            scans.append((seconds + 1e-9 * nanoseconds, np.frombuffer(data, "<f4", count, place + 4)))
-    return scans
-
-
 def circular(backend: str, arguments: Any) -> list[dict[str, Any]]:
     """Rank true poses by the beams whose ranges agree with rays from positions 0.4 m apart, at all headings at once."""
     turns, edges, rows = 360, np.geomspace(0.3, 20.0, 25), []
@@ -245,20 +227,11 @@ def circular(backend: str, arguments: Any) -> list[dict[str, Any]]:
 
 def olin(backend: str, arguments: Any) -> list[dict[str, Any]]:
     """Localise scans of the Olin bag in its map."""
-    folder = arguments.data / "olin_mac_bag"
-    grid = gs.read_map(folder / "mac_1st_floor_9_23.yaml")
-    reference = np.loadtxt(folder / "derived_reference.csv", delimiter=",", skiprows=1)
-    scans = evenly(bag_scans(arguments.data / OLIN), arguments.scans)
-    count = len(scans[0][1])
-    scanner = gs.Scanner.uniform(
-        angle_min=np.radians(-179.0), angle_increment=np.radians(359 / (count - 1)), count=count, range_max=30.0,
-        mount=(0.0039, 0.0, np.pi / 2),
-    )  # fmt: skip
+    recording = recordings.load("olin")
+    ((grid, scanner),) = recording.places
     model = gs.LikelihoodFieldModel(grid, scanner, backend=backend, beams=180)
-    truth = [reference[np.abs(reference[:, 0] - stamp).argmin(), 1:4] for stamp, _ in scans]
-    return [
-        {"log": "olin", "map": "olin"} | located(model, [(z, pose) for (_, z), pose in zip(scans, truth, strict=True)])
-    ]
+    chosen = evenly([(event.ranges, event.truth) for event in recording.events], arguments.scans)
+    return [{"log": "olin", "map": "olin"} | located(model, chosen)]
 
 
 PARTS = {"locate": locate, "window": window, "large": large, "maps": maps, "match": match, "olin": olin,

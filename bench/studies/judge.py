@@ -7,7 +7,8 @@ found if a judged pose says "lost" within it, after ``LATE`` scans at most, or a
 stretch says "lost" without such a scan in it or in the ``LATE`` scans before it.
 
 The poses have no covariance, so their radius comes from the scans. The second table has its integrity at an alert limit
-of ``ALERT_LIMIT``, with the truth of the logs (``gs.integrity``); limits of shares as in ``protection_report``.
+of ``ALERT_LIMIT``, with the truth of the logs (``gs.integrity``); the limit of a share comes from a bootstrap of blocks
+of scans, or from their number if that is larger.
 
     python bench/studies/judge.py --output judge_cpu
     python bench/studies/judge.py --times --output judge_times_cpu
@@ -26,11 +27,11 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
-import protection_report
 import recordings
 import verdict_runs as runs
 from accuracy.compiled_peers import Follower, Weigher
 from common import make_parser, note, parse, publish, table
+from scipy.stats import beta
 from speed.filters import PEERS, load
 
 import gpusense as gs
@@ -52,8 +53,8 @@ CASES = ("as recorded", "carried away")
 LEAST, LATE, FAR, FAR_TURN = 5, 20, 1.0, 0.5
 # Errors of poses that are certainly right [m, rad].
 NEAR, NEAR_TURN = 0.3, 0.15
-# Largest safe error [m].
-ALERT_LIMIT = 0.5
+# Largest safe error [m]; risks of the radius; scans of a block.
+ALERT_LIMIT, RISKS, BLOCK = 0.5, (0.01, 0.05), 13
 COLUMNS = (
     "program", "case", "runs", "scans", "losses", "found", "missed", "median delay [scans]", "false stretches",
     "right scans", "said lost [%]", "scans within 0.3 m", "said lost [%]",
@@ -116,7 +117,7 @@ def one_run(recording, models, weigher, chosen, case, args, rng):
     near = (off[:, 0] < NEAR) & (off[:, 1] < NEAR_TURN)
     lost, sure = (np.array([one == word for one in found.verdicts]) for word in ("lost", "tracking"))
     known = off[:, 0], ~wrong
-    rated = {risk: integrity_of(models, scans, poses, risk, *known) for risk in protection_report.RISKS}
+    rated = {risk: integrity_of(models, scans, poses, risk, *known) for risk in RISKS}
     places = []
     for stretch in found.stretches:
         if stretch.place is not None and stretch.place.found and wrong[stretch.first : stretch.last + 1].any():
@@ -134,7 +135,7 @@ def one_run(recording, models, weigher, chosen, case, args, rng):
 def integrity_of(models, scans, poses, risk, errors, right):
     """Return the figures of the radii of a trajectory at a risk."""
     radii = gs.judge_trajectory(models, scans, poses, risk=risk, searches=0).radii
-    rated, block = gs.integrity(errors, radii, alert_limit=ALERT_LIMIT), protection_report.BLOCK
+    rated, block = gs.integrity(errors, radii, alert_limit=ALERT_LIMIT), BLOCK
     over = errors > radii
     return dict(
         blocks=[float(over[k : k + block].mean()) for k in range(0, len(over), block)], over=int(over.sum()),
@@ -144,6 +145,17 @@ def integrity_of(models, scans, poses, risk, errors, right):
     )  # fmt: skip
 
 
+def upper_limit(blocks, rng):
+    """Return the upper 95 % limit of the mean of blocks: of a bootstrap, and of as many independent scans.
+
+    The second one counts a block as one scan, so that no excess in n blocks gives about 3 / n.
+    """
+    count, mean = len(blocks), float(blocks.mean())
+    drawn = rng.choice(blocks, (2000, count)).mean(axis=1)
+    alone = float(beta.ppf(0.95, mean * count + 1, count * (1 - mean))) if mean < 1 else 1.0
+    return max(float(np.quantile(drawn, 0.95)), alone)
+
+
 def integrity_row(name, case, risk, chosen):
     """Return a row of the table of integrity."""
     every, scans = [one["integrity"][risk] for one in chosen], sum(one["scans"] for one in chosen)
@@ -151,7 +163,7 @@ def integrity_row(name, case, risk, chosen):
     blocks, radii, alerts = (
         np.array([value for one in every for value in one[key]]) for key in ("blocks", "radii", "alerts")
     )
-    limit = protection_report.upper_limit(blocks, np.random.default_rng(0))
+    limit = upper_limit(blocks, np.random.default_rng(0))
     available, right = (sum(one[key] for one in every) for key in ("available", "right"))
     late = f"{np.median(alerts):.0f}, {alerts.max():.0f}; {(alerts <= 5).sum()} of {len(alerts)}"
     return (
@@ -205,7 +217,7 @@ def study(args):
         for case in CASES:
             part = [one for one in mine if one["case"] == case]
             rows.append(row_of(version, case, part))
-            rated += [integrity_row(version, case, risk, part) for risk in protection_report.RISKS]
+            rated += [integrity_row(version, case, risk, part) for risk in RISKS]
     per_log = [
         row_of("both", log, [one for one in results if one["log"] == log])
         for log in dict.fromkeys(one["log"] for one in results)

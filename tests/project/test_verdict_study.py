@@ -1,4 +1,4 @@
-"""Studies count alarms, misses, excesses and errors of chains as their pages say."""
+"""Studies count alarms, misses, limits and errors of chains as their pages say."""
 
 from __future__ import annotations
 
@@ -65,16 +65,7 @@ def test_the_study_of_the_verdict_counts_alarms_and_misses(monkeypatch: pytest.M
     assert report.at_share([(0.0, 0.5, 0, None, None), (0.5, 1.0, 100, 0.8, 1.0)]) == [None, None]
 
 
-def test_the_study_of_protection_levels_counts_excesses_and_alerts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_limit_of_a_share_without_excesses_is_about_3_over_n(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "bench"))
-    report = importlib.import_module("protection_report")
-    rows = np.zeros((60, report.RADII + 3))
-    rows[:, report.RADII :] = 0.1
-    # Ten errors are larger than the widened radius; a jump at scan 40 shows after three scans.
-    rows[:10, report.ERROR], rows[40:, report.ERROR], rows[43:, report.RADII :] = 0.21, 5.0, np.inf
-    run = ("held out", "intel", "kidnapped", 0, 40, rows)
-    found = report.figures([run], report.RISKS[0], np.random.default_rng(0), 2.0, 0.0)
-    assert found["excesses"] == 13 and found["scans"] == 60 and found["available"] == 1 and found["late"] == [3]
-    assert report.figures([run], report.RISKS[0], np.random.default_rng(0), 2.0, 0.02)["excesses"] == 3
-    # The limit is about 3 / n if no error exceeds.
-    assert report.upper_limit(np.zeros(300), np.random.default_rng(0)) == pytest.approx(3 / 300, rel=0.01)
+    judge = importlib.import_module("studies.judge")
+    assert judge.upper_limit(np.zeros(300), np.random.default_rng(0)) == pytest.approx(3 / 300, rel=0.01)

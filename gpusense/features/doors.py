@@ -9,7 +9,7 @@ import numpy as np
 
 from gpusense._util.angles import wrapped
 from gpusense.features.lines import first_apart, pairs_of, scores_of
-from gpusense.features.result import Found
+from gpusense.features.result import Found, turned_axes
 from gpusense.features.segments import Beams, Segments
 
 # Least and largest width of a door [m].
@@ -142,10 +142,7 @@ def _on_wall(segments: Segments, wall: np.ndarray, other: np.ndarray) -> np.ndar
     middle = segments.ends[other].mean(axis=1)
     xy = segments.place(other, middle)
     across, along = c * xy[:, 0] + s * xy[:, 1] - d, c * xy[:, 1] - s * xy[:, 0]
-    mine, its = segments.covariance[wall], segments.covariance[other]
-    spread = mine[:, 1, 1] - 2 * along * mine[:, 0, 1] + along**2 * mine[:, 0, 0]
-    spread += its[:, 1, 1] - 2 * middle * its[:, 0, 1] + middle**2 * its[:, 0, 0]
-    spread = np.sqrt(np.maximum(spread, 0))
+    spread = np.sqrt(np.maximum(segments.at(wall, along)[:, 0, 0] + segments.at(other, middle)[:, 0, 0], 0))
     good &= (np.abs(across) <= _ASIDE + _DEVIATIONS * spread) & (spread <= _VAGUE)
     return good
 
@@ -190,20 +187,12 @@ def _found(
 ) -> Found:  # fmt: skip
     """Return doors from their walls and jambs (D, 4), see ``ends`` of :class:`_Gaps`."""
     angle, middle = segments.angle[wall], ends[:, :2].mean(axis=1)
-    c, s = np.cos(angle), np.sin(angle)
-    mine = segments.covariance[wall]
     # Twice the variance of an edge between two beams: the neighbours of a jamb may be mistaken for its reveal.
     along = np.square(ends[:, 2:]).sum(axis=1) / 24
-    across = mine[:, 1, 1] - 2 * middle * mine[:, 0, 1] + middle**2 * mine[:, 0, 0]
-    mixed = mine[:, 0, 1] - middle * mine[:, 0, 0]
     covariance = np.zeros((len(wall), 3, 3))
-    covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 2, 2] = across, along, mine[:, 0, 0]
-    covariance[:, 0, 2] = covariance[:, 2, 0] = mixed
-    observed = np.zeros((len(wall), 3, 3))
-    observed[:, 0, 0], observed[:, 0, 1] = c, s
-    observed[:, 1, 0], observed[:, 1, 1], observed[:, 2, 2] = -s, c, 1
+    covariance[:, ::2, ::2], covariance[:, 1, 1] = segments.at(wall, middle), along
     xy = segments.place(wall, middle) + np.array(mount[:2])
     best = np.maximum(scores_of(segments, wall), scores_of(segments, other))
-    found = Found(segments.scan[wall], np.column_stack([xy, angle]), observed, covariance,
+    found = Found(segments.scan[wall], np.column_stack([xy, angle]), turned_axes(angle), covariance,
                   ends[:, 1] - ends[:, 0], best * np.minimum(1, 0.5 + through))  # fmt: skip
     return found.only(np.argsort(found.scan, kind="stable"))

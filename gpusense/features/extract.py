@@ -18,7 +18,7 @@ from gpusense.features.device import ScanDevice
 from gpusense.features.doors import find_doors
 from gpusense.features.lines import find_hallways, find_lines, scores_of, straight
 from gpusense.features.poles import find_poles
-from gpusense.features.result import KINDS, Features, Found, check_kinds, features_of, joined, nothing
+from gpusense.features.result import KINDS, Features, Found, check_kinds, features_of, joined, nothing, turned_axes
 from gpusense.features.segments import NEIGHBOURS, Segments, beams_of, by_bearing, find_segments
 from gpusense.matching.match import readings
 from gpusense.matching.noise import ASSUMED_NOISE, whole_noise
@@ -253,10 +253,8 @@ def _found(rows: np.ndarray, mount: tuple[float, float, float]) -> Found:
     pose = np.column_stack(
         [(distance + radius) * c + mount[0], (distance + radius) * s + mount[1], np.zeros(len(rows))]
     )  # fmt: skip
-    observed = np.zeros((len(rows), 2, 3))
-    observed[:, 0, 0], observed[:, 0, 1], observed[:, 1, 0], observed[:, 1, 1] = c, s, -s, c
     covariance = np.zeros((len(rows), 2, 2))
     covariance[:, 0, 0] = noise**2 / count + _TOGETHER**2
     covariance[:, 1, 1] = distance**2 * variance
     score = np.clip(1 - np.sqrt(covariance[:, 1, 1]) / np.maximum(radius, 1e-3), 0, 1)
-    return Found(scan.astype(np.int64), pose, observed, covariance, radius, score)
+    return Found(scan.astype(np.int64), pose, turned_axes(bearing)[:, :2], covariance, radius, score)

@@ -10,7 +10,7 @@ import numpy as np
 
 from gpusense._util.angles import wrapped
 from gpusense.features.device import ScanDevice
-from gpusense.features.result import Found
+from gpusense.features.result import Found, turned_axes
 from gpusense.features.segments import PENALTY, Segments
 
 # Least points and length [m] of a line, and largest deviation of its direction [rad].
@@ -92,15 +92,10 @@ def scores_of(segments: Segments, which: np.ndarray) -> np.ndarray:
 def find_lines(segments: Segments, which: np.ndarray, mount: tuple[float, float, float]) -> Found:
     """Return the lines of some segments: midpoint and direction, with observed offset and direction."""
     angle, middle = segments.angle[which], segments.ends[which].mean(axis=1)
-    c, s = np.cos(angle), np.sin(angle)
     xy = segments.place(which, middle) + np.array(mount[:2])
-    observed = np.zeros((len(which), 2, 3))
-    observed[:, 0, 0], observed[:, 0, 1], observed[:, 1, 2] = c, s, 1
-    jacobian = np.zeros((len(which), 2, 2))
-    jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 1, 0] = -middle, 1, 1
-    covariance = jacobian @ segments.covariance[which] @ jacobian.transpose(0, 2, 1)
     pose = np.column_stack([xy, angle + math.pi / 2])
-    return Found(segments.scan[which], pose, observed, covariance, segments.length[which], scores_of(segments, which))
+    covariance, length = segments.at(which, middle), segments.length[which]
+    return Found(segments.scan[which], pose, turned_axes(angle)[:, ::2], covariance, length, scores_of(segments, which))
 
 
 # Least and largest width [m], and least length over which the walls face each other [widths].
@@ -149,12 +144,10 @@ def find_hallways(segments: Segments, straight: np.ndarray, mount: tuple[float, 
     both = np.zeros((len(a), 4, 4))
     both[:, :2, :2], both[:, 2:, 2:] = frame.covariance[a], frame.covariance[b]
     covariance = jacobian @ both @ jacobian.transpose(0, 2, 1)
-    observed = np.zeros((len(a), 2, 3))
-    observed[:, 0, 0], observed[:, 0, 1], observed[:, 1, 2] = np.cos(normal), np.sin(normal), 1
     axis = np.mod(normal + math.pi, math.pi) - math.pi / 2
     pose = np.column_stack([offset * np.cos(normal), offset * np.sin(normal), axis])
     score = scores_of(segments, a) * scores_of(segments, b)
-    return Found(segments.scan[a], pose, observed, covariance, width * np.cos(0.5 * off), score)
+    return Found(segments.scan[a], pose, turned_axes(normal)[:, ::2], covariance, width * np.cos(0.5 * off), score)
 
 
 def _extents(segments: Segments, lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -195,6 +195,15 @@ class Found:
         return Found(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
 
+def turned_axes(angle: np.ndarray) -> np.ndarray:
+    """Return the axes (F, 3, 3) of x, y and theta, turned about the vertical by angles."""
+    axes = np.zeros((len(angle), 3, 3))
+    axes[:, 0, 0] = axes[:, 1, 1] = np.cos(angle)
+    axes[:, 0, 1] = np.sin(angle)
+    axes[:, 1, 0], axes[:, 2, 2] = -axes[:, 0, 1], 1
+    return axes
+
+
 def nothing() -> Found:
     """Return an empty set of features."""
     empty = np.zeros(0)

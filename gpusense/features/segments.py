@@ -61,6 +61,13 @@ class Segments:
         c, s, d = np.cos(self.angle[which]), np.sin(self.angle[which]), self.distance[which]
         return np.stack([d * c - along * s, d * s + along * c], axis=1)
 
+    def at(self, which: np.ndarray, along: np.ndarray) -> np.ndarray:
+        """Return the covariances (P, 2, 2) of offset and direction of lines at positions along them."""
+        jacobian = np.zeros((len(which), 2, 2))
+        jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 1, 0] = -along, 1, 1
+        result: np.ndarray = jacobian @ self.covariance[which] @ jacobian.transpose(0, 2, 1)
+        return result
+
 
 def find_segments(device: ScanDevice, points: ScanPoints, noise: np.ndarray) -> Segments:
     """Split scans into segments, and fit lines to them.

@@ -1,16 +1,41 @@
-"""Compute standard errors and Newton steps from the observed information, for independent or correlated readings."""
+"""Number the blocks of correlated readings, and compute Newton steps and standard errors from the information."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense._util.typing import Floats
+from gpusense._util import checks
+from gpusense._util.typing import Floats, Integers
 
 # Scaled information below this share of the largest counts as none.
 _FLAT = 1e-10
+# Standard errors over fewer blocks are rough.
+FEW_BLOCKS = 10
+
+
+def number_blocks(blocks: object, shape: tuple[int, ...], of: NDArray[Any]) -> Integers | None:
+    """Return the blocks of some readings, numbered from 0; None without blocks.
+
+    ``blocks`` labels all readings, of the shape ``shape``; ``of`` holds flat indices of the used ones, or their mask.
+    """
+    if blocks is None:
+        return None
+    labels: Integers = checks.array("blocks", blocks, shape, dtype=np.int64).ravel()
+    known, numbers = np.unique(labels[of], return_inverse=True)
+    if len(known) < 2:
+        raise ValueError(f"blocks: must be at least 2 with a reading that is not missing, got {len(known)}")
+    return numbers.ravel().astype(np.int64)
+
+
+def notes_on_blocks(count: int) -> list[str]:
+    """Return a note on standard errors over few blocks."""
+    if count >= FEW_BLOCKS:
+        return []
+    return [f"standard errors are rough, from {count} {'block' if count == 1 else 'blocks'}"]
 
 
 def scaled_axes(curve: Floats, least: float = 1e-300) -> tuple[Floats, Floats, Floats]:
@@ -40,20 +65,20 @@ def newton_direction(
     return step, 0.5 * float(slope @ along)
 
 
-def errors_of(curve: Floats, rows: Floats, scatter: Floats | None = None) -> Floats:
+def errors_of(curve: Floats, rows: Floats, scatter: Floats | None = None, flat: float = _FLAT) -> Floats:
     """Compute (p,) standard errors of functions with (p, m) derivatives ``rows``, infinite without information.
 
     The covariance of the coordinates is the inverse of the information H, or ``H^-1 S H^-1`` with the scatter S of the
-    gradient over blocks (White 1982; Liang and Zeger 1986).
+    gradient over blocks (White 1982; Liang and Zeger 1986). Scaled information below the share ``flat`` counts as none.
     """
     if not len(curve):
         return np.full(len(rows), math.nan)
     scale, size, axes = scaled_axes(curve)
-    known = size > _FLAT * max(float(size[-1]), 0.0)
+    known = size > flat * max(float(size[-1]), 0.0)
     errors = np.empty(len(rows))
     for k, row_of in enumerate(rows):
         row: Floats = axes.T @ (scale * row_of)
-        unknown = np.abs(row[~known]) > 1e-6 * max(float(np.abs(row).max()), 1e-300)
+        unknown = np.abs(row[~known]) > math.sqrt(flat) * max(float(np.abs(row).max()), 1e-300)
         errors[k] = math.inf if unknown.any() else _error(row, size, known, scale[:, None] * axes, scatter)
     return errors
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gpusense.localization.pose_algebra import compose_poses, invert_poses
 from gpusense.logs.records import Pose
 from gpusense.logs.transforms import planar_mount
 from gpusense.world.messages import field, planar_pose
@@ -31,22 +32,10 @@ def pose_matrix(pose: Pose) -> np.ndarray:
     return np.array([[c, -s, 0, pose[0]], [s, c, 0, pose[1]], [0, 0, 1, 0], [0, 0, 0, 1]])
 
 
-def compose(first: Pose, second: Pose) -> Pose:
-    """Return the pose ``second`` in the frame ``first``, relative to the parent of ``first``."""
-    c, s = math.cos(first[2]), math.sin(first[2])
-    x, y = first[0] + c * second[0] - s * second[1], first[1] + s * second[0] + c * second[1]
-    return x, y, math.remainder(first[2] + second[2], 2 * math.pi)
-
-
-def inverse(pose: Pose) -> Pose:
-    """Return the pose of the parent in the frame of ``pose``."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    return -c * pose[0] - s * pose[1], s * pose[0] - c * pose[1], -pose[2]
-
-
 def map_to_odometry(in_map: Pose, in_odometry: Pose) -> Pose:
     """Return the pose of the odometry frame in the map, from the base's poses in both."""
-    return compose(in_map, inverse(in_odometry))
+    x, y, yaw = compose_poses(in_map, invert_poses(in_odometry)).tolist()
+    return x, y, yaw
 
 
 def moved_enough(before: Pose, after: Pose, least: tuple[float, float]) -> bool:

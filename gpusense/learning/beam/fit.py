@@ -23,7 +23,7 @@ from gpusense.learning.beam.options import Callback, Options, check_options, mak
 from gpusense.learning.beam.pairs import Pairs, make_pairs
 from gpusense.learning.beam.point import HIT, SHORT, Bounds, Point, first_guess, random_start
 from gpusense.learning.beam.problem import NO_PRIOR, Prior, Problem, Value
-from gpusense.learning.beam.report import check_blocks, report
+from gpusense.learning.beam.report import report
 from gpusense.learning.beam.searches import climb_genetic, climb_gradient, climb_hill
 from gpusense.learning.beam.shapes import fit_shape
 from gpusense.learning.fitted import BeamFit
@@ -114,9 +114,7 @@ def fit_beam_parameters(
         >>> fit.converged, round(fit.parameters.sigma_hit, 3)
         (True, 0.098)
     """
-    pairs = make_pairs(ranges, expected, range_max, range_min)
-    if blocks is not None:
-        pairs = replace(pairs, block=check_blocks(blocks, np.shape(ranges), pairs))
+    pairs = make_pairs(ranges, expected, range_max, range_min, blocks)
     options = check_options(
         method=method, max_iterations=max_iterations, tolerance=tolerance, restarts=restarts, seed=seed,
         range_bias=range_bias, progress=progress, callback=callback, responsibilities=responsibilities,

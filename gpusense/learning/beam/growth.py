@@ -181,7 +181,7 @@ def fit_jointly(
         SHAPES[hit], growth,
     )  # fmt: skip
     end = maximize(problem, _ITERATIONS, tolerance)
-    blocks = None if pairs.block is None else np.unique(pairs.block[known], return_inverse=True)[1].ravel()
+    blocks = None if pairs.block is None else pairs.block[known]
     values = problem.values(end.theta)
     inner = report(problem, end, problem.parameters(end.theta, hit), blocks, fit.missing)
     names = (*fit.standard_errors, *new)

@@ -21,7 +21,6 @@ from gpusense.learning.beam.options import Callback, Options, check_options, mak
 from gpusense.learning.beam.pairs import Pairs, make_pairs
 from gpusense.learning.beam.point import Bounds, Point, first_guess
 from gpusense.learning.beam.problem import Prior
-from gpusense.learning.beam.report import check_blocks
 from gpusense.learning.beam.shapes import fit_shape
 from gpusense.learning.fitted import BeamFit
 from gpusense.world.hit_shapes import SHAPES, HitName
@@ -249,9 +248,7 @@ def fit_incidence_parameters(
         >>> [round(p.sigma_hit, 2) for p in fit.parameters.parameters]
         [0.06, 0.2]
     """
-    pairs = make_pairs(ranges, expected, range_max, range_min)
-    if blocks is not None:
-        pairs = replace(pairs, block=check_blocks(blocks, np.shape(ranges), pairs))
+    pairs = make_pairs(ranges, expected, range_max, range_min, blocks)
     angles = _angles(incidence, np.shape(ranges), pairs)
     edges = _edges(bins)
     strength = checks.real("strength", strength, low=0)

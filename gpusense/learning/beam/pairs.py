@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense._util.typing import Integers
+from gpusense.learning.information import number_blocks
 from gpusense.world.plausible import look_at_readings
 from gpusense.world.scanner import Reading, reading_classes
 
@@ -26,7 +28,7 @@ class Pairs:
     kinds: NDArray[np.uint8]  # (n,) class of every reading
     range_max: float  # longest range [m]
     quantum: float  # rounding step of the readings; 0 without one [m]
-    block: NDArray[np.intp] | None = None  # (n,) number of each reading's block, or None
+    block: Integers | None = None  # (n,) number of the block of each reading, -1 if missing; or None
 
     @property
     def hits(self) -> int:
@@ -43,6 +45,11 @@ class Pairs:
         """Number of readings that are missing."""
         return int(np.count_nonzero(self.kinds == Reading.MISSING))
 
+    @property
+    def blocks(self) -> int:
+        """Number of blocks with a reading that is not missing; 0 without blocks."""
+        return 0 if self.block is None else len(np.unique(self.block[self.kinds != Reading.MISSING]))
+
     def subset(self, mask: NDArray[np.bool_]) -> Pairs:
         """Return the pairs of the readings in ``mask`` (n,)."""
         hits = mask[self.places]
@@ -52,8 +59,10 @@ class Pairs:
         return Pairs(*chosen, self.range_max, self.quantum, block)
 
 
-def make_pairs(ranges: ArrayLike, expected: ArrayLike, range_max: float, range_min: float = 0.0) -> Pairs:
-    """Classify the readings and select the hits."""
+def make_pairs(
+    ranges: ArrayLike, expected: ArrayLike, range_max: float, range_min: float = 0.0, blocks: ArrayLike | None = None
+) -> Pairs:
+    """Classify the readings, select the hits, and number the blocks."""
     range_max = checks.real("range_max", range_max, low=checks.SMALLEST, high=checks.FARTHEST)
     range_min = checks.real("range_min", range_min, low=0, below=range_max)
     z = checks.array("ranges", ranges, finite=False, dtype=None)
@@ -63,7 +72,7 @@ def make_pairs(ranges: ArrayLike, expected: ArrayLike, range_max: float, range_m
             f"expected: shape must be that of ranges, {checks.shape_text(z.shape)}, got "
             f"{checks.shape_text(z_expected.shape)}"
         )
-    z, z_expected = z.ravel(), z_expected.ravel()
+    shape, z, z_expected = z.shape, z.ravel(), z_expected.ravel()
     kinds = reading_classes(z, range_min, range_max)
     look_at_readings("ranges", z, range_max, range_min=range_min)
     if not (kinds != Reading.MISSING).any():
@@ -76,10 +85,13 @@ def make_pairs(ranges: ArrayLike, expected: ArrayLike, range_max: float, range_m
             f"{z_expected[index]} at index {index}"
         )
     places = np.flatnonzero(kinds == Reading.HIT)
-    reading = z[places]
+    reading, known = z[places], kinds != Reading.MISSING
+    block, numbers = np.full(len(z), -1), number_blocks(blocks, shape, known)
+    block[known] = -1 if numbers is None else numbers
     return Pairs(
-        reading, np.minimum(z_expected[places], range_max), places, kinds, range_max, range_resolution(reading)
-    )
+        reading, np.minimum(z_expected[places], range_max), places, kinds, range_max, range_resolution(reading),
+        None if numbers is None else block,
+    )  # fmt: skip
 
 
 def range_resolution(reading: NDArray[np.floating]) -> float:

@@ -17,9 +17,8 @@ import math
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from gpusense._util import checks
 from gpusense._util.typing import Floats
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.em import Climb, Watch, climb_em
@@ -29,7 +28,7 @@ from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import BIAS, FORM, HIT, MAX, NAMES, RAND, RATE, SHORT, SIGMA, Point
 from gpusense.learning.beam.problem import NOTHING, Problem, Value
 from gpusense.learning.fitted import BeamFit
-from gpusense.learning.information import errors_of, scatter_of
+from gpusense.learning.information import errors_of, notes_on_blocks, scatter_of
 from gpusense.learning.point.densities import by_shape, truncated
 from gpusense.world.range_causes import ShortDensity
 from gpusense.world.scanner import Reading
@@ -38,8 +37,6 @@ from gpusense.world.scanner import Reading
 _JOINT = 500
 # Relative step of numerical derivatives by a coordinate of the shape of hits.
 _STEP = 1e-5
-# Standard errors over fewer blocks are rough.
-_FEW_BLOCKS = 10
 
 
 def report(problem: Problem, climb: Climb, options: Options, start: Point) -> BeamFit:
@@ -70,7 +67,7 @@ def report(problem: Problem, climb: Climb, options: Options, start: Point) -> Be
         precision=device.real.name,
         device=device.selection,
         independent_errors=independent,
-        blocks=count_blocks(pairs),
+        blocks=pairs.blocks,
         responsibilities=_responsibilities(device, pairs, value.point) if options.responsibilities else None,
     )
 
@@ -85,9 +82,8 @@ def _status(problem: Problem, climb: Climb, value: Value, errors: dict[str, floa
     if problem.readings < count:
         readings = "1 reading" if problem.readings == 1 else f"{problem.readings} readings"
         notes.append(f"{readings} cannot determine {count} parameters")
-    blocks = count_blocks(problem.pairs)
-    if problem.pairs.block is not None and blocks < _FEW_BLOCKS:
-        notes.append(f"standard errors are rough, from {blocks} {'block' if blocks == 1 else 'blocks'}")
+    if problem.pairs.block is not None:
+        notes += notes_on_blocks(problem.pairs.blocks)
     for name in errors.keys() - {NAMES[BIAS]}:
         if errors[name] == math.inf:
             held[name] = "the readings do not determine it"
@@ -203,26 +199,6 @@ def _responsibilities(device: DeviceSums, pairs: Pairs, point: Point) -> NDArray
 
 # Number of readings per pass.
 _PART = 1 << 18
-
-
-def check_blocks(blocks: ArrayLike, shape: tuple[int, ...], pairs: Pairs) -> NDArray[np.intp]:
-    """Return the (n,) blocks of all readings, numbered from 0 in the order of their labels."""
-    labels = checks.as_array("blocks", blocks)
-    if labels.dtype.kind not in "iu":
-        raise TypeError(f"blocks: must hold integers, got {checks.show(blocks)}")
-    if labels.shape != shape:
-        text = checks.shape_text(labels.shape)
-        raise ValueError(f"blocks: shape must be that of ranges, {checks.shape_text(shape)}, got {text}")
-    numbers = np.unique(labels.ravel(), return_inverse=True)[1].ravel()
-    count = len(np.unique(numbers[pairs.kinds != Reading.MISSING]))
-    if count < 2:
-        raise ValueError(f"blocks: must be at least 2 with a reading that is not missing, got {count}")
-    return numbers
-
-
-def count_blocks(pairs: Pairs) -> int:
-    """Return the number of blocks with a reading that is not missing; 0 without blocks."""
-    return 0 if pairs.block is None else len(np.unique(pairs.block[pairs.kinds != Reading.MISSING]))
 
 
 def block_scatter(problem: Problem, point: Point) -> Floats:

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from gpusense._util import checks
-from gpusense._util.typing import Floats
+from gpusense._util.typing import Floats, Integers
 from gpusense.learning.discrete.causes import DiscreteCauses, DiscreteFit
 from gpusense.learning.discrete.probabilities import MOST_BINS, bins_of, check_pairs, separate_causes
-from gpusense.learning.information import errors_of, scatter_of
+from gpusense.learning.information import errors_of, notes_on_blocks, number_blocks, scatter_of
 
 NAMES = ("lambda_short", "lambda_rand", "p_detect", "sigma_hit")
 # Steps of first and second central differences of the mean log-likelihood; they balance rounding and truncation
@@ -26,8 +26,6 @@ _FLAT = 2e-6
 _FEW = 100
 # Number of starts to follow; restarts of a search that ends before the gradient vanishes.
 _BEST, _RESTARTS = 3, 3
-# Standard errors over fewer blocks are rough.
-_FEW_BLOCKS = 10
 # Information below this share of the largest, scaled to a diagonal of 1, counts as none.
 _FLAT_SHARE = 1e-6
 # Number of readings per pass.
@@ -57,40 +55,31 @@ def learn_causes(
     return _causes(theta), _fit(data, value, theta, trace, labels)
 
 
-def _block_counts(data: Counts, ranges: object, expected: object, range_max: float, blocks: object) -> Floats:
+def _block_counts(data: Counts, ranges: object, expected: object, range_max: float, blocks: object) -> Integers:
     """Return the (3, E) block, index among the counts, and number of readings of all occupied cells."""
     z, z_exp = (
         checks.as_array(name, value, masked=True) for name, value in (("ranges", ranges), ("expected", expected))
     )
-    labels = checks.array("blocks", blocks, z.shape, dtype=np.int64).ravel()
     readings, expected_ranges = check_pairs(z.ravel(), z_exp.ravel(), range_max)
     i, j = (bins_of(each, range_max, data.bins) for each in (readings, expected_ranges))
     known = i >= 0
-    numbers = np.unique(labels[known], return_inverse=True)[1].ravel()
-    count = int(numbers.max(initial=-1)) + 1
-    if count < 2:
-        raise ValueError(f"blocks: must be at least 2 with a reading that is not missing, got {count}")
+    numbers = number_blocks(blocks, z.shape, known)
+    assert numbers is not None
     cells = np.searchsorted(data.rows * (data.bins + 1) + data.steps, j[known] * (data.bins + 1) + i[known])
     both, times = np.unique(np.stack([numbers, cells]), axis=1, return_counts=True)
-    return np.vstack([both, times]).astype(np.float64)
+    return np.vstack([both, times])
 
 
-def _block_errors(data: Counts, theta: Floats, free: NDArray[np.bool], labels: Floats) -> dict[str, float]:
-    """Compute standard errors over blocks; NaN where errors for independent readings are NaN."""
-    (block, cell), times = labels[:2].astype(np.int64), labels[2]
-    places = np.flatnonzero(free)
+def _block_scatter(data: Counts, theta: Floats, places: Integers, labels: Integers) -> Floats:
+    """Return the (m, m) scatter of the gradient over blocks by some coordinates of the search."""
+    block, cell, times = labels
     slopes = []
     for step in (_FIRST * np.eye(len(theta)))[places]:
         ends = [separate_causes(data.bins, data.width, **_causes(theta + sign * step).to_dict(), rows=data.rows,
                                 steps=data.steps) for sign in (1, -1)]  # fmt: skip
         slope = (ends[0] - ends[1]) / (2 * _FIRST)
         slopes.append(np.bincount(block, times * slope[cell]))
-    errors = np.full(len(theta), np.nan)
-    errors[places] = errors_of(
-        _information(data, theta, places), np.eye(len(places)), scatter_of(np.array(slopes, np.float64).T)
-    )
-    errors[~np.isfinite(errors)] = np.nan
-    return _in_units(theta, errors)
+    return scatter_of(np.array(slopes, np.float64).reshape(len(places), -1).T)
 
 
 def _search(data: Counts, start: Floats) -> tuple[float, Floats, list[float]]:
@@ -130,15 +119,14 @@ def _gradient(data: Counts, theta: Floats) -> Floats:
     return np.array([(_loss(data, theta + step) - _loss(data, theta - step)) / (2 * _FIRST) for step in steps])
 
 
-def _fit(data: Counts, value: float, theta: Floats, trace: list[float], labels: Floats | None) -> DiscreteFit:
+def _fit(data: Counts, value: float, theta: Floats, trace: list[float], labels: Integers | None) -> DiscreteFit:
     low, high = np.transpose(_bounds(data))
     at_low, at_high = theta <= low + 1e-9, theta >= high - 1e-9
     converged = _is_flat(data, theta)
-    errors = independent = _standard_errors(data, theta, ~(at_low | at_high))
+    free = ~(at_low | at_high)
+    independent = _standard_errors(data, theta, free)
+    errors = independent if labels is None else _standard_errors(data, theta, free, labels)
     blocks = 0 if labels is None else int(labels[0].max()) + 1
-    if labels is not None:
-        over_blocks = _block_errors(data, theta, ~(at_low | at_high), labels)
-        errors = {name: over_blocks[name] if math.isfinite(independent[name]) else math.nan for name in NAMES}
     status = "the gradient vanishes" if converged else "the search ended before the gradient vanished"
     ends = [name for name, end in zip(NAMES, at_low | at_high, strict=True) if end]
     unknown = [name for name, error in errors.items() if math.isnan(error) and name not in ends]
@@ -146,8 +134,8 @@ def _fit(data: Counts, value: float, theta: Floats, trace: list[float], labels: 
         status += f"; at a bound: {', '.join(ends)}"
     if unknown:
         status += f"; the readings do not determine {', '.join(unknown)}"
-    if 0 < blocks < _FEW_BLOCKS:
-        status += f"; standard errors are rough, from {blocks} blocks"
+    if labels is not None:
+        status = "; ".join([status, *notes_on_blocks(blocks)])
     none = data.steps == data.bins
     return DiscreteFit(
         log_likelihood=-value * data.total,
@@ -196,22 +184,26 @@ def _starts(data: Counts) -> list[Floats]:
     return sorted(starts, key=lambda theta: _loss(data, theta))
 
 
-def _standard_errors(data: Counts, theta: Floats, free: NDArray[np.bool]) -> dict[str, float]:
-    """Compute standard errors from the observed information, in the parameters' units; NaN if undetermined."""
-    places = np.flatnonzero(free)
+def _standard_errors(
+    data: Counts, theta: Floats, free: NDArray[np.bool], labels: Integers | None = None
+) -> dict[str, float]:
+    """Compute standard errors in the units of the parameters, over blocks if there are any; NaN if undetermined."""
     errors = np.full(len(theta), np.nan)
-    errors[places] = _errors(_information(data, theta, places))
-    return _in_units(theta, errors)
-
-
-def _in_units(theta: Floats, errors: Floats) -> dict[str, float]:
-    """Convert errors of the search's coordinates to the model's parameters."""
+    information = _information(data, theta, np.flatnonzero(free))
+    # Differences by a parameter without influence contain only rounding errors.
+    size = np.diagonal(information)
+    kept = np.flatnonzero(size > 1e-8 * max(float(size.max(initial=0)), 0))
+    places = np.flatnonzero(free)[kept]
+    if len(places):
+        scatter = None if labels is None else _block_scatter(data, theta, places, labels)
+        errors[places] = errors_of(information[np.ix_(kept, kept)], np.eye(len(places)), scatter, _FLAT_SHARE)
+    errors[~np.isfinite(errors)] = np.nan
     causes = _causes(theta)
     scale = {name: getattr(causes, name) for name in NAMES} | {"p_detect": causes.p_detect * (1 - causes.p_detect)}
     return {name: float(error * scale[name]) for name, error in zip(NAMES, errors, strict=True)}
 
 
-def _information(data: Counts, theta: Floats, places: NDArray[np.intp]) -> Floats:
+def _information(data: Counts, theta: Floats, places: Integers) -> Floats:
     """Return the (m, m) observed information of some parameters of the search."""
 
     def loss(*shifts: Floats) -> float:
@@ -226,26 +218,6 @@ def _information(data: Counts, theta: Floats, places: NDArray[np.intp]) -> Float
             mixed = loss(one, two) - loss(one, -two) - loss(-one, two) + loss(-one, -two)
             information[a, b] = information[b, a] = mixed / (4 * _SECOND**2)
     return information * data.total
-
-
-def _errors(information: Floats) -> Floats:
-    """Return (m,) standard errors from the (m, m) information; NaN for parameters in a flat direction.
-
-    Other parameters keep their standard errors: flat directions are eigenvectors of the matrix scaled to a diagonal of
-    1.
-    """
-    errors = np.full(len(information), np.nan)
-    # Differences by a parameter without influence contain only rounding errors.
-    places = np.flatnonzero(np.diagonal(information) > 1e-8 * max(float(np.diagonal(information).max(initial=0)), 0))
-    if not len(places):
-        return errors
-    scale = 1 / np.sqrt(np.diagonal(information)[places])
-    size, axes = np.linalg.eigh(information[np.ix_(places, places)] * np.outer(scale, scale))
-    known = size > _FLAT_SHARE * size[-1]
-    for place, factor, row in zip(places, scale, axes, strict=True):
-        if (np.abs(row[~known]) < 1e-3).all():
-            errors[place] = factor * math.sqrt(float((row[known] ** 2 / size[known]).sum()))
-    return errors
 
 
 @dataclass(frozen=True)

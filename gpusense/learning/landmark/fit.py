@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers
 from gpusense.learning.fitted import LandmarkFit
-from gpusense.learning.information import scaled_axes
+from gpusense.learning.information import errors_of
 from gpusense.learning.landmark.em import NOTHING, SIGMAS, bounds_of, climb, first_guess, free
 from gpusense.learning.landmark.pairs import (
     BEARING_BIAS,
@@ -32,9 +32,6 @@ from gpusense.learning.landmark.pairs import (
 from gpusense.models.landmark.features import check_correspondence, check_features
 from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.parameters import LandmarkParameters
-
-# Scaled information below this counts as none.
-_FLAT = 1e-10
 
 
 @dataclass(frozen=True)
@@ -241,11 +238,7 @@ def _biases(pairs: Pairs, value: Value, second: Floats, bias: bool) -> list[tupl
 def _errors(second: Floats, places: Integers) -> Floats:
     """Return (6,) standard errors along the coordinates; NaN outside ``places``, infinite without information."""
     errors = np.full(6, np.nan)
-    if len(places):
-        scale, size, axes = scaled_axes(-second[np.ix_(places, places)])
-        errors[places] = np.inf
-        if size[0] > _FLAT:
-            errors[places] = scale * np.sqrt((axes**2 / size).sum(axis=1))
+    errors[places] = errors_of(-second[np.ix_(places, places)], np.eye(len(places)))
     return errors
 
 

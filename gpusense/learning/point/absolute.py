@@ -13,8 +13,9 @@ from gpusense._util import checks
 from gpusense._util.angles import wrapped
 from gpusense._util.typing import Floats
 from gpusense.learning.fitted import PointFit
+from gpusense.learning.information import number_blocks
 from gpusense.learning.point.densities import von_mises, wrapped_normal
-from gpusense.learning.point.problem import Problem, maximize, mix, number_blocks, of_weight, places_of
+from gpusense.learning.point.problem import Problem, maximize, mix, of_weight, places_of
 from gpusense.learning.point.report import report
 from gpusense.world.sensor_parameters import HeadingParameters, PositionParameters
 
@@ -164,7 +165,7 @@ def fit_position_parameters(
     if base.region is not None:
         x, y, far_x, far_y = base.region
         area, inside = (far_x - x) * (far_y - y), ((z[used] >= (x, y)) & (z[used] <= (far_x, far_y))).all(axis=1)
-    numbers = number_blocks(blocks, len(pose), used)
+    numbers = number_blocks(blocks, (len(pose),), used)
     start = base.mount
     errors = z[used] - places_of(pose[used], (0.0, 0.0) if fit_mount else start)
     shown = errors if not fit_mount else z[used] - places_of(pose[used], start)
@@ -277,7 +278,7 @@ def fit_heading_parameters(
     used = np.isfinite(z)
     if not used.any():
         raise ValueError(f"headings: must hold one that is finite, got {len(z)} without")
-    numbers = number_blocks(blocks, len(pose), used)
+    numbers = number_blocks(blocks, (len(pose),), used)
     turned = wrapped(wrapped(z[used]) - wrapped(pose[used, 2]))
     problem = _Headings(turned, kind)
     end = maximize(problem, most, least)

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers
 from gpusense.learning.fitted import PointFit
+from gpusense.learning.information import number_blocks
 from gpusense.learning.point.densities import truncated
-from gpusense.learning.point.problem import Problem, maximize, mix, number_blocks, of_weight, places_of
+from gpusense.learning.point.problem import Problem, maximize, mix, of_weight, places_of
 from gpusense.learning.point.report import report
 from gpusense.world.hit_shapes import NORMAL, StudentHit
 from gpusense.world.range_causes import RandomDensity
@@ -194,7 +195,7 @@ def fit_beacon_parameters(
     used = (z >= 0) & (z <= longest)
     if not used.any():
         raise ValueError(f"ranges: must hold one in [0, {longest:g}] m, got {len(z)} without")
-    numbers = number_blocks(blocks, len(pose), index[0][used])
+    numbers = number_blocks(blocks, (len(pose),), index[0][used])
     residual = z[used] - distances[used]
     spread = 1.4826 * float(np.median(np.abs(residual - np.median(residual)))) or float(np.ptp(residual))
     problem = _Beacons(

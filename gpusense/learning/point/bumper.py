@@ -13,7 +13,8 @@ from gpusense._util import checks
 from gpusense._util.typing import Floats, Precision, Space
 from gpusense.backends import Selection, get_backend
 from gpusense.learning.fitted import PointFit
-from gpusense.learning.point.problem import Problem, maximize, mix, number_blocks, of_weight
+from gpusense.learning.information import number_blocks
+from gpusense.learning.point.problem import Problem, maximize, mix, of_weight
 from gpusense.learning.point.report import report
 from gpusense.models.point.bumper import BumperModel
 from gpusense.world.grid import OccupancyGrid
@@ -131,7 +132,7 @@ def fit_bumper_parameters(
         raise ValueError(f"pressed: every value must be 0, 1 or nan, got {checks.show(table[used].max())}")
     if not used.any():
         raise ValueError(f"pressed: must hold one that is not nan, got {table.size} without")
-    numbers = number_blocks(blocks, len(pose), np.nonzero(used)[0])
+    numbers = number_blocks(blocks, (len(pose),), np.nonzero(used)[0])
     problem = _Bumps(outline_gaps(model, pose)[used], table[used], grid.resolution)
     end = maximize(problem, most, least)
     return report(problem, end, BumperParameters(**problem.values(end.theta)), numbers, int((~used).sum()))

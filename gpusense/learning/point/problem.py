@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util import checks
-from gpusense._util.typing import Floats, Integers
+from gpusense._util.typing import Floats
 
 
 def places_of(poses: Floats, mount: object) -> Floats:
@@ -121,20 +121,6 @@ def mix(parts: list[tuple[float, Floats]]) -> tuple[Floats, Floats, list[Floats]
     # Beyond e^700 a ratio would overflow; the search needs only its sign.
     ratios = [np.exp(np.minimum(log - floor, 700.0)) for log in logs]
     return log_p, shares, ratios
-
-
-def number_blocks(blocks: object, rows: int, of: NDArray[Any]) -> Integers | None:
-    """Return the blocks of some rows, numbered from 0; None without blocks.
-
-    ``blocks`` labels all rows; ``of`` holds the rows of the readings, as indices or a mask.
-    """
-    if blocks is None:
-        return None
-    labels: Integers = checks.array("blocks", blocks, (rows,), dtype=np.int64)
-    known, numbers = np.unique(labels[of], return_inverse=True)
-    if len(known) < 2:
-        raise ValueError(f"blocks: must be at least 2 with a reading that is not missing, got {len(known)}")
-    return numbers.ravel().astype(np.int64)
 
 
 def of_weight(weight: float) -> float:

@@ -8,11 +8,8 @@ import numpy as np
 
 from gpusense._util.typing import Integers
 from gpusense.learning.fitted import PointFit, Q
-from gpusense.learning.information import errors_of, scatter_of
+from gpusense.learning.information import FEW_BLOCKS, errors_of, notes_on_blocks, scatter_of
 from gpusense.learning.point.problem import Climb, Problem
-
-# Standard errors over fewer blocks are rough.
-_FEW_BLOCKS = 10
 
 
 def report(problem: Problem, end: Climb, parameters: Q, blocks: Integers | None, missing: int) -> PointFit[Q]:
@@ -31,11 +28,11 @@ def report(problem: Problem, end: Climb, parameters: Q, blocks: Integers | None,
         elif blocks is not None and touched[name] < 2:
             held[name], errors[name] = "the readings that determine it are in one block", math.nan
     notes: list[str] = [] if end.converged else ["did not converge"]
-    rough = [name for name in values if name not in held and touched[name] < _FEW_BLOCKS] if blocks is not None else []
-    if blocks is not None and count < _FEW_BLOCKS:
-        notes.append(f"standard errors are rough, from {count} blocks")
-    elif rough:
-        notes.append(f"standard errors from fewer than {_FEW_BLOCKS} blocks are rough: {_list(rough)}")
+    rough = [name for name in values if name not in held and touched[name] < FEW_BLOCKS] if blocks is not None else []
+    few = [] if blocks is None else notes_on_blocks(count)
+    notes += few
+    if rough and not few:
+        notes.append(f"standard errors from fewer than {FEW_BLOCKS} blocks are rough: {_list(rough)}")
     for reason in dict.fromkeys(held.values()):
         notes.append(f"{_list([name for name in held if held[name] == reason])}: {reason}")
     return PointFit(

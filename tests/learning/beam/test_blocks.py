@@ -97,7 +97,7 @@ def test_few_blocks_are_reported() -> None:
     ("error", "message", "blocks"),
     [
         (TypeError, "blocks: must hold integers", [0.5, 1.0]),
-        (ValueError, "blocks: shape must be that of ranges", [0, 1, 2]),
+        (ValueError, r"blocks: shape must be \(2,\), got \(3,\)", [0, 1, 2]),
         (ValueError, "blocks: must be at least 2 with a reading that is not missing, got 1", [3, 3]),
     ],
 )

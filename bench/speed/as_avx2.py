@@ -5,7 +5,7 @@
 
 PoCL's compiler asks by the instruction ``xgetbv`` which registers the system saves. A copy of PoCL's wheel has ``push
 7; pop rax`` in place of its three bytes, ``0f 01 d0``: registers of AVX but not of AVX-512. Kernels are then compiled
-for ``haswell``, as ``gpusense backends`` shows. Code that PoCL does not compile, such as numba's, keeps AVX-512.
+for ``haswell``, as ``gpusense devices`` shows. Code that PoCL does not compile, such as numba's, keeps AVX-512.
 """
 
 from __future__ import annotations

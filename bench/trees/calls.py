@@ -24,7 +24,11 @@ import numpy as np
 
 import gpusense as gs
 
-MODELS = {"field": gs.LikelihoodFieldModel, "beam model": gs.BeamModel}
+# The default of the field's parameters differs between versions.
+MODELS = {
+    "field": functools.partial(gs.LikelihoodFieldModel, parameters=gs.LikelihoodFieldParameters()),
+    "beam model": gs.BeamModel,
+}
 # Number of bound calls between waits.
 IN_A_ROW = 20
 

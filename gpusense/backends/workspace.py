@@ -126,11 +126,9 @@ class Workspace:
     ) -> frozenset[str]:
         """Run a program on this workspace's buffers; programs of earlier calls are kept, and repeated where they fit.
 
-        Args:
-            key: All sizes and flags on which the program depends, and all numbers that seldom change.
-            changing: Arguments that change from call to call, by name: numbers, and buffers of other owners.
-            make: Function that returns the program.
-            version: The version of the map's table; programs of other versions are dropped.
+        ``key``: all sizes and flags on which the program depends, and all numbers that seldom change; ``changing``:
+        arguments that change from call to call, by name: numbers, and buffers of other owners; ``make``: function that
+        returns the program; ``version``: the version of the map's table; programs of other versions are dropped.
 
         Returns:
             The flags of its launches.

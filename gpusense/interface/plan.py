@@ -100,8 +100,7 @@ def share(part: float, whole: float) -> str:
 def component_notes(components: Iterable[tuple[str, float, str]]) -> tuple[list[Omission], list[Note]]:
     """Return the components of a mixture that are left out (weight 0), and those that are kept.
 
-    Args:
-        components: (name of the weight, its value, cost of the component per particle-beam).
+    ``components``: (name of the weight, its value, cost of the component per particle-beam).
     """
     omissions, kept = [], []
     for name, weight, cost in components:
@@ -124,10 +123,8 @@ def precision_notes(precision: str) -> tuple[list[Note], list[Note]]:
 def launch_omissions(code: frozenset[str], least_ordered: tuple[int, int] | None = None) -> list[Omission]:
     """Return the parts that the cloud of the last call makes unnecessary; none before the first call.
 
-    Args:
-        code: The flags of the last call.
-        least_ordered: Least numbers of rays and particles from which a beam model orders particles; None for devices
-            and models that never do.
+    ``code``: the flags of the last call; ``least_ordered``: least numbers of rays and particles from which a beam model
+    orders particles; None for devices and models that never do.
     """
     omissions = [ORDINARY_HEADINGS] if code and "HUGE_HEADINGS" not in code else []
     if code and "WORLDS" not in code:

@@ -42,14 +42,9 @@ Part = tuple[int, int]
 class Poses:
     """(N, 3) poses of a request.
 
-    Args:
-        poses: Numbers, or an array on the device.
-        backend: The device.
-        name: Their name in messages.
-        scans: None, or S of (S, N, 3) poses of S scans, one after the other.
-        in_place: An array on the device must be used without a copy, now and later.
-        late: A GPU may bound parts of many host poses, and so reveal values that are not finite, when their corners
-            are asked for first.
+    ``poses``: numbers, or an array on the device; ``scans``: None, or S of (S, N, 3) poses of S scans, one after the
+    other; ``in_place``: an array on the device must be used without a copy, now and later; ``late``: a GPU may bound
+    parts of many host poses, and so reveal values that are not finite, when their corners are asked for first.
     """
 
     # Corners of the box of poses on the device, if their owner knows them; they affect only the table.

@@ -42,15 +42,9 @@ def walk_ray(
 
     They are infinite for none. A pair of walls that share a corner stops a ray.
 
-    Args:
-        start: (2, R) columns and rows where rays begin [cells].
-        slope: (2, R) directions.
-        steps: (R,) numbers of steps.
-        cells: Values of the cells of a part of the map.
-        part: Column and row of the map at which the part begins.
-        rows: Rows of the part.
-        cols: Columns of the part.
-        occupied: Least value of a wall.
+    ``start``: (2, R) columns and rows where rays begin [cells]; ``slope``: (2, R) directions; ``steps``: (R,) numbers
+    of steps; ``cells``: values of the cells of a part of the map; ``part``: column and row of the map at which the part
+    begins; ``occupied``: least value of a wall.
     """
     # All steps of all rays in sequence.
     ray = np.arange(len(steps)).repeat(steps)
@@ -96,17 +90,10 @@ def walk_beside(
 ) -> np.ndarray:  # fmt: skip
     """Return the distances (2, 3, B) [m] along beams and their companions on both sides.
 
-    Args:
-        direction: (B,) directions of the beams in the map's frame [rad].
-        origin: Where the beams begin [m].
-        companion: Companions' offset from a beam at its start [m], and angle of divergence [rad].
-        steps: (B,) numbers of steps.
-        cells: Values of the cells of a part of the map.
-        part: Column and row of the map at which the part begins.
-        rows: Rows of the part.
-        cols: Columns of the part.
-        cell: Side of a cell [m].
-        occupied: Least value of a wall.
+    ``direction``: (B,) directions of the beams in the map's frame [rad]; ``origin``: where the beams begin [m];
+    ``companion``: companions' offset from a beam at its start [m], and angle of divergence [rad]; ``steps``: (B,)
+    numbers of steps; ``cells``: values of the cells of a part of the map; ``part``: column and row of the map at which
+    the part begins; ``cell``: side of a cell [m]; ``occupied``: least value of a wall.
     """
     slope = np.empty((2, len(SIDES), len(direction)))
     slope[0], slope[1] = cos_sin(direction + SIDES * companion[1])

@@ -18,15 +18,8 @@ def cast_ray(
 ) -> np.ndarray:  # fmt: skip
     """Return the distance in cells to the first occupied cell, limit where none is nearer.
 
-    Args:
-        flags: Flags of the signature table.
-        map_table: Padded cells, flat.
-        window: Size of the grid.
-        cell: (M, 2) integer column and row of each origin.
-        pose: (M, 4) fraction of the cell in x and y, cosine and sine of the heading.
-        ray: (M, 2) cosine and sine of each bearing.
-        limit: Longest distance in cells.
-        caster: Not used.
+    ``flags``: flags of the signature table; ``cell``: (M, 2) integer column and row of each origin; ``pose``: (M, 4)
+    fraction of the cell in x and y, cosine and sine of the heading; ``ray``: (M, 2) cosine and sine of each bearing.
     """
     r = make_ray(pose, ray)
     origin, k, t, ranges, active = start_casts(flags, r, cell, window, limit)

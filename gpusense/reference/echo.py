@@ -68,20 +68,10 @@ def nearest_echo(
 
     A ray whose angle of incidence has a cosine below critical has no return: the surface reflects it like a mirror.
 
-    Args:
-        flags: Flags of the signature table.
-        map_table: The caster's table of the map.
-        normals: Padded normals; see above.
-        window: Size of the grid.
-        cell: (M, 2) integer column and row of each origin.
-        pose: (M, 4) fraction of the cell in x and y, cosine and sine of the heading.
-        ray: (M, C, 2) cosine and sine of each cone's rays.
-        critical: Least cosine.
-        limit: Longest distance in cells.
-        caster: The knobs of the caster.
-        shapes: The shapes of all worlds.
-        world: (2 M, 2) numbers of the worlds of the cones; not read without SHAPES.
-        crowd: The numbers of shapes.
+    ``flags``: flags of the signature table; ``map_table``: the caster's table of the map; ``cell``: (M, 2) integer
+    column and row of each origin; ``pose``: (M, 4) fraction of the cell in x and y, cosine and sine of the heading;
+    ``ray``: (M, C, 2) cosine and sine of each cone's rays; ``caster``: the knobs of the caster; ``shapes``: the shapes
+    of all worlds; ``world``: (2 M, 2) numbers of the worlds of the cones; not read without SHAPES.
 
     Returns:
         (M,) distances in cells, limit where nothing returns, and cosines and sines of angles of incidence. A beam

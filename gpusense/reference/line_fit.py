@@ -12,10 +12,8 @@ def line_through(point: np.ndarray, sums: np.ndarray, size: np.ndarray) -> np.nd
 
     A point without neighbours gets the line perpendicular to its beam, and -1 instead of the sum.
 
-    Args:
-        point: (N, 4) points.
-        sums: (5, N) sums of the neighbours' x, y, x x, x y and y y relative to the points.
-        size: (N,) numbers of points.
+    ``point``: (N, 4) points; ``sums``: (5, N) sums of the neighbours' x, y, x x, x y and y y relative to the points;
+    ``size``: (N,) numbers of points.
     """
     mean_x, mean_y = sums[0] / size, sums[1] / size
     a, b = sums[2] - size * mean_x * mean_x, sums[3] - size * mean_x * mean_y
@@ -37,14 +35,10 @@ def fit_scan(
 ) -> np.ndarray:
     """Return the lines (N, 4) through the points of a scan and their neighbours.
 
-    Args:
-        point: (N, 4) points.
-        reach: Neighbours on either side.
-        most: Most neighbours on either side, those beyond ``reach`` within a distance of ``width``.
-        ratio: Farthest distance of a neighbour from the one before, by the range of that one.
-        slack: The distance that is added to it [m].
-        width: Half the least length of a line [m].
-        gap: Largest step of bearing between neighbours [rad].
+    ``point``: (N, 4) points; ``most``: most neighbours on either side, those beyond ``reach`` within a distance of
+    ``width``; ``ratio``: farthest distance of a neighbour from the one before, by the range of that one; ``slack``: the
+    distance that is added to it [m]; ``width``: half the least length of a line [m]; ``gap``: largest step of bearing
+    between neighbours [rad].
     """
     count = len(point)
     sums, size = np.zeros((5, count), point.dtype), np.ones(count, point.dtype)

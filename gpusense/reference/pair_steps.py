@@ -28,12 +28,9 @@ def deviation_of(
     The unit is the standard deviation of this difference, with the errors of both neighbours times their derivatives.
     Call it where invalid operations are ignored.
 
-    Args:
-        before: (S, P) ranges of the beams before [m]; NaN is unknown.
-        here: (S, P) ranges.
-        after: (S, P) ranges of the beams after.
-        left: (P,) weights of the neighbours before.
-        right: (P,) weights of the neighbours after.
+    ``before``: (S, P) ranges of the beams before [m]; NaN is unknown; ``here``: (S, P) ranges; ``after``: (S, P) ranges
+    of the beams after; ``left``: (P,) weights of the neighbours before; ``right``: (P,) weights of the neighbours
+    after.
 
     Returns:
         (S, P), infinite where the three are on different surfaces.
@@ -53,9 +50,8 @@ def rounding_of(ranges: np.ndarray, deviation: np.ndarray) -> np.ndarray:
 
     Infinite ranges do not count. Call it where invalid operations are ignored.
 
-    Args:
-        ranges: The ranges [m].
-        deviation: (S,) deviations; where the rounding to a step is smaller, the result may be 0.
+    ``ranges``: the ranges [m]; ``deviation``: (S,) deviations; where the rounding to a step is smaller, the result may
+    be 0.
     """
     gap = ranges[:, 1:] - ranges[:, :-1]
     # Differences of infinite ranges are NaN.
@@ -75,11 +71,8 @@ def rounding_of(ranges: np.ndarray, deviation: np.ndarray) -> np.ndarray:
 def noise_of(known: np.ndarray, places: tuple[slice, ...], left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the standard deviations (S,) of the ranges of scans [m], NaN where too few beams measure it.
 
-    Args:
-        known: (S, K) ranges [m], NaN where a reading is none.
-        places: The beams before, at and after (P,) places.
-        left: (P,) weights of the neighbours before.
-        right: (P,) weights of the neighbours after.
+    ``known``: (S, K) ranges [m], NaN where a reading is none; ``places``: the beams before, at and after (P,) places;
+    ``left``: (P,) weights of the neighbours before; ``right``: (P,) weights of the neighbours after.
     """
     before, here, after = (known[:, part] for part in places)
     with np.errstate(all="ignore"):
@@ -97,10 +90,8 @@ def noise_of(known: np.ndarray, places: tuple[slice, ...], left: np.ndarray, rig
 def level_of(noise: float, largest: np.ndarray, assumed: int) -> int:
     """Return the level of noise of a pair: the first one whose largest noise is not exceeded, or the last one.
 
-    Args:
-        noise: Larger noise of both scans [m], NaN where neither measures it.
-        largest: (L,) largest noise of each level.
-        assumed: The level of unknown noise.
+    ``noise``: larger noise of both scans [m], NaN where neither measures it; ``largest``: (L,) largest noise of each
+    level; ``assumed``: the level of unknown noise.
     """
     return assumed if np.isnan(noise) else min(int(np.searchsorted(largest, noise)), len(largest) - 1)
 
@@ -110,12 +101,8 @@ def place_points(
 ) -> tuple[np.ndarray, float]:
     """Return the points (N, 4) of a scan's hits, and the sum of squared ranges.
 
-    Args:
-        readings: (K,) readings [m].
-        beam: (K, 4) cosines, sines, bearings in [0, 2 pi), and places of the readings; beams come by bearing.
-        nearest: Least range [m].
-        farthest: Least larger reading that is no range [m].
-        real: Precision of the points.
+    ``readings``: (K,) readings [m]; ``beam``: (K, 4) cosines, sines, bearings in [0, 2 pi), and places of the readings;
+    beams come by bearing; ``nearest``: least range [m]; ``farthest``: least larger reading that is no range [m].
     """
     z = readings[beam[:, 3].astype(int)]
     kept = is_hit(z, nearest, farthest) & (z > NEAREST)

@@ -33,12 +33,9 @@ def crossed_before(
 
     Products of lengths fit in 64 bits, since rays span at most 2^19 cells.
 
-    Args:
-        first: Distance to the first boundary of the axis.
-        size: Length of the ray along the axis.
-        reached: Distance to the boundary of the other axis.
-        other: Length of the ray along the other axis.
-        ties: Whether boundaries that the ray crosses at the same time count.
+    ``first``: distance to the first boundary of the axis; ``size``: length of the ray along the axis; ``reached``:
+    distance to the boundary of the other axis; ``other``: length of the ray along the other axis; ``ties``: whether
+    boundaries that the ray crosses at the same time count.
     """
     room = reached * size - first * other - (not ties)
     return np.where(room < 0, 0, room // (UNIT * np.maximum(other, 1)) + 1)

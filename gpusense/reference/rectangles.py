@@ -79,10 +79,8 @@ def _runs(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def longest(runs: np.ndarray, along: int, across: int) -> np.ndarray:
     """Find the rectangles of a quadrant and sector that begin at each cell of rows of runs and extend to the right.
 
-    Args:
-        runs: (lines, length) free cells across the lines, at most LONGEST.
-        along: Cells along the lines in the proportion of the sector's middle.
-        across: Cells across them.
+    ``runs``: (lines, length) free cells across the lines, at most LONGEST; ``along``: cells along the lines in the
+    proportion of the sector's middle.
 
     Returns:
         (2, lines, length) cells along and across. The longest one that is high enough is combined from powers of two; a

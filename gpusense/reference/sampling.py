@@ -175,14 +175,9 @@ def reading_of(
 ) -> np.ndarray:  # fmt: skip
     """Return readings drawn from the mixture; infinity without return, NaN where no reading is possible.
 
-    Args:
-        flags: Flags of the shape of hits.
-        u: Numbers in (0, 1) that choose the component.
-        v: Numbers in (0, 1) that choose the reading.
-        expected: Expected ranges in [0, range_max].
-        mixture: Numbers of the mixtures; see above.
-        bins: Mixture of each reading.
-        range_max: Longest range.
+    ``flags``: flags of the shape of hits; ``u``: numbers in (0, 1) that choose the component; ``v``: numbers in (0, 1)
+    that choose the reading; ``expected``: expected ranges in [0, range_max]; ``mixture``: numbers of the mixtures; see
+    above.
     """
     terms = (mixture[DRAW_TERMS * bins + i] for i in range(DRAW_TERMS))
     hit, short, none, rand, sigma, growth, bias, decay, place = terms

@@ -10,9 +10,7 @@ from gpusense.interface import structs
 def particles_of_scans(particles: int, batch: structs.ScanBatch) -> Iterator[tuple[int, slice]]:
     """Yield the index of each scan and its particles, of a launch that has a part of all particles.
 
-    Args:
-        particles: Particles of the launch.
-        batch: Particles of each scan, and those of earlier launches.
+    ``batch``: particles of each scan, and those of earlier launches.
     """
     begin = 0
     while begin < particles:

@@ -99,14 +99,9 @@ def nearest_shape(
 ) -> np.ndarray:  # fmt: skip
     """Return the nearest of the shapes along M rays and of obstacles at distances t.
 
-    Args:
-        shapes: The shapes of all worlds, flat.
-        world: (2 M, 2) numbers of the rays' particles.
-        crowd: The numbers of shapes.
-        cell: (M, 2) cells of the rays' origins.
-        pose: (M, 4) fractions of these cells, and headings.
-        ray: (M, 2) cosines and sines of bearings.
-        t: (M,) distances in cells.
+    ``shapes``: the shapes of all worlds, flat; ``world``: (2 M, 2) numbers of the rays' particles; ``cell``: (M, 2)
+    cells of the rays' origins; ``pose``: (M, 4) fractions of these cells, and headings; ``ray``: (M, 2) cosines and
+    sines of bearings; ``t``: (M,) distances in cells.
 
     Returns:
         (2, M) distances, and cosines of angles of incidence, 2 where no shape is nearer than t.

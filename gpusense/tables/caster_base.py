@@ -18,32 +18,20 @@ from gpusense.world.windows import Window
 
 @dataclass(frozen=True)
 class CasterInput:
-    """Window of a map, the input of a caster's table.
+    """Window of a map, the input of a caster's table."""
 
-    Attributes:
-        obstacles: (rows, cols) bool.
-        limit: Longest range [cells].
-        outside: ``"free"`` or ``"occupied"``: state of space outside the grid.
-    """
-
-    obstacles: np.ndarray
-    limit: float
-    outside: str
+    obstacles: np.ndarray  # (rows, cols) bool
+    limit: float  # longest range [cells]
+    outside: str  # ``"free"`` or ``"occupied"``: state of space outside the grid
 
 
 @dataclass(frozen=True)
 class Table:
-    """Table of a caster on a device.
+    """Table of a caster on a device."""
 
-    Attributes:
-        buffer: The table.
-        size: Its size [bytes].
-        flags: Flags of the kernels that read it.
-    """
-
-    buffer: Buffer
-    size: int
-    flags: frozenset[str] = frozenset()
+    buffer: Buffer  # the table
+    size: int  # its size [bytes]
+    flags: frozenset[str] = frozenset()  # flags of the kernels that read it
 
 
 class Caster(ABC):

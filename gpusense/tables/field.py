@@ -30,15 +30,10 @@ _LARGEST_REFRESH = 0.5
 class FieldTable:
     """Table of a likelihood field model.
 
-    Args:
-        real: Precision.
-        parameters: Parameters of the likelihood field.
-        resolution: Side of a cell [m].
-        range_max: Longest range [m].
-        outside: ``"free"`` or ``"occupied"``: state of space outside the grid.
-        weights: The book's likelihood, or the peer whose terms the cells hold.
-        log_table: Whether cells hold terms of the sum instead of distances [m].
-        flags: Flags of the model's kernel, to share a program.
+    ``parameters``: parameters of the likelihood field; ``resolution``: side of a cell [m]; ``range_max``: longest range
+    [m]; ``outside``: ``"free"`` or ``"occupied"``: state of space outside the grid; ``weights``: the book's likelihood,
+    or the peer whose terms the cells hold; ``log_table``: whether cells hold terms of the sum instead of distances [m];
+    ``flags``: flags of the model's kernel, to share a program.
     """
 
     def __init__(

@@ -56,18 +56,13 @@ class ReachableMap:
 
     An interrupt or an error leaves the map as before or as after the call, never in between.
 
-    Args:
-        backend: The device.
-        grid: The map.
-        unknown: Treatment of unknown cells: ``"free"`` or ``"occupied"``.
-        mount: The sensor's pose on the robot [m, m, rad].
-        reach: Longest relevant distance from a sensor [cells].
-        prepare: Function that makes the table of a window from its (rows, cols) obstacles.
-        crop: True to prepare only the reachable window, False for the whole map.
-        refresh: Function that updates a table in place after obstacles changed in a part of its window, and returns
-            whether it could; otherwise the table is rebuilt.
-        obstacles_of: Function that returns the mask of obstacles from the grid and ``unknown``.
-        neighbors: Radius of the neighbourhood that determines a cell's state in the mask [cells].
+    ``unknown``: treatment of unknown cells: ``"free"`` or ``"occupied"``; ``mount``: the sensor's pose on the robot [m,
+    m, rad]; ``reach``: longest relevant distance from a sensor [cells]; ``prepare``: function that makes the table of a
+    window from its (rows, cols) obstacles; ``crop``: true to prepare only the reachable window, False for the whole
+    map; ``refresh``: function that updates a table in place after obstacles changed in a part of its window, and
+    returns whether it could; otherwise the table is rebuilt; ``obstacles_of``: function that returns the mask of
+    obstacles from the grid and ``unknown``; ``neighbors``: radius of the neighbourhood that determines a cell's state
+    in the mask [cells].
     """
 
     def __init__(

@@ -142,16 +142,10 @@ def _make(
 ) -> None:
     """Start the launches that make planes of some worlds.
 
-    Args:
-        backend: The device.
-        space: Memory of runs and stacks.
-        marked: Obstacles of a band of rows, with the worlds' lines interleaved: bytes on a processor, else bits.
-        place: First cell of each world in tables with a ring.
-        rectangles: The planes.
-        planes: How they are stored.
-        changed_part: Rows, columns, sectors, the band's first row and its rows, and the changed window.
-        columns: The first column of runs and the one after the last.
-        worlds: Number of worlds.
+    ``space``: memory of runs and stacks; ``marked``: obstacles of a band of rows, with the worlds' lines interleaved:
+    bytes on a processor, else bits; ``place``: first cell of each world in tables with a ring; ``changed_part``: rows,
+    columns, sectors, the band's first row and its rows, and the changed window; ``columns``: the first column of runs
+    and the one after the last.
     """
     rows, cols, sectors, _, band, top, left, bottom, right = changed_part
     begin, end = columns

@@ -36,9 +36,7 @@ def part_of_arc(motion: Floats, share: Floats) -> tuple[Floats, Floats, Floats]:
     For an arc that turns by theta, the chord to a fraction f of it has sin(f theta / 2) / sin(theta / 2) of the length
     of the whole chord, and is turned by (f - 1) theta / 2 from the whole chord.
 
-    Args:
-        motion: (..., 3) motions [m, m, rad].
-        share: Shares that broadcast with the motions.
+    ``motion``: (..., 3) motions [m, m, rad]; ``share``: shares that broadcast with the motions.
     """
     half = motion[..., 2] / 2
     # sinc has no division by zero where the robot does not turn.
@@ -52,9 +50,7 @@ def part_of_arc(motion: Floats, share: Floats) -> tuple[Floats, Floats, Floats]:
 def beam_poses(motion: Floats, beams: int) -> tuple[Floats, Floats]:
     """Return the robot's pose at each beam in its frame at the first beam, for constant velocities.
 
-    Args:
-        motion: (S, 3) pose at the last beam in the frame at the first beam [m, m, rad].
-        beams: K.
+    ``motion``: (S, 3) pose at the last beam in the frame at the first beam [m, m, rad].
 
     Returns:
         (S, K, 2) positions [m] and (S, K) headings [rad].

@@ -24,15 +24,10 @@ from gpusense.world.range_causes import NoReturn, RandomDensity
 
 @dataclass(frozen=True)
 class FieldDensity:
-    """Density of a likelihood field with these parameters.
+    """Density of a likelihood field with these parameters."""
 
-    Attributes:
-        parameters: Parameters of the field.
-        range_max: Longest range of the scanner [m].
-    """
-
-    parameters: LikelihoodFieldParameters
-    range_max: float
+    parameters: LikelihoodFieldParameters  # parameters of the field
+    range_max: float  # longest range of the scanner [m]
 
     @property
     def sigma(self) -> float:

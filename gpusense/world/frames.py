@@ -54,17 +54,11 @@ _IN_TWO_PARTS = frozenset({"TWO_PART_POINTS"})
 
 @dataclass(frozen=True)
 class PlacedPoses:
-    """Sensor origins in a grid's frame.
+    """Sensor origins in a grid's frame."""
 
-    Attributes:
-        cell: (N, 2) int32 column and row.
-        pose: (N, 4) fraction in x and y, cosine and sine of the heading, rounded.
-        low: (N, 4) rounding error (low part) of ``pose``, itself rounded.
-    """
-
-    cell: np.ndarray
-    pose: np.ndarray
-    low: np.ndarray
+    cell: np.ndarray  # (N, 2) int32 column and row
+    pose: np.ndarray  # (N, 4) fraction in x and y, cosine and sine of the heading, rounded
+    low: np.ndarray  # (N, 4) rounding error (low part) of ``pose``, itself rounded
 
 
 def split(values: np.ndarray, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
@@ -91,11 +85,8 @@ def frame_of(grid: Cells, mount: Mount) -> structs.Frame:
 def place_poses(poses: np.ndarray, grid: Cells, mount: Mount, real: np.dtype) -> PlacedPoses:
     """Place sensors in a grid: compose each robot pose with the mount, without the mount's yaw.
 
-    Args:
-        poses: (N, 3) float64 robot poses in the world [m, m, rad].
-        grid: Cells that define the frame.
-        mount: The sensor's pose on the robot [m, m, rad]; its yaw is part of the bearings.
-        real: Precision of the result.
+    ``poses``: (N, 3) float64 robot poses in the world [m, m, rad]; ``grid``: cells that define the frame; ``mount``:
+    the sensor's pose on the robot [m, m, rad]; its yaw is part of the bearings.
     """
     count = len(poses)
     placed = PlacedPoses(np.empty((count, 2), np.int32), np.empty((count, 4), real), np.empty((count, 4), real))

@@ -17,15 +17,10 @@ FARTHEST_ORIGIN = 1e9
 
 
 class GridFrame(NamedTuple):
-    """Frame of a grid.
+    """Frame of a grid."""
 
-    Attributes:
-        resolution: Side of a cell [m].
-        origin: Pose (x, y, yaw) of the outer corner of cell (0, 0) in the world [m, m, rad].
-    """
-
-    resolution: float
-    origin: tuple[float, float, float]
+    resolution: float  # side of a cell [m]
+    origin: tuple[float, float, float]  # pose (x, y, yaw) of the outer corner of cell (0, 0) in the world [m, m, rad]
 
     def to_cells(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert (M, 2) points in the world [m] to column and row coordinates [cells], all in float64.

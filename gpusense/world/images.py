@@ -41,26 +41,17 @@ _Strip = tuple[NDArray[np.uint8], NDArray[np.bool] | None]
 
 @dataclass(frozen=True)
 class Raster:
-    """Image, read strip by strip.
+    """Image, read strip by strip."""
 
-    Attributes:
-        rows: Rows of pixels.
-        cols: Columns of pixels.
-        strips: Strips of rows, topmost first.
-    """
-
-    rows: int
-    cols: int
-    strips: Iterator[_Strip]
+    rows: int  # rows of pixels
+    cols: int  # columns of pixels
+    strips: Iterator[_Strip]  # strips of rows, topmost first
 
 
 def open_raster(stream: BinaryIO, file: Path, size: int) -> Raster:
     """Open an image; its first bytes choose the format.
 
-    Args:
-        stream: The open file.
-        file: Name of the file for messages.
-        size: Length of the file [bytes].
+    ``file``: name of the file for messages; ``size``: length of the file [bytes].
     """
     magic = stream.read(8)
     stream.seek(0)

@@ -67,10 +67,7 @@ class Likelihood:
     def without_readings(self, constant: float, first: float, *, cubes: bool) -> float:
         """Return the log-likelihood of a scan without evaluated readings.
 
-        Args:
-            constant: Sum of its constant terms.
-            first: First term of sums.
-            cubes: True if the model sums cubes, without constant terms.
+        ``constant``: sum of its constant terms; ``cubes``: true if the model sums cubes, without constant terms.
         """
         with np.errstate(divide="ignore"):
             return float(np.log(first)) if cubes else constant

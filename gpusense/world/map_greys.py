@@ -16,21 +16,13 @@ _UNKNOWN = 255  # the byte of the cell -1
 
 
 class Painting(NamedTuple):
-    """Pixels of a map, topmost row first, and the keys of the YAML file for reading them.
+    """Pixels of a map, topmost row first, and the keys of the YAML file for reading them."""
 
-    Attributes:
-        mode: Mode of map_server.
-        pixels: A grey for each cell; with ``alpha``, each followed by its opacity.
-        alpha: True if unknown cells are transparent.
-        occupied_thresh: Least darkness of an occupied cell.
-        free_thresh: Largest darkness of a free cell.
-    """
-
-    mode: MapMode
-    pixels: bytes
-    alpha: bool
-    occupied_thresh: float
-    free_thresh: float
+    mode: MapMode  # mode of map_server
+    pixels: bytes  # a grey for each cell; with ``alpha``, each followed by its opacity
+    alpha: bool  # true if unknown cells are transparent
+    occupied_thresh: float  # least darkness of an occupied cell
+    free_thresh: float  # largest darkness of a free cell
 
 
 def paint(grid: OccupancyGrid, mode: MapMode | None) -> Painting:

@@ -19,10 +19,8 @@ LEVEL = math.acos(1 - 1e-3)
 def field(name: str, message: object, path: str) -> Any:
     """Return a field of a message, such as ``info.origin``.
 
-    Args:
-        name: Name of the argument, for errors.
-        message: An object with attributes, or a mapping with keys.
-        path: Name of the field; dots separate nested names.
+    ``name``: name of the argument, for errors; ``message``: an object with attributes, or a mapping with keys;
+    ``path``: name of the field; dots separate nested names.
     """
     value = message
     for part in path.split("."):
@@ -105,11 +103,8 @@ def distinct_beams(step: float, count: int) -> int:
 def nearest_beams(bearings: NDArray[np.float64], first: float, step: float, count: int) -> NDArray[np.int64]:
     """Return the index of the beam nearest to each bearing; -1 where the nearest beam is over half a step away.
 
-    Args:
-        bearings: (K,) bearings, any number of turns [rad].
-        first: Bearing of beam 0 [rad].
-        step: Step between beams [rad].
-        count: Number of beams.
+    ``bearings``: (K,) bearings, any number of turns [rad]; ``first``: bearing of beam 0 [rad]; ``step``: step between
+    beams [rad].
     """
     turned = bearings - first if step > 0 else first - bearings
     width = abs(step)
@@ -120,10 +115,8 @@ def nearest_beams(bearings: NDArray[np.float64], first: float, step: float, coun
 def spread_readings(message: object, places: int, upside_down: bool = False) -> NDArray[np.float64]:
     """Map the readings of a ``sensor_msgs/LaserScan`` to evenly spaced bearings of a full turn; NaN in gaps.
 
-    Args:
-        message: The scan.
-        places: Number of bearings, from -pi on; each reading goes to the nearest one.
-        upside_down: Whether the beams run clockwise.
+    ``places``: number of bearings, from -pi on; each reading goes to the nearest one; ``upside_down``: whether the
+    beams run clockwise.
     """
     raw = checks.array("message.ranges", field("message", message, "ranges"), ("K",), finite=False)
     first, step, count = laser_beams(message)
@@ -157,10 +150,7 @@ def _range_limit(message: object, name: str, value: float | None, **rule: float)
 def laser_geometry(message: object, range_max: float | None = None, range_min: float | None = None) -> dict[str, Any]:
     """Return angle_min, angle_increment, count, range_min and range_max of a ``sensor_msgs/LaserScan``.
 
-    Args:
-        message: The scan.
-        range_max: Upper limit instead of the message's [m].
-        range_min: Lower limit instead of the message's [m].
+    ``range_max``: upper limit instead of the message's [m]; ``range_min``: lower limit instead of the message's [m].
     """
     first, step, count = laser_beams(message)
     nearest = _range_limit(message, "range_min", range_min, low=0)

@@ -115,9 +115,7 @@ def look_at_grid(resolution: float, origin: tuple[float, float, float]) -> None:
 def look_at_scene(range_max: float, size: float) -> None:
     """Warn of a range far larger than the map.
 
-    Args:
-        range_max: Largest range [m].
-        size: Diagonal of the map [m].
+    ``range_max``: largest range [m]; ``size``: diagonal of the map [m].
     """
     if _FAR < range_max <= _FARTHEST and range_max > 10 * size:
         _notice(
@@ -131,12 +129,9 @@ def look_at_readings(
 ) -> bool:
     """Warn of negative readings, of many readings of exactly 0 m, and of readings in other units than metres.
 
-    Args:
-        name: Name of the argument.
-        ranges: Readings of one scan or several scans [m].
-        range_max: Longest range of the scanner [m].
-        size: Diagonal of the map [m]; None without a map.
-        range_min: Shortest range of the scanner [m]; above 0, readings of 0 are missing.
+    ``ranges``: readings of one scan or several scans [m]; ``range_max``: longest range of the scanner [m]; ``size``:
+    diagonal of the map [m]; None without a map; ``range_min``: shortest range of the scanner [m]; above 0, readings of
+    0 are missing.
 
     Returns:
         Whether a reading was implausible.
@@ -171,9 +166,7 @@ def look_at_readings(
 class FirstScans:
     """Check of a scanner's first scans until one is doubtful; later scans cost nothing.
 
-    Args:
-        range_max: Longest range of the scanner [m].
-        range_min: Shortest range of the scanner [m].
+    ``range_max``: longest range of the scanner [m]; ``range_min``: shortest range of the scanner [m].
 
     Attributes:
         left: Number of further calls to check.
@@ -199,10 +192,8 @@ class FirstScans:
 def look_at_start(pose: NDArray[np.float64], inside: bool, bounds: tuple[float, float, float, float]) -> None:
     """Warn of a start off the map, or with a heading in degrees.
 
-    Args:
-        pose: (3,) start [m, m, rad].
-        inside: True if the start is on the map.
-        bounds: (x_min, y_min, x_max, y_max) of the map [m].
+    ``pose``: (3,) start [m, m, rad]; ``inside``: true if the start is on the map; ``bounds``: (x_min, y_min, x_max,
+    y_max) of the map [m].
     """
     x, y, theta = pose.tolist()
     if not inside:

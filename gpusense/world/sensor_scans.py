@@ -18,19 +18,12 @@ Reader = Callable[[str, Any, Scanner], NDArray[Any]]
 
 @dataclass(frozen=True, eq=False)
 class SensorScans:
-    """S scans of L scanners.
+    """S scans of L scanners."""
 
-    Attributes:
-        scanners: The scanners.
-        sensor: (S,) index of the scanner of each scan.
-        rows: For each scanner, the ascending indices of its scans.
-        readings: For each scanner, the readings (S_l, K_l) of these scans [m].
-    """
-
-    scanners: tuple[Scanner, ...]
-    sensor: Integers
-    rows: tuple[Integers, ...]
-    readings: tuple[NDArray[Any], ...]
+    scanners: tuple[Scanner, ...]  # the scanners
+    sensor: Integers  # (S,) index of the scanner of each scan
+    rows: tuple[Integers, ...]  # for each scanner, the ascending indices of its scans
+    readings: tuple[NDArray[Any], ...]  # for each scanner, the readings (S_l, K_l) of these scans [m]
 
     def __len__(self) -> int:
         return len(self.sensor)
@@ -46,13 +39,10 @@ class SensorScans:
 def check_scans(scans: Any, scanner: Scanner | Sequence[Scanner], sensor: Any, read: Reader) -> SensorScans:
     """Group S scans by scanner.
 
-    Args:
-        scans: (S, K) readings of one scanner, or S scans of several scanners, each with its scanner's number of
-            readings [m].
-        scanner: The scanner, or L scanners.
-        sensor: (S,) indices of the scanners; None for one scanner.
-        read: Function that checks and returns the readings of one scanner, from the argument's name, its value and the
-            scanner.
+    ``scans``: (S, K) readings of one scanner, or S scans of several scanners, each with its scanner's number of
+    readings [m]; ``scanner``: the scanner, or L scanners; ``sensor``: (S,) indices of the scanners; None for one
+    scanner; ``read``: function that checks and returns the readings of one scanner, from the argument's name, its value
+    and the scanner.
     """
     if isinstance(scanner, Scanner):
         if sensor is not None:

@@ -129,12 +129,9 @@ def extent(grid: Cells, corners: Corners, mount: Mount) -> tuple[float, float, f
 def needed(grid: OccupancyGrid, corners: Corners, mount: Mount, reach: float, slack: float = 0.0) -> Window:
     """Return the smallest window that holds all cells within ``reach`` cells of any sensor, at least one cell.
 
-    Args:
-        grid: The map.
-        corners: Poses [m, m, rad], at least one, that span a box around all poses.
-        mount: The sensor's pose on the robot.
-        reach: Longest distance that matters, ring and rounding included [cells].
-        slack: Additional margin on every side [cells].
+    ``corners``: poses [m, m, rad], at least one, that span a box around all poses; ``mount``: the sensor's pose on the
+    robot; ``reach``: longest distance that matters, ring and rounding included [cells]; ``slack``: additional margin on
+    every side [cells].
     """
     left, right, low, high = extent(grid, corners, mount)
     margin = reach + slack + 3

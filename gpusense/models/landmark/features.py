@@ -217,14 +217,9 @@ def _set_reaches(
 ) -> None:  # fmt: skip
     """Set the discs in which landmarks matter, wider by the rounding errors of distances.
 
-    Args:
-        numbers: (K, FEATURE) numbers of the features.
-        p: The parameters.
-        sensor: Constants of the sensor.
-        distances: (K,) measured ranges [m].
-        measured: (K, 3) whether range, bearing and signature were measured.
-        bounds: (K,) largest differences of a landmark's log density from the highest one.
-        slack: Rounding error of a distance [m].
+    ``numbers``: (K, FEATURE) numbers of the features; ``distances``: (K,) measured ranges [m]; ``measured``: (K, 3)
+    whether range, bearing and signature were measured; ``bounds``: (K,) largest differences of a landmark's log density
+    from the highest one; ``slack``: rounding error of a distance [m].
     """
     # (d + slack)^2 <= 1.01 d^2 + 101 slack^2, and kernels look for 1.01 d^2.
     numbers[:, at.SLACK] = 101 * slack**2

@@ -102,15 +102,10 @@ def prepare_lines(
 ) -> PreparedFeatures:
     """Return the numbers of (F, 7) possible lines.
 
-    Args:
-        features: Angle, distance, ends and covariance; NaN where left out.
-        p: The parameters.
-        mount: The sensor's pose on the robot.
-        real: Precision of the numbers.
-        extent: Largest coordinate of the map in its buckets' frame [m].
-        longest: Half the length of the longest line of the map [m].
-        gated: Whether to bound the lines that can matter.
-        grouped: Largest number of features among which overlaps are searched.
+    ``features``: angle, distance, ends and covariance; NaN where left out; ``mount``: the sensor's pose on the robot;
+    ``extent``: largest coordinate of the map in its buckets' frame [m]; ``longest``: half the length of the longest
+    line of the map [m]; ``gated``: whether to bound the lines that can matter; ``grouped``: largest number of features
+    among which overlaps are searched.
     """
     columns = np.flatnonzero(~np.isnan(features[:, ANGLE]))
     kept = features[columns]

@@ -112,14 +112,10 @@ class PointModel(Pickled):
     ) -> Any:
         """Return log p of each pose, computed in parts; 0 without a program.
 
-        Args:
-            poses: (N, 3) poses.
-            out: The array for the result, or None.
-            program: Function that makes the program that writes log p of some poses into a buffer.
-            left_out: The omissions by these readings.
-            items: Cost of each pose, in readings of a scan.
-            itemsize: Bytes that are kept for each pose and item.
-            after: Function called with each part after its program has started.
+        ``poses``: (N, 3) poses; ``out``: the array for the result, or None; ``program``: function that makes the
+        program that writes log p of some poses into a buffer; ``left_out``: the omissions by these readings; ``items``:
+        cost of each pose, in readings of a scan; ``itemsize``: bytes that are kept for each pose and item; ``after``:
+        function called with each part after its program has started.
         """
         backend, space, real = self._backend, self._workspace, self._real
         checked = Poses(poses, backend, late=program is not None)
@@ -152,11 +148,7 @@ class PointModel(Pickled):
     def _relative(self, poses: Poses, part: Part, kernel: str, numbers: dict[str, float]) -> tuple[Buffer, Program]:
         """Return the places or residuals of some poses, and the launch of the file ``relative`` that computes them.
 
-        Args:
-            poses: The poses.
-            part: The first of them and the one after the last.
-            kernel: ``"place_relative"`` or ``"wrap_headings"``.
-            numbers: The kernel's real numbers.
+        ``part``: the first of them and the one after the last; ``kernel``: ``"place_relative"`` or ``"wrap_headings"``.
         """
         backend, space, count = self._backend, self._workspace, part[1] - part[0]
         name, width = {"place_relative": ("place", 4), "wrap_headings": ("residual", 2)}[kernel]

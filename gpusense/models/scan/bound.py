@@ -83,15 +83,12 @@ class BoundCall(ABC):
 class RecordedCall(BoundCall):
     """A recorded program on arrays of the device, made anew when the map's table changes.
 
-    Args:
-        pipeline: The stages of the model.
-        lock: Held while the model's buffers are in use.
-        poses, ranges, out: See ``ScanModel.bind``.
-        status: A shared buffer for the non-finite flag, which its owner inspects; None for a private one.
-        limits: The type to which the scanner's limits are rounded; None for the type of the ranges.
-        corners: Corners of the box of the poses, where their owner knows them: the map's table may be cropped then.
-        inside: The worlds of the poses, on the device; None in a single map. Ranges may then be (N, K).
-        per_beam: Whether to keep the term of each reading, for ``terms``; of few poses in a single map.
+    ``pipeline``: the stages of the model; ``lock``: held while the model's buffers are in use; ``poses``, ``ranges``,
+    ``out``: see ``ScanModel.bind``; ``status``: a shared buffer for the non-finite flag, which its owner inspects; None
+    for a private one; ``limits``: the type to which the scanner's limits are rounded; None for the type of the ranges;
+    ``corners``: corners of the box of the poses, where their owner knows them: the map's table may be cropped then;
+    ``inside``: the worlds of the poses, on the device; None in a single map. Ranges may then be (N, K); ``per_beam``:
+    whether to keep the term of each reading, for ``terms``; of few poses in a single map.
     """
 
     waits = False

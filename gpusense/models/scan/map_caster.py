@@ -38,17 +38,10 @@ from gpusense.world.windows import Window
 class MapCaster:
     """The caster of one map, sensor mount and range on one device; models share its table of the map.
 
-    Args:
-        backend: The device.
-        real: Precision.
-        grid: The map.
-        mount: The sensor's pose on the robot; its yaw belongs to the ray vectors.
-        range_max: Longest range [m].
-        method: The method for ranges.
-        unknown: Treatment of unknown cells: ``"free"`` or ``"occupied"``.
-        outside: Treatment of space outside the grid: ``"free"`` or ``"occupied"``.
-        crop: False prepares the whole map at once.
-        obstacles_of: Function that returns the mask of a grid's cells that stop a beam, from the grid and ``unknown``.
+    ``mount``: the sensor's pose on the robot; its yaw belongs to the ray vectors; ``range_max``: longest range [m];
+    ``unknown``: treatment of unknown cells: ``"free"`` or ``"occupied"``; ``outside``: treatment of space outside the
+    grid: ``"free"`` or ``"occupied"``; ``crop``: False prepares the whole map at once; ``obstacles_of``: function that
+    returns the mask of a grid's cells that stop a beam, from the grid and ``unknown``.
     """
 
     def __init__(
@@ -183,13 +176,9 @@ class MapCaster:
     ) -> Any:  # fmt: skip
         """Cast rays, in pieces that fit the memory.
 
-        Args:
-            poses: (N, 3) poses.
-            vectors: (K, 2) ray vectors, or (K, C, 2) of cones.
-            out: The array for the result, or None.
-            cones: Cones of the sensor.
-            world: (N,) indices of the poses' worlds.
-            ignore: (N,) indices of the shapes that poses do not see.
+        ``poses``: (N, 3) poses; ``vectors``: (K, 2) ray vectors, or (K, C, 2) of cones; ``out``: the array for the
+        result, or None; ``world``: (N,) indices of the poses' worlds; ``ignore``: (N,) indices of the shapes that poses
+        do not see.
 
         Returns:
             (N, K) expected ranges, or angles of incidence.

@@ -80,14 +80,9 @@ class PackedCall:
     or an array of the device that is used in place. Poses and readings of the host are float64 on the device, exact for
     float32. Limits of readings are rounded to the precision of the readings, as on the host.
 
-    Args:
-        pipeline: The stages of the model.
-        lock: Held while the program is recorded.
-        count: Number of poses.
-        inputs: The (N, 3) poses and the (K,) readings.
-        out: The (N,) log-likelihoods.
-        limits: The type of the readings; None for the type of readings on the device.
-        corners: Corners of the box of the first poses; None for the table of the whole map.
+    ``pipeline``: the stages of the model; ``lock``: held while the program is recorded; ``inputs``: the (N, 3) poses
+    and the (K,) readings; ``out``: the (N,) log-likelihoods; ``limits``: the type of the readings; None for the type of
+    readings on the device; ``corners``: corners of the box of the first poses; None for the table of the whole map.
     """
 
     def __init__(
@@ -130,11 +125,9 @@ class PackedCall:
     def score(self, poses: Any, ranges: Any, out: Any, corners: Corners | None = None) -> bool:
         """Score poses, and write their log-likelihoods; arrays that are used in place are ignored.
 
-        Args:
-            poses: (N, 3) poses: an array of the host, or a buffer.
-            ranges: (K,) readings, the same.
-            out: (N,) array or buffer for the log-likelihoods.
-            corners: Corners of the box of the poses; None for the table of the whole map.
+        ``poses``: (N, 3) poses: an array of the host, or a buffer; ``ranges``: (K,) readings, the same; ``out``: (N,)
+        array or buffer for the log-likelihoods; ``corners``: corners of the box of the poses; None for the table of the
+        whole map.
 
         Returns:
             False where a pose is not finite; nothing is written on the host then.

@@ -83,17 +83,10 @@ def make_request(
 ) -> Request:
     """Check the arguments of a call.
 
-    Args:
-        context: The model's device, precision and scanner.
-        poses: (N, 3), or (S, N, 3).
-        ranges: (K,), or (S, K).
-        out: None, or the array for the result.
-        per_beam: True if the log-likelihoods of the readings are requested.
-        known: Poses that were checked before.
-        before: See Request.
-        worlds: The worlds of a model of worlds.
-        world: (N,) indices of the poses' worlds.
-        ignore: (N,) indices of the shapes that poses do not see.
+    ``context``: the model's device, precision and scanner; ``poses``: (N, 3), or (S, N, 3); ``ranges``: (K,), or (S,
+    K); ``out``: None, or the array for the result; ``per_beam``: true if the log-likelihoods of the readings are
+    requested; ``known``: poses that were checked before; ``worlds``: the worlds of a model of worlds; ``world``: (N,)
+    indices of the poses' worlds; ``ignore``: (N,) indices of the shapes that poses do not see.
     """
     backend, real, scanner = context.backend, context.real, context.rules.scanner
     if scanner._first_scans.left and isinstance(poses, (np.ndarray, list, tuple)):

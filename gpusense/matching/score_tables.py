@@ -17,10 +17,11 @@ _NO_FLAGS: frozenset[str] = frozenset()
 RUN = 16
 # Rows of shifts of a work-item, as in the kernel file.
 SHIFT_ROWS = 8
-# Levels between the blocks of a level and the steps of their first cells.
-_STEP = 2
-# Largest score of a cell, and scores in a unit of the losses of folded tables.
-TOP, _UNIT = 255, 8
+# Largest score of a cell.
+TOP = 255
+# Levels between the blocks of a level and the steps of their first cells, and scores in a unit of the losses of folded
+# tables, by kind of device: processors need few images in their caches, and add losses of several points in a byte.
+_STEP, _UNIT = {"cpu": 2, "gpu": 8}, {"cpu": 8, "gpu": 1}
 # Cells of a table and of its copies, which kernels index in 32 bits.
 _MOST_CELLS = (1 << 31) - 1
 
@@ -100,10 +101,9 @@ class ScoreTables:
     def _size(self) -> tuple[int, int, int]:
         return self.shape.cols + 2 * self.shape.margin, self.shape.rows + 2 * self.shape.margin, self.shape.tables
 
-    @staticmethod
-    def step(level: int) -> int:
+    def step(self, level: int) -> int:
         """Return the cells between neighbouring first cells of the folded tables of a level."""
-        return 1 << max(level - _STEP, 0)
+        return 1 << max(level - _STEP[self.backend.info.kind], 0)
 
     def level(self, level: int) -> Buffer:
         """Return the tables of a level; a cell is the largest score of ``2^level`` positions along each axis."""
@@ -139,7 +139,7 @@ class ScoreTables:
         Their cells begin at multiples of a step, so a cell covers additional cells for points off the multiples.
         Losses of poses are exact; losses of blocks are rounded down to units.
         """
-        period, step, unit = self.stride << level, self.step(level), _UNIT if level else 1
+        period, step, unit = self.stride << level, self.step(level), _UNIT[self.backend.info.kind] if level else 1
         if level not in self._folded:
             lines, stride = self.shape.rows + 2 * self.shape.margin, self.shape.cols + 2 * self.shape.margin
             images = self.shape.tables * (period // step) ** 2

@@ -14,9 +14,10 @@ score less the cell's, divided by a unit and rounded down, so that losses of sev
 
 import warp as wp
 
-from .prelude import kernel
+from .prelude import kernel, reader
 from .score_cells import SHIFT_ROWS, TOP, ScoreTable, block_index, padded_lines, padded_stride
 
+byte_at, number_at, cell_at = reader(wp.uint8), reader(wp.int32), reader(wp.vec2i)
 # Sums of neighbouring rows.
 Rows = wp.types.vector(length=SHIFT_ROWS, dtype=wp.int32)
 # Points after which sums are compared.
@@ -106,8 +107,9 @@ def divided(
         even = int(0)
         odd = int(0)
         while k < stop:
-            cell = point[k]
-            four = quarters[image[k] * size + block_index(scores, cell.y + row, cell.x + col, 0, 0)]
+            cell = cell_at(point, k)
+            begins = number_at(image, k) * size
+            four = number_at(quarters, begins + block_index(scores, cell.y + row, cell.x + col, 0, 0))
             even = even + (four & 0xFF00FF)
             odd = odd + ((four >> 8) & 0xFF00FF)
             k = k + 1
@@ -137,10 +139,10 @@ def shift_scores(table, point, image, first, allowed, score, scores, begin, item
         last = first[item + 1]
     total = Rows()
     for k in range(first[item], last):
-        cell = point[k]
-        place = image[k] * size + block_index(scores, cell.y + row, cell.x + col, SHIFT_ROWS - 1, 0)
+        cell = cell_at(point, k)
+        place = number_at(image, k) * size + block_index(scores, cell.y + row, cell.x + col, SHIFT_ROWS - 1, 0)
         for i in range(SHIFT_ROWS):
-            total[i] = total[i] + int(table[place + i * stride])
+            total[i] = total[i] + int(byte_at(table, place + i * stride))
     for i in range(SHIFT_ROWS):
         if row + i < height:
             n = (row + i) * width + col

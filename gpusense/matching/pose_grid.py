@@ -92,11 +92,12 @@ def distinct_poses(poses: np.ndarray, count: int, radius: float, angle: float, f
     The best pose has the index ``first``. Poses within ``radius`` [m] and ``angle`` [rad] of a better one are left out.
     """
     chosen: list[int] = []
-    left, following = np.ones(len(poses), bool), first
-    while len(chosen) < count and left.any():
+    left, (x, y, heading) = np.arange(len(poses)), poses.T
+    following = first
+    while len(left) and len(chosen) < count:
         chosen.append(following)
-        off = poses - poses[following]
-        turn = np.abs(wrapped(off[:, 2]))
-        left &= (np.hypot(off[:, 0], off[:, 1]) > radius) | (turn > angle)
-        following = int(np.argmax(left))
+        at = poses[following]
+        far = np.flatnonzero((np.hypot(x - at[0], y - at[1]) > radius) | (np.abs(wrapped(heading - at[2])) > angle))
+        left, x, y, heading = left[far], x[far], y[far], heading[far]
+        following = int(left[0]) if len(left) else -1
     return chosen

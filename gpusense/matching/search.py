@@ -299,8 +299,10 @@ class _Run:
 
     def _ordered(self, poses: np.ndarray) -> np.ndarray:
         """Return poses by scan, falling score, row, column and heading."""
-        scan, heading = np.divmod(poses[:, 0], self._turns)
-        ordered: np.ndarray = poses[np.lexsort((heading, poses[:, 2], poses[:, 1], -poses[:, 3], scan))]
+        scan, heading = np.divmod(poses[:, 0].astype(np.int64), self._turns)
+        place = (poses[:, 1].astype(np.int64) * self._grid.width + poses[:, 2]) * self._turns + heading
+        # Scores have 31 bits.
+        ordered: np.ndarray = poses[np.lexsort((place, (scan << 32) - poses[:, 3]))]
         return ordered
 
     def found(self) -> Found:

@@ -110,7 +110,13 @@ return tid;
 def work_item(tid: wp.int32) -> wp.int32: ...
 
 
-_C_TYPES = {wp.float32: "float", wp.float64: "double", wp.int32: "int", wp.uint16: "unsigned short", wp.uint8: "unsigned char"}
+_C_TYPES = {
+    wp.float32: "float",
+    wp.float64: "double",
+    wp.int32: "int",
+    wp.uint16: "unsigned short",
+    wp.uint8: "unsigned char",
+}
 
 
 @functools.cache

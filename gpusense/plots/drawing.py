@@ -198,7 +198,9 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     formats = figure.canvas.get_supported_filetypes()
     if kind not in formats:
         raise ValueError(f"path: must end in one of {', '.join('.' + name for name in formats)}, got {target}")
-    write_whole(target, lambda stream: figure.savefig(stream, format=kind))
+    # Twice as fast as the default level, for a file that is a sixth larger.
+    options = dict(pil_kwargs=dict(compress_level=3)) if kind == "png" else {}
+    write_whole(target, lambda stream: figure.savefig(stream, format=kind, **options))
 
 
 def colours() -> Colormap:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 # Results other than a single number.
 _NO_NUMBER = ("rank_histogram", "verdict", "evidence")
-_PARTS = ("predict", "score", "resample", "estimate")
+_PARTS = ("predict", "correct", "estimate")
 
 
 def report(
@@ -144,7 +144,7 @@ def _print_details(pf: ParticleFilter, result: dict[str, Any]) -> None:
         )
     print(
         f"effective sample size median {s['effective_sample_size_median']}; temperature {s['temperature']}\n"
-        f"ms per scan           predict {s['ms_predict']}, score {s['ms_score']}, resample {s['ms_resample']}, "
+        f"ms per scan           predict {s['ms_predict']}, correct {s['ms_correct']}, "
         f"estimate {s['ms_estimate']}\n{pf!r}\n{machine_line()}",
     )
 

@@ -41,7 +41,7 @@ class Track:
         verdicts: "tracking", "uncertain" or "lost" for each estimate.
         explained: Shares of beams that the estimates explain; NaN for a scan without beams.
         radii: Radii that errors exceed with at most the probability ``RISK`` [m].
-        seconds: Seconds of each step: predict, score, resample, estimate.
+        seconds: Seconds of each step: predict, correct, estimate.
     """
 
     steps: list[Step] = field(default_factory=list)
@@ -54,7 +54,7 @@ class Track:
     explained: list[float] = field(default_factory=list)
     radii: list[float] = field(default_factory=list)
     temperatures: list[float] = field(default_factory=list)
-    seconds: list[tuple[float, float, float, float]] = field(default_factory=list)
+    seconds: list[tuple[float, float, float]] = field(default_factory=list)
 
     @property
     def verdict(self) -> Word:
@@ -111,20 +111,15 @@ def start(
 
 def follow(pf: ParticleFilter, steps: Iterable[Step], track: Track) -> Iterable[Step]:
     """Run a filter along a log; yield each step after it was added to the track."""
-    pf.time_scoring()
     for step in steps:
         times = [time.perf_counter()]
         if track.steps:
             pf.predict(track.steps[-1].odometry, step.odometry)
-            pf.flush()
         times.append(time.perf_counter())
-        before = pf.scoring_seconds
         pf.correct({pf.models[step.sensor]: step.scan.ranges})
         times.append(time.perf_counter())
-        scoring = pf.scoring_seconds - before
         found = pf.estimate()
         times.append(time.perf_counter())
-        predict, correct, estimate = np.diff(times)
         rank = None
         if step.reference is not None:
             rank = rank_of(pf.host_particles(), pf.host_weights(), np.array(step.reference))
@@ -138,7 +133,8 @@ def follow(pf: ParticleFilter, steps: Iterable[Step], track: Track) -> Iterable[
         track.explained.append(found.explained)
         track.radii.append(found.protection_level(RISK))
         track.temperatures.append(found.temperature)
-        track.seconds.append((float(predict), scoring, float(correct) - scoring, float(estimate)))
+        predict, correct, estimate = np.diff(times).tolist()
+        track.seconds.append((predict, correct, estimate))
         track.steps.append(step)
         yield step
 
@@ -149,7 +145,7 @@ def summary(track: Track) -> dict[str, Any]:
     Figures against reference poses are None without them, as is the median share of explained beams without beams.
     """
     count = len(track.steps)
-    seconds = np.array(track.seconds).reshape(-1, 4) * 1000
+    seconds = np.array(track.seconds).reshape(-1, 3) * 1000
     means = np.median(seconds, axis=0)
     tail = max(count // 10, 1)
     result: dict[str, Any] = {
@@ -166,7 +162,7 @@ def summary(track: Track) -> dict[str, Any]:
         "temperature": track.temperatures[-1],
         "effective_sample_size_median": float(np.median(track.sizes)),
     }
-    result |= dict(zip(("ms_predict", "ms_score", "ms_resample", "ms_estimate"), map(float, means), strict=True))
+    result |= dict(zip(("ms_predict", "ms_correct", "ms_estimate"), map(float, means), strict=True))
     differences, references = track.differences(), track.references
     if differences is None or references is None:
         return result | {"references": 0, "references_repeat_odometry": False} | dict.fromkeys(_WITH_REFERENCE)

@@ -27,7 +27,7 @@ class Defaults(NamedTuple):
         most_injected: Largest share of injected particles.
         recovery: Recovery of the filter.
         temperature: Temperature of the filter.
-        calibrations: Number of first corrections that all teach the temperature; later two in ten do.
+        calibrations: Number of first corrections that all teach the temperature; later two in 25 do.
         alpha: Noise of the odometry.
         reverse: Probability that a translation went the other direction.
         least: Least deviations of a step [m, rad].

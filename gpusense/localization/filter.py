@@ -316,18 +316,6 @@ class ParticleFilter(Transactional):
         return self._parts.verdict.gain
 
     @property
-    def scoring_seconds(self) -> float:
-        """Time of the models' log-likelihoods since the call of ``time_scoring`` [s].
-
-        Unless ``time_scoring`` was called, only their start counts; for a step of one recorded program it is 0.
-        """
-        return self._cloud.scoring_seconds
-
-    def time_scoring(self) -> None:
-        """Wait for the log-likelihoods of each stage from now on, for ``scoring_seconds``."""
-        self._cloud.time_scoring()
-
-    @property
     def grid(self) -> OccupancyGrid:
         """The map of the first model that has one.
 

@@ -39,7 +39,6 @@ class FilterCore:
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("last",)
-    PARTS: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, sensors: Sequence[Sensor], options: Options, cloud: FilterCloud) -> None:
         self.sensors, self.options = sensors, options

@@ -145,7 +145,6 @@ class Particles:
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("count", "block", "places", "pool", "pool_size")
-    PARTS: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
         self, backend: Backend, capacity: int, readings: Sequence[int], precision: np.dtype, *, residual: bool = False

@@ -148,7 +148,7 @@ class Rival:
             # A place from a search on the whole map is no likelier than its rivals: compare them at once.
             rho = correlation(*motion_between(pose, at)) if sensors in self._last and self._prior < 0.0 else 0.0
             self.log_odds += new_part(ratio, before, rho)
-            self._last[sensors] = ratio, np.array(pose)
+            self._last = {**self._last, sensors: (ratio, np.array(pose))}
         self._scans += 1
 
     def judge(
@@ -226,7 +226,6 @@ class Recovery:
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("rival", "everywhere")
-    PARTS: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, tracker: Tracker, verdict: Verdict) -> None:
         self._tracker, self._verdict = tracker, verdict

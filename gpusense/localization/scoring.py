@@ -69,7 +69,7 @@ class FilterCloud(Cloud):
     def __init__(self, sensors: Sequence[Sensor], capacity: int, *, residual: bool = False) -> None:
         readings = [sensor.readings for sensor in sensors]
         super().__init__(sensors[0].backend, capacity, readings, sensors[0].precision, residual=residual)
-        self._scored, self._timed = sensors, False
+        self._scored = sensors
         self._programs = ProgramCache[tuple[Program, object]](_MOST_PROGRAMS)
         # Views of buffers for models, by the number of particles.
         self._views: dict[tuple[str, int, int], Any] = {}
@@ -111,7 +111,7 @@ class FilterCloud(Cloud):
         poses = self._poses(stage.source)
         before = None if stage.kind is None else functools.partial(self.begin, stage)
         for place, (index, reading) in enumerate(readings):
-            self._scored[index].score(poses, reading, self._log_p(place), before=before, timed=self._timed)
+            self._scored[index].score(poses, reading, self._log_p(place), before=before)
             before = None
         self.weigh(stage)
 
@@ -150,12 +150,3 @@ class FilterCloud(Cloud):
             self._views.clear()
         self._views[key] = self.backend.view(buffer, shape, dtype)
         return self._views[key]
-
-    @property
-    def scoring_seconds(self) -> float:
-        """Seconds of all log-likelihoods; 0 where a step is one recorded program."""
-        return sum(sensor.seconds for sensor in self._scored)
-
-    def time_scoring(self) -> None:
-        """Wait for the log-likelihoods of each stage from now on, for ``scoring_seconds``."""
-        self._timed = True

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import functools
-import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -54,13 +53,12 @@ class Sensor:
     Attributes:
         beams: Used beams of a scan; 0 for other models.
         readings: All beams of a scan; 0 for other models.
-        seconds: Time of all calls of ``score``.
         calibrates: Whether temperature="auto" learns from this sensor.
         ambiguous: True if its likelihood may have several peaks among concentrated particles, for example exchangeable
             landmarks.
     """
 
-    MEMORY, PARTS = ("_correlation", "_seen", "_learned", "_lesson"), ()
+    MEMORY = ("_correlation", "_seen", "_learned", "_lesson")
 
     def __init__(self, model: Any) -> None:
         if not isinstance(model, (ScanModel, PointModel)):
@@ -86,7 +84,7 @@ class Sensor:
         self._values: np.ndarray | None = None
         self._sent: list[np.ndarray] = []
         self._judge: MapJudge | None = None
-        self.seconds, self._started = 0.0, 0
+        self._started = 0
 
     def temperature(self, chosen: float | str) -> float:
         """Return the present temperature of the log-likelihood, for the option ``chosen``."""
@@ -104,8 +102,11 @@ class Sensor:
 
     @property
     def due(self) -> bool:
-        """Return whether to learn the correlation of beams from the last scan: each of the first, then two in ten."""
-        return self._seen <= DEFAULTS.calibrations or self._seen % 10 <= 1
+        """Return whether to learn the correlation of beams from the last scan: each of the first, then two in 25.
+
+        A lesson takes as long as a step on a GPU, so fewer than a tenth of the steps have one.
+        """
+        return self._seen <= DEFAULTS.calibrations or self._seen % 25 <= 1
 
     def count(self) -> None:
         """Count a scan."""
@@ -186,15 +187,12 @@ class Sensor:
         poses: Any,
         reading: tuple[Any, ...],
         out: Any,
-        *,
         before: Callable[[], None] | None = None,
-        timed: bool = False,
     ) -> None:
         """Start writing the log-likelihoods of (N, 3) poses on the device to (N,) ``out``.
 
-        ``before`` starts the launches that write the poses. With ``timed`` the call waits, for ``seconds``.
+        ``before`` starts the launches that write the poses.
         """
-        begin = time.perf_counter()
         if self.calibrates:
             if np.ndim(reading[0]) != 1:
                 raise ValueError(
@@ -203,14 +201,13 @@ class Sensor:
             self.model.start_scoring(poses, *reading, out=out, before=before)
             self._started += 1
             # Keep arrays alive until the device has read them.
-            if timed or self._started >= _MOST_STARTED:
+            if self._started >= _MOST_STARTED:
                 self.model.finish_scoring()
                 self._started = 0
         else:
             if before is not None:
                 before()
             self.model.log_likelihood(poses, *reading, out=out)
-        self.seconds += time.perf_counter() - begin
 
     # ---- recorded steps
 

@@ -61,7 +61,6 @@ class Tracker:
     MEMORY: ClassVar[tuple[str, ...]] = (
         "started", "progress", "shown", "wide", "together", "pool", "corrections",
     )  # fmt: skip
-    PARTS: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, sensors: Sequence[Sensor], options: Options, cloud: FilterCloud) -> None:
         self.sensors, self.options, self.cloud = sensors, options, cloud

@@ -93,7 +93,7 @@ def test_figures_come_as_json(place, capsys):
     document = json.loads(capsys.readouterr().out)
     found = document["summary"]
     assert found["scans"] == 4 and len(document["poses"]) == len(document["times"]) == 4 and found["temperature"] == 0.2
-    assert 0 <= found["coverage_50"] <= found["coverage_95"] <= 1 and found["ms_score"] > 0
+    assert 0 <= found["coverage_50"] <= found["coverage_95"] <= 1 and found["ms_correct"] > 0
 
 
 @pytest.mark.long

@@ -78,7 +78,7 @@ def test_convergence_is_counted_in_scans_not_in_references(place):
             column.append(value)
         track.temperatures.append(1.0)
         track.verdicts.append("tracking")
-        track.seconds.append((0.0, 0.0, 0.0, 0.0))
+        track.seconds.append((0.0, 0.0, 0.0))
     # Only four of five necessary references remain.
     assert summary(track)["converged_at"] is None
     track.poses[4] = np.array(steps[4].reference)

@@ -14,7 +14,7 @@ from gpusense.localization.beam_consistency import BeamConsistency, beam_consist
 from gpusense.localization.belief import Belief
 from gpusense.localization.diagnosis import Diagnosis, evidence_of
 from gpusense.localization.map_judge import MapJudge
-from gpusense.localization.scan_evidence import explained_of_scan, ratio_of_scan
+from gpusense.localization.scan_evidence import evidence_of_scan
 from gpusense.localization.spread import LOST, TRACKING, Word
 from gpusense.localization.temperature import BeamCorrelation, learn_from_scan
 from gpusense.logs import Scan
@@ -88,7 +88,7 @@ class FitnessOfLog:
         log_p = self._model.log_likelihood(poses, scan.ranges)
         ranges = np.asarray(scan.ranges, np.float64)
         found = beam_consistency(self._model.grid, scan.scanner, pose, ranges, judge=self._judge)
-        share, ratio, better = explained_of_scan([found]), ratio_of_scan([found]), math.nan
+        (ratio, share), better = evidence_of_scan([found]), math.nan
         # Readings that are equally likely or impossible everywhere are no evidence.
         if np.isfinite(log_p).any() and (log_p != log_p[0]).any():
             better = float(np.mean(log_p[1:] < log_p[0]))

@@ -7,7 +7,6 @@ recorded program.
 from __future__ import annotations
 
 import math
-import threading
 import weakref
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
@@ -18,7 +17,7 @@ from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.programs import ProgramCache, RecordedProgram, RepeatedPrograms
 from gpusense.interface.constants import ESTIMATE, FAR_SHARE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
-from gpusense.localization.cloud_state import Contents, Summary, deeper, is_starved, meaningful, summary_of
+from gpusense.localization.cloud_state import Contents, Snapshot, Summary, deeper, is_starved, meaningful, summary_of
 from gpusense.localization.map_judge import MapJudge
 from gpusense.localization.particles import BufferSlots, Particles, Stage
 
@@ -26,29 +25,6 @@ _DOUBLE = np.dtype(np.float64)
 _MOST_RECORDED, _MOST_STAGES = 64, 48
 # Consecutive corrections with a read estimate after which corrections compute the estimate.
 _ASKED = 3
-
-
-class Snapshot:
-    """Particles of one moment, copied to the host when they are asked for, or before a step overwrites them."""
-
-    def __init__(self, cloud: Cloud, count: int) -> None:
-        self.places, self._count, self._lock = cloud.places, count, threading.Lock()
-        self._cloud: Cloud | None = cloud
-        self._copies: tuple[np.ndarray, np.ndarray] | None = None
-
-    @property
-    def is_on_device(self) -> bool:
-        """Return whether the particles have not been copied yet."""
-        return self._copies is None
-
-    def __call__(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return (N, 3) poses and (N,) unnormalised weights."""
-        with self._lock:
-            if self._copies is None and (cloud := self._cloud) is not None:
-                poses = cloud.host_poses(self.places.shown, self._count)
-                self._copies, self._cloud = (poses, cloud._read(cloud.weights[self.places.weight], self._count)), None
-        assert self._copies is not None
-        return self._copies
 
 
 class Cloud(Particles):
@@ -154,7 +130,7 @@ class Cloud(Particles):
             meanwhile: Called while the device works on the first stage.
             given: Sets the inputs of a recorded correction, which its first stage copies to the device.
         """
-        self.use(sensors)
+        self._sensors = sensors
         self._begin_change()
         self._prepared, self._meanwhile = judges, meanwhile
         self._asked, self._was_asked = self._asked + 1 if self._was_asked else 0, False
@@ -269,7 +245,7 @@ class Cloud(Particles):
         self._start(recorded, read=stage.most > 1 or self._estimates_too)
 
     def _start(self, recorded: RecordedProgram, *, read: bool) -> None:
-        """Start a stage with the copy of a correction's inputs, and that of its results: one graph of a CUDA device."""
+        """Start a stage, and copy a correction's inputs and results with it: one graph of a CUDA device."""
         backend = self.backend
         backend.begin_batch()
         try:
@@ -391,9 +367,9 @@ class Cloud(Particles):
         """Return a copy of the poses of a buffer."""
         return self._read(self.poses[index], 3 * count).reshape(count, 3)
 
-    def host_weights(self, count: int) -> np.ndarray:
-        """Return a copy of the unnormalised weights of the shown particles."""
-        return self._read(self.weights[self.places.weight], count)
+    def host_weights(self, count: int, index: int | None = None) -> np.ndarray:
+        """Return a copy of the unnormalised weights of a buffer, by default of the shown particles."""
+        return self._read(self.weights[self.places.weight if index is None else index], count)
 
     def contents(self, count: int) -> Contents:
         """Return a copy of all particles; ``count`` of them are shown."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -79,6 +80,29 @@ class Contents(NamedTuple):
             ("poses", places.shown, self.poses), ("weights", places.weight, self.weights),
             ("poses", places.next, self.next_poses), ("weights", places.before, self.next_weights),
         ]  # fmt: skip
+
+
+class Snapshot:
+    """Particles of one moment, copied to the host when they are asked for, or before a step overwrites them."""
+
+    def __init__(self, cloud: Any, count: int) -> None:
+        self.places, self._count, self._lock = cloud.places, count, threading.Lock()
+        self._cloud: Any = cloud
+        self._copies: tuple[np.ndarray, np.ndarray] | None = None
+
+    @property
+    def is_on_device(self) -> bool:
+        """Return whether the particles have not been copied yet."""
+        return self._copies is None
+
+    def __call__(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (N, 3) poses and (N,) unnormalised weights."""
+        with self._lock:
+            if self._copies is None and (cloud := self._cloud) is not None:
+                poses = cloud.host_poses(self.places.shown, self._count)
+                self._copies, self._cloud = (poses, cloud.host_weights(self._count, self.places.weight)), None
+        assert self._copies is not None
+        return self._copies
 
 
 class Summary(NamedTuple):

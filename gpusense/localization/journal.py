@@ -124,7 +124,7 @@ def consistent(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W
 
 
 class Held(NamedTuple):
-    """Attributes of an object within a state, which are set on a copy of the present object."""
+    """Attributes of an object within a state, to set on a copy of the present object."""
 
     values: dict[str, Any]
 

@@ -118,7 +118,8 @@ class Packed:
     Attributes:
         buffer: The buffer.
         parts: The arrays on the device.
-        spans: Places of the arrays among the numbers of the buffer, which are ``size``.
+        size: Numbers of the buffer.
+        spans: Places of the arrays among these numbers.
     """
 
     def __init__(self, backend: Backend, sizes: Sequence[int]) -> None:
@@ -180,10 +181,6 @@ class Particles:
         if count != self.count:
             self.block = weight_block(self.backend, count)
         self.places, self.count = places, count
-
-    def use(self, sensors: int) -> None:
-        """Set the number of sensors of the next correction."""
-        self._sensors = sensors
 
     # ---- launches
 

@@ -65,7 +65,7 @@ def ratio_of_scan(scans: Sequence[BeamConsistency]) -> float:
 
 
 def evidence_of_scan(scans: Sequence[BeamConsistency]) -> tuple[float, float]:
-    """Return the results of :func:`ratio_of_scan` and :func:`explained_of_scan`."""
+    """Return the ratio of simultaneous scans, and the agreeing share of their explainable beams; NaN without any."""
     if not scans:
         return math.nan, math.nan
     counts = counts_of(scans)
@@ -89,11 +89,6 @@ def _ratio_of(counts: Counts, scans: Sequence[BeamConsistency]) -> float:
 def _odds(one: int, other: int) -> float:
     """Return the log odds of two counts, with half a beam added to each."""
     return math.log((one + 0.5) / (other + 0.5))
-
-
-def explained_of_scan(scans: Sequence[BeamConsistency]) -> float:
-    """Return the agreeing share of the explainable beams; NaN without any."""
-    return evidence_of_scan(scans)[1]
 
 
 def ratio_of_places(lead: float, beams: float, walls: float, *, is_found: bool) -> float:

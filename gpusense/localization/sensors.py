@@ -273,7 +273,7 @@ def sensors_of(models: Any) -> list[Sensor]:
         raise ValueError("models: must be different ones, since readings are found by their model, got one twice")
     for model in chosen:
         check_one_map("models", model)
-    sensors = [model if isinstance(model, Sensor) else Sensor(model) for model in chosen]
+    sensors = [Sensor(model) for model in chosen]
     backend = sensors[0].backend
     if any(sensor.backend is not backend for sensor in sensors):
         names = ", ".join(sorted({sensor.backend.info.selection for sensor in sensors}))

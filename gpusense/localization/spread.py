@@ -60,11 +60,6 @@ def spread_of(covariance: Floats) -> Spread:
     )  # fmt: skip
 
 
-def is_wide(covariance: Floats) -> bool:
-    """Return whether the position's deviation exceeds 0.5 m, or the heading's 0.25 rad."""
-    return spread_of(covariance).wide
-
-
 def verdict_label(p_lost: float, wrong: float, *, wide: bool, apart: bool) -> Word:
     """Return the word for the probability of being lost, and of another place being right by the scans.
 

@@ -26,7 +26,7 @@ from gpusense.localization.landmark_gain import LEAST_GAIN, Evidence, Gains
 from gpusense.localization.motion import STILL, SampledMotion
 from gpusense.localization.scan_evidence import evidence_of_scan, ratio_of_features
 from gpusense.localization.sensors import Sensor
-from gpusense.localization.spread import TRACKING, is_wide, spread_of
+from gpusense.localization.spread import TRACKING, spread_of
 from gpusense.models.landmark.base import FeatureModel
 from gpusense.world.scanner import float64_readings
 
@@ -212,7 +212,7 @@ class Verdict:
 
     def compared(self, pose: np.ndarray, covariance: np.ndarray, ratio: float) -> None:
         """Add the ratio of other places against the last judged pose (3,), or NaN, unless its covariance is wide."""
-        if is_wide(covariance):
+        if spread_of(covariance).wide:
             return
         x, y, theta = (float(value) for value in pose)
         self.state = self.state._replace(belief=self.state.belief.compared_with((x, y, theta), ratio))

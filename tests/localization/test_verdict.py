@@ -15,7 +15,7 @@ from gpusense.localization import belief as constants
 from gpusense.localization.beam_consistency import beam_consistency
 from gpusense.localization.belief import ALIKE, ALIKE_CHOSEN, FOUND, LENGTH, PER_METRE, PER_SCAN, STAYS, Belief
 from gpusense.localization.map_judge import MapJudge
-from gpusense.localization.scan_evidence import LIMITS, explained_of_scan, ratio_of_scan
+from gpusense.localization.scan_evidence import LIMITS, evidence_of_scan, ratio_of_scan
 from gpusense.localization.spread import share_off, share_off_of, verdict_label
 
 STILL = np.zeros((3, 3))
@@ -137,9 +137,9 @@ def test_the_ratio_ignores_short_beams_and_has_limits():
     assert one == two == LIMITS[0]
     elsewhere = ratio_of_scan([beam_consistency(GRID, SCANNER, POSE + np.array([3.5, 0.0, 0.0]), right)])
     assert one + 3 < elsewhere <= LIMITS[1]
-    assert math.isnan(ratio_of_scan([])) and math.isnan(explained_of_scan([]))
+    assert math.isnan(ratio_of_scan([])) and math.isnan(evidence_of_scan([])[1])
     nothing = beam_consistency(GRID, SCANNER, POSE, np.full(64, np.nan))
-    assert math.isnan(ratio_of_scan([nothing])) and math.isnan(explained_of_scan([nothing]))
+    assert math.isnan(ratio_of_scan([nothing])) and math.isnan(evidence_of_scan([nothing])[1])
 
 
 def test_the_belief_is_the_exact_filter_of_two_states():

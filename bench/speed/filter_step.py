@@ -112,7 +112,8 @@ WARM = 100
 QUANTILES = (0.1, 0.5, 0.9, 0.99, 1.0)
 # Methods with extra work, by a word for it; a commit has the methods of its time.
 WORK = {
-    "learn": ("sensors.Sensor", ("correlate", "begin_lesson")),
+    "begin": ("sensors.Sensor", ("begin_lesson",)),
+    "learn": ("temperature.BeamCorrelation", ("add",)),
     "search": ("rival.Rival", ("start",)),
     "rival": ("rival.Rival", ("correct",)),
     "stage": ("cloud.Cloud", ("_draw",)),

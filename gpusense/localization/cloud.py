@@ -45,9 +45,9 @@ class Cloud(Particles):
         self._known: tuple[Hashable, np.ndarray] | None = None
         self._far: tuple[Hashable, float] | None = None
         self._snapshots: list[weakref.ref[Snapshot]] = []
-        # Consecutive corrections with a read estimate; whether the last one's was read; number of its last stage;
-        # whether the present stage computes the estimate.
-        self._asked, self._was_asked, self._last_stage, self._estimates_too = 0, False, 0, False
+        # Consecutive corrections with a read estimate; whether the last one's was read; whether the stages of the
+        # present one compute the estimate.
+        self._asked, self._was_asked, self._estimates_too = 0, False, False
         # Function that prepares judges of scans; judges of the last correction until they receive the result.
         self._prepared: Callable[[], list[tuple[MapJudge, np.ndarray]]] | None = None
         self._judges: Sequence[MapJudge] = ()
@@ -134,6 +134,7 @@ class Cloud(Particles):
         self._begin_change()
         self._prepared, self._meanwhile = judges, meanwhile
         self._asked, self._was_asked = self._asked + 1 if self._was_asked else 0, False
+        self._estimates_too = self._asked >= _ASKED
         if given is None:
             self.upload_settings(settings)
         else:
@@ -143,7 +144,6 @@ class Cloud(Particles):
             self._copy_state(self.places.state, stages[0].state)
         for stage in stages:
             last, deep = stage.most == 1, settings
-            self._estimates_too = self._asked >= _ASKED and stage.number >= self._last_stage
             self._results = None
             score(stage)
             self._use_wait()
@@ -156,7 +156,6 @@ class Cloud(Particles):
                 self.upload_settings(settings)
             if last:
                 break
-        self._last_stage = stage.number
         places = stage.places
         self._estimated_of = (places, self.count) if self._estimates_too else None
         self.set_particles(places, drawn)

@@ -1,4 +1,4 @@
-"""Run ``gpusense score``: rank the poses of a log among particles, on one or several backends."""
+"""Run ``gpusense score``: rank the poses of a log among particles."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import contextlib
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gpusense._util.progress import is_terminal, progress
 from gpusense.commands.arguments import (
-    BACKEND_HELP,
+    add_backend,
     add_json,
     add_model,
     add_parameters,
@@ -39,9 +39,8 @@ from gpusense.commands.signals import held
 from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
-    from gpusense.evaluation.agreement import Agreement, Model
     from gpusense.evaluation.fitness import Fitness, FitnessOfLog
-    from gpusense.evaluation.scoring import BackendScore, LogScoring, ScanScore
+    from gpusense.evaluation.scoring import LogScore, LogScoring, Model, ScanScore
     from gpusense.logs import Scan
     from gpusense.world.grid import OccupancyGrid
 
@@ -63,19 +62,17 @@ message states their share and the place of most of them. Cases in between are u
 
 -v prints a row for each scan at once. Ctrl-C ends the run with the results so far.
 
-Exit codes: 0 the log fits the map, 1 it does not or the verdict is uncertain, or two backends rank the particles
-differently by more than rounding explains, 2 bad input, 130 interrupted, 143 terminated.
+Exit codes: 0 the log fits the map, 1 it does not or the verdict is uncertain, 2 bad input, 130 interrupted, 143
+terminated.
 
 examples:
   gpusense score --map map.yaml --log run.log.gz --model field --particles 20000
   gpusense score --map map.yaml --log run.log.gz \\
-      --parameters fitted/parameters.yaml
-  gpusense score --map map.yaml --log run.log.gz --every 2 --offset 1 \\
-      --backend opencl --backend numpy --limit 3"""
+      --parameters fitted/parameters.yaml"""
 
 # Columns of the table, and their widths.
 _COLUMNS = {
-    "scan": 5, "backend": 10, "rank": 7, "percentile": 10, "error [m]": 9, "error [rad]": 11, "effective": 9,
+    "scan": 5, "rank": 7, "percentile": 10, "error [m]": 9, "error [rad]": 11, "effective": 9,
     "beams": 5,
 }  # fmt: skip
 
@@ -87,8 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_log(parser, "a log with corrected poses, or any with --reference")
     add_reference(parser)
     add_model(parser)
-    add("--backend", action="append", metavar="DEVICE",
-        help=f"{BACKEND_HELP}; may be repeated to compare rankings (default: auto)")  # fmt: skip
+    add_backend(parser)
     add("--particles", type=whole_number(low=2), default=20_000, metavar="N", help="per scan (default: %(default)s)")
     add("--sigma-position", type=not_negative_number, default=0.5, metavar="M",
         help="deviation of the particles around the logged pose, in x and in y [m] (default: %(default)s)")  # fmt: skip
@@ -113,108 +109,86 @@ def run(args: argparse.Namespace) -> int:
     sampler = ParticleSampler(args.particles, args.sigma_position, args.sigma_heading, args.seed)
     grid = read_map(args.map)
     scans = read_scans(args)
-    models = make_models(args, grid, scans)
-    scoring, fitness = LogScoring(models, sampler), FitnessOfLog(models[0], seed=args.seed)
+    model = make_model(args, grid, scans)
+    scoring, fitness = LogScoring(model, sampler), FitnessOfLog(model, seed=args.seed)
     with held(scoring) as stops:
-        _score(args, models, scans, scoring, fitness)
-    (scores, agreements), fit = scoring.results(), fitness.result()
-    _report(args, models, scores, agreements, fit, len(scans))
+        _score(args, scans, scoring, fitness)
+    score, fit = scoring.result(), fitness.result()
+    _report(args, model, score, fit, len(scans))
     if stops:
         raise stops[0]
     if args.plot is not None:
-        _draw(args.plot, grid, scores[0], pose_name(args))
+        _draw(args.plot, grid, score, pose_name(args))
         if not args.json:
             print_files(args.plot)
-    return 0 if fit.fits and all(agreement.same for agreement in agreements) else DIFFERENT
+    return 0 if fit.fits else DIFFERENT
 
 
-def _score(
-    args: argparse.Namespace,
-    models: list[Model],
-    scans: list[tuple[int, Scan]],
-    scoring: LogScoring,
-    fitness: FitnessOfLog,
-) -> None:
+def _score(args: argparse.Namespace, scans: list[tuple[int, Scan]], scoring: LogScoring, fitness: FitnessOfLog) -> None:
     """Score the scans, and print rows immediately."""
     # Rows on a terminal show the progress.
     shown = args.verbose and is_terminal(sys.stdout)
-    optional = (*(("backend",) if len(models) == 1 else ()), "beams", "effective", "error [rad]")
-    table = TableStream(_COLUMNS, left=("backend",), optional=optional)
+    table = TableStream(_COLUMNS, optional=("beams", "effective", "error [rad]"))
     with contextlib.nullcontext(lambda text: None) if shown else progress(len(scans)) as step:
         for index, scan in scans:
             step(f"scan {index}")
-            scores = scoring.add(index, scan)
+            score = scoring.add(index, scan)
             fitness.add(index, scan)
             if args.verbose:
-                for model, score in zip(models, scores, strict=True):
-                    table.add(_row(model.device.selection, score))
+                table.add(_row(score))
 
 
-def _row(backend: str, scan: ScanScore) -> dict[str, str]:
+def _row(scan: ScanScore) -> dict[str, str]:
     position, heading = (number_text(value, "none: all -inf") for value in (scan.error_position, scan.error_heading))
-    values = (str(scan.index), backend, f"{scan.rank:g}", f"{scan.percentile:.3f}", position, heading,
+    values = (str(scan.index), f"{scan.rank:g}", f"{scan.percentile:.3f}", position, heading,
               number_text(scan.effective), str(scan.beams))  # fmt: skip
     return dict(zip(_COLUMNS, values, strict=True))
 
 
-def _draw(path: Path, grid: OccupancyGrid, score: BackendScore, pose: str) -> None:
+def _draw(path: Path, grid: OccupancyGrid, score: LogScore, pose: str) -> None:
     from gpusense.plots.drawing import save
     from gpusense.plots.runs import scores_figure
 
     save(scores_figure(grid, score, pose), path)
 
 
-def make_models(args: argparse.Namespace, grid: OccupancyGrid, scans: list[tuple[int, Scan]]) -> list[Model]:
-    """Make the model on each distinct backend, with one temperature."""
+def make_model(args: argparse.Namespace, grid: OccupancyGrid, scans: list[tuple[int, Scan]]) -> Model:
+    """Make the model, by default with the temperature of the scans."""
     from gpusense.evaluation.fitness import temperature_of_log
     from gpusense.models.scan.beam import BeamModel
     from gpusense.models.scan.field import LikelihoodFieldModel
     from gpusense.world.parameters import BeamParameters
 
-    parameters = parameters_of(args)
-    scanner, backends = scans[0][1].scanner, args.backend or ["auto"]
+    parameters, scanner = parameters_of(args), scans[0][1].scanner
 
-    def make(backend: str, temperature: float) -> Model:
-        common = {"backend": backend, "precision": args.precision, "temperature": temperature, "beams": args.beams}
+    def make(temperature: float) -> Model:
+        common = dict(backend=args.backend, precision=args.precision, temperature=temperature, beams=args.beams)
         if isinstance(parameters, BeamParameters):
             return BeamModel(grid, scanner, parameters, **common)
         return LikelihoodFieldModel(grid, scanner, parameters, **common)
 
-    temperature = args.temperature
-    if temperature == "auto":
-        temperature = temperature_of_log(make(backends[0], 1.0), scans)
-    models: dict[str, Model] = {}
-    for backend in backends:
-        model = make(backend, temperature)
-        models.setdefault(model.device.selection, model)
-    return list(models.values())
+    return make(temperature_of_log(make(1.0), scans) if args.temperature == "auto" else args.temperature)
 
 
-def _report(
-    args: argparse.Namespace,
-    models: list[Model],
-    scores: list[BackendScore],
-    agreements: list[Agreement],
-    fitness: Fitness,
-    chosen: int,
-) -> None:
+def _report(args: argparse.Namespace, model: Model, score: LogScore, fitness: Fitness, chosen: int) -> None:
     """Print the results of all scans, or of the scans before an interrupt."""
+    from gpusense.evaluation.scoring import summary
+
     if args.json:
-        verdict = {"fits": fitness.fits, "verdict": fitness.verdict}
-        facts = _document(models, scores, agreements)
-        print_report({**facts, "scans_chosen": chosen, "fitness": asdict(fitness) | verdict}, args)
+        facts = {
+            "parameters": model.parameters.to_dict(), "temperature": model.temperature,
+            "range_max": model.scanner.range_max, **asdict(score), "summary": summary(score), "scans_chosen": chosen,
+            "fitness": asdict(fitness) | {"fits": fitness.fits, "verdict": fitness.verdict},
+        }  # fmt: skip
+        print_report(facts, args)
         return
-    pose = pose_name(args)
     if args.verbose:
         print()
-    print_result(_fitness(fitness, pose))
-    for score in scores:
-        _print(score, pose)
-    for agreement in agreements:
-        print_fact("backends", _verdict(agreement, pose))
-    print_interrupted(len(scores[0].scans), chosen)
+    print_result(_fitness(fitness, pose_name(args)))
+    _print(score, pose_name(args))
+    print_interrupted(len(score.scans), chosen)
     if args.verbose:
-        _print_details(args, models, scores, agreements)
+        _print_details(args, model, score)
 
 
 def pose_name(args: argparse.Namespace) -> str:
@@ -222,20 +196,8 @@ def pose_name(args: argparse.Namespace) -> str:
     return "logged pose" if args.reference is None else "reference pose"
 
 
-def _document(models: list[Model], scores: list[BackendScore], agreements: list[Agreement]) -> dict[str, Any]:
-    from gpusense.evaluation.scoring import summary
-
-    return {
-        "parameters": models[0].parameters.to_dict(),
-        "temperature": models[0].temperature,
-        "range_max": models[0].scanner.range_max,
-        "backends": [asdict(score) | {"summary": summary(score)} for score in scores],
-        "agreement": [asdict(agreement) | {"same_ranking": agreement.same} for agreement in agreements],
-    }
-
-
-def _print(score: BackendScore, pose: str) -> None:
-    """Print the rank of the true pose, and the error of the weighted mean, on one backend."""
+def _print(score: LogScore, pose: str) -> None:
+    """Print the rank of the true pose, and the error of the weighted mean."""
     from gpusense.evaluation.scoring import summary
 
     s = summary(score)
@@ -253,38 +215,20 @@ def _print(score: BackendScore, pose: str) -> None:
                    "degrees")  # fmt: skip
 
 
-def _print_details(
-    args: argparse.Namespace, models: list[Model], scores: list[BackendScore], agreements: list[Agreement]
-) -> None:
-    """Print parameters, temperature, effective sample sizes, rates, and agreement of backends."""
+def _print_details(args: argparse.Namespace, model: Model, score: LogScore) -> None:
+    """Print parameters, temperature, effective sample size and rate."""
     from gpusense.evaluation.scoring import summary
 
-    values = ", ".join(f"{name} {value}" for name, value in models[0].parameters.to_dict().items())
-    print(f"\n{args.model} model, {args.precision}: {values}, range_max {models[0].scanner.range_max:.6g} m")
+    values = ", ".join(f"{name} {value}" for name, value in model.parameters.to_dict().items())
+    print(f"\n{args.model} model, {args.precision}: {values}, range_max {model.scanner.range_max:.6g} m")
     how = "calibrated from the scans" if args.temperature == "auto" else "given"
-    print(f"temperature {models[0].temperature:.4g}, {how}")
-    for score in scores:
-        s = {name: number_text(value) for name, value in summary(score).items()}
-        print(
-            f"{score.device.selection}: effective sample size: median {s['effective_median']}; scans with all "
-            f"particles at -inf: {s['degenerate']}; {s['particle_beams_per_second']} particle-beams/s of whole calls, "
-            "NumPy in and out"
-        )
-    for a in agreements:
-        print(
-            f"{a.left} and {a.right}: no two particles change places in {a.same_order} of {a.scans} scans; least rank "
-            f"correlation {a.spearman:.9f}; largest difference {a.difference:.3g} nats; particles that change places "
-            f"are at most {a.gap:.3g} nats apart; rounding explains {a.allowed:.3g}"
-        )
+    print(f"temperature {model.temperature:.4g}, {how}")
+    s = {name: number_text(value) for name, value in summary(score).items()}
+    print(
+        f"effective sample size: median {s['effective_median']}; scans with all particles at -inf: {s['degenerate']}; "
+        f"{s['particle_beams_per_second']} particle-beams/s of whole calls, NumPy in and out"
+    )
     print(machine_line())
-
-
-def _verdict(a: Agreement, pose: str) -> str:
-    if a.same:
-        verdict = "the same ranking" if a.same_order == a.scans else "the same ranking to within rounding"
-    else:
-        verdict = "ANOTHER RANKING"
-    return f"{a.left} and {a.right}: {verdict}; the {pose} has the same rank in {a.same_rank} of {a.scans} scans"
 
 
 def _fitness(fitness: Fitness, pose: str) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gpusense.evaluation.agreement import Model
+from gpusense.evaluation.scoring import Model
 from gpusense.evaluation.worlds import cloud_uniform
 from gpusense.localization.beam_consistency import BeamConsistency, beam_consistency
 from gpusense.localization.belief import Belief

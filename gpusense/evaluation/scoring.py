@@ -1,4 +1,4 @@
-"""Score the scans of a log for clouds of particles and rank the logged poses, on one backend or several.
+"""Score the scans of a log for clouds of particles and rank the logged poses.
 
 The particles of a scan are the logged pose, poses around it, and as many poses uniform over the map's free cells. The
 logged pose is ranked among them. The weighted mean excludes it, since it would bias the mean.
@@ -21,18 +21,20 @@ from numpy.typing import NDArray
 from gpusense._util import checks
 from gpusense._util.typing import Floats
 from gpusense.backends import BackendInfo
-from gpusense.evaluation.agreement import Agreement, Model
 from gpusense.evaluation.worlds import cloud_around, cloud_uniform
 from gpusense.localization.weights import normalize_weights
 from gpusense.logs import Pose, Scan
 from gpusense.logs.reader import LogOptions, read_laser
 from gpusense.logs.records import check_scanner
+from gpusense.models.scan.beam import BeamModel
+from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.models.scan.rules import choose_beams
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, classify
 from gpusense.world.sensor_table import SensorTable
 
 Array = NDArray[Any]
+Model = BeamModel | LikelihoodFieldModel
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ class ParticleSampler:
 
 @dataclass(frozen=True)
 class ScanScore:
-    """Score of one scan on one backend.
+    """Score of one scan.
 
     Attributes:
         index: Index of the scan in its log, from 0.
@@ -92,8 +94,8 @@ class ScanScore:
 
 
 @dataclass(frozen=True)
-class BackendScore:
-    """Scores of all scans on one backend."""
+class LogScore:
+    """Scores of all scans."""
 
     device: BackendInfo
     particles: int
@@ -128,8 +130,8 @@ def score_scan(index: int, poses: Floats, log_p: Array, beams: int, seconds: flo
     )  # fmt: skip
 
 
-def summary(score: BackendScore) -> dict[str, Any]:
-    """Return medians, 90 % quantiles and extremes over a backend's scans; None if no scan has a value."""
+def summary(score: LogScore) -> dict[str, Any]:
+    """Return medians, 90 % quantiles and extremes over the scans; None if no scan has a value."""
 
     def over_scans(pick: Callable[[ScanScore], float | None], take: Callable[[Sequence[float]], float]) -> float | None:
         values = [value for value in map(pick, score.scans) if value is not None]
@@ -202,56 +204,30 @@ def with_one_scanner(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]
 
 
 class LogScoring:
-    """Scores of a log's scans on one backend or several, scan by scan."""
+    """Scores of a log's scans, scan by scan."""
 
-    def __init__(self, models: Sequence[Model], sampler: ParticleSampler) -> None:
-        """Prepare to score the same model on one backend or several, with particles of a sampler."""
-        self._models, self._sampler = models, sampler
-        self._scores: list[tuple[ScanScore, ...]] = []
-        self._pairs = list(itertools.combinations(range(len(models)), 2))
-        names = [model.device.selection for model in models]
-        self._agreements = [Agreement(names[a], names[b]) for a, b in self._pairs]
+    def __init__(self, model: Model, sampler: ParticleSampler) -> None:
+        """Prepare to score particles of a sampler."""
+        self._model, self._sampler = model, sampler
+        self._scores: list[ScanScore] = []
 
     def __len__(self) -> int:
         """Return the number of scored scans."""
         return len(self._scores)
 
-    def add(self, index: int, scan: Scan) -> tuple[ScanScore, ...]:
-        """Score a scan with every model on the same particles, and return a score for each."""
+    def add(self, index: int, scan: Scan) -> ScanScore:
+        """Score a scan."""
         assert scan.pose is not None
-        poses = self._sampler.draw(index, scan.pose, self._models[0].grid)
-        beams = evaluated_beams(self._models[0], scan.ranges)
-        log_ps, scores = [], []
-        for model in self._models:
-            begin = time.perf_counter()
-            log_ps.append(model.log_likelihood(poses, scan.ranges))
-            scores.append(score_scan(index, poses, log_ps[-1], beams, time.perf_counter() - begin))
-        for agreement, (a, b) in zip(self._agreements, self._pairs, strict=True):
-            agreement.add((self._models[a], self._models[b]), log_ps[a], log_ps[b])
-        self._scores.append(tuple(scores))
+        poses = self._sampler.draw(index, scan.pose, self._model.grid)
+        begin = time.perf_counter()
+        log_p = self._model.log_likelihood(poses, scan.ranges)
+        seconds = time.perf_counter() - begin
+        self._scores.append(score_scan(index, poses, log_p, evaluated_beams(self._model, scan.ranges), seconds))
         return self._scores[-1]
 
-    def results(self) -> tuple[list[BackendScore], list[Agreement]]:
-        """Return the scores of the scans so far, and how the models agree in pairs; empty before the first scan."""
-        if not self._scores:
-            return [], []
-        each = zip(self._models, zip(*self._scores, strict=True), strict=True)
-        scores = [BackendScore(model.device, self._sampler.particles, scans) for model, scans in each]
-        return scores, self._agreements
-
-
-def score_log(
-    models: Sequence[Model],
-    scans: Sequence[tuple[int, Scan]],
-    sampler: ParticleSampler,
-    step: Callable[[str], None] = lambda text: None,
-) -> tuple[list[BackendScore], list[Agreement]]:
-    """Score every scan with every model on the same particles, and compare the models in pairs."""
-    scoring = LogScoring(models, sampler)
-    for index, scan in scans:
-        step(f"scan {index}")
-        scoring.add(index, scan)
-    return scoring.results()
+    def result(self) -> LogScore:
+        """Return the scores of the scans so far."""
+        return LogScore(self._model.device, self._sampler.particles, tuple(self._scores))
 
 
 def evaluated_beams(model: Model, ranges: Array) -> int:

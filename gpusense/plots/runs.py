@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gpusense.evaluation.scoring import BackendScore
+from gpusense.evaluation.scoring import LogScore
 from gpusense.evaluation.tracking import Track
 from gpusense.localization.filter import ParticleFilter
 from gpusense.plots.drawing import CLOUD, ESTIMATE, REFERENCE, VERDICTS, add_legend, draw_map, new_figure
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def scores_figure(grid: OccupancyGrid, score: BackendScore, pose: str = "logged pose") -> Figure:
+def scores_figure(grid: OccupancyGrid, score: LogScore, pose: str = "logged pose") -> Figure:
     """Draw the map with poses of the scans and weighted means, and histograms of percentiles and errors."""
     figure = new_figure(11.0, 6.0)
     axes = figure.subplot_mosaic([["map", "percentile"], ["map", "error"]], width_ratios=(1.6, 1.0))

@@ -103,14 +103,16 @@ def localize(job: Job, store: Store) -> Values:
 
 def score(job: Job, store: Store) -> Values:
     """Rank the logged poses among particles; return the figures of ``gpusense score``."""
-    from gpusense.evaluation.scoring import ParticleSampler, score_log, summary
+    from gpusense.evaluation.scoring import LogScoring, ParticleSampler, summary
 
     scans = store.scans(job)
     model = model_of(job, store, scans[0][1].scanner, temperature=job.option("temperature", 1.0))
     names = ("particles", "sigma_position", "sigma_heading")
     options = {name: job.option(name) for name in names if job.option(name) is not None}
-    scores, _ = score_log([model], scans, ParticleSampler(seed=job.seed, **options))
-    return summary(scores[0])
+    scoring = LogScoring(model, ParticleSampler(seed=job.seed, **options))
+    for index, scan in scans:
+        scoring.add(index, scan)
+    return summary(scoring.result())
 
 
 def fit(job: Job, store: Store) -> Values:

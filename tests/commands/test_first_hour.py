@@ -74,7 +74,7 @@ def test_an_interrupted_score_prints_its_results_so_far(capsys, recorded, monkey
     assert "interrupted: results of 3 of 5 scans" in out and "3 scans, 50 particles each" in out
     assert main(score(recorded, "--json")) == 130
     document = json.loads(capsys.readouterr().out)
-    assert [scan["index"] for scan in document["backends"][0]["scans"]] == [0, 1, 2] and document["scans_chosen"] == 5
+    assert [scan["index"] for scan in document["scans"]] == [0, 1, 2] and document["scans_chosen"] == 5
 
 
 def test_a_score_interrupted_before_its_first_scan_prints_nothing(capsys, recorded, monkeypatch):

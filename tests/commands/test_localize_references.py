@@ -262,15 +262,14 @@ def test_other_commands_take_the_poses_of_a_trajectory(place, capsys, tmp_path):
 
     score = ["score", *room, "--model", "field", "--particles", "500", "--beams", "60"]
     good, said = document(*score, *reference)
-    (found,) = good["backends"]
-    assert [row["index"] for row in found["scans"]] == list(range(0, COUNT, 2))
+    assert [row["index"] for row in good["scans"]] == list(range(0, COUNT, 2))
     assert said == f"gpusense: --reference: has poses of {COUNT // 2} of {COUNT} chosen scans\n"
     for more, name in ((reference, "reference"), ([], "logged")):
         assert cli.main([*score, *log, "--backend", "numpy", *more]) in (0, 1)
         text = capsys.readouterr().out
         assert f"of the {name} pose among them: median" in text and f"the {name} poses explain" in text
     bad, _ = document(*score)
-    ranks = [np.mean([row["rank"] for row in one["backends"][0]["scans"]]) for one in (good, bad)]
+    ranks = [np.mean([row["rank"] for row in one["scans"]]) for one in (good, bad)]
     assert ranks[1] > 10 * ranks[0]
 
     right, said = document("fit", *room, *reference, "--fit-motion")

@@ -48,7 +48,7 @@ calls of --particles times --beams.
 Scenes: 'building' and 'clutter' are generated. If GPUSENSE_DATA names the folder of recorded data, 'basement',
 'spielberg', 'willow' and 'intel' are added; --map adds others.
 
---output DIR receives report.json and report.md with all points and the reasons of failures. --html FILE writes the
+--output DIR receives report.json with all points and the reasons of failures. --html FILE writes the
 interactive page of docs/error-vs-time.md for this measurement: time over error, the method for a budget, and
 performance profiles.
 
@@ -67,7 +67,7 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
-    add("--output", type=Path, metavar="DIR", help="folder for the reports, created if absent")
+    add("--output", type=Path, metavar="DIR", help="folder for the report, created if absent")
     add("--html", type=Path, metavar="FILE", help="interactive page of the measurement, one file that works offline")
     add("--quick", action="store_true",
         help="small maps, few values of the knobs, float32: half a minute plus compiling")  # fmt: skip
@@ -201,11 +201,10 @@ def _check_folder(folder: Path) -> None:
 
 
 def write_report(folder: Path, report: Mapping[str, Any]) -> None:
-    """Write the report as Markdown and as JSON, each file atomically; create the folder if missing."""
-    from gpusense.evaluation.benchmark.report import markdown, to_json
+    """Write the report as JSON atomically; create the folder if missing."""
+    from gpusense.evaluation.benchmark.report import to_json
 
     folder.mkdir(exist_ok=True)
-    write_whole(folder / "report.md", lambda stream: stream.write((markdown(report) + "\n").encode()))
     write_whole(folder / "report.json", lambda stream: stream.write(to_json(report).encode()))
 
 

@@ -1,4 +1,4 @@
-"""Write the report of a run as one JSON document and as Markdown."""
+"""Write the report of a run as one JSON document, and tables as Markdown."""
 
 from __future__ import annotations
 
@@ -12,27 +12,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from gpusense.evaluation.benchmark.choice import error_of, label, setting
 from gpusense.evaluation.benchmark.runner import Outcome, Plan
 
 SCHEMA = 2
 """Version of the report's fields."""
 
 _DIGITS = 6
-
-_READING = """\
-A row is a method with a value of its knob on a device, in a scene with a cloud; report.json has all figures. Times are
-nanoseconds per particle-beam: *call* is the shortest call with NumPy arrays in and out (a star marks a single call),
-*processor* its processor time over all threads. *build* builds the map's tables.
-
-Errors are against the exact caster and the models in float64: rays wrong by more than a cell, root mean square of log p
-in nats, and for the posterior at a comparable temperature the Kullback-Leibler divergence in nats and the shift of its
-mean. *fewer beams* counts each of every n-th beam n times; *compat* computes another program's model."""
-_COLUMNS = (
-    "problem", "scene", "cloud", "backend", "method", "knob", "precision", "remark", "call ns", "processor ns",
-    "build s", "table MB", "> 1 cell", "log p rms", "KL", "shift m",
-)  # fmt: skip
-_WORDS = _COLUMNS.index("call ns")
 
 
 def document(
@@ -98,50 +83,9 @@ def commit() -> str | None:
     return None
 
 
-def markdown(report: Mapping[str, Any]) -> str:
-    """Format a report of :func:`document` as Markdown, with a row for each point."""
-    machine, truth = report["machine"], report["truth"]
-    facts = ", ".join(f"{name} {value}" for name, value in machine.items())
-    lines = [
-        "# Error against run time", "", f"{report['date']}, commit {report['commit'] or 'unknown'}. {facts}.", "",
-        *(f"- {d['selection']}: {d['name']} ({d['driver']})" for d in report["devices"]),
-        *(f"- absent: {text}" for text in report["absent"]), "",
-        f"Truth: {truth['backend']} ({truth['device']}), {truth['precision']}: {truth['note']}.",
-        f"Arguments: {', '.join(f'{key} {value}' for key, value in report['arguments'].items())}.", "", _READING, "",
-        *table(_COLUMNS, [_row(point) for point in report["points"]], _WORDS),
-    ]  # fmt: skip
-    return "\n".join(lines)
-
-
 def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: int) -> list[str]:
     """Format the lines of a Markdown table; columns from ``numbers`` on are right-aligned."""
     rule = [" --- " if i < numbers else " ---: " for i in range(len(columns))]
     cells = [columns, *([text.replace("|", "\\|") for text in row] for row in rows)]
     lines = [f"| {' | '.join(row)} |" for row in cells]
     return [lines[0], f"|{'|'.join(rule)}|", *lines[1:]]
-
-
-def _row(point: Mapping[str, Any]) -> list[str]:
-    """Format a point's cells of ``_COLUMNS``."""
-    time_s, memory = (point[name] or {} for name in ("time", "memory"))
-    backend = f"{point['backend']}: {point['device']}" if point["outside"] else point["backend"]
-    name = f"**{label(point)}**" if point["exact"] else label(point)
-    remark = "" if point["status"] == "ok" else f"{point['status']}: {point['reason']}"
-    wrong = error_of(point, "ranges", "wrong_1")
-    errors = (("log_p", "rms"), ("comparable", "kl"), ("comparable", "shift_m"))
-    return [
-        *(str(point[key]) for key in ("problem", "scene", "cloud")), backend, name, setting(point), point["precision"],
-        remark, _per_beam(point, "call_min_s") + ("*" if time_s.get("calls") == 1 else ""),
-        _per_beam(point, "processor_s"), _text(time_s.get("build_s")),
-        _text(memory.get("table_bytes"), 1e-6), "-" if wrong is None else f"{100 * wrong:.2g} %",
-        *(_text(error_of(point, *place)) for place in errors),
-    ]  # fmt: skip
-
-
-def _per_beam(point: Mapping[str, Any], name: str) -> str:
-    seconds = (point["time"] or {}).get(name)
-    return _text(None if seconds is None else seconds / max(point["work"], 1), 1e9)
-
-
-def _text(value: float | None, scale: float = 1.0) -> str:
-    return "-" if value is None else f"{value * scale:.3g}"

@@ -13,7 +13,7 @@ from support.paths import ROOT
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.evaluation.benchmark import accuracy, candidates, measure, report, runner
+from gpusense.evaluation.benchmark import accuracy, candidates, measure, runner
 
 pytestmark = pytest.mark.usefixtures("no_data")
 
@@ -108,9 +108,6 @@ def test_failures_are_shown(made, status, reason):
     outcome = runner.run(plan)
     assert [(p["status"], p["reason"], p["errors"]) for p in outcome.points] == [(status, reason, None)] * 2
     assert [p["time"] is None for p in outcome.points] == [status != "unstable"] * 2
-    shown = report.document(plan, outcome, {}, {"processor": "p"}, [])
-    text = report.markdown(shown)
-    assert f"| {status}: {reason} |" in text
 
 
 def test_a_point_that_works_is_measured():

@@ -136,6 +136,7 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         worlds = gs.Worlds(cells, RESOLUTION, backend=recorder)
         caster = gs.RayCaster(worlds, RANGE_MAX, backend=recorder)
         index = np.arange(count, dtype=np.int32).repeat(ROBOTS)
+        index = rng.permutation(index) if arguments.shuffled else index
         poses, where = on_device(backend, poses_in(count, rng), index)
         (new,), changed = on_device(backend, kinds), np.arange(len(kinds))
 
@@ -254,6 +255,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--worlds", default="64,1024", help="numbers of worlds, with commas (default: 64,1024)")
     parser.add_argument("--shapes", type=int, default=0, help="moving shapes of each world (default: 0)")
     parser.add_argument("--kernels", action="store_true", help="measure each launch by the device's clock")
+    parser.add_argument("--shuffled", action="store_true", help="robots of a world do not follow each other")
     parser.add_argument("--peers", action="store_true", help="compare a lidar among discs with those of peers")
     parser.add_argument("--tiles", action="store_true", help="cast rays of worlds in tiles of poses and rays")
     add_repeats(parser, 20, 5.0)

@@ -25,7 +25,7 @@ BEYOND = 16384
 
 
 def put_cells(
-    flags: frozenset[str], cells: np.ndarray, place: np.ndarray, store: np.ndarray, count: int, worlds: int
+    flags: frozenset[str], cells: np.ndarray, place: np.ndarray, store: np.ndarray, count: int, worlds: int, items: int
 ) -> None:
     """Copy the cells of some worlds to their places."""
     for w in range(worlds):

@@ -28,10 +28,14 @@
 // Return the index of a cell in a padded plane.
 int padded(const int row, const int col, const int cols) { return (row + 1) * (cols + 2) + col + 1; }
 
-// Return the index of a cell in a padded plane of groups of rows.
+// Return the index of a cell in a padded plane of groups of rows, a power of two of them.
 int padded_in_groups(const int row, const int col, const int cols, const int group) {
-    return (row + 1) / group * (cols + 2) * group + (col + 1) * group + (row + 1) % group;
+    const int in_group = (row + 1) & (group - 1);
+    return (row + 1 - in_group) * (cols + 2) + (col + 1) * group + in_group;
 }
+
+// Return a quotient of integers from 0, for dividends up to 4000 and divisors up to 12.
+int divided(const int dividend, const int divisor) { return (dividend * (65536 / divisor + 1)) >> 16; }
 
 // Return the first cell along an axis whose rectangle can contain the cell low or one beyond it. Rectangles extend to
 // larger (way 1) or smaller (way -1) indices.
@@ -120,8 +124,8 @@ kernel void free_rows(ARGUMENTS) {
 // cells of a column in a quadrant, from the far end on. height and width are the sides of the highest rectangle of
 // sufficient width, narrower is the width of a rectangle that is one row higher, and bound is the number of rows to the
 // nearest row with this width. From one cell to the next the height grows by one at most, and its rows without the new
-// row allow every smaller height. So the next cell's sides need no other row, unless the row that bounds the width has
-// left the rectangle.
+// row allow every smaller height. So the next cell's sides need no other row, unless the row that bounds the width is
+// left behind.
 kernel void rectangles_scan(ARGUMENTS) {
     const int quadrant = get_global_id(2) & 3, w = get_global_id(2) >> 2;
     const int dx = quadrant & 1 ? -1 : 1, dy = quadrant & 2 ? -1 : 1;
@@ -133,26 +137,34 @@ kernel void rectangles_scan(ARGUMENTS) {
     global ushort *out = rectangles + (long)place[w] * 4 * sectors;
     out += (long)(quadrant * sectors + sector) * lines * (cols + 2);
     const int2 middle = slope(sectors, sector);
-    const long step = (long)dy * worlds * cols;
+    const long line = (long)worlds * cols, step = dy * line;
     int height = 0, width = LONGEST, narrower = 0, bound = 0;
     for (int i = 0; i < end - begin; ++i) {
         const int row = dy > 0 ? end - 1 - i : begin + i, room = min(dy > 0 ? rows - row : row + 1, LONGEST);
-        global const uchar *run = column + (long)(row - first) * worlds * cols;
-        const int here = run[0], least = min(here, width);
-        const int higher = height < room && least * middle.x >= (height + 1) * middle.y;
-        bound = here <= width ? 0 : bound + 1;
-        if (i > 0 && (higher || here <= width || bound < height)) {
-            height = higher ? height + 1 : min(height, here * middle.x / middle.y);
-            narrower = height == room ? 0 : higher ? min(here, narrower) : least;
-            width = height > 0 ? least : LONGEST;
-        } else {
-            height = 0, width = LONGEST, bound = 0;
+        global const uchar *run = column + (row - first) * line;
+        if (i == 0) {
             for (;;) {
                 narrower = height < room ? min(width, (int)run[height * step]) : 0;
                 if (narrower * middle.x < (height + 1) * middle.y) break;
                 bound = narrower < width ? height : bound;
                 width = narrower;
                 ++height;
+            }
+        } else {
+            const int here = run[0], least = min(here, width);
+            const int higher = height < room && least * middle.x >= (height + 1) * middle.y;
+            bound = here <= width ? 0 : bound + 1;
+            const int left_behind = !higher && bound >= height && bound > 0;
+            height = higher ? height + 1 : min(height, divided(here * middle.x, middle.y));
+            narrower = height == room ? 0 : higher ? min(here, narrower) : least;
+            width = height > 0 && !left_behind ? least : LONGEST;
+            if (left_behind) {
+                bound = 0;
+                for (int j = 0; j < height; ++j) {
+                    const int other = run[j * step];
+                    bound = other < width ? j : bound;
+                    width = min(width, other);
+                }
             }
         }
         const int best = narrower * middle.x > height * middle.y;

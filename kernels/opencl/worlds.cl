@@ -13,11 +13,11 @@
 // Distance from a world to which its segments and boxes reach [cells].
 #define BEYOND 16384
 
-// Copy the cells of some worlds to their places. One work-item takes a cell.
+// Copy the cells of some worlds to their places. One work-item takes every items-th cell.
 kernel void put_cells(ARGUMENTS) {
-    const int i = get_global_id(0), w = get_global_id(1);
-    if (i >= count || w >= worlds) return;
-    store[(long)place[w] + i] = cells[(long)w * count + i];
+    const int first = get_global_id(0), w = get_global_id(1);
+    if (first >= items || w >= worlds) return;
+    for (int i = first; i < count; i += items) store[(long)place[w] + i] = cells[(long)w * count + i];
 }
 
 // Return whether a cell stops a beam.
@@ -28,8 +28,8 @@ int stops_beam(const int cell, const int threshold, const int unknown) {
 // Mark the obstacles of worlds as bytes or as bits, with a margin of obstacles around each world. One work-item takes 32
 // cells of a line.
 kernel void mark_obstacles(ARGUMENTS) {
-    const int word = get_global_id(0), line = get_global_id(1), width = cols + 2 * margin;
-    if (word >= words || line >= (rows + 2 * margin) * worlds) return;
+    const int item = get_global_id(0), word = item % words, line = item / words, width = cols + 2 * margin;
+    if (line >= (rows + 2 * margin) * worlds) return;
     const int row = line / worlds - margin, w = line % worlds;
     uint marked = 0;
     for (int i = 0; i < 32 && 32 * word + i < width; ++i) {

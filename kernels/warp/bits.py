@@ -4,8 +4,11 @@ of the last word of a row are 0. One read of a word gives 32 cells.
 
 import warp as wp
 
+from .prelude import reader
+
 NONE = wp.constant(0x7FFFFFFF)
 ALL_BITS = wp.constant(wp.uint32(0xFFFFFFFF))
+word_at = reader(wp.int32)
 
 
 # Return the index of the lowest 1 of a word that is not 0.
@@ -37,10 +40,10 @@ def cells_right(bits: wp.array(dtype=wp.int32), begin: wp.int32, words: wp.int32
     """
     last = wp.min((col + most) >> 5, words - 1)
     i = col >> 5
-    word = wp.uint32(bits[begin + i]) & (ALL_BITS << wp.uint32(col & 31))
+    word = wp.uint32(word_at(bits, begin + i)) & (ALL_BITS << wp.uint32(col & 31))
     while word == wp.uint32(0) and i < last:
         i += 1
-        word = wp.uint32(bits[begin + i])
+        word = wp.uint32(word_at(bits, begin + i))
     cells = int(NONE)
     if word != wp.uint32(0):
         cells = 32 * i + lowest_bit(word) - col
@@ -52,10 +55,10 @@ def cells_left(bits: wp.array(dtype=wp.int32), begin: wp.int32, col: wp.int32, m
     """Count the cells to the first occupied one to its left."""
     last = wp.max(col - most, 0) >> 5
     i = col >> 5
-    word = wp.uint32(bits[begin + i]) & (ALL_BITS >> wp.uint32(31 - (col & 31)))
+    word = wp.uint32(word_at(bits, begin + i)) & (ALL_BITS >> wp.uint32(31 - (col & 31)))
     while word == wp.uint32(0) and i > last:
         i -= 1
-        word = wp.uint32(bits[begin + i])
+        word = wp.uint32(word_at(bits, begin + i))
     cells = int(NONE)
     if word != wp.uint32(0):
         cells = col - 32 * i - highest_bit(word)

@@ -22,7 +22,7 @@ whole rows of the map, from row first on.
 import warp as wp
 
 from .bits import cells_left, cells_right
-from .prelude import behind, kernel
+from .prelude import behind, kernel, reader, writer
 
 LONGEST = wp.constant(255)
 # The entry of an occupied cell; ring cells have 0.
@@ -33,7 +33,8 @@ RECTANGLE_REACH = wp.constant(254)
 STACK = wp.constant(256)
 # Cells of a column that a work-item of a GPU takes.
 TALL = wp.constant(64)
-behind_of = behind(wp.uint16)
+behind_of, run_at = behind(wp.uint16), reader(wp.uint8)
+put, put_run = writer(wp.uint16), writer(wp.uint8)
 
 
 @wp.func
@@ -44,8 +45,15 @@ def padded(row: wp.int32, col: wp.int32, cols: wp.int32):
 
 @wp.func
 def padded_in_groups(row: wp.int32, col: wp.int32, cols: wp.int32, group: wp.int32):
-    """Return the index of a cell in a padded plane of groups of rows."""
-    return (row + 1) // group * (cols + 2) * group + (col + 1) * group + (row + 1) % group
+    """Return the index of a cell in a padded plane of groups of rows, a power of two of them."""
+    in_group = (row + 1) & (group - 1)
+    return (row + 1 - in_group) * (cols + 2) + (col + 1) * group + in_group
+
+
+@wp.func
+def divided(dividend: wp.int32, divisor: wp.int32):
+    """Return a quotient of integers from 0, for dividends up to 4000 and divisors up to 12."""
+    return (dividend * (65536 // divisor + 1)) >> 16
 
 
 @wp.func
@@ -173,8 +181,8 @@ def free_rows(bits, runs, band, cols, words, begin, end):
     cell = row * cols + col
     right = wp.min(cells_right(bits, row * words, words, col, LONGEST), cols - col)
     left = wp.min(cells_left(bits, row * words, col, LONGEST), col + 1)
-    runs[cell] = wp.uint8(wp.min(right, LONGEST))
-    runs[band * cols + cell] = wp.uint8(wp.min(left, LONGEST))
+    put_run(runs, cell, wp.uint8(wp.min(right, LONGEST)))
+    put_run(runs, band * cols + cell, wp.uint8(wp.min(left, LONGEST)))
 
 
 @kernel()
@@ -187,7 +195,7 @@ def rectangles_scan(
     width are the sides of the highest rectangle of sufficient width, narrower is the width of a rectangle that is one
     row higher, and bound is the number of rows to the nearest row with this width. From one cell to the next the height
     grows by one at most, and its rows without the new row allow every smaller height. So the next cell's sides need no
-    other row, unless the row that bounds the width has left the rectangle.
+    other row, unless the row that bounds the width is left behind.
     """
     way, tile_item, col_item = wp.tid()
     quadrant = way & 3
@@ -213,38 +221,42 @@ def rectangles_scan(
         row = wp.where(dy > 0, end - 1 - i, begin + i)
         room = wp.min(wp.where(dy > 0, rows - row, row + 1), LONGEST)
         run = column + (row - first) * worlds * cols
-        here = int(runs[run])
-        least = wp.min(here, width)
-        higher = height < room and least * middle[0] >= (height + 1) * middle[1]
-        bound = wp.where(here <= width, 0, bound + 1)
-        if i > 0 and (higher or here <= width or bound < height):
-            if higher:
-                height += 1
-                narrower = wp.min(here, narrower)
-            else:
-                height = wp.min(height, here * middle[0] // middle[1])
-                narrower = least
-            if height == room:
-                narrower = int(0)
-            width = wp.where(height > 0, least, LONGEST)
-        else:
-            height = int(0)
-            width = int(LONGEST)
-            bound = int(0)
+        if i == 0:
             fits = bool(True)
             while fits:
                 narrower = int(0)
                 if height < room:
-                    narrower = wp.min(width, int(runs[run + height * step]))
+                    narrower = wp.min(width, int(run_at(runs, run + height * step)))
                 fits = narrower * middle[0] >= (height + 1) * middle[1]
                 if fits:
                     bound = wp.where(narrower < width, height, bound)
                     width = narrower
                     height += 1
+        else:
+            here = int(run_at(runs, run))
+            least = wp.min(here, width)
+            higher = height < room and least * middle[0] >= (height + 1) * middle[1]
+            bound = wp.where(here <= width, 0, bound + 1)
+            left_behind = not higher and bound >= height and bound > 0
+            if higher:
+                height += 1
+                narrower = wp.min(here, narrower)
+            else:
+                height = wp.min(height, divided(here * middle[0], middle[1]))
+                narrower = least
+            if height == room:
+                narrower = int(0)
+            width = wp.where(height > 0 and not left_behind, least, LONGEST)
+            if left_behind:
+                bound = int(0)
+                for j in range(height):
+                    other = int(run_at(runs, run + j * step))
+                    bound = wp.where(other < width, j, bound)
+                    width = wp.min(width, other)
         sides = wp.where(height > 0, width + 256 * height, OCCUPIED)
         if narrower * middle[0] > height * middle[1]:
             sides = narrower + 256 * (height + 1)
-        planes[out + padded_in_groups(row, col, cols, group)] = wp.uint16(sides)
+        put(planes, out + padded_in_groups(row, col, cols, group), wp.uint16(sides))
 
 
 def make(name, flags):

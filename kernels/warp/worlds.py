@@ -27,12 +27,13 @@ BEYOND = wp.constant(wp.float64(16384.0))
 
 
 @kernel()
-def put_cells(cells, place, store, count, worlds):
-    """Copy the cells of some worlds to their places. One work-item takes a cell."""
-    w, i = wp.tid()
-    if i >= count or w >= worlds:
+def put_cells(cells, place, store, count, worlds, items):
+    """Copy the cells of some worlds to their places. One work-item takes every items-th cell."""
+    w, first = wp.tid()
+    if first >= items or w >= worlds:
         return
-    store[place[w] + i] = cells[w * count + i]
+    for i in range(first, count, items):
+        store[place[w] + i] = cells[w * count + i]
 
 
 @wp.func
@@ -47,9 +48,11 @@ def mark_obstacles(store, place, occupied, bits, rows, cols, worlds, words, marg
 
     One work-item takes 32 cells of a line.
     """
-    line, word = wp.tid()
+    item = work_item(wp.tid())
+    line = item // words
+    word = item % words
     width = cols + 2 * margin
-    if word >= words or line >= (rows + 2 * margin) * worlds:
+    if line >= (rows + 2 * margin) * worlds:
         return
     row = line // worlds - margin
     w = line % worlds

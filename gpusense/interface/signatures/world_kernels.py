@@ -11,11 +11,11 @@ _RULES = ("int threshold", "int unknown")
 
 KERNELS: dict[str, Kernel] = {
     "put_cells": kernel(
-        "worlds", "cell world", "uchar cells [worlds * count]", _PLACE, "out uchar store [map]", "int count",
-        "int worlds",
+        "worlds", "item world", "uchar cells [worlds * count]", _PLACE, "out uchar store [map]", "int count",
+        "int worlds", "int items",
     ),
     "mark_obstacles": kernel(
-        "worlds", "word line", "uchar store [map]", _PLACE, "out uchar occupied [map]", "out int bits [map]", *_SIZE,
+        "worlds", "item", "uchar store [map]", _PLACE, "out uchar occupied [map]", "out int bits [map]", *_SIZE,
         "int words", "int margin", *_RULES, "int as_bits",
     ),
     "fill_worlds": kernel(

@@ -235,18 +235,30 @@ class PlacedPoses(NamedTuple):
         )  # fmt: skip
 
     def launches(self) -> Program:
-        """Return the launch that places them; none where the host has placed them."""
+        """Return the launches that place them; none where the host has placed them."""
         if self.source is None:
             return ()
         if self.inside is not None:
             inside, arguments = self.inside, self.arguments()
             del arguments["window"]
-            flags = self.flags | inside.flags | flags_if(SEES=inside.sights > 0)
-            return (
+            sees = inside.sights > 0
+            flags = self.flags | inside.flags | flags_if(SEES=sees)
+            placed = (
                 launch(
                     "place_in_worlds", flags, (self.count,), **arguments, **self.places(), index=inside.index,
                     ignore=inside.ignore, frames=inside.worlds.frames, worlds=len(inside.worlds), wide=inside.wide,
                     wide_ignore=inside.wide_ignore,
+                ),
+            )  # fmt: skip
+            if not sees:
+                return placed
+            crowd, flags = inside.crowd, inside.flags | (self.flags & {"FLOAT64"})
+            items = self.count * (crowd.discs + crowd.boxes + crowd.segments)
+            return (
+                *placed,
+                launch(
+                    "find_sights", flags, (items,), **self.places(), sights=self.world, pose_cell=self.cell,
+                    pose=self.pose, particles=self.count,
                 ),
             )  # fmt: skip
         return (

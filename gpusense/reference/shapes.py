@@ -17,6 +17,9 @@ from gpusense.interface import structs
 from gpusense.reference.ray import TINY, ray_direction
 
 DISC, BOX, SEGMENT = 4, 8, 4
+# Ranges of directions of a particle's sights, and the widening of a shape's range.
+SIGHTS = 64
+APART = 2e-3
 
 
 def world_window(world: np.ndarray, n: int) -> structs.Window:
@@ -35,6 +38,41 @@ def particles_of_worlds(world: np.ndarray, particles: int) -> Iterator[np.ndarra
     index = world[1 : 2 * particles : 2, 0]
     order = np.argsort(index, kind="stable")
     yield from np.split(order, np.flatnonzero(np.diff(index[order])) + 1)
+
+
+def sight_of(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the places of directions among the ranges of sights, from 0 to SIGHTS. They grow with the angle."""
+    part = y / (np.abs(x) + np.abs(y))
+    return np.where(x >= 0, 1 + part, 3 - part) * x.dtype.type(SIGHTS / 4)
+
+
+def sights_of(
+    shapes: np.ndarray, world: np.ndarray, crowd: structs.Crowd, i: int, cell: np.ndarray, pose: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first range of directions in which each particle sees a shape and the one after the last."""
+    real, (index, ignored) = pose.dtype.type, world[1::2].T
+    boxes, segments = max(i - crowd.discs, 0), max(i - crowd.discs - crowd.boxes, 0)
+    one = index.astype(np.int64) * crowd.stride + DISC * (i - boxes) + BOX * (boxes - segments) + SEGMENT * segments
+    x, y = ((shapes[one + k] - cell[:, k].astype(real)) - pose[:, k] for k in range(2))
+    if i < crowd.discs + crowd.boxes:
+        sine = shapes[one + (2 if i < crowd.discs else 6)] / np.sqrt(x * x + y * y) + real(1e-5)
+        cosine = np.sqrt((1 - sine) * (1 + sine))
+        low = x * cosine + y * sine, y * cosine - x * sine
+        high, around = (x * cosine - y * sine, y * cosine + x * sine), ~(sine < real(0.99))
+    else:
+        end_x, end_y = ((shapes[one + 2 + k] - cell[:, k].astype(real)) - pose[:, k] for k in range(2))
+        turn, along = x * end_y - y * end_x, x * end_x + y * end_y
+        ends = ((x, y), (end_x, end_y))
+        low, high = (
+            tuple(np.where(turn >= 0, a, b) for a, b in zip(*pair, strict=True)) for pair in (ends, ends[::-1])
+        )
+        around = (np.abs(turn) <= real(-1e-3) * along) | ((x == 0) & (y == 0)) | ((end_x == 0) & (end_y == 0))
+    begin, last = (
+        np.floor(np.where(around, real(0), sight_of(*end) + real(by))) for end, by in ((low, -APART), (high, APART))
+    )
+    none = (i == ignored) | ~np.isfinite(x)
+    end = np.where(around, SIGHTS, np.where(last < begin, last + SIGHTS, last) + 1)
+    return np.where(none, 0, begin).astype(int), np.where(none, 0, end).astype(int)
 
 
 def meet_disc(dx: np.ndarray, dy: np.ndarray, x: np.ndarray, y: np.ndarray, radius: np.ndarray) -> np.ndarray:

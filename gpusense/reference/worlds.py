@@ -12,7 +12,16 @@ import numpy as np
 from gpusense.interface import structs
 from gpusense.reference.heading import cos_sin
 from gpusense.reference.placement import FARTHEST, place_pose, within_reach
-from gpusense.reference.shapes import BOX, DISC, particles_of_worlds, shape_distance, world_begin, world_window
+from gpusense.reference.shapes import (
+    BOX,
+    DISC,
+    SIGHTS,
+    particles_of_worlds,
+    shape_distance,
+    sights_of,
+    world_begin,
+    world_window,
+)
 
 # Cells above this one are unknown.
 MOST_KNOWN = 127
@@ -105,6 +114,20 @@ def place_in_worlds(
     if not known.all():
         pose_status[0] |= 2
         pose_cell[:particles][~known] = -int(FARTHEST)
+
+
+def find_sights(
+    flags: frozenset[str], shapes: np.ndarray, world: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
+    sights: np.ndarray, particles: int, crowd: structs.Crowd,
+) -> None:  # fmt: skip
+    """Find the sights of particles. NumPy's rays test every shape, and need none."""
+    words = 2 * crowd.pairs
+    found = sights[2 * crowd.begin : 2 * crowd.begin + particles * SIGHTS * words].reshape(particles, SIGHTS, words)
+    with np.errstate(all="ignore"):
+        for i in range(crowd.discs + crowd.boxes + crowd.segments):
+            ranges = sights_of(shapes, world[: 2 * particles], crowd, i, pose_cell[:particles], pose[:particles])
+            for n, (begin, end) in enumerate(zip(*ranges, strict=True)):
+                found[n, np.arange(begin, end) % SIGHTS, i // 32] |= np.array(1 << i % 32, np.uint32).view(np.int32)
 
 
 def point_in(points: np.ndarray, here: structs.Frame) -> np.ndarray:

@@ -60,39 +60,26 @@ int2 sights_of_segment(const real x, const real y, const real end_x, const real 
     return turn >= 0 ? sights_between(one, other, between) : sights_between(other, one, between);
 }
 
-// Find the sights of a particle.
-void find_sights(global const real *shapes, global int2 *world, const Crowd crowd, const int n, const int2 cell,
-                 const real4 pose) {
+// Return the index of a shape's first number.
+int shape_at(const Crowd crowd, const int i) {
+    const int boxes = max(i - crowd.discs, 0), segments = max(boxes - crowd.boxes, 0);
+    return DISC * (i - boxes) + BOX * (boxes - segments) + SEGMENT * segments;
+}
+
+// Return the first range of directions in which a particle sees a shape and the one after the last.
+int2 sights_of(global const real *shapes, global const int2 *world, const Crowd crowd, const int n, const int i,
+               const int2 cell, const real4 pose) {
     const int2 seen = world[2 * n + 1];
-    global const real *one = shapes + (long)seen.x * crowd.stride;
-    global int *sights = (global int *)(world + crowd.begin + (long)n * SIGHTS * crowd.pairs);
-    for (int k = 0; k < 2 * SIGHTS * crowd.pairs; ++k) sights[k] = 0;
-    const int boxes = crowd.discs + crowd.boxes;
-    for (int i = 0; i < boxes + crowd.segments; ++i) {
-        const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
-        int2 range;
-        if (i < boxes) {
-            range = sights_of_disc(x, y, i < crowd.discs ? one[2] : one[6]);
-            one += i < crowd.discs ? DISC : BOX;
-        } else {
-            range = sights_of_segment(x, y, (one[2] - cell.x) - pose.x, (one[3] - cell.y) - pose.y);
-            one += SEGMENT;
-        }
-        if (i == seen.y || !(x - x == 0)) continue;
-        for (int k = range.x; k < range.y; ++k)
-            sights[2 * crowd.pairs * (k & (SIGHTS - 1)) + i / 32] |= (int)(1u << (i % 32));
-    }
+    global const real *one = shapes + (long)seen.x * crowd.stride + shape_at(crowd, i);
+    const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
+    if (i == seen.y || !(x - x == 0)) return (int2)(0, 0);
+    if (i < crowd.discs + crowd.boxes) return sights_of_disc(x, y, i < crowd.discs ? one[2] : one[6]);
+    return sights_of_segment(x, y, (one[2] - cell.x) - pose.x, (one[3] - cell.y) - pose.y);
 }
 
 // Return the index of the first pair of numbers that hold the shapes which a particle may see in a range of directions.
 int sight_at(const Crowd crowd, const int n, const int sight) {
     return crowd.begin + (n * SIGHTS + (sight & (SIGHTS - 1))) * crowd.pairs;
-}
-
-// Return the index of a shape's first number.
-int shape_at(const Crowd crowd, const int i) {
-    const int boxes = max(i - crowd.discs, 0), segments = max(boxes - crowd.boxes, 0);
-    return DISC * (i - boxes) + BOX * (boxes - segments) + SEGMENT * segments;
 }
 
 // Return the distance along a ray to a disc, infinite where it is not met, and the cosine of the angle of incidence;

@@ -63,7 +63,7 @@ Frame frame_in(global const double *frames, const int index, const Frame frame) 
 }
 
 // Place poses in their worlds; see place_pose. An index of no world sets the second bit of pose_status, and the pose
-// sees nothing. With SEES its sights follow; see the file shapes. One work-item takes a particle.
+// sees nothing. With SEES its sights, see the file shapes, become empty. One work-item takes a particle.
 kernel void place_in_worlds(ARGUMENTS) {
     const int particle = get_global_id(0);
     if (particle >= particles) return;
@@ -81,12 +81,24 @@ kernel void place_in_worlds(ARGUMENTS) {
 #if SHAPES
     world[2 * particle + 1] = (int2)(w, ignore[wide_ignore * particle]);
 #if SEES
-    find_sights(shapes, world, crowd, particle, pose_cell[particle], pose[particle]);
+    for (int k = 0; k < SIGHTS * crowd.pairs; ++k) world[crowd.begin + (long)k * particles + particle] = 0;
 #endif
 #else
     world[2 * particle + 1] = (int2)(w, -1);
 #endif
 }
+
+#if SHAPES
+// Find the sights of particles. One work-item takes a particle and shape.
+kernel void find_sights(ARGUMENTS) {
+    const int item = get_global_id(0), count = crowd.discs + crowd.boxes + crowd.segments;
+    const int n = item / count, i = item % count;
+    if (n >= particles) return;
+    const int2 range = sights_of(shapes, world, crowd, n, i, pose_cell[n], pose[n]);
+    for (int k = range.x; k < range.y; ++k)
+        atomic_or(&sights[2 * sight_at(crowd, n, k) + i / 32], (int)(1u << (i % 32)));
+}
+#endif
 
 // Return a point of the world in cells of a frame.
 double2 point_in(const double x, const double y, const Frame here) {

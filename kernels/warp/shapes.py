@@ -98,36 +98,29 @@ def functions(flags):
         return sights_between(other, one, between)
 
     @wp.func
-    def find_sights(
-        shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32, cell: wp.vec2i,
-        pose: vec4,
+    def shape_at(crowd: types.Crowd, i: wp.int32):
+        """Return the index of a shape's first number."""
+        boxes = wp.max(i - crowd.discs, 0)
+        segments = wp.max(boxes - crowd.boxes, 0)
+        return DISC * (i - boxes) + BOX * (boxes - segments) + SEGMENT * segments
+
+    @wp.func
+    def sights_of(
+        shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32, i: wp.int32,
+        cell: wp.vec2i, pose: vec4,
     ):  # fmt: skip
-        """Find the sights of a particle."""
+        """Return the first range of directions in which a particle sees a shape and the one after the last."""
         seen = world[2 * n + 1]
-        one = seen.x * crowd.stride
-        sights = crowd.begin + n * SIGHTS * crowd.pairs
-        for k in range(SIGHTS * crowd.pairs):
-            world[sights + k] = wp.vec2i(0, 0)
-        boxes = crowd.discs + crowd.boxes
-        for i in range(boxes + crowd.segments):
-            x = (number_at(shapes, one) - real(cell.x)) - pose.x
-            y = (number_at(shapes, one + 1) - real(cell.y)) - pose.y
-            directions = wp.vec2i(0, 0)
-            if i < boxes:
-                radius = number_at(shapes, one + wp.where(i < crowd.discs, 2, 6))
-                directions = sights_of_disc(x, y, radius)
-                one += wp.where(i < crowd.discs, DISC, BOX)
-            else:
-                end_x = (number_at(shapes, one + 2) - real(cell.x)) - pose.x
-                end_y = (number_at(shapes, one + 3) - real(cell.y)) - pose.y
-                directions = sights_of_segment(x, y, end_x, end_y)
-                one += SEGMENT
-            if i != seen.y and x - x == ZERO:
-                bit = int(wp.uint32(1) << wp.uint32(i & 31))
-                both = wp.where((i & 32) == 0, wp.vec2i(bit, 0), wp.vec2i(0, bit))
-                for k in range(directions.x, directions.y):
-                    at = sights + (k & (SIGHTS - 1)) * crowd.pairs + (i >> 6)
-                    world[at] = wp.vec2i(world[at].x | both.x, world[at].y | both.y)
+        one = seen.x * crowd.stride + shape_at(crowd, i)
+        x = (number_at(shapes, one) - real(cell.x)) - pose.x
+        y = (number_at(shapes, one + 1) - real(cell.y)) - pose.y
+        if i == seen.y or not (x - x == ZERO):
+            return wp.vec2i(0, 0)
+        if i < crowd.discs + crowd.boxes:
+            return sights_of_disc(x, y, number_at(shapes, one + wp.where(i < crowd.discs, 2, 6)))
+        end_x = (number_at(shapes, one + 2) - real(cell.x)) - pose.x
+        end_y = (number_at(shapes, one + 3) - real(cell.y)) - pose.y
+        return sights_of_segment(x, y, end_x, end_y)
 
     @wp.func
     def sight_at(crowd: types.Crowd, n: wp.int32, sight: wp.int32):
@@ -135,13 +128,6 @@ def functions(flags):
         directions.
         """
         return crowd.begin + (n * SIGHTS + (sight & (SIGHTS - 1))) * crowd.pairs
-
-    @wp.func
-    def shape_at(crowd: types.Crowd, i: wp.int32):
-        """Return the index of a shape's first number."""
-        boxes = wp.max(i - crowd.discs, 0)
-        segments = wp.max(boxes - crowd.boxes, 0)
-        return DISC * (i - boxes) + BOX * (boxes - segments) + SEGMENT * segments
 
     @wp.func
     def meet_disc(dx: real, dy: real, x: real, y: real, radius: real):

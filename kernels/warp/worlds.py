@@ -14,7 +14,7 @@ from . import heading, placement
 from . import shapes as shapes_file
 from .placement import FARTHEST, ZERO, within_reach
 from .prelude import kernel, precision, work_item
-from .shapes import BOX, DISC, world_window
+from .shapes import BOX, DISC, SIGHTS, world_window
 
 # Cells above this one are unknown.
 MOST_KNOWN = wp.constant(127)
@@ -80,7 +80,7 @@ def make(name, flags):
     place_pose = placement.functions(flags).place_pose
     cos_sin = heading.functions(flags & {"HUGE_HEADINGS"}).cos_sin
     SHAPES, SEES = "SHAPES" in flags, "SEES" in flags
-    find_sights = shapes_file.functions(flags).find_sights
+    sights_of, sight_at = shapes_file.functions(flags).sights_of, shapes_file.functions(flags).sight_at
     shape_distance = shapes_file.functions(flags).shape_distance
     NUMBER_ZERO, NUMBER_ONE = real(0.0), real(1.0)
     NEVER, NONE, TWO = real(math.inf), real(math.nan), wp.float64(2.0)
@@ -126,8 +126,8 @@ def make(name, flags):
     ):  # fmt: skip
         """Place poses in their worlds; see place_pose.
 
-        An index of no world sets the second bit of pose_status, and the pose sees nothing. With SEES its sights follow;
-        see the file shapes. One work-item takes a particle.
+        An index of no world sets the second bit of pose_status, and the pose sees nothing. With SEES its sights, see
+        the file shapes, become empty. One work-item takes a particle.
         """
         particle = work_item(wp.tid())
         if particle >= particles:
@@ -150,9 +150,24 @@ def make(name, flags):
         if SHAPES:
             world[2 * particle + 1] = wp.vec2i(w, ignore[wide_ignore * particle])
             if SEES:
-                find_sights(shapes, world, crowd, particle, pose_cell[particle], pose[particle])
+                for k in range(SIGHTS * crowd.pairs):
+                    world[crowd.begin + k * particles + particle] = wp.vec2i(0, 0)
         else:
             world[2 * particle + 1] = wp.vec2i(w, -1)
+
+    @kernel(flags)
+    def find_sights(shapes, world, pose_cell, pose, sights, particles, crowd):
+        """Find the sights of particles. One work-item takes a particle and shape."""
+        item = work_item(wp.tid())
+        count = crowd.discs + crowd.boxes + crowd.segments
+        n = item // count
+        i = item % count
+        if n >= particles:
+            return
+        directions = sights_of(shapes, world, crowd, n, i, pose_cell[n], pose[n])
+        for k in range(directions.x, directions.y):
+            # Each bit is added to a word once.
+            wp.atomic_add(sights, 2 * sight_at(crowd, n, k) + (i >> 5), int(wp.uint32(1) << wp.uint32(i & 31)))
 
     @wp.func
     def point_in(x: wp.float64, y: wp.float64, here: types.Frame):

@@ -30,6 +30,10 @@ KERNELS: dict[str, Kernel] = {
         "out int2 world [2 * particles]", "out int pose_status [2]", "Frame frame", "int particles", "int worlds",
         "int wide", "int wide_ignore", "Crowd crowd",
     ),
+    "find_sights": kernel(
+        "worlds", "item", "real shapes [crowd.stride]", "int2 world [2 * particles]", *POSES,
+        "out int sights [2 * crowd.begin]", "int particles", "Crowd crowd",
+    ),
     "place_shapes": kernel(
         "worlds", "shape world", "coordinate raw [worlds * count * numbers]", _FRAMES,
         "out real shapes [worlds * stride]",

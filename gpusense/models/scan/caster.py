@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
@@ -74,6 +75,8 @@ class RayCaster(Pickled):
         self.unknown = checks.choice("unknown", unknown, ("free", "occupied"))
         self.outside = checks.choice("outside", outside, ("free", "occupied"))
         self._seen = False
+        # Bearings and ray vectors of the last call.
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
         self._selection = backend
         self._backend = get_backend(backend)
         self._real = real_dtype(precision, self._backend)
@@ -206,4 +209,7 @@ class RayCaster(Pickled):
         if not self._seen:
             self._seen = True
             look_at_bearings("bearings", checked)
-        return ray_vectors(checked, _NO_MOUNT)
+        last = self._last
+        if last is None or not np.array_equal(last[0], checked):
+            self._last = last = checked.copy(), ray_vectors(checked, _NO_MOUNT)
+        return last[1]

@@ -17,7 +17,7 @@ from support.selection import on_every_backend
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan
 from gpusense.models import chunking
-from gpusense.models.scan import map_caster, tiles
+from gpusense.models.scan import tiles
 from gpusense.tables.casters import CASTERS
 
 RANGE, BEAMS, COUNT = 5.0, 53, 150
@@ -173,9 +173,9 @@ def test_casters(method, kind, ordered, as_gpu):
 
 def test_each_cast_orders_its_own_cloud(as_gpu, monkeypatch):
     """A repeated program bounds the headings of the last cloud alone, however wide clouds before it were."""
-    device, orders = as_gpu(), []
+    device, orders, order_of = as_gpu(), [], tiles.order_of
     monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
-    monkeypatch.setattr(map_caster, "order_of", lambda *a: orders.append(tiles.order_of(*a)) or orders[-1])
+    monkeypatch.setattr(tiles, "order_of", lambda *a: orders.append(order_of(*a)) or orders[-1])
     grid, scanner, _ = world()
     wide = poses_of("inside")
     narrow = wide * (1, 1, 0.01)

@@ -17,6 +17,7 @@ import errno
 import functools
 import hashlib
 import io
+import logging
 import os
 import re
 import stat
@@ -221,10 +222,6 @@ class BinaryCache:
 _MOST_BYTES = 256 << 20
 
 
-class RefusedError(ValueError):
-    """Packed files that are intact but exceed a limit."""
-
-
 def pack(files: dict[str, bytes]) -> bytes:
     """Return files, by their paths below some folder, as the contents of one entry."""
     stream = io.BytesIO()
@@ -236,35 +233,30 @@ def pack(files: dict[str, bytes]) -> bytes:
 
 
 def unpack(payload: bytes) -> dict[str, bytes]:
-    """Return the files of :func:`pack`."""
+    """Return the files of :func:`pack`, whatever sizes the archive claims."""
+    files, left = dict[str, bytes](), _MOST_BYTES
     try:
         with zipfile.ZipFile(io.BytesIO(payload)) as archive:
             for name in archive.namelist():
-                if not _is_below(name):
-                    raise RefusedError(f"entry: must hold paths below its folder, got {name!r}")
-            return _read_all(archive)
-    except RefusedError:
-        raise
+                with archive.open(name) as file:
+                    files[name] = file.read(left + 1)
+                left -= len(files[name])
+                if left < 0:
+                    break
     except (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, RuntimeError, ValueError) as error:
         raise ValueError(f"entry: must hold packed files, got other contents ({error})") from None
+    if left < 0:
+        raise ValueError(f"entry: must hold at most {_MOST_BYTES} bytes of files, got more")
+    for name in files:
+        if not _is_below(name):
+            raise ValueError(f"entry: must hold paths below its folder, got {name!r}")
+    return files
 
 
 def _is_below(name: str) -> bool:
     """Return whether a path leads to a place below a folder, on every system."""
     kinds = (PurePosixPath(name), PureWindowsPath(name))
     return not any(path.anchor or ".." in path.parts for path in kinds)
-
-
-def _read_all(archive: zipfile.ZipFile) -> dict[str, bytes]:
-    """Return all files of an archive, whatever sizes it claims."""
-    files, left = {}, _MOST_BYTES
-    for name in archive.namelist():
-        with archive.open(name) as file:
-            files[name] = file.read(left + 1)
-        left -= len(files[name])
-        if left < 0:
-            raise RefusedError(f"entry: must hold at most {_MOST_BYTES} bytes of files, got more")
-    return files
 
 
 def write_files(folder: Path, files: dict[str, bytes]) -> None:
@@ -277,3 +269,27 @@ def write_files(folder: Path, files: dict[str, bytes]) -> None:
             file.write(data)
         os.chmod(temporary, 0o700)
         os.replace(temporary, path)
+
+
+def restore_files(key: str, folder: Path) -> frozenset[str]:
+    """Write the files of an entry below a folder, and return their paths in it; none without a usable entry."""
+    payload = load_entry(key)
+    if payload is None:
+        return frozenset()
+    try:
+        files = unpack(payload)
+        write_files(folder, files)
+    except (OSError, ValueError) as error:
+        logging.getLogger("gpusense").debug("compiled kernels were not restored: %s", error)
+        return frozenset()
+    return frozenset(files)
+
+
+def store_files(key: str, folder: Path, names: frozenset[str]) -> bool:
+    """Store files below a folder as an entry; return whether all can be read."""
+    try:
+        files = {name: (folder / name).read_bytes() for name in names}
+    except OSError:
+        return False
+    store_entry(key, pack(files))
+    return True

@@ -16,7 +16,6 @@ import atexit
 import contextlib
 import functools
 import hashlib
-import logging
 import os
 import re
 import threading
@@ -25,7 +24,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from gpusense._util.private import UnsafeFolderError, check_private
-from gpusense.backends.cache import load_entry, pack, store_entry, unpack, write_files
+from gpusense.backends.cache import restore_files, store_files
 from gpusense.backends.scratch import scratch_folder
 
 # Files that PoCL reads again: programs, and kernels for a group size.
@@ -79,7 +78,8 @@ class PoclKernels:
         """Restore the entry of a program before it is built, and note the folders that PoCL makes for it."""
         with self._lock:
             if key not in self._folders:
-                self._folders[key] = self._restore(key)
+                self._saved[key] = restore_files(key, self.folder)
+                self._folders[key] = {"/".join(name.split("/")[:2]) for name in self._saved[key]}
             before = self._listed()
             yield
             self._folders[key] |= self._listed() - before
@@ -116,11 +116,9 @@ class PoclKernels:
             changed, self.changed = self.changed, set()
             for key in changed:
                 names = frozenset(self._files(key))
-                if names - self._saved.get(key, frozenset()):
-                    # The next process recompiles kernels that cannot be read.
-                    with contextlib.suppress(OSError):
-                        store_entry(key, pack({name: (self.folder / name).read_bytes() for name in names}))
-                        self._saved[key] = names
+                # The next process recompiles kernels that cannot be read.
+                if names - self._saved.get(key, frozenset()) and store_files(key, self.folder, names):
+                    self._saved[key] = names
 
     def _save_all(self) -> None:
         """Save the kernels of all programs at exit; a forked child saves none."""
@@ -128,20 +126,6 @@ class PoclKernels:
             return
         self.changed |= self._folders.keys()
         self.save()
-
-    def _restore(self, key: str) -> set[str]:
-        """Write the files of an entry, and return their folders."""
-        payload = load_entry(key)
-        if payload is None:
-            return set()
-        try:
-            files = unpack(payload)
-            write_files(self.folder, files)
-        except (OSError, ValueError) as error:
-            logging.getLogger("gpusense").debug("compiled kernels were not restored: %s", error)
-            return set()
-        self._saved[key] = frozenset(files)
-        return {"/".join(name.split("/")[:2]) for name in files}
 
     def _listed(self) -> set[str]:
         """Return the folders of all programs."""

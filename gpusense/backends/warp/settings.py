@@ -15,7 +15,7 @@ import warp as wp
 
 from gpusense._util.files import unnamed_file
 from gpusense._version import __version__
-from gpusense.backends.cache import load_entry, pack, store_entry, unpack, write_files
+from gpusense.backends.cache import restore_files, store_files
 from gpusense.backends.processor import fingerprint
 from gpusense.backends.scratch import scratch_folder
 
@@ -89,26 +89,11 @@ def load(module: wp.Module, device: wp.Device, group: int) -> None:
     host = fingerprint() if device.is_cpu else f"{device.arch}"
     # The name holds a hash of the module's code.
     key = "\n".join(["warp", wp.__version__, __version__, device.name, host, name])
-    restored = _restore(key)
+    restored = restore_files(key, _folder())
     wp.load_module(module, device=device, block_dim=group)
-    files = {f"{name}/{path.name}": path for path in (_folder() / name).glob("*") if path.is_file()}
-    if files.keys() - restored:
-        with contextlib.suppress(OSError):
-            store_entry(key, pack({file: path.read_bytes() for file, path in files.items()}))
-
-
-def _restore(key: str) -> set[str]:
-    """Write the files of an entry into this process's folder, and return their names."""
-    payload = load_entry(key)
-    if payload is None:
-        return set()
-    try:
-        files = unpack(payload)
-        write_files(_folder(), files)
-    except (OSError, ValueError) as error:
-        _LOG.debug("compiled kernels were not restored: %s", error)
-        return set()
-    return set(files)
+    files = frozenset(f"{name}/{path.name}" for path in (_folder() / name).glob("*") if path.is_file())
+    if files - restored:
+        store_files(key, _folder(), files)
 
 
 @contextlib.contextmanager

@@ -8,11 +8,12 @@ import pytest
 @pytest.fixture
 def kernels(needs, tmp_path, monkeypatch):
     needs("opencl")
+    from gpusense.backends import cache
     from gpusense.backends.opencl import pocl_kernels
 
     stored: dict[str, bytes] = {}
-    monkeypatch.setattr(pocl_kernels, "load_entry", stored.get)
-    monkeypatch.setattr(pocl_kernels, "store_entry", stored.__setitem__)
+    monkeypatch.setattr(cache, "load_entry", stored.get)
+    monkeypatch.setattr(cache, "store_entry", stored.__setitem__)
     monkeypatch.setattr(pocl_kernels.atexit, "register", lambda _: None)
 
     def new(folder):

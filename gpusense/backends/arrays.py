@@ -103,8 +103,11 @@ def bounds_of(poses: np.ndarray) -> Bounds:
     count = len(poses)
     if not count:
         return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    if count < 2 * _SHARE:
-        low, high = _bounds_of_few(poses) if count < _FEW else _bounds_of_many(poses)
+    if count < _FEW:
+        rows = np.ascontiguousarray(poses.T)
+        low, high = np.minimum.reduce(rows, axis=1), np.maximum.reduce(rows, axis=1)
+    elif count < 2 * _SHARE:
+        low, high = _bounds_of_many(poses)
     else:
         step = max(-(-count // min(helpers.threads(), _MOST_SHARES)), _SHARE)
         started = [
@@ -121,18 +124,13 @@ def bounds_of(poses: np.ndarray) -> Bounds:
     return tuple(low.tolist()), tuple(high.tolist())
 
 
-def _bounds_of_few(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the largest of each column."""
-    rows = np.ascontiguousarray(poses.T)
-    return np.minimum.reduce(rows, axis=1), np.maximum.reduce(rows, axis=1)
-
-
 def _bounds_of_many(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the least and the largest of each column of ``_WIDTH`` poses or more."""
     rows = len(poses) // _WIDTH
     body, rest = poses[: rows * _WIDTH].reshape(rows, 3 * _WIDTH), poses[rows * _WIDTH :]
     low, high = np.minimum.reduce(body, axis=0).reshape(-1, 3), np.maximum.reduce(body, axis=0).reshape(-1, 3)
-    return _bounds_of_few(np.concatenate([low, rest]))[0], _bounds_of_few(np.concatenate([high, rest]))[1]
+    bounds = np.array([bounds_of(np.concatenate([low, rest]))[0], bounds_of(np.concatenate([high, rest]))[1]])
+    return bounds[0], bounds[1]
 
 
 def adopt_poses(

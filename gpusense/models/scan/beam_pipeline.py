@@ -107,15 +107,12 @@ class BeamPipeline(ScanPipeline):
 
     def conditions(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None) -> frozenset[str]:
         shared = "SHARED_RAYS" in readings.flags
-        return (
-            self.caster.flags
-            | placed.world_flags
-            | flags_if(
-                ORIGINS_OUTSIDE=not (self.specialize and placed.within(0)),
-                ORDERED=tiles is not None and tiles.order is not None,
-                STRANDED=tiles is not None and not shared and stranded(readings.rays, tiles.spread),
-            )
+        flags = self.caster.flags | flags_if(
+            ORIGINS_OUTSIDE=not (self.specialize and placed.within(0)),
+            ORDERED=tiles is not None and tiles.order is not None,
+            STRANDED=tiles is not None and not shared and stranded(readings.rays, tiles.spread),
         )
+        return flags if placed.inside is None else flags | placed.world_flags
 
     def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
         flags = self._fixed_flags | self.cones.flags | conditions

@@ -63,33 +63,25 @@ class ClassedScans:
         scans: S.
         most_readings: Largest number of readings of a scan.
         most_rays: Largest number of rays of a scan.
+        shared: Whether several readings share a ray.
     """
 
     __slots__ = (
         "columns", "constants", "counts", "left_out", "most_rays", "most_readings", "ray_counts", "ray_offsets", "rays",
-        "readings", "scans", "vectors",
+        "readings", "scans", "shared", "vectors",
     )  # fmt: skip
 
     def __init__(
         self, columns: np.ndarray, readings: np.ndarray, vectors: np.ndarray, rays: np.ndarray, ray_offsets: np.ndarray,
         ray_counts: np.ndarray, counts: np.ndarray, constants: np.ndarray, left_out: OmittedReadings,
     ) -> None:  # fmt: skip
-        self.columns, self.readings, self.vectors, self.rays, self.ray_offsets = (
-            columns,
-            readings,
-            vectors,
-            rays,
-            ray_offsets,
-        )
+        self.columns, self.readings, self.vectors = columns, readings, vectors
+        self.rays, self.ray_offsets = rays, ray_offsets
         self.ray_counts, self.counts, self.constants, self.left_out = ray_counts, counts, constants, left_out
         self.scans = len(counts)
         self.most_readings = len(readings) if self.scans == 1 else max(counts.tolist(), default=0)
+        self.shared = len(rays) < len(readings)
         self.most_rays = len(rays) if self.scans == 1 else max(ray_counts.tolist(), default=0)
-
-    @property
-    def shared(self) -> bool:
-        """Return whether several readings share a ray."""
-        return len(self.rays) < len(self.readings)
 
     def part(self, begin: int, end: int) -> ClassedScans:
         """Return scans ``begin`` to ``end`` - 1."""

@@ -190,7 +190,7 @@ class MapCaster:
         result = Result(poses, out, (checked.count, rays), self.real, self.backend, on_device=checked.on_device)
         if checked.count * rays:
             with self._lock, self._workspace:
-                ray = self._workspace.upload("ray", vectors.astype(self.real))
+                ray = self._ray(vectors)
                 chunk = chunk_of(self.backend, rays * cones.rays + checked.sights, self.real.itemsize)
                 run_pieces(
                     self._workspace, Piece(0, checked.count, checked.count), chunk,
@@ -198,6 +198,11 @@ class MapCaster:
                 )  # fmt: skip
                 finish(self._workspace, checked.on_device)
         return result.user_array()
+
+    def _ray(self, vectors: np.ndarray) -> Buffer:
+        """Return ray vectors on the device, copied where the last call had others."""
+        key = vectors.shape, vectors.tobytes()
+        return self._workspace.hold("ray", key, lambda: vectors.astype(self.real))
 
     def draw(self, poses: Poses, vectors: np.ndarray, flat: Any, cones: Cones, drawing: Drawing) -> None:
         """Draw readings at S N poses into flat memory, in pieces that fit the device's memory.
@@ -208,7 +213,7 @@ class MapCaster:
         if not poses.count * rays:
             return
         with self._lock, self._workspace as space:
-            ray = space.upload("ray", vectors.astype(self.real))
+            ray = self._ray(vectors)
             chunk = chunk_of(self.backend, rays * cones.rays + poses.sights, 2 * self.real.itemsize)
             # Random numbers depend on the index of a particle among all, so scans may be split.
             run_pieces(

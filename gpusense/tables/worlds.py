@@ -347,8 +347,7 @@ class Worlds:
             each = max(_TOGETHER[self.backend.info.kind] // (rows * cols), 1)
             for first in range(0, len(members), each):
                 part = members[first : first + each]
-                place = self.backend.upload(self._place[part])
-                yield Stack(part, rows, cols, place, self.space)
+                yield Stack(part, rows, cols, self._places(part), self.space)
 
     def marked(self, stack: Stack, unknown: str, margin: int = 0) -> tuple[Buffer, tuple[int, int]]:
         """Return the obstacles of a stack, with a margin of obstacles around each world, and the size of each.
@@ -393,13 +392,16 @@ class Worlds:
             cells = buffer
             if buffer is None:
                 cells = self.backend.upload(np.ascontiguousarray(given[first : first + step]).view(_BYTE))
-            place = self.backend.upload(self._place[part])
             self._run(
-                "put_cells", (items, len(part)), cells=cells, place=place, store=self.store, count=count,
+                "put_cells", (items, len(part)), cells=cells, place=self._places(part), store=self.store, count=count,
                 worlds=len(part), items=items,
             )  # fmt: skip
             if first + step < len(indices):
                 self.backend.synchronize()
+
+    def _places(self, indices: np.ndarray) -> Buffer:
+        """Return the first cells of some worlds in tables, on the device."""
+        return self.space.hold("place", indices.tobytes(), lambda: self._place[indices])
 
     def _run(self, kernel: str, size: tuple[int, ...], **arguments: Any) -> None:
         self.backend.run((launch(kernel, _NO_FLAGS, size, **arguments),))

@@ -201,3 +201,15 @@ def test_the_poses_are_the_same_in_several_launches(name, limits, monkeypatch, n
     assert len(whole.scan) > 40
     for name in ("scan", "row", "col", "heading", "score"):
         np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_exact_bounds_as_on_gpus_divide_fewer_blocks(name, monkeypatch, needs):
+    scores, points, grid = scene(3)
+    rounded = Search(ScoreTables(get_backend(needs(name)), scores, levels=3)).find(points, grid, slack=50)
+    monkeypatch.setattr("gpusense.matching.score_tables._STEP", {"cpu": 8})
+    monkeypatch.setattr("gpusense.matching.score_tables._UNIT", {"cpu": 1})
+    exact = Search(ScoreTables(get_backend(needs(name)), scores, levels=3)).find(points, grid, slack=50)
+    for field in ("scan", "row", "col", "heading", "score"):
+        np.testing.assert_array_equal(getattr(exact, field), getattr(rounded, field))
+    assert exact.evaluated < rounded.evaluated

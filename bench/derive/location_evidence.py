@@ -1,4 +1,4 @@
-"""Fit the weights of the probability that a pose on a whole map is right: ``gpusense/matching/location_evidence.py``.
+"""Fit the weights of the probability that a pose on a whole map is right: ``gpusense/matching/location.py``.
 
     GPUSENSE_DATA=DATA python bench/derive/location_evidence.py --backend opencl
 
@@ -17,7 +17,7 @@ from scipy.optimize import minimize
 
 import gpusense as gs
 from gpusense.evaluation.worlds import free_pose
-from gpusense.matching.location_evidence import explained_logs
+from gpusense.matching.location import explained_logs
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 

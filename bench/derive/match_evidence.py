@@ -1,4 +1,4 @@
-"""Fit the weights of the probability that a match is right: ``gpusense/matching/evidence.py``.
+"""Fit the weights of the probability that a match is right: ``gpusense/matching/verdicts.py``.
 
     GPUSENSE_DATA=DATA python bench/derive/match_evidence.py --backend opencl
 
@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gpusense.matching.evidence import features_of
 from gpusense.matching.result import STATUSES
+from gpusense.matching.verdicts import features_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 

@@ -14,18 +14,18 @@ from gpusense.matching.columns import (
     cosine_and_sine,
     is_not,
     larger,
+    moved,
     rows_of,
     square_root,
+    squared_length,
 )
-from gpusense.matching.evidence import pair_evidence
 from gpusense.matching.icp import STRAIGHT_WIDTH, WIDTH, IcpPairs, PlacedPairs, space_of
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints
 from gpusense.matching.result import ScanMatch
 from gpusense.matching.start_search import UNSETTLED, Best, Levels, nearby, search
-from gpusense.matching.triangles import moved, squared_length
 from gpusense.matching.uncertainty import statuses
-from gpusense.matching.verdicts import PairSums, concluded, tested
+from gpusense.matching.verdicts import PairSums, concluded, pair_evidence, tested
 
 # Scores below the first value start a search of the window. Scores below the second one start a search near the guess
 # if the result is farther from it than this distance [capture radii] or turn [rad].

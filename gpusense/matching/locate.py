@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util import checks, masks
 from gpusense._util.angles import wrapped
 from gpusense.matching.field_search import Candidates, FieldSearch, field_search, log_likelihoods_of, searchable
-from gpusense.matching.location import Location, PoseMode, Status
-from gpusense.matching.location_evidence import NAMES, location_evidence, probability_right
+from gpusense.matching.location import NAMES, Location, PoseMode, Status, location_evidence, probability_right
 from gpusense.matching.pose_grid import PoseGrid, distinct_poses
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel

@@ -1,9 +1,19 @@
-"""Results of global localisation."""
+"""Results of global localisation, and the probability that a pose is right.
+
+The probability is a product of two: the pose explains the scan, and it is the right one among poses of nearly the same
+score. The latter is 1/2 where a second pose is as good. Both are logistic functions;
+``bench/derive/location_evidence.py`` fitted their weights to scans of half of the recorded logs and of simulated ones,
+on the maps of the same and of other places; right and wrong poses have equal weight.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
+
+import numpy as np
 
 from gpusense._util.html import card
 from gpusense._util.typing import Floats
@@ -52,7 +62,7 @@ class Location:
         p_right: Probability that the pose is right: off by at most 0.5 m and 5 degrees. It assumes that scans from the
             map's place and from other places are equally frequent.
         evidence: (E,) numbers from which ``p_right`` is computed, see
-            :data:`gpusense.matching.location_evidence.NAMES`.
+            :data:`gpusense.matching.location.NAMES`.
         status: ``"found"``; ``"ambiguous"`` where other modes are as good; ``"no match"`` where no pose explains the
             scan.
         resolution: Distance between neighbouring positions of the grid of poses [m].
@@ -90,3 +100,52 @@ class Location:
     def found(self) -> bool:
         """Return whether a single pose explains the scan."""
         return self.status == "found"
+
+
+# ---- evidence, and the probability that a pose is right
+
+NAMES = ("miss", "through", "short", "gap", "ahead")
+"""Evidence for and against a pose.
+
+``miss``: 1 less the score. ``through``, ``short``: shares of the hits that pass through walls of the map, and that end
+    before them. ``gap``: lead in score over the second mode, relative to the depth to which modes are searched;
+    infinite without a second mode. ``ahead``: lead in agreement over that mode.
+"""
+
+# Constant, and weights of the logarithms of miss, through and short: whether the pose explains the scan.
+_CONSTANT = -6.73
+_WEIGHTS = (-0.04, -4.83, 0.34)
+# Weights of gap and ahead: whether it is the right one of two modes.
+_RIVAL_WEIGHTS = (1.87, 5.22)
+# Offsets added before logarithms are taken.
+_LEAST = (3e-3, 1e-2, 1e-2)
+
+
+def location_evidence(modes: Sequence[PoseMode], depth: float) -> np.ndarray:
+    """Return the evidence (5,) on the first mode, see :data:`NAMES`; modes are searched down to ``depth``."""
+    best = modes[0]
+    rivals = [np.array([(best.score - mode.score) / depth, best.agreement - mode.agreement]) for mode in modes[1:]]
+    strongest = min(rivals, key=rival_odds, default=np.array([math.inf, best.agreement]))
+    return np.array([1 - best.score, best.through, best.short, *strongest])
+
+
+def explained_logs(evidence: np.ndarray) -> np.ndarray:
+    """Return the numbers (..., 3) that the first weights multiply."""
+    logs: np.ndarray = np.log(np.maximum(evidence[..., :3], 0) + _LEAST)
+    return logs
+
+
+def rival_odds(gap_and_ahead: np.ndarray) -> float:
+    """Return the log odds of the first mode against another mode."""
+    gap, ahead = gap_and_ahead
+    return math.inf if math.isinf(gap) else float(_RIVAL_WEIGHTS[0] * gap + _RIVAL_WEIGHTS[1] * ahead)
+
+
+def probability_right(evidence: np.ndarray) -> float:
+    """Return the probability that a pose is right."""
+    explained = _CONSTANT + float(explained_logs(evidence) @ _WEIGHTS)
+    return _logistic(explained) * _logistic(rival_odds(evidence[3:]))
+
+
+def _logistic(x: float) -> float:
+    return 1 / (1 + math.exp(-min(max(x, -50.0), 50.0)))

@@ -18,16 +18,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpusense.matching.columns import Column, all_of, column_of, is_not, larger, square_root, upright, values_of
-from gpusense.matching.triangles import (
+from gpusense.matching.columns import (
     UPPER,
+    Column,
     Triangle,
+    all_of,
     axes_of_one,
     balanced,
+    column_of,
     inverse_of,
     is_definite,
+    is_not,
+    larger,
     matrices_of,
+    square_root,
     triangle_of,
+    upright,
+    values_of,
 )
 
 # Probability that an unobserved direction counts as observed, and the normal quantile of its complement.

@@ -64,7 +64,7 @@ class ScanMatch:
             by ``lever``; their signs are arbitrary.
         lever: Root mean square range of the second scan [m].
         noise: Standard deviation of ranges that was used [m].
-        evidence: (E,) numbers from which ``p_right`` is computed, see :data:`gpusense.matching.evidence.NAMES`.
+        evidence: (E,) numbers from which ``p_right`` is computed, see :data:`gpusense.matching.verdicts.NAMES`.
         status: One of :data:`gpusense.matching.result.STATUSES`; an array of strings for S matches.
 
     Example:

@@ -16,8 +16,7 @@ from gpusense._util.angles import wrapped
 from gpusense._util.typing import CasterName
 from gpusense.backends import Backend
 from gpusense.matching.basin import is_held
-from gpusense.matching.columns import column_of
-from gpusense.matching.evidence import pair_evidence
+from gpusense.matching.columns import column_of, matrices_of, triangle_of
 from gpusense.matching.icp_with_search import DOUBTFUL, match_pairs
 from gpusense.matching.observability import axes_of, balance_of, observed_information, orthonormal
 from gpusense.matching.options import MatchOptions
@@ -25,9 +24,8 @@ from gpusense.matching.points import ScanPoints, dense_scanner, scan_points
 from gpusense.matching.result import ScanMatch
 from gpusense.matching.score_tables import ScoreTables, field_scores
 from gpusense.matching.search import PoseGrid, Search
-from gpusense.matching.triangles import matrices_of, triangle_of
 from gpusense.matching.uncertainty import observable_directions
-from gpusense.matching.verdicts import concluded, judged, pair_sums
+from gpusense.matching.verdicts import concluded, judged, pair_evidence, pair_sums
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.tables.distances import distance_transform

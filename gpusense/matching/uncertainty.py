@@ -19,12 +19,22 @@ from collections.abc import Sequence
 import numpy as np
 
 from gpusense.backends import Backend
-from gpusense.matching.columns import Column, chosen, column_of, columns_of, is_not, larger, values_of
+from gpusense.matching.columns import (
+    Column,
+    Triangle,
+    chosen,
+    column_of,
+    columns_of,
+    is_not,
+    larger,
+    matrices_of,
+    triangle_of,
+    values_of,
+)
 from gpusense.matching.icp import LONG_WIDTH, WIDTH, IcpPairs, points_of_line, space_of
 from gpusense.matching.observability import LEAST_PAIRS, Observed, observed_information
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import scan_points
-from gpusense.matching.triangles import Triangle, matrices_of, triangle_of
 from gpusense.world.scanner import Scanner
 
 # Least pairs of points of a match, least share of points in common sight, and least score.

@@ -10,11 +10,11 @@ import pytest
 from support.matching_scenes import FRONT, RING, WALL, box, random_pairs, relative, segments_scan
 
 import gpusense as gs
-from gpusense.matching.evidence import NAMES
+from gpusense.matching.columns import matrices_of, triangle_of
 from gpusense.matching.noise import ROOT, scan_noise
 from gpusense.matching.observability import covariance_of, critical_ratio, observed_information
 from gpusense.matching.result import STATUSES
-from gpusense.matching.triangles import matrices_of, triangle_of
+from gpusense.matching.verdicts import NAMES
 
 # A corridor longer than the scanners' range, and a room unlike ROOM everywhere.
 CORRIDOR = np.array([[-200.0, -1.2, 200.0, -1.2], [-200.0, 1.4, 200.0, 1.4]])

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gpusense.matching.columns import column_of, columns_of
-from gpusense.matching.triangles import (
+from gpusense.matching.columns import (
     axes_of_one,
     balanced,
+    column_of,
+    columns_of,
     inverse_of,
     is_definite,
     matrices_of,

@@ -30,7 +30,6 @@ from gpusense.models.scan import tiles
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from common import Recorder, add_repeats, make_parser, note, parse, publish, table
-from launches import least_by_events
 
 SIDE, ROBOTS, RESOLUTION, RANGE_MAX = 256, 16, 0.05, 10.0
 BEARINGS = np.linspace(-np.pi, np.pi, 360, endpoint=False)
@@ -111,6 +110,45 @@ def rate_of_one(backend: Any, side: int, worlds: int, repeats: int, seconds: flo
     rate = len(poses) * len(BEARINGS) / least(lambda: caster.cast(poses, BEARINGS), backend, repeats, seconds)
     note(f"one map of {side} x {side}: {rate / 1e6:.0f} M rays/s")
     return rate
+
+
+def by_events(device: Any, launches: list[Callable[[], None]]) -> list[tuple[str, float]]:
+    """Return name and seconds of each launch of an OpenCL or CUDA device."""
+    if device.info.backend == "warp":
+        import warp as wp
+
+        wp.timing_begin(cuda_filter=wp.TIMING_KERNEL, synchronize=True)
+        for launch in launches:
+            launch()
+        return [(result.name, result.elapsed * 1e-3) for result in wp.timing_end(synchronize=True)]
+    import pyopencl as cl
+
+    from gpusense.backends.opencl.pocl_kernels import source_name
+
+    before, found = device._queue, []
+    device._queue = cl.CommandQueue(device._context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+
+    def enqueue(kernel: Any, size: tuple[int, ...], group: tuple[int, ...]) -> None:
+        found.append(
+            (source_name(kernel.function_name), cl.enqueue_nd_range_kernel(device._queue, kernel, size, group))
+        )
+
+    device.enqueue = enqueue
+    try:
+        for launch in launches:
+            launch()
+        device._queue.finish()
+    finally:
+        device._queue = before
+        del device.enqueue
+    return [(name, (event.profile.end - event.profile.start) * 1e-9) for name, event in found]
+
+
+def least_by_events(device: Any, launches: list[Callable[[], None]], repeats: int) -> list[tuple[str, float]]:
+    """Return name and least seconds of each launch."""
+    runs = [by_events(device, launches) for _ in range(repeats)]
+    names = [name.removeprefix("forward kernel ").removeprefix("make__locals__") for name, _ in runs[0]]
+    return list(zip(names, np.min([[taken for _, taken in run] for run in runs], axis=0).tolist(), strict=True))
 
 
 def timed(recorder: Any, run: Callable[[], Any]) -> str:

@@ -37,11 +37,6 @@ class Entry:
     array_selection: str = ""
 
     @property
-    def has_parts(self) -> bool:
-        """Return whether a selection string may name a device after the backend's name."""
-        return any(":" in selection for selection in self.selections)
-
-    @property
     def best(self) -> int:
         """The rank of its fastest kind of device."""
         return min(self.speed.values())

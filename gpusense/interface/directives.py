@@ -7,6 +7,7 @@ a compiler would resolve them without knowing the flags.
 
 from __future__ import annotations
 
+import functools
 import re
 from dataclasses import dataclass
 
@@ -27,6 +28,7 @@ class _Branches:
     ended: bool = False  # ``#else`` has been read
 
 
+@functools.lru_cache(maxsize=512)
 def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
     """Keep the taken branches of ``#if`` and ``#elif`` with ``FLAG`` or ``!FLAG``; the rest becomes empty lines.
 

@@ -34,6 +34,8 @@ _STRUCTS = {"real2", "double2"}
 _FIELDS = {"x": "hi", "y": "lo"}
 _WANTED = re.compile(r"^// in lanes: (.*)\n", re.MULTILINE)
 _DEFINED = re.compile(r"^\w[\w* ]*?[ *](\w+_lanes)[(;]", re.MULTILINE)
+# Lists the functions and types in lanes that a text defines.
+_names_in_lanes = functools.lru_cache(maxsize=512)(_DEFINED.findall)
 _DEFINITION = re.compile(
     r"^(?:#define (?P<macro>\w+) [^\n]*|typedef struct \{[^}]*\} (?P<struct>\w+);"
     r"|(?:\w+ )+(?P<function>\w+)\([^;{}]*\) \{(?:[^\n]*\}$|.*?^\}))",
@@ -65,12 +67,6 @@ def written_in_lanes(text: str, file: str, sources: dict[str, str]) -> str:
         return f'{written}#line {line + 1} "{file}.cl"\n'
 
     return _WANTED.sub(definitions, text)
-
-
-@functools.lru_cache(maxsize=512)
-def _names_in_lanes(text: str) -> list[str]:
-    """List the functions and types in lanes that a text defines."""
-    return _DEFINED.findall(text)
 
 
 @functools.lru_cache(maxsize=512)

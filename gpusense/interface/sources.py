@@ -116,12 +116,7 @@ def _with_requirements(name: str, flags: frozenset[str]) -> list[str]:
 
 
 def _requirements(name: str) -> list[str]:
-    return _named_files(opencl_source(name))
-
-
-@functools.lru_cache(maxsize=512)
-def _named_files(text: str) -> list[str]:
-    match = _REQUIRES.search(text)
+    match = _REQUIRES.search(opencl_source(name))
     return match.group(1).split() if match else []
 
 
@@ -156,16 +151,10 @@ def _words(text: str) -> frozenset[str]:
     return frozenset(_WORD.findall(text))
 
 
-@functools.lru_cache(maxsize=512)
-def _resolved(text: str, flags: frozenset[str], name: str) -> str:
-    """Return a source with the branches that the flags select."""
-    return resolve(text, flags, name)
-
-
 def _kept(file: str, flags: frozenset[str]) -> str:
     """Return a kernel file with the branches that the flags select; the file need not name all flags."""
     text = source_text(file, flags)
-    return _resolved(text, flags & _words(text), f"{file}.cl")
+    return resolve(text, flags & _words(text), f"{file}.cl")
 
 
 def assemble(file: str, flags: frozenset[str]) -> str:

@@ -79,14 +79,12 @@ def chosen_library(flags: Set[str]) -> Library:
     return next(library for library in reversed(LIBRARIES) if library.needs <= flags)
 
 
-def lacking(flags: Set[str]) -> list[str]:
-    """Return the instruction sets that the library PoCL takes uses, and that the processor lacks."""
-    return sorted(chosen_library(flags).uses - flags)
-
-
 def lacking_for(device: cl.Device) -> list[str]:
     """Return the instruction sets that PoCL's library uses on a device and that the processor lacks."""
-    return lacking(_flags(device)) if _is_misfit(device) and instruction_sets() else []
+    if not _is_misfit(device) or not instruction_sets():
+        return []
+    flags = _flags(device)
+    return sorted(chosen_library(flags).uses - flags)
 
 
 def target_of(device: cl.Device) -> str:

@@ -156,7 +156,7 @@ def class_scans(ranges: np.ndarray, rules: BeamSelection) -> ClassedScans:
 
 def _of_complete_scan(ranges: np.ndarray, classes: tuple[np.ndarray, np.ndarray], rules: BeamSelection) -> ClassedScans:
     """Return the chosen readings of a single scan in which every reading is a range."""
-    (used, columns, vectors), (first, count, constants) = rules.of_complete_scan, rules.sizes_of_complete_scan
+    used, columns, vectors, first, count, constants = rules.of_complete_scan
     hit, far = classes[0][0], classes[1][0]
     values = ranges[0] if rules.choice.every else ranges[0].take(columns)
     left_out = OmittedReadings(hit, far, used, far, far, rules.z_max > 0)

@@ -224,8 +224,11 @@ class PackedCallCache:
         corners = self._corners(poses) if in_host else None
         if in_host and corners is None:
             return None
-        if pipeline.context.temperature < 1 and (inputs.kinds[1] is not None or not self._has_range(ranges)):
-            return None
+        if pipeline.context.temperature < 1:
+            # Without a range that depends on the pose, the constant term is rounded differently.
+            hit = None if inputs.kinds[1] is not None else classify_ranges(ranges, *pipeline.rules.limits)[0]
+            if hit is None or not hit.any():
+                return None
         try:
             result = None
             if in_host:
@@ -287,10 +290,6 @@ class PackedCallCache:
         if seen < _BEFORE:
             self._seen.keep(key, seen + 1)
         return seen >= _BEFORE
-
-    def _has_range(self, ranges: np.ndarray) -> bool:
-        """Return whether a reading depends on the pose; without one the constant term is rounded differently."""
-        return bool(classify_ranges(ranges, *self._pipeline.rules.limits)[0].any())
 
     def _corners(self, poses: np.ndarray) -> Corners | None:
         """Return corners of the box of poses; None where one is not finite."""

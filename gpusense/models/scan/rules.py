@@ -87,17 +87,15 @@ class BeamSelection:
         return np.arange(self.scanner.count)
 
     @functools.cached_property
-    def of_complete_scan(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Which readings (K,) of a scan of ranges alone are used, their positions (M,) and vectors (M, 2)."""
-        used = self.choice.used(np.ones(self.scanner.count, bool))
-        columns = used.nonzero()[0]
-        return used, columns, self.vectors.take(columns, axis=0)
+    def of_complete_scan(self) -> tuple[np.ndarray, ...]:
+        """Parts of a scan of ranges alone, as ``ClassedScans`` names them.
 
-    @functools.cached_property
-    def sizes_of_complete_scan(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Begins of each ray (M + 1,), number of readings (1,), and constant term (1,) of such a scan."""
-        count = len(self.of_complete_scan[1])
-        return np.arange(count + 1, dtype=np.int32), np.array([count]), np.zeros(1)
+        Which readings (K,) are used, their columns (M,), vectors (M, 2), ray offsets (M + 1,), count and constant (1,).
+        """
+        used = self.choice.used(np.ones(self.scanner.count, bool))
+        columns, count = used.nonzero()[0], np.count_nonzero(used)
+        begins = np.arange(count + 1, dtype=np.int32)
+        return used, columns, self.vectors.take(columns, axis=0), begins, np.array([count]), np.zeros(1)
 
     @functools.cached_property
     def separate(self) -> bool:

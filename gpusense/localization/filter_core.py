@@ -11,8 +11,8 @@ import numpy as np
 
 from gpusense._util.typing import AnyArray
 from gpusense.backends import arrays
-from gpusense.localization import skipping, starts
-from gpusense.localization.cloud_state import Contents
+from gpusense.localization import starts
+from gpusense.localization.cloud_state import Contents, SensorReadings
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.estimates import Estimate, clustered
 from gpusense.localization.journal import plain_state, set_state
@@ -26,6 +26,9 @@ from gpusense.localization.sensors import Sensor, grid_of
 from gpusense.localization.spread import share_off, share_off_of, spread_of, verdict_label
 from gpusense.localization.tracker import Tracker, is_together
 from gpusense.localization.verdict import Verdict
+
+# Number of evaluated particles; largest share of skipped beams.
+_ASKED, _MOST_SKIPPED = 100, 0.7
 
 
 class FilterCore:
@@ -117,7 +120,9 @@ class FilterCore:
         if verdict.watches(everything):
             verdict.predicted(*tracker.moved_particles(), everything)
         if share is not None:
-            used = skipping.skipped(self.sensors, used, tracker.moved_particles(), verdict.anywhere, share)
+            particles = tracker.moved_particles()
+            if is_together(tracker.mean_and_covariance()[1]):
+                used = skipped(self.sensors, used, particles, verdict.anywhere(), share)
         for sensor in self.sensors:
             sensor.receive()
         judged = verdict.expected(everything, tracker.progress.motion)
@@ -207,3 +212,60 @@ class FilterCore:
             set_state(sensor, values)
         self.recovery.restore(memory["recovery"])
         self.last = {index: tuple(map(copy.copy, reading)) for index, reading in memory["readings"].items()}
+
+
+# ---- beams to skip
+
+
+def skipped(
+    sensors: Sequence[Sensor],
+    readings: list[SensorReadings],
+    particles: tuple[np.ndarray, np.ndarray],
+    anywhere: np.ndarray,
+    share: float,
+) -> list[SensorReadings]:
+    """Return readings without the beams that less than a share of (N, 3) particles, by (N,) weights, explains.
+
+    In nav2_amcl's ``do_beamskip`` a particle explains a beam that ends within 0.5 m of a wall. Here it explains a beam
+    that it makes likelier than poses anywhere do, so that any model of scans can skip. Unlike there, nonexistent beams
+    do not count as skipped, and a scan with too many skipped beams is used completely. So are all scans while the
+    particles are spread out, since then only the few right particles explain most beams.
+    """
+    every = max(len(particles[0]) // _ASKED, 1)
+    few = particles[0][::every], particles[1][::every]
+    return [
+        (i, without_skipped(sensors[i], reading, *few, anywhere, share) if sensors[i].calibrates else reading)
+        for i, reading in readings
+    ]
+
+
+def without_skipped(
+    sensor: Sensor,
+    reading: tuple[Any, ...],
+    poses: np.ndarray,
+    weights: np.ndarray,
+    elsewhere: np.ndarray,
+    share: float,
+) -> tuple[Any, ...]:
+    """Return a scan with missing readings for the beams that less than a share of the particles explains."""
+    parts = sensor.parts(np.vstack([poses, elsewhere]), reading)
+    near, far = parts[: len(poses)], parts[len(poses) :]
+    used = (near != 0).any(axis=0)
+    least = boundary(far[:, used])
+    if least is None:
+        return reading
+    explained = weights @ (near > least) >= share * weights.sum()
+    if np.count_nonzero(used & ~explained) > _MOST_SKIPPED * np.count_nonzero(used):
+        return reading
+    ranges = np.array(arrays.copied_to_host(reading[0], sensor.backend, "ranges"))
+    ranges[~(used & explained)] = np.nan
+    return (ranges, *reading[1:])
+
+
+def boundary(elsewhere: np.ndarray) -> float | None:
+    """Return the least log-likelihood of an explained beam, from (M, K) at poses anywhere; None if all are alike."""
+    values = elsewhere[np.isfinite(elsewhere)]
+    if not values.size:
+        return None
+    poor, good = np.percentile(values, (50, 99))
+    return float((poor + good) / 2) if good > poor else None

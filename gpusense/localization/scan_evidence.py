@@ -40,7 +40,7 @@ offset, on 71 further simulated runs and on the log robotdata4 of Wean Hall, wit
 BY_CHANCE and IS_FOUND were chosen on 246 more simulated runs, half of them with 30 % of the walls moved, and on the
 tuning half of the recorded logs. The 200 runs, with few doubtful right poses, yield 0.29, 1.6 and 0.0 for the three.
 
-Among landmarks the ratio comes from the prediction of features (:mod:`gpusense.localization.landmark_gain`).
+Among landmarks the ratio comes from the prediction of features (:class:`gpusense.localization.verdict.Evidence`).
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import gpusense as gs
+from gpusense.localization.filter_core import without_skipped
 from gpusense.localization.sensors import Sensor
-from gpusense.localization.skipping import together, without_skipped
 
 GRID = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
 SCANNER = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.1, count=60, range_max=10.0)
@@ -47,7 +47,15 @@ def test_a_scan_that_no_particle_explains_is_used_whole():
 
 
 def test_particles_that_lie_apart_skip_nothing():
-    assert together(NEAR, np.full(50, 0.02)) and not together(ANYWHERE, np.full(64, 1 / 64))
+    field = gs.LikelihoodFieldModel(GRID, SCANNER, backend="numpy")
+    ranges, found = WALLS.copy(), []
+    ranges[BLOCKED] = 0.5
+    for share in (0.3, None):
+        pf = gs.ParticleFilter(field, particles=300, seed=3, beam_skip=share)
+        pf.initialize_uniform()
+        pf.correct(ranges)
+        found.append(pf.host_particles())
+    assert np.array_equal(*found)
 
 
 def test_a_filter_skips(backend):

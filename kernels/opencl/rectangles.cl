@@ -138,7 +138,8 @@ kernel void rectangles_scan(ARGUMENTS) {
     out += (long)(quadrant * sectors + sector) * lines * (cols + 2);
     const int2 middle = slope(sectors, sector);
     const long line = (long)worlds * cols, step = dy * line;
-    int height = 0, width = LONGEST, narrower = 0, bound = 0;
+    int height = 0, width = LONGEST, narrower = 0, bound = 0, filled = 0;
+    ulong four = 0;
     for (int i = 0; i < end - begin; ++i) {
         const int row = dy > 0 ? end - 1 - i : begin + i, room = min(dy > 0 ? rows - row : row + 1, LONGEST);
         global const uchar *run = column + (row - first) * line;
@@ -169,6 +170,18 @@ kernel void rectangles_scan(ARGUMENTS) {
         }
         const int best = narrower * middle.x > height * middle.y;
         const int sides = best ? narrower + 256 * (height + 1) : height > 0 ? width + 256 * height : OCCUPIED;
-        out[padded_in_groups(row, col, cols, group)] = (ushort)sides;
+        const int at = padded_in_groups(row, col, cols, group), part = (row + 1) & 3, first = at - part;
+        if (group == 1) {
+            out[at] = (ushort)sides;
+            continue;
+        }
+        // A write of four rows takes no longer than a write of one.
+        four |= (ulong)sides << 16 * part;
+        ++filled;
+        if (part != (dy > 0 ? 0 : 3) && i < end - begin - 1) continue;
+        if (filled == 4) *(global ulong *)(out + first) = four;
+        for (int k = part; filled < 4 && filled > 0; --filled, k += dy) out[first + k] = (ushort)(four >> 16 * k);
+        four = 0;
+        filled = 0;
     }
 }

@@ -80,6 +80,7 @@ ON_PURPOSE = [
     Purpose("hit_shape", "mass_place mass_at", (WARP,), STAGES),
     Purpose("field_term", "_near", REFERENCE_ONLY, ARRAYS),
     Purpose("ranges", "cast_in_worlds", REFERENCE_ONLY, WORLD_BY_WORLD),
+    Purpose("rectangles", "put_four", (WARP,), "OpenCL has pointers"),
     Purpose("rectangles", "divided", KERNELS_ONLY, "a division takes many instructions of a GPU"),
     Purpose("raycast", "sectors_of", REFERENCE_ONLY, "SECTORS is a constant of the kernels"),
     Purpose("shapes", "particles_of_worlds", REFERENCE_ONLY, WORLD_BY_WORLD),

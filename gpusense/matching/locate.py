@@ -183,7 +183,9 @@ def end_points_of(model: LikelihoodFieldModel, ranges: np.ndarray) -> tuple[list
     scanner._first_scans.look_at("ranges", ranges, math.hypot(model.grid.width, model.grid.height))
     choice, vectors = BeamChoice.of(model.beams, scanner.count), ray_vectors(scanner.bearings, scanner.mount)
     mount = np.array(scanner.mount[:2])
-    hits = [np.flatnonzero(choice.used(hit)) for hit in classify(ranges, scanner) == Reading.HIT]
+    is_hit = classify(ranges, scanner) == Reading.HIT
+    all_used = len(choice.columns) == scanner.count <= choice.most
+    hits = [hit.nonzero()[0] if all_used else choice.used(hit).nonzero()[0] for hit in is_hit]
     return hits, [scan[hit, None] * vectors[hit] + mount for scan, hit in zip(ranges, hits, strict=True)]
 
 

@@ -277,7 +277,8 @@ class _Run:
 
     def _raise(self, poses: np.ndarray) -> None:
         """Raise the lower bounds of scans."""
-        np.maximum.at(self._best, poses[:, 0] // self._turns, poses[:, 3])
+        # Of equal types, which NumPy does not convert number by number.
+        np.maximum.at(self._best, poses[:, 0] // self._turns, poses[:, 3].astype(np.int64))
         np.maximum(self._floor, np.where(self._best >= 0, self._best - self._slack, -1), out=self._floor)
 
     def _keep(self, poses: np.ndarray) -> None:

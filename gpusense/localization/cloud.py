@@ -275,7 +275,7 @@ class Cloud(Particles):
         """Return the state after the last correction."""
         results, index = self._read_results(), self.places.state
         if self._summary is None or self._summary[0] is not results or self._summary[1] != index:
-            self._summary = results, index, summary_of(self._state_of(index))
+            self._summary = results, index, summary_of(results[self.results.spans[index]])
         return self._summary[2]
 
     def shares(self, count: int) -> Any:

@@ -97,9 +97,6 @@ class ParticleFilter(Transactional):
         self._cloud = FilterCloud(self._sensors, self.options.most, residual=self.options.resampling == "residual")
         self._parts = FilterCore(self._sensors, self.options, self._cloud)
 
-    def _keep(self) -> None:
-        self._parts.keep()
-
     def _changing(self) -> tuple[Any, ...]:
         return self._parts.changing()
 

@@ -51,14 +51,9 @@ class FilterCore:
         self.last: dict[int, tuple[Any, ...]] = {}
         self._margins = margins_of(sensors)
 
-    def keep(self) -> None:
-        """Record the buffers that the present call must not overwrite."""
-        self.tracker.keep()
-        self.recovery.keep()
-
     def changing(self) -> tuple[Any, ...]:
-        """Return the objects whose state a call may change."""
-        return self, self.tracker, self.tracker.cloud, self.verdict, *self.sensors, *self.recovery.changing()
+        """Return the objects whose state a call may change, and keep their present buffers."""
+        return self, self.verdict, *self.sensors, *self.tracker.changing(), *self.recovery.changing()
 
     def check_started(self) -> None:
         """Refuse to continue without particles."""

@@ -65,11 +65,8 @@ class Transactional:
         """Prepare the object for :func:`atomic` calls."""
         self._calls = threading.RLock()
 
-    def _keep(self) -> None:
-        """Record the buffers that the present call must not overwrite."""
-
     def _changing(self) -> tuple[Any, ...]:
-        """Return all objects that a call may change: this one and its parts."""
+        """Return all objects that a call may change: this one and its parts; called when a call begins."""
         return (self,)
 
     def settle(self) -> None:
@@ -92,7 +89,6 @@ def atomic(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P]
             if self._journal is not None:
                 # A call within an atomic call.
                 return method(self, *args, **kwargs)
-            self._keep()
             journal = self._journal = Journal(self._changing(), sys._getframe())
             try:
                 result = method(self, *args, **kwargs)

@@ -48,8 +48,6 @@ COMPARISONS = 3
 PRIOR = -7.0
 # Mask that turns the filter's seed into the rival's seed.
 _RIVAL = 0x9E3779B97F4A7C15
-# Probability of another place that starts the search for a rival; above the prior before the first scan.
-_DOUBT = 0.2
 # Particles of a rival; half widths around each of its initial poses [m, m, rad].
 PARTICLES, _SPREAD = 1000, (0.1, 0.1, 0.05)
 # Largest distance and turn between two clouds at a place [m, rad].
@@ -79,13 +77,9 @@ class Rival:
         self._ratios = np.zeros(3)
         self._search = RivalSearch(tracker.sensors)
 
-    def keep(self) -> None:
-        """Record the buffers that the present call must not overwrite."""
-        self._tracker.keep()
-
     def changing(self) -> tuple[Any, ...]:
-        """Return the objects whose state a correction may change."""
-        return self, self._tracker, self._tracker.cloud
+        """Return the objects whose state a correction may change, and keep their present buffers."""
+        return self, *self._tracker.changing()
 
     def state(self) -> tuple[dict[str, Any], Contents, dict[str, Any]]:
         """Return the rival as plain data: its state, its particles and their memory."""
@@ -239,13 +233,8 @@ class Recovery:
         return self.rival if self.rival is not None and self.rival.active else None
 
     def changing(self) -> tuple[Any, ...]:
-        """Return the objects whose state a call may change."""
+        """Return the objects whose state a call may change, and keep their present buffers."""
         return (self,) if self.rival is None else (self, *self.rival.changing())
-
-    def keep(self) -> None:
-        """Record the buffers that the present call must not overwrite."""
-        if self.rival is not None:
-            self.rival.keep()
 
     def restart(self) -> None:
         """Forget the rival for new particles."""
@@ -264,9 +253,7 @@ class Recovery:
 
     def is_doubted(self) -> bool:
         """Return whether the last judged scans contradict the pose, or a rival competes with it."""
-        verdict = self._verdict
-        apart = self.active is not None or not self._tracker.together
-        return apart or verdict.wrong > _DOUBT or verdict.explains_little
+        return self.active is not None or not self._tracker.together or self._verdict.doubts
 
     def corrected(self, readings: list[SensorReadings], last: Mapping[int, tuple[Any, ...]]) -> None:
         """Compare the particles with their rival, judge their pose, and search for a rival if scans contradict it.

@@ -69,9 +69,10 @@ class Tracker:
         self.together, self.corrections = False, 0
         self.pool: tuple[int, starts.Spread] = 0, (0.0, 0.0, 0.0)
 
-    def keep(self) -> None:
-        """Record the buffers that the present call must not overwrite."""
+    def changing(self) -> tuple[Any, ...]:
+        """Return the objects whose state a call may change; the call will not overwrite their present buffers."""
         self.cloud.kept = self.cloud.places
+        return self, self.cloud
 
     # ---- particles
 
@@ -145,7 +146,8 @@ class Tracker:
 
     def follow(self, motion: SampledMotion) -> None:
         """Postpone a motion to share the next correction's program."""
-        self.move()
+        if self.progress.motion is not None:
+            self.move()
         now = self.progress
         moved = motion.after(now.moved or (0.0, 0.0, 0.0))
         self.progress = Progress(now.step + 1, motion, moved, now.copies)

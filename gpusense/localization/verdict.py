@@ -36,8 +36,9 @@ _RANDOM = 64
 _SURE, _WAY, _TURNED, _SELDOM, _DROP = 0.05, 0.25, 0.25, 10, 3.0
 # Corrections before a single judgement of an unsure pose may begin a search.
 _INTERVAL = 5
-# Least share of explained beams that makes a search elsewhere unnecessary.
-_FEW = 0.4
+# Least share of explained beams that makes a search elsewhere unnecessary, and the probability of another place that
+# starts one; above the prior before the first scan.
+_FEW, _DOUBT = 0.4, 0.2
 # Gain at which right and wrong are equally likely [nats per feature]; scans in the average; number of poses anywhere,
 # and their margin around the landmarks [m].
 LEAST_GAIN, _RECENT, _ANYWHERE, _MARGIN = 1.0, 20, 1000, 1.0
@@ -156,9 +157,10 @@ class Verdict:
         self.state = self.state._replace(belief=Belief.anywhere(after=places - 1), judged=-1, places=places)
 
     @property
-    def explains_little(self) -> bool:
-        """Return whether few beams of the last judged scans agree with the pose, perhaps because of people."""
-        return self.state.explained < _FEW
+    def doubts(self) -> bool:
+        """Return whether the scans contradict the pose, or few beams of the last judged ones agree with it."""
+        state = self.state
+        return state.explained < _FEW or (self.informed and state.belief.wrong > _DOUBT)
 
     @property
     def wrong(self) -> float:

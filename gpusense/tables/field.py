@@ -74,10 +74,10 @@ class FieldTable:
         walled = _walled(obstacles, margin, Window(0, 0, rows + 2 * margin, cols + 2 * margin))
         size = (rows + 2 * RING, cols + 2 * RING)
         if density is None:
-            distances = backend.download(squared_distances(backend, walled), np.empty(walled.shape, np.int32))
+            squared = backend.download(squared_distances(backend, walled), np.empty(walled.shape, np.int32))
             table = np.full(size, self._outside_value)
             inside = slice(RING - margin, -(RING - margin) or None)
-            table[inside, inside] = self._values(_with_infinity(distances))
+            table[inside, inside] = self._values(np.where(squared == NO_OBSTACLE, np.inf, squared.astype(np.float64)))
             if overlaid is not None:
                 table[RING:-RING, RING:-RING][overlaid] = self._overlay
             return backend.upload(table)
@@ -194,8 +194,3 @@ def _walled(obstacles: np.ndarray, margin: int, part: Window) -> np.ndarray:
     if inside is not None:
         inside.moved(-part.row, -part.col).cut(walled)[...] = inside.moved(-margin, -margin).cut(obstacles)
     return walled
-
-
-def _with_infinity(squared: np.ndarray) -> np.ndarray:
-    """Convert squared distances to float64, infinite without an obstacle."""
-    return np.where(squared == NO_OBSTACLE, np.inf, squared.astype(np.float64))

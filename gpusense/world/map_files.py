@@ -97,12 +97,14 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
         table = _cell_table(meta)
         cells = np.empty((raster.rows, raster.cols), np.int8)
         end, freed = raster.rows, 0
+        # Whether the grey that map_saver writes for unknown cells is free.
+        frees = meta.mode == "trinary" and not meta.negate and table[UNKNOWN_GREY] == 0
         for greys, opaque in raster.strips:
             block = cells[end - len(greys) : end][::-1]
             block[:] = mapped(greys, table)
             if opaque is not None and meta.mode != "raw":
                 block[~opaque] = -1
-            if _frees_unknown(meta, table):
+            if frees:
                 freed += int(np.count_nonzero((greys == UNKNOWN_GREY) & (block == 0)))
             end -= len(block)
     if freed:
@@ -268,11 +270,6 @@ def _cell_table(meta: _MapYaml) -> NDArray[np.int8]:
         share = (p[between] - free) / single(meta.occupied_thresh - meta.free_thresh) * single(100)
         cells[between] = np.floor(share.astype(np.float64) + 0.5)
     return cells
-
-
-def _frees_unknown(meta: _MapYaml, table: NDArray[np.int8]) -> bool:
-    """Return whether the grey that map_saver writes for unknown cells is free."""
-    return meta.mode == "trinary" and not meta.negate and bool(table[UNKNOWN_GREY] == 0)
 
 
 def _check_no_image(file: Path) -> None:

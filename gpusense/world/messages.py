@@ -69,14 +69,9 @@ def rotation_matrix(x: float, y: float, z: float, w: float) -> np.ndarray:
     ])  # fmt: skip
 
 
-def rotation_of(name: str, quaternion: object) -> np.ndarray:
-    """Return the (3, 3) rotation matrix of a quaternion with fields x, y, z and w."""
-    return rotation_matrix(*unit_quaternion(name, quaternion))
-
-
 def planar_part(name: str, pose: object) -> tuple[tuple[float, float, float], float]:
     """Return (x, y, yaw) of a pose with fields position and orientation, and its tilt [rad]."""
-    rotation = rotation_of(f"{name}.orientation", field(name, pose, "orientation"))
+    rotation = rotation_matrix(*unit_quaternion(f"{name}.orientation", field(name, pose, "orientation")))
     x, y = (real_field(name, pose, f"position.{axis}") for axis in "xy")
     return (x, y, math.atan2(rotation[1, 0], rotation[0, 0])), tilt_of(rotation)
 

@@ -136,7 +136,10 @@ class BumperModel(PointModel):
             return cast(np.ndarray, self._score(poses, out, None, left_out))
         sizes = np.diff(self._start)
         kept = np.repeat(valid, sizes)
-        points = [self._backend.upload(each) for each in self._select(kept)] if not kept.all() else self._all_points
+        points = self._all_points
+        if not kept.all():
+            chosen = split(self._points[kept] / self.grid.resolution, self._real)
+            points = [self._backend.upload(each) for each in chosen]
         start = np.concatenate([[0], np.cumsum(sizes[valid])]).astype(np.int32)
         known = states[valid].astype(np.int32)
         flags = self._flags | flags_if(TWO_PART_POINTS=self._real == np.float32)
@@ -218,10 +221,6 @@ class BumperModel(PointModel):
             why = "positions are split into cell and fraction in float64"
             omissions.append(Omission("float64", why, "half the bytes and wide units"))
         return "bumper", omissions
-
-    def _select(self, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        high, low = split(self._points[kept] / self.grid.resolution, self._real)
-        return high, low
 
     def _states(self, pressed: object) -> np.ndarray:
         """Return (B,) states: 1 pressed, 0 released, -1 missing."""

@@ -184,8 +184,7 @@ def end_points_of(model: LikelihoodFieldModel, ranges: np.ndarray) -> tuple[list
     choice, vectors = BeamChoice.of(model.beams, scanner.count), ray_vectors(scanner.bearings, scanner.mount)
     mount = np.array(scanner.mount[:2])
     is_hit = classify(ranges, scanner) == Reading.HIT
-    all_used = len(choice.columns) == scanner.count <= choice.most
-    hits = [hit.nonzero()[0] if all_used else choice.used(hit).nonzero()[0] for hit in is_hit]
+    hits = [(hit if choice.every else choice.used(hit)).nonzero()[0] for hit in is_hit]
     return hits, [scan[hit, None] * vectors[hit] + mount for scan, hit in zip(ranges, hits, strict=True)]
 
 

@@ -71,7 +71,7 @@ class Gradients:
         self._run(request.poses, piece, readings, rows)
 
     def _split(self, scans: ClassedScans) -> ClassedScans:
-        """Return scans as they are copied."""
+        """Return scans to copy."""
         return scans
 
     def _run(self, poses: Poses, piece: Piece, readings: Readings, rows: np.ndarray) -> None:
@@ -103,7 +103,7 @@ class Gradients:
 
 
 class Climbs(Gradients):
-    """Climbs of S poses, one of each scan, to maxima of the likelihood; see the kernel file ``field_climb``.
+    """Climbs of S poses, each with a scan, to maxima of the likelihood; see the kernel file ``field_climb``.
 
     On GPUs a scan is split into parts, each with a pose, since a work-item evaluates a pose.
     """

@@ -51,7 +51,7 @@ class Fitted(Generic[P]):
 
     def to_dict(self) -> dict[str, Any]:
         """Return all attributes except arrays of readings as plain numbers, lists and strings; None if not finite."""
-        return {one.name: _plain(getattr(self, one.name)) for one in fields(self) if one.repr}
+        return plain_fields(self)
 
     def _rows(self) -> list[FitRow]:
         """List the rows of the table."""
@@ -263,12 +263,17 @@ def _offset(name: str, value: float, error: float, is_fitted: bool) -> FitRow:
     return FitRow(name, value, error, "fitted" if is_fitted else "estimated, not in the parameters")
 
 
+def plain_fields(value: Any) -> dict[str, Any]:
+    """Return the shown fields of a result as plain numbers, lists, strings and dictionaries of these."""
+    return {one.name: _plain(getattr(value, one.name)) for one in fields(value) if one.repr}
+
+
 def _plain(value: Any) -> Any:
     """Return parameters, arrays and mappings as dictionaries and lists of plain values."""
     if hasattr(value, "to_dict"):
         return value.to_dict()
-    if isinstance(value, np.ndarray):
-        return [_plain(number) for number in value.tolist()]
+    if isinstance(value, (np.ndarray, tuple)):
+        return [_plain(one) for one in (value if isinstance(value, tuple) else value.tolist())]
     if isinstance(value, dict):
         return {name: _plain(number) for name, number in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value

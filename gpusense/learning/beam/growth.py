@@ -21,8 +21,7 @@ from gpusense.learning.beam.point import Bounds
 from gpusense.learning.beam.shapes import without_ranges
 from gpusense.learning.fitted import BeamFit
 from gpusense.learning.point.densities import by_shape, truncated
-from gpusense.learning.point.problem import Climb, Problem, climb, maximize, mix, of_weight
-from gpusense.learning.point.report import report
+from gpusense.learning.point.problem import Climb, Problem, climb, maximize, mix, of_weight, report
 from gpusense.world.hit_shapes import SHAPES, HitName, HitShape
 from gpusense.world.hit_tables import TabulatedHit
 from gpusense.world.parameters import BeamParameters

@@ -22,7 +22,7 @@ from gpusense.learning.beam.pairs import Pairs, make_pairs
 from gpusense.learning.beam.point import Bounds, Point, first_guess
 from gpusense.learning.beam.problem import Prior
 from gpusense.learning.beam.shapes import fit_shape
-from gpusense.learning.fitted import BeamFit
+from gpusense.learning.fitted import BeamFit, plain_fields
 from gpusense.world.hit_shapes import SHAPES, HitName
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.scanner import Reading
@@ -126,15 +126,7 @@ class IncidenceFit:
 
     def to_dict(self) -> dict[str, Any]:
         """Return all attributes as plain numbers, lists and strings."""
-        return {
-            "parameters": self.parameters.to_dict(),
-            "pooled": self.pooled.to_dict(),
-            "fits": [fit.to_dict() for fit in self.fits],
-            "counts": list(self.counts),
-            "no_surface": None if self.no_surface is None else self.no_surface.to_dict(),
-            "no_surface_count": self.no_surface_count,
-            "strength": self.strength,
-        }
+        return plain_fields(self)
 
     def __repr__(self) -> str:
         return (

@@ -15,8 +15,7 @@ from gpusense._util.typing import Floats
 from gpusense.learning.fitted import PointFit
 from gpusense.learning.information import number_blocks
 from gpusense.learning.point.densities import von_mises, wrapped_normal
-from gpusense.learning.point.problem import Problem, maximize, mix, of_weight, places_of
-from gpusense.learning.point.report import report
+from gpusense.learning.point.problem import Problem, maximize, mix, of_weight, places_of, report
 from gpusense.world.sensor_parameters import HeadingParameters, PositionParameters
 
 _LOG_TWO_PI = math.log(2 * math.pi)

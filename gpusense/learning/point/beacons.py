@@ -14,8 +14,7 @@ from gpusense._util.typing import Floats, Integers
 from gpusense.learning.fitted import PointFit
 from gpusense.learning.information import number_blocks
 from gpusense.learning.point.densities import truncated
-from gpusense.learning.point.problem import Problem, maximize, mix, of_weight, places_of
-from gpusense.learning.point.report import report
+from gpusense.learning.point.problem import Problem, maximize, mix, of_weight, places_of, report
 from gpusense.world.hit_shapes import NORMAL, StudentHit
 from gpusense.world.range_causes import RandomDensity
 from gpusense.world.sensor_parameters import MOST_DEGREES, BeaconParameters

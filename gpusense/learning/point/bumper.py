@@ -14,8 +14,7 @@ from gpusense._util.typing import Floats, Precision, Space
 from gpusense.backends import Selection, get_backend
 from gpusense.learning.fitted import PointFit
 from gpusense.learning.information import number_blocks
-from gpusense.learning.point.problem import Problem, maximize, mix, of_weight
-from gpusense.learning.point.report import report
+from gpusense.learning.point.problem import Problem, maximize, mix, of_weight, report
 from gpusense.models.point.bumper import BumperModel
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.sensor_parameters import BumperParameters

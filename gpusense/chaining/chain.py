@@ -26,7 +26,7 @@ from gpusense.chaining.joint import Joint
 from gpusense.chaining.links import CLOSURE, Links
 from gpusense.chaining.matcher import Matcher, TeamMatcher, signed_duration
 from gpusense.chaining.motion import relative
-from gpusense.chaining.options import ChainOptions, check_durations, check_steps, check_times
+from gpusense.chaining.options import ChainOptions, check_durations, check_step, check_times
 from gpusense.chaining.place_recognition import place_points_of
 from gpusense.chaining.result import ScanChain, doubts_of
 from gpusense.chaining.selected import pose_covariances
@@ -48,7 +48,6 @@ def chain_scans(
     duration: float | Sequence[float] = 0.0,
     motion: OdometryMotion | None = None,
     step: ArrayLike = (0.02, 0.01),
-    key_step: ArrayLike = (0.5, 0.35),
     close_loops: bool = True,
     precision: Precision = "float32",
     backend: Selection = "auto",
@@ -76,7 +75,6 @@ def chain_scans(
             best agreement of scans is used. 0: at once. For several scanners optionally a number each.
         motion: Noise of the odometry. None: fitted to the matches.
         step: Least motion by odometry of a matched scan [m, rad]; other scans cost nothing.
-        key_step: Motion between key scans [m, rad].
         close_loops: Whether to search for revisited places.
         precision: Precision of the matches, ``"float32"`` or ``"float64"``.
         backend: The device, see :func:`gpusense.devices`.
@@ -97,7 +95,7 @@ def chain_scans(
     """
     chainer = Chainer(
         scans, scanner, odometry, sensor=sensor, times=times, duration=duration, motion=motion, step=step,
-        key_step=key_step, close_loops=close_loops, precision=precision, backend=backend,
+        close_loops=close_loops, precision=precision, backend=backend,
     )  # fmt: skip
     for _ in chainer.steps():
         pass
@@ -118,7 +116,6 @@ class Chainer:
         duration: float | Sequence[float] = 0.0,
         motion: OdometryMotion | None = None,
         step: ArrayLike = (0.02, 0.01),
-        key_step: ArrayLike = (0.5, 0.35),
         close_loops: bool = True,
         precision: Precision = "float32",
         backend: Selection = "auto",
@@ -137,7 +134,7 @@ class Chainer:
             raise TypeError(f"motion: must be an OdometryMotion, got {checks.show(motion)}")
         checks.boolean("close_loops", close_loops)
         self._options = ChainOptions(
-            check_steps("step", step), check_steps("key_step", key_step), 0.0, motion, close_loops, backend, precision,
+            check_step(step), 0.0, motion, close_loops, backend, precision,
         )  # fmt: skip
         self._fronts = [self._new_front(one) for one in range(len(data.scanners))]
         self._loops: tuple[Joint, Loops] | None = None

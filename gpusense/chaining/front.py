@@ -23,6 +23,8 @@ from gpusense.localization.pose_algebra import compose_poses, invert_poses, pose
 from gpusense.matching.result import ScanMatch
 from gpusense.world.scanner import Scanner
 
+# Motion between key scans [m, rad].
+_KEY_STEP, _KEY_TURN = 0.5, 0.35
 # Number of preceding key scans to match with a key scan.
 LOCAL = 4
 # Least p_right of a failed match that is still a better guess than constant motion.
@@ -243,12 +245,11 @@ class Front:
     def _choose_keys(self, begin: int, end: int) -> None:
         """Choose key scans among nodes: after a motion, and on both sides of a failed match."""
         poses, sure = self.poses.tolist(), (self.p_right >= SURE).tolist()
-        length, turn = self._options.key_step
         for k in range(begin, end):
             (x, y, theta), (last_x, last_y, last_theta) = poses[k], poses[self.keys[-1]]
             if not sure[k - 1]:
                 self.keys += [n for n in (k - 1, k) if n > self.keys[-1]]
-            elif math.hypot(x - last_x, y - last_y) >= length or abs(wrapped(theta - last_theta)) >= turn:
+            elif math.hypot(x - last_x, y - last_y) >= _KEY_STEP or abs(wrapped(theta - last_theta)) >= _KEY_TURN:
                 self.keys.append(k)
 
     def _match_locally(self, last: bool) -> None:

@@ -24,7 +24,6 @@ class ChainOptions:
     """Options of a chain."""
 
     step: tuple[float, float]  # least motion by odometry of a matched scan [m, rad]
-    key_step: tuple[float, float]  # motion between key scans [m, rad]
     duration: float  # time from the first beam of a scan to the last one [s]
     motion: OdometryMotion | None  # noise of the odometry; None to fit it to the matches
     close_loops: bool  # whether to search for revisited places
@@ -32,11 +31,11 @@ class ChainOptions:
     precision: Precision  # precision of the matches
 
 
-def check_steps(name: str, value: object) -> tuple[float, float]:
+def check_step(value: object) -> tuple[float, float]:
     """Return a step in x and y [m], and a turn [rad]."""
-    values = checks.array(name, value, (2,))
-    length = checks.real(f"{name}[0]", float(values[0]), low=0.0, high=checks.FARTHEST)
-    return length, checks.real(f"{name}[1]", float(values[1]), low=0.0, high=math.pi + 1e-9)
+    values = checks.array("step", value, (2,))
+    length = checks.real("step[0]", float(values[0]), low=0.0, high=checks.FARTHEST)
+    return length, checks.real("step[1]", float(values[1]), low=0.0, high=math.pi + 1e-9)
 
 
 def check_times(times: object, scans: int) -> Floats | None:

@@ -84,19 +84,17 @@ def landmarks_of_map(
     *,
     kinds: str | Sequence[str] = MAP_KINDS,
     range_max: float = _RANGE,
-    spacing: float = _SPACING,
     backend: Selection = "auto",
 ) -> FeatureMap:
     """Make landmarks and lines from the features of scans cast in a map.
 
-    Scans of 720 beams are cast from free positions all over the map, and :func:`map_features` clusters their features.
-    The rounding of walls to cells counts as noise.
+    At most 4000 scans of 720 beams are cast from free positions all over the map, at least a metre apart, and
+    :func:`map_features` clusters their features. The rounding of walls to cells counts as noise.
 
     Args:
         grid: The map.
         kinds: Kinds out of "line", "corner", "door", "pole" and "reflector".
         range_max: Range of the scans [m].
-        spacing: Distance between neighbouring scans [m]; enlarged to keep the number of scans at 4000.
         backend: The device, see ``gpusense.devices()``.
 
     Raises:
@@ -113,7 +111,7 @@ def landmarks_of_map(
     checks.instance("grid", grid, OccupancyGrid)
     kinds = check_kinds("kinds", kinds, MAP_KINDS)
     limit = checks.real("range_max", range_max, above=0, high=checks.FARTHEST)
-    poses = _free_places(grid, checks.real("spacing", spacing, low=checks.SMALLEST, high=checks.FARTHEST))
+    poses = _free_places(grid)
     scanner = Scanner(np.arange(_BEAMS) * (2 * math.pi / _BEAMS) - math.pi, limit)
     ranges = np.zeros((0, _BEAMS))
     if len(poses):
@@ -122,13 +120,13 @@ def landmarks_of_map(
     return map_features(features, poses, kinds=kinds, pose_deviation=(0.5 * grid.resolution, 0.0), least=_VIEWS)
 
 
-def _free_places(grid: OccupancyGrid, spacing: float) -> Floats:
+def _free_places(grid: OccupancyGrid) -> Floats:
     """Return (S, 3) poses of heading 0 on a lattice of free cells away from obstacles."""
     from scipy.ndimage import distance_transform_edt
 
     blocked = np.pad(grid.occupied | grid.unknown, 1, constant_values=True)
     room = distance_transform_edt(~blocked)[1:-1, 1:-1] * grid.resolution
-    step = max(round(spacing / grid.resolution), 1)
+    step = max(round(_SPACING / grid.resolution), 1)
     while True:
         first = min(step // 2, min(grid.shape) // 2)
         part = room[first::step, first::step]

@@ -11,7 +11,8 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.evaluation import held_out, range_data
 from gpusense.learning.beam.fit import fit_beam_parameters
-from gpusense.learning.discrete.table import DiscreteBeamModel, DiscreteCauses
+from gpusense.learning.discrete.causes import DiscreteCauses
+from gpusense.learning.discrete.table import DiscreteBeamModel
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.sweeps.job import Job

@@ -342,7 +342,6 @@ def test_a_run_that_is_interrupted_keeps_what_it_has(lap: tuple[np.ndarray, ...]
         ({"duration": -1.0}, "duration"),
         ({"step": (0.1,)}, "step"),
         ({"step": (-0.1, 0.0)}, r"step\[0\]"),
-        ({"key_step": (0.5, 9.0)}, r"key_step\[1\]"),
         ({"precision": "half"}, "precision"),
         ({"backend": "abacus"}, "backend"),
     ],

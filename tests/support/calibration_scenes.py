@@ -13,7 +13,8 @@ from support.calibration import Draw, Score
 from gpusense.backends import Selection
 from gpusense.evaluation.buildings import building
 from gpusense.evaluation.worlds import cloud_uniform
-from gpusense.learning.discrete.table import DiscreteBeamModel, DiscreteCauses
+from gpusense.learning.discrete.causes import DiscreteCauses
+from gpusense.learning.discrete.table import DiscreteBeamModel
 from gpusense.models.landmark.lines import LineModel
 from gpusense.models.landmark.model import LandmarkModel
 from gpusense.models.point.absolute import HeadingModel, PositionModel

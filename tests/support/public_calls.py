@@ -370,8 +370,8 @@ def _add_learning(s: SimpleNamespace, add: Any, made: Any) -> None:
         landmarks=landmarks, correspondence=known, scan=scans, range_max=20.0, field_of_view=6.28, signature_span=None,
         mount=(0.0, 0.0, 0.0), bias=False, initial=None, **search)  # fmt: skip
     add("suspicious_landmarks", lambda: gs.suspicious_landmarks, poses=s.many[scans], features=np.concatenate(seen),
-        landmarks=landmarks, correspondence=known, parameters=gs.LandmarkParameters(), mount=(0.0, 0.0, 0.0),
-        least_gain=20.0, least_readings=5)  # fmt: skip
+        landmarks=landmarks, correspondence=known, parameters=gs.LandmarkParameters(),
+        mount=(0.0, 0.0, 0.0))  # fmt: skip
     solver = dict(weights=np.ones(4), loss="huber", loss_scale=1.0)
     add("trilaterate", lambda: gs.trilaterate, xy=s.beacons, ranges=s.distances, sigma=0.1, **solver)
     add("triangulate", lambda: gs.triangulate, xy=s.beacons, bearings=s.bearings, heading=0.0, sigma=0.05, **solver)
@@ -408,14 +408,14 @@ def _add_matching(s: SimpleNamespace, add: Any, made: Any) -> None:
         occupied_threshold=65, motion=None, backend=BACKEND)  # fmt: skip
     few = s.ranges[[0, 1, 0, 1]]
     add("chain_scans", lambda: gs.chain_scans, scans=few, scanner=s.scanner, odometry=s.poses[[0, 1, 0, 1]],
-        sensor=None, times=np.arange(4.0), duration=0.0, motion=None, step=(0.02, 0.01), key_step=(0.5, 0.35),
+        sensor=None, times=np.arange(4.0), duration=0.0, motion=None, step=(0.02, 0.01),
         close_loops=False, precision="float32", backend=BACKEND)  # fmt: skip
     add("extract_features", lambda: gs.extract_features, ranges=s.ranges, scanner=s.scanner, kinds=("line", "corner"),
         backend=BACKEND, noise=0.02, intensities=np.ones_like(s.ranges))  # fmt: skip
     features = gs.extract_features(s.ranges, s.scanner, backend=BACKEND)
     add("map_features", lambda: gs.map_features, features=features, poses=s.poses, kinds=("line", "corner"),
         pose_deviation=(0.03, 0.01), least=1)  # fmt: skip
-    add("landmarks_of_map", lambda: gs.landmarks_of_map, grid=s.grid, kinds="line", range_max=6.0, spacing=1.0,
+    add("landmarks_of_map", lambda: gs.landmarks_of_map, grid=s.grid, kinds="line", range_max=6.0,
         backend=BACKEND)  # fmt: skip
     add("Features.of_scan", lambda: features.of_scan, scan=0)
     add("Features.range_bearing", lambda: features.range_bearing, kind="corner")

@@ -15,6 +15,9 @@ from gpusense.models.landmark.tables import span_of
 from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.parameters import LandmarkParameters
 
+# Smallest gain of an exchange [nats], and least number of features for judging a landmark.
+_LEAST_GAIN, _FEWEST = 20.0, 5
+
 
 @dataclass(frozen=True)
 class Exchange:
@@ -64,15 +67,14 @@ def suspicious_landmarks(
     parameters: LandmarkParameters,
     *,
     mount: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    least_gain: float = 20.0,
-    least_readings: int = 5,
 ) -> Suspicions:
     """Find exchanged and misplaced landmarks by comparing features with the positions of all landmarks.
 
     S[j, k] is the log-likelihood of the features labelled j at the position of landmark k, false positives included.
     Landmarks j and k are reported as exchanged if each fits better at the other's position, S[j, k] > S[j, j] and S[k,
-    j] > S[k, k], and both gains together are at least ``least_gain``. The parameters may be fitted to the same
-    features, since false positives absorb features that do not fit. Signatures are ignored.
+    j] > S[k, k], and both gains together are at least 20 nats. Landmarks with fewer than 5 features are not judged. The
+    parameters may be fitted to the same features, since false positives absorb features that do not fit. Signatures are
+    ignored.
 
     Args:
         poses: (F, 3) pose of the robot for each feature [m, m, rad].
@@ -81,8 +83,6 @@ def suspicious_landmarks(
         correspondence: (F,) labelled landmark of each feature, -1 for none.
         parameters: Parameters of the sensor; a z_false or z_detect below 1e-3 counts as 1e-3.
         mount: The sensor's pose on the robot [m, m, rad].
-        least_gain: Smallest gain of an exchange [nats], > 0.
-        least_readings: Least number of features for judging a landmark.
 
     Returns:
         Exchanged pairs, and landmarks that agree with less than half of their features.
@@ -105,15 +105,13 @@ def suspicious_landmarks(
     known = check_correspondence(correspondence, len(full), len(landmarks))
     robots = checks.array("poses", poses, (len(full), 3), largest=checks.FARTHEST)
     x, y, yaw = (float(number) for number in checks.array("mount", mount, (3,), largest=checks.FARTHEST))
-    least = checks.real("least_gain", least_gain, above=0)
-    fewest = checks.integer("least_readings", least_readings, low=1)
     full[:, 2] = np.nan
     used = (known >= 0) & (~np.isnan(full)).any(axis=1)
     known, full, sensors = known[used], full[used], sensor_poses(robots[used], (x, y, yaw))
     count = np.bincount(known, minlength=len(landmarks))
     log_p, agree = _scores(full, sensors, known, count, landmarks, parameters)
-    judged = np.flatnonzero(count >= fewest)
-    exchanged = _exchanges(judged, count, log_p, agree, least)
+    judged = np.flatnonzero(count >= _FEWEST)
+    exchanged = _exchanges(judged, count, log_p, agree)
     explained = {index for pair in exchanged for index in (pair.first, pair.second)}
     misplaced = [
         Misplaced(int(j), int(count[j]), float(agree[j, j])) for j in judged if j not in explained and agree[j, j] < 0.5
@@ -121,7 +119,7 @@ def suspicious_landmarks(
     return Suspicions(tuple(exchanged), tuple(misplaced))
 
 
-def _exchanges(judged: np.ndarray, count: np.ndarray, log_p: Floats, agree: Floats, least: float) -> list[Exchange]:
+def _exchanges(judged: np.ndarray, count: np.ndarray, log_p: Floats, agree: Floats) -> list[Exchange]:
     """Return disjoint exchanges among the judged landmarks, the largest gain first.
 
     Rows of ``log_p`` and ``agree`` (M, M) are labels of features, columns positions.
@@ -130,7 +128,7 @@ def _exchanges(judged: np.ndarray, count: np.ndarray, log_p: Floats, agree: Floa
     for place, j in enumerate(judged):
         for k in judged[place + 1 :]:
             gains = log_p[j, k] - log_p[j, j], log_p[k, j] - log_p[k, k]
-            if min(gains) > 0 and sum(gains) >= least:
+            if min(gains) > 0 and sum(gains) >= _LEAST_GAIN:
                 candidates.append(Exchange(
                     int(j), int(k), (int(count[j]), int(count[k])), float(sum(gains)),
                     (float(agree[j, j]), float(agree[k, k])), (float(agree[j, k]), float(agree[k, j])),

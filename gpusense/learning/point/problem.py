@@ -285,7 +285,7 @@ def _errors(problem: Problem, end: Climb, blocks: Integers | None) -> dict[str, 
     if blocks is not None:
         size, gradients = int(blocks.max()) + 1, problem.log_p(end.theta)[1][:, free]
         scatter = scatter_of(np.stack([np.bincount(blocks, column, size) for column in gradients.T], axis=1))
-    errors = errors_of(-problem.hessian(end.theta, free), rows, scatter)
+    errors = errors_of(-problem.hessian(end.theta, free), rows, scatter, _NEGATIVE)
     errors[~rows.any(axis=1)] = math.nan
     return dict(zip(problem.values(end.theta), errors.tolist(), strict=True))
 

@@ -77,6 +77,21 @@ def test_without_growth_the_fit_is_the_plain_one() -> None:
     assert fit.range_bias_error == pytest.approx(plain.range_bias_error, rel=1e-3)
 
 
+@pytest.mark.parametrize("options", [{}, {"hit": "student"}, {"range_bias": True}], ids=str)
+def test_readings_at_one_range_do_not_determine_the_growth(options: dict[str, Any]) -> None:
+    """Only sigma_hit + sigma_growth z* is determined; over blocks, gradients vanish along the other direction."""
+    rng = np.random.default_rng(0)
+    z, blocks = 4 + rng.normal(0, 0.1, 400), np.arange(400) // 20
+    for labels in (None, blocks):
+        fit = gs.fit_beam_parameters(
+            z, np.full(400, 4.0), 8.0, sigma_growth=True, blocks=labels, backend="numpy", **options
+        )
+        for name in ("sigma_hit", "sigma_growth"):
+            assert fit.standard_errors[name] == fit.independent_errors[name] == np.inf
+            assert fit.held[name] == "the readings do not determine it"
+        assert np.isfinite(fit.range_bias_error)
+
+
 def test_bad_input() -> None:
     with pytest.raises(TypeError, match=r"^sigma_growth: must be True or False, got 1$"):
         gs.fit_beam_parameters([1.0], [1.0], 10.0, sigma_growth=1)

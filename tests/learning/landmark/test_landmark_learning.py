@@ -243,8 +243,6 @@ def test_bad_input(options, kind, message):
     [
         ({"landmarks": None}, TypeError, "landmarks: must be a LandmarkMap, got None"),
         ({"parameters": None}, TypeError, "parameters: must be LandmarkParameters, got None"),
-        ({"least_gain": 0}, ValueError, "least_gain: must be finite and > 0, got 0"),
-        ({"least_readings": 0}, ValueError, "least_readings: must be >= 1, got 0"),
         ({"poses": POSES[:1]}, ValueError, "poses: shape must be (2, 3), got (1, 3)"),
         ({"correspondence": [0, 5]}, ValueError, "correspondence: indices must be in [-1, 2), got 5 at index 1"),
     ],

@@ -10,7 +10,6 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
-from gpusense.backends.registry import BY_NAME
 from gpusense.interface import structs
 from gpusense.interface.casters import ENTRIES, CasterEntry
 from gpusense.world.windows import Window
@@ -44,7 +43,6 @@ class Caster(ABC):
         memory: Memory on the device, in words.
         precomputation: Work on the map before the first ray, in words.
         knobs: Parameters that trade error for time, in words.
-        backends: Backends that implement it.
         whole: True if the table needs the whole map at once.
         ring: True if a ring of cells in the table represents space outside the grid.
         stops: True if a ray may end before the longest range.
@@ -56,7 +54,6 @@ class Caster(ABC):
     memory: ClassVar[str]
     precomputation: ClassVar[str]
     knobs: ClassVar[str] = "none"
-    backends: ClassVar[tuple[str, ...]] = tuple(BY_NAME)
     whole: ClassVar[bool] = False
     ring: ClassVar[bool] = True
     stops: ClassVar[bool] = True

@@ -103,7 +103,10 @@ def read_mapping(file: Path) -> dict[Any, Any]:
     """Read the mapping in a YAML file of plain values; numbers are decimal."""
     import yaml
 
-    text = _bounded(file, _LARGEST_YAML_BYTES, "a YAML file")
+    with file.open("rb") as stream:
+        text = stream.read(_LARGEST_YAML_BYTES + 1)
+    if len(text) > _LARGEST_YAML_BYTES:
+        raise ValueError(f"{file}: must be a YAML file of at most {_LARGEST_YAML_BYTES} bytes, got a larger file")
     try:
         check_yaml(text)
         loader = _loader()(text)
@@ -152,12 +155,3 @@ def _problem(error: Exception) -> str:
         if text := getattr(error, name, None):
             return " ".join(str(text).split())
     return str(error) if type(error) is ValueError and str(error) else type(error).__name__
-
-
-def _bounded(file: Path, most: int, kind: str) -> bytes:
-    """Return the bytes of a file, up to a bound."""
-    with file.open("rb") as stream:
-        text = stream.read(most + 1)
-    if len(text) > most:
-        raise ValueError(f"{file}: must be {kind} of at most {most} bytes, got a larger file")
-    return text

@@ -120,8 +120,8 @@ kernel void free_rows(ARGUMENTS) {
     runs[(long)band * cols + cell] = (uchar)min(left, LONGEST);
 }
 
-// Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a sector of TALL
-// cells of a column in a quadrant, from the far end on. height and width are the sides of the highest rectangle of
+// Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a sector of
+// TALL cells of a column in a quadrant, from the far end on. height and width are the sides of the highest rectangle of
 // sufficient width, narrower is the width of a rectangle that is one row higher, and bound is the number of rows to the
 // nearest row with this width. From one cell to the next the height grows by one at most, and its rows without the new
 // row allow every smaller height. So the next cell's sides need no other row, unless the row that bounds the width is

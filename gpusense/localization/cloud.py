@@ -79,10 +79,14 @@ class Cloud(Particles):
 
     def upload_settings(self, settings: np.ndarray) -> None:
         """Copy the settings of a step to the device."""
-        self._uploads.append(settings)
-        self.backend.upload(settings, self.settings, wait=False)
+        self.backend.upload(self._held(settings), self.settings, wait=False)
+
+    def _held(self, array: np.ndarray) -> np.ndarray:
+        """Return an array, kept alive until the device has read it."""
         if len(self._uploads) > 64:
             self.wait()
+        self._uploads.append(array)
+        return array
 
     def wait(self) -> None:
         """Wait until the device is idle."""
@@ -190,8 +194,7 @@ class Cloud(Particles):
             prepared, self._prepared = self._prepared(), None
             for place, (_, scan) in enumerate(prepared):
                 if self._given is None:
-                    self._uploads.append(scan)
-                    self.backend.refill(scan, self.scans[place])
+                    self.backend.refill(self._held(scan), self.scans[place])
                 else:
                     self._given[self.inputs.spans[1 + len(self.readings) + place]] = scan
             self._judges = [judge for judge, _ in prepared]
@@ -245,15 +248,15 @@ class Cloud(Particles):
 
     def _start(self, recorded: RecordedProgram, *, read: bool) -> None:
         """Start a stage, and copy a correction's inputs and results with it: one graph of a CUDA device."""
-        backend = self.backend
+        backend, given, self._given = self.backend, self._given, None
+        if given is not None:
+            self._held(given)
         backend.begin_batch()
         try:
-            if self._given is not None:
-                self._uploads.append(self._given)
-                backend.upload(self._given, self.inputs.buffer, wait=False)
+            if given is not None:
+                backend.upload(given, self.inputs.buffer, wait=False)
                 for source, target, size in self._adopted:
                     backend.copy(source, target, size)
-                self._given = None
             recorded({})
             if read and backend.in_batch:
                 results = backend.download(self.results.buffer, np.empty(self.results.size), wait=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import weakref
 
 import numpy as np
 import pytest
@@ -63,6 +64,21 @@ def test_a_correction_is_one_graph_with_a_copy_of_its_inputs_and_one_of_its_resu
         if step > 4 and pf._cloud.summary().stages == 1:
             assert copies == ["upload", "download"]
             assert pf.explain().endswith("launches and 2 copies")
+
+
+def test_steps_keep_the_inputs_of_few_steps_alive(warp_as_gpu, monkeypatch):
+    made: list[weakref.ref[np.ndarray]] = []
+    upload = type(warp_as_gpu).upload
+    monkeypatch.setattr(
+        type(warp_as_gpu), "upload",
+        lambda self, array, *a, **k: (made.append(weakref.ref(array)), upload(self, array, *a, **k))[1],
+    )  # fmt: skip
+    pf, _ = tracked(2)
+    for _ in range(200):
+        pf.predict((0, 0, 0), (0.001, 0, 0))
+        pf.correct(np.full(60, 2.0))
+        pf.estimate()
+    assert len(made) > 200 and sum(one() is not None for one in made) < 150
 
 
 @pytest.mark.parametrize("graphs", [False, True])

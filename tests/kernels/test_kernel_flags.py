@@ -116,6 +116,7 @@ def test_flags_that_are_off_leave_no_trace_in_opencl(
     assert "#if" not in source.split("#line 1", 1)[1]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.sampled(0.08)
 @traces
 def test_flags_that_are_off_leave_no_trace_in_warp(

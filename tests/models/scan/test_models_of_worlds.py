@@ -108,6 +108,7 @@ def test_expected_ranges_incidence_and_samples_are_those_of_single_maps(scene: d
     assert drawn[first].tobytes() == alone.sample(places, seed=3)[first].tobytes()
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("name", ["beam", "field"])
 def test_replaced_worlds_change_scores(name: str, scene: dict[str, Any], backend: str) -> None:
     kind, options = MODELS[name]

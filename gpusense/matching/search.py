@@ -154,12 +154,18 @@ class _Run:
         else:
             there, made = given, [np.zeros(size, np.int32) for size in sizes.values()]
             place = get_backend("numpy").compile("place_ends", _NO_FLAGS)
-        place((self._most, self._items), *there, *made, self._items, self._turns, self._tables.stride,
-              self._level, self._tables.step(self._level).bit_length() - 1, folded.offset)  # fmt: skip
+        for begin, end in self._parts_of_items():
+            place((self._most, end - begin), *there, *made, begin, end, self._turns, self._tables.stride,
+                  self._level, self._tables.step(self._level).bit_length() - 1, folded.offset)  # fmt: skip
         if not self._backend.info.float64:
             there = [space.upload(name, array) for name, array in zip(_GIVEN, given, strict=True)]
             made = [space.upload(name, array) for name, array in zip(sizes, made, strict=True)]
         self._ends, self._folded_ends = (made[0], there[4], there[3]), (made[1], made[2], there[3])
+
+    def _parts_of_items(self) -> list[tuple[int, int]]:
+        """Return the first item of each launch, and the one after its last."""
+        begins = range(0, self._items, _MOST_ITEMS)
+        return [(begin, min(begin + _MOST_ITEMS, self._items)) for begin in begins]
 
     def search(self) -> None:
         """Find first lower bounds, then divide all blocks whose bounds reach them."""
@@ -192,11 +198,10 @@ class _Run:
 
     def _bound(self) -> None:
         """Bound all blocks: scores (S * A, rows, cols), -1 where none is allowed, and the best of each row."""
-        folded, items, rows = self._tables.folded(self._level), self._items, self._items * self._height
+        folded, rows = self._tables.folded(self._level), self._items * self._height
         self._score = self._space.empty("bounds", rows * self._width, _INT)
         flags = with_lanes_flag(self._backend.info.lanes, "shift_scores", _NO_FLAGS)
-        for begin in range(0, items, _MOST_ITEMS):
-            end = min(begin + _MOST_ITEMS, items)
+        for begin, end in self._parts_of_items():
             self._launch(
                 "shift_scores", (self._width, -(-self._height // SHIFT_ROWS), end - begin), folded.table,
                 *self._folded_ends, self._allowed[self._level], self._score, folded.shape, begin, end, self._height,

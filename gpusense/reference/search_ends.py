@@ -7,20 +7,20 @@ import numpy as np
 
 def place_ends(
     flags: frozenset[str], end: np.ndarray, heading: np.ndarray, start: np.ndarray, first: np.ndarray,
-    image: np.ndarray, point: np.ndarray, folded: np.ndarray, folded_image: np.ndarray, items: int, turns: int,
-    stride: int, level: int, step_level: int, offset: int,
+    image: np.ndarray, point: np.ndarray, folded: np.ndarray, folded_image: np.ndarray, begin: int, items: int,
+    turns: int, stride: int, level: int, step_level: int, offset: int,
 ) -> None:  # fmt: skip
     """Place the end points of scans at headings in cells of the tables, and in cells and images of a folded table."""
     period, side = stride << level, stride << (level - step_level)
-    for scan in range(items // turns):
-        begin, last = int(first[scan * turns]), int(first[(scan + 1) * turns])
-        count = (last - begin) // turns
-        x, y = end[2 * (begin // turns) : 2 * (begin // turns + count)].reshape(count, 2).T
+    for scan in range(begin // turns, items // turns):
+        at, last = int(first[scan * turns]), int(first[(scan + 1) * turns])
+        count = (last - at) // turns
+        x, y = end[2 * (at // turns) : 2 * (at // turns + count)].reshape(count, 2).T
         cos, sin = heading[2 * scan * turns : 2 * (scan + 1) * turns].reshape(turns, 2, 1).swapaxes(0, 1)
         start_x, start_y = start[2 * scan : 2 * scan + 2]
         places = np.stack([start_x + (cos * x - sin * y), start_y + (sin * x + cos * y)], axis=-1)
         cells = np.floor(places).astype(np.int32).reshape(-1, 2)
-        point[begin:last] = cells
-        folded[begin:last] = (cells + offset) // period
-        phase = (cells + offset - folded[begin:last] * period) >> step_level
-        folded_image[begin:last] = (image[begin:last] * side + phase[:, 1]) * side + phase[:, 0]
+        point[at:last] = cells
+        folded[at:last] = (cells + offset) // period
+        phase = (cells + offset - folded[at:last] * period) >> step_level
+        folded_image[at:last] = (image[at:last] * side + phase[:, 1]) * side + phase[:, 0]

@@ -17,13 +17,14 @@ def periods(cell: wp.int32, stride: wp.int32, level: wp.int32):
 
 @kernel()
 def place_ends(
-    end, heading, start, first, image, point, folded, folded_image, items, turns, stride, level, step_level,
+    end, heading, start, first, image, point, folded, folded_image, begin, items, turns, stride, level, step_level,
     offset,
 ):  # fmt: skip
     """Place the end points of a scan at a heading in cells of the tables, and in cells and images of a folded table.
     One work-item takes a point of an item.
     """
-    item, n = wp.tid()
+    part, n = wp.tid()
+    item = begin + part
     if item >= items:
         return
     k = first[item] + n

@@ -106,7 +106,7 @@ def test_kernels_have_the_sums_of_the_reference(name, needs):
         ("fold_scores", (48, 45, 8), table, np.zeros(8 * 45 * 48, np.uint8), shape, folded, 4, 2, 9, 8),
         ("pack_quarters", (63, 52, 2), table, np.zeros_like(quarters), shape, 4, 0),
         ("pack_quarters", (63, 52, 2), table, np.zeros_like(quarters), shape, 4, 1),
-        ("place_ends", (20, 6), end, heading, start, ends, image[:90], *made, 6, 3, 3, 2, 1, 18),
+        ("place_ends", (20, 6), end, heading, start, ends, image[:90], *made, 0, 6, 3, 3, 2, 1, 18),
         ("shift_scores", (21, 2, 3), losses, point, image, first, allowed, np.zeros(3 * 11 * 21, np.int32), shape,
          0, 3, 11, 21, 8),
         ("shift_scores", (21, 2, 3), table, point, image, first, allowed, np.zeros(3 * 11 * 21, np.int32), shape,

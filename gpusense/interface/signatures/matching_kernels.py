@@ -61,8 +61,8 @@ KERNELS: dict[str, Kernel] = {
     "place_ends": kernel(
         "search_ends", "point item", "double end [2 * ends]", "double heading [2 * items]", "double start [2 * scans]",
         "int first [items + 1]", "int image [points]", "out int2 point [points]", "out int2 folded [points]",
-        "out int folded_image [points]", "int items", "int turns", "int stride", "int level", "int step_level",
-        "int offset",
+        "out int folded_image [points]", "int begin", "int items", "int turns", "int stride", "int level",
+        "int step_level", "int offset",
     ),
     "shift_scores": kernel(
         "search", "col rows item", _CELLS, *_ENDS, "uchar allowed [height * width]",

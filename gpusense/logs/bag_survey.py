@@ -61,16 +61,18 @@ def survey(path: Path, topic: str | None, frame: str | None, odometry_from: str 
     odometer = odometry_topic(odometers, chosen, odometry_from)
     bag, skipped = Bag(path, chosen), _Skipped()
     bag.track.source = odometer
-    stamps = _TransformStamps()
+    # Numbers of moving transforms without and with a stamp; one with a stamp suffices.
+    stamped: Counter[bool] = Counter()
     for message in messages(path, {**scans_on(chosen), ODOMETRY: {odometer}, TRANSFORMS: None}):
         for each in message.fields.transforms if message.kind == TRANSFORMS else (message.fields,):
             try:
                 _take(bag, message, each)
-                stamps.look_at(message, each)
+                if message.kind == TRANSFORMS and not stamped[True] and not _is_static(message):
+                    stamped[stamp_of("message", each) != 0] += 1
             except ValueError as error:
                 skipped.add(message, error)
     skipped.warn(path)
-    if stamps.absent:
+    if stamped[False] > 1 and not stamped[True]:
         bag.transforms = _by_the_clock(path)
     if not bag.lasers:
         raise ValueError(f"{path}: must hold scans on {chosen}, got none{skipped.reason(chosen)}")
@@ -128,22 +130,6 @@ def _take(bag: Bag, message: Message, part: object) -> None:
 
 def _is_static(message: Message) -> bool:
     return message.topic.endswith("tf_static")
-
-
-class _TransformStamps:
-    """Search for a stamped transform."""
-
-    def __init__(self) -> None:
-        self._count, self._any = 0, False
-
-    def look_at(self, message: Message, transform: object) -> None:
-        if message.kind == TRANSFORMS and not self._any and not _is_static(message):
-            self._count += 1
-            self._any = stamp_of("message", transform) != 0
-
-    @property
-    def absent(self) -> bool:
-        return self._count > 1 and not self._any
 
 
 def _by_the_clock(path: Path) -> TransformBuffer:

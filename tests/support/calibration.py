@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from gpusense._util.typing import Floats
+
 Draw = Callable[[Floats, int], np.ndarray]
 Score = Callable[[Floats, np.ndarray], np.ndarray]
 FUNCTIONS = ("x", "y", "theta", "log p")

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from support.calibration import Draw, Score
 
+from gpusense._util.typing import Floats
 from gpusense.backends import Selection
 from gpusense.evaluation.buildings import building
 from gpusense.evaluation.worlds import cloud_uniform
@@ -33,8 +33,6 @@ from gpusense.world.sensor_parameters import (
     LineParameters,
     PositionParameters,
 )
-
-Floats = NDArray[np.float64]
 
 
 class Scene(NamedTuple):

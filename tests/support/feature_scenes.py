@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from gpusense._util.typing import Floats
 
 # Thickness of walls [m].
 WALL = 0.12

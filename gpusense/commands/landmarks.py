@@ -90,6 +90,7 @@ def run(args: argparse.Namespace) -> int:
     """Fit the noise, check the map, associate, localise, and print the results."""
     from gpusense.evaluation import landmark_runs
     from gpusense.evaluation.landmark_runs import run_motion
+    from gpusense.learning.landmark.suspicious import suspicious_landmarks
     from gpusense.logs.mrclam import read_mrclam
     from gpusense.models.landmark.model import LandmarkModel
 
@@ -99,7 +100,9 @@ def run(args: argparse.Namespace) -> int:
     recorded_run = landmark_runs.first_scans(recorded, args.scans)
     # Suspicions need the recorded landmarks even with --unknown.
     known_fit = landmark_runs.fit_run(recorded_run)
-    suspicions = landmark_runs.suspicions(recorded_run, known_fit)
+    suspicions = suspicious_landmarks(
+        recorded_run.poses, recorded_run.features, recorded_run.landmarks, recorded_run.ids, known_fit.parameters
+    )
     fit = known_fit if args.known else landmark_runs.fit_run(recorded_run, known=False)
     model = LandmarkModel(recorded_run.landmarks, landmark_runs.usable(fit.parameters), backend=args.backend)
     agreement = landmark_runs.association(recorded_run, model)

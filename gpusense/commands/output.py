@@ -92,12 +92,13 @@ def print_table(
     if not is_terminal(sys.stdout):
         print(*lines, sep="\n")
         return
+    # Rich puts three columns between two cells, and one at each end.
     for name in optional:
-        if max(map(len, lines)) > terminal_width():
+        if max(map(len, lines)) + len(columns) + 1 > terminal_width():
             kept = [place for place, column in enumerate(columns) if column != name]
             columns, rows = [columns[k] for k in kept], [[row[k] for k in kept] for row in rows]
             lines = table_lines(columns, rows, right=right)
-    if max(map(len, lines)) > terminal_width():
+    if max(map(len, lines)) + len(columns) + 1 > terminal_width():
         print(*paragraph_lines(columns, rows), sep="\n")
         return
     from rich.box import SIMPLE_HEAD
@@ -107,42 +108,10 @@ def print_table(
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for column in columns:
-        table.add_column(column, justify="right" if column in right else "left", overflow="fold")
+        table.add_column(Text(column), justify="right" if column in right else "left", overflow="fold")
     for row in rows:
         table.add_row(*(Text(text) for text in row))
     Console().print(table)
-
-
-class TableStream:
-    """Table that is printed row by row; a terminal gets as many columns as fit.
-
-    Attributes:
-        kept: Names of the printed columns.
-    """
-
-    def __init__(self, columns: Mapping[str, int], *, left: Sequence[str] = (), optional: Sequence[str] = ()) -> None:
-        """Choose the columns."""
-        self._widths = {name: max(width, len(name)) for name, width in columns.items()}
-        self._left = left
-        for name in optional if is_terminal(sys.stdout) else ():
-            if sum(self._widths.values()) + 2 * (len(self._widths) - 1) > terminal_width():
-                del self._widths[name]
-        self.kept, self._begun = tuple(self._widths), False
-
-    def add(self, row: Mapping[str, str]) -> None:
-        """Print a row of values by column."""
-        if not self._begun:
-            self._begun = True
-            self._print({name: name for name in self.kept})
-            self._print({name: "-" * width for name, width in self._widths.items()})
-        self._print(row)
-
-    def _print(self, row: Mapping[str, str]) -> None:
-        cells = (
-            row[name].ljust(width) if name in self._left else row[name].rjust(width)
-            for name, width in self._widths.items()
-        )
-        print("  ".join(cells).rstrip(), flush=True)
 
 
 def terminal_width() -> int:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gpusense._util.progress import is_terminal, progress
+from gpusense._util.progress import progress
 from gpusense.commands.arguments import (
     add_backend,
     add_json,
@@ -23,7 +21,6 @@ from gpusense.commands.arguments import (
     whole_number,
 )
 from gpusense.commands.output import (
-    TableStream,
     counted,
     degrees,
     grouped,
@@ -33,14 +30,15 @@ from gpusense.commands.output import (
     print_interrupted,
     print_report,
     print_result,
+    print_table,
 )
 from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans
 from gpusense.commands.signals import held
 from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
-    from gpusense.evaluation.fitness import Fitness, FitnessOfLog
-    from gpusense.evaluation.scoring import LogScore, LogScoring, Model, ScanScore
+    from gpusense.evaluation.fitness import Fitness
+    from gpusense.evaluation.scoring import LogScore, Model, ScanScore
     from gpusense.logs import Scan
     from gpusense.world.grid import OccupancyGrid
 
@@ -60,7 +58,7 @@ correlation of beams at the logged poses of the first 100 chosen scans. --temper
 The verdict is whether the logged poses explain the beams of their scans. On a wrong map beams pass through walls: the
 message states their share and the place of most of them. Cases in between are uncertain.
 
--v prints a row for each scan at once. Ctrl-C ends the run with the results so far.
+-v also prints a row for each scan. Ctrl-C ends the run with the results so far.
 
 Exit codes: 0 the log fits the map, 1 it does not or the verdict is uncertain, 2 bad input, 130 interrupted, 143
 terminated.
@@ -70,11 +68,7 @@ examples:
   gpusense score --map map.yaml --log run.log.gz \\
       --parameters fitted/parameters.yaml"""
 
-# Columns of the table, and their widths.
-_COLUMNS = {
-    "scan": 5, "rank": 7, "percentile": 10, "error [m]": 9, "error [rad]": 11, "effective": 9,
-    "beams": 5,
-}  # fmt: skip
+_COLUMNS = ("scan", "rank", "percentile", "error [m]", "error [rad]", "effective", "beams")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -111,8 +105,11 @@ def run(args: argparse.Namespace) -> int:
     scans = read_scans(args)
     model = make_model(args, grid, scans)
     scoring, fitness = LogScoring(model, sampler), FitnessOfLog(model, seed=args.seed)
-    with held(scoring) as stops:
-        _score(args, scans, scoring, fitness)
+    with held(scoring) as stops, progress(len(scans)) as step:
+        for index, scan in scans:
+            step(f"scan {index}")
+            scoring.add(index, scan)
+            fitness.add(index, scan)
     score, fit = scoring.result(), fitness.result()
     _report(args, model, score, fit, len(scans))
     if stops:
@@ -124,25 +121,10 @@ def run(args: argparse.Namespace) -> int:
     return 0 if fit.fits else DIFFERENT
 
 
-def _score(args: argparse.Namespace, scans: list[tuple[int, Scan]], scoring: LogScoring, fitness: FitnessOfLog) -> None:
-    """Score the scans, and print rows immediately."""
-    # Rows on a terminal show the progress.
-    shown = args.verbose and is_terminal(sys.stdout)
-    table = TableStream(_COLUMNS, optional=("beams", "effective", "error [rad]"))
-    with contextlib.nullcontext(lambda text: None) if shown else progress(len(scans)) as step:
-        for index, scan in scans:
-            step(f"scan {index}")
-            score = scoring.add(index, scan)
-            fitness.add(index, scan)
-            if args.verbose:
-                table.add(_row(score))
-
-
-def _row(scan: ScanScore) -> dict[str, str]:
+def _row(scan: ScanScore) -> tuple[str, ...]:
     position, heading = (number_text(value, "none: all -inf") for value in (scan.error_position, scan.error_heading))
-    values = (str(scan.index), f"{scan.rank:g}", f"{scan.percentile:.3f}", position, heading,
-              number_text(scan.effective), str(scan.beams))  # fmt: skip
-    return dict(zip(_COLUMNS, values, strict=True))
+    return (str(scan.index), f"{scan.rank:g}", f"{scan.percentile:.3f}", position, heading,
+            number_text(scan.effective), str(scan.beams))  # fmt: skip
 
 
 def _draw(path: Path, grid: OccupancyGrid, score: LogScore, pose: str) -> None:
@@ -182,8 +164,6 @@ def _report(args: argparse.Namespace, model: Model, score: LogScore, fitness: Fi
         }  # fmt: skip
         print_report(facts, args)
         return
-    if args.verbose:
-        print()
     print_result(_fitness(fitness, pose_name(args)))
     _print(score, pose_name(args))
     print_interrupted(len(score.scans), chosen)
@@ -216,9 +196,13 @@ def _print(score: LogScore, pose: str) -> None:
 
 
 def _print_details(args: argparse.Namespace, model: Model, score: LogScore) -> None:
-    """Print parameters, temperature, effective sample size and rate."""
+    """Print a row for each scan, parameters, temperature, effective sample size and rate."""
     from gpusense.evaluation.scoring import summary
 
+    print()
+    print_table(
+        _COLUMNS, [_row(scan) for scan in score.scans], right=_COLUMNS, optional=("beams", "effective", "error [rad]")
+    )
     values = ", ".join(f"{name} {value}" for name, value in model.parameters.to_dict().items())
     print(f"\n{args.model} model, {args.precision}: {values}, range_max {model.scanner.range_max:.6g} m")
     how = "calibrated from the scans" if args.temperature == "auto" else "given"

@@ -14,7 +14,6 @@ from gpusense._util import checks
 from gpusense._util.typing import Floats
 from gpusense.learning.fitted import LandmarkFit
 from gpusense.learning.landmark.fit import fit_landmark_parameters
-from gpusense.learning.landmark.suspicious import Suspicions, suspicious_landmarks
 from gpusense.localization.filter import ParticleFilter
 from gpusense.localization.motion import OdometryMotion, SampledMotion
 from gpusense.localization.motion_fit import fit_odometry_motion
@@ -89,8 +88,6 @@ def run_motion(run: LandmarkRun, *, drift: tuple[float, float] | None = None, fi
 
 # Lower bound of z_false for a filter, since a fit of clean data gives 0, and the next feature may be a false positive.
 LEAST_FALSE = 0.01
-
-
 # Tracks begin around the first logged pose, with these deviations of x and y [m], and of the heading [rad].
 START, START_HEADING = 0.5, 0.3
 
@@ -148,17 +145,12 @@ class Track:
         }  # fmt: skip
 
 
-def fit_run(run: LandmarkRun, *, known: bool = True, bias: bool = False) -> LandmarkFit:
-    """Fit the noise of a run's features at its logged poses, and with ``bias`` offsets of range and bearing."""
+def fit_run(run: LandmarkRun, *, known: bool = True) -> LandmarkFit:
+    """Fit the noise of a run's features at its logged poses."""
     return fit_landmark_parameters(
         run.truth, run.features, run.landmarks, correspondence=run.ids if known else None, scan=run.scan,
-        range_max=run.range_max, field_of_view=run.field_of_view, bias=bias,
+        range_max=run.range_max, field_of_view=run.field_of_view,
     )  # fmt: skip
-
-
-def suspicions(run: LandmarkRun, fit: LandmarkFit) -> Suspicions:
-    """Find landmarks of a run whose positions are exchanged or wrong."""
-    return suspicious_landmarks(run.poses, run.features, run.landmarks, run.ids, fit.parameters)
 
 
 def usable(parameters: LandmarkParameters) -> LandmarkParameters:
@@ -167,18 +159,15 @@ def usable(parameters: LandmarkParameters) -> LandmarkParameters:
     return parameters.replace(z_false=z, z_detect=1 - z)
 
 
-def association(run: LandmarkRun, model: LandmarkModel, poses: Floats | None = None) -> dict[str, float]:
-    """Compare the likeliest landmark of each feature with the recorded one.
-
-    ``poses``: (S, 3) poses of the scans [m, m, rad]; None for the logged ones.
+def association(run: LandmarkRun, model: LandmarkModel) -> dict[str, float]:
+    """Compare the likeliest landmark of each feature at the logged poses with the recorded one.
 
     Returns:
         Shares of features: right, none (classed as a false positive but recorded as a landmark) and wrong.
     """
-    poses = run.truth if poses is None else poses
     likeliest = np.empty(len(run.ids), np.int64)
     for first, last in _scans(run):
-        likeliest[first:last] = model.associate(poses[[run.scan[first]]], run.features[first:last])[0][0]
+        likeliest[first:last] = model.associate(run.truth[[run.scan[first]]], run.features[first:last])[0][0]
     right = likeliest == run.ids
     none = ~right & (likeliest == -1)
     return {"right": float(right.mean()), "none": float(none.mean()), "wrong": float((~right & ~none).mean())}
@@ -211,15 +200,9 @@ def localise(
         found = pf.estimate()
         degenerate += found.degenerate and s in rows
         estimate[s], gain[s], p_lost[s] = found.pose, pf.gain, found.p_lost
-    return _track(run, estimate, degenerate, gain, p_lost)
-
-
-def _track(run: LandmarkRun, estimate: Floats, degenerate: int, gain: Floats, p_lost: Floats) -> Track:
-    """Return a filter's result with its errors against the logged poses."""
     away = estimate - run.truth
-    turn = np.abs(np.arctan2(np.sin(away[:, 2]), np.cos(away[:, 2])))
-    position = np.hypot(away[:, 0], away[:, 1])
-    return Track(estimate, position, turn, degenerate, run.time, gain, p_lost > LOST, p_lost)
+    turn = np.abs(wrap_angle(away[:, 2]))
+    return Track(estimate, np.hypot(*away[:, :2].T), turn, degenerate, run.time, gain, p_lost > LOST, p_lost)
 
 
 def _scans(run: LandmarkRun) -> list[tuple[int, int]]:

@@ -40,8 +40,8 @@ _MOST_ITEMS = 1 << 15
 _READ, _WORKERS = 512, {"gpu": (1 << 17, 1), "cpu": (1 << 10, 64)}
 # Turn of the circle between points that are summed in turns, so that few of them tell about all directions.
 _TURN = (5**0.5 - 1) / 2
-# Arrays that place end points.
-_GIVEN = ("end", "heading", "start", "first", "image")
+# Arrays that place end points, and the numbers of arrays of placed points for each of them.
+_GIVEN, _MADE = ("end", "heading", "start", "first", "image"), {"point": 2, "folded": 2, "folded image": 1}
 
 
 class Search:
@@ -135,32 +135,27 @@ class _Run:
         self._most, total = max(*each, 1), max(int(first[-1]), 1)
         ends = np.concatenate([*(part[order] for part, order in zip(points, orders, strict=True)), np.zeros((1, 2))])
         turned = np.stack([np.cos(grid.headings), np.sin(grid.headings)], axis=-1)
-        given = [ends.reshape(-1), turned.reshape(-1), grid.start.astype(np.float64).reshape(-1), first]
+        given = [ends, turned, grid.start.astype(np.float64), first]
         if images is not None or self._tables.shape.tables > 1:
             images = [np.full(count, scan) for scan, count in enumerate(each)] if images is None else images
             named = [np.broadcast_to(part, (self._turns, count))[:, order].reshape(-1)
                      for part, count, order in zip(images, each, orders, strict=True)]  # fmt: skip
             given.append(np.concatenate([*named, [0]]).astype(np.int32))
-        elif not self._backend.info.float64:
-            given.append(np.zeros(total, np.int32))
-        sizes = {"point": 2 * total, "folded": 2 * total, "folded image": total}
-        made: list[Any]
-        there: list[Any]
-        if self._backend.info.float64:
-            there = [space.upload(name, array) for name, array in zip(_GIVEN, given, strict=False)]
-            there = there if len(there) == len(_GIVEN) else [*there, space.empty("table 0", total, _INT, zero=True)]
-            made = [space.empty(name, size, _INT) for name, size in sizes.items()]
-            place = self._backend.compile("place_ends", _NO_FLAGS)
-        else:
-            there, made = given, [np.zeros(size, np.int32) for size in sizes.values()]
-            place = get_backend("numpy").compile("place_ends", _NO_FLAGS)
+        # The host places them for devices without float64.
+        backend = self._backend if self._backend.info.float64 else get_backend("numpy")
+        there = space if backend is self._backend else Workspace(backend)
+        inputs = [there.upload(name, array) for name, array in zip(_GIVEN, given, strict=False)]
+        if len(given) < len(_GIVEN):
+            inputs.append(there.empty("table 0", total, _INT, zero=True))
+        made = [there.empty(name, size * total, _INT) for name, size in _MADE.items()]
+        place = backend.compile("place_ends", _NO_FLAGS)
         for begin, end in self._parts_of_items():
-            place((self._most, end - begin), *there, *made, begin, end, self._turns, self._tables.stride,
+            place((self._most, end - begin), *inputs, *made, begin, end, self._turns, self._tables.stride,
                   self._level, self._tables.step(self._level).bit_length() - 1, folded.offset)  # fmt: skip
-        if not self._backend.info.float64:
-            there = [space.upload(name, array) for name, array in zip(_GIVEN, given, strict=True)]
-            made = [space.upload(name, array) for name, array in zip(sizes, made, strict=True)]
-        self._ends, self._folded_ends = (made[0], there[4], there[3]), (made[1], made[2], there[3])
+        if there is not space:
+            inputs, made = ([space.upload(name, array) for name, array in zip(names, arrays, strict=True)]
+                            for names, arrays in ((_GIVEN, inputs), (_MADE, made)))  # fmt: skip
+        self._ends, self._folded_ends = (made[0], inputs[4], inputs[3]), (made[1], made[2], inputs[3])
 
     def _parts_of_items(self) -> list[tuple[int, int]]:
         """Return the first item of each launch, and the one after its last."""

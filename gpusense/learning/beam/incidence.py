@@ -14,63 +14,18 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util import checks
 from gpusense._util.html import card
 from gpusense._util.typing import FitMethod, Precision
-from gpusense.backends import Backend, Selection
+from gpusense.backends import Selection
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.fit import fit_pairs
-from gpusense.learning.beam.options import Callback, Options, check_options, make_bounds, open_device, start_of
+from gpusense.learning.beam.options import Callback, check_options, make_bounds, open_device, start_of
 from gpusense.learning.beam.pairs import Pairs, make_pairs
-from gpusense.learning.beam.point import Bounds, Point, first_guess
+from gpusense.learning.beam.point import Point, first_guess
 from gpusense.learning.beam.problem import Prior
 from gpusense.learning.beam.shapes import fit_shape
 from gpusense.learning.fitted import BeamFit, plain_fields
 from gpusense.world.hit_shapes import SHAPES, HitName
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.scanner import Reading
-
-
-class Binned:
-    """Fits of bins with the pooled fit as prior."""
-
-    def __init__(
-        self, device: tuple[Backend, np.dtype], bounds: Bounds, options: Options, pooled: BeamFit, strength: float
-    ) -> None:
-        self._device, self._bounds, self._options, self._strength = device, bounds, options, strength
-        self._start = Point.of(pooled.parameters)
-        start = self._start
-        self._prior = Prior(strength * start.weights, start.sigma, start.rate, start.bias, start.shape)
-
-    def fit_bins(
-        self, pairs: Pairs, surface: NDArray[np.bool_], angles: NDArray[np.float64], edges: NDArray[np.float64]
-    ) -> tuple[tuple[BeamFit, ...], tuple[int, ...]]:
-        """Fit the bins between (B + 1,) edges of the (n,) angles [rad]; return fits and numbers of readings."""
-        incidence_bin = np.digitize(angles, edges[1:-1])
-        fits, counts = [], []
-        for number in range(len(edges) - 1):
-            subset = pairs.subset(surface & (incidence_bin == number))
-            counts.append(subset.hits + subset.max_readings)
-            if not counts[-1] and self._strength == 0:
-                low, high = np.degrees(edges[number : number + 2])
-                raise ValueError(
-                    f"strength: must be > 0 where a bin has no reading, got {self._strength} and none from {low:.3g} "
-                    f"to {high:.3g} degrees"
-                )
-            fits.append(self._fit(subset, self._start))
-        return tuple(fits), tuple(counts)
-
-    def fit_no_surface(self, pairs: Pairs) -> tuple[BeamFit | None, int]:
-        """Fit the beams that hit no surface; return the fit, or None, and their number of readings."""
-        count = pairs.hits + pairs.max_readings
-        if not count and self._strength == 0:
-            return None, 0
-        start = self._start
-        if count:
-            # These beams may have causes that beams with a surface lack.
-            start = replace(start, weights=0.5 * (start.weights + first_guess(pairs, self._bounds).weights))
-        return self._fit(pairs, start), count
-
-    def _fit(self, pairs: Pairs, start: Point) -> BeamFit:
-        return fit_pairs(DeviceSums(*self._device, pairs), pairs, self._bounds, start, self._options, self._prior)
-
 
 _MOST_BINS = 1000
 # Bound on the rounding error of a float32 pi / 2.
@@ -263,15 +218,42 @@ def fit_incidence_parameters(
     pooled = fit_pairs(sums, surfaces, bounds, start, options, chosen=initial is not None)
     if hit != "normal":
         pooled = fit_shape(pooled, sums, surfaces, bounds, options, hit, start, initial)
-    binned = Binned(device, bounds, options, pooled, strength)
-    fits, counts = binned.fit_bins(pairs, surface, angles, edges)
-    no_surface, no_surface_count = binned.fit_no_surface(pairs.subset(~surface))
+    start = Point.of(pooled.parameters)
+    prior = Prior(strength * start.weights, start.sigma, start.rate, start.bias, start.shape)
+
+    def fit_of(some: Pairs, start: Point) -> BeamFit:
+        return fit_pairs(DeviceSums(*device, some), some, bounds, start, options, prior)
+
+    parts = _parts(pairs, angles, edges, strength)
+    fits = tuple(fit_of(part, start) for part in parts)
+    others, no_surface = pairs.subset(~surface), None
+    if others.readings:
+        # These beams may have causes that beams with a surface lack.
+        weights = 0.5 * (start.weights + first_guess(others, bounds).weights)
+        no_surface = fit_of(others, replace(start, weights=weights))
+    elif strength > 0:
+        no_surface = fit_of(others, start)
     parameters = IncidenceParameters(
         tuple(edges.tolist()),
         tuple(fit.parameters for fit in fits),
         None if no_surface is None else no_surface.parameters,
     )
-    return IncidenceFit(parameters, pooled, fits, counts, no_surface, no_surface_count, strength)
+    counts = tuple(part.readings for part in parts)
+    return IncidenceFit(parameters, pooled, fits, counts, no_surface, others.readings, strength)
+
+
+def _parts(pairs: Pairs, angles: NDArray[np.float64], edges: NDArray[np.float64], strength: float) -> list[Pairs]:
+    """Return the pairs of each bin between (B + 1,) edges of the (n,) angles [rad]."""
+    incidence_bin = np.where(np.isnan(angles), -1, np.digitize(angles, edges[1:-1]))
+    parts = [pairs.subset(incidence_bin == number) for number in range(len(edges) - 1)]
+    for number, part in enumerate(parts):
+        if not part.readings and strength == 0:
+            low, high = np.degrees(edges[number : number + 2])
+            raise ValueError(
+                f"strength: must be > 0 where a bin has no reading, got {strength} and none from {low:.3g} "
+                f"to {high:.3g} degrees"
+            )
+    return parts
 
 
 def _angles(incidence: ArrayLike, shape: tuple[int, ...], pairs: Pairs) -> NDArray[np.float64]:

@@ -166,7 +166,7 @@ class Sample:
         if pairs.hits > _SAMPLE:
             chosen = np.random.default_rng(0).choice(pairs.hits, _SAMPLE, replace=False)
         z, expected = (values[chosen].astype(np.float64) for values in (pairs.reading, pairs.expected))
-        return cls(z, expected, pairs.max_readings / (pairs.hits + pairs.max_readings), pairs.range_max)
+        return cls(z, expected, pairs.max_readings / pairs.readings, pairs.range_max)
 
 
 def choose_starts(pairs: Pairs, bounds: Bounds, causes: NDArray[np.bool_], fit_bias: bool) -> list[Point]:

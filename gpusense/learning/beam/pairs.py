@@ -41,6 +41,11 @@ class Pairs:
         return int(np.count_nonzero(self.kinds == Reading.MAX))
 
     @property
+    def readings(self) -> int:
+        """Number of readings that are not missing."""
+        return self.hits + self.max_readings
+
+    @property
     def missing(self) -> int:
         """Number of readings that are missing."""
         return int(np.count_nonzero(self.kinds == Reading.MISSING))

@@ -111,7 +111,7 @@ def possible_causes(pairs: Pairs) -> NDArray[np.bool_]:
 def first_guess(pairs: Pairs, bounds: Bounds) -> Point:
     """Guess a start: weights from the classes of readings, sigma from the median distance to the expected range."""
     possible = possible_causes(pairs)
-    share = pairs.max_readings / (pairs.hits + pairs.max_readings)
+    share = pairs.max_readings / pairs.readings
     weights = np.where(possible, [(1 - share) * 0.5, (1 - share) * 0.2, share, (1 - share) * 0.3], 0)
     sigma, rate = 0.05 * pairs.range_max, 2 / pairs.range_max
     if pairs.hits:

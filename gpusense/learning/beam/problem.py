@@ -156,7 +156,7 @@ class Problem:
 
     def __init__(self, device: DeviceSums, pairs: Pairs, bounds: Bounds, prior: Prior, fit_bias: bool) -> None:
         self.device, self.pairs, self.bounds, self.prior, self.fit_bias = device, pairs, bounds, prior, fit_bias
-        self.readings = pairs.hits + pairs.max_readings
+        self.readings = pairs.readings
         self.total = self.readings + float(prior.counts.sum())
 
     def noise(self, value: Value) -> float:

@@ -301,14 +301,11 @@ class Cloud(Particles):
         """Return mean and covariance of the shown particles: on a GPU an array of the device's library."""
         if self.backend.info.kind != "gpu":
             return self.estimate(count)[:MOMENTS]
-        out, poses, weight = (
-            self.backend.empty_external(ESTIMATE, _DOUBLE),
-            self.poses[self.places.shown],
-            self.places.weight,
-        )
+        out = self.backend.empty_external(ESTIMATE, _DOUBLE)
+        poses, weights = self.poses[self.places.shown], self.weights[self.places.weight]
         for second_pass in (0, 1):
             # The second pass is correct for any headings.
-            self.backend.run(self.sums.estimate(poses, self.weights[weight], out, count, second_pass))
+            self.backend.run(self.sums.estimate(poses, weights, out, count, second_pass))
         return self._lent(out, (MOMENTS,))
 
     def particles(self, count: int) -> Any:

@@ -116,7 +116,7 @@ def window(events, length, rng, *, kidnapped=False):
         first = int(rng.integers(len(events) - length + 1))
     chosen = events[first : first + length]
     if not kidnapped:
-        return chosen, None
+        return chosen
     half, rest = length // 2, length - length // 2
     for _ in range(200):
         second = int(rng.integers(len(events) - rest + 1))
@@ -124,7 +124,7 @@ def window(events, length, rng, *, kidnapped=False):
         if known and math.dist(chosen[half - 1].truth[:2], events[second].truth[:2]) > 5:
             break
     else:
-        return None, None
+        return None
     after = events[second : second + rest]
     start = chosen[half - 1].odometry
     moved = [
@@ -133,7 +133,7 @@ def window(events, length, rng, *, kidnapped=False):
         )
         for e in after
     ]
-    return [*chosen[:half], *moved], half
+    return [*chosen[:half], *moved]
 
 
 def simulated(seed, *, scans=60, hidden=0.0, moved=0.0, glass=0.0, beams=180, around=False, step=0.2, case="own"):

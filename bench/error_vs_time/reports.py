@@ -26,8 +26,11 @@ PATTERN = "error_vs_time_*_{}.json"
 # Folders whose changes make a report old, and the number of commits to them after which it must not be published.
 FOLDERS = ("kernels", "gpusense/models", "gpusense/tables", "gpusense/backends")
 LIMIT = 150
-# Subjects of commits that change docstrings and comments only: they do not count.
-WORDS_ONLY = "docstring|comments|sentences|error sections|^Describe internal|^State shapes|^Name buffers"
+# Subjects of commits that change docstrings, comments, type hints and names of classes only: they do not count.
+WORDS_ONLY = (
+    "docstring|comments|sentences|error sections|aliases of array types|^Describe (internal|the search)|^State "
+    "(shapes|arguments|how rays)|^Name (buffers|classes|modules|the bound calls)"
+)
 TASK_MEASURES = {"median": "median error", "p95": "95 % error", "max": "largest error"}
 UNITS = {"%": "relative"}
 DISCRETE = "gs.DiscreteBeamModel(gs.BeamParameters(), range_max=scanner.range_max)"

@@ -101,7 +101,7 @@ def rate(found, wrong):
 def one_run(recording, models, weigher, chosen, case, args, rng):
     """Return the figures of a run; None where the log has no such part."""
     known = [event for event in recording.events if np.isfinite(event.truth).all()]
-    events, _ = runs.window(known, args.scans, rng, kidnapped=case == CASES[1])
+    events = runs.window(known, args.scans, rng, kidnapped=case == CASES[1])
     if events is None:
         return None
     scanner = recording.places[0][1]

@@ -85,7 +85,7 @@ def prepared(job, args):
         return [(grid, scanner)], events, _start(case, grid, events, rng)
     parts = runs.parts_of(name)
     recording = runs.load(parts[seed % len(parts)])
-    events, _ = runs.window(recording.events, SCANS, rng, kidnapped=case == "kidnapped")
+    events = runs.window(recording.events, SCANS, rng, kidnapped=case == "kidnapped")
     if events is None:
         return None
     places = recording.places

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -14,7 +14,6 @@ from gpusense.evaluation.benchmark.accuracy import Truth, UnstableError, errors,
 from gpusense.evaluation.benchmark.candidates import Candidate
 from gpusense.evaluation.benchmark.measure import Made, Runner, measure
 from gpusense.evaluation.benchmark.scenes import CLOUDS, MapSource, Scene, make_scene
-from gpusense.localization.weights import normalize_weights
 
 PRECISIONS = ("float32", "float64")
 
@@ -126,7 +125,7 @@ def run(plan: Plan, step: Callable[[str], None] = lambda text: None, outcome: Ou
     for source in plan.sources:
         scene = make_scene(source, device, beams=plan.beams, particles=plan.cloud, seed=plan.seed)
         truths = {cloud: Truth(scene, scene.clouds[cloud][: plan.checked], device) for cloud in CLOUDS}
-        outcome.scenes.append(_description(scene, truths))
+        outcome.scenes.append(_description(scene))
         paces: dict[tuple[str, str], float] = {}
         for job in jobs(plan):
             made: Made | None = None
@@ -221,7 +220,7 @@ def _left_out(plan: Plan, job: Job, scene: Scene, pace: float | None, made: Made
     return ""
 
 
-def _description(scene: Scene, truths: Mapping[str, Truth]) -> dict[str, Any]:
+def _description(scene: Scene) -> dict[str, Any]:
     rows, cols = scene.grid.shape
     return {
         "name": scene.name, "map": scene.origin, "rows": rows, "cols": cols, "resolution": scene.grid.resolution,
@@ -229,19 +228,4 @@ def _description(scene: Scene, truths: Mapping[str, Truth]) -> dict[str, Any]:
         "range_max": scene.scanner.range_max, "beams": scene.scanner.count, "hits": scene.hits,
         "pose": scene.pose.tolist(), "beam": scene.beam.to_dict(), "field": scene.field.to_dict(),
         "fingerprint": scene.fingerprint,
-        "clouds": {cloud: _cloud_description(truth) for cloud, truth in truths.items()},
     }  # fmt: skip
-
-
-def _cloud_description(truth: Truth) -> dict[str, Any]:
-    """Describe a cloud by the truth: share of rays that hit, mean range, effective sample sizes, temperatures."""
-    ranges = truth.ranges
-    return {
-        "checked": len(truth.poses),
-        "rays_that_hit": float(np.mean(ranges < truth.scene.scanner.range_max)),
-        "mean_range": float(ranges.mean()),
-        "effective_sample_size": {
-            problem: normalize_weights(truth.log_p(problem)).effective_sample_size for problem in ("beam", "field")
-        },
-        "temperature": {problem: truth.temperatures[problem] for problem in ("beam", "field")},
-    }

@@ -20,6 +20,7 @@ from gpusense._util import checks
 from gpusense._util.typing import Space
 from gpusense.backends.base import Buffer
 from gpusense.tables.outlines import REACH, SPANS, Outlines
+from gpusense.tables.reachable import obstacles_of
 from gpusense.tables.world_stack import Stack, Table
 from gpusense.tables.worlds import Worlds
 from gpusense.world.grid import OccupancyGrid
@@ -72,7 +73,7 @@ def surface_normals(grid: OccupancyGrid, *, unknown: Space = "free", outside: Sp
     checks.instance("grid", grid, OccupancyGrid)
     checks.choice("unknown", unknown, ("free", "occupied"))
     checks.choice("outside", outside, ("free", "occupied"))
-    obstacles = grid.obstacles("occupied" if unknown == "occupied" else "free")
+    obstacles = obstacles_of(grid, unknown)
     table = normal_table(obstacles, whole(grid), outside, np.dtype(np.float64))[1:-1, 1:-1]
     table[~obstacles] = np.nan
     c, s = math.cos(grid.origin[2]), math.sin(grid.origin[2])
@@ -107,7 +108,7 @@ def normals_of_worlds(worlds: Worlds, unknown: str, outside: str, real: np.dtype
 
     def fill(stack: Stack, table: Buffer) -> None:
         for index in stack.indices.tolist():
-            obstacles = worlds.obstacles(index, unknown)
+            obstacles = obstacles_of(worlds.grid(index), unknown)
             worlds.put(index, table, normal_table(obstacles, Window(0, 0, *obstacles.shape), outside, real), 2)
 
     def make() -> Table:

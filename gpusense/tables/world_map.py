@@ -30,7 +30,7 @@ class WorldMap:
         self.table: Buffer = None
         self.window = Window(0, 0, *worlds.shape)
         self.frame = Frame(self.window, plain_cells(worlds), mount)
-        worlds.watch(self)
+        worlds.maps.add(self)
 
     def ensure(self, corners: object) -> WorldMap:
         """Return the map with its table."""

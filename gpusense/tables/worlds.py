@@ -102,7 +102,7 @@ class Worlds:
         self._place = np.append(0, np.cumsum(padded)[:-1]).astype(np.int32)
         self.space = Workspace(self.backend)
         self._tables: dict[Hashable, Table] = {}
-        self._maps: weakref.WeakSet[Any] = weakref.WeakSet()
+        self.maps: weakref.WeakSet[Any] = weakref.WeakSet()  # maps of models, whose versions follow the shapes
         self.store = self.allocate(1, _BYTE)
         self.frames = self.backend.upload(frames_of(self._origins, self._resolution, self._sizes, self._place))
         self.crowd = CrowdTable(self.backend, self.frames, self._resolution, count)
@@ -200,10 +200,6 @@ class Worlds:
             cells.reshape(rows, cols), self._resolution, self._origins[number], occupied_threshold=self.threshold
         )
 
-    def obstacles(self, index: int, unknown: str) -> np.ndarray:
-        """Return the (H, W) mask of a world's cells that stop a beam."""
-        return self.grid(index).obstacles("occupied" if unknown == "occupied" else "free")
-
     # ---- changes
 
     @property
@@ -216,7 +212,7 @@ class Worlds:
         version = self.crowd.version
         self.crowd.assign(shapes)
         if self.crowd.version != version:
-            for one in self._maps:
+            for one in self.maps:
                 one.version += 1
 
     def replace(self, index: ArrayLike, cells: Any) -> None:
@@ -369,10 +365,6 @@ class Worlds:
         """Copy numbers from host memory to a world's part of a table with ``each`` numbers of a cell."""
         first = int(self._place[index]) * each
         self.backend.upload(numbers.reshape(-1), self.backend.part(table, first, numbers.size, numbers.dtype))
-
-    def watch(self, one: Any) -> None:
-        """Tell a model's map when the shapes get other numbers."""
-        self._maps.add(one)
 
     def _put(self, indices: np.ndarray, given: Any) -> None:
         """Copy the cells of some worlds to the device."""

@@ -8,7 +8,7 @@ expected drift, the drift cannot confirm a match, and a group needs more evidenc
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -48,25 +48,6 @@ def agreeing(matches: Links, poses: Floats, needed: Floats) -> Flags:
         kept = kept & ~lone
 
 
-class Groups(NamedTuple):
-    """Groups of matches that agree directly or through other matches."""
-
-    group: Integers  # (L,) group of each match; -1 if too few agree with it
-    evidence: Floats  # (G,) evidence of each group
-    scans: Integers  # (G,) number of different scans on the side with fewer
-
-
-def groups_of(matches: Links, poses: Floats) -> Groups:
-    """Return the groups of matches of places, given the poses (K, 3) of the key scans."""
-    group = np.full(len(matches), -1)
-    if not len(matches):
-        return Groups(group, np.zeros(0), _NONE)
-    table = _consistent(matches, poses)
-    kept = _supported(table, np.ones(len(matches), bool))
-    group[kept], evidence, scans = _groups(table, kept, matches)
-    return Groups(group, evidence, scans)
-
-
 def _supported(table: Any, kept: Flags) -> Flags:
     """Return the mask (L,) of matches that agree with enough supported matches."""
     while True:
@@ -76,13 +57,16 @@ def _supported(table: Any, kept: Flags) -> Flags:
         kept = fewer
 
 
-def _groups(table: Any, kept: Flags, matches: Links) -> Groups:
-    """Return the groups of the kept matches."""
+def _groups(table: Any, kept: Flags, matches: Links) -> tuple[Integers, Floats, Integers]:
+    """Group the kept matches that agree directly or through others.
+
+    Returns (K,) group of each, (G,) evidence of each group, and (G,) different scans on the side with fewer.
+    """
     from scipy.sparse.csgraph import connected_components
 
     rows = np.flatnonzero(kept)
     if not len(rows):
-        return Groups(_NONE, np.zeros(0), _NONE)
+        return _NONE, np.zeros(0), _NONE
     count, found = connected_components(table[rows][:, rows], directed=False)
     group: Integers = np.asarray(found, np.int64)
     evidence = np.bincount(group, -np.log10(1 - np.minimum(matches.p_right[rows], _MOST_RIGHT)), count)
@@ -90,7 +74,7 @@ def _groups(table: Any, kept: Flags, matches: Links) -> Groups:
         np.bincount(np.unique(np.stack([group, ends[rows]]), axis=1)[0], minlength=count)
         for ends in (matches.first, matches.second)
     ]
-    return Groups(group, evidence.astype(np.float64), np.minimum(*scans).astype(np.int64))
+    return group, evidence.astype(np.float64), np.minimum(*scans).astype(np.int64)
 
 
 def _consistent(matches: Links, poses: Floats) -> Any:

@@ -180,11 +180,3 @@ def check_options(job: Job) -> None:
         if name not in known and not training and not (dot and group == "parameters"):
             rule = f"options: of the task {job.task} are {', '.join(sorted(known))}, parameters.* and training.*"
             raise ValueError(f"{rule}, got {name!r}")
-
-
-_TIMINGS = ("seconds", "cpu_seconds", "worker", "device", "attempts", "particle_beams_per_second")
-
-
-def is_timing(column: str) -> bool:
-    """Return whether a column depends on time or place, so that it differs between two runs of a job."""
-    return column.startswith("ms_") or column in _TIMINGS

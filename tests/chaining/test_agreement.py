@@ -8,7 +8,7 @@ from support.matching_scenes import CORRIDOR, segments_scan, table_legs
 from support.selection import present
 
 import gpusense as gs
-from gpusense.chaining.agreement import EVIDENCE, EVIDENCE_OVER_WEAK, agreeing, groups_of
+from gpusense.chaining.agreement import EVIDENCE, EVIDENCE_OVER_WEAK, agreeing
 from gpusense.chaining.closing import joined_breaks
 from gpusense.chaining.links import CLOSURE, Links
 from gpusense.chaining.matcher import SURE, Matcher
@@ -29,7 +29,7 @@ def log(scenes: list[np.ndarray]) -> np.ndarray:
 def test_directions_that_few_pairs_observe_are_taken_among_furniture_alone(scene):
     shifts = np.linspace(-0.3, 0.3, 12)[:, None] * (0, 1, 0, 1)
     scenes = [table_legs(seed) for seed in range(12)] if scene == "furniture" else [CORRIDOR + s for s in shifts]
-    options = ChainOptions((0, 0), (0.5, 0.5), 0.0, None, False, present("opencl"), "float32")
+    options = ChainOptions((0, 0), 0.0, None, False, present("opencl"), "float32")
     matcher, first = Matcher(log(scenes), FRONT, options), np.arange(12)
     found = matcher.match(first, first + 12, np.tile(MOVED, (12, 1)))
     lost = (found.eigenvalues == 0) & (found.usable & (found.p_right >= SURE))[:, None]
@@ -64,7 +64,6 @@ def test_two_matches_do_not_suffice_and_a_wrong_one_is_left_out() -> None:
     poses, links = passages([0.95] * 5)
     links.pose[3] += (1.0, 0.0, 0.2)
     assert agreeing(links, poses, np.zeros(5)).tolist() == [True, True, True, False, True]
-    assert groups_of(links, poses).group.tolist() == [0, 0, 0, -1, 0]
     assert not len(agreeing(links[:0], poses, np.zeros(0)))
 
 
@@ -73,10 +72,9 @@ def test_where_the_drift_tells_nothing_a_group_needs_evidence(right: list[float]
     poses, links = passages(right)
     assert agreeing(links, poses, np.zeros(len(right))).all()
     assert agreeing(links, poses, np.full(len(right), EVIDENCE)).tolist() == [taken] * len(right)
-    found = groups_of(links, poses)
-    assert found.group.tolist() == [0] * len(right)
-    assert found.evidence == pytest.approx([-np.log10(1 - np.array(right)).sum()])
-    assert found.scans.tolist() == [len(right)]
+    evidence = -np.log10(1 - np.array(right)).sum()
+    for needed, enough in ((evidence - 1e-9, True), (evidence + 1e-9, False)):
+        assert agreeing(links, poses, np.full(len(right), needed)).tolist() == [enough] * len(right)
     # Weak steps need less evidence.
     weak = np.full(len(right), EVIDENCE_OVER_WEAK)
     assert agreeing(links, poses, weak).all()

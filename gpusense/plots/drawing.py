@@ -192,7 +192,19 @@ def add_colour_bar(ax: Axes, mappable: Any, label: str) -> None:
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Write a figure atomically, in the format of the path's suffix."""
+    """Write a figure atomically, in the format of the path's suffix.
+
+    Args:
+        figure: The figure.
+        path: A path that ends in .png, .pdf, .svg or another format that Matplotlib writes.
+
+    Raises:
+        ValueError: Matplotlib has no format for the suffix.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.plots.save(gs.plots.new_figure(6.0, 4.0), "empty.png")
+    """
     target = checks.path("path", path)
     kind = target.suffix.lower().removeprefix(".")
     formats = figure.canvas.get_supported_filetypes()

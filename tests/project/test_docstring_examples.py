@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import doctest
 import importlib
+import inspect
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -31,3 +33,21 @@ def test_examples(name, tmp_path, monkeypatch):
         assert result.failed == 0, "".join(report)
         attempted += result.attempted
     assert attempted > 0
+
+
+def public_functions() -> dict[str, Callable[..., object]]:
+    """Return the functions of gs and of its public modules by name."""
+    spaces = {"": gpusense} | {name: getattr(gpusense, name) for name in ("plots", "worlds", "sweep", "compat")}
+    return {
+        f"{prefix}.{name}".lstrip("."): one
+        for prefix, space in spaces.items()
+        for name in space.__all__
+        if inspect.isfunction(one := getattr(space, name))
+    }
+
+
+def test_public_functions_describe_their_arguments():
+    functions = public_functions()
+    assert len(functions) > 60 and "plots.save" in functions and "locate_scan" in functions
+    taking = {name: one for name, one in functions.items() if inspect.signature(one).parameters}
+    assert [name for name, one in taking.items() if "Args:" not in (one.__doc__ or "")] == []

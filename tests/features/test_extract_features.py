@@ -156,6 +156,7 @@ def test_ties_are_the_same_in_float32(noise, monkeypatch, needs):
     np.testing.assert_array_equal(found.scan, expected.scan)
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("beams", [0, 1, 2, 3, 10, 180, 1081])
 def test_scans_without_features_have_none(backend, beams):
     scanner, rng = ring(beams) if beams else gs.Scanner([], range_max=25.0), np.random.default_rng(beams)

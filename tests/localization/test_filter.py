@@ -59,6 +59,7 @@ def test_errors_fall_with_the_root_of_the_number_of_particles():
     assert 2.5 < errors[0] / errors[1] < 6.5
 
 
+@pytest.mark.long_on("warp")
 def test_many_particles_take_no_more_stages_than_they_need(backend):
     # For a ratio r of the variances of fix and prior, r (2 + r) / (1 + r)^2 = 7.5 % of the particles are effective.
     def state(count, deviation):

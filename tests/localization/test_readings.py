@@ -64,6 +64,7 @@ def test_several_scans_are_no_reading():
         filter_of(model).correct(np.ones((2, 40)))
 
 
+@pytest.mark.long_on("warp")
 def test_a_filter_begins_from_the_likelihood_of_a_scan(backend):
     cells = np.where(GRID.occupied, 100, 0)
     cells[:15, :12] = 100

@@ -103,6 +103,7 @@ def test_pairs_of_different_noise_share_a_launch_and_keep_their_rules(device):
     assert not (both == alone[0]).all(axis=(1, 2)).all()
 
 
+@pytest.mark.long_on("warp")
 def test_the_search_by_bearing_finds_the_nearest_of_all_points(device):
     """One iteration from far-off guesses: pairs and their sums equal a comparison of all points."""
     rng = np.random.default_rng(1)

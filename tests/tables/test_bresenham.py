@@ -13,6 +13,7 @@ from gpusense.tables import casters
 from gpusense.tables.cells import chebyshev_distances
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize(
     ("shape", "range_max", "line"),
     [

@@ -82,6 +82,7 @@ def test_float32_ends_within_a_hundredth_of_a_standard_error(needs) -> None:
     assert (np.abs(values(fit) - values(reference)) < 0.01 * errors(reference)).all()
 
 
+@pytest.mark.long_on("warp")
 def test_the_log_likelihood_is_the_sum_of_the_mixture(backend: str) -> None:
     z, expected = draw(TYPICAL, 2000, 2)
     fit = gs.fit_beam_parameters(z, expected, RANGE_MAX, backend=backend, responsibilities=True)

@@ -141,6 +141,7 @@ def test_any_batches_of_a_cropped_map(kind, call, backend, monkeypatch):
     same_bits(found, whole[along])
 
 
+@pytest.mark.long_on("warp")
 def test_any_order(call):
     whole = call(cloud())
     for order in (np.arange(COUNT)[::-1], np.random.default_rng(9).permutation(COUNT)):

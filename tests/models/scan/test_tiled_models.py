@@ -105,6 +105,7 @@ PARTS = [
 ]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.long_on("warp")
 @pytest.mark.parametrize(("options", "flags"), PARTS, ids=["offset", "dda", "cubes"])
 def test_parts_of_beam_models(options, flags, as_gpu):

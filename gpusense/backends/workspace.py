@@ -210,7 +210,12 @@ class Workspace:
         return buffer
 
     def upload_all(self, name: str, arrays: Sequence[np.ndarray]) -> list[Buffer]:
-        """Start copying arrays of one dtype, none of them empty, as one."""
+        """Start copying arrays of one dtype, none of them empty; as one where parts of buffers are plain memory.
+
+        Overlapping parts of OpenCL's buffers, freed soon, are the suspected cause of crashes of NVIDIA's driver.
+        """
+        if not self.backend.has_views:
+            return [self.upload(f"{name} {number}", array) for number, array in enumerate(arrays)]
         sizes, dtype = tuple([array.size for array in arrays]), arrays[0].dtype
         aligned = max(_ALIGNED, self.backend.alignment) // dtype.itemsize
         firsts, total = [], 0

@@ -51,6 +51,24 @@ def test_shared_memory_changes_no_bit(kind, two_ways):
     assert differing(found[1], expected[1]) == 0
 
 
+@pytest.mark.parametrize("kind", MODELS)
+def test_scans_are_not_copied_into_parts_of_buffers_that_are_objects_of_the_driver(kind, two_ways, monkeypatch):
+    """Models evaluate scans of different numbers of readings without parts of a buffer of the driver."""
+    divided = []
+    for device in two_ways:
+        part = device.part
+        monkeypatch.setattr(device, "part", lambda buffer, first, *rest, part=part: (
+            divided.append(first) if first else None, part(buffer, first, *rest))[1])  # fmt: skip
+        model, few = kind(GRID, SCANNER, backend=device), scan(1)
+        few[::3] = np.nan
+        results = [model.log_likelihood(cloud(1), one) for one in (scan(1), few)]
+        results.append(model.log_likelihood(np.stack([cloud(1), cloud(2)]), np.stack([scan(1), few])))
+        if device is two_ways[0]:
+            expected, copied = results, len(divided)
+    assert 0 < copied == len(divided)
+    assert [differing(*both) for both in zip(results, expected, strict=True)] == [0, 0, 0]
+
+
 def test_launches_see_the_contents_of_their_time(two_ways):
     """Copies stay in order with launches, and released memory lives until the launches have ended."""
     device, numpy = two_ways[0], get_backend("numpy")

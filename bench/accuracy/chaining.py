@@ -45,7 +45,7 @@ from chaining_logs import BOTH, Log, load, references
 from chaining_peers import csm_steps, kiss_icp
 from common import make_parser, note, parse, publish, table
 
-from gpusense.chaining.agreement import groups_of
+from gpusense.chaining.agreement import _consistent, _groups, _supported
 from gpusense.chaining.chain import Chainer
 from gpusense.chaining.closing import Loops
 
@@ -136,13 +136,18 @@ def contradicted(links: Any, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 def judged_groups(loops: Loops, truth: np.ndarray) -> list[dict[str, float]]:
     """Return the evidence of each group with references, its matches with references, and the right ones of these."""
-    groups = groups_of(loops.matches, loops.solution.poses)
+    matches = loops.matches
+    if not len(matches):
+        return []
+    agreement, group = _consistent(matches, loops.solution.poses), np.full(len(matches), -1)
+    kept = _supported(agreement, np.ones(len(matches), bool))
+    group[kept], evidence, _ = _groups(agreement, kept, matches)
     rows, wrong = contradicted(loops.matches.renumbered(loops.nodes), truth)
     result = []
-    for k, evidence in enumerate(groups.evidence.tolist()):
-        some = groups.group[rows] == k
+    for k, strength in enumerate(evidence.tolist()):
+        some = group[rows] == k
         if some.any():
-            result.append({"evidence": evidence, "compared": int(some.sum()), "right": int((some & ~wrong).sum())})
+            result.append({"evidence": strength, "compared": int(some.sum()), "right": int((some & ~wrong).sum())})
     return result
 
 

@@ -113,7 +113,8 @@ def call_of(what: str, device, precision: str):
     size = np.dtype(precision).itemsize
     if what == "caster":
         caster = gs.RayCaster(GRID, RANGE, backend=device, precision=precision)
-        copied = (lambda n: [24 * n, 2 * size * BEAMS], lambda n: [size * n * BEAMS])
+        # Equal bearings stay on the device.
+        copied = (lambda n: [24 * n], lambda n: [size * n * BEAMS])
         return lambda some, z: caster.cast(some, SCANNER.bearings), *copied
     if what == "beam":
         model = gs.BeamModel(GRID, SCANNER, backend=device, precision=precision)

@@ -162,11 +162,13 @@ def test_a_proxy_forwards_methods(name, arguments, options, monkeypatch):
 
 def test_a_proxy_forwards_properties():
     class Able(Plain):
-        alignment = 256
+        alignment, has_views = 256, False
         in_batch = replays = True
 
     proxy = Proxy(Able())
-    assert (proxy.info, proxy.alignment, proxy.in_batch, proxy.replays) == (Plain.info, 256, True, True)
+    assert (proxy.info, proxy.alignment, proxy.has_views, proxy.in_batch, proxy.replays) == (
+        Plain.info, 256, False, True, True,
+    )  # fmt: skip
 
 
 def test_a_proxy_sees_each_launch_of_programs_and_recordings(backend):

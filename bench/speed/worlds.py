@@ -5,9 +5,9 @@
 
 Every world is a room of 256 x 256 cells with boxes in it, each with 16 robots of 360 beams. A single map has as many
 robots as the largest number of worlds, and either the size of a room or as many cells as all rooms, up to 4096 x 4096.
-Rates are of whole calls with poses and indices in host memory, on CUDA on the device. --kernels adds the time of each
+Rates time whole calls. Poses and indices are in host memory, on CUDA in the device's. --kernels adds the time of each
 launch by the device's clock, and --tiles casts rays of worlds in tiles of poses and rays, as rays of one map. --peers
-casts the lidars of robots among discs in worlds without walls, beside VMAS and ir-sim where they are installed.
+casts lidars among discs in worlds without walls, and runs VMAS and ir-sim on the same scene where they are installed.
 """
 
 from __future__ import annotations

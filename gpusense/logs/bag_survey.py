@@ -61,7 +61,7 @@ def survey(path: Path, topic: str | None, frame: str | None, odometry_from: str 
     odometer = odometry_topic(odometers, chosen, odometry_from)
     bag, skipped = Bag(path, chosen), _Skipped()
     bag.track.source = odometer
-    # Numbers of moving transforms without and with a stamp; one with a stamp suffices.
+    # Counts of moving transforms, by whether they have a stamp; a single stamped one suffices.
     stamped: Counter[bool] = Counter()
     for message in messages(path, {**scans_on(chosen), ODOMETRY: {odometer}, TRANSFORMS: None}):
         for each in message.fields.transforms if message.kind == TRANSFORMS else (message.fields,):

@@ -60,7 +60,7 @@ class Poses:
         self.host: np.ndarray | None = None
         self._name, self._scans = name, scans
         self._last_corners: tuple[Part, Corners] | None = None
-        # Distance by which launches may move poses [m].
+        # Farthest that launches move a pose [m].
         self.reach = 0.0
         # Poses that a workspace has on the device before they are placed.
         self._ahead: tuple[Part, Workspace, Buffer] | None = None

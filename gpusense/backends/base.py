@@ -74,7 +74,6 @@ class Backend(ABC):
 
     info: BackendInfo  # the device behind this backend
     alignment: int = 1  # parts of buffers begin at multiples of this number of bytes
-    has_views: bool = True  # true if parts of buffers are addresses in their memory, without objects of the driver
     # Memory of freed results on the host; None where a new array costs less.
     results: ResultMemory | None = None
 

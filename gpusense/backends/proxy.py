@@ -39,7 +39,6 @@ class Proxy(Backend):
         return self._backend.info
 
     alignment = _forwarded_property("alignment")
-    has_views = _forwarded_property("has_views")
     in_batch = _forwarded_property("in_batch")
     replays = _forwarded_property("replays")
     results = _forwarded_property("results")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any, TypeVar
@@ -14,10 +15,10 @@ from gpusense.interface.launches import Program, flags_of
 
 T = TypeVar("T")
 
-# Number of programs of earlier calls that are kept.
+# Number of programs of earlier calls that are kept, and of divided buffers of a name.
 _MOST_KEPT = 64
-# Alignment of arrays that are uploaded as one [bytes].
-_ALIGNED = 256
+# Alignment of arrays that are uploaded as one, and their largest total size [bytes].
+_ALIGNED, _MOST_TOGETHER = 256, 256 << 10
 # The non-finite flag of poses on the device.
 POSE_STATUS = ("pose_status", np.dtype(np.int32))
 
@@ -88,7 +89,8 @@ class Workspace:
         # Programs of earlier calls, keyed by everything on which they depend.
         self._programs = ProgramCache[Any](_MOST_KEPT)
         self._version = 0
-        self._parts: dict[Hashable, list[Buffer]] = {}
+        # Buffers of arrays that are uploaded as one, with their parts, by name and by sizes of the parts.
+        self._packs: dict[Hashable, dict[tuple[int, ...], tuple[Buffer, list[Buffer]]]] = {}
         # Keys of arrays that buffers hold, with these buffers.
         self._held: dict[str, tuple[Hashable, Buffer]] = {}
 
@@ -114,7 +116,7 @@ class Workspace:
         """Drop the non-finite flag and held arrays after an error: copies and launches may not have ended."""
         self._held.clear()
         if POSE_STATUS in self._buffers:
-            self._forget()
+            self._programs.clear()
             del self._buffers[POSE_STATUS]
 
     def submit(self) -> None:
@@ -172,7 +174,7 @@ class Workspace:
         """Return a buffer of at least ``count`` numbers; its old contents are lost."""
         capacity, buffer = self._buffers.get((name, dtype), (0, None))
         if buffer is None or capacity < count:
-            self._forget()
+            self._programs.clear()
             self._buffers.pop((name, dtype), None)
             capacity = max(count, capacity + capacity // 2, 1)
             buffer = None
@@ -210,28 +212,36 @@ class Workspace:
         return buffer
 
     def upload_all(self, name: str, arrays: Sequence[np.ndarray]) -> list[Buffer]:
-        """Start copying arrays of one dtype, none of them empty; as one where parts of buffers are plain memory.
+        """Start copying arrays of one dtype, none of them empty; short ones as one.
 
-        Overlapping parts of OpenCL's buffers, freed soon, are the suspected cause of crashes of NVIDIA's driver.
+        Each part of a buffer has at least the size of its array. No two parts overlap, and none is freed before the
+        workspace: overlapping parts that were freed early are the suspected cause of crashes of NVIDIA's OpenCL.
         """
-        if not self.backend.has_views:
-            return [self.upload(f"{name} {number}", array) for number, array in enumerate(arrays)]
-        sizes, dtype = tuple([array.size for array in arrays]), arrays[0].dtype
+        dtype = arrays[0].dtype
         aligned = max(_ALIGNED, self.backend.alignment) // dtype.itemsize
-        firsts, total = [], 0
-        for size in sizes:
-            firsts.append(total)
-            total += -(-size // aligned) * aligned
-        packed = np.empty(total, dtype)
-        for first, array in zip(firsts, arrays, strict=True):
+        sizes, firsts = [], [0]
+        for array in arrays:
+            # Few sizes, at most a quarter longer than the array.
+            step = max(aligned, (1 << array.size.bit_length()) >> 3)
+            sizes.append(-(-array.size // step) * step)
+            firsts.append(firsts[-1] + sizes[-1])
+        if firsts[-1] * dtype.itemsize > _MOST_TOGETHER:
+            return [self.upload(f"{name} {number}", array) for number, array in enumerate(arrays)]
+        packs, key = self._packs.setdefault((name, dtype), {}), tuple(sizes)
+        if key not in packs:
+            if len(packs) >= _MOST_KEPT:
+                self.wait()
+                self._programs.clear()
+                packs.clear()
+            whole = self.backend.empty(firsts[-1], dtype)
+            pairs = itertools.pairwise(firsts)
+            packs[key] = whole, [self.backend.part(whole, first, end - first, dtype) for first, end in pairs]
+        whole, parts = packs[key]
+        packed = np.empty(firsts[-1], dtype)
+        for first, array in zip(firsts, arrays, strict=False):
             packed[first : first + array.size] = array.reshape(-1)
-        buffer, key = self.upload(name, packed), (name, dtype, sizes)
-        parts = self._parts.get(key)
-        if parts is None:
-            if len(self._parts) >= _MOST_KEPT:
-                self._parts.clear()
-            parts = [self.backend.part(buffer, *part, dtype) for part in zip(firsts, sizes, strict=True)]
-            self._parts[key] = parts
+        self._busy.append(packed)
+        self.backend.upload(packed, whole, wait=False)
         return parts
 
     def download(self, buffer: Buffer, out: np.ndarray) -> None:
@@ -249,14 +259,10 @@ class Workspace:
         self.backend.synchronize()
         self._busy.clear()
 
-    def _forget(self) -> None:
-        """Drop programs and parts, because a buffer is replaced."""
-        self._programs.clear()
-        self._parts.clear()
-
     def release(self, keep: str = "") -> None:
         """Wait, and free all memory except the buffers named ``keep``; the next call allocates anew."""
         self.wait()
-        self._forget()
+        self._programs.clear()
+        self._packs.clear()
         self._held.clear()
         self._buffers = {key: kept for key, kept in self._buffers.items() if key[0] == keep}

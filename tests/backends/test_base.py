@@ -161,13 +161,11 @@ def test_a_proxy_forwards_methods(name, arguments, options, monkeypatch):
 
 def test_a_proxy_forwards_properties():
     class Able(Plain):
-        alignment, has_views = 256, False
+        alignment = 256
         in_batch = replays = True
 
     proxy = Proxy(Able())
-    assert (proxy.info, proxy.alignment, proxy.has_views, proxy.in_batch, proxy.replays) == (
-        Plain.info, 256, False, True, True,
-    )  # fmt: skip
+    assert (proxy.info, proxy.alignment, proxy.in_batch, proxy.replays) == (Plain.info, 256, True, True)
 
 
 def test_a_proxy_sees_each_launch_of_programs_and_recordings(backend):

@@ -62,7 +62,7 @@ class OpenCLBackend(ProcessBound, Backend):
         # Intel's driver does not keep the context of a queue alive.
         self._context = cl.Context([device]) if queue is None else queue.context
         self._queue = cl.CommandQueue(self._context) if queue is None else queue
-        self._shared = self.has_views = shares_memory(device)
+        self._shared = shares_memory(device)
         self.results = ResultMemory() if info.kind == "gpu" else None
         # Staged copies, only for the driver with which they were measured.
         staged = info.kind == "gpu" and not self._shared and "NVIDIA" in device.vendor

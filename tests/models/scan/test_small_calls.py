@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import threading
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,21 +54,39 @@ def test_shared_memory_changes_no_bit(kind, two_ways):
 
 
 @pytest.mark.parametrize("kind", MODELS)
-def test_scans_are_not_copied_into_parts_of_buffers_that_are_objects_of_the_driver(kind, two_ways, monkeypatch):
-    """Models evaluate scans of different numbers of readings without parts of a buffer of the driver."""
-    divided = []
-    for device in two_ways:
-        part = device.part
-        monkeypatch.setattr(device, "part", lambda buffer, first, *rest, part=part: (
-            divided.append(first) if first else None, part(buffer, first, *rest))[1])  # fmt: skip
-        model, few = kind(GRID, SCANNER, backend=device), scan(1)
-        few[::3] = np.nan
-        results = [model.log_likelihood(cloud(1), one) for one in (scan(1), few)]
-        results.append(model.log_likelihood(np.stack([cloud(1), cloud(2)]), np.stack([scan(1), few])))
-        if device is two_ways[0]:
-            expected, copied = results, len(divided)
-    assert 0 < copied == len(divided)
-    assert [differing(*both) for both in zip(results, expected, strict=True)] == [0, 0, 0]
+def test_parts_of_buffers_do_not_overlap_and_stay(kind, two_ways, monkeypatch):
+    """Scans of different numbers of readings, which are uploaded as one array each."""
+    made: list[tuple[Any, int, int]] = []
+
+    def watched(buffer: Any, first: int, count: int, dtype: np.dtype) -> Any:
+        made.append((buffer, first * dtype.itemsize, (first + count) * dtype.itemsize))
+        return part(buffer, first, count, dtype)
+
+    few, single, part = scan(1), np.full(BEAMS, np.nan), two_ways[1].part
+    few[::3], single[4] = np.nan, 2.0
+    calls = [(cloud(1), one) for one in (scan(1), few, single)]
+    calls.append((np.stack([cloud(1), cloud(2)]), np.stack([scan(1), few])))
+    monkeypatch.setattr(two_ways[1], "part", watched)
+    expected, found = (kind(GRID, SCANNER, backend=device) for device in two_ways)
+    for again in range(2):
+        before = len(made)
+        for call in calls:
+            assert differing(found.log_likelihood(*call), expected.log_likelihood(*call)) == 0
+        assert again == (len(made) == before)
+    for (one, begin, end), (other, first, last) in itertools.combinations(made, 2):
+        assert one is not other or end <= first or last <= begin
+
+
+def test_uploads_of_many_sizes_keep_few_buffers(two_ways, monkeypatch):
+    """Sizes share buffers; contents are right when buffers are dropped, and for arrays that are copied apart."""
+    device, made = two_ways[1], []
+    empty, space = device.empty, Workspace(device)
+    monkeypatch.setattr(device, "empty", lambda *one, **how: (made.append(one), empty(*one, **how))[1])
+    for other, size in itertools.product((3, 1000, 2000, 3000), (*range(1, 40_000, 500), 100_000)):
+        arrays = [np.arange(size, dtype=np.float32), np.full(other, size, np.float32)]
+        for array, part in zip(arrays, space.upload_all("some", arrays), strict=True):
+            assert np.array_equal(device.download(part, np.empty_like(array)), array)
+    assert 64 < len(made) < 130
 
 
 def test_launches_see_the_contents_of_their_time(two_ways):

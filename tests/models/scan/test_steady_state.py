@@ -32,8 +32,21 @@ def scan(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0, 4.99, BEAMS)
 
 
+@pytest.fixture
+def as_gpu(as_gpu, monkeypatch):
+    """Devices that pass as GPUs; with OpenCL they do not share their memory with the host."""
+
+    def pretend(gpu: bool):
+        device = as_gpu(gpu)
+        if gpu and device.info.backend == "opencl":
+            monkeypatch.setattr(device, "_shared", False)
+        return device
+
+    return pretend
+
+
 class Watch:
-    """A counter of a backend's allocations, compilations and copied bytes."""
+    """A counter of a backend's allocations, parts of buffers, compilations and copied bytes."""
 
     def __init__(self, device, monkeypatch) -> None:
         kind = type(device)
@@ -41,7 +54,7 @@ class Watch:
         self.compiled: list[str] = []
         self.up: list[int] = []
         self.down: list[int] = []
-        upload, download, empty = kind.upload, kind.download, kind.empty
+        upload, download, empty, part = kind.upload, kind.download, kind.empty, kind.part
 
         def watched_upload(backend, array, out=None, *, wait=True):
             self.up.append(array.nbytes)
@@ -55,6 +68,11 @@ class Watch:
             self.allocated.append(count)
             return empty(backend, count, dtype, zero=zero)
 
+        def watched_part(backend, buffer, first, count, dtype):
+            self.allocated.append(count)
+            return part(backend, buffer, first, count, dtype)
+
+        monkeypatch.setattr(kind, "part", watched_part)
         monkeypatch.setattr(kind, "upload", watched_upload)
         monkeypatch.setattr(kind, "download", watched_download)
         monkeypatch.setattr(kind, "empty", watched_empty)

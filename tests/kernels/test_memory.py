@@ -45,10 +45,14 @@ changed, part = cells > 0, Window(4, 0, 3, 5)
 part.cut(changed)[...] = ~part.cut(changed)
 
 
+loops = device.info.vector_loops
+
+
 def pretend(kind):
-    # Processors and GPUs have kernels of their own, and tables of 2 and 4 sectors.
+    # Processors and GPUs have kernels of their own, and tables of 2 and 4 sectors. No GPU has loops in vectors.
     for one in (device, numpy):
         object.__setattr__(one.info, "kind", kind)
+    object.__setattr__(device.info, "vector_loops", loops and kind == "cpu")
 
 
 for kind in ("cpu", "gpu"):

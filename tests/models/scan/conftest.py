@@ -23,7 +23,8 @@ def batching(needs, monkeypatch):
     installed(monkeypatch)
     monkeypatch.setattr(arrays, "on_device", lambda array: isinstance(array, (wp.array, Array, Adopted)))
     device = get_backend("warp:cpu")
-    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1, graphs=True))
+    info = dataclasses.replace(device.info, kind="gpu", lanes=1, vector_loops=False, graphs=True)
+    monkeypatch.setattr(device, "info", info)
     monkeypatch.setattr(device, "_graphs", GraphCache(device._device))
     started, launch = [], wp.capture_launch
     monkeypatch.setattr(wp, "capture_launch", lambda *given: started.append(launch(*given)))

@@ -25,7 +25,7 @@ from gpusense.backends.base import Backend, Launcher, Recording
 from gpusense.backends.proxy import Proxy
 from gpusense.evaluation.benchmark.report import commit
 from gpusense.evaluation.machine import machine
-from gpusense.evaluation.scoring import chosen_scans, with_poses
+from gpusense.evaluation.steps import chosen_scans, with_poses
 from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
 from gpusense.interface.launches import Launch, Program
 

@@ -29,7 +29,7 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation import stiff
 from gpusense.evaluation.benchmark.report import commit
-from gpusense.evaluation.tolerances import TOLERANCES
+from gpusense.evaluation.tolerances import TOLERANCES, Check
 from gpusense.models.scan.densities import naive_log_hit, naive_log_short
 from gpusense.reference.mixture import log_density
 
@@ -141,34 +141,25 @@ def plot(path: Path, sweeps: dict[str, Sweep], label: str, title: str) -> None:
     figure.savefig(path, dpi=110)
 
 
-def family_of(quantity: str) -> str:
-    """Return the family of a quantity of ``stiff.run``; empty for the textbook's formulas."""
-    if quantity.startswith("textbook"):
-        return ""
-    if quantity.startswith("ranges"):
-        return "ranges"
-    if quantity.endswith("sum of the weights"):
-        return "sum of the weights"
-    model = "beam model" if quantity.startswith("beam model") else ", ".join(quantity.split(", ")[:2])
-    return f"{model}, a {'scan' if ', scans,' in quantity else 'beam'}"
-
-
-def family_rows(backend: str, precision: str, rows: list[stiff.Row]) -> list[dict[str, Any]]:
-    """Return the row with the largest share of its bound of each family."""
+def family_rows(precision: str, checks: list[Check]) -> list[dict[str, Any]]:
+    """Return the check with the largest share of its bound of each quantity, over all cases."""
+    families: dict[str, list[Check]] = {}
+    for check in checks:
+        families.setdefault(check.quantity.partition("; ")[0].removeprefix(f"{precision} "), []).append(check)
     found = []
-    for family in sorted(filter(None, {family_of(row.quantity) for row in rows})):
-        own = [row for row in rows if family_of(row.quantity) == family]
-        worst = max(own, key=lambda row: (row.nonfinite, _share(row)))
+    for family, group in sorted(families.items()):
+        worst = max(group, key=_share)
+        lost = sum(math.isinf(check.difference) for check in group)
         found.append({
-            "backend": backend, "precision": precision, "family": family, "worst": worst.worst,
-            "share": _share(worst), "not_finite": sum(row.nonfinite for row in own), "case": worst.case,
+            "backend": worst.left, "precision": precision, "family": family, "worst": worst.difference,
+            "share": _share(worst), "not_finite": lost, "case": worst.quantity.partition("; ")[2],
         })  # fmt: skip
     return found
 
 
-def _share(row: stiff.Row) -> float:
+def _share(check: Check) -> float:
     """Return an error as a share of its bound; for a bound of 0 return 0 or 2."""
-    return row.worst / row.bound if row.bound else 2.0 * (row.worst > 0)
+    return check.difference / check.tolerance.value if check.tolerance.value else 2.0 * (check.difference > 0)
 
 
 def picture(families: list[dict[str, Any]]) -> str:
@@ -208,13 +199,16 @@ def grid_rows(backends: list[str], families: list[dict[str, Any]]) -> list[dict[
     found = []
     for backend in backends:
         for precision in PRECISIONS[: 1 + get_backend(backend).info.float64]:
-            rows = stiff.run(backend, precision)
-            families += family_rows(backend, precision, rows)
-            own, naive, *_ = rows
+            checks, grid = stiff.run(backend, precision), stiff.density_grid(backend, precision)
+            families += family_rows(precision, checks)
+            densities = checks[0]
+            bound, naive = densities.tolerance.value, stiff.error_in_eps(grid.naive(), grid.truth(), precision)
             found.append({
-                "backend": backend, "precision": precision, "worst": own.worst, "not_finite": own.nonfinite,
-                "bound": own.bound, "kept": sum(row.ok for row in rows), "rows": len(rows), "naive_worst": naive.worst,
-                "naive_not_finite": naive.nonfinite, "readings": own.case.split()[0],
+                "backend": backend, "precision": precision, "worst": densities.difference,
+                "not_finite": int(np.isinf(stiff.error_in_eps(grid.log_p, grid.truth(), precision)).sum()),
+                "bound": bound, "kept": sum(check.passed for check in checks), "rows": len(checks),
+                "naive_worst": float(np.mean(naive > bound)), "naive_not_finite": int(np.isinf(naive).sum()),
+                "readings": len(grid.z),
             })  # fmt: skip
     return found
 

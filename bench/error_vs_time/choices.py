@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from gpusense.evaluation.benchmark.choice import choose, error_text, time_text
-from gpusense.evaluation.benchmark.report import table
-from gpusense.evaluation.benchmark.rows import ALL, Row
+from gpusense.evaluation.benchmark.report import ALL, Row, table
 
 WRONG, MEDIAN, TAIL, LARGEST = (
     "rays wrong by more than a cell", "median error of a ray", "95 % error of a ray", "largest error of a ray",

@@ -35,8 +35,7 @@ from error_vs_time.reports import LIMIT, RESULTS, ROOT, Source, commit_trouble, 
 
 from gpusense._util.files import write_whole
 from gpusense.evaluation.benchmark.choice import front, time_text
-from gpusense.evaluation.benchmark.report import table
-from gpusense.evaluation.benchmark.rows import ALL, Row
+from gpusense.evaluation.benchmark.report import ALL, Row, table
 from gpusense.plots.error_page import error_page
 
 HERE = Path(__file__).parent

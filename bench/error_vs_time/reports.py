@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from gpusense._util.files import write_whole
-from gpusense.evaluation.benchmark.rows import ALL, MODEL_MEASURES, Row, model_rows, origin_of, titles_of
+from gpusense.evaluation.benchmark.report import ALL, MODEL_MEASURES, Row, model_rows, origin_of, titles_of
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "bench" / "results"

@@ -30,7 +30,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from gpusense._util.extras import install_command
-from gpusense.evaluation.benchmark.candidates import Candidate
+from gpusense.evaluation.benchmark.candidates import Candidate, Runner
 from gpusense.evaluation.benchmark.scenes import Scene
 from gpusense.world.scanner import Reading, classify
 
@@ -52,13 +52,6 @@ except ImportError as error:
     numba, NUMBA_MISSING = None, f"not installed ({error}): {install_command('numba')}"
 else:
     NUMBA_MISSING = ""
-
-
-class Runner:
-    """A candidate prepared for a scene, as ``gpusense bench`` measures it."""
-
-    def __init__(self, run: Callable[[np.ndarray], np.ndarray], table_bytes: int) -> None:
-        self.run, self.table_bytes = run, table_bytes
 
 
 def in_cells(scene: Scene, poses: np.ndarray) -> np.ndarray:
@@ -166,7 +159,7 @@ def numba_field(kind: str) -> Callable[[Scene, None, str], Runner]:
         cells, bearings = scene.readings[chosen] / scene.grid.resolution, scene.scanner.bearings[chosen]
         points = cells[:, None] * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
         score = {"log grid": score_logs, "log of products": score_products, "sum of cubes": score_cubes}[kind]
-        return Runner(lambda poses: score(grid, beyond, in_cells(scene, poses), points), grid.nbytes)
+        return Runner(lambda poses: score(grid, beyond, in_cells(scene, poses), points))
 
     return make
 
@@ -192,7 +185,7 @@ def numba_march(bins: int) -> Callable[[Scene, None, str], Runner]:
             placed[:, :2] *= side
             return march(distances, side, placed, scanner.bearings, cosines, sines, scanner.range_max)
 
-        return Runner(run, distances.nbytes)
+        return Runner(run)
 
     return make
 
@@ -207,7 +200,7 @@ def range_libc_caster(library: Any, kind: str, bins: int) -> Callable[[Scene, No
         def run(poses: np.ndarray) -> np.ndarray:
             return caster.cast(in_cells(scene, poses), scene.scanner.bearings) * scene.grid.resolution
 
-        return Runner(run, caster.table_bytes)
+        return Runner(run)
 
     return make
 
@@ -234,7 +227,7 @@ def f1tenth_scan(module: Any, bins: int) -> Callable[[Scene, None, str], Runner]
             turned = poses + np.array([0.0, 0.0, middle])
             return np.minimum(np.array([simulator.scan(pose, *noise) for pose in turned]), limit)
 
-        return Runner(run, simulator.dt.nbytes)
+        return Runner(run)
 
     return make
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from accuracy import compiled_peers
 
-from gpusense.evaluation.benchmark.candidates import Candidate
+from gpusense.evaluation.benchmark.candidates import Candidate, Runner
 from gpusense.evaluation.benchmark.scenes import Scene
 from gpusense.world.grid import OccupancyGrid
 
@@ -30,28 +30,23 @@ MODELS = {"beam": {"beam": "sum of cubes"}, "field": {"field": "sum of cubes", "
 _kept: list[tempfile.TemporaryDirectory[str]] = []
 
 
-class Runner:
-    """A model prepared for a scene, as ``gpusense bench`` measures it."""
+def runner_of(compiled: compiled_peers.Compiled, scene: Scene, problem: str, model: str) -> Runner:
+    """Prepare a model for a scene; its runner returns the logarithms of the weights."""
+    grid, beam, field = scene.grid, scene.beam, scene.field
+    placed = OccupancyGrid(np.where(grid.occupied, 100, 0).astype(np.int8), grid.resolution)
+    one = beam if problem == "beam" else field
+    parameters = (one.z_hit, beam.z_short, beam.z_max, one.z_rand, one.sigma_hit, beam.lambda_short,
+                  field.max_distance)  # fmt: skip
+    weigh = compiled_peers.Weigher(compiled, placed, scene.scanner, parameters, model)
 
-    def __init__(self, compiled: compiled_peers.Compiled, scene: Scene, problem: str, model: str) -> None:
-        grid, beam, field = scene.grid, scene.beam, scene.field
-        cells = np.where(grid.occupied, 100, 0).astype(np.int8)
-        self._turn, self._side, self._scene = grid.origin[2], grid.resolution, scene
-        placed = OccupancyGrid(cells, grid.resolution)
-        one = beam if problem == "beam" else field
-        parameters = (one.z_hit, beam.z_short, beam.z_max, one.z_rand, one.sigma_hit, beam.lambda_short,
-                      field.max_distance)  # fmt: skip
-        self._weigh = compiled_peers.Weigher(compiled, placed, scene.scanner, parameters, model)
-        # Distances of nav2_amcl, 4 bytes of state and 8 of distance a cell; a float a cell of Beluga.
-        self.table_bytes = cells.size * (16 if compiled.name == "amcl" else 4) if problem == "field" else 0
-
-    def run(self, poses: np.ndarray) -> np.ndarray:
-        """Return the logarithms of the weights."""
-        placed = np.empty_like(poses)
-        placed[:, :2] = self._scene.grid.world_to_cells(poses[:, :2]) * self._side
-        placed[:, 2] = poses[:, 2] - self._turn
+    def run(poses: np.ndarray) -> np.ndarray:
+        moved = np.empty_like(poses)
+        moved[:, :2] = grid.world_to_cells(poses[:, :2]) * grid.resolution
+        moved[:, 2] = poses[:, 2] - grid.origin[2]
         with np.errstate(divide="ignore"):
-            return np.log(self._weigh(placed, self._scene.readings))
+            return np.log(weigh(moved, scene.readings))
+
+    return Runner(run)
 
 
 def load(name: str) -> tuple[compiled_peers.Compiled | None, str, str]:
@@ -83,4 +78,4 @@ def candidates() -> list[Candidate]:
 
 
 def _maker(compiled: Any, problem: str, model: str) -> Callable[[Scene, None, str], Runner]:
-    return lambda scene, backend, precision: Runner(compiled, scene, problem, model)
+    return lambda scene, backend, precision: runner_of(compiled, scene, problem, model)

@@ -13,6 +13,7 @@ Integers: TypeAlias = NDArray[np.int64]
 Flags: TypeAlias = NDArray[np.bool]
 
 Precision: TypeAlias = Literal["float32", "float64"]
+PRECISIONS: tuple[Precision, ...] = ("float32", "float64")
 Space: TypeAlias = Literal["free", "occupied"]
 Compat: TypeAlias = Literal["amcl", "beluga"]
 CasterName: TypeAlias = Literal["exact", "dda", "march", "bresenham", "cddt", "lookup"]

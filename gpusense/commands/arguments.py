@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from gpusense._util.extras import check_library
 from gpusense._util.files import check_writable
+from gpusense._util.typing import PRECISIONS
 from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
@@ -198,7 +199,7 @@ def add_model(parser: argparse.ArgumentParser) -> None:
     """Add ``--model`` and ``--precision``."""
     add = parser.add_argument
     add("--model", choices=("beam", "field"), default="beam", help="measurement model (default: %(default)s)")
-    add("--precision", choices=("float32", "float64"), default="float32", help="precision (default: %(default)s)")
+    add("--precision", choices=PRECISIONS, default="float32", help="precision (default: %(default)s)")
 
 
 def add_parameters(parser: argparse.ArgumentParser) -> None:

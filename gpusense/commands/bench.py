@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from gpusense._util.files import check_writable, write_whole
 from gpusense._util.progress import progress
+from gpusense._util.typing import PRECISIONS
 from gpusense.commands.arguments import BACKEND_HELP, add_json, open_backends, positive_number, whole_number
 from gpusense.commands.output import print_json, print_result, print_table
 from gpusense.commands.signals import held
@@ -25,15 +26,12 @@ HELP = "Measure error against run time of every caster and model, and name the f
 FIRST = ("quick", "html", "map", "max_error", "max_time")
 
 PROBLEMS = ("ranges", "beam", "field")
-PRECISIONS = ("float32", "float64")
-DEFAULTS: dict[str, Any] = {"particles": None, "checked": 512, "beams": 360, "repeats": 20, "seed": 0}
-QUICK: dict[str, Any] = {"particles": 128, "checked": 128, "beams": 60, "repeats": 10, "seed": 0}
-# Measuring time after which a quick run starts no further point, and its longest time to build a table [s].
-_QUICK_DEADLINE, _QUICK_BUILD = 40.0, 3.0
-# Longest time of a point's calls in a quick run, and of its launches [s].
-_QUICK_SECONDS = 0.02
-# Slower tables [s] are built once in a quick run, and their times include compiling.
-_QUICK_TWICE = 0.03
+# Fields of the plan of a quick run that differ: 40 s of measuring, 20 ms of calls a point.
+QUICK: dict[str, Any] = {
+    "particles": 128, "checked": 128, "beams": 60, "repeats": 10, "build_limit": 3.0, "seconds": 0.02, "deadline": 40.0,
+}  # fmt: skip
+# Options that are fields of the plan.
+_FIELDS = ("particles", "checked", "beams", "repeats", "seconds", "build_limit", "seed")
 
 EPILOG = """\
 Every method with every value of its knob computes the same ranges and scores the same scan, for particles over the
@@ -51,9 +49,6 @@ Scenes: 'building' and 'clutter' are generated. If GPUSENSE_DATA names the folde
 --output DIR receives report.json with all points and the reasons of failures. --html FILE writes the
 interactive page of docs/error-vs-time.md for this measurement: time over error, the method for a budget, and
 performance profiles.
-
---quick builds a table that takes more than 0.03 s once, and its time to build then includes compiling; a look-up table
-or CDDT serves both clouds of a scene.
 
 examples:
   gpusense bench --quick --html bench.html
@@ -145,10 +140,7 @@ def make_plan(args: argparse.Namespace) -> tuple[Plan, list[str]]:
     from gpusense.evaluation.benchmark.runner import Plan
     from gpusense.evaluation.benchmark.scenes import sources
 
-    numbers = {
-        name: default if getattr(args, name) is None else getattr(args, name)
-        for name, default in (QUICK if args.quick else DEFAULTS).items()
-    }
+    numbers = {name: getattr(args, name) for name in _FIELDS if getattr(args, name) is not None}
     chosen = candidates(args.problem or PROBLEMS, quick=args.quick)
     if args.method:
         names = list(dict.fromkeys(candidate.method for candidate in chosen))
@@ -162,10 +154,7 @@ def make_plan(args: argparse.Namespace) -> tuple[Plan, list[str]]:
     plan = Plan(
         sources(args.scene, args.map, quick=args.quick), backends, chosen,
         args.precision or (PRECISIONS[:1] if args.quick else PRECISIONS),
-        build_limit=args.build_limit or (_QUICK_BUILD if args.quick else 60.0),
-        seconds=args.seconds or (_QUICK_SECONDS if args.quick else 5.0),
-        deadline=_QUICK_DEADLINE if args.quick else float("inf"),
-        slow_to_make=_QUICK_TWICE if args.quick else None, **numbers,
+        **({"seconds": 5.0} | (QUICK if args.quick else {}) | numbers),
     )  # fmt: skip
     return plan, [*_absent_devices(args.backend), *failures]
 
@@ -178,13 +167,10 @@ def _absent_devices(selections: Sequence[str] | None) -> list[str]:
 
 def arguments_of(args: argparse.Namespace, plan: Plan) -> dict[str, Any]:
     """Return the arguments that affect the measurements; files are reduced to names."""
-    return {
+    return {name: getattr(plan, name) for name in _FIELDS} | {
         "quick": plan.deadline < float("inf"), "scenes": [source.name for source in plan.sources],
-        "particles": plan.particles, "checked": plan.checked, "beams": plan.beams,
-        "repeats": plan.repeats, "seconds": plan.seconds, "seed": plan.seed,
-        "precisions": list(plan.precisions), "build_limit": plan.build_limit,
-        "max_error": [list(one) for one in args.max_error], "max_time": args.max_time,
-        "problems": list(args.problem or PROBLEMS), "methods": args.method or [],
+        "precisions": list(plan.precisions), "max_error": [list(one) for one in args.max_error],
+        "max_time": args.max_time, "problems": list(args.problem or PROBLEMS), "methods": args.method or [],
     }  # fmt: skip
 
 
@@ -210,7 +196,7 @@ def write_report(folder: Path, report: Mapping[str, Any]) -> None:
 
 def write_page(file: Path, report: Mapping[str, Any]) -> None:
     """Write the interactive page of a report atomically."""
-    from gpusense.evaluation.benchmark.rows import model_rows
+    from gpusense.evaluation.benchmark.report import model_rows
     from gpusense.plots.error_page import error_page
 
     page = error_page(model_rows(report), text=f"{report['date']}. {machine_line()}")

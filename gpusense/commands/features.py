@@ -11,10 +11,19 @@ import numpy as np
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import add_backend, add_json, output_path, positive_number, whole_number
-from gpusense.commands.output import counted, print_fact, print_files, print_interrupted, print_report, print_result
+from gpusense.commands.output import (
+    counted,
+    draw,
+    print_details,
+    print_fact,
+    print_files,
+    print_interrupted,
+    print_report,
+    print_result,
+    write_table,
+)
 from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans
 from gpusense.commands.signals import held
-from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
     from gpusense.features.feature_map import FeatureMap
@@ -25,6 +34,9 @@ NAME = "features"
 HELP = "Extract lines, corners, doors, hallways, poles and reflectors from the scans of a log."
 FIRST = ("log", "reference", "kinds", "map_out", "plot")
 
+_COLUMNS = (
+    "scan", "kind", "x", "y", "theta", "deviation_x", "deviation_y", "deviation_theta", "size", "score",
+)  # fmt: skip
 # Scans per call and step of the progress bar.
 _CALL = 256
 
@@ -127,6 +139,7 @@ def _report(
     """Print and write the features of all scans, or of the scans before an interrupt."""
     from gpusense.features.landmarks import map_features
     from gpusense.features.result import joined
+    from gpusense.plots.features import features_figure
 
     features = joined(parts, _CALL)
     done = min(_CALL * len(parts), len(scans))
@@ -137,8 +150,9 @@ def _report(
         _write_landmarks(args, landmarks, None)
     if args.out is not None:
         _write(args.out, features, scans)
-    if args.plot is not None:
-        _draw(args.plot, features, scans[:done])
+    most = int(np.bincount(features.scan, minlength=done).argmax())
+    shown = scans[most][1]
+    draw(args.plot, lambda: features_figure(features.of_scan(most), shown.ranges, shown.scanner))
     counts = {str(kind): int(count) for kind, count in zip(*np.unique(features.kind, return_counts=True), strict=True)}
     if args.json:
         rows = None if landmarks is None else _landmark_rows(landmarks)
@@ -153,8 +167,7 @@ def _report(
         print_fact("landmarks", f"{len(landmarks.kind)}, each in {args.least} scans or more: {_kinds(landmarks.kind)}")
     print_interrupted(done, len(scans))
     _print_files(args)
-    if args.verbose:
-        print(f"\n{1e3 * seconds / done:.3g} ms each with the first call's compilation\n{machine_line()}")
+    print_details(args, f"{1e3 * seconds / done:.3g} ms each with the first call's compilation")
 
 
 def _kinds(kinds: np.ndarray) -> str:
@@ -175,35 +188,16 @@ def _landmark_rows(landmarks: FeatureMap) -> list[dict[str, Any]]:
 
 
 def _write_landmarks(args: argparse.Namespace, landmarks: FeatureMap, grid: Any) -> None:
-    from gpusense.plots.drawing import save
     from gpusense.plots.features import landmarks_figure
 
     if args.map_out is not None:
         landmarks.save(args.map_out)
-    if args.map_plot is not None:
-        save(landmarks_figure(landmarks, grid), args.map_plot)
+    draw(args.map_plot, lambda: landmarks_figure(landmarks, grid))
 
 
 def _write(path: Path, features: Features, scans: list[tuple[int, Scan]]) -> None:
-    """Write one line per feature: scan, kind, pose, deviations, size and score."""
-    from gpusense._util.files import write_whole
-
-    deviation = np.sqrt(np.einsum("fii->fi", features.covariance))
-    lines = ["scan,kind,x,y,theta,deviation_x,deviation_y,deviation_theta,size,score"]
-    for scan, kind, pose, spread, size, score in zip(
-        features.scan, features.kind, features.pose, deviation, features.size, features.score, strict=True
-    ):
-        numbers = ",".join(repr(float(value)) for value in (*pose, *spread, size, score))
-        lines.append(f"{scans[int(scan)][0]},{kind},{numbers}")
-    text = "\n".join(lines) + "\n"
-    write_whole(path, lambda file: file.write(text.encode()))
-
-
-def _draw(path: Path, features: Features, scans: list[tuple[int, Scan]]) -> None:
-    """Draw the scan with the most features."""
-    from gpusense.plots.drawing import save
-    from gpusense.plots.features import features_figure
-
-    most = int(np.bincount(features.scan, minlength=len(scans)).argmax())
-    scan = scans[most][1]
-    save(features_figure(features.of_scan(most), scan.ranges, scan.scanner), path)
+    """Write a row per feature: scan, kind, pose, deviations, size and score."""
+    deviations = np.sqrt(np.einsum("fii->fi", features.covariance))
+    index = np.array([index for index, _ in scans])[features.scan]
+    columns = (index, features.kind, *features.pose.T, *deviations.T, features.size, features.score)
+    write_table(path, _COLUMNS, zip(*columns, strict=True))

@@ -158,7 +158,7 @@ def _read(args: argparse.Namespace) -> RangeData:
 
 
 def _fit(args: argparse.Namespace, data: RangeData, motion: MotionFit | None, partial: PartialFit) -> FitResult:
-    from gpusense.evaluation.held_out import compare_held_out
+    from gpusense.evaluation.range_data import compare_held_out
     from gpusense.learning.beam.fit import fit_beam_parameters
     from gpusense.learning.beam.incidence import fit_incidence_parameters
     from gpusense.world.scanner import Reading

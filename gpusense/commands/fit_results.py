@@ -20,8 +20,7 @@ from gpusense.commands.output import (
 from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
-    from gpusense.evaluation.held_out import HeldOut
-    from gpusense.evaluation.range_data import RangeData
+    from gpusense.evaluation.range_data import HeldOut, RangeData
     from gpusense.learning.beam.incidence import IncidenceFit
     from gpusense.learning.fitted import BeamFit
     from gpusense.localization.motion_fit import MotionFit

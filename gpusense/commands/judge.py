@@ -3,15 +3,34 @@
 from __future__ import annotations
 
 import argparse
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import add_backend, add_json, output_path, positive_number
+from gpusense.commands.output import (
+    counted,
+    draw,
+    length,
+    print_fact,
+    print_files,
+    print_report,
+    print_result,
+    write_table,
+)
 from gpusense.commands.scans import add_choice, add_log, options_named, read_chosen_steps
+from gpusense.commands.signals import held
 
 if TYPE_CHECKING:
+    from gpusense.evaluation.integrity import Integrity
+    from gpusense.evaluation.judging import Judgement, Stretch
     from gpusense.evaluation.steps import Step
+    from gpusense.logs import Scan
     from gpusense.models.scan.model import ScanModel
     from gpusense.world.grid import OccupancyGrid
 
@@ -78,9 +97,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Judge the poses, and print the results; after Ctrl-C, the results so far."""
-    from gpusense.commands.judge_report import report
     from gpusense.evaluation.judging import TrajectoryJudge
-    from gpusense.evaluation.posed_scans import posed_scans
+    from gpusense.evaluation.steps import posed_scans
     from gpusense.evaluation.trajectory_files import read_tum
     from gpusense.world.map_files import read_map
 
@@ -88,19 +106,16 @@ def run(args: argparse.Namespace) -> int:
     truth = None if args.truth is None else read_tum(args.truth)
     steps = read_chosen_steps(args)
     with options_named():
-        posed = posed_scans(args.log, steps, args.poses, map_frame=args.map_frame)
+        source, posed = posed_scans(args.log, steps, args.poses, map_frame=args.map_frame)
         judge = TrajectoryJudge(_models(args, grid, steps), risk=args.risk)
-    try:
-        with progress(len(posed.scans)) as step:
-            for one in posed.scans:
-                step(f"scan {one.index}")
-                judge.add(one.index, one.scan, one.pose, one.covariance, one.odometry)
-    except KeyboardInterrupt:
-        if judge.count:
-            report(args, grid, judge.result(len(steps)), posed, truth)
-        raise
+    with held(judge) as stops, progress(len(posed)) as step:
+        for one in posed:
+            step(f"scan {one.index}")
+            judge.add(one.index, one.scan, np.array(one.reference), one.covariance, one.odometry)
     found = judge.result(len(steps))
-    report(args, grid, found, posed, truth)
+    _report(args, grid, found, source, [one.scan for one in posed[: len(judge)]], truth)
+    if stops:
+        raise stops[0]
     return 0 if found.informed and not found.lost else LOST
 
 
@@ -116,3 +131,155 @@ def _models(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step]) ->
 
     scanners = dict.fromkeys(step.scan.scanner for step in steps)
     return [LikelihoodFieldModel(grid, one, backend=args.backend) for one in scanners]
+
+
+_COLUMNS = ("scan", "time", "x", "y", "theta", "p_lost", "verdict", "explained", "radius", "error")
+
+
+def _report(
+    args: argparse.Namespace, grid: OccupancyGrid, found: Judgement, source: str, scans: Sequence[Scan],
+    truth: tuple[np.ndarray, np.ndarray] | None,
+) -> None:  # fmt: skip
+    """Write the files, and print the results."""
+    from gpusense.evaluation.integrity import integrity
+    from gpusense.evaluation.judging import errors_of
+    from gpusense.plots.judgements import judgement_figure
+    from gpusense.plots.viewer import Recording
+
+    errors, rated = np.full(len(found.times), math.nan), None
+    if truth is not None:
+        errors = errors_of(found, *truth)
+        known = np.isfinite(errors)
+        times = found.times[known] if (np.diff(found.times[known]) > 0).all() else None
+        rated = integrity(errors[known], found.radii[known], alert_limit=args.alert_limit, times=times)
+    if args.csv is not None:
+        clock = [f"{time:.6f}" for time in found.times]
+        numbers = (found.p_lost, found.verdicts, found.explained, found.radii, errors)
+        write_table(args.csv, _COLUMNS, zip(found.index, clock, *found.poses.T, *numbers, strict=True))
+    draw(args.plot, lambda: judgement_figure(grid, found, rated, errors))
+    if args.record is not None:
+        Recording(grid, "judge").write_judgement(found, scans, args.record)
+    if args.json:
+        print_report(_document(found, source, rated, errors), args)
+        return
+    print_result(headline(found))
+    print_fact("poses", f"{len(found.times)} of {counted(found.scans, 'scan')}, by {source}")
+    print_stretches(found.stretches, float(found.times[0]), found.risk)
+    if rated is not None:
+        _print_integrity(rated, found.risk)
+    print_files(args.plot, args.csv, args.record)
+
+
+def headline(found: Judgement) -> str:
+    """Return the verdict in one line."""
+    total, right = found.duration(), found.duration("tracking")
+    if not found.informed:
+        return f"no verdict: no scan of {_seconds(total)} has a reading to judge by"
+    if len(found.times) == 1:
+        (verdict,) = found.verdicts
+        return f"{'right' if verdict == 'tracking' else verdict} at its only pose; p_lost {found.p_lost[0]:.2g}"
+    lost = [one for one in found.stretches if one.verdict == "lost"]
+    parts = [f"right for {_seconds(right, unit=False)} of {_seconds(total)}"]
+    unsure = found.duration("uncertain")
+    if lost:
+        parts.append(_lost(lost, float(found.times[0])))
+    if unsure:
+        parts.append(f"uncertain for {_seconds(unsure)}")
+    if len(parts) == 1:
+        parts.append(f"p_lost at most {found.p_lost.max():.2g}")
+    return "; ".join(parts)
+
+
+def _lost(lost: Sequence[Stretch], begin: float) -> str:
+    """Return when the poses were lost, and how far off."""
+    off = max((one.off for one in lost if not math.isnan(one.off)), default=math.nan)
+    away = "" if math.isnan(off) else f", {'up to ' if len(lost) > 1 else ''}{off:.1f} m off the likeliest place"
+    if len(lost) == 1:
+        return f"lost from {lost[0].start - begin:.1f} s to {lost[0].end - begin:.1f} s{away}"
+    total = sum(one.duration for one in lost)
+    return f"lost for {_seconds(total)} in {len(lost)} stretches, first from {lost[0].start - begin:.1f} s{away}"
+
+
+def _seconds(time: float, *, unit: bool = True) -> str:
+    return (f"{time:.0f}" if time >= 9.95 else f"{time:.1f}") + (" s" if unit else "")
+
+
+def _print_integrity(rated: Integrity, risk: float) -> None:
+    print_fact(
+        "integrity",
+        f"hazardously misleading {100 * rated.hazardous:.3g} %, misleading {100 * rated.misleading:.3g} %, available "
+        f"{100 * rated.available:.3g} % of {counted(len(rated.errors), 'pose')} with a truth, at risk {risk:g} and "
+        f"alert limit {rated.alert_limit:g} m",
+    )
+    print_fact("error", f"median {length(float(np.median(rated.errors)))}; above the radius in "
+               f"{100 * rated.exceeded:.3g} % of the poses")  # fmt: skip
+    delays = rated.times_to_alert
+    if len(delays):
+        alerted = delays[np.isfinite(delays)]
+        longest = f", after at most {alerted.max():.2g} s" if len(alerted) else ""
+        print_fact("alerts", f"{len(alerted)} of {counted(len(delays), 'error')} above the alert limit{longest}")
+
+
+def _document(found: Judgement, source: str, rated: Integrity | None, errors: np.ndarray) -> dict[str, Any]:
+    names = ("lost", "informed", "scans", "risk", "index", "times", "poses", "p_lost", "verdicts", "explained", "radii")
+    result = {name: getattr(found, name) for name in names} | {
+        "verdict": headline(found), "source": source, "stretches": stretch_rows(found.stretches), "integrity": None,
+        "seconds": {word: found.duration(word) for word in ("tracking", "uncertain", "lost")},
+    }  # fmt: skip
+    if rated is not None:
+        figures = ("alert_limit", "hazardous", "misleading", "available", "exceeded", "times_to_alert")
+        integrity = {"poses": len(rated.errors)} | {name: getattr(rated, name) for name in figures}
+        result |= {"errors": errors, "integrity": integrity}
+    return result
+
+
+# Most stretches that are printed.
+_MOST = 12
+
+
+def print_stretches(stretches: Sequence[Stretch], begin: float, risk: float) -> None:
+    """Print the stretches, the worst ones of many, by time since ``begin`` [s]."""
+    order = {"lost": 0, "uncertain": 1, "tracking": 2}
+    chosen = sorted(stretches, key=lambda one: (order[one.verdict], -one.duration))[:_MOST]
+    for one in sorted(chosen, key=lambda one: one.first):
+        print_fact(one.verdict, _summary(one, begin, risk))
+        if one.place is not None:
+            print_fact("", _place(one))
+        if one.diagnosis is not None:
+            print_fact("", one.diagnosis.text)
+    if len(chosen) < len(stretches):
+        print_fact("", f"and {len(stretches) - len(chosen)} shorter ones; --json lists all")
+
+
+def _summary(one: Stretch, begin: float, risk: float) -> str:
+    share, radius = "no beam to judge by", "no radius"
+    if math.isfinite(one.explained):
+        share = f"{100 * one.explained:.0f} % of the beams explained"
+    if math.isfinite(one.radius):
+        some = "" if one.promised == 1 else f" ({math.floor(100 * one.promised)} % of the scans)"
+        radius = f"within {length(one.radius)} at risk {risk:g}{some}"
+    return f"{one.start - begin:.1f} s to {one.end - begin:.1f} s: p_lost at most {one.p_lost:.2g}, {share}, {radius}"
+
+
+def _place(one: Stretch) -> str:
+    assert one.place is not None
+    if one.place.status == "no match":
+        return "no place of the map explains the scans"
+    x, y, theta = one.place.pose.tolist()
+    sure = "more likely at" if one.place.status == "found" else "among several places, likeliest at"
+    return (
+        f"{sure} x = {x:.2f}, y = {y:.2f}, theta = {theta:.2f} (p_right {one.place.p_right:.2g}), {one.off:.1f} m off"
+    )
+
+
+def stretch_rows(stretches: Sequence[Stretch]) -> list[dict[str, Any]]:
+    """Return the stretches as JSON documents."""
+    rows = []
+    for one in stretches:
+        names = ("verdict", "first", "last", "start", "end", "p_lost", "explained", "radius", "promised", "pose", "off")
+        row = {name: getattr(one, name) for name in names}
+        place = one.place
+        row["place"] = place and {"pose": place.pose, "p_right": place.p_right, "status": place.status}
+        row["evidence"] = None if one.diagnosis is None else asdict(one.diagnosis) | {"text": one.diagnosis.text}
+        rows.append(row)
+    return rows

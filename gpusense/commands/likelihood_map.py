@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,10 +15,18 @@ from gpusense.commands.arguments import (
     positive_number,
     whole_number,
 )
-from gpusense.commands.output import grouped, print_fact, print_files, print_report, print_result, print_table
+from gpusense.commands.output import (
+    grouped,
+    print_details,
+    print_fact,
+    print_files,
+    print_interrupted,
+    print_report,
+    print_result,
+    print_table,
+)
 from gpusense.commands.scans import add_log, add_range_max, read_scan
-from gpusense.commands.signals import code_of, word_of
-from gpusense.evaluation.machine import machine_line
+from gpusense.commands.signals import held
 
 if TYPE_CHECKING:
     import numpy as np
@@ -83,13 +90,10 @@ def run(args: argparse.Namespace) -> int:
     result, tiles = prepare_tiles(
         model, scan.ranges, resolution=args.resolution, headings=args.headings, positions=args.positions
     )
-    done, stopped = 0.0, None
-    with progress(100) as step:
-        try:
-            for done in tiles:
-                step(f"{100 * done:.0f}%")
-        except KeyboardInterrupt as stop:
-            stopped = stop
+    done = 0.0
+    with held((result,)) as stops, progress(100) as step:
+        for done in tiles:
+            step(f"{100 * done:.0f}%")
     result.plot(args.out)
     poses, log_p, gain = refine_modes(model, scan.ranges, result, _MODES)
     if args.json:
@@ -102,12 +106,11 @@ def run(args: argparse.Namespace) -> int:
         })  # fmt: skip
     else:
         _print(args, poses, log_p, gain)
-        if args.verbose:
-            print(f"\n{grouped(result.log_p.size)} poses, entropy {result.entropy:.2f} nats; refinement gains "
-                  f"{gain:.2g} nats\n{machine_line()}")  # fmt: skip
-    if stopped is not None:
-        sys.stderr.write(f"gpusense: {word_of(stopped)}: {100 * done:.0f}% of the positions are done\n")
-        return code_of(stopped)
+        print_interrupted(round(100 * done), 100, "per cent of the positions")
+        print_details(args, f"{grouped(result.log_p.size)} poses, entropy {result.entropy:.2f} nats; refinement gains "
+                      f"{gain:.2g} nats")  # fmt: skip
+    if stops:
+        raise stops[0]
     return 0
 
 

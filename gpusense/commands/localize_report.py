@@ -9,8 +9,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gpusense.commands.judge import print_stretches, stretch_rows
 from gpusense.commands.output import (
     degrees,
+    draw,
     length,
     print_fact,
     print_files,
@@ -19,7 +21,6 @@ from gpusense.commands.output import (
     print_result,
 )
 from gpusense.commands.scans import scan_times
-from gpusense.commands.stretches import print_stretches, stretch_rows
 from gpusense.evaluation.machine import machine_line
 from gpusense.localization.spread import WIDE, WIDE_TURN
 
@@ -27,8 +28,7 @@ if TYPE_CHECKING:
     from gpusense.evaluation.tracking import Track
     from gpusense.localization.diagnosis import Diagnosis
     from gpusense.localization.filter import ParticleFilter
-    from gpusense.plots.animation import Animation
-    from gpusense.plots.viewer import Recording
+    from gpusense.plots.viewer import Animation, Recording
 
     Recorder = Recording | Animation
 
@@ -45,6 +45,7 @@ def report(
     from gpusense.evaluation.judging import stretches_of_track
     from gpusense.evaluation.tracking import RISK, summary
     from gpusense.evaluation.trajectory_files import write_tum
+    from gpusense.plots.runs import track_figure
 
     result, stretches = summary(track), stretches_of_track(track)
     found = _diagnosis(pf, track, tracking=result["verdict"] == "tracking")
@@ -53,8 +54,7 @@ def report(
     if args.tum is not None:
         times, indices = scan_times([step.scan.time for step in track.steps])
         write_tum(args.tum, times[first:], track.poses[first:], indices=indices)
-    if args.plot is not None:
-        _draw(args.plot, pf, track)
+    draw(args.plot, lambda: track_figure(pf, track))
     for path, recorder in recorders.items():
         recorder.write(track, path)
     if args.json:
@@ -183,10 +183,3 @@ def _doubt(deviations: list[float], agrees: bool) -> str:
     if position > WIDE or heading > WIDE_TURN:
         return f"the particles lie {position:.1f} m and {math.degrees(heading):.0f} degrees apart"
     return "the scans so far fit other places as well: drive on" if agrees else ""
-
-
-def _draw(path: Path, pf: ParticleFilter, track: Track) -> None:
-    from gpusense.plots.drawing import save
-    from gpusense.plots.runs import track_figure
-
-    save(track_figure(pf, track), path)

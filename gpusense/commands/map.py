@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import (
@@ -15,25 +19,29 @@ from gpusense.commands.arguments import (
     output_path,
     positive_number,
 )
-from gpusense.commands.map_chain import (
-    add_chain,
-    chain_log,
-    check_chain,
-    document,
-    is_chained,
-    print_chain,
-    write_chain,
+from gpusense.commands.output import (
+    counted,
+    draw,
+    grouped,
+    print_details,
+    print_fact,
+    print_files,
+    print_interrupted,
+    print_report,
+    print_result,
+    write_table,
 )
-from gpusense.commands.output import counted, grouped, print_fact, print_files, print_report, print_result
-from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans_of_lasers, scanners_of
-from gpusense.commands.signals import code_of, word_of
-from gpusense.evaluation.machine import machine_line
+from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans_of_lasers, scan_times, scanners_of
+from gpusense.commands.signals import held
 from gpusense.world.map_greys import MODES
 
 if TYPE_CHECKING:
-    from gpusense.commands.map_chain import ChainedScans
+    from gpusense.chaining.result import ScanChain
+    from gpusense.logs import Scan
     from gpusense.mapping.build import MapBuilder
     from gpusense.world.grid import OccupancyGrid
+
+    Scans = list[tuple[int, Scan]]
 
 NAME = "map"
 HELP = "Build an occupancy grid from the scans of a log."
@@ -74,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add_log(parser, "a log with scans", several="lasers of the map")
     add_reference(parser)
-    add_chain(parser)
+    _add_chain(parser)
     add("--out", required=True, type=output_path(".yaml"), metavar="YAML", help="the map, next to its image")
     add("--mode", choices=MODES, default="trinary",
         help="trinary: white, black and grey; scale: shades, a PNG; raw: per cent as greys, almost black "
@@ -92,38 +100,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Build and write the map; after Ctrl-C, the map of the scans so far."""
-    from gpusense.evaluation.scoring import check_poses
+    from gpusense.evaluation.steps import check_poses
     from gpusense.mapping.build import MapBuilder
 
-    check_chain(args)
+    if args.chain and args.reference is not None:
+        raise ValueError("--chain: must not be used with --reference, which has the poses, got both")
     scans, sensor = read_scans_of_lasers(args)
-    chained, stop, chosen = None, None, len(scans)
-    if is_chained(args, scans):
-        chained = chain_log(args, scans, sensor)
-        scans, stop = chained.scans, chained.stop
-        sensor = sensor[: len(scans)]
+    chained, chosen = None, len(scans)
+    if _is_chained(args, scans):
+        chained = _chain_log(args, scans, sensor)
+        scans, sensor = chained.scans, sensor[: len(chained.scans)]
     check_poses(scans, args.log)
-    motions = None if chained is None else chained.chain.motions
     builder = MapBuilder(
         [scan.ranges for _, scan in scans], [scan.pose or (0.0, 0.0, 0.0) for _, scan in scans],
         resolution=args.resolution, origin=None, shape=None, range_limit=args.range_limit, clear_max=args.clear_max,
         p_hit=args.p_hit, p_miss=args.p_miss, p_prior=0.5, occupied_threshold=65, backend=args.backend, each=_SCANS,
-        motion=motions, **scanners_of(scans, sensor),
+        motion=None if chained is None else chained.chain.motions, **scanners_of(scans, sensor),
     )  # fmt: skip
-    done, ended = _build(builder)
+    done = 0.0
+    with held((builder,)) as stops, progress(max(builder.parts, 1)) as step:
+        for done in builder.steps():
+            step(f"{100 * done:.0f}%")
     grid = builder.grid()
     image = _write(args, grid)
     if chained is not None:
-        write_chain(args, chained, grid)
-    counted = round(done * len(scans))
-    _report(args, builder, grid, image, (counted, chosen), chained)
-    stop = stop or ended
-    if stop is not None:
-        held = f"{counted} of {chosen} scans"
-        if builder.bands > 1:
-            held = f"its lower part, {100 * done:.0f}% of the work; the rest is unknown"
-        sys.stderr.write(f"gpusense: {word_of(stop)}: the map holds {held}\n")
-        return code_of(stop)
+        _write_chain(args, chained, grid)
+        stops = chained.stops + stops
+    _report(args, builder, grid, image, (round(done * len(scans)), chosen), chained)
+    if stops:
+        raise stops[0]
     return 0
 
 
@@ -150,31 +155,173 @@ def _report(
             "map": str(args.out), "image": str(image), "mode": args.mode, "scans": scans[0],
             "scans_chosen": scans[1], "rays": builder.rays, "rows": rows, "cols": cols,
             "resolution": grid.resolution, "origin": grid.origin, "free": free, "occupied": occupied,
-            "chain": None if chained is None else document(args, chained),
+            "chain": None if chained is None else _chain_document(args, chained),
         })  # fmt: skip
         return
     if chained is None:
         print_result(f"MAPPED: {counted(scans[0], 'scan')} at {'reference' if args.reference else 'logged'} poses")
     else:
-        print_chain(chained)
+        _print_chain(chained)
     size = f"{cols * grid.resolution:.0f} x {rows * grid.resolution:.0f} m, cells of {grid.resolution:g} m"
     print_fact("map", f"{size}: {grouped(occupied)} occupied, {grouped(free)} free")
+    print_interrupted(*scans, "scans" if builder.bands == 1 else "scans' worth of rays")
     print_files(args.out, image, args.plot, args.tum, args.poses)
     start = " --start 0 0 0" if chained is not None else ""
     print(f"next       gpusense localize --map {args.out} --log {args.log}{start}")
-    if args.verbose:
-        chain = "" if chained is None else f"{chained.chain.explain()}\nchained in {chained.seconds:.1f} s\n"
-        print(f"\n{chain}{counted(builder.rays, 'ray')} of {counted(scans[0], 'scan')}, {rows} x {cols} cells\n"
-              f"{machine_line()}")  # fmt: skip
+    chain = "" if chained is None else f"{chained.chain.explain()}\nchained in {chained.seconds:.1f} s\n"
+    print_details(args, f"{chain}{counted(builder.rays, 'ray')} of {counted(scans[0], 'scan')}, {rows} x {cols} cells")
 
 
-def _build(builder: MapBuilder) -> tuple[float, KeyboardInterrupt | None]:
-    """Count all rays; return the finished share of the work, and the signal that stopped it, or None."""
-    done = 0.0
-    with progress(max(builder.parts, 1)) as step:
-        try:
-            for done in builder.steps():
-                step(f"{100 * done:.0f}%")
-        except KeyboardInterrupt as stop:
-            return done, stop
-    return done, None
+# Steps of the progress bar during the search for loops.
+_ROUNDS = 20
+# Columns of a file of poses.
+_COLUMNS = (
+    "scan", "time", "x", "y", "theta", "var_x", "cov_xy", "cov_xtheta", "var_y", "cov_ytheta", "var_theta", "doubtful",
+    "laser",
+)  # fmt: skip
+
+
+@dataclass
+class ChainedScans:
+    """Scans with poses from a chain.
+
+    Attributes:
+        stops: The signal that interrupted the chain, if any.
+    """
+
+    scans: Scans
+    chain: ScanChain
+    seconds: float
+    stops: list[KeyboardInterrupt]
+
+
+def _add_chain(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a chain."""
+    add = parser.add_argument
+    add("--chain", action="store_true",
+        help="find the poses by matching the scans and closing loops, even if the log has "
+        "poses (default: if it has none)")  # fmt: skip
+    add("--no-odometry", action="store_true", help="chain the scans without the log's odometry")
+    add("--no-loops", action="store_true", help="do not search for revisited places")
+    add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the poses of a chain for evo")
+    add("--poses", type=output_path(".csv"), metavar="CSV",
+        help="write the poses of a chain with covariances and doubts")  # fmt: skip
+    add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
+        help="draw the map with trajectory, closures and doubtful stretches of a chain")  # fmt: skip
+
+
+def _is_chained(args: argparse.Namespace, scans: Scans) -> bool:
+    """Return whether a chain finds the poses, and check the options that need a chain."""
+    chained = args.chain or (args.reference is None and any(scan.pose is None for _, scan in scans))
+    for name in ("tum", "poses", "plot", "no_odometry", "no_loops"):
+        if not chained and getattr(args, name):
+            option = name.replace("_", "-")
+            raise ValueError(f"--{option}: must be used with --chain where the scans have poses, got it without")
+    return chained
+
+
+def _chain_log(args: argparse.Namespace, scans: Scans, sensor: list[int]) -> ChainedScans:
+    """Chain the scans of lasers; after Ctrl-C, the scans so far."""
+    from gpusense.chaining.chain import Chainer
+
+    readings = [scan.ranges for _, scan in scans]
+    odometry = None if args.no_odometry else _odometry(scans)
+    times = np.array([scan.time for _, scan in scans])
+    known = bool((np.diff(times) >= 0).all())
+    each = [
+        [scan.duration for (_, scan), k in zip(scans, sensor, strict=True) if k == one] for one in sorted(set(sensor))
+    ]
+    durations = [float(np.median(some)) if known else 0.0 for some in each]
+    chainer = Chainer(
+        readings, odometry=odometry, times=times if known else None, close_loops=not args.no_loops,
+        duration=durations if len(durations) > 1 else durations[0], backend=args.backend, **scanners_of(scans, sensor),
+    )  # fmt: skip
+    begun, done = time.perf_counter(), 0
+    with held((chainer,)) as stops, progress(len(scans) + _ROUNDS) as step:
+        for word in chainer.steps():
+            for _ in range(max(chainer.scans - done, 1)):
+                step(word)
+            done = chainer.scans
+    chain = chainer.chain()
+    placed = [
+        (index, replace(scan, pose=tuple(pose)))
+        for (index, scan), pose in zip(scans, chain.poses.tolist(), strict=False)
+    ]
+    return ChainedScans(placed, chain, time.perf_counter() - begun, stops)
+
+
+def _odometry(scans: Scans) -> np.ndarray | None:
+    """Return the odometry of scans; None, with a message, if it is absent or constant."""
+    poses = np.array([scan.odometry for _, scan in scans])
+    if len(poses) > 1 and (poses == poses[0]).all():
+        sys.stderr.write("gpusense: the odometry of the log never changes: the scans are chained without it\n")
+        return None
+    return poses
+
+
+def _write_chain(args: argparse.Namespace, chained: ChainedScans, grid: OccupancyGrid) -> None:
+    """Write the requested files: trajectory, poses with covariances, picture."""
+    from gpusense.evaluation.trajectory_files import write_tum
+    from gpusense.plots.runs import chain_figure
+
+    if args.tum is not None:
+        # If beams are in reverse order, poses belong to the end of scans.
+        at = np.array([scan.time for _, scan in chained.scans]) + chained.chain.later
+        rows = np.arange(len(at))
+        if len(np.unique(chained.chain.sensor)) > 1:
+            # Write one pose per time of several lasers.
+            rows = np.unique(at, return_index=True)[1]
+        times, indices = scan_times(at[rows].tolist())
+        write_tum(args.tum, times, chained.chain.poses[rows], indices=indices)
+    if args.poses is not None:
+        _write_poses(args.poses, chained)
+    draw(args.plot, lambda: chain_figure(grid, chained.chain))
+
+
+def _write_poses(path: Path, chained: ChainedScans) -> None:
+    """Write a row per scan: index, time, pose, upper triangle of the covariance, whether doubtful, laser."""
+    chain = chained.chain
+    upper = chain.covariance[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    scans = [
+        (index, f"{scan.time + later:.6f}") for (index, scan), later in zip(chained.scans, chain.later, strict=True)
+    ]
+    numbers = (*chain.poses.T, *upper.T, chain.doubtful.astype(int), chain.sensor)
+    write_table(path, _COLUMNS, zip(*zip(*scans, strict=True), *numbers, strict=True))
+
+
+def _chain_document(args: argparse.Namespace, chained: ChainedScans) -> dict[str, Any]:
+    """Return the facts of a chain for ``--json``."""
+    chain = chained.chain
+    corrections = chain.corrections
+    return {
+        "seconds": chained.seconds, "matched": chain.matched, "key_scans": len(chain.keys), "links": len(chain.links),
+        "closures": len(corrections), "largest_correction": float(corrections.max()) if len(corrections) else None,
+        "scan_duration": chain.duration, "odometry": chain.motion is not None,
+        "doubtful_scans": int(chain.doubtful.sum()),
+        "doubts": [doubt._asdict() for doubt in chain.doubts],
+        "files": {name: str(getattr(args, name)) for name in ("tum", "poses", "plot") if getattr(args, name)},
+    }  # fmt: skip
+
+
+def _print_chain(chained: ChainedScans) -> None:
+    """Print the verdict on a chain, its closures and its doubtful stretches."""
+    from gpusense.chaining.result import REASONS
+
+    chain = chained.chain
+    way = float(np.hypot(*np.diff(chain.poses[:, :2], axis=0).T).sum())
+    share = chain.doubtful.mean() if len(chain.poses) else 0.0
+    verdict = "CONSISTENT" if not chain.doubts else f"DOUBTFUL in {counted(len(chain.doubts), 'stretch', 'stretches')}"
+    doubt = f", {100 * share:.2g} % of them in doubt" if chain.doubts else ""
+    print_result(f"{verdict}: chained {counted(len(chain.poses), 'scan')} over {way:.0f} m{doubt}")
+    if len(chain.corrections):
+        print_fact("loops", f"{len(chain.corrections)} closed, moving scans by {np.median(chain.corrections):.2f} m in "
+                   f"the median, {chain.corrections.max():.2f} m at most")  # fmt: skip
+    else:
+        print_fact("loops", "none closed, since no place was seen again with certainty: the map bends by the drift of "
+                   "the whole way")  # fmt: skip
+    for reason, meaning in REASONS.items():
+        some = [doubt for doubt in chain.doubts if doubt.reason == reason]
+        if some:
+            spans = ", ".join(f"{doubt.first} to {doubt.last}" for doubt in some[:5])
+            more = f" and {len(some) - 5} more" if len(some) > 5 else ""
+            print_fact("doubt", f"scans {spans}{more}: {meaning}")

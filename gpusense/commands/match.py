@@ -22,18 +22,22 @@ from gpusense.commands.arguments import (
 from gpusense.commands.output import (
     counted,
     degrees,
+    draw,
     length,
+    print_details,
     print_fact,
     print_files,
     print_interrupted,
     print_report,
     print_result,
+    write_table,
 )
 from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans, scan_times
 from gpusense.commands.signals import held
-from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from gpusense.evaluation.matching import LogMatches
     from gpusense.logs import Scan
     from gpusense.world.grid import OccupancyGrid
@@ -55,6 +59,10 @@ examples:
   gpusense match --log run.bag --topic /scan --noise 0.03 --tum run.tum
   gpusense match --log run.log.gz --map map.yaml --shift 0.5 --turn 10 \\
       --out poses.csv"""
+
+_COLUMNS = (
+    "reference", "scan", "x", "y", "theta", "deviation_x", "deviation_y", "deviation_theta", "score", "status",
+)  # fmt: skip
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -122,20 +130,21 @@ def _report(
     matches = joined(parts)
     total = summary(matches) | {"milliseconds_each": 1e3 * seconds / len(matches.match)}
     if args.out is not None:
-        _write(args.out, matches)
+        match = matches.match
+        deviations = np.sqrt(np.einsum("sii->si", match.covariance))
+        columns = (*matches.indices.T, *match.pose.T, *deviations.T, match.score, match.status)
+        write_table(args.out, _COLUMNS, zip(*columns, strict=True))
     if args.tum is not None:
         _write_tum(args.tum, scans, matches)
-    if args.plot is not None:
-        _draw(args.plot, grid, dict(scans), matches)
+    draw(args.plot, lambda: _worst(grid, dict(scans), matches))
     if args.json:
         print_report(_document(matches, total, len(scans)), args)
         return
     _print(total)
     print_interrupted(len(matches.match), len(scans) - (grid is None), "matches")
     print_files(args.out, args.plot, args.tum)
-    if args.verbose:
-        print(f"\nscore: median {total['score_median']:.3f}\n{total['milliseconds_each']:.3g} ms each with the first "
-              f"call's compilation\n{machine_line()}")  # fmt: skip
+    print_details(args, f"score: median {total['score_median']:.3f}\n{total['milliseconds_each']:.3g} ms each with the "
+                  "first call's compilation")  # fmt: skip
 
 
 def _print(total: dict[str, Any]) -> None:
@@ -171,22 +180,6 @@ def _document(matches: LogMatches, total: dict[str, Any], chosen: int) -> dict[s
     return {"scans_chosen": chosen, "summary": total, "matches": rows}
 
 
-def _write(path: Path, matches: LogMatches) -> None:
-    """Write one line per match: indices, pose, standard deviations, score and status."""
-    from gpusense._util.files import write_whole
-
-    match = matches.match
-    deviations = np.sqrt(np.einsum("sii->si", match.covariance))
-    lines = ["reference,scan,x,y,theta,deviation_x,deviation_y,deviation_theta,score,status"]
-    for (first, second), pose, deviation, score, status in zip(
-        matches.indices, match.pose, deviations, match.score, match.status, strict=True
-    ):
-        numbers = ",".join(repr(float(value)) for value in (*pose, *deviation, score))
-        lines.append(f"{first},{second},{numbers},{status}")
-    text = "\n".join(lines) + "\n"
-    write_whole(path, lambda file: file.write(text.encode()))
-
-
 def _write_tum(path: Path, scans: list[tuple[int, Scan]], matches: LogMatches) -> None:
     """Write the trajectory of the matched scans from the first scan's logged pose or odometry."""
     from gpusense.evaluation.matching import trajectory
@@ -198,15 +191,14 @@ def _write_tum(path: Path, scans: list[tuple[int, Scan]], matches: LogMatches) -
     write_tum(path, times, poses, indices=indices)
 
 
-def _draw(path: Path, grid: OccupancyGrid | None, scans: dict[int, Scan], matches: LogMatches) -> None:
+def _worst(grid: OccupancyGrid | None, scans: dict[int, Scan], matches: LogMatches) -> Figure:
+    """Draw the match with the largest correction."""
     from gpusense.evaluation.matching import differences
-    from gpusense.plots.drawing import save
-    from gpusense.plots.matches import match_figure
+    from gpusense.plots.runs import match_figure
 
     distance, turn = differences(matches.match.pose, matches.guess)
     worst = int(np.argmax(distance + turn * matches.match.lever / 10))
     first, second = matches.indices[worst]
     scan = scans[int(second)]
     reference = scans[int(first)].ranges if grid is None else grid
-    pose = matches.match.pose[worst]
-    save(match_figure(reference, scan.ranges, scan.scanner, matches.guess[worst], pose), path)
+    return match_figure(reference, scan.ranges, scan.scanner, matches.guess[worst], matches.match.pose[worst])

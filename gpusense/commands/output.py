@@ -8,13 +8,19 @@ import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from gpusense._util.files import write_whole
 from gpusense._util.progress import is_terminal
 
 if TYPE_CHECKING:
     import argparse
+
+    from matplotlib.figure import Figure
 
     from gpusense.backends import BackendInfo, Device
 
@@ -70,11 +76,39 @@ def print_interrupted(done: int, total: int, noun: str = "scans") -> None:
         print(f"interrupted: results of {done} of {total} {noun}")
 
 
+def print_details(args: argparse.Namespace, text: str) -> None:
+    """Print details and the machine, with ``--verbose``."""
+    if args.verbose:
+        from gpusense.evaluation.machine import machine_line
+
+        print(f"\n{text}\n{machine_line()}")
+
+
 def print_files(*paths: os.PathLike[str] | None) -> None:
     """Print the files that a command wrote, with the command that opens each; None is left out."""
     for path in filter(None, paths):
         opener = _OPENERS.get(os.path.splitext(path)[1].lower())
         print(f"{'written':<{_INDENT}}{path}{f'; open it with: {opener} {path}' if opener else ''}")
+
+
+def draw(path: Path | None, make: Callable[[], Figure]) -> None:
+    """Draw a picture, if a file for it is passed."""
+    if path is not None:
+        from gpusense.plots.drawing import save
+
+        save(make(), path)
+
+
+def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a CSV file; numbers have nine digits, and NaN is an empty field."""
+
+    def text(value: Any) -> str:
+        if isinstance(value, (float, np.floating)):
+            return "" if math.isnan(value) else f"{value:.9g}"
+        return str(value)
+
+    lines = [",".join(columns), *(",".join(map(text, row)) for row in rows)]
+    write_whole(path, lambda stream: stream.write(("\n".join(lines) + "\n").encode()))
 
 
 def _wrapped(text: str, width: int, indent: str = "") -> str:

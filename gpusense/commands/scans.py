@@ -99,7 +99,7 @@ def options_named() -> Iterator[None]:
 
 def read_scans(args: argparse.Namespace, *, posed: bool = True) -> list[tuple[int, Scan]]:
     """Read the chosen scans of ``--log`` with their indices; if ``posed``, each must have a pose."""
-    from gpusense.evaluation.scoring import chosen_scans, with_one_scanner, with_poses
+    from gpusense.evaluation.steps import chosen_scans, with_one_scanner, with_poses
 
     with options_named():
         scans = chosen_scans(

@@ -23,6 +23,7 @@ from gpusense.commands.arguments import (
 from gpusense.commands.output import (
     counted,
     degrees,
+    draw,
     grouped,
     length,
     print_fact,
@@ -37,8 +38,7 @@ from gpusense.commands.signals import held
 from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
-    from gpusense.evaluation.fitness import Fitness
-    from gpusense.evaluation.scoring import LogScore, Model, ScanScore
+    from gpusense.evaluation.scoring import Fitness, LogScore, Model, ScanScore
     from gpusense.logs import Scan
     from gpusense.world.grid import OccupancyGrid
 
@@ -96,28 +96,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Score the scans and print the results; after Ctrl-C, the results so far."""
-    from gpusense.evaluation.fitness import FitnessOfLog
-    from gpusense.evaluation.scoring import LogScoring, ParticleSampler
+    from gpusense.evaluation.scoring import FitnessOfLog, LogScoring, ParticleSampler
+    from gpusense.plots.runs import scores_figure
     from gpusense.world.map_files import read_map
 
     sampler = ParticleSampler(args.particles, args.sigma_position, args.sigma_heading, args.seed)
     grid = read_map(args.map)
     scans = read_scans(args)
     model = make_model(args, grid, scans)
-    scoring, fitness = LogScoring(model, sampler), FitnessOfLog(model, seed=args.seed)
+    scoring, fitness = LogScoring(model, sampler), FitnessOfLog(model)
     with held(scoring) as stops, progress(len(scans)) as step:
         for index, scan in scans:
             step(f"scan {index}")
-            scoring.add(index, scan)
-            fitness.add(index, scan)
+            fitness.add(scan, scoring.add(index, scan).better)
     score, fit = scoring.result(), fitness.result()
     _report(args, model, score, fit, len(scans))
     if stops:
         raise stops[0]
-    if args.plot is not None:
-        _draw(args.plot, grid, score, pose_name(args))
-        if not args.json:
-            print_files(args.plot)
+    draw(args.plot, lambda: scores_figure(grid, score, pose_name(args)))
+    if not args.json:
+        print_files(args.plot)
     return 0 if fit.fits else DIFFERENT
 
 
@@ -127,16 +125,9 @@ def _row(scan: ScanScore) -> tuple[str, ...]:
             number_text(scan.effective), str(scan.beams))  # fmt: skip
 
 
-def _draw(path: Path, grid: OccupancyGrid, score: LogScore, pose: str) -> None:
-    from gpusense.plots.drawing import save
-    from gpusense.plots.runs import scores_figure
-
-    save(scores_figure(grid, score, pose), path)
-
-
 def make_model(args: argparse.Namespace, grid: OccupancyGrid, scans: list[tuple[int, Scan]]) -> Model:
     """Make the model, by default with the temperature of the scans."""
-    from gpusense.evaluation.fitness import temperature_of_log
+    from gpusense.evaluation.scoring import temperature_of_log
     from gpusense.models.scan.beam import BeamModel
     from gpusense.models.scan.field import LikelihoodFieldModel
     from gpusense.world.parameters import BeamParameters

@@ -213,7 +213,7 @@ def _report(args: argparse.Namespace, ended: Sweep, seconds: float) -> None:
 def _drawn(table: str, path: Path) -> bool:
     """Draw the picture; return whether any job could be drawn."""
     from gpusense.plots.drawing import save
-    from gpusense.plots.sweeps import sweep_figure
+    from gpusense.plots.runs import sweep_figure
     from gpusense.sweeps.table import read_table
 
     try:

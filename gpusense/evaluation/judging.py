@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Floats
-from gpusense.evaluation.posed_scans import NEAR
+from gpusense.evaluation.steps import NEAR
 from gpusense.evaluation.tracking import RISK, Track
 from gpusense.evaluation.trajectory_files import nearest_index, poses_at
 from gpusense.localization.diagnosis import Diagnosis
@@ -161,9 +161,8 @@ class TrajectoryJudge:
         self._locators: dict[Scanner, LikelihoodFieldModel] = {}
         self._judged: list[tuple[int, Scan, Moment, tuple[float, Word, float, float]]] = []
 
-    @property
-    def count(self) -> int:
-        """Number of judged poses."""
+    def __len__(self) -> int:
+        """Return the number of judged poses."""
         return len(self._judged)
 
     def add(

@@ -6,14 +6,12 @@ logged pose is ranked among them. The weighted mean excludes it, since it would 
 
 from __future__ import annotations
 
-import itertools
 import math
-import os
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Unpack, cast
+from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +20,15 @@ from gpusense._util import checks
 from gpusense._util.typing import Floats
 from gpusense.backends import BackendInfo
 from gpusense.evaluation.worlds import cloud_around, cloud_uniform
+from gpusense.localization.beam_consistency import BeamConsistency, beam_consistency
+from gpusense.localization.belief import Belief
+from gpusense.localization.diagnosis import Diagnosis, evidence_of
+from gpusense.localization.map_judge import MapJudge
+from gpusense.localization.scan_evidence import evidence_of_scan
+from gpusense.localization.spread import LOST, TRACKING, Word
+from gpusense.localization.temperature import BeamCorrelation, learn_from_scan
 from gpusense.localization.weights import normalize_weights
 from gpusense.logs import Pose, Scan
-from gpusense.logs.reader import LogOptions, read_laser
-from gpusense.logs.records import check_scanner
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.models.scan.rules import choose_beams
@@ -56,12 +59,16 @@ class ParticleSampler:
         checks.integer("particles", self.particles, low=2)
         checks.integer("seed", self.seed, low=0)
 
+    @property
+    def near(self) -> int:
+        """Number of the particles around the logged pose."""
+        return (self.particles - 1) // 2
+
     def draw(self, index: int, pose: Pose, grid: OccupancyGrid) -> Floats:
         """Draw (N, 3) particles of a scan: its pose, particles around it, particles over all free cells [m, m, rad]."""
         random = np.random.default_rng((self.seed, index))
-        near = (self.particles - 1) // 2
-        around = cloud_around(pose, near, self.sigma_position, self.sigma_heading, random)
-        return np.concatenate([[pose], around, cloud_uniform(grid, self.particles - 1 - near, random)])
+        around = cloud_around(pose, self.near, self.sigma_position, self.sigma_heading, random)
+        return np.concatenate([[pose], around, cloud_uniform(grid, self.particles - 1 - self.near, random)])
 
 
 @dataclass(frozen=True)
@@ -78,6 +85,8 @@ class ScanScore:
         effective: Effective sample size of the other particles, or None.
         degenerate: Whether every other particle has probability 0.
         beams: Readings that are evaluated at every particle.
+        better: Share of the particles anywhere in the free space at which the scan is less likely than at the logged
+            pose; None if it is equally likely or impossible at all of them.
     """
 
     index: int
@@ -91,6 +100,7 @@ class ScanScore:
     degenerate: bool
     beams: int
     seconds: float
+    better: float | None = None
 
 
 @dataclass(frozen=True)
@@ -157,52 +167,6 @@ def summary(score: LogScore) -> dict[str, Any]:
     }
 
 
-def chosen_scans(
-    path: str | os.PathLike[str],
-    *,
-    every: int = 1,
-    offset: int = 0,
-    limit: int | None = None,
-    topic: str | None = None,
-    **options: Unpack[LogOptions],
-) -> list[tuple[int, Scan]]:
-    """Read scans of a log with their indices: ``offset``, ``offset + every``, ..., at most ``limit`` scans.
-
-    ``limit``: Largest number of scans; None for all. ``topic``: The laser, see :func:`gpusense.logs.reader.read_laser`;
-    None for the only or main laser.
-    """
-    last = None if limit is None else offset + every * limit
-    scans = read_laser(path, topic, **options)
-    chosen = list(itertools.islice(enumerate(scans), offset, last, every))
-    if not chosen:
-        raise ValueError(f"log: must have a scan of index {offset}, the first one chosen, got fewer scans in {path}")
-    return chosen
-
-
-def with_poses(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> list[tuple[int, Scan]]:
-    """Return numbered scans of a log, which must have poses and one scanner."""
-    check_poses(scans, path)
-    return with_one_scanner(scans, path)
-
-
-def check_poses(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> None:
-    """Check that numbered scans of a log have poses."""
-    for index, scan in scans:
-        if scan.pose is None:
-            rule = "every scan must have a pose, of its own or by --reference"
-            raise ValueError(
-                f"log: {rule}, got none at scan {index} of {path}; trajectories for --reference: of a SLAM program, of "
-                "'gpusense localize --tum' in a map, of 'gpusense map --tum' without one"
-            )
-
-
-def with_one_scanner(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> list[tuple[int, Scan]]:
-    """Return numbered scans of a log, which must have one scanner."""
-    for index, scan in scans:
-        check_scanner(scan, scans[0][1].scanner, f"scan {index} of {path}")
-    return scans
-
-
 class LogScoring:
     """Scores of a log's scans, scan by scan."""
 
@@ -222,8 +186,13 @@ class LogScoring:
         begin = time.perf_counter()
         log_p = self._model.log_likelihood(poses, scan.ranges)
         seconds = time.perf_counter() - begin
-        self._scores.append(score_scan(index, poses, log_p, evaluated_beams(self._model, scan.ranges), seconds))
-        return self._scores[-1]
+        score = score_scan(index, poses, log_p, evaluated_beams(self._model, scan.ranges), seconds)
+        anywhere = log_p[1 + self._sampler.near :]
+        # Readings that are equally likely or impossible everywhere are no evidence.
+        if np.isfinite(log_p).any() and (anywhere != log_p[0]).any():
+            score = replace(score, better=float(np.mean(anywhere < log_p[0])))
+        self._scores.append(score)
+        return score
 
     def result(self) -> LogScore:
         """Return the scores of the scans so far."""
@@ -235,3 +204,101 @@ def evaluated_beams(model: Model, ranges: Array) -> int:
     kinds = classify(ranges, model.scanner)
     informative = isinstance(model.parameters, SensorTable) or model.parameters.z_max > 0
     return int(np.count_nonzero(choose_beams(kinds, model.beams, informative) & (kinds == Reading.HIT)))
+
+
+# Least share of random poses that a right logged pose excels; it is 1/2 by chance.
+LEAST_BETTER = 0.9
+# The share b of random poses that score lower has the density EXCELS b^(EXCELS - 1) at right poses, and 1 at wrong
+# poses; the log-likelihood ratio is limited.
+_EXCELS, _LIMIT = 20, 3.0
+
+
+@dataclass(frozen=True)
+class Fitness:
+    """Agreement of logged poses with their scans.
+
+    Attributes:
+        scans: Number of scans that give evidence.
+        explained: Median share of the beams that the logged poses explain; None without such scans.
+        better: Median share of poses anywhere in the free space at which a scan is less likely; None without such
+            scans.
+        p_lost: Median over the scans of the probability that the logged pose is wrong; None without such scans.
+    """
+
+    scans: int
+    explained: float | None
+    better: float | None
+    p_lost: float | None
+    evidence: Diagnosis
+
+    @property
+    def verdict(self) -> Word:
+        """Return "tracking" for a log of this map, "lost" for a log of another map, and "uncertain" in between."""
+        if self.p_lost is None:
+            return "uncertain"
+        if self.p_lost > LOST:
+            return "lost"
+        better = self.better is None or self.better >= LEAST_BETTER
+        return "tracking" if self.p_lost <= TRACKING and better else "uncertain"
+
+    @property
+    def fits(self) -> bool:
+        """Tell whether the log belongs to this map; False if no scan could be judged."""
+        return self.verdict == "tracking"
+
+
+class FitnessOfLog:
+    """Running judgement of a log's poses, scan by scan.
+
+    Args:
+        model: A model on the map.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self._grid = model.grid
+        # The host judges beams for devices without float64.
+        device = model.backend if model.backend.info.float64 else None
+        self._belief, self._judge = Belief(), None if device is None else MapJudge(device, model.grid)
+        self._scans: list[BeamConsistency] = []
+        self._shares: list[float] = []
+        self._better: list[float] = []
+        self._p_lost: list[float] = []
+
+    def add(self, scan: Scan, better: float | None) -> None:
+        """Add a scan with its :attr:`ScanScore.better`."""
+        pose, ranges = np.array(scan.pose, np.float64), np.asarray(scan.ranges, np.float64)
+        found = beam_consistency(self._grid, scan.scanner, pose, ranges, judge=self._judge)
+        ratio, share = evidence_of_scan([found])
+        ratio += 0.0 if better is None else _ratio_of_rank(better)
+        x, y, theta = (float(value) for value in pose)
+        self._belief = self._belief.counted().judged((x, y, theta), ratio)
+        if not math.isnan(ratio):
+            self._scans.append(found)
+            self._shares.append(share)
+            self._better += [] if better is None else [better]
+            self._p_lost.append(self._belief.wrong)
+
+    def result(self) -> Fitness:
+        """Return the judgement of the scans so far."""
+        known = [share for share in self._shares if not math.isnan(share)]
+        explained, better, p_lost = (
+            float(np.median(values)) if values else None for values in (known, self._better, self._p_lost)
+        )
+        evidence = evidence_of(self._scans)
+        if p_lost is not None:
+            evidence = replace(evidence, cause="map" if p_lost > LOST else "none")
+        return Fitness(len(self._scans), explained, better, p_lost, evidence)
+
+
+def _ratio_of_rank(better: float) -> float:
+    """Return the log-likelihood ratio of a wrong pose against a right one, given the share of poses that it excels."""
+    ratio = math.inf if better == 0 else -math.log(_EXCELS) - (_EXCELS - 1) * math.log(better)
+    return min(max(ratio, -_LIMIT), _LIMIT)
+
+
+def temperature_of_log(model: Model, scans: Sequence[tuple[int, Scan]], *, most: int = 100) -> float:
+    """Return the temperature of scans at their logged poses, as a filter with ``temperature="auto"`` learns it."""
+    correlation = BeamCorrelation()
+    for _, scan in scans[:most]:
+        learn_from_scan(correlation, model, scan.ranges, np.array(scan.pose))
+    return correlation.temperature(model.used_beams)

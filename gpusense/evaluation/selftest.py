@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gpusense._util.typing import Precision
+from gpusense._util.typing import PRECISIONS, Precision
 from gpusense.backends import Backend, devices, get_backend
 from gpusense.evaluation.replay import Launch, Recorder, replay
 from gpusense.evaluation.tolerances import TOLERANCES, Check, Tolerance, beam_tolerance, scan_tolerance
@@ -119,8 +119,7 @@ def evaluate_backend(backend: Backend, scene: Scene, *, sonar: bool = True) -> t
     """Compute a scene on a backend; return the results, and their comparisons with the truth on its rounded inputs."""
     results, checks = _tables(backend, scene)
     launches: dict[str, Launch] = {}
-    precisions: tuple[Precision, ...] = ("float32", "float64")
-    for precision in precisions[: 1 + backend.info.float64]:
+    for precision in PRECISIONS[: 1 + backend.info.float64]:
         results |= _ranges(backend, scene, precision, sonar=sonar)
         for model in (name for name in _MODELS if sonar or name != _SONAR):
             key = f"{precision} {model}"

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Unpack
 
 import numpy as np
 
 from gpusense._util.typing import Floats
-from gpusense.evaluation.trajectory_files import poses_at
+from gpusense.evaluation.trajectory_files import nearest_index, poses_at, read_tum
 from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
 from gpusense.logs import Odometry, Pose, Scan
-from gpusense.logs.reader import LogOptions, read_lasers
+from gpusense.logs.bag_poses import PoseTrack, read_poses
+from gpusense.logs.reader import LogOptions, format_of, read_laser, read_lasers
 from gpusense.logs.records import check_scanner
 from gpusense.world.scanner import Scanner
 
@@ -29,7 +32,8 @@ class Step:
     Attributes:
         index: Index of the scan in the log.
         odometry: Pose by raw odometry alone [m, m, rad].
-        reference: Pose of the robot for comparison with estimates, by default the logged one; None if unknown.
+        reference: Pose of the robot to judge or to compare with, by default the logged one; None if unknown.
+        covariance: (3, 3) covariance of the reference; None if unknown.
     """
 
     index: int
@@ -37,6 +41,7 @@ class Step:
     odometry: Pose
     sensor: int = 0
     reference: Pose | None = None
+    covariance: Floats | None = None
 
 
 def read_steps(
@@ -81,6 +86,52 @@ def read_steps(
     return steps
 
 
+def chosen_scans(
+    path: str | os.PathLike[str],
+    *,
+    every: int = 1,
+    offset: int = 0,
+    limit: int | None = None,
+    topic: str | None = None,
+    **options: Unpack[LogOptions],
+) -> list[tuple[int, Scan]]:
+    """Read scans of a log with their indices: ``offset``, ``offset + every``, ..., at most ``limit`` scans.
+
+    ``limit``: Largest number of scans; None for all. ``topic``: The laser, see :func:`gpusense.logs.reader.read_laser`;
+    None for the only or main laser.
+    """
+    last = None if limit is None else offset + every * limit
+    scans = read_laser(path, topic, **options)
+    chosen = list(itertools.islice(enumerate(scans), offset, last, every))
+    if not chosen:
+        raise ValueError(f"log: must have a scan of index {offset}, the first one chosen, got fewer scans in {path}")
+    return chosen
+
+
+def with_poses(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> list[tuple[int, Scan]]:
+    """Return numbered scans of a log, which must have poses and one scanner."""
+    check_poses(scans, path)
+    return with_one_scanner(scans, path)
+
+
+def check_poses(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> None:
+    """Check that numbered scans of a log have poses."""
+    for index, scan in scans:
+        if scan.pose is None:
+            rule = "every scan must have a pose, of its own or by --reference"
+            raise ValueError(
+                f"log: {rule}, got none at scan {index} of {path}; trajectories for --reference: of a SLAM program, of "
+                "'gpusense localize --tum' in a map, of 'gpusense map --tum' without one"
+            )
+
+
+def with_one_scanner(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> list[tuple[int, Scan]]:
+    """Return numbered scans of a log, which must have one scanner."""
+    for index, scan in scans:
+        check_scanner(scan, scans[0][1].scanner, f"scan {index} of {path}")
+    return scans
+
+
 def repeats_odometry(steps: Sequence[Step]) -> bool:
     """Return whether the reference poses repeat the odometry, as in a log without corrections."""
     known = [step for step in steps if step.reference is not None]
@@ -110,3 +161,43 @@ def with_references(steps: Sequence[Step], times: Floats, poses: Floats) -> list
     """Return steps with references from a trajectory: (T, 3) poses at (T,) increasing times [s]."""
     found = poses_at([step.scan.time for step in steps], times, poses)
     return [replace(step, reference=pose) for step, pose in zip(steps, found, strict=True)]
+
+
+NEAR = 0.05
+"""Largest time from a scan to a pose that belongs to it [s]."""
+
+
+def posed_scans(
+    log: Path, steps: Sequence[Step], source: str | Path | None = None, *, map_frame: str = "map"
+) -> tuple[str, list[Step]]:
+    """Return the steps of a log that have a pose of a localiser, as their reference, and the origin of the poses.
+
+    ``source``: A TUM trajectory as a path, or a topic of a bag as for :func:`gpusense.logs.bag_poses.read_poses`. None
+    takes the likeliest poses of a bag, and the logged poses of another log.
+    """
+    times = [step.scan.time for step in steps]
+    form = format_of(log)
+    if isinstance(source, Path):
+        track = PoseTrack(str(source), *read_tum(source))
+    elif form.topics:
+        track = read_poses(log, np.array(times), topic=source, map_frame=map_frame)
+    elif source is not None:
+        raise ValueError(f"poses: must be a TUM trajectory such as run.tum for {form.name}, got {source!r}")
+    else:
+        known = [step for step in steps if step.reference is not None]
+        if not known:
+            raise ValueError(f"poses: must be given as a TUM trajectory for {log}, which has no poses, got None")
+        return f"the poses of {log}", known
+    poses, covariances = poses_at(times, track.times, track.poses, near=NEAR, name="poses"), _covariances(track, times)
+    judged = zip(steps, poses, covariances, strict=True)
+    return track.source, [
+        replace(step, reference=pose, covariance=covariance) for step, pose, covariance in judged if pose is not None
+    ]
+
+
+def _covariances(track: PoseTrack, times: Sequence[float]) -> list[Floats | None]:
+    """Return the covariance of the pose nearest to each time; None where it is unknown."""
+    if track.covariances is None:
+        return [None] * len(times)
+    near = track.covariances[nearest_index(times, track.times)]
+    return [None if np.isnan(one).any() else one for one in near]

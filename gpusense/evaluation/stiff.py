@@ -1,9 +1,9 @@
-"""Evaluate a catalogue of stiff and extreme cases on a backend: each row is an error, its bound and a verdict.
+"""Evaluate a catalogue of stiff and extreme cases on a backend.
 
 :func:`density_grid` evaluates the mixture in the device's scoring kernel on a grid of densities for which the
 textbook's formulas fail; the truth is ``gpusense.models.scan.densities`` in float64, which tests compare with mpmath at
-60 digits. The truth of the scenes of :mod:`gpusense.evaluation.stiff_cases` is evaluated in float64 on the device's
-rounded inputs and expected ranges.
+60 digits. The truth of the scenes of :func:`cases` is evaluated in float64 on the device's rounded inputs and expected
+ranges.
 """
 
 from __future__ import annotations
@@ -11,17 +11,16 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gpusense._util.typing import Reals
+from gpusense._util.typing import Precision, Reals
 from gpusense.backends import Backend, Selection, get_backend
 from gpusense.evaluation.replay import Launch, Recorder, replay
-from gpusense.evaluation.stiff_cases import Case, cases
-from gpusense.evaluation.tolerances import TOLERANCES, beam_tolerance, per_scan
+from gpusense.evaluation.tolerances import TOLERANCES, Check, Tolerance, beam_tolerance, per_scan
 from gpusense.interface import structs
 from gpusense.interface.launches import launch
 from gpusense.localization.weights import normalize_weights
@@ -34,12 +33,13 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 from gpusense.world.scanner import Scanner
 
-# The density grid: range_max [m], in cells of 1 m; deviations over range_max; rates times range_max; and the least
-# share of the grid in which the textbook's formulas fail, below which the grid is not stiff.
+# The density grid: range_max [m], in cells of 1 m; deviations over range_max; rates times range_max.
 RANGE_MAX = 16.0
+_DENSITIES = Tolerance("densities", 16, "eps (1 + |log p_k|) of the precision", "as for float32 beams")
+_SCANS = Tolerance("stiff scans", 1, "of the scan's bound", "the bounds of the beams, and of their summation")
+_WEIGHTS = Tolerance("sum of weights", 1e-6, "of 1", "normalised in float64; all are 0 where every pose is impossible")
 SIGMAS = tuple(10.0**k for k in range(-8, 7))
 RATES = (0.0, 1e-12, 1e-3, 1.0, 30.0, 1e3, 1e6)
-NAIVE_LOSES = 0.3
 
 # (z_hit, z_short, z_max, z_rand), deviations and rates.
 _MIXTURES: tuple[tuple[tuple[float, float, float, float], tuple[float, ...], tuple[float, ...]], ...] = (
@@ -50,24 +50,6 @@ _MIXTURES: tuple[tuple[tuple[float, float, float, float], tuple[float, ...], tup
     ((0.0, 1.0, 0.0, 0.0), (1.0,), RATES),
     ((0.0, 0.0, 0.0, 1.0), (1.0,), (1.0,)),
 )
-
-
-@dataclass(frozen=True)
-class Row:
-    """Largest error of one quantity in one case, on one backend in one precision.
-
-    Attributes:
-        bound: Largest error allowed; for the textbook's formulas the least share of failures.
-        nonfinite: Number of results that are NaN, or infinite where the truth is not.
-        ok: Whether ``nonfinite`` is 0 and the bound is kept.
-    """
-
-    case: str
-    quantity: str
-    worst: float
-    bound: float
-    nonfinite: int
-    ok: bool
 
 
 @dataclass(frozen=True)
@@ -94,7 +76,7 @@ class Densities:
         return np.asarray(naive_log_mixture(self.z, self.expected, range_max=RANGE_MAX, **self.parameters))
 
 
-def density_grid(backend: Selection, precision: str) -> Densities:
+def density_grid(backend: Selection, precision: Precision) -> Densities:
     """Evaluate the density grid in the kernel ``score_beams``.
 
     The map is one row of cells with a wall. Eight particles face it from distances that are exact in cells: inside the
@@ -167,21 +149,87 @@ def error_in_eps(computed: ArrayLike, truth: ArrayLike, precision: str) -> Reals
     return np.where(a == b, 0.0, np.where(np.isfinite(a) & np.isfinite(b), error, np.inf))
 
 
-def _row(case: str, quantity: str, worst: float, bound: float, computed: ArrayLike, truth: ArrayLike) -> Row:
-    a, b = np.asarray(computed), np.asarray(truth)
-    lost = int(np.count_nonzero(np.isnan(a) | (np.isinf(a) & (a != b))))
-    return Row(case, quantity, worst, bound, lost, worst <= bound and not lost)
+@dataclass(frozen=True)
+class Case:
+    """A scene that is extreme in one respect.
+
+    Attributes:
+        local: (N, 3) poses in the grid's frame [cells, cells, rad].
+        beams: Beams of a scanner with a field of view of 360 degrees.
+        readings: Readings that a scan repeats [cells]; None for the first pose's expected ranges, with missing and max
+            readings.
+        options: Arguments of the models, such as ``outside``.
+        weights: Weights z_hit, z_short, z_max and z_rand.
+        sigma: Standard deviation [cells].
+        constant: log p if all particles have the same value; else None.
+    """
+
+    name: str
+    grid: OccupancyGrid
+    local: Reals
+    beams: int = 41
+    readings: tuple[float, ...] | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+    weights: tuple[float, float, float, float] = (0.5, 0.125, 0.125, 0.25)
+    sigma: float = 0.25
+    constant: float | None = None
+
+    @property
+    def scanner(self) -> Scanner:
+        """Return the scanner; its range of 20 cells ends at walls on the map, and not always off the map."""
+        return Scanner(np.linspace(-math.pi, math.pi, self.beams, endpoint=False), 20 * self.grid.resolution)
+
+    @property
+    def poses(self) -> Reals:
+        """Return (N, 3) poses in the world [m, m, rad]."""
+        x, y, yaw = self.grid.origin
+        (u, v), c, s = (self.local[:, :2] * self.grid.resolution).T, math.cos(yaw), math.sin(yaw)
+        return np.stack([x + (c * u - s * v), y + (s * u + c * v), self.local[:, 2] + yaw], axis=1)
+
+    @property
+    def ranges(self) -> Reals:
+        """Return (K,) readings [m]."""
+        if self.readings is not None:
+            return np.asarray(np.resize(self.readings, self.beams) * self.grid.resolution)
+        far, bearings = self.scanner.range_max, self.scanner.bearings
+        caster = RayCaster(self.grid, far, backend="numpy", precision="float64", **self.options)
+        z = np.resize(caster.cast(self.poses[:1], bearings), self.beams)
+        z[3::13], z[4::17], z[5::19], z[6::23] = np.nan, np.inf, 0.0, np.nextafter(far, 0)
+        return z
 
 
-def _grid_rows(backend: Backend, precision: str) -> Iterator[Row]:
-    grid = density_grid(backend, precision)
-    truth, naive, case = grid.truth(), grid.naive(), f"{len(grid.z)} densities"
-    few = TOLERANCES["float32 beam"].value
-    worst = float(error_in_eps(grid.log_p, truth, precision).max())
-    yield _row(case, "beam model, eps (1 + |log p_k|)", worst, few, grid.log_p, truth)
-    share = float(np.mean(error_in_eps(naive, truth, precision) > few))
-    quantity = f"textbook formulas, share above {few:g} eps"
-    yield replace(_row(case, quantity, share, NAIVE_LOSES, naive, truth), ok=share >= NAIVE_LOSES)
+def cases() -> Iterator[Case]:
+    """Yield the catalogue of scenes."""
+    random = np.random.default_rng(0)
+    inside = random.uniform((1.5, 1.5, -4), (14.5, 10.5, 4), (40, 3))
+    around = random.uniform((-8, -8, -4), (24, 20, 4), (40, 3))
+    corners = np.array([(x, y, k * math.pi / 4) for x in (2, 7, 13) for y in (2, 5, 9) for k in range(-4, 5)], float)
+    cells = np.pad(np.zeros((10, 14), np.int8), 1, constant_values=100)
+    room, pillar, free = OccupancyGrid(cells, 0.25), cells.copy(), OccupancyGrid(0 * cells, 0.25)
+    pillar[5:7, 7:9] = 100
+    scene, unknown = OccupancyGrid(pillar, 0.25), OccupancyGrid(0 * cells - 1, 0.25)
+    yield Case("no beams", scene, inside, beams=0, constant=0.0)
+    yield Case("one beam", scene, inside, beams=1)
+    yield Case("100 000 beams", scene, inside[:1], beams=100_000)
+    yield Case("no particles", scene, inside[:0])
+    yield Case("20 000 particles", scene, np.resize(inside, (20_000, 3)), beams=3)
+    for rows, cols in ((1, 1), (1, 9), (9, 1), (12, 16)):
+        yield Case(f"{rows} x {cols}, empty", OccupancyGrid(np.zeros((rows, cols), int), 0.25), around)
+        yield Case(f"{rows} x {cols}, full", OccupancyGrid(np.full((rows, cols), 100), 0.25), around)
+    yield Case("all unknown, free", unknown, around, options={"unknown": "free"})
+    yield Case("all unknown, occupied", unknown, around, options={"unknown": "occupied"})
+    yield Case("walls outside", free, around, options={"outside": "occupied"})
+    yield Case("cells of 1 mm", OccupancyGrid(cells, 1e-3), inside)
+    yield Case("cells of 100 m", OccupancyGrid(cells, 100.0), inside)
+    yield Case("edges and corners, axes and 45 degrees", room, corners, beams=8)
+    yield Case("in walls, on corners, off the map", scene, np.concatenate([np.round(around), around]), beams=16)
+    yield Case("origin at 5e6 m, turned", OccupancyGrid(cells, 0.25, (5e6, -5e6, 1.0)), inside)
+    yield Case("theta of 1e6 rad", room, inside + np.array([0, 0, 1e6]))
+    yield Case("scan all NaN", scene, inside, readings=(math.nan,), constant=0.0)
+    yield Case("scan all max", scene, inside, readings=(math.inf,), constant=41 * math.log(0.125))
+    yield Case("scan all equal", scene, inside, readings=(3.0,))
+    yield Case("log p of -1e9", scene, inside, readings=(2.5, 9.3), weights=(1.0, 0.0, 0.0, 0.0), sigma=1e-4)
+    yield Case("impossible", scene, inside, readings=(19.5,), weights=(0.0, 1.0, 0.0, 0.0), constant=-math.inf)
 
 
 def _models(case: Case) -> Iterator[tuple[str, Callable[..., BeamModel | LikelihoodFieldModel], Any]]:
@@ -193,13 +241,18 @@ def _models(case: Case) -> Iterator[tuple[str, Callable[..., BeamModel | Likelih
     yield "field, bilinear", LikelihoodFieldModel, nearest.replace(interpolation="bilinear")
 
 
-def _case_rows(case: Case, device: Backend, precision: str) -> Iterator[Row]:
+def case_checks(case: Case, device: Backend, precision: Precision) -> Iterator[Check]:
+    """Compare the expected ranges of a scene with NumPy's, and the scores of all models with the truth."""
     scanner, poses, ranges = case.scanner, case.poses, case.ranges
     options: dict[str, Any] = {**case.options, "precision": precision}
     casters = (RayCaster(case.grid, scanner.range_max, backend=each, **options) for each in ("numpy", device))
     truth, cast = (caster.cast(poses, scanner.bearings) for caster in casters)
     exact, tolerance = TOLERANCES[f"{precision} ranges"], beam_tolerance(precision)
-    yield _row(case.name, f"ranges, {exact.unit}", exact.difference(cast, truth), exact.value, cast, truth)
+
+    def check(quantity: str, difference: float, allowed: Tolerance) -> Check:
+        return Check(device.info.selection, "truth", f"{precision} {quantity}; {case.name}", difference, allowed)
+
+    yield check("ranges", exact.difference(cast, truth), exact)
     for name, make, parameters in _models(case):
         recorder, specialize = Recorder(device), device.info.backend != "warp"
         model = make(case.grid, scanner, parameters, backend=recorder, specialize=specialize, **options)
@@ -209,18 +262,16 @@ def _case_rows(case: Case, device: Backend, precision: str) -> Iterator[Row]:
             truth = np.concatenate([_truth(launch, parameters) for launch in recorder.launches])
             parts = np.concatenate([launch.parts for launch in recorder.launches])
             fixed = float(recorder.launches[0].values["score"].constant_term)
-            worst = tolerance.difference(parts, truth)
-            yield _row(case.name, f"{name}, {tolerance.unit}", worst, tolerance.value, parts, truth)
+            yield check(f"{name}, beams", tolerance.difference(parts, truth), tolerance)
         total = truth.sum(axis=1) + fixed
         with np.errstate(all="ignore"):
             shares = np.abs(log_p - total) / per_scan(truth, precision, fixed=fixed)
-        share = float(np.max(np.where(log_p == total, 0.0, shares), initial=0.0))
-        yield _row(case.name, f"{name}, scans, share of their bound", share, 1.0, log_p, total)
+        shares = np.where(log_p == total, 0.0, np.where(np.isnan(shares), np.inf, shares))
+        yield check(f"{name}, scans", float(np.max(shares, initial=0.0)), _SCANS)
         if len(log_p):
             result = normalize_weights(log_p)
-            consistent = result.degenerate == (case.constant == -math.inf)
-            error = abs(float(result.weights.sum()) - 1) if consistent else math.inf
-            yield _row(case.name, f"{name}, sum of the weights", error, 1e-6, result.weights, 0)
+            consistent = result.degenerate == (case.constant == -math.inf) and np.isfinite(result.weights).all()
+            yield check(f"{name}, weights", abs(float(result.weights.sum()) - 1) if consistent else math.inf, _WEIGHTS)
 
 
 def _truth(launch: Launch, parameters: Any) -> Reals:
@@ -236,7 +287,9 @@ def _truth(launch: Launch, parameters: Any) -> Reals:
     return np.where(np.isnan(z), 0.0, log_mixture(z, expected, range_max=top, **parameters.to_dict()))
 
 
-def run(backend: Selection, precision: str) -> list[Row]:
+def run(backend: Selection, precision: Precision) -> list[Check]:
     """Run the whole catalogue on a backend in a precision."""
-    device = get_backend(backend)
-    return [*_grid_rows(device, precision), *(row for case in cases() for row in _case_rows(case, device, precision))]
+    device, grid = get_backend(backend), density_grid(backend, precision)
+    quantity, worst = f"{precision} densities; grid of {len(grid.z)}", error_in_eps(grid.log_p, grid.truth(), precision)
+    listed = [Check(device.info.selection, "truth", quantity, float(worst.max()), _DENSITIES)]
+    return listed + [check for case in cases() for check in case_checks(case, device, precision)]

@@ -1,6 +1,5 @@
 """Draw maps, scans, particles, fits and positions onto a Matplotlib ``Axes``."""
 
-from gpusense.plots.chains import chain_figure
 from gpusense.plots.drawing import (
     add_colour_bar,
     add_legend,
@@ -13,9 +12,7 @@ from gpusense.plots.drawing import (
 )
 from gpusense.plots.features import draw_features, draw_landmarks, features_figure, landmarks_figure
 from gpusense.plots.judgements import draw_stanford, judgement_figure
-from gpusense.plots.localization import localization_figure
-from gpusense.plots.matches import match_figure
-from gpusense.plots.pose_densities import draw_particles, draw_pose_density, pose_lattice
+from gpusense.plots.pose_densities import draw_particles, draw_pose_density, localization_figure, pose_lattice
 from gpusense.plots.pose_maps import (
     draw_likelihood_field,
     draw_pose_likelihood,
@@ -31,6 +28,7 @@ from gpusense.plots.positions import (
     set_view,
     tile_centers,
 )
+from gpusense.plots.runs import chain_figure, match_figure
 
 __all__ = [
     "add_colour_bar",

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gpusense._util import checks
+from gpusense._util import checks, masks
 from gpusense._util.files import write_whole
+from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, Scanner, classify
 
@@ -116,17 +117,25 @@ def draw_scan(ax: Axes, grid: OccupancyGrid, scanner: Scanner, pose: ArrayLike, 
 
     x, y, theta = checks.array("pose", pose, (3,)).tolist()
     z = checks.array("ranges", ranges, (scanner.count,), finite=False, dtype=None)
-    hit = classify(z, scanner) == Reading.HIT
-    ahead, aside, turn = scanner.mount
+    ahead, aside, _ = scanner.mount
     c, s = math.cos(theta), math.sin(theta)
     start = np.array([x + c * ahead - s * aside, y + s * ahead + c * aside])
-    heading = theta + turn + scanner.bearings[hit]
-    ends = start + z[hit, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    ends = end_points(z, scanner, (x, y, theta))
     beams = np.stack([np.broadcast_to(start, ends.shape), ends], axis=1)
     ax.add_collection(LineCollection(list(beams), colors=BEAM, linewidths=0.6, alpha=0.35, zorder=4), autolim=False)
     ax.scatter(ends[:, 0], ends[:, 1], s=9, c=BEAM, linewidths=0, zorder=5)
     draw_pose(ax, (x, y, theta), length=0.07 * max(grid.width, grid.height))
-    return int(np.count_nonzero(hit))
+    return len(ends)
+
+
+def end_points(ranges: ArrayLike, scanner: Scanner, pose: ArrayLike = (0.0, 0.0, 0.0)) -> NDArray[np.float64]:
+    """Return the (M, 2) end points of the hits of a scan at a (3,) pose of the robot [m]."""
+    z = np.asarray(masks.filled(ranges))
+    hit = classify(z, scanner) == Reading.HIT
+    x, y, theta = np.asarray(pose, np.float64)
+    c, s = np.cos(theta), np.sin(theta)
+    points = z[hit, None] * ray_vectors(scanner.bearings, scanner.mount)[hit] + np.array(scanner.mount[:2])
+    return points @ np.array([[c, s], [-s, c]]) + (x, y)
 
 
 def draw_pose(ax: Axes, pose: ArrayLike, *, length: float, colour: str = ROBOT) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gpusense.evaluation.benchmark.rows import Row
+from gpusense.evaluation.benchmark.report import Row
 
 _PAGES = Path(__file__).parent / "pages"
 

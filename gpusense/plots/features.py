@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
-from gpusense.features.feature_map import FeatureMap
-from gpusense.features.result import Features
-from gpusense.plots.drawing import add_legend, draw_map, draw_pose, new_figure
-from gpusense.plots.matches import points_of
+from gpusense.plots.drawing import add_legend, draw_map, draw_pose, end_points, new_figure
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from gpusense.features.feature_map import FeatureMap
+    from gpusense.features.result import Features
 
 POINTS = "#9aa5b1"
 COLOURS = {"line": "#1d3557", "corner": "#d7263d", "door": "#b5179e", "hallway": "#2a9d8f", "pole": "#f3722c",
@@ -52,7 +52,7 @@ def draw_features(ax: Axes, features: Features, ranges: ArrayLike, scanner: Scan
         'x [m]'
     """
     z = checks.array("ranges", ranges, (scanner.count,), finite=False, dtype=None)
-    points = points_of(z, scanner)
+    points = end_points(z, scanner)
     ax.plot(points[:, 0], points[:, 1], ".", color=POINTS, ms=2.5, zorder=2, label="readings")
     shown = set()
     for kind, (x, y, theta), size in zip(features.kind, features.pose, features.size, strict=True):

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.evaluation.range_data import RangeData
 from gpusense.plots.drawing import BEAM, FRAME, ROBOT, colours, new_figure
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.range_causes import NoReturn, RandomDensity
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from gpusense.evaluation.range_data import RangeData
     from gpusense.learning.beam.incidence import IncidenceFit
 
 # Cells of the histograms over (z, z*) and over z.

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gpusense.evaluation.integrity import Integrity
-from gpusense.evaluation.judging import Judgement
 from gpusense.plots.drawing import (
     CLOUD,
     ESTIMATE,
@@ -25,6 +23,9 @@ from gpusense.world.grid import OccupancyGrid
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from gpusense.evaluation.integrity import Integrity
+    from gpusense.evaluation.judging import Judgement
 
 # Space around the track, relative to its size, and at least [m].
 _MARGIN, _LEAST = 0.15, 3.0

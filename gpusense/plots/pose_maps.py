@@ -11,14 +11,22 @@ from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense.matching.pose_likelihood import PoseLikelihood
-from gpusense.plots.drawing import _over_grid, add_colour_bar, colours, draw_map, draw_pose, new_figure, save
+from gpusense.plots.drawing import (
+    _over_grid,
+    add_colour_bar,
+    colours,
+    draw_map,
+    draw_pose,
+    end_points,
+    new_figure,
+    save,
+)
 from gpusense.plots.pose_densities import _scale
 from gpusense.tables.distances import distance_transform
 from gpusense.world.field_density import FieldDensity
-from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import LikelihoodFieldParameters
-from gpusense.world.scanner import Reading, Scanner, classify
+from gpusense.world.scanner import Scanner
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -139,11 +147,9 @@ def draw_scan_field(
         (40, 36)
     """
     z = checks.array("ranges", ranges, (scanner.count,), finite=False, dtype=None)
-    hits = classify(z, scanner) == Reading.HIT
-    if not hits.any():
+    ends, cell = end_points(z, scanner), checks.real("resolution", resolution, above=0)
+    if not len(ends):
         raise ValueError("ranges: must have a range, got none")
-    cell = checks.real("resolution", resolution, above=0)
-    ends = z[hits, None] * ray_vectors(scanner.bearings, scanner.mount)[hits] + np.array(scanner.mount[:2])
     place = np.floor(ends / cell).astype(int)
     low = place.min(axis=0) - _MARGIN
     cols, rows = (place.max(axis=0) + _MARGIN + 1 - low).tolist()

@@ -2,18 +2,34 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from gpusense.evaluation.scoring import LogScore
-from gpusense.evaluation.tracking import Track
-from gpusense.localization.filter import ParticleFilter
-from gpusense.plots.drawing import CLOUD, ESTIMATE, REFERENCE, VERDICTS, add_legend, draw_map, new_figure
+from gpusense.plots.drawing import (
+    CLOSED,
+    CLOUD,
+    ESTIMATE,
+    OCCUPIED,
+    REFERENCE,
+    VERDICTS,
+    add_legend,
+    draw_map,
+    end_points,
+    new_figure,
+)
 from gpusense.world.grid import OccupancyGrid
+from gpusense.world.scanner import Scanner
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from gpusense.chaining.result import ScanChain
+    from gpusense.evaluation.scoring import LogScore
+    from gpusense.evaluation.tracking import Track
+    from gpusense.localization.filter import ParticleFilter
 
 
 def scores_figure(grid: OccupancyGrid, score: LogScore, pose: str = "logged pose") -> Figure:
@@ -79,3 +95,156 @@ def track_figure(pf: ParticleFilter, track: Track) -> Figure:
     lower.set(xlabel="scan", ylim=(0, 1.02))
     add_legend(lower, 2)
     return figure
+
+
+PATH, DOUBTED, KEY = CLOUD, ESTIMATE, "#1f3552"
+# Number of ellipses.
+_ELLIPSES = 40
+
+
+def chain_figure(grid: OccupancyGrid, chain: ScanChain) -> Figure:
+    """Draw the map and the trajectory with closures, doubtful stretches and ellipses of one deviation.
+
+    Args:
+        grid: The map of the scans.
+        chain: The chain.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> scanner = gs.Scanner([-0.5, 0.0, 0.5], range_max=9.0)
+        >>> chain = gs.chain_scans(np.ones((2, 3)), scanner, backend="numpy")
+        >>> figure = gs.plots.chain_figure(gs.OccupancyGrid([[0]], 1.0), chain)
+        >>> figure.axes[0].get_xlabel()
+        'x [m]'
+    """
+    from matplotlib.collections import LineCollection
+
+    figure = new_figure(9.0, 8.0)
+    ax = figure.add_subplot()
+    draw_map(ax, grid)
+    poses, closures = chain.poses, chain.closures
+    ax.plot(poses[:, 0], poses[:, 1], "-", color=PATH, lw=0.9, label="trajectory")
+    ax.plot(*poses[chain.keys, :2].T, ".", color=KEY, ms=2, label="key scans")
+    if len(closures):
+        ends = np.stack([poses[closures.first, :2], poses[closures.second, :2]], axis=1)
+        ax.add_collection(LineCollection(list(ends), colors=CLOSED, linewidths=0.7, label="closures"))
+    for number, doubt in enumerate(chain.doubts):
+        part = poses[doubt.first : doubt.last + 1]
+        ax.plot(part[:, 0], part[:, 1], "-", color=DOUBTED, lw=2.2, label="" if number else "doubtful")
+    for number, k in enumerate(chain.keys[:: max(len(chain.keys) // _ELLIPSES, 1)]):
+        label = "" if number else "one deviation, from the first pose"
+        _ellipse(ax, poses[k], chain.covariance[k, :2, :2], float(np.ptp(poses[:, :2], axis=0).max()), label)
+    ax.set(xlabel="x [m]", ylabel="y [m]")
+    doubts = f"DOUBTFUL in {len(chain.doubts)} places" if chain.doubts else "CONSISTENT"
+    ax.set_title(f"{doubts}: {len(poses)} scans, {len(chain.corrections)} closures", loc="left")
+    add_legend(ax, 5)
+    return figure
+
+
+def _ellipse(ax: object, pose: np.ndarray, covariance: np.ndarray, largest: float, label: str) -> None:
+    """Draw an ellipse of one deviation, no larger than the trajectory."""
+    values, vectors = np.linalg.eigh(covariance)
+    axes = np.minimum(np.sqrt(np.maximum(values, 0.0)), max(largest, 1e-3))
+    t = np.linspace(0, 2 * np.pi, 37)
+    x, y = pose[:2, None] + vectors @ (axes[:, None] * np.stack([np.cos(t), np.sin(t)]))
+    ax.plot(x, y, "-", color=PATH, lw=0.5, alpha=0.7, label=label)  # type: ignore[attr-defined]
+
+
+def match_figure(
+    reference: ArrayLike | OccupancyGrid, ranges: ArrayLike, scanner: Scanner, guess: ArrayLike, pose: ArrayLike
+) -> Figure:
+    """Draw the reference, and the second scan at the guess and at the matched pose.
+
+    Args:
+        reference: (K,) readings of the earlier scan [m], or the map.
+        ranges: (K,) readings of the second scan [m].
+        scanner: The scanner of both.
+        guess: (3,) pose before the match [m, m, rad].
+        pose: (3,) pose of the match.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> scanner = gs.Scanner([-0.5, 0.0, 0.5], range_max=9.0)
+        >>> figure = gs.plots.match_figure(np.ones(3), np.ones(3), scanner, (0.2, 0, 0), (0, 0, 0))
+        >>> [axes.get_title() for axes in figure.axes]
+        ['before: 0.20 m, 0.00 m, 0.0 degrees', 'after: 0.00 m, 0.00 m, 0.0 degrees']
+    """
+    figure = new_figure(11.0, 5.5)
+    axes = figure.subplots(1, 2, sharex=True, sharey=True)
+    for ax, title, at in zip(axes, ("before", "after"), (guess, pose), strict=True):
+        x, y, theta = np.asarray(at, np.float64)
+        moved = end_points(ranges, scanner, at)
+        if isinstance(reference, OccupancyGrid):
+            draw_map(ax, reference)
+        else:
+            ax.plot(*end_points(reference, scanner).T, ".", color=OCCUPIED, ms=3, label="reference")
+        ax.plot(*moved.T, ".", color=ESTIMATE, ms=2, label="second scan")
+        ax.set(
+            title=f"{title}: {x:z.2f} m, {y:z.2f} m, {np.degrees(theta):z.1f} degrees",
+            xlabel="x [m]",
+            ylabel="y [m]",
+            aspect="equal",
+        )
+    near = np.concatenate([moved, [(x, y)]])
+    margin = 0.5
+    axes[0].set(xlim=(near[:, 0].min() - margin, near[:, 0].max() + margin),
+                ylim=(near[:, 1].min() - margin, near[:, 1].max() + margin))  # fmt: skip
+    add_legend(axes[1])
+    return figure
+
+
+_COLOURS = ("#4c78a8", "#e4572e", "#54a24b", "#b279a2", "#f2a541", "#72b7b2", "#9d755d", "#ff9da6")
+_MARKERS = "osD^vP*X<>"
+_LABELS = {
+    "error_median": "median error of position [m]", "error_position_median": "median error of the mean [m]",
+    "per_reading": "log-likelihood of a reading [nats]",
+}  # fmt: skip
+
+
+def sweep_figure(columns: Mapping[str, Sequence[Any]]) -> Figure:
+    """Draw the jobs of a table; models have colours, values of a second axis have shapes."""
+    from gpusense.sweeps.tasks import TASKS
+
+    tasks = [TASKS[task].error for task in dict.fromkeys(columns.get("task", ())) if task in TASKS]
+    error = next((name for name in tasks if name in columns), None)
+    if error is None:
+        raise ValueError("table: must have jobs with an error to draw, got none")
+    name, unit = ("ms_step", "time of a step [ms]") if "ms_step" in columns else ("seconds", "time of a job [s]")
+    time, values = (np.array([np.nan if one is None else one for one in columns[key]], float) for key in (name, error))
+    drawn = np.isfinite(time) & np.isfinite(values)
+    if not drawn.any():
+        raise ValueError("table: must have jobs with an error to draw, got none")
+    colour, shape = _axes(columns)
+    figure = new_figure(8.5, 5.5)
+    ax = figure.subplots()
+    colours, shapes = _places(columns, colour), _places(columns, shape)
+    for pair in dict.fromkeys(zip(colours, shapes, strict=True)):
+        chosen = drawn & np.array([one == pair for one in zip(colours, shapes, strict=True)])
+        text = ", ".join(dict.fromkeys(str(one) for one in pair if one is not None))
+        style = dict(
+            color=_COLOURS[list(dict.fromkeys(colours)).index(pair[0]) % len(_COLOURS)],
+            marker=_MARKERS[list(dict.fromkeys(shapes)).index(pair[1]) % len(_MARKERS)],
+        )
+        ax.plot(time[chosen], values[chosen], ls="", ms=4, alpha=0.6, label=text, **style)  # type: ignore[arg-type]
+    ax.set(xscale="log", xlabel=unit, ylabel=_LABELS.get(error, error))
+    if (values[drawn] > 0).all():
+        ax.set_yscale("log")
+    failed = sum(status == "failed" for status in columns["status"])
+    ax.set_title(f"{int(drawn.sum())} jobs" + (f", {failed} failed" if failed else ""), loc="left")
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize="small", title=" and ".join(one for one in (colour, shape) if one), title_fontsize="small")
+    return figure
+
+
+def _axes(columns: Mapping[str, Sequence[Any]]) -> tuple[str, str]:
+    """Return the columns for colours and shapes: models, labelled axes, particles, or ""."""
+    labelled = {name: 1 for name in columns if name.startswith("axis.")}
+    candidates = {"model": 0, **labelled, "axis.log": 2, "particles": 3}
+    varied = {name: len(set(columns[name])) for name in candidates if name in columns}
+    chosen = sorted((rank, name) for name, rank in candidates.items() if 1 < varied.get(name, 0) <= len(_MARKERS))
+    names = [name for _, name in chosen] + ["", ""]
+    return names[0], names[1]
+
+
+def _places(columns: Mapping[str, Sequence[Any]], name: str) -> list[Any]:
+    return list(columns[name]) if name else [None] * len(columns["key"])

@@ -71,7 +71,7 @@ class Store:
 
     def scans(self, job: Job, group: str = "") -> list[tuple[int, Scan]]:
         """Return the scans of a job with logged poses; ``group`` names the options that choose them."""
-        from gpusense.evaluation.scoring import chosen_scans, with_poses
+        from gpusense.evaluation.steps import chosen_scans, with_poses
 
         chosen, topic, path = _chosen(job, group), _topic(job), self.path(job.log)
         key = ("poses", job.log, topic, *chosen.items())

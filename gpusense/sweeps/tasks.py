@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.evaluation import held_out, range_data
+from gpusense.evaluation import range_data
 from gpusense.learning.beam.fit import fit_beam_parameters
 from gpusense.learning.discrete.causes import DiscreteCauses
 from gpusense.learning.discrete.table import DiscreteBeamModel
@@ -76,7 +76,7 @@ def _parameters(job: Job, store: Store) -> Any:
     if job.model == "discrete":
         return DiscreteBeamModel.learn(data.ranges, data.expected, data.range_max, job.option("bins", _BINS))
     fit = fit_beam_parameters(data.ranges, data.expected, data.range_max, backend=store.device)
-    return held_out.softened(fit.parameters, fit.hits + fit.max_readings)
+    return range_data.softened(fit.parameters, fit.hits + fit.max_readings)
 
 
 def localize(job: Job, store: Store) -> Values:

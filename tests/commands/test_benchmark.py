@@ -19,7 +19,7 @@ SMALL = ["--quick", "--particles", "8", "--checked", "6", "--beams", "7", "--rep
 FIELD = ["bench", "--problem", "field", "--method", "field", "--scene", "clutter"]
 POINT_KEYS = {
     "scene", "cloud", "problem", "backend", "device", "kind", "method", "variant", "knob", "value", "code", "precision",
-    "exact", "outside", "particles", "beams", "work", "checked", "status", "reason", "time", "memory", "errors",
+    "exact", "outside", "particles", "beams", "work", "checked", "status", "reason", "time", "errors",
 }  # fmt: skip
 
 
@@ -41,7 +41,6 @@ def test_quick_run_writes_whole_files(needs, tmp_path, capsys):
         assert set(point) == POINT_KEYS
         assert point["status"] == "ok", point["reason"]
         assert set(point["time"]) == TIMES
-        assert set(point["memory"]) == {"table_bytes"}
         kinds = set(ERRORS) - ({"ranges"} if point["problem"] == "field" else set())
         known = {k: ERRORS[k] for k in kinds}
         if point["cloud"] == "tracking" and point["problem"] != "ranges":

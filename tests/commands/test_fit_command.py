@@ -14,7 +14,6 @@ from scipy.integrate import quad
 import gpusense as gs
 from gpusense.commands import fit as command
 from gpusense.commands.cli import main
-from gpusense.evaluation import held_out
 from gpusense.evaluation import range_data as fitting
 from gpusense.evaluation.worlds import building, free_pose, simulate_scan
 from gpusense.models.scan.densities import log_mixture
@@ -162,7 +161,7 @@ def test_log_likelihoods_are_those_of_the_model(recorded):
     data = fitting.data_of_log(grid, numbered, backend="numpy", block=7)
     model = gs.BeamModel(grid, scans[0].scanner, TRUTH, backend="numpy", precision="float64")
     wanted = [model.log_likelihood([scan.pose], scan.ranges)[0] for scan in scans]
-    found = held_out.log_densities(TRUTH, data).reshape(SCANS, BEAMS).sum(axis=1)
+    found = fitting.log_densities(TRUTH, data).reshape(SCANS, BEAMS).sum(axis=1)
     # One casts in float32, the other in float64.
     np.testing.assert_allclose(found, wanted, atol=0.05)
     assert data.block.tolist() == [i // 7 for i in range(SCANS) for _ in range(BEAMS)]
@@ -175,9 +174,9 @@ def test_peers_are_proper_densities():
 
     def density(z, p):
         data = fitting.RangeData(np.array([z]), np.array([3.0]), None, np.zeros(1, int), RANGE)
-        return math.exp(held_out.log_densities(p, data)[0])
+        return math.exp(fitting.log_densities(p, data)[0])
 
-    for p in held_out.peer_parameters().values():
+    for p in fitting.peer_parameters().values():
         mass = quad(density, 0, RANGE, args=(p,), points=[2, 3, 4], limit=200)[0]
         assert mass + p.z_max == pytest.approx(1, abs=1e-6)
 
@@ -186,12 +185,12 @@ def test_standard_errors_are_those_of_blocks():
     """40 blocks of 25 equal values have the information of 40 values; unequal blocks use a ratio of sums."""
     random = np.random.default_rng(0)
     values = random.normal(size=40)
-    mean, error = held_out.block_mean(np.repeat(values, 25), np.repeat(np.arange(40), 25))
+    mean, error = fitting.block_mean(np.repeat(values, 25), np.repeat(np.arange(40), 25))
     assert mean == pytest.approx(values.mean()) and error == pytest.approx(values.std(ddof=1) / math.sqrt(40))
-    mean, error = held_out.block_mean(np.array([1.0, 3.0, 3.0, 3.0]), np.array([0, 1, 1, 1]))
+    mean, error = fitting.block_mean(np.array([1.0, 3.0, 3.0, 3.0]), np.array([0, 1, 1, 1]))
     assert mean == 2.5 and error == pytest.approx(math.sqrt(2 * (1.5**2 + 1.5**2)) / 4)
-    assert math.isnan(held_out.block_mean(np.ones(3), np.zeros(3, int))[1])
-    mean, error = held_out.block_mean(np.array([1.0, -math.inf]), np.array([0, 1]))
+    assert math.isnan(fitting.block_mean(np.ones(3), np.zeros(3, int))[1])
+    mean, error = fitting.block_mean(np.array([1.0, -math.inf]), np.array([0, 1]))
     assert mean == -math.inf and math.isnan(error)
 
 

@@ -16,7 +16,7 @@ import gpusense as gs
 from gpusense.commands import cli
 from gpusense.evaluation import tracking
 from gpusense.evaluation.steps import read_steps
-from gpusense.plots import animation
+from gpusense.plots import viewer
 
 BEARINGS = np.radians(np.arange(-90, 91, 1.0))
 
@@ -286,7 +286,7 @@ def test_a_run_is_animated(place, tmp_path, capsys, monkeypatch):
         assert movie.n_frames == 12 and movie.info["loop"] == 0
         frames = [movie.seek(number) or movie.convert("RGB").tobytes() for number in (0, 6, 11)]
     assert len(set(frames)) == 3
-    monkeypatch.setattr(animation, "FRAMES", 5)
+    monkeypatch.setattr(viewer, "FRAMES", 5)
     assert cli.main(call(place, "--animate", str(path))) == 0
     with Image.open(path) as movie:
         assert movie.n_frames == 4

@@ -141,13 +141,13 @@ def test_an_interrupt_keeps_the_chain_so_far(log, truth, tmp_path, capsys, monke
 
         yield show
 
-    monkeypatch.setattr("gpusense.commands.map_chain.progress", interrupting)
+    monkeypatch.setattr("gpusense.commands.map.progress", interrupting)
     out, tum = tmp_path / "map.yaml", tmp_path / "run.tum"
     command = ["map", "--log", str(log), "--chain", "--out", str(out), "--tum", str(tum), "--range-max", "29"]
     assert main([*command, "--backend", needs("opencl")]) == 130
     found, said = capsys.readouterr()
-    assert "21 scans" in found
-    assert "interrupted: the map holds 21 of 24 scans" in said
+    assert "21 scans" in found and "interrupted: results of 21 of 24 scans" in found
+    assert said == "gpusense: interrupted\n"
     assert gs.read_map(out).occupied.any()
     assert off(read_tum(tum)[1], truth[:21]) < 0.05
 

@@ -54,8 +54,8 @@ LOG = ["--log", "run.log", "--range-max", "20", "--backend", "numpy"]
 MAP = ["--map", "map.yaml"]
 # Arguments of a command, the progress step of the signal, and the expected output at the end.
 COMMANDS: dict[str, tuple[list[str], int, str]] = {
-    "map": ([*LOG, "--out", "OUT/made.yaml"], 2, "the map holds 4 of 6 scans"),
-    "likelihood_map": ([*MAP, *LOG, "--out", "OUT/made.png", "--headings", "4"], 2, "of the positions are done"),
+    "map": ([*LOG, "--out", "OUT/made.yaml"], 2, "results of 4 of 6 scans"),
+    "likelihood_map": ([*MAP, *LOG, "--out", "OUT/made.png", "--headings", "4"], 2, "per cent of the positions"),
     "score": ([*MAP, *LOG, "--particles", "50"], 3, "results of 2 of 6 scans"),
     "match": (LOG, 2, "results of "),
     "features": ([*LOG, "--map-out", "OUT/made.csv"], 4, "results of 4 of 6 scans"),

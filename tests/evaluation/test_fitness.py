@@ -7,7 +7,7 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.evaluation.fitness import FitnessOfLog
+from gpusense.evaluation.scoring import FitnessOfLog
 
 GRID = gs.worlds.building(2, (20.0, 20.0))
 SCANNER = gs.Scanner.uniform(angle_min=-2.0, angle_increment=4.0 / 59, count=60, range_max=10.0)
@@ -15,9 +15,9 @@ SCANNER = gs.Scanner.uniform(angle_min=-2.0, angle_increment=4.0 / 59, count=60,
 
 def judged(device: object, scans: list[gs.Scan]) -> object:
     """Return the judgement of scans by a field on a device."""
-    fitness = FitnessOfLog(gs.LikelihoodFieldModel(GRID, SCANNER, backend=device), seed=1)
-    for index, scan in enumerate(scans):
-        fitness.add(index, scan)
+    fitness = FitnessOfLog(gs.LikelihoodFieldModel(GRID, SCANNER, backend=device))
+    for scan in scans:
+        fitness.add(scan, 1.0)
     return fitness.result()
 
 

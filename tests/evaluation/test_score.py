@@ -11,7 +11,7 @@ import yaml
 
 import gpusense as gs
 from gpusense.commands.cli import main
-from gpusense.evaluation import scoring
+from gpusense.evaluation import scoring, steps
 from gpusense.evaluation.worlds import building, free_pose, simulate_scan
 
 
@@ -113,7 +113,7 @@ def test_temperature_is_calibrated_from_the_log_or_given(capsys, recorded):
     options = ["--model", "field", "--particles", "50", "--backend", "numpy"]
     _, out, _ = run(capsys, recorded, *options, "--json")
     grid = gs.read_map(recorded / "map.yaml")
-    scans = [scan for _, scan in scoring.chosen_scans(recorded / "run.log")]
+    scans = [scan for _, scan in steps.chosen_scans(recorded / "run.log")]
     model = gs.LikelihoodFieldModel(grid, scans[0].scanner, backend="numpy")
     poses = np.array([scan.pose for scan in scans])
     wanted = gs.calibrate_temperature(model, np.array([scan.ranges for scan in scans]), poses)

@@ -15,7 +15,15 @@ from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.commands.cli import main
 from gpusense.evaluation import selftest, stiff
 from gpusense.evaluation.replay import Recorder, replay
-from gpusense.evaluation.tolerances import TOLERANCES, beam_tolerance, differing, per_beam, per_scan, scan_tolerance
+from gpusense.evaluation.tolerances import (
+    TOLERANCES,
+    Check,
+    beam_tolerance,
+    differing,
+    per_beam,
+    per_scan,
+    scan_tolerance,
+)
 from gpusense.interface.signatures import KERNELS
 from gpusense.interface.structs import Score
 from gpusense.models.scan import tiles
@@ -343,15 +351,15 @@ def test_the_stiff_catalogue_on_the_command_line(capsys):
     assert main(["selftest", "--stiff", "--backend", "numpy", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["passed"]
-    assert {row["precision"] for row in document["rows"]} == {"float32", "float64"}
-    assert all(row["ok"] for row in document["rows"])
-    assert len(document["rows"]) > 400
+    quantities = [check["quantity"] for check in document["checks"] if check["passed"]]
+    assert len(quantities) > 400
+    assert {quantity.split()[0] for quantity in quantities} == {"float32", "float64"}
 
 
 def test_a_stiff_breach_is_reported_and_fails(capsys, monkeypatch):
-    row = stiff.Row("a case", "log p", 17.0, 16.0, 0, False)
-    monkeypatch.setattr(stiff, "run", lambda backend, precision: [row])
+    wrong = Check("numpy", "truth", "log p; a case", 17.0, beam_tolerance("float32"))
+    monkeypatch.setattr(stiff, "run", lambda backend, precision: [wrong])
     assert main(["selftest", "--stiff", "--backend", "numpy"]) == 1
     output = capsys.readouterr().out
     assert "BREACH" in output
-    assert output.startswith("FAILED: 2 of 2 cases beyond tolerance")
+    assert output.startswith("FAILED: 2 of 2 comparisons beyond tolerance")

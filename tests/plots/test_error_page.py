@@ -14,7 +14,7 @@ from support.browser import CHROMIUM, in_browser, in_node
 
 from gpusense.commands import cli
 from gpusense.evaluation.benchmark import choice
-from gpusense.evaluation.benchmark.rows import ALL, Row, model_rows
+from gpusense.evaluation.benchmark.report import ALL, Row, model_rows
 from gpusense.plots import error_page as made
 
 SCRIPT = (Path(made.__file__).parent / "pages" / "error.js").read_text(encoding="utf-8")

@@ -9,9 +9,7 @@ import numpy as np
 from gpusense.backends import get_backend
 from gpusense.evaluation.benchmark import candidates, report, runner, scenes
 
-TIMES = {
-    "first_s", "build_s", "compile_s", "call_min_s", "call_q1_s", "call_median_s", "call_q3_s", "processor_s", "calls",
-}  # fmt: skip
+TIMES = {"first_s", "call_min_s", "call_q1_s", "call_median_s", "call_q3_s", "processor_s", "calls"}
 ERRORS = {
     "ranges": {"median", "p95", "max", "wrong_1"},
     "log_p": {"max", "rms"},
@@ -36,11 +34,10 @@ def plan_of(*chosen, **changes):
 def candidate(run, problem="ranges", **changes):
     """Return a candidate whose runner calls ``run(scene, poses)``."""
 
-    class Made:
-        def __init__(self, scene):
-            self.run = lambda poses: run(scene, poses)
+    def make(scene, backend, precision):
+        return candidates.Runner(lambda poses: run(scene, poses))
 
-    return candidates.Candidate(problem, "made up", lambda scene, backend, precision: Made(scene), **changes)
+    return candidates.Candidate(problem, "made up", make, **changes)
 
 
 def free_ranges(scene, poses):
@@ -54,7 +51,6 @@ def made_point(**changes):
         "method": "exact", "variant": "", "knob": "", "value": None, "code": "", "precision": "float32", "exact": False,
         "outside": False, "particles": 10, "beams": 10, "work": 100, "checked": 5, "status": "ok", "reason": "",
         "time": dict.fromkeys(TIMES, 1.0) | {"calls": 20},
-        "memory": {"table_bytes": 8},
         "errors": {kind: dict.fromkeys(names, 0.5) for kind, names in ERRORS.items()},
     }  # fmt: skip
     point = copy.deepcopy(point)

@@ -14,7 +14,6 @@ import numpy as np
 
 from gpusense._util.typing import Precision
 from gpusense.backends import Backend
-from gpusense.evaluation.benchmark.measure import Runner
 from gpusense.evaluation.benchmark.scenes import Scene
 from gpusense.interface.casters import ENTRIES
 from gpusense.models.scan.beam import BeamModel
@@ -25,6 +24,20 @@ from gpusense.tables.casters import CASTERS, Caster
 
 PROBLEMS = ("ranges", "beam", "field")
 """Expected ranges; log-likelihoods of the beam model; log-likelihoods of the likelihood field."""
+
+
+@dataclass(frozen=True)
+class Runner:
+    """A candidate made for a scene.
+
+    Attributes:
+        run: Computes (N, K) ranges or (N,) log-likelihoods of (N, 3) poses.
+        ranges: Computes the (N, K) expected ranges of a beam model; None for other candidates.
+    """
+
+    run: Callable[[np.ndarray], np.ndarray]
+    ranges: Callable[[np.ndarray], np.ndarray] | None = None
+
 
 # Makes a runner from a scene, a device (None for outside candidates) and a precision.
 Make = Callable[[Scene, Any, Any], Runner]
@@ -153,31 +166,11 @@ def _code_of(method: str, options: Mapping[str, Any]) -> str:
     return f"gs.casters.{CASTERS[method].__name__}({', '.join(words)})".replace("'", '"')
 
 
-class _ModelRunner:
-    """A runner of this package's model or caster."""
-
-    def __init__(self, model: Any, run: Callable[[np.ndarray], np.ndarray]) -> None:
-        self._model, self._run = model, run
-        for method, model_method in (("prepare", "prepare"), ("ranges", "expected_ranges")):
-            if hasattr(model, model_method):
-                setattr(self, method, getattr(model, model_method))
-
-    def run(self, poses: np.ndarray) -> np.ndarray:
-        """Compute (N, K) ranges or (N,) log-likelihoods of (N, 3) poses."""
-        return self._run(poses)
-
-    @property
-    def table_bytes(self) -> int | None:
-        """Return the bytes of the map's tables on the device once they are built, else None."""
-        size = getattr(self._model, "table_bytes", None)
-        return None if size is None else int(size)
-
-
 def _ranges(caster: Caster, scene: Scene, backend: Backend, precision: Precision) -> Runner:
     """Make a runner that casts rays."""
     limit, bearings = scene.scanner.range_max, scene.scanner.bearings
     ray_caster = RayCaster(scene.grid, limit, caster=caster, backend=backend, precision=precision)
-    return _ModelRunner(ray_caster, lambda poses: ray_caster.cast(poses, bearings))
+    return Runner(lambda poses: ray_caster.cast(poses, bearings))
 
 
 def _scores(kind: type[BeamModel] | type[LikelihoodFieldModel], share: int = 1, **options: Any) -> Make:
@@ -189,7 +182,8 @@ def _scores(kind: type[BeamModel] | type[LikelihoodFieldModel], share: int = 1, 
         model = kind(
             scene.grid, scene.scanner, parameters, backend=backend, precision=precision, beams=beams, **options
         )
-        return _ModelRunner(model, lambda poses: model.log_likelihood(poses, scene.readings))
+        ranges = model.expected_ranges if isinstance(model, BeamModel) else None
+        return Runner(lambda poses: model.log_likelihood(poses, scene.readings), ranges)
 
     return make
 

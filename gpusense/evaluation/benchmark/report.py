@@ -8,10 +8,11 @@ import math
 import subprocess
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from gpusense.evaluation.benchmark.choice import Entry, error_of, label, setting
 from gpusense.evaluation.benchmark.runner import Outcome, Plan
 
 SCHEMA = 2
@@ -89,3 +90,204 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: int) -
     cells = [columns, *([text.replace("|", "\\|") for text in row] for row in rows)]
     lines = [f"| {' | '.join(row)} |" for row in cells]
     return [lines[0], f"|{'|'.join(rule)}|", *lines[1:]]
+
+
+ALL = "all maps"
+NEEDS = {"ranges": "rays", "beam": "beam model", "field": "likelihood field"}
+# Measures of each need as (place in a point, cloud or "" for all, text, unit); the limit applies to the first.
+MODEL_MEASURES = {
+    "rays": (
+        (("ranges", "wrong_1"), "", "rays wrong by more than a cell", "share"),
+        (("ranges", "median"), "", "median error of a ray", "cells"),
+        (("ranges", "p95"), "", "95 % error of a ray", "cells"),
+        (("ranges", "max"), "", "largest error of a ray", "cells"),
+    ),
+    "beam model": (
+        (("comparable", "kl"), "tracking", "KL divergence at a comparable temperature", "nats"),
+        (("comparable", "kl"), "global", "the same, all over the map", "nats"),
+        (("fine", "kl"), "tracking", "KL divergence from the true posterior", "nats"),
+        (("comparable", "shift_m"), "tracking", "shift of the mean position", "m"),
+        (("log_p", "rms"), "tracking", "RMS error of log p", "nats"),
+    ),
+}
+MODEL_MEASURES["likelihood field"] = MODEL_MEASURES["beam model"]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A method in one scene: a map with a cloud.
+
+    Attributes:
+        errors: By the text of the measure; only measures of this cloud.
+    """
+
+    name: str
+    seconds: float
+    errors: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method on a device, in one map or in all.
+
+    Attributes:
+        need: Need that it serves, a value of ``NEEDS``.
+        device: Title of the device.
+        scene: Name of the map; ``ALL`` for the worst error and the mean time over all maps.
+        seconds: Time of a call, a step or a match: on a processor its CPU time over all cores, on a GPU the least
+            elapsed time.
+        quartiles: Quartiles of the elapsed times [s]; geometric means over the maps.
+        errors: By the text of the measure.
+        exact: Whether it computes the model itself.
+        outside: Version and threads of another implementation; empty for gpusense.
+        work: Rays or readings of a call; 1 for tasks.
+        maps: "8 of 10 clouds" if some were left out because of the time that a table takes; such a row is never chosen.
+        cases: For a row of all maps, each scene by itself.
+        origin: Command that measured it, with date and commit.
+        doubt: See :class:`~gpusense.evaluation.benchmark.choice.Entry`.
+    """
+
+    need: str
+    device: str
+    scene: str
+    method: str
+    setting: str
+    precision: str
+    code: str
+    seconds: float
+    quartiles: tuple[float, float, float]
+    errors: Mapping[str, float]
+    units: Mapping[str, str]
+    exact: bool = False
+    outside: str = ""
+    work: int = 1
+    maps: str = ""
+    cases: tuple[Case, ...] = ()
+    origin: str = ""
+    doubt: float = 1.0
+
+    @property
+    def text(self) -> str:
+        """Name the method with setting and precision; float32 is not named."""
+        precision = self.precision if self.precision != "float32" and self.need != "learning" else ""
+        text = ", ".join(word for word in (self.method, self.setting, precision) if word)
+        return f"{text} ({self.maps})" if self.maps else text
+
+    def entry(self, measure: str) -> Entry:
+        """Return the row as an entry to choose from, by a measure."""
+        return Entry(
+            self.method, self.setting, self.precision, self.errors[measure], self.seconds, self.exact, self.doubt,
+        )  # fmt: skip
+
+
+def title_of(point: Mapping[str, Any], machine: Mapping[str, Any], driver: str = "", target: str = "") -> str:
+    """Name a point's device: library, and processor with cores or GPU; PoCL's ``target`` "haswell" has no AVX-512."""
+    library = {"opencl": "OpenCL", "warp:cuda": "CUDA", "warp:cpu": "Warp"}
+    if driver.startswith("Intel"):
+        library["opencl"] = "Intel's OpenCL"
+    prefix = next((name for name in ("warp:cuda", "warp:cpu", "opencl") if point["backend"].startswith(name)), "")
+    if point["kind"] == "gpu":
+        return f"{point['device']}, {library[prefix]}"
+    made = "PoCL" if "pthread" in point["device"] or "cpu-" in point["device"] else library.get(prefix, "NumPy")
+    made += ", AVX2 only" if target == "haswell" else ""
+    cores = 1 if prefix == "warp:cpu" else machine["processors"]
+    return f"{cores} core{'s' * (cores > 1)} of an {machine['processor']}, {made}"
+
+
+def titles_of(
+    points: Iterable[Mapping[str, Any]], machine: Mapping[str, Any], devices: Iterable[Mapping[str, Any]] = ()
+) -> dict[str, str]:
+    """Return a title for each device of some points, by selection string; equal titles are extended by device names.
+
+    Other implementations (selection string ``"outside"``) have the title of the first processor.
+    """
+    drivers = {device["selection"]: (device["driver"], device.get("target", "")) for device in devices}
+    first: dict[str, Mapping[str, Any]] = {}
+    for point in points:
+        first.setdefault(point["backend"], point)
+    outside = first.pop("outside", None)
+    plain = {name: title_of(point, machine, *drivers.get(name, ())) for name, point in first.items()}
+    alike = list(plain.values())
+    titles = {name: f"{title}, {name}" if alike.count(title) > 1 else title for name, title in plain.items()}
+    if outside is not None:
+        own = next((titles[name] for name, point in first.items() if point["kind"] == outside["kind"]), None)
+        titles["outside"] = own or next(iter(titles.values()), title_of(outside, machine))
+    return titles
+
+
+def origin_of(report: Mapping[str, Any]) -> str:
+    """Name the command of a report, its date and its commit."""
+    return f"{report['command'] or 'gpusense bench'} ({report['date']}, commit {report['commit'] or 'unknown'})"
+
+
+def mean(numbers: Iterable[float]) -> float:
+    """Return the geometric mean of positive numbers."""
+    logs = [math.log(number) for number in numbers]
+    return math.exp(sum(logs) / len(logs))
+
+
+def seconds_of(point: Mapping[str, Any]) -> float | None:
+    """Return the time of a point: CPU time on a processor, least elapsed time on a GPU."""
+    name = "call_min_s" if point["kind"] == "gpu" else "processor_s"
+    value = (point["time"] or {}).get(name)
+    return float(value) if value else None
+
+
+def model_rows(report: Mapping[str, Any]) -> list[Row]:
+    """Return the rows of a report of ``gpusense bench``, for each map and for all together.
+
+    A method that failed in a scene has no row for the scene and none for all maps. A scene where every method was left
+    out, such as one after the deadline of a quick run, does not count.
+    """
+    titles, origin = titles_of(report["points"], report["machine"], report.get("devices", ())), origin_of(report)
+    groups: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
+    everywhere: dict[tuple[str, ...], set[tuple[str, str]]] = {}
+    for point in report["points"]:
+        run = (NEEDS[point["problem"]], point["backend"], point["precision"])
+        groups.setdefault((*run, point["device"], label(point), setting(point)), []).append(point)
+        if point["status"] != "left out":
+            everywhere.setdefault(run, set()).add((point["scene"], point["cloud"]))
+    rows = []
+    for (need, backend, precision, *_), group in groups.items():
+        kept = [point for point in group if point["status"] != "left out"]
+        whole = len(everywhere.get((need, backend, precision), ()))
+        for scene in [*dict.fromkeys(point["scene"] for point in kept), ALL]:
+            part = kept if scene == ALL else [point for point in kept if point["scene"] == scene]
+            made = _model_row(need, titles[backend], scene, part) if part else None
+            if made is not None:
+                some = scene == ALL and len(part) < whole
+                maps = f"{len(part)} of {whole} clouds" if some else ""
+                cases = tuple(_case(need, point) for point in part) if scene == ALL else ()
+                rows.append(replace(made, maps=maps, cases=cases, origin=origin))
+    return rows
+
+
+def _measured(need: str, point: Mapping[str, Any]) -> dict[str, float]:
+    """Return the errors of a point that concern its cloud, by their texts."""
+    places = {text: place for place, cloud, text, _ in MODEL_MEASURES[need] if cloud in ("", point["cloud"])}
+    known = {text: error_of(point, *place) for text, place in places.items()}
+    return {text: error for text, error in known.items() if error is not None}
+
+
+def _case(need: str, point: Mapping[str, Any]) -> Case:
+    return Case(f"{point['scene']}, {point['cloud']}", seconds_of(point) or 0.0, _measured(need, point))
+
+
+def _model_row(need: str, title: str, scene: str, group: Sequence[Mapping[str, Any]]) -> Row | None:
+    times = [seconds_of(point) for point in group]
+    if any(time is None or point["status"] != "ok" for time, point in zip(times, group, strict=True)):
+        return None
+    found = [_measured(need, point) for point in group]
+    errors = {
+        text: max(each[text] for each in found if text in each)
+        for _, _, text, _ in MODEL_MEASURES[need]
+        if any(text in each for each in found)
+    }
+    units = {text: unit for _, _, text, unit in MODEL_MEASURES[need] if text in errors}
+    first = group[0]
+    low, middle, high = (mean(point["time"][f"call_{name}_s"] for point in group) for name in ("q1", "median", "q3"))
+    return Row(
+        need, title, scene, label(first), setting(first), first["precision"], first["code"],
+        mean(time or 1.0 for time in times), (low, middle, high), errors, units, bool(first["exact"]),
+        first["device"] if first["outside"] else "", first["work"],
+    )  # fmt: skip

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from gpusense._util.typing import PRECISIONS
 from gpusense.backends import Backend
 from gpusense.evaluation.benchmark.accuracy import Truth, UnstableError, errors, fine_errors, truth_device
-from gpusense.evaluation.benchmark.candidates import Candidate
-from gpusense.evaluation.benchmark.measure import Made, Runner, measure
+from gpusense.evaluation.benchmark.candidates import Candidate, Runner
 from gpusense.evaluation.benchmark.scenes import CLOUDS, MapSource, Scene, make_scene
-
-PRECISIONS = ("float32", "float64")
 
 FINE_CLOUD = "tracking"
 """The cloud with which the errors on a fine grid of poses around the true pose are reported."""
+
+LONG = 1.0
+"""Duration of a call above which it is not repeated [s]."""
+FEWEST = 3
+"""Least number of timed calls."""
 
 # Default number of particles of a call: enough to fill the device.
 PARTICLES = {"gpu": 4096, "cpu": 1024}
@@ -40,7 +44,6 @@ class Plan:
         seconds: Longest time of a point's timed calls, of which there are at least three [s].
         build_limit: Longest time to build a table [s]; a point above it is left out.
         deadline: Measuring time, without compiling, after which no further point begins [s].
-        slow_to_make: Duration of a first call above which building includes compiling [s]; None as in ``measure``.
     """
 
     sources: Sequence[MapSource]
@@ -55,7 +58,6 @@ class Plan:
     seconds: float = float("inf")
     build_limit: float = 60.0
     deadline: float = float("inf")
-    slow_to_make: float | None = None
 
     def particles_on(self, backend: Backend | None) -> int:
         """Return N of a timed call on a device; None means an outside candidate."""
@@ -128,25 +130,25 @@ def run(plan: Plan, step: Callable[[str], None] = lambda text: None, outcome: Ou
         outcome.scenes.append(_description(scene))
         paces: dict[tuple[str, str], float] = {}
         for job in jobs(plan):
-            made: Made | None = None
+            made: Runner | None = None
             for cloud, truth in truths.items():
                 step(f"{scene.name}, {cloud}, {job.candidate.label}")
-                reason = _left_out(plan, job, scene, paces.get(job.place), made, spent)
+                reason = _left_out(plan, job, scene, paces.get(job.place), spent)
                 begin = time.perf_counter()
                 point, made = point_of(plan, job, truth, cloud, reason, made)
                 outcome.points.append(point)
                 spent += time.perf_counter() - begin
                 if point["time"]:
                     # Compiling does not count, so a first run measures about as many points as the next one.
-                    spent -= point["time"]["compile_s"] or 0.0
+                    spent -= point["time"]["first_s"]
                     if job.candidate.method == "exact" and job.candidate.problem == "ranges":
                         paces[job.place] = point["work"] / point["time"]["call_min_s"]
     return outcome
 
 
 def point_of(
-    plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "", made: Made | None = None
-) -> tuple[dict[str, Any], Made | None]:
+    plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "", made: Runner | None = None
+) -> tuple[dict[str, Any], Runner | None]:
     """Measure one point; a failure becomes its status and reason.
 
     ``made``: The runner of another cloud, which serves this one if its table is of the whole map.
@@ -168,19 +170,21 @@ def point_of(
         "code": candidate.code, "precision": job.precision, "exact": candidate.exact,
         "outside": bool(candidate.outside), "particles": particles, "beams": beams, "work": particles * beams,
         "checked": len(truth.poses), "status": "left out" if reason else "ok", "reason": reason, "time": None,
-        "memory": None, "errors": None,
+        "errors": None,
     }  # fmt: skip
     if reason:
         return point, made
-    made = made if candidate.whole else None
+    made, first = made if candidate.whole else None, 0.0
     try:
-        cost, made = measure(
-            lambda: candidate.make(scene, backend, job.precision), backend, scene.clouds[cloud][:particles],
-            plan.repeats, plan.seconds, plan.slow_to_make, made,
-        )  # fmt: skip
-        times = asdict(cost)
-        point |= {"memory": {"table_bytes": times.pop("table_bytes")}, "time": times}
-        point["errors"] = _errors(truth, candidate, made.runner, fine=cloud == FINE_CLOUD)
+        poses = scene.clouds[cloud][:particles]
+        if made is None:
+            begin = time.perf_counter()
+            made = candidate.make(scene, backend, job.precision)
+            made.run(poses)
+            first = time.perf_counter() - begin
+        runner = made
+        point["time"] = {"first_s": first} | call_times(lambda: runner.run(poses), plan.repeats, plan.seconds)
+        point["errors"] = _errors(truth, candidate, made, fine=cloud == FINE_CLOUD)
     except LeftOutError as error:
         point |= {"status": "left out", "reason": str(error)}
     except UnstableError as error:
@@ -194,19 +198,18 @@ def _errors(truth: Truth, candidate: Candidate, runner: Runner, *, fine: bool) -
     result, problem = runner.run(truth.poses), candidate.problem
     if problem == "ranges":
         return errors(truth, problem, ranges=result, log_p=None)
-    cast = getattr(runner, "ranges", None) if problem == "beam" else None
-    ranges, factor = None if cast is None else cast(truth.poses), candidate.temperature
+    ranges = runner.ranges(truth.poses) if problem == "beam" and runner.ranges else None
+    factor = candidate.temperature
     found = errors(truth, problem, ranges=ranges, log_p=result, temperature=factor)
     if fine:
         found["fine"] = fine_errors(truth, problem, runner.run(truth.fine(problem).poses), factor)
     return found
 
 
-def _left_out(plan: Plan, job: Job, scene: Scene, pace: float | None, made: Made | None, spent: float) -> str:
+def _left_out(plan: Plan, job: Job, scene: Scene, pace: float | None, spent: float) -> str:
     """Return why a point is left out; empty if it is measured.
 
-    ``pace``: Rays per second of the exact caster. ``made``: The runner of the scene's other cloud. ``spent``: Measuring
-    time so far [s].
+    ``pace``: Rays per second of the exact caster. ``spent``: Measuring time so far [s].
     """
     if job.candidate.missing:
         return job.candidate.missing
@@ -215,9 +218,28 @@ def _left_out(plan: Plan, job: Job, scene: Scene, pace: float | None, made: Made
     rays = job.candidate.table_rays(scene) if job.candidate.table_rays else 0.0
     if pace and rays / pace > plan.build_limit:
         return f"building its table would take about {rays / pace:.0f} s, more than {plan.build_limit:g} s"
-    if made is not None and made.build_s > plan.build_limit:
-        return f"building its table has taken {made.build_s:.0f} s in this scene, more than {plan.build_limit:g} s"
     return ""
+
+
+def call_times(run: Callable[[], object], repeats: int, seconds: float = float("inf")) -> dict[str, float]:
+    """Time calls after a warm-up, or the warm-up alone if it takes more than ``LONG``.
+
+    ``seconds``: Time after which no further call begins, if there are at least ``FEWEST`` [s].
+
+    Returns:
+        Least time and quartiles of the elapsed times, the mean processor time over all threads [s], number of calls.
+    """
+    used: list[tuple[float, float]] = []
+    while not used or (used[0][0] <= LONG and len(used) <= repeats):
+        if len(used) > FEWEST and sum(elapsed for elapsed, _ in used[1:]) >= seconds:
+            break
+        begin, before = time.perf_counter(), time.process_time()
+        run()
+        used.append((time.perf_counter() - begin, time.process_time() - before))
+    elapsed, processor = zip(*(used[1:] or used), strict=True)
+    names, shares = ("call_min_s", "call_q1_s", "call_median_s", "call_q3_s"), (0.0, 0.25, 0.5, 0.75)
+    quartiles = dict(zip(names, np.quantile(elapsed, shares).tolist(), strict=True))
+    return quartiles | {"processor_s": statistics.fmean(processor), "calls": len(elapsed)}
 
 
 def _description(scene: Scene) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from support.paths import ROOT
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.evaluation.benchmark import accuracy, candidates, measure, runner
+from gpusense.evaluation.benchmark import accuracy, candidates, runner
 
 pytestmark = pytest.mark.usefixtures("no_data")
 
@@ -28,35 +28,12 @@ def test_methods_are_those_of_the_package():
     assert {one.problem for one in candidates.candidates(["field"])} == {"field"}
 
 
-def test_costs_of_a_caster():
-    scene = quick_scene()
-    chosen = next(one for one in candidates.candidates(["ranges"]) if one.method == "exact")
-    poses = scene.clouds["global"]
-    device = get_backend("numpy")
-    cost, made = measure.measure(lambda: chosen.make(scene, device, "float32"), device, poses, 3)
-    assert made.runner.run(poses).shape == (20, 9)
-    assert cost.calls == 3 and 0 < cost.call_min_s <= cost.call_q1_s <= cost.call_median_s <= cost.call_q3_s
-    assert cost.build_s > 0 and cost.first_s > 0 and cost.compile_s is not None
-    rows, cols = scene.grid.shape
-    assert cost.table_bytes == 8 * (rows + 2) * (cols + 2)
-
-
-def test_a_table_that_is_slow_to_make_is_made_once(monkeypatch):
-    scene, made = quick_scene(), []
-    poses = scene.clouds["global"]
-    slow = candidate(free_ranges)
-
-    def make():
-        made.append(1)
-        return slow.make(scene, None, "float32")
-
-    assert measure.measure(make, None, poses, 1)[0].compile_s is not None
-    monkeypatch.setattr(measure, "SLOW_TO_MAKE", -1.0)
-    first, runner_of_first = measure.measure(make, None, poses, 1)
-    assert first.compile_s is None and len(made) == 3
-    second, again = measure.measure(make, None, poses, 1, made=runner_of_first)
-    assert len(made) == 3 and again == runner_of_first
-    assert (second.first_s, second.build_s) == (first.first_s, first.build_s)
+def test_times_of_calls():
+    times = runner.call_times(lambda: time.sleep(1e-3), 3)
+    assert times["calls"] == 3
+    assert 1e-3 <= times["call_min_s"] <= times["call_q1_s"] <= times["call_median_s"] <= times["call_q3_s"]
+    # At least three calls, however long they take.
+    assert runner.call_times(lambda: None, 9, seconds=0.0)["calls"] == 3
 
 
 @pytest.mark.parametrize("whole", [True, False])
@@ -68,15 +45,15 @@ def test_a_table_of_the_whole_map_serves_both_clouds(whole):
         return candidate(free_ranges).make(scene, backend, precision)
 
     one = replace(candidate(free_ranges, outside="somewhere", whole=whole), make=make)
-    outcome = runner.run(plan_of(one, slow_to_make=-1.0))
+    outcome = runner.run(plan_of(one))
     assert [(p["cloud"], p["status"]) for p in outcome.points] == [("global", "ok"), ("tracking", "ok")]
     assert len(made) == (1 if whole else 2)
 
 
 def test_long_calls_are_not_repeated(monkeypatch):
-    monkeypatch.setattr(measure, "LONG", 0.0)
+    monkeypatch.setattr(runner, "LONG", 0.0)
     calls = []
-    assert len(measure.series(lambda: calls.append(1), 20)) == len(calls) == 1
+    assert runner.call_times(lambda: calls.append(1), 20)["calls"] == len(calls) == 1
 
 
 def test_numpy_gets_fewer_particles():
@@ -121,14 +98,9 @@ def test_a_point_that_works_is_measured():
 def test_tables_that_take_too_long_and_late_points_are_left_out():
     own = [one for one in candidates.candidates(["ranges"], quick=True) if one.method in ("exact", "lookup")]
     outcome = runner.run(plan_of(*own, build_limit=1e-6))
-    assert [(p["method"], p["status"]) for p in outcome.points][:3] == [
-        ("exact", "ok"), ("exact", "left out"), ("lookup", "left out"),
-    ]  # fmt: skip
+    assert {(p["method"], p["status"]) for p in outcome.points} == {("exact", "ok"), ("lookup", "left out")}
     assert "building its table would take" in outcome.points[2]["reason"]
     own = [candidate(free_ranges, outside="somewhere")]
-    slow = runner.run(plan_of(*own, build_limit=-1.0))
-    assert [p["status"] for p in slow.points] == ["ok", "left out"]
-    assert "building its table has taken" in slow.points[1]["reason"]
     late = runner.run(plan_of(*own, deadline=-1.0))
     assert {p["reason"] for p in late.points} == {"the -1 s of this run were over"}
 
@@ -143,7 +115,7 @@ def test_compiling_does_not_use_up_the_time_of_a_run():
 
     outcome = runner.run(plan_of(replace(candidate(free_ranges, outside="somewhere"), make=compile_once), deadline=1.0))
     assert [p["status"] for p in outcome.points] == ["ok", "ok"]
-    assert outcome.points[0]["time"]["compile_s"] > 1.0
+    assert outcome.points[0]["time"]["first_s"] > 1.0
 
 
 # Outside candidates

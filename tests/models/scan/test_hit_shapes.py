@@ -11,8 +11,7 @@ from mpmath import mp
 from scipy import stats
 
 import gpusense as gs
-from gpusense.evaluation.held_out import log_densities
-from gpusense.evaluation.range_data import RangeData
+from gpusense.evaluation.range_data import RangeData, log_densities
 from gpusense.evaluation.tolerances import per_beam
 from gpusense.models.scan.densities import log_hit, log_mixture
 from gpusense.plots import fits

@@ -18,12 +18,21 @@ from gpusense.commands.arguments import (
     range_number,
     whole_number,
 )
-from gpusense.commands.output import counted, degrees, length, print_fact, print_parameters, print_report, print_result
-from gpusense.evaluation.machine import machine_line
+from gpusense.commands.output import (
+    counted,
+    degrees,
+    length,
+    print_details,
+    print_fact,
+    print_interrupted,
+    print_parameters,
+    print_report,
+    print_result,
+)
+from gpusense.commands.signals import held
 from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
-    from gpusense.evaluation.landmark_runs import DriftingOdometry, Track
     from gpusense.learning.fitted import LandmarkFit
     from gpusense.learning.landmark.suspicious import Suspicions
     from gpusense.logs.records import LandmarkRun
@@ -53,7 +62,9 @@ small one the robot gets lost.
 The final verdict needs no logged poses: it is 'lost' if the particles predict the last readings hardly better than
 poses anywhere among the landmarks, as on a wrong map.
 
-Exit codes: 0 success, 1 lost at the end, 2 bad input.
+Ctrl-C ends the run with the results so far.
+
+Exit codes: 0 success, 1 lost at the end, 2 bad input, 130 interrupted, 143 terminated.
 
 examples:
   gpusense landmarks --folder MRCLAM_Dataset1 --robot 1
@@ -87,9 +98,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit the noise, check the map, associate, localise, and print the results."""
+    """Fit the noise, check the map, associate, localise, and print the results; after Ctrl-C, of the scans so far."""
     from gpusense.evaluation import landmark_runs
-    from gpusense.evaluation.landmark_runs import run_motion
+    from gpusense.evaluation.tracking import Track, summary
     from gpusense.learning.landmark.suspicious import suspicious_landmarks
     from gpusense.logs.mrclam import read_mrclam
     from gpusense.models.landmark.model import LandmarkModel
@@ -97,103 +108,85 @@ def run(args: argparse.Namespace) -> int:
     if args.field_of_view is not None and args.field_of_view > 2 * math.pi:
         raise ValueError(f"--field-of-view: must be in (0, 2 pi], got {args.field_of_view:g}")
     recorded = read_mrclam(args.folder, args.robot, range_max=args.range_max, field_of_view=args.field_of_view)
-    recorded_run = landmark_runs.first_scans(recorded, args.scans)
+    recorded = landmark_runs.first_scans(recorded, args.scans)
     # Suspicions need the recorded landmarks even with --unknown.
-    known_fit = landmark_runs.fit_run(recorded_run)
-    suspicions = suspicious_landmarks(
-        recorded_run.poses, recorded_run.features, recorded_run.landmarks, recorded_run.ids, known_fit.parameters
-    )
-    fit = known_fit if args.known else landmark_runs.fit_run(recorded_run, known=False)
-    model = LandmarkModel(recorded_run.landmarks, landmark_runs.usable(fit.parameters), backend=args.backend)
-    agreement = landmark_runs.association(recorded_run, model)
+    fit = landmark_runs.fit_run(recorded)
+    doubts = suspicious_landmarks(recorded.poses, recorded.features, recorded.landmarks, recorded.ids, fit.parameters)
+    fit = fit if args.known else landmark_runs.fit_run(recorded, known=False)
+    model = LandmarkModel(recorded.landmarks, landmark_runs.usable(fit.parameters), backend=args.backend)
+    agreement = landmark_runs.association(recorded, model)
     drift = None if args.drift is None else tuple(args.drift)
-    motion = run_motion(recorded_run, drift=drift, fit=args.fit_motion)
-    try:
-        with progress((len(recorded_run.time) + 99) // 100) as step:
-            track = landmark_runs.localise(
-                recorded_run, model, known=args.known, particles=args.particles, seed=args.seed, motion=motion,
-                step=step,
-            )  # fmt: skip
-    except KeyboardInterrupt:
-        _print_fit(args, fit)
-        raise
+    motion = landmark_runs.run_motion(recorded, drift=drift, fit=args.fit_motion)
+    pf, track = landmark_runs.make_filter(recorded, model, motion, particles=args.particles, seed=args.seed), Track()
+    with held(track.steps) as stops, progress(len(recorded.time)) as step:
+        for one in landmark_runs.follow(pf, recorded, track, known=args.known):
+            step(f"scan {one.index}" + (", lost" if track.verdicts[-1] == "lost" else ""))
+    figures = summary(track) | {"gain": pf.gain}
     if args.json:
-        print_report(_document(recorded_run, fit, suspicions, agreement, track, motion, model.device.selection), args)
+        print_report(_document(recorded, fit, doubts) | {
+            "association": agreement, "motion": asdict(motion), "filter": figures, "device": model.device.selection,
+        }, args)  # fmt: skip
     else:
-        _print(args, recorded_run, fit, suspicions, agreement, track, motion)
-    return LOST if track.lost else 0
+        _print(args, recorded, fit, doubts, agreement, figures)
+        alpha = " ".join(f"{value:.3g}" for value in motion.alpha)
+        print_details(
+            args,
+            f"{fit}\n\nleft out of the recording: {_left_out(recorded)}\nmotion noise {alpha}, reverse "
+            f"{motion.reverse:.2g}, random walk {motion.drift:.2g} m and {motion.drift_heading:.2g} rad per sqrt(s)",
+        )
+    if stops:
+        raise stops[0]
+    return LOST if track.verdict == "lost" else 0
 
 
-def _print_fit(args: argparse.Namespace, fit: LandmarkFit) -> None:
-    """Print the fit of a run with an interrupted localisation."""
-    if args.json:
-        print_report({"interrupted": True, "fit": fit.to_dict()})
-    else:
-        print(f"interrupted while localising; the noise of the sensor:\n\n{fit}")
+def _left_out(run: LandmarkRun) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in run.left_out.items())
 
 
-def _document(
-    recorded_run: LandmarkRun, fit: LandmarkFit, suspicions: Suspicions, agreement: dict[str, float], track: Track,
-    motion: DriftingOdometry, device: str,
-) -> dict[str, Any]:  # fmt: skip
-    label = recorded_run.labels.tolist()
+def _document(run: LandmarkRun, fit: LandmarkFit, doubts: Suspicions) -> dict[str, Any]:
+    label = run.labels.tolist()
     return {
-        "scans": len(recorded_run.time),
-        "features": len(recorded_run.ids),
-        "left_out": recorded_run.left_out,
-        "fit": fit.to_dict(),
+        "scans": len(run.time), "features": len(run.ids), "left_out": run.left_out, "fit": fit.to_dict(),
         "exchanged": [
-            asdict(pair) | {"first": label[pair.first], "second": label[pair.second]} for pair in suspicions.exchanged
+            asdict(pair) | {"first": label[pair.first], "second": label[pair.second]} for pair in doubts.exchanged
         ],
-        "misplaced": [asdict(each) | {"landmark": label[each.landmark]} for each in suspicions.misplaced],
-        "association": agreement,
-        "motion": asdict(motion),
-        "filter": track.summary(),
-        "device": device,
-    }
+        "misplaced": [asdict(each) | {"landmark": label[each.landmark]} for each in doubts.misplaced],
+    }  # fmt: skip
 
 
 def _print(
-    args: argparse.Namespace, recorded_run: LandmarkRun, fit: LandmarkFit, suspicions: Suspicions,
-    agreement: dict[str, float], track: Track, motion: DriftingOdometry,
+    args: argparse.Namespace, run: LandmarkRun, fit: LandmarkFit, doubts: Suspicions, agreement: dict[str, float],
+    figures: dict[str, Any],
 ) -> None:  # fmt: skip
-    s: dict[str, Any] = track.summary()
     kind = "known" if args.known else "unknown"
-    doubts = len(suspicions.exchanged) + len(suspicions.misplaced)
-    print_result(f"{_verdict(track)}; {counted(doubts, 'suspicion')} about landmarks")
-    print_fact("error", f"median {length(s['error_median'])}, 90 % below {length(s['error_90'])}, at most "
-               f"{length(s['error_max'])}; heading {degrees(s['heading_median'])}, "
-               f"{degrees(s['heading_90'])} and {degrees(float(track.error_heading.max()))} degrees")  # fmt: skip
-    _print_suspicions(recorded_run, suspicions)
+    count = len(doubts.exchanged) + len(doubts.misplaced)
+    print_result(f"{_verdict(figures)}; {counted(count, 'suspicion')} about landmarks")
+    print_interrupted(figures["scans"], len(run.time))
+    print_fact("error", f"median {length(figures['error_median'])}, 95 % below {length(figures['error_95'])}; heading "
+               f"{degrees(figures['heading_median'])} and {degrees(figures['heading_95'])} degrees")  # fmt: skip
+    _print_suspicions(run, doubts)
     right, wrong, none = (f"{100 * agreement[name]:.1f} %" for name in ("right", "wrong", "none"))
     print_fact("likeliest", f"landmark at the logged pose: right {right}, wrong {wrong}, taken for false "
                f"positives {none}")  # fmt: skip
-    print_fact("readings", f"{len(recorded_run.ids)} of {len(recorded_run.landmarks)} landmarks in "
-               f"{len(recorded_run.time)} scans, {args.particles} particles, {kind} landmarks")  # fmt: skip
+    print_fact("readings", f"{len(run.ids)} of {len(run.landmarks)} landmarks in {len(run.time)} scans, "
+               f"{args.particles} particles, {kind} landmarks")  # fmt: skip
     print_parameters(fit.parameters, fit.standard_errors, _UNITS)
-    if args.verbose:
-        print(f"\n{fit}")
-        left_out = ", ".join(f"{count} {reason}" for reason, count in recorded_run.left_out.items())
-        alpha = " ".join(f"{value:.3g}" for value in motion.alpha)
-        print(
-            f"\nleft out of the recording: {left_out}\nmotion noise {alpha}, reverse {motion.reverse:.2g}, random walk "
-            f"{motion.drift:.2g} m and {motion.drift_heading:.2g} rad per sqrt(s)\n{machine_line()}"
-        )
 
 
-def _verdict(track: Track) -> str:
-    s = track.summary()
-    if s["gain_last"] is None:
+def _verdict(figures: dict[str, Any]) -> str:
+    if math.isnan(figures["gain"]):
         return "NO VERDICT: too few scans with readings"
-    share = f"the particles predict a reading {s['gain_last']:.1f} nats better than chance; p_lost {s['p_lost']:.2g}"
-    if track.lost:
-        return f"LOST since {s['lost_since']:.0f} s: {share}; is this the map of the run, and --drift large enough?"
-    before = f"; lost in {s['scans_lost']} scans before" if s["scans_lost"] else ""
-    return f"TRACKING: {share}{before}"
+    verdict = figures["verdict"]
+    since = f"; lost in {figures['scans_lost']} scans" if figures["scans_lost"] else ""
+    cure = "; is this the map of the run, and --drift large enough?" if verdict == "lost" else ""
+    return (
+        f"{verdict.upper()}: the particles predict a reading {figures['gain']:.1f} nats better than chance; p_lost "
+        f"{figures['p_lost']:.2g}{since}{cure}"
+    )
 
 
-def _print_suspicions(recorded_run: LandmarkRun, suspicions: Suspicions) -> None:
-    labels = recorded_run.labels
+def _print_suspicions(run: LandmarkRun, suspicions: Suspicions) -> None:
+    labels = run.labels
     for pair in suspicions.exchanged:
         a, b = labels[pair.first], labels[pair.second]
         before, after = (" and ".join(f"{100 * each:.0f} %" for each in both) for both in (pair.before, pair.after))

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpusense._util import checks
-from gpusense._util.typing import Floats
+from gpusense.evaluation.steps import Step
+from gpusense.evaluation.tracking import Track
 from gpusense.learning.fitted import LandmarkFit
 from gpusense.learning.landmark.fit import fit_landmark_parameters
 from gpusense.localization.filter import ParticleFilter
 from gpusense.localization.motion import OdometryMotion, SampledMotion
 from gpusense.localization.motion_fit import fit_odometry_motion
 from gpusense.localization.pose_algebra import wrap_angle
-from gpusense.localization.spread import LOST
-from gpusense.logs.records import LandmarkRun
+from gpusense.logs.records import LandmarkRun, Pose, Scan
 from gpusense.models.landmark.model import LandmarkModel
 from gpusense.world.parameters import LandmarkParameters
+from gpusense.world.scanner import Scanner
 
 ALPHA: tuple[float, ...] = (0.09, 0.01, 0.04, 0.0004)
 # Random walk of the position [m / sqrt(s)], and the least measured random walk of the heading [rad / sqrt(s)].
@@ -92,59 +93,6 @@ LEAST_FALSE = 0.01
 START, START_HEADING = 0.5, 0.3
 
 
-@dataclass(frozen=True, eq=False)
-class Track:
-    """Result of a particle filter.
-
-    Attributes:
-        estimate: (S, 3) weighted means after each scan [m, m, rad].
-        error: (S,) distance from the logged position [m].
-        error_heading: (S,) absolute error of the heading [rad].
-        degenerate: Number of scans that are impossible at every particle.
-        time: (S,) time of each scan [s].
-        gain: (S,) gain of the particles over chance in predicting recent features [nats per feature].
-        scans_lost: (S,) whether p_lost is above 0.5 after each scan.
-        p_lost: (S,) probability that the estimate is off by more than 1 m or 0.5 rad.
-    """
-
-    estimate: Floats
-    error: Floats
-    error_heading: Floats
-    degenerate: int
-    time: Floats
-    gain: Floats
-    scans_lost: NDArray[np.bool_]
-    p_lost: Floats
-
-    @property
-    def lost(self) -> bool:
-        """Tell whether the filter is lost at the end: at most of the last tenth of the scans."""
-        return bool(np.mean(self.scans_lost[-max(len(self.time) // 10, 1) :]) > 0.5)
-
-    @property
-    def lost_since(self) -> float | None:
-        """Time after the first scan from which the filter is lost to the end [s]; None if it is not lost."""
-        if not self.lost:
-            return None
-        found = np.flatnonzero(~self.scans_lost)
-        last = int(np.flatnonzero(self.scans_lost)[-1])
-        before = found[found < last]
-        return float(self.time[int(before[-1]) + 1 if len(before) else 0] - self.time[0])
-
-    def summary(self) -> dict[str, float | bool | None]:
-        """Return medians, 90 % quantiles and largest errors, and the verdict."""
-        last = max(len(self.time) // 10, 1)
-        tail = self.gain[-last:]
-        return {
-            "error_median": float(np.median(self.error)), "error_90": float(np.quantile(self.error, 0.9)),
-            "error_max": float(self.error.max()), "heading_median": float(np.median(self.error_heading)),
-            "heading_90": float(np.quantile(self.error_heading, 0.9)), "degenerate": self.degenerate,
-            "lost": self.lost, "lost_since": self.lost_since, "scans_lost": int(self.scans_lost.sum()),
-            "p_lost": float(np.median(self.p_lost[-last:])),
-            "gain_last": None if np.isnan(tail).all() else float(np.nanmedian(tail)),
-        }  # fmt: skip
-
-
 def fit_run(run: LandmarkRun, *, known: bool = True) -> LandmarkFit:
     """Fit the noise of a run's features at its logged poses."""
     return fit_landmark_parameters(
@@ -173,36 +121,31 @@ def association(run: LandmarkRun, model: LandmarkModel) -> dict[str, float]:
     return {"right": float(right.mean()), "none": float(none.mean()), "wrong": float((~right & ~none).mean())}
 
 
-def localise(
-    run: LandmarkRun,
-    model: LandmarkModel,
-    *,
-    known: bool,
-    particles: int = 2000,
-    seed: int = 0,
-    motion: DriftingOdometry | None = None,
-    step: Callable[[str], None] | None = None,
-) -> Track:
-    """Run :class:`ParticleFilter` along a run, from around its first logged pose (``START``)."""
-    pf = ParticleFilter(model, motion=run_motion(run) if motion is None else motion, particles=particles, seed=seed)
+def make_filter(
+    run: LandmarkRun, model: LandmarkModel, motion: DriftingOdometry, *, particles: int = 2000, seed: int = 0
+) -> ParticleFilter:
+    """Make a filter that starts around the first logged pose of a run (``START``)."""
+    pf = ParticleFilter(model, motion=motion, particles=particles, seed=seed)
     pf.initialize(mean=run.truth[0], covariance=np.diag([START**2, START**2, START_HEADING**2]))
-    degenerate = 0
-    estimate, gain, p_lost = np.empty_like(run.truth), np.empty(len(run.time)), np.empty(len(run.time))
+    return pf
+
+
+def follow(pf: ParticleFilter, run: LandmarkRun, track: Track, *, known: bool) -> Iterator[Step]:
+    """Run a filter along a run; yield each step, a scan without beams, after it was added to the track."""
     rows = {int(run.scan[first]): slice(first, last) for first, last in _scans(run)}
-    for s in range(len(run.time)):
-        if step is not None and s % 100 == 0:
-            step(f"scan {s}" + (", lost" if s and p_lost[s - 1] > LOST else ""))
+    no_beams = Scanner((), 1.0)
+    for s, (seconds, odometry, truth) in enumerate(zip(run.time, run.odometry, run.truth, strict=True)):
+        clock = [time.perf_counter()]
         if s:
-            pf.predict(run.odometry[s - 1], run.odometry[s], float(run.time[s] - run.time[s - 1]))
+            pf.predict(run.odometry[s - 1], odometry, float(seconds - run.time[s - 1]))
+        clock.append(time.perf_counter())
         if s in rows:
-            features, ids = run.features[rows[s]], run.ids[rows[s]] if known else None
-            pf.correct((features, ids))
-        found = pf.estimate()
-        degenerate += found.degenerate and s in rows
-        estimate[s], gain[s], p_lost[s] = found.pose, pf.gain, found.p_lost
-    away = estimate - run.truth
-    turn = np.abs(wrap_angle(away[:, 2]))
-    return Track(estimate, np.hypot(*away[:, :2].T), turn, degenerate, run.time, gain, p_lost > LOST, p_lost)
+            pf.correct((run.features[rows[s]], run.ids[rows[s]] if known else None))
+        clock.append(time.perf_counter())
+        pose, reference = (cast(Pose, tuple(pose.tolist())) for pose in (odometry, truth))
+        step = Step(s, Scan(float(seconds), np.empty(0), no_beams, pose, reference), pose, reference=reference)
+        track.add(pf, step, clock)
+        yield step
 
 
 def _scans(run: LandmarkRun) -> list[tuple[int, int]]:

@@ -56,6 +56,23 @@ class Track:
     temperatures: list[float] = field(default_factory=list)
     seconds: list[tuple[float, float, float]] = field(default_factory=list)
 
+    def add(self, pf: ParticleFilter, step: Step, clock: list[float]) -> None:
+        """Add the estimate of a filter after a step; ``clock`` has the times before predict, correct and estimate."""
+        found = pf.estimate()
+        predict, correct, estimate = np.diff([*clock, time.perf_counter()]).tolist()
+        self.seconds.append((predict, correct, estimate))
+        if step.reference is not None:
+            self.ranks.append(rank_of(pf.host_particles(), pf.host_weights(), np.array(step.reference)))
+        self.poses.append(found.pose)
+        self.covariances.append(found.covariance)
+        self.sizes.append(found.effective_sample_size)
+        self.p_lost.append(found.p_lost)
+        self.verdicts.append(found.verdict)
+        self.explained.append(found.explained)
+        self.radii.append(found.protection_level(RISK))
+        self.temperatures.append(found.temperature)
+        self.steps.append(step)
+
     @property
     def verdict(self) -> Word:
         """Most frequent verdict of the last tenth of the scans, at most 10; in a tie, the worse verdict."""
@@ -112,30 +129,13 @@ def start(
 def follow(pf: ParticleFilter, steps: Iterable[Step], track: Track) -> Iterable[Step]:
     """Run a filter along a log; yield each step after it was added to the track."""
     for step in steps:
-        times = [time.perf_counter()]
+        clock = [time.perf_counter()]
         if track.steps:
             pf.predict(track.steps[-1].odometry, step.odometry)
-        times.append(time.perf_counter())
+        clock.append(time.perf_counter())
         pf.correct({pf.models[step.sensor]: step.scan.ranges})
-        times.append(time.perf_counter())
-        found = pf.estimate()
-        times.append(time.perf_counter())
-        rank = None
-        if step.reference is not None:
-            rank = rank_of(pf.host_particles(), pf.host_weights(), np.array(step.reference))
-        track.poses.append(found.pose)
-        track.covariances.append(found.covariance)
-        if rank is not None:
-            track.ranks.append(rank)
-        track.sizes.append(found.effective_sample_size)
-        track.p_lost.append(found.p_lost)
-        track.verdicts.append(found.verdict)
-        track.explained.append(found.explained)
-        track.radii.append(found.protection_level(RISK))
-        track.temperatures.append(found.temperature)
-        predict, correct, estimate = np.diff(times).tolist()
-        track.seconds.append((predict, correct, estimate))
-        track.steps.append(step)
+        clock.append(time.perf_counter())
+        track.add(pf, step, clock)
         yield step
 
 

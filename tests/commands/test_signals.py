@@ -61,7 +61,7 @@ COMMANDS: dict[str, tuple[list[str], int, str]] = {
     "features": ([*LOG, "--map-out", "OUT/made.csv"], 4, "results of 4 of 6 scans"),
     "localize": ([*MAP, *LOG, "--particles", "100", "--tum", "OUT/made.tum"], 4, "results of 3 of 6 scans"),
     "sweep": (["plan.yaml", "--table", "OUT/made.csv", "--device", "numpy"], 4, "made.csv has the finished jobs"),
-    "landmarks": (["--folder", ".", "--robot", "1", "--backend", "numpy"], 1, "while localising; the noise of"),
+    "landmarks": (["--folder", ".", "--robot", "1", "--backend", "numpy"], 3, "interrupted: results of 3 of "),
     "selftest": (["--backend", "numpy", "--backend", "warp:cpu"], 2, "INTERRUPTED after "),
     "bench": (["--quick", "--particles", "8", "--checked", "6", "--beams", "7", "--repeats", "1",
                "--backend", "numpy", "--scene", "clutter", "--method", "exact", "--output", "OUT"], 3, "exact"),

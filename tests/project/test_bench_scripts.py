@@ -66,10 +66,6 @@ APART: dict[str, tuple[str, Callable[[dict[str, Any]], object]]] = {
     "accuracy/match_verdicts.py": (
         "--count 6 --backend opencl --part corridors --part few", lambda report: len(report["rows"]["few"]) == 12
     ),
-    "accuracy/features.py": (
-        "--data data --backend opencl --floors 1 --scans 2 --every 12 --limit 20 --repeats 1 --parts simulated rates",
-        lambda report: report["simulated"]["360 0.01 line"]["recall"] > 0.9,
-    ),
     "accuracy/chaining.py": (
         "--data data --log olin --backend opencl", lambda report: report["maps"][0]["chain"][0] > 95
     ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import io
 import itertools
 import re
@@ -12,6 +13,8 @@ from pathlib import Path
 
 import pytest
 from support.paths import ROOT
+
+import gpusense as gs
 
 # Reports hold the commands of their day; folders of tools are no part of the project.
 _LEFT_OUT = ("bench/results/", ".git/", ".venv/", "venv/", "build/", "dist/", "shared/", "site/", "htmlcov/")
@@ -196,3 +199,47 @@ def test_the_check_finds_links_that_lead_nowhere():
     assert broken_links("docs/models.md", text.replace("(#here)", "()").replace("(#code-and-more)", "()")) == [
         f"docs/models.md: {target}" for target in ("none.md", "../README.md#nowhere", "img/none.png", "away.md")
     ]
+
+
+def imported_names(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield the modules of gpusense, and of bench, with the names that a script takes from them."""
+    tree, modules = ast.parse(path.read_text(encoding="utf-8")), {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            modules |= {alias.asname or alias.name: alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield from ((node.module, alias.name) for alias in node.names)
+            modules |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in modules:
+            yield modules[node.value.id], node.attr
+
+
+@functools.cache
+def defined_names(path: Path) -> set[str]:
+    """Return the names at the top level of a script."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return {name for node in ast.walk(tree) for name in (
+        [node.id] if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+        else [node.name] if isinstance(node, (ast.FunctionDef, ast.ClassDef))
+        else [alias.asname or alias.name for alias in node.names] if isinstance(node, (ast.Import, ast.ImportFrom))
+        else []
+    )}  # fmt: skip
+
+
+def test_names_that_bench_imports_exist():
+    """Scripts that no test runs would notice a removed name only when somebody measures again."""
+    missing, public = [], {*dir(gs), *gs.__all__}
+    for path in sorted((ROOT / "bench").rglob("*.py")):
+        for module, name in imported_names(path):
+            places = [folder / module.replace(".", "/") for folder in (ROOT, ROOT / "bench", path.parent)]
+            files = [file for place in places for file in (place.with_suffix(".py"), place / "__init__.py")]
+            if (file := next(filter(Path.is_file, files), None)) is None:
+                # A module of a library, or a class.
+                continue
+            known = public if module == "gpusense" else defined_names(file)
+            if name.startswith("__"):
+                continue
+            if name not in known and not any((place / f"{name}.py").is_file() for place in places):
+                missing.append(f"{path.relative_to(ROOT)}: {module}.{name}")
+    assert missing == []

@@ -15,8 +15,6 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from gpusense._util import masks
-
 T = TypeVar("T")
 
 FARTHEST = 1e9
@@ -122,7 +120,7 @@ def as_array(name: str, value: object, *, masked: bool = False) -> NDArray[Any]:
         return value
     check_values(name, value)
     try:
-        plain: Any = masks.filled(value) if masked else masks.unmasked(name, value)
+        plain: Any = filled(value) if masked else unmasked(name, value)
         return np.asarray(plain)
     except ValueError as error:
         if str(error).startswith(f"{name}: "):
@@ -287,3 +285,65 @@ def _fits(shape: tuple[int, ...], rule: Sequence[int | str]) -> bool:
 
 def _index_text(index: tuple[Any, ...]) -> str:
     return str(int(index[0])) if len(index) == 1 else shape_text([int(i) for i in index])
+
+
+# ---- convert NumPy's masked arrays: a masked reading is missing, a masked pose or cell is an error
+
+
+_NUMBERS = {int, float, np.float32, np.float64}
+
+
+def is_masked(value: object) -> bool:
+    """Return whether a value is a masked array, or a list or tuple that contains one at any depth."""
+    if type(value) is np.ndarray:
+        return False
+    library = sys.modules.get("numpy.ma")
+    if library is None:
+        return False
+    if isinstance(value, (list, tuple)):
+        # Lists of numbers are long: inspect only types.
+        kinds = set(map(type, value))
+        if kinds <= _NUMBERS:
+            return False
+        return any(issubclass(kind, library.MaskedArray) for kind in kinds) or (
+            any(issubclass(kind, (list, tuple)) for kind in kinds) and any(map(is_masked, value))
+        )
+    return isinstance(value, library.MaskedArray)
+
+
+def filled(value: Any) -> Any:
+    """Return a masked array, or nested lists that contain one, as an array with NaN where masked.
+
+    Masked integers and booleans become float64. Other values are returned unchanged.
+    """
+    if not is_masked(value):
+        return value
+    data, mask = _parts(value)
+    if not mask.any():
+        return data
+    if data.dtype.kind not in "fc":
+        data = data.astype(np.float64)
+    return np.where(mask, data.dtype.type(np.nan), data)
+
+
+def unmasked(name: str, value: Any) -> Any:
+    """Return a masked array without masked values as a plain array, and other values unchanged."""
+    if not is_masked(value):
+        return value
+    data, mask = _parts(value)
+    if mask.any():
+        index = tuple(int(i) for i in np.argwhere(mask)[0])
+        place = f" at index {index[0] if len(index) == 1 else index}" if index else ""
+        raise ValueError(f"{name}: no value may be masked, got {int(mask.sum())}, the first{place}")
+    return data
+
+
+def _parts(value: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers and the mask of a masked array, or of nested lists that contain one."""
+    if isinstance(value, (list, tuple)):
+        datas, masks = zip(*map(_parts, value), strict=True)
+        return np.stack(datas), np.stack(masks)
+    if isinstance(value, np.ma.MaskedArray):
+        return np.asarray(value.data), np.ma.getmaskarray(value)
+    plain = np.asarray(value)
+    return plain, np.zeros(plain.shape, bool)

@@ -4,8 +4,7 @@
 :mod:`~gpusense.backends.selection` opens them.
 """
 
-from gpusense.backends.base import Backend
-from gpusense.backends.info import BackendInfo
+from gpusense.backends.base import Backend, BackendInfo
 from gpusense.backends.listing import Device, devices, open_device, short_driver
 from gpusense.backends.registry import SPEED_CLASSES, set_up_child
 from gpusense.backends.selection import Selection, default_failures, get_backend

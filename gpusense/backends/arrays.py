@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from gpusense._util import checks, masks
+from gpusense._util import checks
 from gpusense._util.checks import check_gradients, shape_text, show
-from gpusense.backends import helpers
+from gpusense.backends import processor
 from gpusense.backends.base import Adopted, Backend, Buffer
 from gpusense.backends.registry import entry_of_array, selection_for
 
@@ -44,7 +44,7 @@ def on_device(array: object) -> bool:
 def to_host(array: object, name: str = "poses") -> object:
     """Return a NumPy view of an array of another library in host memory; return other objects unchanged."""
     if isinstance(array, (np.ndarray, list, tuple)):
-        return masks.unmasked(name, array)
+        return checks.unmasked(name, array)
     if not hasattr(array, "__dlpack__"):
         return array
     try:
@@ -58,7 +58,7 @@ def copied_to_host(array: object, backend: Backend, name: str) -> object:
     """Return readings as a NumPy array, NaN where masked; device arrays are copied after the device has finished."""
     if type(array) is np.ndarray:
         return array
-    array = masks.filled(array)
+    array = checks.filled(array)
     if not on_device(array):
         return to_host(array, name)
     return _adopt(array, backend, name).to_host()
@@ -109,15 +109,15 @@ def bounds_of(poses: np.ndarray) -> Bounds:
     elif count < 2 * _SHARE:
         low, high = _bounds_of_many(poses)
     else:
-        step = max(-(-count // min(helpers.threads(), _MOST_SHARES)), _SHARE)
+        step = max(-(-count // min(processor.threads(), _MOST_SHARES)), _SHARE)
         started = [
-            helpers.pool(os.getpid()).submit(_bounds_of_many, poses[begin : begin + step])
+            processor.pool(os.getpid()).submit(_bounds_of_many, poses[begin : begin + step])
             for begin in range(step, count, step)
         ]
         try:
             parts = [_bounds_of_many(poses[:step]), *(one.result() for one in started)]
         finally:
-            helpers.finish(started)
+            processor.finish(started)
         low = np.minimum.reduce([part[0] for part in parts])
         high = np.maximum.reduce([part[1] for part in parts])
     # Both functions propagate NaN.

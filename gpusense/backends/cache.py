@@ -1,6 +1,6 @@
 """Compiled kernels and verdicts on drivers, kept on disk: only the first run on a device makes them.
 
-Entries are in gpusense's folder (see :mod:`gpusense.backends.folders`). An entry is one file that is named by a hash of
+Entries are in gpusense's folder (see :mod:`gpusense.backends.scratch`). An entry is one file that is named by a hash of
 its key and written by rename. It begins with that hash and a checksum of hash and contents, so neither damage nor an
 exchange of two files goes unnoticed. The oldest entries are evicted when the folder exceeds its limit; only a file with
 the name and the head of an entry is deleted. If the folder is not safe or not writable, a private temporary folder
@@ -30,10 +30,10 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from gpusense._util.private import read_regular
 from gpusense._version import __version__
-from gpusense.backends import folders
-from gpusense.backends.folders import Place
-from gpusense.backends.info import BackendInfo
+from gpusense.backends import scratch
+from gpusense.backends.base import BackendInfo
 from gpusense.backends.processor import fingerprint
+from gpusense.backends.scratch import Place
 
 MAX_BYTES = 256 << 20
 MAX_ENTRIES = 1024
@@ -53,15 +53,15 @@ _STALE = 3600
 
 def _folders() -> Iterator[tuple[Place, Path]]:
     """Yield the folder in the chosen place, then the temporary one in case no file can be written there."""
-    chosen = folders.chosen_place()
+    chosen = scratch.chosen_place()
     if chosen is None:
         return
-    temporary = folders.temporary_place()
+    temporary = scratch.temporary_place()
     for place in (chosen, temporary) if temporary is not None and temporary.folder != chosen.folder else (chosen,):
         try:
-            folder = folders.own_folder(place.folder)
+            folder = scratch.own_folder(place.folder)
         except OSError as error:
-            folders.report(place, error)
+            scratch.report(place, error)
             continue
         yield place, folder
         if str(folder) not in _failed and _takes_files(place, folder):
@@ -79,7 +79,7 @@ def _takes_files(place: Place, folder: Path) -> bool:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(bytes(_SMALL))
     except OSError as error:
-        folders.report(place, error)
+        scratch.report(place, error)
         return False
     return True
 
@@ -123,7 +123,7 @@ def store_entry(key: str, payload: bytes) -> None:
             return
         except OSError as error:
             _failed.add(str(folder))
-            folders.report(place, error)
+            scratch.report(place, error)
 
 
 def discard_entry(key: str) -> None:

@@ -18,10 +18,11 @@ import threading
 from dataclasses import dataclass
 from typing import Any
 
+from gpusense._util import notices
 from gpusense._version import __version__
-from gpusense.backends import notices, probe_process
+from gpusense.backends import probe_process
+from gpusense.backends.base import BackendInfo
 from gpusense.backends.cache import discard_entry, load_entry, store_entry
-from gpusense.backends.info import BackendInfo
 from gpusense.backends.processor import fingerprint
 
 # Families of kernels.

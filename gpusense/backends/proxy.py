@@ -5,8 +5,7 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-from gpusense.backends.base import Backend
-from gpusense.backends.info import BackendInfo
+from gpusense.backends.base import Backend, BackendInfo
 
 
 def _forwarded(name: str) -> Any:

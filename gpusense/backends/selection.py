@@ -4,7 +4,7 @@ Selection strings: ``"auto"``, ``"numpy"``, ``"opencl"``, ``"opencl:P:D"`` (plat
 ``"opencl:<part of a device's or driver's name>"``, ``"warp"``, ``"warp:cpu"``, ``"warp:cuda:0"``; ``"gpu"`` and
 ``"cpu"`` are the fastest device of their kind, and ``"cuda"`` is ``"warp:cuda"``. A queue of pyopencl
 selects its device, and a backend that works on that queue. ``"auto"`` is the value of ``$GPUSENSE_BACKEND``, and else
-the fastest device that is proved and opens (see :mod:`gpusense.backends.proof`, :mod:`gpusense.backends.fallback`).
+the fastest device that is proved and opens (see :mod:`gpusense.backends.proof`, :mod:`gpusense.backends.listing`).
 
 A selection string is looked up once. It is looked up again in a forked process, and after a change of the variables on
 which devices depend.
@@ -20,14 +20,12 @@ import threading
 import weakref
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from gpusense._util import notices
 from gpusense._util.checks import show
-from gpusense.backends import listing, notices, proof, registry
-from gpusense.backends.base import Backend
-from gpusense.backends.fallback import FallbackOrder, best_of
-from gpusense.backends.info import ProcessBound
-from gpusense.backends.library import Library
-from gpusense.backends.listing import Device, short_driver
-from gpusense.backends.registry import BY_NAME, ENTRIES, Entry
+from gpusense.backends import listing, proof, registry
+from gpusense.backends.base import Backend, ProcessBound
+from gpusense.backends.listing import Device, FallbackOrder, best_of, short_driver
+from gpusense.backends.registry import BY_NAME, ENTRIES, Entry, Library
 
 if TYPE_CHECKING:
     import pyopencl

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gpusense.backends import helpers
+from gpusense.backends import processor
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -76,7 +76,7 @@ class Staging:
 
     def _run(self, array: np.ndarray, buffer: Any, copy: Callable[..., None]) -> bool:
         """Copy an array by a function, if that pays and no other thread uses the slots."""
-        if array.nbytes < LEAST or helpers.threads() < _LEAST_THREADS or not self._lock.acquire(blocking=False):
+        if array.nbytes < LEAST or processor.threads() < _LEAST_THREADS or not self._lock.acquire(blocking=False):
             return False
         started: list[Future[None]] = []
         try:
@@ -86,7 +86,7 @@ class Staging:
         finally:
             # No thread may use slots or array any more, not even after an error.
             try:
-                helpers.finish(started)
+                processor.finish(started)
             finally:
                 self._lock.release()
         return True
@@ -100,7 +100,7 @@ def _pieces(size: int) -> list[tuple[int, int]]:
 
 def _send(slots: Sequence[Slot], source: np.ndarray, buffer: Any, started: list[Any]) -> None:
     """Copy an array to a device."""
-    pool, pieces = helpers.pool(os.getpid()), _pieces(source.size)
+    pool, pieces = processor.pool(os.getpid()), _pieces(source.size)
 
     def fill(number: int) -> None:
         (first, size), slot = pieces[number], slots[number % len(slots)]
@@ -122,7 +122,7 @@ def _send(slots: Sequence[Slot], source: np.ndarray, buffer: Any, started: list[
 
 def _receive(slots: Sequence[Slot], out: np.ndarray, buffer: Any, started: list[Any]) -> None:
     """Copy from a device to an array."""
-    pool, pieces = helpers.pool(os.getpid()), _pieces(out.size)
+    pool, pieces = processor.pool(os.getpid()), _pieces(out.size)
     for slot, piece in zip(slots, pieces, strict=False):
         # The device may still read what an earlier call has sent.
         slot.wait()

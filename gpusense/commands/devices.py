@@ -90,7 +90,8 @@ def _status(device: Device) -> str:
 
 def _auto() -> tuple[str | None, str | None]:
     """Return the selection of 'auto', or the error of opening it, which this command only reports."""
-    from gpusense.backends import get_backend, notices
+    from gpusense._util import notices
+    from gpusense.backends import get_backend
 
     try:
         with notices.held() as lines:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
-from gpusense.backends.programs import ProgramCache, RecordedProgram, RepeatedPrograms
+from gpusense.backends.workspace import ProgramCache, RecordedProgram, RepeatedPrograms
 from gpusense.interface.constants import ESTIMATE, FAR_SHARE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
 from gpusense.localization.cloud_state import Contents, Snapshot, Summary, deeper, is_starved, meaningful, summary_of

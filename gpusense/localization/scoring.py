@@ -10,7 +10,7 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.backends.base import Buffer
-from gpusense.backends.programs import ProgramCache
+from gpusense.backends.workspace import ProgramCache
 from gpusense.interface.launches import Program
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.cloud_state import SensorReadings, Step

@@ -18,7 +18,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from gpusense._util import masks
+from gpusense._util import checks
 from gpusense.backends import arrays
 from gpusense.localization.beam_consistency import BeamConsistency, beam_consistency
 from gpusense.localization.belief import Belief, motion_between
@@ -121,7 +121,7 @@ class Verdict:
         for index, evidence in self._evidence.items():
             if index not in readings or not _count(readings[index]):
                 continue
-            features = np.asarray(masks.filled(readings[index][0]), np.float64)
+            features = np.asarray(checks.filled(readings[index][0]), np.float64)
             gain = evidence.gain(poses, weights, features)
             if not math.isnan(gain):
                 gains[index] = gains.get(index, Gains()).added(gain, len(features))

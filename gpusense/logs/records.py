@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense._util import masks
+from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers
 from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.scanner import Scanner
@@ -43,7 +43,7 @@ class Scan:
     """(K,) intensities of the readings in the scanner's unit, read-only; None if the log has none."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "ranges", masks.filled(self.ranges))
+        object.__setattr__(self, "ranges", checks.filled(self.ranges))
 
     def __repr__(self) -> str:
         return f"Scan(time={self.time}, {len(self.ranges)} readings, odometry={self.odometry}, pose={self.pose})"

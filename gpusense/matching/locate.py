@@ -9,7 +9,7 @@ from typing import Any, Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gpusense._util import checks, masks
+from gpusense._util import checks
 from gpusense._util.angles import wrapped
 from gpusense.matching.field_search import Candidates, FieldSearch, field_search, log_likelihoods_of, searchable
 from gpusense.matching.location import NAMES, Location, PoseMode, Status, location_evidence, probability_right
@@ -118,7 +118,7 @@ def locate_scan(
         raise ValueError(
             f"model: must have compat=None, since weights of peers are no likelihood, got {model.compat!r}"
         )
-    model, ranges = searchable(model), masks.filled(ranges)
+    model, ranges = searchable(model), checks.filled(ranges)
     cell = model.grid.resolution
     stride = max(round(checks.real("resolution", resolution, above=0, high=checks.FARTHEST) / cell), 1)
     turns = 4 * math.ceil(math.pi / 2 / checks.real("angle", angle, above=1e-4, high=math.pi / 2) - 1e-9)

@@ -15,8 +15,7 @@ from scipy.special import erf
 from gpusense.interface import structs
 from gpusense.interface.constants import BEACON, STUDENT_T, TWO_NORMALS
 from gpusense.reference.error_free import Pair, add_term, pair_product, pair_sum, two_sum
-from gpusense.reference.log_terms import bounded_square, either
-from gpusense.reference.offsets import distance_pair, offset
+from gpusense.reference.log_terms import bounded_square, distance_pair, either, offset
 
 # A beacon has its place (x, its low part, y, its low part), the reading minus the bias with its low part, and the bias.
 # From this tangent on an arc is a quarter turn to the last bit; the tangent's square is still finite.

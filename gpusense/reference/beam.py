@@ -7,14 +7,13 @@ from collections.abc import Callable
 import numpy as np
 
 from gpusense.interface import structs
-from gpusense.reference.compat import compat_density
 from gpusense.reference.echo import echoes, incidence_terms
 from gpusense.reference.error_free import add_term, strand_sums, strands_in
-from gpusense.reference.mixture import last_range, log_density
+from gpusense.reference.mixture import compat_density, last_range, log_density
 from gpusense.reference.ranges import cast_ranges
 from gpusense.reference.ray import expected_range
-from gpusense.reference.scans import particles_of_scans
 from gpusense.reference.sensor_table import tabulated_density
+from gpusense.reference.sums import particles_of_scans
 
 
 def ray_limit(

@@ -12,8 +12,8 @@ from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.reference.beam import sum_terms
 from gpusense.reference.error_free import block_sums
 from gpusense.reference.field_term import reading_value
-from gpusense.reference.scans import particles_of_scans
 from gpusense.reference.shapes import particles_of_worlds, world_begin, world_window
+from gpusense.reference.sums import particles_of_scans
 
 BLOCK = 1 << 18
 

@@ -17,7 +17,7 @@ from gpusense.reference.error_free import Pair, block_sums
 from gpusense.reference.field import BLOCK
 from gpusense.reference.field_term import bilinear, field_exponent, field_square, log_field
 from gpusense.reference.hit_shape import shape_weight
-from gpusense.reference.scans import particles_of_scans
+from gpusense.reference.sums import particles_of_scans
 
 
 def hit_share(flags: frozenset[str], distance: Pair, terms: structs.FieldTerms) -> np.ndarray:

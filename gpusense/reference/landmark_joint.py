@@ -17,8 +17,7 @@ from gpusense.interface import structs
 from gpusense.interface.feature_layout import FALSE_POSITIVE, FEATURE, GROUP, RADIUS
 from gpusense.reference.landmark_grid import log_match, may_match
 from gpusense.reference.landmarks import direction, sensor_place
-from gpusense.reference.log_terms import either
-from gpusense.reference.offsets import offset
+from gpusense.reference.log_terms import either, offset
 
 # A landmark's part of a density exceeds the false positive's if the density is more than twice the latter.
 LOG_2 = 0.69314718055994531

@@ -39,7 +39,7 @@ from gpusense.interface.feature_layout import (
     UPPER_LOW,
 )
 from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_product, two_sum, where_pair
-from gpusense.reference.offsets import Quad, distance_pair
+from gpusense.reference.log_terms import Quad, distance_pair
 
 # Below this distance [m] all bearings are equally likely.
 ZERO_RANGE = 1e-6

@@ -74,3 +74,18 @@ def place_poses(
     for begin in range(0, particles, BLOCK):
         block = slice(begin, min(begin + BLOCK, particles))
         place_pose(flags, all_poses[block], pose_cell[block], pose[block], pose_low[block], pose_status, frame, window)
+
+
+def bound_numbers(
+    flags: frozenset[str], number: np.ndarray, bounds: np.ndarray, count: int, apart: int, items: int
+) -> None:
+    """Write the least of some numbers, and the largest of the numbers that lie apart from them; NaN remains.
+
+    Work-item ``i`` takes every ``items``-th number from ``i`` on; ``items`` is a multiple of three, so that each sees
+    one column of poses. A first launch bounds the poses, and a second one the results of the first, in two halves.
+    """
+    rows = -(-count // items)
+    for half, first, reduce, beyond in ((0, 0, np.minimum.reduce, np.inf), (1, apart, np.maximum.reduce, -np.inf)):
+        padded = np.full(rows * items, beyond)
+        padded[:count] = number[first : first + count]
+        bounds[half * items : (half + 1) * items] = reduce(padded.reshape(rows, items), axis=0)

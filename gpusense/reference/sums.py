@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from gpusense.interface import structs
@@ -34,3 +36,16 @@ def sum_parts(
     if "CUBES" not in flags:
         log_sum = np.where(np.isinf(total[0]), total[0], log_sum)
     log_p[particle] = log_sum
+
+
+def particles_of_scans(particles: int, batch: structs.ScanBatch) -> Iterator[tuple[int, slice]]:
+    """Yield the index of each scan and its particles, of a launch that has a part of all particles.
+
+    ``batch``: particles of each scan, and those of earlier launches.
+    """
+    begin = 0
+    while begin < particles:
+        scan = (begin + batch.ahead) // batch.per_scan
+        end = min((scan + 1) * batch.per_scan - batch.ahead, particles)
+        yield scan, slice(begin, end)
+        begin = end

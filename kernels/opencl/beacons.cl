@@ -3,7 +3,7 @@
 // d is the distance to the beacon. f is normal, a Student t with nu degrees of freedom, or a sum of two normals, one of
 // them wide. m is the mass of f on [0, range_max], with d + bias clamped to that interval. For an integer nu the mass
 // of a t between 0 and t is a finite sum of positive terms (Abramowitz and Stegun, 26.7.3 and 26.7.4).
-// requires: error_free log_terms offsets
+// requires: error_free log_terms
 
 #define NORMAL 0
 #define STUDENT_T 1

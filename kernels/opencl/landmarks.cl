@@ -6,7 +6,7 @@
 // two numbers, since a relative error of eps in a distance of 20 m is too large for a deviation of 1 cm. A feature is
 // FEATURE numbers, named below, in the same order in all three languages. A place is (x, its low part, y, its low
 // part), and so are an offset and a direction. The sensor's numbers are FeatureTerms of the signature table.
-// requires: error_free log_terms offsets
+// requires: error_free log_terms
 
 // Range; cosine and sine of the bearing on the robot; signature.
 #define RANGE_AT 0

@@ -216,3 +216,21 @@ real log_density(const real z, const real expected, global const MixtureTerms *t
 #endif
 }
 #endif
+
+#if CUBES
+// Return the density to be cubed, whose cubes nav2_amcl and Beluga sum over the beams of a scan: amcl's without
+// normalisers, Beluga's with both (book table 6.1). Terms are linear; hit_peak is z_hit alone for amcl, and z_max is no
+// logarithm. A reading of range_max is a max reading; amcl's longer readings are neither random nor max readings.
+real compat_density(const real z, const real expected, global const MixtureTerms *terms) {
+    const real off = z - expected, lambda = terms->lambda_short;
+    real p = terms->hit_peak * exp(-(off * (off * terms->square_scale)));
+#if AMCL
+    if (z < expected) p += terms->z_short * lambda * exp(-lambda * z);
+    if (z > terms->range_max) return p;
+#else
+    p /= hit_mass(expected, terms->range_max - expected, terms->erf_scale);
+    if (z < expected) p += terms->z_short * short_factor(lambda * expected) * exp(-lambda * z) / expected;
+#endif
+    return p + (z >= terms->range_max ? terms->z_max : terms->rand_density);
+}
+#endif

@@ -89,3 +89,19 @@ kernel void place_poses(ARGUMENTS) {
     if (particle >= particles) return;
     place_pose(particle, poses, pose_cell, pose, pose_low, pose_status, frame, window);
 }
+
+// Write the least of some numbers, and the largest of the numbers that lie apart from them; NaN remains. One work-item
+// takes every items-th number; items is a multiple of three, so that each sees one column of poses. A first launch bounds
+// the poses, and a second one the results of the first, which fill two halves.
+kernel void bound_numbers(ARGUMENTS) {
+    const int i = get_global_id(0);
+    if (i >= items) return;
+    double low = INFINITY, high = -INFINITY;
+    for (long n = i; n < count; n += items) {
+        const double a = number[n], b = number[apart + n];
+        low = a < low || a != a ? a : low;
+        high = b > high || b != b ? b : high;
+    }
+    bounds[i] = low;
+    bounds[items + i] = high;
+}

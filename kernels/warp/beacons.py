@@ -11,7 +11,7 @@ import functools
 
 import warp as wp
 
-from . import error_free, log_terms, offsets
+from . import error_free, log_terms
 from .prelude import kernel, precision
 
 STUDENT_T, TWO_NORMALS = wp.constant(1), wp.constant(2)
@@ -25,9 +25,9 @@ def make(name, flags):
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     base = flags & {"FLOAT64"}
-    exact, logs, between = error_free.functions(base), log_terms.functions(base), offsets.functions(base)
+    exact, logs = error_free.functions(base), log_terms.functions(base)
     two_sum, add_term = exact.two_sum, exact.add_term
-    offset, distance_pair = between.offset, between.distance_pair
+    offset, distance_pair = logs.offset, logs.distance_pair
     pair_sum, pair_product = exact.pair_sum, exact.pair_product
     bounded_square, either = logs.bounded_square, logs.either
     ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)

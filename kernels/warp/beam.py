@@ -8,7 +8,7 @@ import math
 
 import warp as wp
 
-from . import compat, echo, error_free, mixture, sensor_table
+from . import echo, error_free, mixture, sensor_table
 from . import ray as ray_file
 from . import shapes as shapes_file
 from .error_free import BLOCK_TERMS, STRANDS
@@ -29,14 +29,14 @@ def make(name, flags):
     cast_ray = casting.functions(flags).cast_ray
     expected_range = ray_file.functions(flags).expected_range
     tabulated_density = sensor_table.functions(flags).tabulated_density
-    compat_density = compat.functions(flags).compat_density
     SENSOR_TABLE = "SENSOR_TABLE" in flags
     IN_LANES = "IN_LANES" in flags
     made = lane_mixture.functions(flags) if IN_LANES else None
     block_terms, block_of_bins = (made.block_terms, made.block_of_bins) if made else (None, None)
     CUBES = "CUBES" in flags
-    log_density = mixture.functions(flags).log_density
-    last_range = mixture.functions(flags).last_range
+    mixed = mixture.functions(flags)
+    log_density, compat_density = mixed.log_density, mixed.compat_density
+    last_range = mixed.last_range
     STOPS = "STOPS" in flags
     add_strands = error_free.functions(flags).add_strands
     SHARED_RAYS = "SHARED_RAYS" in flags

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import error_free, offsets
+from . import error_free, log_terms
 from .prelude import precision
 
 # Range; cosine and sine of the bearing on the robot; signature.
@@ -54,7 +54,7 @@ def functions(flags):
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags & {"FLOAT64"})
     two_sum, two_product, pair_sum, pair_product = exact.two_sum, exact.two_product, exact.pair_sum, exact.pair_product
-    between = offsets.functions(flags & {"FLOAT64"})
+    between = log_terms.functions(flags & {"FLOAT64"})
     distance_pair = between.distance_pair
     RANGE = "RANGE" in flags
     BEARING = "BEARING" in flags

@@ -27,7 +27,7 @@ def functions(flags):
     pair_sum, rest_of = exact.pair_sum, exact.rest_of
     shape = hit_shape.functions(flags)
     shape_exponent, half_mass = shape.shape_exponent, shape.half_mass
-    MASS_TABLE = "MASS_TABLE" in flags
+    AMCL, MASS_TABLE = "AMCL" in flags, "MASS_TABLE" in flags
     EXACT_EXPONENT = "EXACT_EXPONENT" in flags
     BIAS = "BIAS" in flags
     GROWTH = "GROWTH" in flags
@@ -285,5 +285,35 @@ def functions(flags):
                 if RAND:
                     p += wp.exp(term_of.rand_density(terms) - largest)  # 4: random measurement
                 return largest + wp.log(p)
+
+    @wp.func
+    def compat_density(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
+        """Return the density to be cubed, whose cubes nav2_amcl and Beluga sum over the beams of a scan.
+
+        amcl's is without normalisers, Beluga's with both (book table 6.1). Terms are linear; hit_peak is z_hit alone
+        for amcl, and z_max is no logarithm. A reading of range_max is a max reading; amcl's longer readings are neither
+        random nor max readings.
+        """
+        off = z - expected
+        p = terms[0].hit_peak * wp.exp(-(off * (off * terms[0].square_scale)))
+        if AMCL:
+            if z < expected:
+                p += terms[0].z_short * terms[0].lambda_short * wp.exp(-terms[0].lambda_short * z)
+            if z > terms[0].range_max:
+                return p
+        else:
+            p /= hit_mass(expected, terms[0].range_max - expected, terms[0].erf_scale)
+            if z < expected:
+                p += (
+                    terms[0].z_short
+                    * short_factor(terms[0].lambda_short * expected)
+                    * wp.exp(-terms[0].lambda_short * z)
+                    / expected
+                )
+        if z >= terms[0].range_max:
+            p += terms[0].z_max
+        else:
+            p += terms[0].rand_density
+        return p
 
     return SimpleNamespace(**locals())

@@ -13,6 +13,7 @@ from .prelude import kernel, precision, work_item
 
 # Coordinates are clamped to this many cells: no range reaches so far, and the sum of two fits int32.
 FARTHEST, MINUS_FARTHEST = wp.constant(wp.float64(1073741824.0)), wp.constant(wp.float64(-1073741824.0))
+INFINITE, MINUS_INFINITE = wp.constant(wp.float64(float("inf"))), wp.constant(wp.float64(float("-inf")))
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 
 
@@ -106,5 +107,24 @@ def make(name, flags):
         if particle >= particles:
             return
         place_pose(particle, poses, pose_cell, pose, pose_low, pose_status, frame, window)  # fmt: skip
+
+    @kernel(flags)
+    def bound_numbers(number, bounds, count, apart, items):
+        """Write the least of some numbers, and the largest of the numbers that lie apart from them; NaN remains.
+
+        One work-item takes every items-th number; items is a multiple of three, so that each sees one column of poses.
+        """
+        i = wp.tid()
+        if i >= items:
+            return
+        low = INFINITE
+        high = MINUS_INFINITE
+        for n in range(i, count, items):
+            a = wp.float64(number[n])
+            b = wp.float64(number[apart + n])
+            low = wp.where(a < low or a != a, a, low)
+            high = wp.where(b > high or b != b, b, high)
+        bounds[i] = low
+        bounds[items + i] = high
 
     return locals()[name]

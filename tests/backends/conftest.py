@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gpusense.backends import cache, folders
+from gpusense.backends import cache, scratch
 
 
 @pytest.fixture
@@ -15,7 +15,7 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Use a private folder of temporary files, without earlier reports of failures."""
     (tmp_path / "tmp").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
-    monkeypatch.setattr(folders, "_reported", set())
+    monkeypatch.setattr(scratch, "_reported", set())
     monkeypatch.setattr(cache, "_failed", set())
     cache._takes_files.cache_clear()
     return tmp_path / "tmp"

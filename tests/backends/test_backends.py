@@ -9,7 +9,7 @@ import pytest
 
 import gpusense as gs
 from gpusense import backends
-from gpusense.backends import fallback, get_backend, listing, registry, selection
+from gpusense.backends import get_backend, listing, registry, selection
 from gpusense.backends.proof import DeviceCheck
 
 
@@ -23,12 +23,12 @@ def use_devices(monkeypatch, listed: list[backends.Device], verdicts: dict[str, 
     rows = [*listed, backends.Device("numpy", "NumPy reference", "cpu", True, "", "numpy")]
     monkeypatch.setattr(listing, "present", lambda entry: ([d for d in rows if d.backend == entry.name], []))
     proved = DeviceCheck(True, 1, True, rate=100.0)
-    monkeypatch.setattr(fallback, "_verdict_of", lambda device: (verdicts or {}).get(device.selection, proved))
+    monkeypatch.setattr(listing, "_verdict_of", lambda device: (verdicts or {}).get(device.selection, proved))
 
 
 def fastest() -> str:
     """Return the device that ``"auto"`` would open first."""
-    return next(iter(fallback.FallbackOrder())).selection
+    return next(iter(listing.FallbackOrder())).selection
 
 
 def test_devices_name_what_is_present_and_what_is_absent():
@@ -163,7 +163,7 @@ def test_a_gpu_of_opencl_is_taken_without_loading_warp(monkeypatch):
     asked = []
     rows = {"opencl": fake_devices(("opencl", "GPU", "gpu")), "warp": fake_devices(("warp", "GPU", "gpu"))}
     monkeypatch.setattr(listing, "present", lambda entry: (asked.append(entry.name) or rows[entry.name], []))
-    monkeypatch.setattr(fallback, "_verdict_of", lambda device: DeviceCheck(True, 1, True))
+    monkeypatch.setattr(listing, "_verdict_of", lambda device: DeviceCheck(True, 1, True))
     assert fastest() == "opencl:0:0"
     assert asked == ["opencl"]
 

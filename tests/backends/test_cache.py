@@ -15,7 +15,7 @@ import platformdirs
 import pytest
 from support.cache_folders import BLOCKED, blocked, contents, entries_in
 
-from gpusense.backends import BackendInfo, cache, folders
+from gpusense.backends import BackendInfo, cache, scratch
 from gpusense.backends.cache import BinaryCache, discard_entry, load_entry, pack, store_entry, unpack, write_files
 
 
@@ -35,7 +35,7 @@ def test_the_cache_is_where_the_system_has_caches(tmp_path, monkeypatch, module,
     if module == "windows":
         monkeypatch.setattr(system, "get_win_folder", lambda _: str(tmp_path / "local"))
     monkeypatch.setattr(platformdirs, "PlatformDirs", getattr(system, name))
-    assert folders.chosen_place().folder == tmp_path / place
+    assert scratch.chosen_place().folder == tmp_path / place
 
 
 INFO = BackendInfo("opencl:0:0", "opencl", "Some device", "gpu", "Driver 1", 1 << 30, 1 << 28, True)
@@ -57,9 +57,9 @@ def test_a_program_is_kept_and_found_again(place):
     assert programs.load("source", ["-a"]) is None
     programs.store("source", ["-a"], b"binary")
     assert programs.load("source", ["-a"]) == b"binary"
-    assert [path.name for path in place.iterdir()] == [folders.OWN]
-    assert stat.S_IMODE((place / folders.OWN).stat().st_mode) == 0o700
-    assert sorted(path.suffix for path in (place / folders.OWN).iterdir()) == [".TAG", ".gpusense"]
+    assert [path.name for path in place.iterdir()] == [scratch.OWN]
+    assert stat.S_IMODE((place / scratch.OWN).stat().st_mode) == 0o700
+    assert sorted(path.suffix for path in (place / scratch.OWN).iterdir()) == [".TAG", ".gpusense"]
 
 
 @pytest.mark.parametrize("other", ["source", "options", "driver", "device", "processor"])
@@ -91,7 +91,7 @@ def test_two_entries_that_were_exchanged_are_none(place):
     """Both are complete, and written by gpusense."""
     store_entry("first", b"one")
     store_entry("second", b"two")
-    first, second = (place / folders.OWN / cache._file(key) for key in ("first", "second"))
+    first, second = (place / scratch.OWN / cache._file(key) for key in ("first", "second"))
     first.rename(place / "away")
     second.rename(first)
     (place / "away").rename(second)
@@ -140,14 +140,14 @@ def make_folder(path: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("make", [make_fifo, make_device, make_link, make_folder])
 def test_what_is_no_regular_file_is_no_entry_and_stays(place, tmp_path, caplog, alarm, make):
     store_entry("other", b"other")
-    path = place / folders.OWN / cache._file("key")
+    path = place / scratch.OWN / cache._file("key")
     make(path, tmp_path)
-    before = contents(place)[f"{folders.OWN}/{path.name}"]
+    before = contents(place)[f"{scratch.OWN}/{path.name}"]
     assert load_entry("key") is None
     discard_entry("key")
     store_entry("key", b"new")
     # The entry is in the folder for temporary files now.
-    assert load_entry("key") == b"new" and contents(place)[f"{folders.OWN}/{path.name}"] == before
+    assert load_entry("key") == b"new" and contents(place)[f"{scratch.OWN}/{path.name}"] == before
     (message,) = caplog.messages
     assert f"the cache folder {place} cannot be written: " in message and "is no regular file" in message
 
@@ -203,19 +203,19 @@ def foreign_files(folder: Path) -> list[Path]:
         (folder / other).write_bytes(text)
         os.utime(folder / other, (time.time() - 1e6,) * 2)
     (folder / f"{hashlib.sha256(b'z').hexdigest()}.gpusense").mkdir()
-    return sorted(path for path in folder.iterdir() if path.name != folders.MARKER)
+    return sorted(path for path in folder.iterdir() if path.name != scratch.MARKER)
 
 
 def test_only_entries_are_evicted(place, monkeypatch):
     """Files of other programs stay, even in gpusense's folder, with any names and age."""
-    folders.own_folder(place)
-    foreign = foreign_files(place / folders.OWN)
+    scratch.own_folder(place)
+    foreign = foreign_files(place / scratch.OWN)
     monkeypatch.setattr(cache, "MAX_ENTRIES", 1)
     for number in range(4):
         store_entry(f"entry {number}", b"payload")
         for path in entries_in(place):
             os.utime(path, (path.stat().st_mtime - 10,) * 2)
-    left = sorted(path for path in (place / folders.OWN).iterdir() if path.name != folders.MARKER)
+    left = sorted(path for path in (place / scratch.OWN).iterdir() if path.name != scratch.MARKER)
     assert set(foreign) <= set(left) and len(left) <= len(foreign) + 1
 
 
@@ -225,11 +225,11 @@ def test_unfinished_files_of_killed_processes_are_removed(place):
     heads = [cache._head(bytes.fromhex(name), b"payload") for name in names]
     begun = [b"", heads[1][:20], heads[2] + b"pay", heads[3] + b"pay"]
     for turn, (name, text) in enumerate(zip(names, begun, strict=True)):
-        path = place / folders.OWN / f"{name}-abcd_123.new"
+        path = place / scratch.OWN / f"{name}-abcd_123.new"
         path.write_bytes(text)
         os.utime(path, (time.time() - (7200 if turn < 3 else 0),) * 2)
     store_entry("second", b"payload")
-    assert [path.name[:64] for path in (place / folders.OWN).glob("*.new")] == [names[3]]
+    assert [path.name[:64] for path in (place / scratch.OWN).glob("*.new")] == [names[3]]
 
 
 def test_the_cache_can_be_switched_off(place, monkeypatch):

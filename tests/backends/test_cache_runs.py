@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from support import fake_driver
 from support.cache_folders import BLOCKED, blocked
 
-from gpusense.backends import folders
+from gpusense.backends import scratch
 
 _RUN = """
 import sys
@@ -51,7 +51,7 @@ def expected() -> str:
 
 
 def entries(folder: Path) -> dict[str, int]:
-    return {path.name: path.stat().st_ino for path in (folder / folders.OWN).glob("*.gpusense")}
+    return {path.name: path.stat().st_ino for path in (folder / scratch.OWN).glob("*.gpusense")}
 
 
 @pytest.mark.sampled(0.5)
@@ -76,10 +76,10 @@ def test_a_second_process_compiles_nothing(needs, tmp_path, expected, family):
     assert len(first) > 5
     assert outcome(start(family, environment)) == (0, expected, "")
     assert entries(folder) == first
-    after = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if folders.OWN not in path.parts}
+    after = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if scratch.OWN not in path.parts}
     assert after == before and len(before) == 164
-    others = [path.name for path in (folder / folders.OWN).iterdir() if path.suffix != ".gpusense"]
-    assert others == [folders.MARKER]
+    others = [path.name for path in (folder / scratch.OWN).iterdir() if path.suffix != ".gpusense"]
+    assert others == [scratch.MARKER]
 
 
 # The default is the backend that the test of a second process does not use.
@@ -114,13 +114,13 @@ def test_damaged_files_of_every_kind_are_made_anew(needs, tmp_path, expected, fa
     whole = entries(tmp_path / "cold")
     assert len(whole) >= len(DAMAGES)
     for number, name in enumerate(sorted(whole)):
-        path = tmp_path / "cold" / folders.OWN / name
+        path = tmp_path / "cold" / scratch.OWN / name
         path.write_bytes(list(DAMAGES.values())[number % len(DAMAGES)](path.read_bytes()))
     assert outcome(start(family, environment)) == (0, expected, "")
     assert entries(tmp_path / "cold").keys() == whole.keys()
     for name in whole:
-        (tmp_path / "cold" / folders.OWN / name).unlink()
-        (tmp_path / "cold" / folders.OWN / name).mkdir()
+        (tmp_path / "cold" / scratch.OWN / name).unlink()
+        (tmp_path / "cold" / scratch.OWN / name).mkdir()
     code, out, errors = outcome(start(family, environment))
     assert (code, out, errors.count("\n")) == (0, expected, 1), errors
     assert f"the cache folder {tmp_path / 'cold'} cannot be written" in errors

@@ -10,7 +10,8 @@ import sys
 import pytest
 from support import fake_driver
 
-from gpusense.backends import Device, default_failures, fallback, get_backend, listing, notices, selection
+from gpusense._util import notices
+from gpusense.backends import Device, default_failures, get_backend, listing, selection
 from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.backends.proof import DeviceCheck
 
@@ -46,7 +47,7 @@ def machine(monkeypatch):
             "present",
             lambda entry: tuple([d for d in rows if d.backend == entry.name] for rows in ([*devices, NUMPY], parts)),
         )
-        monkeypatch.setattr(fallback, "_verdict_of", verdict_of)
+        monkeypatch.setattr(listing, "_verdict_of", verdict_of)
         monkeypatch.setattr(selection, "_open", open_one)
         monkeypatch.setattr(selection, "_looks", ((), {}))
         monkeypatch.setattr(selection, "_passed_over", [])
@@ -109,7 +110,7 @@ def test_a_verdict_is_reported_by_the_process_that_makes_it(machine, caplog):
     machine([GPU, WARP], {"opencl:0:0": KEPT})
     assert get_backend("auto").info.selection == "warp:cpu" and caplog.messages == []
     text = "opencl:0:0 (A GPU, Driver 1) is unusable: scalar kernels hang; update the driver"
-    made = fallback.FallbackOrder([fallback.Failure("opencl:0:0", "", text, True)])
+    made = listing.FallbackOrder([listing.Failure("opencl:0:0", "", text, True)])
     held = ["another warning", text]
     made.report(WARP, held)
     assert held == ["another warning", f"'auto' is warp:cpu (CPU): {text}"]

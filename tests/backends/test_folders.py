@@ -12,7 +12,7 @@ from support.cache_folders import blocked, contents, entries_in
 
 from gpusense._util import private
 from gpusense._util.private import UnsafeFolderError, check_private, read_regular
-from gpusense.backends import folders
+from gpusense.backends import scratch
 from gpusense.backends.cache import load_entry, store_entry
 
 as_root = pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can give folders away")
@@ -39,7 +39,7 @@ def poison(key: str) -> None:
     """Write an entry, and forget the check of its folder."""
     store_entry(key, b"code")
     assert load_entry(key) == b"code"
-    folders._checked.clear()
+    scratch._checked.clear()
 
 
 @as_root
@@ -61,10 +61,10 @@ def test_no_code_is_read_from_a_folder_that_others_can_change(
         monkeypatch.setenv(variable, str(tmp_path / "chosen"))
     for rule, (change, text) in (RULES if where == "own" else PARENT_RULES).items():
         poison(f"{variable} {rule}")
-        folder = place / folders.OWN if where == "own" else place
+        folder = place / scratch.OWN if where == "own" else place
         change(folder)
         caplog.clear()
-        folders._reported.clear()
+        scratch._reported.clear()
         assert load_entry(f"{variable} {rule}") is None
         store_entry(f"{variable} {rule}", b"new")
         messages = [message for message in caplog.messages if "is not used" in message]
@@ -73,7 +73,7 @@ def test_no_code_is_read_from_a_folder_that_others_can_change(
         assert messages[0].endswith(f"(the folder comes from {variable})")
         os.chown(folder, 0, -1)
         folder.chmod(0o700)
-        folders._checked.clear()
+        scratch._checked.clear()
         # Nothing was written to a refused folder.
         assert load_entry(f"{variable} {rule}") == b"code"
         for path in [*entries_in(place), *temporary.rglob("*.gpusense")]:
@@ -91,9 +91,9 @@ def test_nothing_is_made_where_others_could_replace_it(place, temporary):
 @with_owners
 def test_a_link_is_no_folder_of_gpusense(tmp_path, place, caplog):
     store_entry("key", b"code")
-    (place / folders.OWN).rename(tmp_path / "elsewhere")
-    (place / folders.OWN).symlink_to(tmp_path / "elsewhere")
-    folders._checked.clear()
+    (place / scratch.OWN).rename(tmp_path / "elsewhere")
+    (place / scratch.OWN).symlink_to(tmp_path / "elsewhere")
+    scratch._checked.clear()
     assert load_entry("key") is None
     assert "must be a real directory, got a symbolic link" in caplog.messages[0]
 
@@ -112,7 +112,7 @@ def test_a_place_may_be_a_link(tmp_path, place):
 def test_folders_are_made_for_this_user_alone_whatever_the_umask(tmp_path, umask):
     before = os.umask(umask)
     try:
-        folder = folders.own_folder(tmp_path / "a" / "b" / "c")
+        folder = scratch.own_folder(tmp_path / "a" / "b" / "c")
     finally:
         os.umask(before)
     check_private(folder)
@@ -122,7 +122,7 @@ def test_folders_are_made_for_this_user_alone_whatever_the_umask(tmp_path, umask
 
 @with_owners
 def test_a_sticky_folder_and_the_group_of_one_user_are_safe_above(tmp_path, monkeypatch):
-    folder = folders.own_folder(tmp_path / "cache")
+    folder = scratch.own_folder(tmp_path / "cache")
     folder.parent.chmod(0o1777)
     check_private(folder)
     folder.parent.chmod(0o770)
@@ -177,24 +177,24 @@ def test_systems_without_owners_have_caches_too(place, monkeypatch):
         monkeypatch.delattr(os, name, raising=False)
     store_entry("key", b"code")
     assert load_entry("key") == b"code"
-    assert folders.temporary_place() == (folders.Place(Path(folders.tempfile.gettempdir()) / "gpusense-0", "TMPDIR"))
+    assert scratch.temporary_place() == (scratch.Place(Path(scratch.tempfile.gettempdir()) / "gpusense-0", "TMPDIR"))
 
 
 # ---- the marker
 
 
 def test_the_marker_keeps_the_folder_out_of_backups(place):
-    folder = folders.own_folder(place)
+    folder = scratch.own_folder(place)
     assert (folder / "CACHEDIR.TAG").read_bytes().startswith(b"Signature: 8a477f597d28d172789f06886806bc55\n")
 
 
 @pytest.mark.parametrize("marker", [None, b"", b"Signature", b"another's"])
 def test_a_folder_that_gpusense_did_not_make_is_left_alone(place, caplog, marker):
-    own = place / folders.OWN
+    own = place / scratch.OWN
     own.mkdir(parents=True, mode=0o700)
     (own / "thesis.txt").write_text("mine")
     if marker is not None:
-        (own / folders.MARKER).write_bytes(marker)
+        (own / scratch.MARKER).write_bytes(marker)
     before = contents(place)
     store_entry("key", b"code")
     assert load_entry("key") == b"code" and contents(place) == before
@@ -203,20 +203,20 @@ def test_a_folder_that_gpusense_did_not_make_is_left_alone(place, caplog, marker
 
 @pytest.mark.parametrize("begun", [0, 1, 40, 97])
 def test_a_marker_that_was_begun_is_completed(place, begun):
-    own = place / folders.OWN
+    own = place / scratch.OWN
     own.mkdir(parents=True, mode=0o700)
-    (own / folders.MARKER).write_bytes(folders._MARKER_TEXT[:begun])
-    folders.own_folder(place)
-    assert (own / folders.MARKER).read_bytes() == folders._MARKER_TEXT
+    (own / scratch.MARKER).write_bytes(scratch._MARKER_TEXT[:begun])
+    scratch.own_folder(place)
+    assert (own / scratch.MARKER).read_bytes() == scratch._MARKER_TEXT
 
 
 def test_a_marker_that_is_another_programs_stays(place):
-    own = place / folders.OWN
+    own = place / scratch.OWN
     own.mkdir(parents=True, mode=0o700)
-    (own / folders.MARKER).write_bytes(b"Signature: mine\n")
+    (own / scratch.MARKER).write_bytes(b"Signature: mine\n")
     with pytest.raises(UnsafeFolderError, match=r"one without its CACHEDIR\.TAG"):
-        folders.own_folder(place)
-    assert (own / folders.MARKER).read_bytes() == b"Signature: mine\n"
+        scratch.own_folder(place)
+    assert (own / scratch.MARKER).read_bytes() == b"Signature: mine\n"
 
 
 _COLD = """

@@ -13,8 +13,7 @@ from support.tracking_scene import GRID
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.backends.programs import ProgramCache, RecordedProgram, RepeatedPrograms
-from gpusense.backends.workspace import ChangingProgram, Workspace
+from gpusense.backends.workspace import ChangingProgram, ProgramCache, RecordedProgram, RepeatedPrograms, Workspace
 from gpusense.interface.launches import launch
 
 REAL, POSES = np.dtype(np.float64), np.array([(1.0, 1.0, 0.3), (1.2, 1.1, -0.4)])

@@ -14,7 +14,7 @@ from support import fake_driver
 
 import gpusense as gs
 from gpusense._util import files
-from gpusense.backends import BackendInfo, get_backend, helpers, probe_process, proof, selection
+from gpusense.backends import BackendInfo, get_backend, probe_process, processor, proof, selection
 from gpusense.backends.probe_process import Outcome
 from gpusense.backends.proof import FLOAT64, SCALAR, VECTORS, DeviceCheck, verdict_on
 
@@ -426,7 +426,7 @@ def test_devices_of_several_backends_are_proved_at_once(needs, monkeypatch):
     needs("opencl")
     needs("warp")
     monkeypatch.setattr(proof, "awaits_child", lambda info: True)
-    monkeypatch.setattr(helpers, "threads", lambda: 2)
+    monkeypatch.setattr(processor, "threads", lambda: 2)
     both, met = threading.Barrier(2, timeout=60), set()
 
     def verdict(info, *, setup=None, anew=False):

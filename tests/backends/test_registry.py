@@ -9,11 +9,10 @@ from types import ModuleType
 import pytest
 
 import gpusense as gs
-from gpusense.backends import BackendInfo, fallback, get_backend, listing, registry, selection
-from gpusense.backends.library import Absent, Library
+from gpusense.backends import BackendInfo, get_backend, listing, registry, selection
 from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.backends.proof import DeviceCheck
-from gpusense.backends.registry import BY_NAME, ENTRIES, SPEED_CLASSES, Entry
+from gpusense.backends.registry import BY_NAME, ENTRIES, SPEED_CLASSES, Absent, Entry, Library
 
 INFO = BackendInfo("metal:0", "metal", "Some GPU", "gpu", "Metal 3", 1 << 30, 1 << 28, False)
 METAL = Entry(
@@ -57,10 +56,10 @@ def metal(monkeypatch):
     library.LIBRARY, package.Array = Metal(), type("Array", (), {})
     package.__spec__ = sys.__spec__
     entries = (*ENTRIES, METAL)
-    for module in (registry, listing, selection, fallback):
+    for module in (registry, listing, selection):
         monkeypatch.setattr(module, "ENTRIES", entries)
         monkeypatch.setattr(module, "BY_NAME", {entry.name: entry for entry in entries})
-    monkeypatch.setattr(fallback, "SPEED_CLASSES", (("metal", "gpu"), *SPEED_CLASSES))
+    monkeypatch.setattr(listing, "SPEED_CLASSES", (("metal", "gpu"), *SPEED_CLASSES))
     monkeypatch.setitem(sys.modules, "metal_library", library)
     monkeypatch.setitem(sys.modules, "metalpy", package)
     monkeypatch.setattr(listing.proof, "verdict_on", lambda info, **options: DeviceCheck(True, 4, info.float64))

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from support.cache_folders import contents
 
-from gpusense.backends import folders, scratch
+from gpusense.backends import scratch
 from gpusense.backends.scratch import scratch_folder
 
 
@@ -39,7 +39,7 @@ def made(place):
 
 def test_a_process_has_a_folder_in_the_cache(place, made):
     path = made()
-    assert path.parent == place / folders.OWN and stat.S_IMODE(path.stat().st_mode) == 0o700
+    assert path.parent == place / scratch.OWN and stat.S_IMODE(path.stat().st_mode) == 0o700
     assert [entry.name for entry in path.iterdir()] == ["lock"]
 
 
@@ -159,7 +159,7 @@ LEFT = {
 def test_only_folders_that_processes_of_gpusense_left_are_removed(tmp_path, made, monkeypatch, case, shared):
     """Folders are in the cache, or in a folder for files of all users."""
     name, lock, others, removed = LEFT[case]
-    parent = folders.own_folder(tmp_path / "cache")
+    parent = scratch.own_folder(tmp_path / "cache")
     if shared:
         parent = tmp_path / "shared"
         parent.mkdir()
@@ -181,7 +181,7 @@ def test_only_folders_that_processes_of_gpusense_left_are_removed(tmp_path, made
 
 @pytest.mark.parametrize("change", ["mode", "owner", "link", "fifo"])
 def test_a_folder_that_is_not_private_is_not_removed(tmp_path, made, change):
-    parent, name = folders.own_folder(tmp_path / "cache"), "gpusense-run-abcdefgh"
+    parent, name = scratch.own_folder(tmp_path / "cache"), "gpusense-run-abcdefgh"
     folder = parent / name
     folder.mkdir(mode=0o700)
     (folder / "lock").write_bytes(text(name))

@@ -7,7 +7,7 @@ import gc
 import numpy as np
 import pytest
 
-from gpusense.backends import arrays, helpers, recycled, staging
+from gpusense.backends import arrays, processor, recycled, staging
 
 
 class _Slot(staging.Slot):
@@ -39,7 +39,7 @@ def slots(monkeypatch):
     monkeypatch.setattr(staging, "SLOT", 4096)
     monkeypatch.setattr(staging, "LEAST", 100)
     monkeypatch.setattr(staging, "_LEAST_PIECE", 512)
-    monkeypatch.setattr(helpers, "threads", lambda: 4)
+    monkeypatch.setattr(processor, "threads", lambda: 4)
     return [_Slot(4096) for _ in range(staging.SLOTS)]
 
 
@@ -65,7 +65,7 @@ def test_plain_copies(slots, monkeypatch):
     with large._lock:
         assert not large.upload(array, there)
     assert large.upload(array, there)
-    monkeypatch.setattr(helpers, "threads", lambda: 2)
+    monkeypatch.setattr(processor, "threads", lambda: 2)
     assert not large.download(there, array)
 
 

@@ -6,9 +6,9 @@ import random
 
 import pytest
 
-from gpusense.interface.directives import resolve
 from gpusense.interface.flags import FLAGS
 from gpusense.interface.kernel_files import opencl_names, opencl_source
+from gpusense.interface.sources import resolve
 
 NAMES = sorted(FLAGS)[:4]
 

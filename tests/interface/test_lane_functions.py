@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gpusense.interface.lane_functions import written_in_lanes
-from gpusense.interface.lanes import with_teams_flags
+from gpusense.interface.lanes import with_teams_flags, written_in_lanes
 from gpusense.interface.sources import assemble, relevant
 
 

@@ -24,7 +24,6 @@ OTHER_FILES = {
     WARP: {"__init__": "makes the folder a package", "prelude": "types and decorators of all Warp kernels"},
     NUMPY: {
         "__init__": "makes the folder a package",
-        "scans": "loops over the scans of a launch; a work-item finds its scan by a division",
     },
 }
 
@@ -82,6 +81,7 @@ ON_PURPOSE = [
     Purpose("ranges", "cast_in_worlds", REFERENCE_ONLY, WORLD_BY_WORLD),
     Purpose("rectangles", "put_four", (WARP,), "OpenCL has pointers"),
     Purpose("rectangles", "divided", KERNELS_ONLY, "a division takes many instructions of a GPU"),
+    Purpose("sums", "particles_of_scans", REFERENCE_ONLY, "a work-item finds its scan by a division"),
     Purpose("raycast", "sectors_of", REFERENCE_ONLY, "SECTORS is a constant of the kernels"),
     Purpose("shapes", "particles_of_worlds", REFERENCE_ONLY, WORLD_BY_WORLD),
     Purpose(

@@ -16,7 +16,7 @@ from support.interrupts import Line, executed_lines, interrupt
 from support.tracking_scene import field
 
 import gpusense as gs
-from gpusense.backends.programs import RecordedProgram
+from gpusense.backends.workspace import RecordedProgram
 from gpusense.localization import journal, sensors, starts
 
 # Rooms with lines to interrupt: lower rooms do not use filters.

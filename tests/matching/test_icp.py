@@ -14,7 +14,7 @@ from gpusense.interface.structs import MatchRules
 from gpusense.matching.icp import IcpPairs, space_of
 from gpusense.matching.points import scan_points
 from gpusense.reference import icp_pairs as reference
-from gpusense.reference.lines import fit_lines
+from gpusense.reference.line_fit import fit_lines
 
 RULES = MatchRules(40, 2, 3, 1, 0, 0, 1.0, 0.3, 1.0, 0.03, 0.85, 0.06, 0.3, 1e-4)
 # Sums have another order than NumPy's: information is compared relative to its largest number.

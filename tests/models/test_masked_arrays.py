@@ -9,7 +9,7 @@ import pytest
 from support.model_world import BEARINGS, RANGE, cloud, make, room, same_bits, scan
 
 import gpusense as gs
-from gpusense._util import masks
+from gpusense._util import checks
 from gpusense.learning.discrete.fit import count_pairs
 
 GRID = room()
@@ -128,12 +128,13 @@ def test_masked_readings_are_missing(needs, name):
 
 
 def test_masked_integers_and_booleans_are_missing():
-    found = masks.filled([np.ma.array([1, 2], mask=[True, False]), [3, 4]])
+    found = checks.filled([np.ma.array([1, 2], mask=[True, False]), [3, 4]])
     np.testing.assert_array_equal(found, [[np.nan, 2], [3, 4]])
-    assert masks.filled(np.ma.array([1, 2])).dtype.kind == "i" and masks.filled(np.ma.array([1, 2])).tolist() == [1, 2]
+    plain = checks.filled(np.ma.array([1, 2]))
+    assert plain.dtype.kind == "i" and plain.tolist() == [1, 2]
     single = np.ma.array(np.float32([1, 2]), mask=[False, True])
-    assert masks.filled(single).dtype == np.float32 and np.isnan(masks.filled(single)[1])
-    assert np.isnan(masks.filled(np.ma.masked)) and type(masks.filled(single)) is np.ndarray
+    assert checks.filled(single).dtype == np.float32 and np.isnan(checks.filled(single)[1])
+    assert np.isnan(checks.filled(np.ma.masked)) and type(checks.filled(single)) is np.ndarray
     model = gs.BumperModel(FREE, 0.3, gs.BumperParameters(), backend="numpy")
     pressed = np.ma.array([True], mask=[True])
     same_bits(model.log_likelihood(POSES, pressed), model.log_likelihood(POSES, [np.nan]))

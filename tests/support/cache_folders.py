@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from gpusense.backends import folders
+from gpusense.backends import scratch
 
 BLOCKED = ["a file in its place", "a file above it", "a read-only system"]
 
@@ -24,7 +24,7 @@ def blocked(tmp_path: Path, how: str) -> Path:
 
 def entries_in(place: Path) -> list[Path]:
     """Return the sorted entries of the cache in a folder."""
-    return sorted((place / folders.OWN).glob("*.gpusense"))
+    return sorted((place / scratch.OWN).glob("*.gpusense"))
 
 
 def contents(folder: Path) -> dict[str, tuple[int, int]]:

@@ -21,8 +21,7 @@ from gpusense.interface.casters import ENTRIES
 from gpusense.interface.structs import RangeScale, Window
 from gpusense.models.scan.densities import log_mixture
 from gpusense.tables import casters
-from gpusense.tables.caster_base import CasterInput
-from gpusense.tables.casters import Bresenham, Caster, Cddt, Dda, Exact, Lookup, March
+from gpusense.tables.casters import Bresenham, Caster, CasterInput, Cddt, Dda, Exact, Lookup, March
 from gpusense.tables.directional import directional_table
 from gpusense.tables.rectangles import Planes, empty_rectangles, planes_of
 from gpusense.world import windows

@@ -11,8 +11,7 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.interface.structs import Window
 from gpusense.reference import march as march_reference
-from gpusense.tables.caster_base import CasterInput
-from gpusense.tables.casters import March
+from gpusense.tables.casters import CasterInput, March
 
 LEAST_PART = 2.0**-22
 

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from gpusense.backends.base import Backend, Launcher
-from gpusense.backends.info import BackendInfo
-from gpusense.backends.library import Library
+from gpusense.backends.base import Backend, BackendInfo, Launcher
 from gpusense.backends.processor import host_memory
+from gpusense.backends.registry import Library
 from gpusense.interface import structs
 from gpusense.interface.signatures import KERNELS, Argument
 

@@ -14,16 +14,13 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from gpusense.backends import helpers
-from gpusense.backends.base import Adopted, Backend, Buffer
+from gpusense.backends import processor
+from gpusense.backends.base import Adopted, Backend, BackendInfo, Buffer, ProcessBound
 from gpusense.backends.cache import BinaryCache
-from gpusense.backends.info import BackendInfo, ProcessBound
-from gpusense.backends.opencl import arrays, pocl, pocl_kernels
-from gpusense.backends.opencl.caches import new_kernel, without_caches
+from gpusense.backends.opencl import memory, pocl, pocl_kernels
 from gpusense.backends.opencl.devices import group_multiple, shares_memory
-from gpusense.backends.opencl.launch import Launch, watch
+from gpusense.backends.opencl.launch import Launch, OpenCLRecording, new_kernel, watch, without_caches
 from gpusense.backends.opencl.memory import SHARED, DeviceBuffer, SharedBuffer, driver_errors, raise_clearly, slots_of
-from gpusense.backends.opencl.replay import OpenCLRecording
 from gpusense.backends.recycled import ResultMemory
 from gpusense.backends.staging import Staging
 from gpusense.interface.launches import Program
@@ -71,7 +68,7 @@ class OpenCLBackend(ProcessBound, Backend):
         # may be collected while it is held.
         self._count = threading.RLock()
         self._queued = self._ended = 0
-        self.alignment = arrays.alignment_of(device)
+        self.alignment = memory.alignment_of(device)
         self._launchers: dict[tuple[str, frozenset[str]], Launch] = {}
         # Programs with the keys of their entries in the cache.
         self._programs: dict[tuple[str, frozenset[str]], tuple[cl.Program, str]] = {}
@@ -80,7 +77,7 @@ class OpenCLBackend(ProcessBound, Backend):
         self._pocl = pocl_kernels.pocl_kernels() if pocl.is_pocl(device) else None
         self._of_bitcode = pocl.takes_bitcode(device)
         # The last launch, if its groups leave a processor to the calling thread.
-        self._most_watched = helpers.threads() - 1 if self._pocl is not None else 0
+        self._most_watched = processor.threads() - 1 if self._pocl is not None else 0
         self._last: cl.Event | None = None
         # Ranges are the same bits everywhere only if division is rounded correctly, an option on GPUs.
         rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
@@ -166,13 +163,13 @@ class OpenCLBackend(ProcessBound, Backend):
 
     def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
         size = np.dtype(dtype).itemsize
-        return arrays.part_of(buffer, first * size, count * size, self.alignment)
+        return memory.part_of(buffer, first * size, count * size, self.alignment)
 
     def reads(self, array: object) -> bool:
-        return arrays.is_array(array)
+        return memory.is_array(array)
 
     def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
-        return arrays.adopted(array, self._queue, self.info.selection, name, in_place=in_place)
+        return memory.adopted(array, self._queue, self.info.selection, name, in_place=in_place)
 
     def empty_external(self, count: int, dtype: np.dtype) -> Buffer:
         """See Backend.empty_external; arrays of shared memory could not outlive the backend's launches."""
@@ -192,7 +189,7 @@ class OpenCLBackend(ProcessBound, Backend):
                 cl.enqueue_copy(self._queue, target, source, byte_count=size, src_offset=begin, dst_offset=to)
 
     def wrap_external(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
-        return arrays.wrapped(buffer, self._queue, shape, dtype)
+        return memory.wrapped(buffer, self._queue, shape, dtype)
 
     @property
     def replays(self) -> bool:

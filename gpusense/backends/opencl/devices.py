@@ -6,7 +6,7 @@ import os
 
 import pyopencl as cl
 
-from gpusense.backends.info import BackendInfo
+from gpusense.backends.base import BackendInfo
 from gpusense.backends.opencl import drivers, pocl, pocl_kernels
 
 # The devices that this process lists, in which drivers stay loaded.

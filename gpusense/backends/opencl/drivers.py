@@ -2,15 +2,17 @@
 
 The loader loads all drivers at its first use, so a driver that crashes there ends the process, whatever device was
 wanted. Therefore a child loads them first, and a driver that kills the child is left out. While the loader loads, a
-variable names the folder of the drivers' files (see :mod:`gpusense.backends.opencl.driver_files`).
+variable names the folder of the drivers' files (see :mod:`gpusense.backends.opencl.drivers`).
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib.metadata
 import json
 import os
 import re
+import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,11 +20,11 @@ from pathlib import Path
 
 import pyopencl as cl
 
+from gpusense._util import notices
 from gpusense._version import __version__
-from gpusense.backends import notices, probe_process
+from gpusense.backends import probe_process
 from gpusense.backends.cache import discard_entry, load_entry, store_entry
-from gpusense.backends.opencl import driver_files, pocl_kernels
-from gpusense.backends.opencl.driver_files import Driver
+from gpusense.backends.opencl import pocl_kernels
 from gpusense.backends.processor import fingerprint
 from gpusense.backends.scratch import scratch_folder
 
@@ -115,7 +117,7 @@ def renew() -> None:
 
 def _chosen(*, anew: bool = False) -> Choice:
     """Return the choice by the cached verdict; without one, or with ``anew``, by a child's verdict."""
-    drivers, by_itself = driver_files.installed()
+    drivers, by_itself = installed()
     wanted = None if by_itself else drivers
     if not probe_process.can_start() or not _loader():
         return Choice(wanted)
@@ -255,3 +257,67 @@ def _environment(variables: dict[str, str]) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+# ---- the files of the OpenCL drivers of this machine
+
+
+_SYSTEM = "/etc/OpenCL/vendors"
+_INTEL = ("intel-opencl-rt", "libintelocl.so")
+
+
+@dataclass(frozen=True)
+class Driver:
+    """A driver as its ``.icd`` file has it."""
+
+    file: Path  # the file; Intel's library itself where the file is made here
+    library: str  # the library that the loader loads
+
+
+def installed() -> tuple[tuple[Driver, ...], bool]:
+    """Return the drivers of this machine, and whether the loader finds all of them unaided."""
+    present = _registered()
+    intel = _intel(present)
+    return (tuple(present), True) if intel is None else ((*present, intel), False)
+
+
+def _registered() -> list[Driver]:
+    """Return the drivers that the loader finds by itself, the system's first."""
+    place = _place()
+    beside = Path(cl.__file__).parent / ".libs"
+    if place.is_file():
+        # A single file or library replaces all drivers.
+        return [Driver(place, _library(place) if place.suffix == ".icd" else str(place))]
+    files = [*sorted(place.glob("*.icd")), *sorted(beside.glob("*.icd"))]
+    drivers = [Driver(file, _library(file)) for file in files]
+    return [driver for driver in drivers if driver.library]
+
+
+def _place() -> Path:
+    """Return the folder of the system's ``.icd`` files, or the one driver that a variable names."""
+    return Path(os.environ.get("OCL_ICD_VENDORS") or os.environ.get("OPENCL_VENDOR_PATH") or _SYSTEM)
+
+
+def _library(file: Path) -> str:
+    """Return the library that an ``.icd`` file names, by its path if it is in the same folder."""
+    try:
+        name = file.read_text(encoding="utf-8", errors="replace").strip().splitlines()[0].strip()
+    except (OSError, IndexError):
+        return ""
+    near = file.parent / name
+    return str(near) if not os.path.isabs(name) and near.is_file() else name
+
+
+def _intel(present: list[Driver]) -> Driver | None:
+    """Return Intel's runtime where its wheel is installed and no ``.icd`` file names it."""
+    if not sys.platform.startswith("linux") or _place().is_file():
+        # A variable that names a single driver takes precedence.
+        return None
+    if any(re.search(r"libintelocl\.so", driver.library) for driver in present):
+        return None
+    try:
+        files = importlib.metadata.files(_INTEL[0]) or []
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    library = next((Path(str(file.locate())).resolve() for file in files if file.name == _INTEL[1]), None)
+    return Driver(library, str(library)) if library is not None and library.is_file() else None

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import logging
+import sqlite3
 import struct
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 import pyopencl as cl
 
-from gpusense.backends.opencl.caches import new_kernel, without_caches
-from gpusense.backends.opencl.memory import raise_clearly
-from gpusense.backends.opencl.replay import BoundLaunch
+from gpusense._util.checks import show
+from gpusense._util.interrupts import undisturbed
+from gpusense.backends.base import Recording, pluralize
+from gpusense.backends.opencl.memory import check_in_order, driver_errors, raise_clearly
 from gpusense.interface import structs
 from gpusense.interface.signatures import Argument, Kernel, lanes_of, team_of
 
@@ -128,3 +135,126 @@ def _set_as(argument: Argument, real: np.dtype) -> Any:
     if argument.is_struct:
         return np.dtype(("V", struct.calcsize(structs.layout(argument.type, real))))
     return argument.dtype(real).type if argument.shape is None else None
+
+
+# ---- recordings: launches whose arguments stay set, each with a kernel object for itself
+
+
+@dataclass(frozen=True)
+class BoundLaunch:
+    """A kernel with its arguments set, its size and group; keeps the arguments' memory alive."""
+
+    kernel: cl.Kernel
+    size: tuple[int, ...]
+    group: tuple[int, ...]
+    arguments: tuple[Any, ...]
+
+
+class OpenCLRecording(Recording):
+    """Launches that are enqueued together; a stream is a queue of the same context."""
+
+    def __init__(self, queue: cl.CommandQueue, launches: list[BoundLaunch], count: Callable[[int], None]) -> None:
+        self._queue, self._launches, self._count = queue, launches, count
+        self._lock = threading.Lock()
+        # Queues of users on which they were started since the last wait.
+        self._used: list[cl.CommandQueue] = []
+
+    def __call__(self, stream: Any = None) -> None:
+        queue = self._queue if stream is None else self._checked(stream)
+        # Before and after; see ``OpenCLBackend.enqueue``.
+        self._count(len(self._launches))
+        # The launches of two threads must not interleave.
+        with self._lock:
+            if stream is not None and queue not in self._used:
+                self._used.append(queue)
+            try:
+                for launch in self._launches:
+                    cl.enqueue_nd_range_kernel(queue, launch.kernel, launch.size, launch.group)
+                # Flush: a driver may otherwise wait for further commands before it begins.
+                queue.flush()
+            except cl.Error as error:
+                raise_clearly(error)
+        self._count(len(self._launches))
+
+    def __del__(self, run: Callable[[Callable[[], object]], None] = undisturbed) -> None:
+        # As a default, the function is there when the interpreter ends and has emptied its modules.
+        # Memory that is shared with the host must not go while a queue works on it.
+        # An interrupt may come before there is one.
+        if getattr(self, "_used", None):
+            run(self._wait_for_all)
+
+    def wait(self, *, elsewhere: bool = False) -> None:
+        self._wait_for_all(elsewhere=elsewhere)
+        with self._lock:
+            self._used.clear()
+
+    def _wait_for_all(self, *, elsewhere: bool = False) -> None:
+        """Wait for the device's queue and for users' queues; repeated after an interrupt, it waits for all again."""
+        with self._lock:
+            used = [*self._used] if elsewhere else [self._queue, *self._used]
+        with driver_errors():
+            for queue in used:
+                queue.finish()
+
+    def explain(self) -> str:
+        return f"{pluralize(len(self._launches), 'launch')} one by one, their arguments stay set: OpenCL has no graphs"
+
+    def _checked(self, stream: Any) -> cl.CommandQueue:
+        """Return a user's queue for the stream of a call."""
+        same = isinstance(stream, cl.CommandQueue) and (stream.context, stream.device) == (
+            self._queue.context,
+            self._queue.device,
+        )
+        if not same:
+            raise TypeError(f"stream: must be a queue of the model's context and device, got {show(stream)}")
+        check_in_order(stream, "stream")
+        return stream
+
+
+# ---- switch pyopencl's caches off: a read-only folder or a damaged file would end the run
+
+
+# True if pyopencl's caches are off; once it is imported it has no other switch.
+_SWITCH = "_PYOPENCL_NO_CACHE"
+_lock = threading.RLock()
+
+
+def _open_database() -> None:
+    """Import the module that opens the database; where that fails the caches are off for the whole process."""
+    if getattr(cl, _SWITCH, True):
+        return
+    # An object whose construction failed reports that again when it is collected.
+    hook, sys.unraisablehook = sys.unraisablehook, lambda *_: None
+    try:
+        importlib.import_module("pyopencl.invoker")
+    except (ImportError, OSError, sqlite3.Error) as error:
+        setattr(cl, _SWITCH, True)
+        # Programs of gpusense are never kept there.
+        logging.getLogger("gpusense").info("gpusense: pyopencl's cache cannot be used and is left out: %s", error)
+        error.__traceback__ = None
+    finally:
+        sys.unraisablehook = hook
+
+
+_open_database()
+
+
+def new_kernel(program: Any, name: str) -> cl.Kernel:
+    """Return a new kernel object of a program."""
+    with without_caches():
+        return cl.Kernel(program, name)
+
+
+@contextlib.contextmanager
+def without_caches() -> Iterator[None]:
+    """Switch pyopencl's caches off, and restore them on leaving."""
+    with _lock:
+        before = getattr(cl, _SWITCH, None)
+        if before is None:
+            yield
+            return
+        setattr(cl, _SWITCH, True)
+        try:
+            yield
+        finally:
+            setattr(cl, _SWITCH, before)

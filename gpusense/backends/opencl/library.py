@@ -7,13 +7,12 @@ from typing import Any
 
 import pyopencl as cl
 
-from gpusense.backends.base import Backend
-from gpusense.backends.info import BackendInfo
-from gpusense.backends.library import Absent, Library
+from gpusense.backends.base import Backend, BackendInfo
 from gpusense.backends.opencl import devices, drivers
-from gpusense.backends.opencl.arrays import check_in_order
 from gpusense.backends.opencl.backend import OpenCLBackend
+from gpusense.backends.opencl.memory import check_in_order
 from gpusense.backends.proof import remedy_for, with_remedy
+from gpusense.backends.registry import Absent, Library
 
 # Variables that hide drivers and devices.
 HIDING = ("OCL_ICD_VENDORS", "OPENCL_VENDOR_PATH", "OCL_ICD_FILENAMES", "POCL_DEVICES")

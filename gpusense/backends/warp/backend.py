@@ -15,16 +15,14 @@ import numpy as np
 import warp as wp
 
 from gpusense._util.memory import prefer_large_pages
-from gpusense.backends.base import Adopted, Backend, Recording
-from gpusense.backends.info import BackendInfo, ProcessBound
+from gpusense.backends.base import Adopted, Backend, BackendInfo, ProcessBound, Recording
 from gpusense.backends.recycled import ResultMemory
 from gpusense.backends.staging import Staging
 from gpusense.backends.warp.arrays import adopted, has_protocol, slots_of
-from gpusense.backends.warp.graphs import GraphCache
+from gpusense.backends.warp.graphs import GraphCache, WarpRecording
 from gpusense.backends.warp.launch import SCALARS, Launch, host_view
 from gpusense.backends.warp.pieces import SharedLaunch, shared
 from gpusense.backends.warp.queue import CallQueue
-from gpusense.backends.warp.recording import WarpRecording
 from gpusense.backends.warp.settings import LOCK, initialize, load, settings
 from gpusense.interface.kernel_files import warp_module
 from gpusense.interface.launches import Program

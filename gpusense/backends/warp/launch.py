@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from gpusense.backends.warp.queue import CallQueue
-from gpusense.backends.warp.steps import Step
+from gpusense.backends.warp.queue import CallQueue, Step
 from gpusense.interface.signatures import Argument, Kernel
 
 SCALARS = {

@@ -6,10 +6,9 @@ import os
 
 import warp as wp
 
-from gpusense.backends.base import Backend
-from gpusense.backends.info import BackendInfo
-from gpusense.backends.library import Absent, Library
+from gpusense.backends.base import Backend, BackendInfo
 from gpusense.backends.processor import host_memory
+from gpusense.backends.registry import Absent, Library
 from gpusense.backends.warp.backend import WarpBackend
 from gpusense.backends.warp.settings import initialize, trouble
 

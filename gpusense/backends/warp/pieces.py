@@ -13,7 +13,7 @@ import os
 import threading
 from typing import Any
 
-from gpusense.backends import helpers
+from gpusense.backends import processor
 from gpusense.backends.warp.launch import Launch, LaunchStep, slice_of
 from gpusense.interface.signatures import Argument, Kernel
 
@@ -27,7 +27,7 @@ _PIECES = 2
 
 def shared(launch: Launch, row: Kernel) -> Launch | SharedLaunch:
     """Return the launch, cut into pieces where several threads may share it."""
-    return launch if helpers.threads() == 1 or not _independent(row) else SharedLaunch(launch, row)
+    return launch if processor.threads() == 1 or not _independent(row) else SharedLaunch(launch, row)
 
 
 def _shared_axis(row: Kernel) -> str | None:
@@ -64,7 +64,7 @@ class SharedLaunch:
         """See Launcher.__call__."""
         particles = size[self._axis]
         work = particles * max((int(arguments[i]) for i in self._work), default=1)
-        count = min(_PIECES * helpers.threads(), work // _PIECE_WORK, particles)
+        count = min(_PIECES * processor.threads(), work // _PIECE_WORK, particles)
         if count < 2:
             self._launch(size, *arguments)
             return
@@ -87,15 +87,15 @@ class SharedLaunch:
         started = []
         # If the system starts no more threads, the running threads do the work.
         with contextlib.suppress(RuntimeError):
-            for _ in range(min(helpers.threads(), count) - 1):
-                started.append(helpers.pool(os.getpid()).submit(pieces))
+            for _ in range(min(processor.threads(), count) - 1):
+                started.append(processor.pool(os.getpid()).submit(pieces))
         try:
             pieces()
         finally:
             # No thread may write after this returns, even after an error: further pieces are dropped.
             with lock:
                 begins = iter(())
-            helpers.finish(started)
+            processor.finish(started)
         for helper in started:
             if not helper.cancelled():
                 helper.result()

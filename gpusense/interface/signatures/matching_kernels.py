@@ -1,8 +1,15 @@
-"""Kernels that match scans to scans and to maps, by steps from a guess or by exhaustive search."""
+"""Kernels that match scans to scans and to maps, find lines and circles in them, and learn parameters."""
 
 from __future__ import annotations
 
-from gpusense.interface.constants import CLIMB, GRADIENT_NUMBERS, MATCH_RESULT, MATCH_RULES
+from gpusense.interface.constants import (
+    CIRCLE_NUMBERS,
+    CLIMB,
+    GRADIENT_NUMBERS,
+    LINE_NUMBERS,
+    MATCH_RESULT,
+    MATCH_RULES,
+)
 from gpusense.interface.signatures.rows import PLACED, WINDOW, Kernel, kernel
 
 # Points of all scans, sorted by bearing in each scan: x, y [m], bearing in [0, 2 pi), range [m].
@@ -11,6 +18,16 @@ _POINTS = ("real4 point [points]", "int start [scans + 1]")
 _CELLS = "uchar table [scores.tables * (scores.rows + 2 * scores.margin) * (scores.cols + 2 * scores.margin)]"
 _QUARTERS = "int quarters [scores.tables * (scores.rows + 2 * scores.margin) * (scores.cols + 2 * scores.margin)]"
 _ENDS = ("int2 point [points]", "int image [points]", "int first [items + 1]")
+_NOISY = (*_POINTS, "real noise [scans]")
+# Parts of scans: first point and number of points.
+_PARTS = ("int2 part [parts]", "int scan [parts]")
+# Readings and expected ranges to learn from, in blocks of equal length, and the mixture.
+_PAIRS = (
+    "real reading [blocks * readings]",
+    "real expected [blocks * readings]",
+    "MixtureTerms terms [1]",
+    "real masses [1]",
+)
 
 KERNELS: dict[str, Kernel] = {
     "field_gradient": kernel(
@@ -28,7 +45,7 @@ KERNELS: dict[str, Kernel] = {
         "double yaw_sin",
     ),
     "fit_lines": kernel(
-        "lines", "beam scan", *_POINTS, "int which [chosen]", "out real4 line [points]", "int scans", "int points",
+        "line_fit", "beam scan", *_POINTS, "int which [chosen]", "out real4 line [points]", "int scans", "int points",
         "int chosen", "int reach", "int most", "real ratio", "real slack", "real width", "real gap", in_lanes=True,
         lanes_group=8,
     ),
@@ -100,5 +117,25 @@ KERNELS: dict[str, Kernel] = {
         "int low [scans]", "out int part [4 * room]", "out int count [levels]", "ScoreTable scores", "int begin",
         "int some", "int room", "int workers", "int run", "int height", "int width", "int columns", "int turns",
         "int level", "int spacing", "int top",
+    ),
+    "split_scans": kernel(
+        "segments", "scan", *_NOISY, "out real cost [points]", "out int stop [points]", "int scans", "int points",
+        "real penalty", "real gap", group=16,
+    ),
+    "fit_segments": kernel(
+        "segments", "part", *_NOISY, *_PARTS, f"out real line [{LINE_NUMBERS} * parts]", "int scans", "int points",
+        "int parts", group=16,
+    ),
+    "fit_circles": kernel(
+        "circles", "part", *_NOISY, *_PARTS, "real4 edge [parts]", f"out real circle [{CIRCLE_NUMBERS} * parts]",
+        "int scans", "int points", "int parts", group=16,
+    ),
+    "e_step": kernel(
+        "learning", "block", *_PAIRS, "out real sums [blocks * width]", "int blocks", "int readings",
+        "int across", "int along", "int width",
+    ),
+    "pair_causes": kernel(
+        "learning", "block", *_PAIRS, "out real4 causes [blocks * readings]", "int blocks",
+        "int readings", "int across", "int along",
     ),
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Kernels that place poses and readings, cast rays and score scans."""
+"""Kernels that place poses and readings, cast rays and score scans, and make tables of maps and of many worlds."""
 
 from __future__ import annotations
 
@@ -35,11 +35,20 @@ _FIRST = "int first [rays + 1] if SHARED_RAYS"
 _RESULT = ("out real log_p [particles]", "out real parts [particles * readings] if PER_BEAM")
 _SCORE = ("Score score", _BATCH)
 _FIELD_TABLE = "real table [(window.rows + 4) * (window.cols + 4)]"
+_MAP = ("int rows", "int cols")
+_PLANES = "ushort rectangles [4 * sectors * (rows + 2) * (cols + 2)]"
+_CHANGED = (
+    *_MAP, "int sectors", "int first", "int band", "int top", "int left", "int bottom", "int right", "int worlds",
+)  # fmt: skip
+_SIZE = ("int rows", "int cols", "int worlds")
+_PLACE = "int place [worlds]"
+_FRAMES = "double frames [8 * worlds]"
+_RULES = ("int threshold", "int unknown")
 
 KERNELS: dict[str, Kernel] = {
     "place_poses": kernel("placement", "particle", *_GIVEN, *_FRAME, in_lanes=True),
     "bound_numbers": kernel(
-        "bounds", "item", "coordinate number [apart + count]", "out double bounds [2 * items]", "int count",
+        "placement", "item", "coordinate number [apart + count]", "out double bounds [2 * items]", "int count",
         "int apart", "int items",
     ),
     "place_inputs": kernel(
@@ -113,5 +122,92 @@ KERNELS: dict[str, Kernel] = {
     "score_field": kernel(
         "field", "particle", _FIELD_TABLE, *_WORLDS, *PLACED, *_POINTS, *_SCANS, *_RESULT, WINDOW, "int particles",
         "int readings", "real guard", *_SCORE, _CROWD, in_lanes=True,
+    ),
+    "distance_lines": kernel(
+        "distance", "line", "uchar occupied [rows * cols]", "out int along [rows * cols]",
+        "int lines", "int length", "int line_stride", "int step", group=16,
+    ),
+    "distance_envelope": kernel(
+        "distance", "line", "int along [rows * cols]", "out int starts [rows * cols]", "out int squared [rows * cols]",
+        "int lines", "int length", "int line_stride", "int step", group=16,
+    ),
+    "distance_bits": kernel(
+        "distance", "col row", "int bits [rows * words]", "out ushort nearest [rows * cols]", *_MAP, "int words",
+        "int reach",
+    ),
+    "distance_blocks": kernel(
+        "distance", "col block", "ushort nearest [rows * cols]", "out ushort blocks [count * cols]", *_MAP, "int count",
+    ),
+    "distance_search": kernel(
+        "distance", "col row", "ushort nearest [rows * cols]", "ushort blocks [count * cols]",
+        "out int squared [rows * cols]", *_MAP, "int count", "int most",
+    ),
+    "free_columns": kernel(
+        "rectangles", "strip direction", "uchar occupied [band * cols]", "out uchar runs [2 * band * cols]",
+        "int band", "int cols", "int begin", "int end", group=1,
+    ),
+    "rectangles_rows": kernel(
+        "rectangles", "row quadrant", "uchar runs [2 * band * cols * worlds]", "int place [worlds]",
+        "out int stack [1024 * rows * worlds]", f"out {_PLANES}", *_CHANGED, group=1,
+    ),
+    "free_rows": kernel(
+        "rectangles", "col row", "int bits [band * words]", "out uchar runs [2 * band * cols]", "int band", "int cols",
+        "int words", "int begin", "int end",
+    ),
+    "rectangles_scan": kernel(
+        "rectangles", "col tile quadrant", "uchar runs [2 * band * cols * worlds]", "int place [worlds]",
+        "out ushort rectangles [4 * sectors * lines * (cols + 2)]", *_CHANGED, "int lines", "int group",
+    ),
+    "fill_lookup": kernel(
+        "lookup_table", "bin cell", "ushort rectangles [map]", "real2 ray [bins]",
+        "out ushort lookup [window.rows * window.cols * bins]", WINDOW, "int bins", "int first_row", "int count",
+        "real limit",
+    ),
+    "fill_field": kernel(
+        "distance", "col row", "int squared [rows * cols]", "real density [cap + 1]",
+        "out real table [begin + height * stride]", *_MAP, "int cap", "real beyond", "int from_col", "int from_row",
+        "int width", "int height", "int begin", "int stride",
+    ),
+    "count_rays": kernel(
+        "ray_counts", "ray", "int2 start_cell [rays]", "int2 start_inside [rays]", "int2 end_cell [rays]",
+        "int2 end_inside [rays]", "int hit [rays]", "out int hits [rows * cols]", "out int misses [rows * cols]",
+        *_MAP, "int rays",
+    ),
+    "judge_beams": kernel(
+        "beam_consistency", "beam", "uchar cells [rows * cols]", "double estimate [9]", "double scan [2 * beams]",
+        "out double judged [2 * beams]", "Frame frame", "BeamRules rules", *_MAP, "int beams", group=4, team=256,
+    ),
+    "put_cells": kernel(
+        "worlds", "item world", "uchar cells [worlds * count]", _PLACE, "out uchar store [map]", "int count",
+        "int worlds", "int items",
+    ),
+    "mark_obstacles": kernel(
+        "worlds", "item", "uchar store [map]", _PLACE, "out uchar occupied [map]", "out int bits [map]", *_SIZE,
+        "int words", "int margin", *_RULES, "int as_bits",
+    ),
+    "fill_worlds": kernel(
+        "worlds", "col line", "int squared [map]", "real density [cap + 1]", _PLACE, "out real table [map]", *_SIZE,
+        "int margin", "int cap", "real beyond",
+    ),
+    "place_in_worlds": kernel(
+        "worlds", "particle", "coordinate poses [particles * 3]", "int index [wide * particles]",
+        "int ignore [wide_ignore * particles]",
+        _FRAMES, "real shapes [crowd.stride]", "out int2 pose_cell [particles]", "out real4 pose [particles]",
+        "out real4 pose_low [particles]",
+        "out int2 world [2 * particles]", "out int pose_status [2]", "Frame frame", "int particles", "int worlds",
+        "int wide", "int wide_ignore", "Crowd crowd",
+    ),
+    "find_sights": kernel(
+        "worlds", "item", "real shapes [crowd.stride]", "int2 world [2 * particles]", *POSES,
+        "out int sights [2 * crowd.begin]", "int particles", "Crowd crowd",
+    ),
+    "place_shapes": kernel(
+        "worlds", "shape world", "coordinate raw [worlds * count * numbers]", _FRAMES,
+        "out real shapes [worlds * stride]",
+        "Frame frame", "int count", "int numbers", "int begin", "int stride", "int worlds",
+    ),
+    "find_collisions": kernel(
+        "worlds", "particle", "uchar store [map]", "int2 world [2 * particles]", "real shapes [crowd.stride]", *POSES,
+        "out uchar hit [particles]", "int particles", "real radius", "Crowd crowd", *_RULES,
     ),
 }  # fmt: skip

@@ -17,14 +17,16 @@ from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Launch, Program, launch
+from gpusense.interface.plan import Omission, share
 from gpusense.interface.structs import Buckets as BucketSizes
 from gpusense.interface.structs import Score
 from gpusense.models.landmark.features import PreparedFeatures, check_correspondence, look_at_feature_angles
-from gpusense.models.landmark.plan import feature_omissions, looked_at
-from gpusense.models.landmark.tables import LandmarkTables
+from gpusense.models.landmark.tables import LandmarkTables, full_circle
 from gpusense.models.point.base import PointModel
 from gpusense.models.poses import Part, PlacedPoses, Poses, place
+from gpusense.world.frames import Mount
 from gpusense.world.landmarks import Buckets
+from gpusense.world.parameters import LandmarkParameters
 from gpusense.world.windows import Frame, Window
 
 # Limits of the joint association, which tries every landmark with each of 2^features sets.
@@ -269,3 +271,69 @@ class FeatureModel(PointModel):
             choice=space.empty("choice", count * sets * call.count, _INT),
             value=space.empty("value", count * sets * call.count, self._real), sets=sets,
         )  # fmt: skip
+
+
+# ---- omissions of a landmark model: by its parameters, and by the features of a call
+
+
+def looked_at(prepared: PreparedFeatures, buckets: Buckets) -> float:
+    """Return the landmarks that a feature inspects, on average over an evenly filled map."""
+    side, (rows, cols) = buckets.resolution, buckets.shape
+    across = np.maximum(2 * prepared.radius, 0) + side
+    looked = np.minimum(across, rows * side) * np.minimum(across, cols * side) / (rows * cols * side**2)
+    return float(len(buckets.index) * np.minimum(looked, 1).mean()) if len(looked) else 0.0
+
+
+def parameter_omissions(p: LandmarkParameters, negative: bool, mount: Mount, precision: str) -> list[Omission]:
+    """Return the omissions of every call, by the parameters."""
+    omissions = [
+        Omission(name[6:], f"{name} = None", cost)
+        for name, cost in (
+            ("sigma_range", "1 exponent per particle, feature and landmark"),
+            ("sigma_bearing", "1 arc tangent and 1 exponent per particle, feature and landmark"),
+            ("sigma_signature", "1 exponent per particle, feature and landmark"),
+        )
+        if getattr(p, name) is None
+    ]
+    if full_circle(p):
+        omissions.append(Omission("mass in the field of view", "it is a full circle", "2 erf or more per landmark"))
+    if not negative:
+        omissions.append(Omission("negative information", "negative=False", "a look at all landmarks in view"))
+    return omissions + common_omissions(mount, precision)
+
+
+def common_omissions(mount: Mount, precision: str) -> list[Omission]:
+    """Return the omissions of every call, of landmarks and of lines."""
+    omissions = []
+    if mount[:2] == (0.0, 0.0):
+        omissions.append(Omission("mount", "the sensor sits at the robot's origin", "a rotation per particle"))
+    if precision == "float32":
+        why = "positions, angles and exponents are kept in two numbers"
+        omissions.append(Omission("float64", why, "wide units, which many devices lack"))
+    return omissions
+
+
+def feature_omissions(
+    prepared: PreparedFeatures, buckets: Buckets, *, name: str, total: int, impossible: int, known: bool
+) -> list[Omission]:
+    """Return the omissions by the features of a call.
+
+    ``impossible``: number of features that the sensor cannot have measured; ``known``: True if the correspondences are
+    known.
+    """
+    omissions, count = [], len(buckets.index)
+    silent = total - len(prepared.columns) - impossible
+    for number, what, why in (
+        (impossible, "impossible features", "have a part that the sensor cannot measure"),
+        (silent, "features", "do not depend on the pose"),
+    ):
+        if number:
+            omissions.append(Omission(what, f"{number} of {total} features {why}", f"{share(number, total)} of them"))
+    if known:
+        omissions.append(Omission("search", "correspondences are known", f"{count - 1} of {count} {name}"))
+    elif len(prepared.columns) and np.isfinite(prepared.radius).any():
+        spared = count - looked_at(prepared, buckets)
+        if spared >= 0.5:
+            why = f"beyond {prepared.radius.max():.3g} m of where features point densities are below eps of the rest"
+            omissions.append(Omission(f"far {name}", why, f"about {share(spared, count)} of {count} {name}"))
+    return omissions

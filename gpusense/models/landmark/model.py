@@ -18,13 +18,12 @@ from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.structs import Buckets, SensorView
-from gpusense.models.landmark.base import FeatureModel
+from gpusense.models.landmark.base import FeatureModel, parameter_omissions
 from gpusense.models.landmark.features import (
     PreparedFeatures,
     possible_features,
     prepare_features,
 )
-from gpusense.models.landmark.plan import parameter_omissions
 from gpusense.models.landmark.sampling import draw_features
 from gpusense.models.landmark.tables import describe, full_circle, upload_tables
 from gpusense.models.point.sampling import draws_at

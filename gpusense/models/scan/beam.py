@@ -14,12 +14,9 @@ from gpusense.backends import Selection
 from gpusense.backends.arrays import Result
 from gpusense.interface.plan import SceneNotes
 from gpusense.models.arguments import check_absent, check_discrete
-from gpusense.models.scan.beam_density import density_of
-from gpusense.models.scan.beam_explain import scene_notes
-from gpusense.models.scan.beam_pipeline import BeamPipeline
-from gpusense.models.scan.cones import cones_of, require_exact
-from gpusense.models.scan.map_caster import MapCaster
-from gpusense.models.scan.mixture import mixture_on_device
+from gpusense.models.scan.beam_pipeline import BeamPipeline, scene_notes
+from gpusense.models.scan.map_caster import MapCaster, cones_of, require_exact
+from gpusense.models.scan.mixture import density_of, mixture_on_device
 from gpusense.models.scan.model import ScanModel
 from gpusense.models.scan.rules import Beams
 from gpusense.models.scan.sampling import drawing_of, poses_to_draw_at

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from gpusense._util import checks, masks
+from gpusense._util import checks
 from gpusense.backends import arrays
 from gpusense.backends.arrays import Result
 from gpusense.models.scan.bound import BoundCall, RecordedCall
@@ -150,7 +150,7 @@ def _check_bound(poses: Any, ranges: Any) -> list[bool]:
 
 def _shape_of(name: str, value: Any, shape: tuple[int | str, ...]) -> tuple[int, ...]:
     """Return the shape of an array in host memory; each call reads its present numbers."""
-    actual = np.shape(cast(Any, arrays.to_host(masks.filled(value), name)))
+    actual = np.shape(cast(Any, arrays.to_host(checks.filled(value), name)))
     if len(actual) != len(shape) or any(isinstance(n, int) and n != m for n, m in zip(shape, actual, strict=True)):
         raise ValueError(f"{name}: shape must be {checks.shape_text(shape)}, got {checks.shape_text(actual)}")
     return actual

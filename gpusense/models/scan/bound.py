@@ -16,8 +16,7 @@ import numpy as np
 from gpusense.backends import arrays
 from gpusense.backends.arrays import Result
 from gpusense.backends.base import Adopted, Buffer
-from gpusense.backends.programs import ProgramCache, RecordedProgram
-from gpusense.backends.workspace import POSE_STATUS, Workspace
+from gpusense.backends.workspace import POSE_STATUS, ProgramCache, RecordedProgram, Workspace
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.launches import Program
 from gpusense.models.chunking import finish

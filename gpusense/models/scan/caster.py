@@ -14,8 +14,7 @@ from gpusense._util.typing import AnyArray, CasterName, Precision, Space
 from gpusense.backends import Selection, get_backend
 from gpusense.models.arguments import Pickled, check_scene, map_words, real_dtype
 from gpusense.models.poses import Poses
-from gpusense.models.scan.cones import Cones, require_exact
-from gpusense.models.scan.map_caster import MapCaster
+from gpusense.models.scan.map_caster import Cones, MapCaster, require_exact
 from gpusense.tables import casters
 from gpusense.tables.casters import Caster
 from gpusense.tables.worlds import Worlds

@@ -16,13 +16,12 @@ from gpusense._util import checks
 from gpusense._util.html import card, split_options
 from gpusense._util.typing import AnyArray, Compat, Precision
 from gpusense.backends import Selection, get_backend
-from gpusense.backends.programs import ProgramCache
-from gpusense.backends.workspace import Workspace
+from gpusense.backends.workspace import ProgramCache, Workspace
 from gpusense.interface.plan import Plan, SceneNotes
 from gpusense.models.arguments import Pickled, check_scene, map_words, real_dtype
 from gpusense.models.chunking import finish
 from gpusense.models.poses import Poses
-from gpusense.models.scan.differentiable import Differentiable, is_recorded, log_likelihood_of
+from gpusense.models.scan.field_gradient import Differentiable, is_recorded, log_likelihood_of
 from gpusense.models.scan.pipeline import Request, ScanPipeline, make_request
 from gpusense.models.scan.rules import Beams, BeamSelection, ModelContext, check_beams
 from gpusense.models.scan.savings import plan_of_call

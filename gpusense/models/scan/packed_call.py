@@ -16,8 +16,7 @@ import numpy as np
 
 from gpusense.backends import Backend, arrays
 from gpusense.backends.arrays import Result
-from gpusense.backends.programs import ProgramCache
-from gpusense.backends.workspace import Workspace
+from gpusense.backends.workspace import ProgramCache, Workspace
 from gpusense.models.poses import corners_of
 from gpusense.models.scan.bound import RecordedCall
 from gpusense.models.scan.pipeline import FLOATS, ScanPipeline

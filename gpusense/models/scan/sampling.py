@@ -16,7 +16,7 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Launch, launch
 from gpusense.interface.structs import MixtureTables, RangeScale
 from gpusense.models.poses import Poses
-from gpusense.models.scan.beam_density import BeamDensity
+from gpusense.models.scan.mixture import BeamDensity
 from gpusense.world.hit_shapes import HitShape, shape_of
 from gpusense.world.hit_tables import mass_table, quantile_table
 from gpusense.world.parameters import BeamParameters

@@ -8,8 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from gpusense.backends.programs import RecordedProgram
-from gpusense.backends.workspace import ChangingProgram, PartialResult, Workspace
+from gpusense.backends.workspace import ChangingProgram, PartialResult, RecordedProgram, Workspace
 from gpusense.models.chunking import Piece, chunk_of, run_pieces
 from gpusense.models.poses import Part, place
 from gpusense.models.scan.classed import ClassedScans

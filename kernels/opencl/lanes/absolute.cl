@@ -1,6 +1,6 @@
 // Densities of positions and headings for LANES particles at once: absolute.cl in lanes, with the functions of
 // lanes/math.
-// requires: lanes/offsets lanes/log_terms
+// requires: lanes/log_terms
 
 // in lanes: NEARBY SERIES VON_MISES WRAPS WAVES NEGLIGIBLE HALF_TURN HALF_TURN_LOW
 

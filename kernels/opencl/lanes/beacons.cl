@@ -1,6 +1,6 @@
 // Ranges to known beacons for LANES particles at once: beacons.cl in lanes, with the functions of lanes/math. Sums have
 // the order of the scalar kernel.
-// requires: lanes/offsets lanes/log_terms
+// requires: lanes/log_terms
 
 // in lanes: STUDENT_T TWO_NORMALS BEACON STEEPEST
 

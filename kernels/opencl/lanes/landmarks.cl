@@ -1,7 +1,7 @@
 // Density of one feature at one landmark for LANES particles at once: landmarks.cl in lanes. Every lane has the
 // arithmetic of the scalar kernel, except that exp, log and erf come from lanes/math, that the arc tangent has two arcs
 // only, 0 and pi/4, and that a fused multiply-add gives the rounding error of a product.
-// requires: landmarks lanes/offsets lanes/log_terms
+// requires: landmarks lanes/log_terms
 
 // tan(pi/8); pi/4, pi/2 and pi as sums of two numbers.
 #define EIGHTH_SLOPE 0.414213562f

@@ -62,3 +62,11 @@ void fit_scan(global const real4 *point, const int count, const int reach, const
               const real slack, const real width, const real gap, global real4 *line) {
     for (int k = 0; k < count; k += LANES) fit_block(point, count, k, reach, most, ratio, slack, width, gap, line);
 }
+
+// Fit lines to LANES points and at most MOST neighbours on either side.
+kernel void fit_lines(ARGUMENTS) {
+    const int begin = LANES * get_global_id(0), scan = which[get_global_id(1)];
+    const int first = start[scan], count = start[scan + 1] - first;
+    if (begin >= count) return;
+    fit_block(point + first, count, begin, reach, most, ratio, slack, width, gap, line + first);
+}

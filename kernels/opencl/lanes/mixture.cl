@@ -285,7 +285,7 @@ lanes log_of_parts_lanes(const DensityParts parts, global const MixtureTerms *te
 #endif
 
 #if CUBES
-// Return the densities to be cubed: compat_density of compat.cl.
+// Return the densities to be cubed: compat_density of mixture.cl.
 lanes compat_density_lanes(const lanes z, const lanes expected, global const MixtureTerms *terms) {
     const lanes off = z - expected;
     lanes p = terms->hit_peak * exp_lanes(-(off * (off * terms->square_scale)));

@@ -13,7 +13,7 @@ import pytest
 from support import fake_driver
 
 pytest.importorskip("pyopencl")
-from gpusense.backends.opencl import driver_files, drivers
+from gpusense.backends.opencl import drivers
 
 _CHOICE = drivers.choice
 
@@ -31,7 +31,7 @@ def machine(tmp_path, monkeypatch):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("GPUSENSE_PROOF", "off")
     monkeypatch.setenv("GPUSENSE_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(driver_files, "_SYSTEM", str(vendors))
+    monkeypatch.setattr(drivers, "_SYSTEM", str(vendors))
     monkeypatch.setattr(drivers.cl, "__file__", str(beside.parent / "__init__.py"))
     monkeypatch.setattr(drivers, "_choice", None)
     monkeypatch.setattr(drivers, "_loaded", False)
@@ -50,7 +50,7 @@ def intel(machine, monkeypatch):
         SimpleNamespace(name="readme", locate=lambda: machine),
         SimpleNamespace(name=library.name, locate=lambda: library),
     ]
-    monkeypatch.setattr(driver_files.importlib.metadata, "files", lambda name: files)
+    monkeypatch.setattr(drivers.importlib.metadata, "files", lambda name: files)
     return library
 
 
@@ -97,9 +97,9 @@ def test_half_a_wheel_is_none(machine, intel, monkeypatch, problem):
     if problem == "not installed":
 
         def absent(name):
-            raise driver_files.importlib.metadata.PackageNotFoundError(name)
+            raise drivers.importlib.metadata.PackageNotFoundError(name)
 
-        monkeypatch.setattr(driver_files.importlib.metadata, "files", absent)
+        monkeypatch.setattr(drivers.importlib.metadata, "files", absent)
     assert drivers.choice() == drivers.Choice(None)
 
 

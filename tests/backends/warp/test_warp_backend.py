@@ -134,12 +134,12 @@ def test_the_cache_can_be_switched_off(needs: Callable[[str], str], tmp_path: Pa
 @pytest.fixture
 def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
     """Return a launcher of the field's scores for three threads, and a function that runs a launcher on particles."""
-    from gpusense.backends import helpers
+    from gpusense.backends import processor
     from gpusense.backends.warp import backend as _warp
     from gpusense.backends.warp import pieces as _warp_pieces
 
-    monkeypatch.setattr(helpers, "threads", lambda: 3)
-    helpers.pool.cache_clear()
+    monkeypatch.setattr(processor, "threads", lambda: 3)
+    processor.pool.cache_clear()
     monkeypatch.setattr(_warp_pieces, "_PIECE_WORK", 50)
     rng = np.random.default_rng(0)
     particles, readings, rows, cols = 61, 20, 30, 40
@@ -169,7 +169,7 @@ def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
         return backend.download(log_p, found[0]), backend.download(parts, found[1])
 
     yield launch, run
-    helpers.pool.cache_clear()
+    processor.pool.cache_clear()
 
 
 @pytest.mark.parametrize("count", [1, 4, 5, 6, 60, 61])

@@ -11,7 +11,7 @@ import pytest
 from support.array_libraries import Recorded
 
 import gpusense as gs
-from gpusense.models.scan import differentiable
+from gpusense.models.scan import field_gradient
 
 SCANNER = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.2, count=20, range_max=6.0, mount=(0.3, -0.1, 0.4))
 RNG = np.random.default_rng(5)
@@ -73,7 +73,7 @@ def test_the_rule_multiplies_the_gradient_by_what_comes_from_above(monkeypatch):
 
 
 def test_models_without_a_gradient_refuse_recorded_poses():
-    assert not differentiable.is_recorded(POSES)
+    assert not field_gradient.is_recorded(POSES)
     for model in (field("nearest"), gs.BeamModel(GRID, SCANNER, backend="numpy")):
         with pytest.raises(TypeError, match=r"poses: must not require gradients"):
             model.log_likelihood(Recorded(POSES), RANGES)
@@ -126,7 +126,7 @@ def test_jax_maps_over_batches_of_poses():
 @pytest.mark.parametrize(("shape", "axes"), [((4, 3), 2), ((5, 4, 3), 2), ((5, 4, 3), 3), ((2, 5, 4, 3), 3)])
 def test_batches_of_poses_are_joined_and_split(shape, axes):
     poses = np.arange(np.prod(shape), dtype=float).reshape(shape)
-    joined, split = differentiable._batches(poses, axes)
+    joined, split = field_gradient._batches(poses, axes)
     # Poses of a scan stay with their scan.
     assert joined.shape == (*shape[-axes:-2], poses[..., 0].size // math.prod(shape[-axes:-2]), 3)
     if axes == 3:

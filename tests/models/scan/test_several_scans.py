@@ -10,7 +10,7 @@ import pytest
 from support.selection import on_every_backend
 
 import gpusense as gs
-from gpusense.backends import get_backend
+from gpusense.backends import get_backend, processor
 from gpusense.backends.proxy import Proxy
 from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
@@ -172,7 +172,6 @@ def test_scans_with_readings_share_one_set_of_launches(kind, gpu, as_gpu, monkey
 
 def test_threads_that_share_a_launch_find_each_particles_scan(needs, monkeypatch):
     """Pieces of a launch on Warp's processor begin and end within scans."""
-    from gpusense.backends import helpers
     from gpusense.backends.warp import pieces as _warp_pieces
 
     model = field()(backend=get_backend(needs("warp:cpu")))
@@ -181,7 +180,7 @@ def test_threads_that_share_a_launch_find_each_particles_scan(needs, monkeypatch
     cut: list[int] = []
     piece = _warp_pieces.SharedLaunch._piece
     monkeypatch.setattr(_warp_pieces, "_PIECE_WORK", 50)
-    monkeypatch.setattr(helpers, "threads", lambda: 5)
+    monkeypatch.setattr(processor, "threads", lambda: 5)
     monkeypatch.setattr(
         _warp_pieces.SharedLaunch, "_piece", lambda self, *given: cut.append(given[2]) or piece(self, *given)
     )

@@ -1,7 +1,7 @@
 """The table of backends: one entry and one folder for each.
 
 An entry holds the facts about a backend before its library is loaded. The module that it names holds ``LIBRARY``, of
-the class in ``library.py``, through which devices are listed, proved and opened. No other module names a backend.
+class :class:`Library`, through which devices are listed, proved and opened. No other module names a backend.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface import structs
 from gpusense.interface.constants import NEARBY, SERIES, VON_MISES, WAVES, WRAPS
 from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_sum
 from gpusense.reference.log_terms import bounded_square, either, log_one_plus
@@ -59,14 +58,7 @@ def log_waves(residual: Pair, waves: np.ndarray) -> np.ndarray:
     return log_one_plus(cosine * newer - older)
 
 
-def score_position(
-    flags: frozenset[str],
-    place: np.ndarray,
-    terms: structs.PositionTerms,
-    log_p: np.ndarray,
-    particles: int,
-    temperature: float,
-) -> None:
+def score_position(flags, place, terms, log_p, particles, temperature):
     """Score positions.
 
     The exponent is ``(x_scale x)^2 + (shear x + y_scale y)^2``, where (x, y) is the offset from the reading to the
@@ -85,10 +77,7 @@ def score_position(
     log_p[:particles] = temperature * log_density
 
 
-def score_heading(
-    flags: frozenset[str], residual: np.ndarray, terms: structs.HeadingTerms, waves: np.ndarray, log_p: np.ndarray,
-    particles: int, kind: int, temperature: float,
-) -> None:  # fmt: skip
+def score_heading(flags, residual, terms, waves, log_p, particles, kind, temperature):
     """Score headings; residuals are headings minus the reading, in [-pi, pi]."""
     r = residual[:particles, 0], residual[:particles, 1]
     scale = terms.scale, terms.scale_low

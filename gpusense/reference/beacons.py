@@ -71,10 +71,7 @@ def log_range(
     return either(log_p, terms.random) if "RAND" in flags else log_p
 
 
-def score_beacons(
-    flags: frozenset[str], place: np.ndarray, beacon: np.ndarray, terms: structs.BeaconTerms, series: np.ndarray,
-    log_p: np.ndarray, particles: int, beacons: int, count: int, kind: int, temperature: float,
-) -> None:  # fmt: skip
+def score_beacons(flags, place, beacon, terms, series, log_p, particles, beacons, count, kind, temperature):
     """Sum log p of ranges over beacons; the first ``count`` numbers of the series belong to a t."""
     sensor = place[:particles, 0], place[:particles, 1], place[:particles, 2], place[:particles, 3]
     zero = np.zeros(particles, place.dtype)

@@ -79,13 +79,10 @@ def readings_of_scan(
 
 
 def score_beams(
-    flags: frozenset[str], map_table: np.ndarray, world: np.ndarray, shapes: np.ndarray, normals: np.ndarray, pose_cell:
-    np.ndarray, pose: np.ndarray, ray: np.ndarray, first: np.ndarray, reading: np.ndarray, terms: structs.MixtureTerms,
-    masses: np.ndarray, edges: np.ndarray, sensor: np.ndarray, start: np.ndarray, constant_terms: np.ndarray, log_p:
-    np.ndarray, parts: np.ndarray, window: structs.Window, particles: int, rays: int, readings: int, tables:
-    structs.MixtureTables, cone: structs.Cone, caster: structs.Caster, scale: structs.RangeScale, crowd: structs.Crowd,
-    score: structs.Score, batch: structs.ScanBatch,
-) -> None:  # fmt: skip
+    flags, map_table, world, shapes, normals, pose_cell, pose, ray, first, reading, terms, masses, edges, sensor,
+    start, constant_terms, log_p, parts, window, particles, rays, readings, tables, cone, caster, scale, crowd,
+    score, batch,
+):  # fmt: skip
     """Score scans; ray r has the readings first[r] to first[r + 1] - 1, and ``score`` has the constant term.
 
     SCANS: the rays of a scan begin at start[scan]; where rays are shared, first counts the readings of all scans.
@@ -125,13 +122,9 @@ def score_beams(
 
 
 def beam_tiles(
-    flags: frozenset[str], map_table: np.ndarray, world: np.ndarray, shapes: np.ndarray, normals: np.ndarray, pose_cell:
-    np.ndarray, pose: np.ndarray, order: np.ndarray, ray: np.ndarray, first: np.ndarray, reading: np.ndarray, terms:
-    structs.MixtureTerms, masses: np.ndarray, edges: np.ndarray, sensor: np.ndarray, start: np.ndarray, parts:
-    np.ndarray, window: structs.Window, particles: int, rays: int, readings: int, tables: structs.MixtureTables, cone:
-    structs.Cone, caster: structs.Caster, scale: structs.RangeScale, crowd: structs.Crowd, spread: int, batch:
-    structs.ScanBatch,
-) -> None:  # fmt: skip
+    flags, map_table, world, shapes, normals, pose_cell, pose, order, ray, first, reading, terms, masses, edges,
+    sensor, start, parts, window, particles, rays, readings, tables, cone, caster, scale, crowd, spread, batch,
+):  # fmt: skip
     """Write the term of reading k to parts[place + k * particles]; GPUs do so in tiles of particles and rays.
 
     STRANDED: the number at place k is the sum of strand k.

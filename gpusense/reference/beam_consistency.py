@@ -133,10 +133,7 @@ def deviations_of(estimate: np.ndarray) -> tuple[float, float]:
     return math.sqrt((xx + yy) / 2 + math.sqrt(half_apart * half_apart + xy * xy)), math.sqrt(tt)
 
 
-def judge_beams(
-    flags: frozenset[str], cells: np.ndarray, estimate: np.ndarray, scan: np.ndarray, judged: np.ndarray,
-    frame: structs.Frame, rules: structs.BeamRules, rows: int, cols: int, beams: int,
-) -> None:  # fmt: skip
+def judge_beams(flags, cells, estimate, scan, judged, frame, rules, rows, cols, beams):
     """Judge the beams of an estimated pose.
 
     The scan has their directions relative to the heading, in the map's frame, then their readings (NaN for no beam).

@@ -130,10 +130,7 @@ def fit_circle(mine: np.ndarray, edge: np.ndarray, sigma: float) -> np.ndarray:
     return np.array([*circle, sums[0], *sums[4:10]])
 
 
-def fit_circles(
-    flags: frozenset[str], point: np.ndarray, start: np.ndarray, noise: np.ndarray, part: np.ndarray, scan: np.ndarray,
-    edge: np.ndarray, circle: np.ndarray, scans: int, points: int, parts: int,
-) -> None:  # fmt: skip
+def fit_circles(flags, point, start, noise, part, scan, edge, circle, scans, points, parts):
     """Fit circles to parts of scans, of a first point and a number of points.
 
     Edges are the bearings of the right and the left edge and their deviations; a deviation of 0 marks an edge that is

@@ -61,10 +61,9 @@ def log_bump(squared: np.ndarray, pressed: int, terms: structs.ContactTerms) -> 
 
 
 def score_contact(
-    flags: frozenset[str], table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
-    point: np.ndarray, point_low: np.ndarray, start: np.ndarray, pressed: np.ndarray, terms: structs.ContactTerms,
-    log_p: np.ndarray, window: structs.Window, particles: int, segments: int, guard: float, temperature: float,
-) -> None:  # fmt: skip
+    flags, table, pose_cell, pose, pose_low, point, point_low, start, pressed, terms, log_p, window, particles,
+    segments, guard, temperature,
+):  # fmt: skip
     """Sum log p over segments; segment s has the points start[s] to start[s + 1] - 1."""
     total = np.zeros(particles, point.dtype)
     sensor_pose, low = pose[:particles, None], pose_low[: particles if "TWO_PART_POINTS" in flags else 1, None]

@@ -26,10 +26,7 @@ def _lines(array: np.ndarray, lines: int, length: int, line_stride: int, step: i
     return np.lib.stride_tricks.as_strided(array, (lines, length), (line_stride * size, step * size))
 
 
-def distance_lines(
-    flags: frozenset[str], occupied: np.ndarray, along: np.ndarray, lines: int, length: int, line_stride: int,
-    step: int,
-) -> None:  # fmt: skip
+def distance_lines(flags, occupied, along, lines, length, line_stride, step):
     """Count the cells to the nearest occupied cell of the same line, NO_OBSTACLE without one (first pass)."""
     cells = _lines(occupied, lines, length, line_stride, step)
     index = np.arange(length, dtype=np.int32)
@@ -40,10 +37,7 @@ def distance_lines(
     _lines(along, lines, length, line_stride, step)[...] = np.where(nearest < length, nearest, NO_OBSTACLE)
 
 
-def distance_envelope(
-    flags: frozenset[str], along: np.ndarray, starts: np.ndarray, squared: np.ndarray, lines: int, length: int,
-    line_stride: int, step: int,
-) -> None:  # fmt: skip
+def distance_envelope(flags, along, starts, squared, lines, length, line_stride, step):
     """Find the lowest parabola of a line at each of its cells (second pass)."""
     across = _lines(along, lines, length, line_stride, step)
     out = _lines(squared, lines, length, line_stride, step)
@@ -64,18 +58,14 @@ def _lowest(start: np.ndarray) -> np.ndarray:
     return np.minimum(best, np.uint32(UNREACHABLE)).astype(np.int32)
 
 
-def distance_bits(
-    flags: frozenset[str], bits: np.ndarray, nearest: np.ndarray, rows: int, cols: int, words: int, reach: int
-) -> None:
+def distance_bits(flags, bits, nearest, rows, cols, words, reach):
     """Count the cells to the nearest occupied cell of the same row, FAR_CELLS where it is over reach (first pass)."""
     cells = unpacked(bits, rows, cols, words)
     nearest_cells = np.minimum(cells_left(cells), cells_right(cells))
     nearest[: rows * cols] = np.where(nearest_cells > reach, FAR_CELLS, nearest_cells).ravel()
 
 
-def distance_blocks(
-    flags: frozenset[str], nearest: np.ndarray, blocks: np.ndarray, rows: int, cols: int, count: int
-) -> None:
+def distance_blocks(flags, nearest, blocks, rows, cols, count):
     """Find the minimum of each column of a block of rows."""
     least = np.minimum.reduceat(nearest[: rows * cols].reshape(rows, cols), np.arange(count) * BLOCK_ROWS, axis=0)
     blocks[: count * cols] = least.ravel()
@@ -86,10 +76,7 @@ def squares_sum(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a * a + b * b
 
 
-def distance_search(
-    flags: frozenset[str], nearest: np.ndarray, blocks: np.ndarray, squared: np.ndarray, rows: int, cols: int,
-    count: int, most: int,
-) -> None:  # fmt: skip
+def distance_search(flags, nearest, blocks, squared, rows, cols, count, most):
     """Find the least sum of squares along each column, UNREACHABLE where it is over most (second pass)."""
     columns = nearest[: rows * cols].reshape(rows, cols).astype(np.uint32).T
     out = squared[: rows * cols].reshape(rows, cols)
@@ -100,9 +87,8 @@ def distance_search(
 
 
 def fill_field(
-    flags: frozenset[str], squared: np.ndarray, density: np.ndarray, table: np.ndarray, rows: int, cols: int, cap: int,
-    beyond: float, from_col: int, from_row: int, width: int, height: int, begin: int, stride: int,
-) -> None:  # fmt: skip
+    flags, squared, density, table, rows, cols, cap, beyond, from_col, from_row, width, height, begin, stride,
+):  # fmt: skip
     """Fill cells of a field's table from squared distances; density has a value for each one up to the cap.
 
     There are height x width cells, which begin at index begin of the table and at cell (from_row, from_col) of the

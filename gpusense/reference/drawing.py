@@ -25,10 +25,7 @@ from gpusense.reference.draws import (
 )
 
 
-def count_copies(
-    flags: frozenset[str], ends: np.ndarray, state: np.ndarray, sums: np.ndarray, particles: int, block: int,
-    blocks: int, drawn: int, stage: int,
-) -> None:  # fmt: skip
+def count_copies(flags, ends, state, sums, particles, block, blocks, drawn, stage):
     """Count the deterministic copies of each block; the other columns are 0."""
     copies = copies_of(ends[:particles], state[stage * STAGE + TOTAL], drawn)
     table = sums[: blocks * WEIGHT_SUMS].reshape(blocks, WEIGHT_SUMS)
@@ -36,19 +33,12 @@ def count_copies(
     table[:, 0] = np.add.reduceat(copies, np.arange(0, particles, block))
 
 
-def set_copies(
-    flags: frozenset[str], ends: np.ndarray, state: np.ndarray, sums: np.ndarray, joined: np.ndarray,
-    copies: np.ndarray, particles: int, block: int, blocks: int, fan: int, drawn: int, stage: int,
-) -> None:  # fmt: skip
+def set_copies(flags, ends, state, sums, joined, copies, particles, block, blocks, fan, drawn, stage):
     """Set the cumulative numbers of deterministic copies."""
     copies[:particles] = np.cumsum(copies_of(ends[:particles], state[stage * STAGE + TOTAL], drawn))
 
 
-def draw_particles(
-    flags: frozenset[str], source: np.ndarray, weight: np.ndarray, ends: np.ndarray, copies: np.ndarray,
-    settings: np.ndarray, state: np.ndarray, pool: np.ndarray, target: np.ndarray, after: np.ndarray, particles: int,
-    drawn: int, stage: int,
-) -> None:  # fmt: skip
+def draw_particles(flags, source, weight, ends, copies, settings, state, pool, target, after, particles, drawn, stage):
     """Draw the particles of the next stage or step, or copy them where no resampling is due."""
     n, own = np.arange(drawn), state[stage * STAGE : (stage + 1) * STAGE]
     if is_copied(own, particles, drawn):

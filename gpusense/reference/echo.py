@@ -101,11 +101,9 @@ def nearest_echo(
 
 
 def cast_echoes(
-    flags: frozenset[str], map_table: np.ndarray, world: np.ndarray, shapes: np.ndarray, normals: np.ndarray,
-    pose_cell: np.ndarray, pose: np.ndarray, ray: np.ndarray, ranges: np.ndarray, incidence: np.ndarray,
-    window: structs.Window, particles: int, rays: int, cone: structs.Cone, caster: structs.Caster,
-    scale: structs.RangeScale, crowd: structs.Crowd,
-) -> None:  # fmt: skip
+    flags, map_table, world, shapes, normals, pose_cell, pose, ray, ranges, incidence, window, particles, rays,
+    cone, caster, scale, crowd,
+):  # fmt: skip
     """Cast the cones of all particles to expected ranges and angles of incidence, NaN without a return.
 
     With COSINES, cosines replace the angles; 2 without a return.

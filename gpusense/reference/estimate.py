@@ -18,10 +18,7 @@ from gpusense.reference.heading import cos_sin
 from gpusense.reference.motion import wrap_once
 
 
-def sum_poses(
-    flags: frozenset[str], poses: np.ndarray, weight: np.ndarray, estimate: np.ndarray, sums: np.ndarray,
-    particles: int, block: int, lanes: int, second_pass: int,
-) -> None:  # fmt: skip
+def sum_poses(flags, poses, weight, estimate, sums, particles, block, lanes, second_pass):
     """Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings or far poses.
 
     A row of sums takes ``lanes`` lanes of a block.
@@ -46,9 +43,7 @@ def sum_poses(
             rows[:, k] = np.cumsum(np.cumsum(padded, axis=0)[-1].reshape(each, lanes), axis=1)[:, -1]
 
 
-def finish_estimate(
-    flags: frozenset[str], poses: np.ndarray, sums: np.ndarray, estimate: np.ndarray, groups: int, second_pass: int
-) -> None:
+def finish_estimate(flags, poses, sums, estimate, groups, second_pass):
     """Write the mean pose, its covariance, and whether headings require a second pass; or write the second pass."""
     total = np.cumsum(sums[: groups * ESTIMATE_SUMS].reshape(groups, ESTIMATE_SUMS), axis=0)[-1]
     weight = total[0] if total[0] > 0.0 else 1.0
@@ -66,8 +61,6 @@ def finish_estimate(
     estimate[8] = total[11] / weight - mean * (2.0 * angle - mean)
 
 
-def normalize_weights(
-    flags: frozenset[str], weight: np.ndarray, estimate: np.ndarray, share: np.ndarray, particles: int
-) -> None:
+def normalize_weights(flags, weight, estimate, share, particles):
     """Divide weights by their sum, which the estimate holds."""
     share[:particles] = weight[:particles] / estimate[9]

@@ -19,11 +19,9 @@ BLOCK = 1 << 18
 
 
 def score_field(
-    flags: frozenset[str], table: np.ndarray, world: np.ndarray, shapes: np.ndarray, pose_cell: np.ndarray,
-    pose: np.ndarray, pose_low: np.ndarray, point: np.ndarray, point_low: np.ndarray, terms: structs.FieldTerms,
-    start: np.ndarray, constant_terms: np.ndarray, log_p: np.ndarray, parts: np.ndarray, window: structs.Window,
-    particles: int, readings: int, guard: float, score: structs.Score, batch: structs.ScanBatch, crowd: structs.Crowd,
-) -> None:  # fmt: skip
+    flags, table, world, shapes, pose_cell, pose, pose_low, point, point_low, terms, start, constant_terms, log_p,
+    parts, window, particles, readings, guard, score, batch, crowd,
+):  # fmt: skip
     """Score scans; the table holds log densities, or capped distances in metres where it is interpolated."""
     if "SCANS" in flags:
         for scan, part in particles_of_scans(particles, batch):
@@ -64,11 +62,9 @@ def score_field(
 
 
 def field_blocks(
-    flags: frozenset[str], table: np.ndarray, world: np.ndarray, shapes: np.ndarray, pose_cell: np.ndarray,
-    pose: np.ndarray, pose_low: np.ndarray, point: np.ndarray, point_low: np.ndarray, terms: structs.FieldTerms,
-    guard: np.ndarray, start: np.ndarray, parts: np.ndarray, window: structs.Window, particles: int, readings: int,
-    spread: int, batch: structs.ScanBatch, crowd: structs.Crowd,
-) -> None:  # fmt: skip
+    flags, table, world, shapes, pose_cell, pose, pose_low, point, point_low, terms, guard, start, parts, window,
+    particles, readings, spread, batch, crowd,
+):  # fmt: skip
     """Write the sums of blocks of readings to parts[n + block * particles]; on GPUs a work-item takes single blocks."""
     if "SCANS" in flags:
         for scan, part in particles_of_scans(particles, batch):

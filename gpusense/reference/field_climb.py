@@ -31,10 +31,7 @@ def damped_step(climb: np.ndarray) -> np.ndarray:
     return limited
 
 
-def climb_step(
-    flags: frozenset[str], gradient: np.ndarray, poses: np.ndarray, climb: np.ndarray, scans: int, parts: int,
-    most: int, small: float, yaw_cos: float, yaw_sin: float,
-) -> None:  # fmt: skip
+def climb_step(flags, gradient, poses, climb, scans, parts, most, small, yaw_cos, yaw_sin):
     """Judge the poses that were evaluated, numbers in the grid's frame, and take the next step of each climb."""
     everyone, pose = climb[: CLIMB * scans].reshape(scans, CLIMB), poses[: 3 * parts * scans].reshape(scans, parts, 3)
     rows = np.flatnonzero(everyone[:, ENDED] == 0)

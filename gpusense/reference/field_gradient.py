@@ -45,11 +45,9 @@ def distance_slope(
 
 
 def field_gradient(
-    flags: frozenset[str], table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
-    point: np.ndarray, point_low: np.ndarray, terms: structs.FieldTerms, start: np.ndarray, constant_terms: np.ndarray,
-    gradient: np.ndarray, window: structs.Window, particles: int, readings: int, guard: float, mount_x: float,
-    mount_y: float, resolution: float, score: structs.Score, batch: structs.ScanBatch,
-) -> None:  # fmt: skip
+    flags, table, pose_cell, pose, pose_low, point, point_low, terms, start, constant_terms, gradient, window,
+    particles, readings, guard, mount_x, mount_y, resolution, score, batch,
+):  # fmt: skip
     """Write log p, its gradient (3) and the information (9) of poses in the grid's frame, each times the temperature.
 
     ``mount_x`` and ``mount_y`` are the sensor's place on the robot in cells.

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from gpusense.interface.constants import MATCH_RESULT, MATCH_RULES
 from gpusense.reference.icp_match import match_in_turns, rules_of
 
 
 def match_scans(
-    flags: frozenset[str], point: np.ndarray, start: np.ndarray, line: np.ndarray, pair: np.ndarray, guess: np.ndarray,
-    rules: np.ndarray, result: np.ndarray, scans: int, points: int, pairs: int, starts: int, levels: int,
-    turns: int, far: float, far_turn: float,
-) -> None:  # fmt: skip
+    flags, point, start, line, pair, guess, rules, result, scans, points, pairs, starts, levels, turns, far,
+    far_turn,
+):  # fmt: skip
     """Match pairs of scans (reference, second scan, level of its rules) from guesses (x, y, theta).
 
     A guess is the pose of the second scan in the reference's frame. ``one_way`` excludes the reference's points from

@@ -3,8 +3,8 @@
 The nearest point is exact. The points of a scan are sorted by bearing: kernels search outwards from the bearing of a
 place, until no point farther in bearing can be nearer. The reference compares all points.
 
-Lines: see line_fit.py, and Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the scale
-shrinks, then Geman and McClure's, ``(1 / (1 + (e / c)^2))^2``.
+Lines: see line_fit.py, and Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the
+scale shrinks, then Geman and McClure's, ``(1 / (1 + (e / c)^2))^2``.
 """
 
 from __future__ import annotations

@@ -13,7 +13,6 @@ import itertools
 
 import numpy as np
 
-from gpusense.interface import structs
 from gpusense.interface.feature_layout import FALSE_POSITIVE, FEATURE, GROUP, RADIUS
 from gpusense.reference.landmark_grid import log_match, may_match
 from gpusense.reference.landmarks import direction, sensor_place
@@ -65,11 +64,9 @@ def best_set(sums: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def joint_features(
-    flags: frozenset[str], landmark: np.ndarray, normal: np.ndarray, signature: np.ndarray, pose_cell: np.ndarray,
-    pose: np.ndarray, pose_low: np.ndarray, feature: np.ndarray, terms: structs.FeatureTerms, arcs: np.ndarray,
-    best: np.ndarray, choice: np.ndarray, value: np.ndarray, log_p: np.ndarray, parts: np.ndarray, which: np.ndarray,
-    landmarks: int, particles: int, features: int, sets: int, buckets: structs.Buckets, score: structs.Score,
-) -> None:  # fmt: skip
+    flags, landmark, normal, signature, pose_cell, pose, pose_low, feature, terms, arcs, best, choice, value, log_p,
+    parts, which, landmarks, particles, features, sets, buckets, score,
+):  # fmt: skip
     """Find the best joint association of each particle.
 
     ``choice[s]`` has the landmark of each feature of set s, and ``value[s]`` its log p; ``sets`` is 2^features.

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface import structs
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.feature_layout import FALSE_POSITIVE, FEATURE
 from gpusense.reference.error_free import add_term
@@ -20,11 +19,9 @@ BLOCK = 1 << 14
 
 
 def score_features(
-    flags: frozenset[str], landmark: np.ndarray, normal: np.ndarray, signature: np.ndarray, start: np.ndarray,
-    pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray, feature: np.ndarray, partner: np.ndarray,
-    terms: structs.FeatureTerms, arcs: np.ndarray, log_p: np.ndarray, parts: np.ndarray, which: np.ndarray,
-    buckets: structs.Buckets, landmarks: int, particles: int, features: int, share: float, score: structs.Score,
-) -> None:  # fmt: skip
+    flags, landmark, normal, signature, start, pose_cell, pose, pose_low, feature, partner, terms, arcs, log_p,
+    parts, which, buckets, landmarks, particles, features, share, score,
+):  # fmt: skip
     """Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one.
 
     PER_BEAM: ``parts`` receives the term of each feature, and ``which`` the index of its likeliest landmark, -1 if a
@@ -67,11 +64,7 @@ def in_view(off: Quad, cosine: np.ndarray, sine: np.ndarray, range_max: float, l
     return (d <= range_max) & (cosine * off[0] + sine * off[2] >= least * d)
 
 
-def count_unseen(
-    flags: frozenset[str], landmark: np.ndarray, start: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
-    pose_low: np.ndarray, which: np.ndarray, log_p: np.ndarray, buckets: structs.Buckets, particles: int, features: int,
-    view: structs.SensorView,
-) -> None:  # fmt: skip
+def count_unseen(flags, landmark, start, pose_cell, pose, pose_low, which, log_p, buckets, particles, features, view):
     """Add ``log_missed`` to log_p for every landmark in view that belongs to no feature."""
     block = max(BLOCK_PAIRS // max(int(start[buckets.rows * buckets.cols]), 1), 1)
     for begin in range(0, particles, block):

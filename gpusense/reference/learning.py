@@ -119,11 +119,7 @@ def add_pair(
         sums[j] += np.where(np.isnan(z), 0, term)
 
 
-def e_step(
-    flags: frozenset[str], reading: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms,
-    masses: np.ndarray, sums: np.ndarray, blocks: int,
-    readings: int, across: int, along: int, width: int,
-) -> None:  # fmt: skip
+def e_step(flags, reading, expected, terms, masses, sums, blocks, readings, across, along, width):
     """Sum over blocks of pairs; pair k of a block is pair block * across + k * along."""
     count = 39 if "INFORMATION" in flags else 13
     total = (np.zeros((count, blocks), reading.dtype), np.zeros((count, blocks), reading.dtype))
@@ -137,11 +133,7 @@ def e_step(
     sums[: blocks * width].reshape(blocks, width)[:, :count] = (total[0] + total[1]).T
 
 
-def pair_causes(
-    flags: frozenset[str], reading: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms,
-    masses: np.ndarray, causes: np.ndarray,
-    blocks: int, readings: int, across: int, along: int,
-) -> None:  # fmt: skip
+def pair_causes(flags, reading, expected, terms, masses, causes, blocks, readings, across, along):
     """Write log p and the responsibilities of each pair, NaN for padding."""
     starts = np.arange(blocks) * across
     for k in range(readings):

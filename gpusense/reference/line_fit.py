@@ -61,10 +61,7 @@ def fit_scan(
     return line_through(point, sums, size)
 
 
-def fit_lines(
-    flags: frozenset[str], point: np.ndarray, start: np.ndarray, which: np.ndarray, line: np.ndarray, scans: int,
-    points: int, chosen: int, reach: int, most: int, ratio: float, slack: float, width: float, gap: float,
-) -> None:  # fmt: skip
+def fit_lines(flags, point, start, which, line, scans, points, chosen, reach, most, ratio, slack, width, gap):
     """Fit a line to each point of the chosen scans and ``reach`` neighbours on either side.
 
     Up to ``most`` neighbours within a distance of ``width`` take part. Each lies within ``slack`` plus ``ratio`` times

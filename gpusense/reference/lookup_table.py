@@ -10,10 +10,7 @@ from gpusense.reference.raycast import cast_ray
 BLOCK = 1 << 15
 
 
-def fill_lookup(
-    flags: frozenset[str], rectangles: np.ndarray, ray: np.ndarray, lookup: np.ndarray, window: structs.Window,
-    bins: int, first_row: int, count: int, limit: float,
-) -> None:  # fmt: skip
+def fill_lookup(flags, rectangles, ray, lookup, window, bins, first_row, count, limit):
     """Fill rows of the table; a hit is at most 65 534, and 65 535 means no hit."""
     real = ray.dtype.type
     block = max(BLOCK // bins, 1)

@@ -42,9 +42,7 @@ def wrap_any(theta: np.ndarray) -> np.ndarray:
     return wrapped
 
 
-def move_particles(
-    flags: frozenset[str], source: np.ndarray, settings: np.ndarray, target: np.ndarray, particles: int, kind: int
-) -> None:
+def move_particles(flags, source, settings, target, particles, kind):
     """Move particles from ``source`` to ``target``, which may be the same array."""
     n = np.arange(particles)
     zero = np.zeros(particles, np.uint64)

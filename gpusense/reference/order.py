@@ -24,9 +24,7 @@ def relative_turn(pose: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.where(2 * whole > TURN, whole - TURN, whole)
 
 
-def order_bounds(
-    flags: frozenset[str], pose_cell: np.ndarray, pose: np.ndarray, bounds: np.ndarray, bins: np.ndarray, particles: int
-) -> None:
+def order_bounds(flags, pose_cell, pose, bounds, bins, particles):
     """Clear the bins; bounds become the negated smallest and the largest row, column and heading."""
     bins[:ALL_BINS] = 0
     sample = np.arange(SAMPLES) * particles // SAMPLES
@@ -43,10 +41,7 @@ def part_of(value: np.ndarray, least: int, most: int, real: np.dtype) -> np.ndar
     return np.clip(part.astype(np.int64), 0, BINS - 1)
 
 
-def order_count(
-    flags: frozenset[str], pose_cell: np.ndarray, pose: np.ndarray, bounds: np.ndarray, bins: np.ndarray,
-    bin_of: np.ndarray, particles: int,
-) -> None:  # fmt: skip
+def order_count(flags, pose_cell, pose, bounds, bins, bin_of, particles):
     """Find the bin of each particle, and count it there."""
     turn = relative_turn(pose[:particles], pose[0])
     values = (pose_cell[:particles, 1], pose_cell[:particles, 0], turn)
@@ -57,13 +52,13 @@ def order_count(
     bins[:ALL_BINS] += np.bincount(bin_of[:particles], minlength=ALL_BINS).astype(np.int32)
 
 
-def order_starts(flags: frozenset[str], bounds: np.ndarray, bins: np.ndarray) -> None:
+def order_starts(flags, bounds, bins):
     """Replace the counts of bins by the indices at which they begin."""
     counts = bins[:ALL_BINS].copy()
     bins[:ALL_BINS] = np.cumsum(counts) - counts
     bounds[6] = counts.sum()
 
 
-def order_fill(flags: frozenset[str], bin_of: np.ndarray, bins: np.ndarray, order: np.ndarray, particles: int) -> None:
+def order_fill(flags, bin_of, bins, order, particles):
     """Put each particle at the next index of its bin."""
     order[:particles] = np.argsort(bin_of[:particles], kind="stable")

@@ -65,10 +65,7 @@ def place_pose(
             pose_low[:, column] = exact[column] - rounded[column]
 
 
-def place_poses(
-    flags: frozenset[str], poses: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
-    pose_status: np.ndarray, frame: structs.Frame, window: structs.Window, particles: int,
-) -> None:  # fmt: skip
+def place_poses(flags, poses, pose_cell, pose, pose_low, pose_status, frame, window, particles):
     """Place all poses, a block of them at a time."""
     all_poses = poses.reshape(-1)[: 3 * particles].reshape(-1, 3)
     for begin in range(0, particles, BLOCK):
@@ -76,9 +73,7 @@ def place_poses(
         place_pose(flags, all_poses[block], pose_cell[block], pose[block], pose_low[block], pose_status, frame, window)
 
 
-def bound_numbers(
-    flags: frozenset[str], number: np.ndarray, bounds: np.ndarray, count: int, apart: int, items: int
-) -> None:
+def bound_numbers(flags, number, bounds, count, apart, items):
     """Write the least of some numbers, and the largest of the numbers that lie apart from them; NaN remains.
 
     Work-item ``i`` takes every ``items``-th number from ``i`` on; ``items`` is a multiple of three, so that each sees

@@ -41,10 +41,8 @@ def cast_in_worlds(
 
 
 def cast_ranges(
-    flags: frozenset[str], map_table: np.ndarray, world: np.ndarray, shapes: np.ndarray, pose_cell: np.ndarray,
-    pose: np.ndarray, ray: np.ndarray, ranges: np.ndarray, window: structs.Window, particles: int, rays: int,
-    caster: structs.Caster, scale: structs.RangeScale, crowd: structs.Crowd,
-) -> None:  # fmt: skip
+    flags, map_table, world, shapes, pose_cell, pose, ray, ranges, window, particles, rays, caster, scale, crowd,
+):  # fmt: skip
     """Cast all rays of all particles."""
     block = max(BLOCK // max(rays, 1), 1)
     for first in range(0, particles, block):
@@ -60,10 +58,9 @@ def cast_ranges(
 
 
 def cast_tiles(
-    flags: frozenset[str], map_table: np.ndarray, world: np.ndarray, shapes: np.ndarray, pose_cell: np.ndarray,
-    pose: np.ndarray, order: np.ndarray, ray: np.ndarray, ranges: np.ndarray, window: structs.Window, particles: int,
-    rays: int, caster: structs.Caster, scale: structs.RangeScale, crowd: structs.Crowd, spread: int,
-) -> None:  # fmt: skip
+    flags, map_table, world, shapes, pose_cell, pose, order, ray, ranges, window, particles, rays, caster, scale,
+    crowd, spread,
+):  # fmt: skip
     """Cast all rays of all particles; GPUs do so in tiles of particles and rays."""
     cast_ranges(
         flags, map_table, world, shapes, pose_cell, pose, ray, ranges, window, particles, rays, caster, scale, crowd

@@ -41,10 +41,7 @@ def crossed_before(
     return np.where(room < 0, 0, room // (UNIT * np.maximum(other, 1)) + 1)
 
 
-def count_rays(
-    flags: frozenset[str], start_cell: np.ndarray, start_inside: np.ndarray, end_cell: np.ndarray,
-    end_inside: np.ndarray, hit: np.ndarray, hits: np.ndarray, misses: np.ndarray, rows: int, cols: int, rays: int,
-) -> None:  # fmt: skip
+def count_rays(flags, start_cell, start_inside, end_cell, end_inside, hit, hits, misses, rows, cols, rays):
     """Add the cells of rays to the counts; cells outside the grid are left out."""
     # Axes first: a column of numbers is contiguous.
     cell, begin = start_cell[:rays].T.astype(np.int64), start_inside[:rays].T.astype(np.int64)

@@ -59,9 +59,7 @@ def slope(sectors: int, sector: int) -> tuple[int, int]:
     return {1: [(1, 1)], 2: [(5, 12), (12, 5)], 4: [(1, 5), (2, 3), (3, 2), (5, 1)]}[sectors][sector]
 
 
-def free_columns(
-    flags: frozenset[str], occupied: np.ndarray, runs: np.ndarray, band: int, cols: int, begin: int, end: int
-) -> None:
+def free_columns(flags, occupied, runs, band, cols, begin, end):
     """Count the free cells along columns of the band, to larger rows (first plane) or smaller rows (second plane)."""
     cells = occupied[: band * cols].reshape(band, cols)[:, begin:end].astype(bool)
     up, down = _runs(np.ascontiguousarray(cells.T))
@@ -116,9 +114,8 @@ def _quadrants(
 
 
 def rectangles_rows(
-    flags: frozenset[str], runs: np.ndarray, place: np.ndarray, stack: np.ndarray, rectangles: np.ndarray, rows: int,
-    cols: int, sectors: int, first: int, band: int, top: int, left: int, bottom: int, right: int, worlds: int,
-) -> None:  # fmt: skip
+    flags, runs, place, stack, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds,
+):  # fmt: skip
     """Find the widest rectangles of sufficient height along rows, from free cells in columns."""
     if worlds > 1:
         lines = runs[: 2 * band * worlds * cols].reshape(2 * band, worlds, cols)
@@ -142,9 +139,7 @@ def rectangles_rows(
             reached_part[sector] = np.maximum(wide + 256 * high, OCCUPIED)[:, part]
 
 
-def free_rows(
-    flags: frozenset[str], bits: np.ndarray, runs: np.ndarray, band: int, cols: int, words: int, begin: int, end: int
-) -> None:
+def free_rows(flags, bits, runs, band, cols, words, begin, end):
     """Count the free cells along rows, to the right (first plane) and to the left (second plane)."""
     out = runs[: 2 * band * cols].reshape(2, band, cols)
     for direction, run in enumerate(_runs(unpacked(bits, band, cols, words))):
@@ -152,10 +147,9 @@ def free_rows(
 
 
 def rectangles_scan(
-    flags: frozenset[str], runs: np.ndarray, place: np.ndarray, rectangles: np.ndarray, rows: int, cols: int,
-    sectors: int, first: int, band: int, top: int, left: int, bottom: int, right: int, worlds: int, lines: int,
-    group: int,
-) -> None:  # fmt: skip
+    flags, runs, place, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds, lines,
+    group,
+):  # fmt: skip
     """Find the highest rectangles of sufficient width along columns, from free cells in rows."""
     if worlds > 1:
         rows_of = runs[: 2 * band * worlds * cols].reshape(2 * band, worlds, cols)

@@ -34,10 +34,7 @@ def rounded_place(at: Pair, real: np.dtype) -> Pair:
     return rounded, ((high - rounded.astype(np.float64)) + low).astype(real)
 
 
-def place_relative(
-    flags: frozenset[str], poses: np.ndarray, place: np.ndarray, pose_status: np.ndarray, origin_x: float,
-    origin_y: float, mount_x: float, mount_y: float, particles: int,
-) -> None:  # fmt: skip
+def place_relative(flags, poses, place, pose_status, origin_x, origin_y, mount_x, mount_y, particles):
     """Place sensors relative to an origin: x, its low part, y, its low part.
 
     ``pose_status``, which the caller clears, becomes 1 at index 0 if a pose is not finite; its place is the origin.
@@ -57,10 +54,7 @@ def place_relative(
     place[:particles, 0::2], place[:particles, 1::2] = rounded_place(x_y, place.dtype)
 
 
-def wrap_headings(
-    flags: frozenset[str], poses: np.ndarray, residual: np.ndarray, pose_status: np.ndarray, target: float,
-    target_low: float, particles: int,
-) -> None:  # fmt: skip
+def wrap_headings(flags, poses, residual, pose_status, target, target_low, particles):
     """Subtract the target from headings and wrap to [-pi, pi], a sum of two numbers; pose_status as for places."""
     all_poses = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
     finite: np.ndarray = np.asarray(np.isfinite(all_poses).all(axis=1))

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface import structs
 from gpusense.interface.constants import (
     DRAW_FIRST,
     DRAW_MARGIN,
@@ -215,11 +214,7 @@ def cell_reading_of(
     return np.where(low == cells, np.inf, (low + (margin + v * (1.0 - 2.0 * margin))) * (range_max / cells))
 
 
-def draw_readings(
-    flags: frozenset[str], incidence: np.ndarray, mixture: np.ndarray, edges: np.ndarray, chances: np.ndarray,
-    settings: np.ndarray, ranges: np.ndarray, particles: int, rays: int, tables: structs.MixtureTables,
-    scale: structs.RangeScale,
-) -> None:  # fmt: skip
+def draw_readings(flags, incidence, mixture, edges, chances, settings, ranges, particles, rays, tables, scale):
     """Replace expected ranges by readings; ``incidence`` holds cosines, and ``edges`` the cosines between bins."""
     count, limit, top = particles * rays, settings[DRAW_RANGE_MAX], settings[DRAW_TOP]
     for begin in range(0, count, BLOCK):

@@ -92,11 +92,9 @@ def place_reading(
 
 
 def place_inputs(
-    flags: frozenset[str], poses: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
-    pose_status: np.ndarray, ranges: np.ndarray, beam: np.ndarray, vector: np.ndarray, point: np.ndarray,
-    point_low: np.ndarray, reading: np.ndarray, guard: np.ndarray, constant_term: np.ndarray, frame: structs.Frame,
-    window: structs.Window, particles: int, head: int, rules: structs.ReadingRules,
-) -> None:  # fmt: skip
+    flags, poses, pose_cell, pose, pose_low, pose_status, ranges, beam, vector, point, point_low, reading, guard,
+    constant_term, frame, window, particles, head, rules,
+):  # fmt: skip
     """Put poses and readings in their places; the first ``head`` work-items of a device are for readings."""
     place_reading(flags, ranges, beam, vector, point, point_low, reading, guard, constant_term, frame.resolution, rules)
     place_poses(flags, poses, pose_cell, pose, pose_low, pose_status, frame, window, particles)  # fmt: skip
@@ -108,11 +106,7 @@ def placed_value(flags: frozenset[str], z: np.ndarray, rules: structs.ReadingRul
     return np.where(is_hit(z, rules.nearest, rules.farthest), z, np.where(far, np.inf, np.nan))
 
 
-def place_scans(
-    flags: frozenset[str], ranges: np.ndarray, beam: np.ndarray, vector: np.ndarray, point: np.ndarray,
-    point_low: np.ndarray, reading: np.ndarray, guard: np.ndarray, scans: int, head: int, blocks: int,
-    resolution: float, rules: structs.ReadingRules,
-) -> None:  # fmt: skip
+def place_scans(flags, ranges, beam, vector, point, point_low, reading, guard, scans, head, blocks, resolution, rules):
     """Place the readings of scans of one particle each, all of them."""
     z = ranges[: scans * head].reshape(scans, head)[:, beam[: rules.beams]].astype(np.float64)
     value = placed_value(flags, z, rules)

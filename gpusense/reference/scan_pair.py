@@ -10,11 +10,9 @@ from gpusense.reference.reading_class import is_hit
 
 
 def place_pair(
-    flags: frozenset[str], reading: np.ndarray, beam: np.ndarray, weight: np.ndarray, level: np.ndarray,
-    work: np.ndarray, point: np.ndarray, line: np.ndarray, start: np.ndarray, pair: np.ndarray, summary: np.ndarray,
-    beams: int, places: int, padded: int, step: int, nearest: float, farthest: float, levels: int, assumed: int,
-    coarse: int, strides: int, reach: int, most: int, ratio: float, width: float, gap: float,
-) -> None:  # fmt: skip
+    flags, reading, beam, weight, level, work, point, line, start, pair, summary, beams, places, padded, step,
+    nearest, farthest, levels, assumed, coarse, strides, reach, most, ratio, width, gap,
+):  # fmt: skip
     """Place two scans of one scanner, a reference and a second one: points of their hits by bearing, and lines.
 
     Lines are fitted for the pair's noise. A beam is its cosine and sine, its bearing in [0, 2 pi), and the place of its

@@ -25,7 +25,7 @@ _BLOCK = 1 << 22
 BINS = 512
 
 
-def pool_scores(flags: frozenset[str], table: np.ndarray, pooled: np.ndarray, scores: ScoreTable, reach: int) -> None:
+def pool_scores(flags, table, pooled, scores, reach):
     """Write the maximum of each cell and the cells up to ``reach`` rows and columns further."""
     lines, stride = padded_lines(scores), padded_stride(scores)
     images = table[: scores.tables * lines * stride].reshape(scores.tables, lines, stride)
@@ -35,10 +35,7 @@ def pool_scores(flags: frozenset[str], table: np.ndarray, pooled: np.ndarray, sc
     pooled[: images.size] = np.maximum(rows, rows[:, :, col]).ravel()
 
 
-def fold_scores(
-    flags: frozenset[str], table: np.ndarray, out: np.ndarray, scores: ScoreTable, folded: ScoreTable, period: int,
-    step: int, beyond: int, unit: int,
-) -> None:  # fmt: skip
+def fold_scores(flags, table, out, scores, folded, period, step, beyond, unit):
     """Write the losses of every period-th row and column of each table as an image, for first cells step apart."""
     lines, stride = padded_lines(scores), padded_stride(scores)
     images = table[: scores.tables * lines * stride].reshape(scores.tables, lines, stride)
@@ -53,9 +50,7 @@ def fold_scores(
             target[:, i, j, margin : margin + part.shape[1], margin : margin + part.shape[2]] = (TOP - part) // unit
 
 
-def pack_quarters(
-    flags: frozenset[str], table: np.ndarray, quarters: np.ndarray, scores: ScoreTable, reach: int, top: int
-) -> None:
+def pack_quarters(flags, table, quarters, scores, reach, top):
     """Write the losses of the quarters of the block that begins at each cell, as bytes of a number.
 
     They are relative to the largest of the four scores or, with ``top``, to the largest possible score.
@@ -91,11 +86,7 @@ def divided(
     return total
 
 
-def shift_scores(
-    flags: frozenset[str], table: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray,
-    allowed: np.ndarray, score: np.ndarray, scores: ScoreTable, begin: int, items: int, height: int, width: int,
-    unit: int,
-) -> None:  # fmt: skip
+def shift_scores(flags, table, point, image, first, allowed, score, scores, begin, items, height, width, unit):
     """Sum the losses of each item's points at all shifts by less than height rows and width columns, and write scores.
 
     A shift that is not allowed has -1.
@@ -111,10 +102,7 @@ def shift_scores(
     total[:, allowed[: height * width].reshape(height, width) == 0] = -1
 
 
-def row_maxima(
-    flags: frozenset[str], score: np.ndarray, best: np.ndarray, histogram: np.ndarray, rows: int, width: int,
-    height: int, turns: int, shift: int,
-) -> None:  # fmt: skip
+def row_maxima(flags, score, best, histogram, rows, width, height, turns, shift):
     """Find the largest score of each row of shifts and its first column, and count the rows of scans by scores."""
     values = score[: rows * width].reshape(rows, width)
     place = values.argmax(axis=1)
@@ -132,20 +120,14 @@ def promising(best: np.ndarray, histogram: np.ndarray, rows: int, scan: int, shi
     return chosen
 
 
-def count_promising(
-    flags: frozenset[str], best: np.ndarray, histogram: np.ndarray, number: np.ndarray, items: int, height: int,
-    turns: int, shift: int, most: int,
-) -> None:  # fmt: skip
+def count_promising(flags, best, histogram, number, items, height, turns, shift, most):
     """Count the promising rows of each item."""
     for scan in range(items // turns):
         chosen = promising(best, histogram, height * turns, scan, shift, most)
         number[scan * turns : (scan + 1) * turns] = chosen.reshape(turns, height).sum(axis=1)
 
 
-def pick_blocks(
-    flags: frozenset[str], best: np.ndarray, histogram: np.ndarray, number: np.ndarray, block: np.ndarray, items: int,
-    height: int, turns: int, level: int, shift: int, most: int,
-) -> None:  # fmt: skip
+def pick_blocks(flags, best, histogram, number, block, items, height, turns, level, shift, most):
     """Take most of the promising rows of each scan, evenly spaced, as blocks; missing blocks have the score -1."""
     rows = height * turns
     made = block[: 4 * most * (items // turns)].reshape(-1, most, 4)
@@ -157,19 +139,14 @@ def pick_blocks(
         made[scan, :taken], made[scan, taken:, 3] = np.stack(columns, axis=1), -1
 
 
-def raise_low(
-    flags: frozenset[str], block: np.ndarray, slack: np.ndarray, low: np.ndarray, blocks: int, most: int
-) -> None:
+def raise_low(flags, block, slack, low, blocks, most):
     """Raise the least scores of scans to the scores of poses less their slack."""
     score = block[: 4 * blocks].reshape(-1, most, 4)[:, :, 3].max(axis=1)
     scans = len(score)
     low[:scans] = np.where(score >= 0, np.maximum(low[:scans], score - slack[:scans]), low[:scans])
 
 
-def choose_blocks(
-    flags: frozenset[str], score: np.ndarray, best: np.ndarray, low: np.ndarray, block: np.ndarray, count: np.ndarray,
-    rows: int, height: int, width: int, turns: int, level: int, room: int,
-) -> None:  # fmt: skip
+def choose_blocks(flags, score, best, low, block, count, rows, height, width, turns, level, room):
     """Collect the shifts whose scores are at least low of their scan."""
     values = score[: rows * width].reshape(-1, height, width)
     scan = np.arange(len(values)) // turns
@@ -180,10 +157,9 @@ def choose_blocks(
 
 
 def follow_blocks(
-    flags: frozenset[str], quarters: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray,
-    allowed: np.ndarray, block: np.ndarray, scores: ScoreTable, blocks: int, height: int, width: int, columns: int,
-    level: int, spacing: int, top: int,
-) -> None:  # fmt: skip
+    flags, quarters, point, image, first, allowed, block, scores, blocks, height, width, columns, level, spacing,
+    top,
+):  # fmt: skip
     """Replace blocks by their best allowed quarters of 2^level x 2^level; a block without any has the score -1."""
     here = block[: 4 * blocks].reshape(blocks, 4)
     mine = np.flatnonzero(here[:, 3] >= 0)
@@ -198,11 +174,9 @@ def follow_blocks(
 
 
 def divide_blocks(
-    flags: frozenset[str], quarters: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray,
-    allowed: np.ndarray, block: np.ndarray, low: np.ndarray, part: np.ndarray, count: np.ndarray, scores: ScoreTable,
-    begin: int, some: int, room: int, workers: int, run: int, height: int, width: int, columns: int, turns: int,
-    level: int, spacing: int, top: int,
-) -> None:  # fmt: skip
+    flags, quarters, point, image, first, allowed, block, low, part, count, scores, begin, some, room, workers, run,
+    height, width, columns, turns, level, spacing, top,
+):  # fmt: skip
     """Divide blocks into quarters of 2^level x 2^level, and collect the allowed ones that reach low of their scan."""
     blocks = min(int(count[level + 1]) - begin, some)
     here = block[4 * begin : 4 * (begin + blocks)].reshape(blocks, 4)

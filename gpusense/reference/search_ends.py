@@ -6,10 +6,9 @@ import numpy as np
 
 
 def place_ends(
-    flags: frozenset[str], end: np.ndarray, heading: np.ndarray, start: np.ndarray, first: np.ndarray,
-    image: np.ndarray, point: np.ndarray, folded: np.ndarray, folded_image: np.ndarray, begin: int, items: int,
-    turns: int, stride: int, level: int, step_level: int, offset: int,
-) -> None:  # fmt: skip
+    flags, end, heading, start, first, image, point, folded, folded_image, begin, items, turns, stride, level,
+    step_level, offset,
+):  # fmt: skip
     """Place the end points of scans at headings in cells of the tables, and in cells and images of a folded table."""
     period, side = stride << level, stride << (level - step_level)
     for scan in range(begin // turns, items // turns):

@@ -173,10 +173,7 @@ def _solve(rows: np.ndarray) -> np.ndarray:
     return np.array([(z[0] - r[0, 1] * second) / r[0, 0], second])
 
 
-def split_scans(
-    flags: frozenset[str], point: np.ndarray, start: np.ndarray, noise: np.ndarray, cost: np.ndarray, stop: np.ndarray,
-    scans: int, points: int, penalty: float, gap: float,
-) -> None:  # fmt: skip
+def split_scans(flags, point, start, noise, cost, stop, scans, points, penalty, gap):
     """Split scans into segments: ``stop`` is the end of the segment that begins at a point, -1 at all other points."""
     for scan in range(scans):
         first, last, sigma = int(start[scan]), int(start[scan + 1]), float(noise[scan])
@@ -189,10 +186,7 @@ def split_scans(
         merge_segments(point, first, last, stop, sigma, penalty, gap)
 
 
-def fit_segments(
-    flags: frozenset[str], point: np.ndarray, start: np.ndarray, noise: np.ndarray, part: np.ndarray, scan: np.ndarray,
-    line: np.ndarray, scans: int, points: int, parts: int,
-) -> None:  # fmt: skip
+def fit_segments(flags, point, start, noise, part, scan, line, scans, points, parts):
     """Fit lines to parts of scans: first point and number of points, which may wrap around to the first point."""
     for k in range(parts):
         begin, end = start[scan[k]], start[scan[k] + 1]

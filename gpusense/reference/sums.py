@@ -10,10 +10,7 @@ from gpusense.interface import structs
 from gpusense.reference.error_free import add_term, strand_sums, strands_in
 
 
-def sum_parts(
-    flags: frozenset[str], parts: np.ndarray, order: np.ndarray, counts: np.ndarray, constant_terms: np.ndarray,
-    log_p: np.ndarray, particles: int, count: int, block: int, score: structs.Score, batch: structs.ScanBatch,
-) -> None:  # fmt: skip
+def sum_parts(flags, parts, order, counts, constant_terms, log_p, particles, count, block, score, batch):
     """Sum ``count`` numbers of each particle, number k at parts[place + k * particles].
 
     The numbers are sums of blocks or strands (block is 1), or single terms; strands of a block are first added without

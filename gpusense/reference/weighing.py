@@ -21,10 +21,7 @@ from gpusense.interface.constants import (
 from gpusense.reference.tempering import largest_of, left_of, possible_of, rung_of, set_stage, tempered
 
 
-def add_scores(
-    flags: frozenset[str], log_p: np.ndarray, settings: np.ndarray, score: np.ndarray, largest: np.ndarray,
-    particles: int, block: int, sensor: int,
-) -> None:  # fmt: skip
+def add_scores(flags, log_p, settings, score, largest, particles, block, sensor):
     """Add a sensor's log-likelihoods times its temperature to the scores, which sensor 0 begins; find block maxima."""
     scaled = settings[TEMPERATURE + sensor] * log_p[:particles].astype(np.float64)
     score[:particles] = scaled if sensor == 0 else score[:particles] + scaled
@@ -32,17 +29,15 @@ def add_scores(
     largest[: len(starts)] = np.maximum.reduceat(score[:particles], starts)
 
 
-def join_scores(flags: frozenset[str], scores: np.ndarray, largest: np.ndarray, blocks: int, fan: int) -> None:
+def join_scores(flags, scores, largest, blocks, fan):
     """Find the largest score of every ``fan`` blocks."""
     starts = np.arange(0, blocks, fan)
     largest[: len(starts)] = np.maximum.reduceat(scores[:blocks], starts)
 
 
 def weigh_particles(
-    flags: frozenset[str], score: np.ndarray, before: np.ndarray, largest: np.ndarray, settings: np.ndarray,
-    state: np.ndarray, sums: np.ndarray, highest: np.ndarray, particles: int, block: int, blocks: int, groups: int,
-    stage: int,
-) -> None:  # fmt: skip
+    flags, score, before, largest, settings, state, sums, highest, particles, block, blocks, groups, stage,
+):  # fmt: skip
     """Sum the integer weights of each block on each rung, their squares, and the previous weights."""
     scale, old = settings[SCALE], before[:particles]
     highest[0] = largest_of(largest, 0, groups)
@@ -56,7 +51,7 @@ def weigh_particles(
         likelihood = likelihood * likelihood
 
 
-def join_rows(flags: frozenset[str], sums: np.ndarray, joined: np.ndarray, rows: int, columns: int, fan: int) -> None:
+def join_rows(flags, sums, joined, rows, columns, fan):
     """Add up every ``fan`` rows of sums in order; a row becomes the sum of the rows before it in its group."""
     table = sums[: rows * columns].reshape(rows, columns)
     for group, begin in enumerate(range(0, rows, fan)):
@@ -67,10 +62,9 @@ def join_rows(flags: frozenset[str], sums: np.ndarray, joined: np.ndarray, rows:
 
 
 def set_weights(
-    flags: frozenset[str], score: np.ndarray, before: np.ndarray, highest: np.ndarray, sums: np.ndarray,
-    joined: np.ndarray, totals: np.ndarray, settings: np.ndarray, state: np.ndarray, weight: np.ndarray,
-    ends: np.ndarray, particles: int, block: int, blocks: int, fan: int, stage: int, stages: int,
-) -> None:  # fmt: skip
+    flags, score, before, highest, sums, joined, totals, settings, state, weight, ends, particles, block, blocks,
+    fan, stage, stages,
+):  # fmt: skip
     """Choose the rung, set the weights and their exact cumulative sums, and write the stage's state."""
     scale, left, high = settings[SCALE], left_of(state, stage), possible_of(totals, highest[0])
     rung = rung_of(totals, settings, settings[SHARE] * particles) if left > 0.0 else 0

@@ -33,9 +33,7 @@ LARGEST_SHAPE = 1e6
 BEYOND = 16384
 
 
-def put_cells(
-    flags: frozenset[str], cells: np.ndarray, place: np.ndarray, store: np.ndarray, count: int, worlds: int, items: int
-) -> None:
+def put_cells(flags, cells, place, store, count, worlds, items):
     """Copy the cells of some worlds to their places."""
     for w in range(worlds):
         store[place[w] : place[w] + count] = cells[w * count : (w + 1) * count]
@@ -46,10 +44,7 @@ def stops_beam(cell: np.ndarray, threshold: int, unknown: int) -> np.ndarray:
     return np.where(cell > MOST_KNOWN, bool(unknown), cell >= threshold)
 
 
-def mark_obstacles(
-    flags: frozenset[str], store: np.ndarray, place: np.ndarray, occupied: np.ndarray, bits: np.ndarray, rows: int,
-    cols: int, worlds: int, words: int, margin: int, threshold: int, unknown: int, as_bits: int,
-) -> None:  # fmt: skip
+def mark_obstacles(flags, store, place, occupied, bits, rows, cols, worlds, words, margin, threshold, unknown, as_bits):
     """Mark the obstacles of worlds as bytes or as bits, with a margin of obstacles around each world."""
     cells = np.stack([store[place[w] : place[w] + rows * cols].reshape(rows, cols) for w in range(worlds)], axis=1)
     ring = ((margin, margin), (0, 0), (margin, margin))
@@ -62,10 +57,7 @@ def mark_obstacles(
     bits[: packed.size // 4] = packed.reshape(-1).view("<i4")
 
 
-def fill_worlds(
-    flags: frozenset[str], squared: np.ndarray, density: np.ndarray, place: np.ndarray, table: np.ndarray, rows: int,
-    cols: int, worlds: int, margin: int, cap: int, beyond: float,
-) -> None:  # fmt: skip
+def fill_worlds(flags, squared, density, place, table, rows, cols, worlds, margin, cap, beyond):
     """Fill the likelihood fields of worlds from squared distances, which include a margin."""
     height, width = rows + 2 * margin, cols + 2 * margin
     known = density[np.minimum(squared[: height * worlds * width].reshape(height, worlds, width), cap)]
@@ -82,11 +74,9 @@ def frame_in(frames: np.ndarray, index: int, frame: structs.Frame) -> structs.Fr
 
 
 def place_in_worlds(
-    flags: frozenset[str], poses: np.ndarray, index: np.ndarray, ignore: np.ndarray, frames: np.ndarray,
-    shapes: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray, world: np.ndarray,
-    pose_status: np.ndarray, frame: structs.Frame, particles: int, worlds: int, wide: int, wide_ignore: int,
-    crowd: structs.Crowd,
-) -> None:  # fmt: skip
+    flags, poses, index, ignore, frames, shapes, pose_cell, pose, pose_low, world, pose_status, frame, particles,
+    worlds, wide, wide_ignore, crowd,
+):  # fmt: skip
     """Place poses in their worlds; see ``place_pose``. The reference makes no sights: its rays test every shape.
 
     An index of no world sets the second bit of ``pose_status``, and the pose sees nothing.
@@ -116,10 +106,7 @@ def place_in_worlds(
         pose_cell[:particles][~known] = -int(FARTHEST)
 
 
-def find_sights(
-    flags: frozenset[str], shapes: np.ndarray, world: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
-    sights: np.ndarray, particles: int, crowd: structs.Crowd,
-) -> None:  # fmt: skip
+def find_sights(flags, shapes, world, pose_cell, pose, sights, particles, crowd):
     """Find the sights of particles. NumPy's rays test every shape, and need none."""
     words = 2 * crowd.pairs
     found = sights[2 * crowd.begin : 2 * crowd.begin + particles * SIGHTS * words].reshape(particles, SIGHTS, words)
@@ -144,10 +131,7 @@ def part_near(low: np.ndarray, high: np.ndarray, at: np.ndarray, reach: float) -
     return np.where(begin < end, begin, low), np.where(begin < end, end, high)
 
 
-def place_shapes(
-    flags: frozenset[str], raw: np.ndarray, frames: np.ndarray, shapes: np.ndarray, frame: structs.Frame, count: int,
-    numbers: int, begin: int, stride: int, worlds: int,
-) -> None:  # fmt: skip
+def place_shapes(flags, raw, frames, shapes, frame, count, numbers, begin, stride, worlds):
     """Place moving shapes of one kind, with 3 (discs), 5 (boxes) or 4 numbers (segments), in the cells of their worlds.
 
     A shape with a number that is not finite or beyond LARGEST_SHAPE, or with a negative size, is none. Segments and
@@ -194,11 +178,7 @@ def place_shapes(
         out[w] = placed.reshape(-1)
 
 
-def find_collisions(
-    flags: frozenset[str], store: np.ndarray, world: np.ndarray, shapes: np.ndarray, pose_cell: np.ndarray,
-    pose: np.ndarray, hit: np.ndarray, particles: int, radius: float, crowd: structs.Crowd, threshold: int,
-    unknown: int,
-) -> None:  # fmt: skip
+def find_collisions(flags, store, world, shapes, pose_cell, pose, hit, particles, radius, crowd, threshold, unknown):
     """Tell which discs about poses, with a radius in cells, meet an obstacle or a shape."""
     hit[:particles] = 0
     if "SHAPES" in flags:

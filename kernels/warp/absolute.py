@@ -27,7 +27,6 @@ SINE = (
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2 = types.real, types.vec2
     base = flags & {"FLOAT64"}

@@ -120,7 +120,6 @@ def walk_ray(
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     structs = precision(flags)
     Frame = structs.Frame
     cos_sin = heading.functions(flags & {"HUGE_HEADINGS"}).cos_sin

@@ -19,7 +19,6 @@ CIRCLE_STEPS, RADIAL_STEPS, CIRCLE_NUMBERS = 25, 8, 10
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec4 = types.real, types.vec4
     # Cost, gradient (3) and information (xx, xy, xr, yy, yr, rr) of a circle.
@@ -237,7 +236,6 @@ def functions(flags):
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     made = functions(flags)
 
     @kernel(flags)

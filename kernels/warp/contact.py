@@ -21,7 +21,6 @@ field_cell = end_point.field_cell
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact, logs = error_free.functions(flags & {"FLOAT64"}), log_terms.functions(flags & {"FLOAT64"})

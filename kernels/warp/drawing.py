@@ -22,7 +22,6 @@ ZERO, RESIDUAL = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(2.0))
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     of = draws.functions(frozenset())
     found_at, mark_of, is_copied, start_of = of.found_at, of.mark_of, of.is_copied, of.start_of
     copy_particle, draw_particle = of.copy_particle, of.draw_particle

@@ -22,7 +22,6 @@ from .shapes import world_begin, world_window
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     casting = caster_of(flags)
@@ -144,7 +143,6 @@ def functions(flags):
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real = types.real
     casting = caster_of(flags)

@@ -25,7 +25,6 @@ def field_cell(col: wp.int32, row: wp.int32, window: Window):
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags)

@@ -21,7 +21,6 @@ STRANDS = wp.constant(4)
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     multiply_add = exact_fma(real)

@@ -23,7 +23,6 @@ totals = wp.types.vector(length=13, dtype=wp.float64)
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     cos_sin = heading.functions(frozenset()).cos_sin
     wrap_once = motion.functions(frozenset()).wrap_once
 

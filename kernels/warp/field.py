@@ -22,7 +22,6 @@ GROUP = wp.constant(64)
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     made = field_term.functions(flags)

@@ -20,7 +20,6 @@ GRADIENT_NUMBERS = wp.constant(13)
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     made = field_term.functions(flags)
@@ -66,7 +65,6 @@ def functions(flags):
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     of_field = field_term.functions(flags)

@@ -18,7 +18,6 @@ from .prelude import precision, reader
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags)

@@ -17,7 +17,6 @@ from .prelude import precision, reader
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2 = types.real, types.vec2
     two_product = error_free.functions(flags).two_product

@@ -11,7 +11,6 @@ from .prelude import kernel, work_item
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     match_in_turns = icp_match.functions(flags).match_in_turns
     TEAM = icp_step.functions(flags).TEAM
 

@@ -20,7 +20,6 @@ MATCH_RULES = wp.constant(14)
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec4, MatchRules = types.real, types.vec4, types.MatchRules
     step_functions, pairs = icp_step.functions(flags), icp_pairs.functions(flags)

@@ -3,8 +3,8 @@
 The nearest point is exact: the points of a scan are sorted by bearing, and a search outwards from the bearing of a
 place ends where no point farther in bearing can be nearer.
 
-Lines: see line_fit.py, and Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the scale
-shrinks, then Geman and McClure's, (1 / (1 + (e / c)^2))^2.
+Lines: see line_fit.py, and Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the
+scale shrinks, then Geman and McClure's, (1 / (1 + (e / c)^2))^2.
 """
 
 import functools
@@ -19,7 +19,6 @@ from .prelude import precision
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     step = icp_step.functions(flags)

@@ -70,7 +70,6 @@ return blocks;
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     IN_TEAMS = "IN_TEAMS" in flags

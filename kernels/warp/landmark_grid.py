@@ -53,7 +53,6 @@ FIRST_END, LAST_END = wp.constant(17), wp.constant(18)
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags & {"FLOAT64"})

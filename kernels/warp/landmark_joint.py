@@ -19,7 +19,6 @@ from .prelude import kernel, precision
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real = types.real
     shape = flags & {"FLOAT64", "RANGE", "BEARING", "SIGNATURE", "FIELD"}

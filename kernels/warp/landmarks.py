@@ -49,7 +49,6 @@ QUARTER_TURN, HALF_TURN = wp.constant(9), wp.constant(10)
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags & {"FLOAT64"})

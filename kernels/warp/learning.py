@@ -31,7 +31,6 @@ from .prelude import kernel, precision
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     INFORMATION = "INFORMATION" in flags

@@ -10,7 +10,6 @@ from .prelude import kernel, precision
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     ZERO, ONE, HALF, MISSING = real(0.0), real(1.0), real(0.5), real(-1.0)
@@ -111,7 +110,6 @@ def functions(flags):
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     line_at = functions(flags).line_at
 
     @kernel(flags)

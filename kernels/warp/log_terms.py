@@ -17,7 +17,6 @@ from .prelude import fuses_on_gpu, log1p_of_gpu, precision
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     gpu_log1p = log1p_of_gpu(real)

@@ -10,7 +10,6 @@ from .prelude import kernel, precision
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     cast_ray = raycast.functions(flags).cast_ray

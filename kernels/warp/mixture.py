@@ -19,7 +19,6 @@ from .prelude import field_readers, precision
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2 = types.real, types.vec2
     exact = error_free.functions(flags)

@@ -61,7 +61,6 @@ def functions(flags):
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     made = functions(frozenset())
     chord_of, wrap_any, cos_sin = made.chord_of, made.wrap_any, made.cos_sin
     normal_pair = philox.functions(frozenset()).normal_pair

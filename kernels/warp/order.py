@@ -21,7 +21,6 @@ stretch_counts = wp.types.vector(length=16, dtype=wp.int32)
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     turn_of = ray_file.functions(flags).turn_of

@@ -114,7 +114,6 @@ def level_of(noise: wp.float64, level: wp.array(dtype=wp.float64), levels: wp.in
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec4 = types.real, types.vec4
 

@@ -26,7 +26,6 @@ def within_reach(position: wp.float64):
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec4 = types.real, types.vec4
     cos_sin = heading.functions(flags & {"HUGE_HEADINGS"}).cos_sin
@@ -96,7 +95,6 @@ def functions(flags):
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     placing = functions(flags)
     place_pose = placing.place_pose
 

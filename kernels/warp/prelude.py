@@ -1,9 +1,10 @@
 """Types of a precision, the decorator of kernels, and readers and writers of arrays, for all kernel files.
 
-Flags are those of ``gpusense.interface``. A factory turns them into closure constants. Warp drops the branches of ``if
-FLAG:`` whose condition is such a constant, so code that a set of flags does not need is never generated. Numbers are
-such constants too. A negative number has a separate constant: some versions of Warp lose the sign of ``-ONE`` in
-float64.
+In each kernel file ``functions(flags)`` makes the file's functions for a set of flags, and ``make(name, flags)`` a
+kernel. Flags are those of ``gpusense.interface``. A factory turns them into closure constants. Warp drops the branches
+of ``if FLAG:`` whose condition is such a constant, so code that a set of flags does not need is never generated.
+Numbers are such constants too. A negative number has a separate constant: some versions of Warp lose the sign of
+``-ONE`` in float64.
 """
 
 import functools

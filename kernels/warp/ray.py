@@ -19,7 +19,6 @@ def off_grid(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags

@@ -21,7 +21,6 @@ LARGEST_HEADING = wp.constant(wp.float64(1048576.0))
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     turning = heading.functions(flags & {"HUGE_HEADINGS"})

@@ -100,7 +100,6 @@ def fine_uniform(high: wp.uint32, low: wp.uint32):
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     MASS_TABLE = "MASS_TABLE" in flags
 
     @wp.func
@@ -242,7 +241,6 @@ def functions(flags):
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real = types.real
     made = functions(flags & {"MASS_TABLE"})

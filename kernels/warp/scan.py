@@ -38,7 +38,6 @@ def is_chosen(rank: wp.int32, informative: wp.int32, chosen: wp.int32):
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     types, place = precision(flags), placement.functions(flags)
     real, vec2, ReadingRules = types.real, types.vec2, types.ReadingRules
     place_pose = place.place_pose

@@ -11,7 +11,6 @@ from .prelude import kernel, precision
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     real = precision(flags).real
     place_points = pair_steps.functions(flags).place_points
     fit_scan = line_fit.functions(flags).fit_scan

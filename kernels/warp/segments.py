@@ -21,7 +21,6 @@ PASSES, STEPS, LINE_NUMBERS = 2, 5, 6
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec4 = types.real, types.vec4
     # The triangular root of rows that were added (11, 12, right side 1, 22, right side 2), and the cost.
@@ -248,7 +247,6 @@ def functions(flags):
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     made = functions(flags)
 
     @kernel(flags)

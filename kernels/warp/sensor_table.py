@@ -14,7 +14,6 @@ from .prelude import precision
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real = types.real
 

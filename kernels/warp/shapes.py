@@ -43,7 +43,6 @@ def world_begin(world: wp.array(dtype=wp.vec2i), n: wp.int32, each: wp.int32):
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     ray_direction = ray_file.functions(flags).ray_direction

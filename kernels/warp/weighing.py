@@ -39,8 +39,6 @@ sixteen = wp.types.vector(length=16, dtype=wp.float64)
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
-
     @kernel(flags)
     def add_scores(log_p, settings, score, largest, particles, block, sensor):
         """Add a sensor's log-likelihoods times its temperature to the scores, which sensor 0 begins, and find the

@@ -71,7 +71,6 @@ def mark_obstacles(store, place, occupied, bits, rows, cols, worlds, words, marg
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file for a set of flags."""
     if name in ("put_cells", "mark_obstacles"):
         return globals()[name]
     types = precision(flags)

@@ -221,7 +221,7 @@ def test_a_marker_that_is_another_programs_stays(place):
 
 _COLD = """
 import sys
-from gpusense.backends import cache, folders
+from gpusense.backends import cache
 print("ready", flush=True)
 sys.stdin.readline()
 for number in range(40):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.backends import arrays
+from gpusense.backends import arrays, get_backend
 from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface import constants as c
@@ -81,13 +81,9 @@ class Drawing:
 
     def on_host(self, first: int, count: int, rays: int, ranges: np.ndarray, incidence: np.ndarray) -> None:
         """Replace ranges by readings on the host."""
-        from gpusense.reference.sampling import draw_readings
-
-        bins, cells, per_metre = self.tables
-        draw_readings(
-            self.flags, incidence, self.mixture, self.edges, self.chances, self.settings(first), ranges, count, rays,
-            MixtureTables(bins, cells, self.real.type(per_metre)),
-            RangeScale(0.0, 0.0, self.real.type(self.range_max)),
+        get_backend("numpy").compile("draw_readings", self.flags)(
+            (rays, count), incidence, self.mixture, self.edges, self.chances, self.settings(first), ranges, count, rays,
+            self.tables, RangeScale(0.0, 0.0, self.range_max),
         )  # fmt: skip
 
 

@@ -189,7 +189,7 @@ def functions(flags):
 
     @wp.func
     def compat_density_lanes(z: real, expected: real, hit: real, terms: wp.array(dtype=types.MixtureTerms)):
-        """Return the density to be cubed, without a division by its hit's mass: compat_density of compat.py."""
+        """Return the density to be cubed, without a division by its hit's mass: compat_density of mixture.py."""
         p = hit
         if AMCL:
             p += wp.where(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gpusense._util import checks, masks
+from gpusense._util import checks
 from gpusense._util.files import write_whole
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
@@ -130,7 +130,7 @@ def draw_scan(ax: Axes, grid: OccupancyGrid, scanner: Scanner, pose: ArrayLike, 
 
 def end_points(ranges: ArrayLike, scanner: Scanner, pose: ArrayLike = (0.0, 0.0, 0.0)) -> NDArray[np.float64]:
     """Return the (M, 2) end points of the hits of a scan at a (3,) pose of the robot [m]."""
-    z = np.asarray(masks.filled(ranges))
+    z = np.asarray(checks.filled(ranges))
     hit = classify(z, scanner) == Reading.HIT
     x, y, theta = np.asarray(pose, np.float64)
     c, s = np.cos(theta), np.sin(theta)

@@ -13,8 +13,6 @@ import time
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from support import fake_driver
 from support.cache_folders import BLOCKED, blocked
 
@@ -94,38 +92,6 @@ def test_with_the_cache_off_nothing_is_kept(needs, tmp_path, expected, family):
     assert [path for path in tmp_path.rglob("*") if path.is_file() and path.suffix != ".sqlite"] == []
 
 
-DAMAGES = {
-    "cut off": lambda data: data[: len(data) // 2],
-    "emptied": lambda data: b"",
-    "zeroed": lambda data: bytes(len(data)),
-    "a bit flipped in the head": lambda data: bytes([data[0] ^ 1]) + data[1:],
-    "a bit flipped in the contents": lambda data: data[:-9] + bytes([data[-9] ^ 16]) + data[-8:],
-    "another's contents": lambda data: b"gpusense entry 3\n" + bytes(200),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("family", ["opencl", "warp:cpu"])
-def test_damaged_files_of_every_kind_are_made_anew(needs, tmp_path, expected, family):
-    """Damage entries of verdicts, programs, PoCL's and Warp's kernels, and replace entries by folders."""
-    needs(family.split(":")[0])
-    environment = fake_driver.environment(tmp_path)
-    assert outcome(start(family, environment)) == (0, expected, "")
-    whole = entries(tmp_path / "cold")
-    assert len(whole) >= len(DAMAGES)
-    for number, name in enumerate(sorted(whole)):
-        path = tmp_path / "cold" / scratch.OWN / name
-        path.write_bytes(list(DAMAGES.values())[number % len(DAMAGES)](path.read_bytes()))
-    assert outcome(start(family, environment)) == (0, expected, "")
-    assert entries(tmp_path / "cold").keys() == whole.keys()
-    for name in whole:
-        (tmp_path / "cold" / scratch.OWN / name).unlink()
-        (tmp_path / "cold" / scratch.OWN / name).mkdir()
-    code, out, errors = outcome(start(family, environment))
-    assert (code, out, errors.count("\n")) == (0, expected, 1), errors
-    assert f"the cache folder {tmp_path / 'cold'} cannot be written" in errors
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("family", "how"), [("opencl", BLOCKED[0]), ("opencl", BLOCKED[2]), ("warp:cpu", BLOCKED[1])])
 def test_a_cache_that_cannot_be_written_is_named_and_stops_nothing(needs, tmp_path, expected, family, how):
@@ -142,26 +108,6 @@ def test_a_cache_that_cannot_be_written_is_named_and_stops_nothing(needs, tmp_pa
         assert len(lines) == len(errors.splitlines()) and all(place in line for line in lines)
         assert turn or lines
     assert len(list((tmp_path / "tmp").rglob("*.gpusense"))) > 5
-
-
-@pytest.mark.slow
-def test_a_full_file_system_is_named_and_stops_nothing(needs, tmp_path, expected):
-    """The cache is a file system of 256 KiB; the folder of the process is elsewhere."""
-    needs("opencl")
-    full = tmp_path / "full"
-    full.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(full)], capture_output=True)
-    if mounted.returncode:
-        pytest.skip("this user cannot mount a small file system")
-    try:
-        (full / "filler").write_bytes(bytes(200 << 10))
-        environment = fake_driver.environment(tmp_path, GPUSENSE_CACHE_DIR=str(full), XDG_CACHE_HOME=str(full))
-        for turn in range(2):
-            code, out, errors = outcome(start("opencl", environment))
-            assert (code, out) == (0, expected), errors
-            assert turn or f"the cache folder {full} cannot be written: No space left" in errors
-    finally:
-        subprocess.run(["umount", "-l", str(full)], check=True)
 
 
 @pytest.mark.slow
@@ -186,26 +132,3 @@ def test_killed_processes_leave_nothing_that_a_later_one_trips_over(needs, tmp_p
         ended += code == 0
     assert ended < 12
     assert outcome(start(family, fake_driver.environment(tmp_path))) == (0, expected, "")
-
-
-@pytest.mark.slow
-@settings(max_examples=2, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    families=st.tuples(*[st.sampled_from(["opencl", "warp:cpu"])] * 2),
-    delay=st.floats(0, 2.5),
-    kill=st.none() | st.floats(0.3, 2.5),
-)
-def test_two_processes_may_start_cold_at_once_in_any_order(needs, tmp_path_factory, expected, families, delay, kill):
-    for family in families:
-        needs(family.split(":")[0])
-    environment = fake_driver.environment(tmp_path_factory.mktemp("cold"))
-    first = start(families[0], environment)
-    time.sleep(delay)
-    second = start(families[1], environment)
-    if kill is not None:
-        time.sleep(kill)
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(first.pid, signal.SIGKILL)
-    code, out, errors = outcome(first)
-    assert (code, out) == (0, expected) or (kill is not None and code == -signal.SIGKILL), errors
-    assert outcome(second) == (0, expected, "")

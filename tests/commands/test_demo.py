@@ -121,19 +121,6 @@ def test_demo_goes_on_without_a_device_that_was_not_asked_for(needs, monkeypatch
     assert any("the compiler crashed" in failure for failure in report["failures"])
 
 
-@pytest.mark.slow
-def test_demo_draws_without_pyplot(tmp_path):
-    done = script(
-        "from gpusense.commands import demo; demo.LATTICE = 0.5\n"
-        "from gpusense.commands.cli import main\n"
-        f"code = main({[*SMALL, '--backend', 'numpy', '--output', 'demo.svg']})\n"
-        "print(code, 'matplotlib.pyplot' in sys.modules)",
-        cwd=tmp_path,
-    )
-    assert done.stdout.splitlines()[-1] == "0 False", done.stderr
-    assert "</svg>" in (tmp_path / "demo.svg").read_text(encoding="utf-8")[-20:]
-
-
 def test_example_finds_the_pose(tmp_path):
     example = ROOT / "examples" / "score_scan.py"
     done = script(f"import runpy; runpy.run_path({str(example)!r})", cwd=tmp_path)

@@ -307,12 +307,6 @@ def test_hits_of_a_student_are_fitted_written_and_read(capsys, recorded, tmp_pat
     capsys.readouterr()
 
 
-@pytest.mark.slow
-def test_hits_of_a_student_are_fitted_by_incidence(capsys, recorded):
-    code, out, _ = run(capsys, *of_log(recorded), "--every", 3, "--hit", "student", "--incidence", 2)
-    assert code == 0 and out.count("hit_dof") >= 2
-
-
 @pytest.mark.parametrize(
     "share, bias, verdict", [(0.02, 0.0, "FITTED"), (0.17, 0.05, "FITTED"), (0.6, 0.0, "DOUBTFUL")]
 )

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import yaml
 from support.command_line import error_of
 
 import gpusense as gs
@@ -94,30 +93,6 @@ def test_figures_come_as_json(place, capsys):
     found = document["summary"]
     assert found["scans"] == 4 and len(document["poses"]) == len(document["times"]) == 4 and found["temperature"] == 0.2
     assert 0 <= found["coverage_50"] <= found["coverage_95"] <= 1 and found["ms_correct"] > 0
-
-
-@pytest.mark.long
-def test_what_the_command_fit_wrote_is_used(place, capsys, tmp_path):
-    fitting = ["fit", *call(place)[1:5], "--range-max", "20", "--backend", "numpy", "--sigma-growth", "--fit-motion"]
-    assert cli.main([*fitting, "--out", str(tmp_path)]) == 0
-    assert "odometry   OdometryMotion(" in capsys.readouterr().out
-    written = yaml.safe_load((tmp_path / "parameters.yaml").read_text())
-    noise = written["odometry_motion"]
-    assert written["beam_model"]["sigma_growth"] >= 0
-    assert "alpha1" not in written["amcl"]["ros__parameters"]
-    fitted = ["--params", str(tmp_path / "parameters.yaml"), "--json", "--sideways", "0.5", "--beam-skip", "0.2"]
-    assert cli.main(call(place, *fitted)) == 0
-    used = json.loads(capsys.readouterr().out)["filter"]
-    motion = gs.OdometryMotion(**noise | {"sideways": 0.5})
-    assert "BeamModel" in used and repr(motion) in used
-    for text, message in (
-        ("odometry_motion: {speed: 1}", "odometry_motion: values: every key must be one of alpha, reverse, least"),
-        ("odometry_motion: [1]", "must hold a mapping odometry_motion"),
-        ("odometry_motion: {alpha: [1, 2]}", "odometry_motion: alpha"),
-        ("a: 1", "must hold a mapping beam_model or odometry_motion"),
-    ):
-        (tmp_path / "wrong.yaml").write_text(text)
-        assert message in error_of(call(place, "--params", str(tmp_path / "wrong.yaml")), capsys)
 
 
 def test_a_log_on_a_wrong_map_is_lost(place, capsys, needs):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import gc
 import json
 import os
@@ -144,31 +143,6 @@ def started(*arguments: str, cwd: Path, **options: Any) -> subprocess.Popen[str]
         [sys.executable, "-m", "gpusense", *arguments], cwd=cwd, env=environment, text=True, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, **options,
     )  # fmt: skip
-
-
-@pytest.mark.long
-def test_a_terminated_sweep_keeps_whole_rows_and_ends_its_processes(place, tmp_path):
-    (place / "long.yaml").write_text(PLAN.replace("SEEDS", "400"))
-    table = tmp_path / "t.csv"
-    process = started("sweep", "long.yaml", "--table", str(table), "--processes", "2", "--device", "numpy", cwd=place)
-    end = time.monotonic() + 120
-    while time.monotonic() < end and (not table.exists() or table.read_text().count("\n") < 3):
-        time.sleep(0.05)
-    # Workers are started by threads.
-    lists = [path.read_text() for path in Path(f"/proc/{process.pid}/task").glob("*/children")]
-    workers = [int(word) for text in lists for word in text.split()]
-    assert len(workers) >= 2
-    process.send_signal(signal.SIGTERM)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 143, err
-    assert err.splitlines()[-1] == "gpusense: terminated" and "has the finished jobs" in err
-    with table.open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    assert len(rows) >= 2 and {row["status"] for row in rows} == {"done"}
-    end = time.monotonic() + 20
-    while time.monotonic() < end and any(Path(f"/proc/{pid}").exists() for pid in workers):
-        time.sleep(0.05)
-    assert not any(Path(f"/proc/{pid}").exists() for pid in workers)
 
 
 def test_signals_that_the_caller_ignores_stay_ignored(place, tmp_path):

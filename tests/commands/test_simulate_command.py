@@ -25,21 +25,6 @@ def office(tmp_path, monkeypatch, capsys):
     return tmp_path
 
 
-@pytest.mark.long
-def test_the_log_runs_through_the_other_commands(office, capsys):
-    log = ["--map", "office.yaml", "--log", "run.log"]
-    rest = ["--json"]
-    assert main(["localize", *log, *rest, "--particles", "300", "--beams", "30"]) == 0
-    assert json.loads(capsys.readouterr().out)["summary"]["error_median"] < 0.2
-    assert main(["score", *log, *rest, "--every", "10", "--particles", "500"]) == 0
-    assert json.loads(capsys.readouterr().out)["fitness"]["fits"]
-    assert main(["fit", *log, *rest, "--every", "2"]) == 0
-    assert abs(json.loads(capsys.readouterr().out)["fit"]["parameters"]["sigma_hit"] - 0.02) < 0.002
-    assert main(["match", "--log", "run.log", "--every", "10", *rest]) == 0
-    assert main(["match", *log, "--every", "20", *rest]) == 0
-    assert main(["map", "--log", "run.log", "--out", "own.yaml", *rest, "--every", "4"]) == 0
-
-
 def test_true_poses_are_in_the_log_and_in_the_trajectory(office):
     times, poses = read_tum(office / "true.tum")
     scans = list(gs.read_log(office / "run.log"))

@@ -187,17 +187,6 @@ def test_replay_casts_on_the_device_that_scored(scene):
 # ---- the command
 
 
-@pytest.mark.slow
-def test_all_backends_present_agree(capsys):
-    code, out, err = run(capsys, "-v")
-    assert err == ""
-    assert code == 0, out
-    assert out.startswith("PASSED: all ")
-    out = " ".join(out.split())
-    for device in gs.devices():
-        assert (device.selection if device.available else device.reason) in out or device.kind == "simulator"
-
-
 # The command's scenes cause no warning.
 @pytest.mark.filterwarnings("error::gpusense.world.plausible.PlausibilityWarning")
 @pytest.mark.long
@@ -344,16 +333,6 @@ def test_a_single_backend_is_held_against_numpy():
     assert [b.info.selection for b in selftest.chosen_backends([name])] == ["numpy", name]
     assert [b.info.selection for b in selftest.chosen_backends(["numpy"])] == ["numpy"]
     assert not any("simulator" in b.info.name.lower() for b in selftest.chosen_backends())
-
-
-@pytest.mark.slow
-def test_the_stiff_catalogue_on_the_command_line(capsys):
-    assert main(["selftest", "--stiff", "--backend", "numpy", "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert document["passed"]
-    quantities = [check["quantity"] for check in document["checks"] if check["passed"]]
-    assert len(quantities) > 400
-    assert {quantity.split()[0] for quantity in quantities} == {"float32", "float64"}
 
 
 def test_a_stiff_breach_is_reported_and_fails(capsys, monkeypatch):

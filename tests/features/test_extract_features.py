@@ -129,20 +129,6 @@ def test_devices_agree_with_the_reference(device, beams, noise):
     np.testing.assert_allclose(found.information, expected.information, rtol=1e-4, atol=1e-3)
 
 
-@pytest.mark.long
-def test_float32_finds_nearly_the_same(device, monkeypatch):
-    scanner = ring(360)
-    ranges, _ = floor_scans(1, scanner, 0.02)
-    expected = gs.extract_features(ranges, scanner, backend=device.info.selection)
-    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, float64=False))
-    found = gs.extract_features(ranges, scanner, backend=device.info.selection)
-    agree = 0
-    for k in range(len(ranges)):
-        one, two = expected.of_scan(k), found.of_scan(k)
-        agree += len(one) == len(two) and (one.kind == two.kind).all() and np.abs(one.pose - two.pose).max() < 1e-3
-    assert agree >= len(ranges) - 1
-
-
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_ties_are_the_same_in_float32(noise, monkeypatch, needs):
     """Some splits on these floors are closer than float32's rounding, and once differed."""

@@ -12,16 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 from support.kernel_scenes import (
-    GRIDS,
     GROUPED,
     PLANES,
-    PRECISIONS,
     UNREACHABLE,
     each_grid,
     on_both,
     planes_of,
     row_after_row,
-    scene_flags,
     squared_distances,
 )
 
@@ -75,16 +72,6 @@ def test_distances_of_a_work_item_a_cell_are_exact_up_to_a_cap(
     np.testing.assert_array_equal(found["squared"], reference["squared"])
     exact = squared_distances(occupied)
     np.testing.assert_array_equal(found["squared"], np.where(exact <= most, exact, UNREACHABLE))
-
-
-def test_bits_of_a_map_are_its_cells() -> None:
-    for occupied in GRIDS.values():
-        for part in (occupied, occupied[:, 1:], occupied[::2, ::2]):
-            words = packed(part)
-            assert (words.dtype, words.shape) == (np.int32, (len(part), -(-part.shape[1] // 32)))
-            cells = (words[:, :, None] >> np.arange(32)) & 1
-            np.testing.assert_array_equal(cells.reshape(len(part), -1)[:, : part.shape[1]], part)
-            assert words.size == 0 or cells.sum() == part.sum()
 
 
 # ---- empty rectangles
@@ -232,23 +219,6 @@ def test_rectangles_have_the_bits_of_the_reference(
         np.testing.assert_array_equal(row_after_row(groups, GROUPED, len(occupied)), in_rows)
 
 
-@each_grid
-def test_free_cells_of_a_part_leave_the_others_alone(occupied: np.ndarray, device: Backend) -> None:
-    rows, cols = occupied.shape
-    for begin, end in ((0, cols), (cols // 3, cols - cols // 4)):
-        blank = np.full((2, rows, cols), 7, np.uint8)
-        strips = -(-(end - begin) // 64)
-        cells, bits = occupied.astype(np.uint8), packed(occupied)
-        call = ("free_columns", frozenset(), (strips, 2), cells, blank, rows, cols, begin, end)
-        reference, found = on_both(device, *call)
-        np.testing.assert_array_equal(found["runs"], reference["runs"])
-        call = ("free_rows", frozenset(), (end - begin, rows), bits, blank, rows, cols, bits.shape[1], begin, end)
-        reference, found = on_both(device, *call)
-        np.testing.assert_array_equal(found["runs"], reference["runs"])
-        outside = np.delete(found["runs"], np.s_[begin:end], axis=2)
-        assert (outside == 7).all()
-
-
 def edits(rng: np.random.Generator, shape: tuple[int, int]) -> list[Window]:
     """Return edits of single cells, including the four corners, and of windows, including windows at borders."""
     rows, cols = shape
@@ -298,54 +268,4 @@ def test_updated_rectangles_are_those_made_anew(
         np.testing.assert_array_equal(planes, np.frombuffer(zlib.decompress(anew), np.uint16).reshape(planes.shape))
 
 
-@pytest.mark.long
-@pytest.mark.sampled(0.3)
-@pytest.mark.parametrize("kind", ["cpu", "gpu"])
-@pytest.mark.parametrize("form", PLANES, ids=repr)
-def test_a_cell_that_comes_and_goes_is_seen_as_far_as_rectangles_reach(
-    form: Planes, kind: str, as_kind: Callable[[str], Backend]
-) -> None:
-    """In an empty map, 255 cells from the borders, the change has its longest reach."""
-    device, shape, place = as_kind(kind), (520, 530), (257, 262)
-    occupied = np.zeros(shape, bool)
-    rectangles = empty_rectangles(device, occupied, form)
-    empty = made(device, occupied, form)
-    for number in range(2):
-        occupied[place] = number == 0
-        mended = made(device, occupied, form, rectangles, Window(*place, 1, 1))
-        expected = planes_of(occupied, form, kind) if number == 0 else empty
-        np.testing.assert_array_equal(mended, expected)
-        if number == 0:
-            differ = np.argwhere((mended != empty).any(axis=(0, 1))) - 1
-            assert np.abs(differ - place).max() == 254
-
-
 # ---- the likelihood field
-
-
-@pytest.mark.parametrize("real", PRECISIONS)
-def test_the_table_is_filled_with_its_ring(real: type, device: Backend) -> None:
-    squared = squared_distances(GRIDS["sparse"])
-    rows, cols = squared.shape
-    cap, beyond = 50, -3.5
-    density = np.random.default_rng(19).random(cap + 1).astype(real)
-    table = np.full((rows + 4, cols + 4), -7, real)
-    place = (-2, -2, cols + 4, rows + 4, 0, cols + 4)
-    call = ("fill_field", scene_flags(real), (cols + 4, rows + 4), squared, density, table, rows, cols, cap, beyond)
-    reference, found = on_both(device, *call, *place)
-    np.testing.assert_array_equal(found["table"], reference["table"])
-    expected = np.pad(density[np.minimum(squared, cap)], 2, constant_values=beyond)
-    np.testing.assert_array_equal(found["table"], expected)
-
-
-@pytest.mark.parametrize("real", PRECISIONS)
-def test_a_part_of_the_table_is_filled(real: type, device: Backend) -> None:
-    squared, density = squared_distances(GRIDS["sparse"]), np.arange(51).astype(real)
-    rows, cols = squared.shape
-    table = np.full((30, 40), -7, real)
-    # Rows 20 to 24 and columns 3 to 9 go to row 6 and column 11.
-    call = ("fill_field", scene_flags(real), (7, 5), squared, density, table, rows, cols, 50, 0.0, 3, 20, 7, 5, 251, 40)
-    reference, found = on_both(device, *call)
-    np.testing.assert_array_equal(found["table"], reference["table"])
-    table[6:11, 11:18] = np.minimum(squared[20:25, 3:10], 50)
-    np.testing.assert_array_equal(found["table"], table)

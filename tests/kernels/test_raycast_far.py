@@ -20,7 +20,6 @@ from support.raycast_scenes import (
     unit,
 )
 
-from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import differing
 from gpusense.tables.rectangles import Planes
 
@@ -73,21 +72,3 @@ def test_origins_nearly_as_far_off_as_a_range_may_be_long(precision, backend):
             assert abs(skipped + walk(occupied.tolist(), near).t - found[i]) <= 1e-9 or backward_error_is_small(
                 occupied.tolist(), near, found[i] - skipped, move=1e-9, turn=FLOAT64_TURN, tolerance=1e-9
             )
-
-
-@pytest.mark.long
-@pytest.mark.sampled(0.5)
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_the_longest_corridor(precision, backend):
-    """After a million cells inside the map, counts of boundaries are as exact as at the beginning."""
-    length = MOST - 100 if get_backend(backend).info.backend != "numpy" else 100_000
-    occupied = np.zeros((3, length), bool)
-    occupied[:, -1] = True
-    rng = np.random.default_rng(23)
-    frac = rng.integers(0, 1 << 24, (60, 2)) / (1 << 24)
-    slope = as_float32(np.where(np.arange(60) % 2, rng.uniform(-9e-7, 9e-7, 60), 0.0))
-    cell = np.stack([rng.integers(0, 50, 60), np.full(60, 1)], axis=1)
-    scene = Scene(occupied, cell, frac, np.stack([np.ones(60), slope], axis=1), float(MOST))
-    expected = length - 1 - cell[:, 0] - frac[:, 0]
-    found = cast(scene, backend, precision, Planes(2), wide=True)
-    assert (np.abs(found - expected) <= np.spacing(expected.astype(precision))).all()

@@ -20,9 +20,6 @@ from support.raycast_scenes import (
     scenes_of,
 )
 
-from gpusense.backends import get_backend
-from gpusense.tables.rectangles import Planes
-
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_float64_is_the_rational_walk(family, backend):
@@ -41,22 +38,6 @@ def test_float32_is_the_rational_walk_of_a_ray_near_by(family):
         wrong = np.flatnonzero(np.abs(found - scene.exact) > FLOAT32_CELLS)
         wrong = unexplained(scene, found, wrong, FLOAT32_MOVE, FLOAT32_TURN, FLOAT32_CELLS)
         assert not len(wrong), [(scene.ray(i), scene.outside_occupied, found[i], scene.exact[i]) for i in wrong[:3]]
-
-
-@pytest.mark.slow
-@pytest.mark.sampled(0.2)
-@pytest.mark.parametrize("family", FAMILIES)
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("sectors", [1, 2, 4])
-def test_every_backend_has_the_bits_of_numpy_for_any_number_of_sectors(family, backend, precision, sectors):
-    bits = np.dtype(precision).str.replace("f", "u")
-    for scene in scenes_of(family):
-        expected = cast(scene, "numpy", precision)
-        # Also in lanes, if the device has lanes.
-        for wide in (False, True) if get_backend(backend).info.lanes > 1 else (False,):
-            found = cast(scene, backend, precision, Planes(sectors), wide=wide)
-            wrong = np.flatnonzero(expected.view(bits) != found.view(bits))
-            assert not len(wrong), [(scene.ray(i), found[i], expected[i]) for i in wrong[:3]]
 
 
 def unexplained(

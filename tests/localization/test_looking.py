@@ -139,12 +139,6 @@ def test_random_looks_leave_the_bits_of_the_belief(seed):
     check(seed, "numpy")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [20, 21])
-def test_random_looks_leave_the_bits_of_the_belief_on_devices(seed, device):
-    check(seed, device.info.selection)
-
-
 @pytest.mark.parametrize("seed", [30, 31])
 def test_random_looks_leave_the_bits_of_the_belief_in_recorded_steps(seed, warp_as_gpu):
     check(seed, "warp:cpu")

@@ -6,10 +6,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from support.kernel_scenes import run
 
 from gpusense.backends import get_backend
-from gpusense.interface.structs import ScoreTable
 from gpusense.matching.score_tables import ScoreTables, field_scores
 from gpusense.matching.search import PoseGrid, Search
 
@@ -68,74 +66,6 @@ def test_branch_and_bound_finds_the_poses_of_brute_force(name, tables, stride, l
             brute = search.find(points, grid, slack=slack, allowed=mask, level=0)
             np.testing.assert_array_equal(brute.score, found.score)
             assert brute.evaluated == grid.count
-
-
-@pytest.mark.parametrize("name", ["opencl", "warp"])
-def test_kernels_have_the_sums_of_the_reference(name, needs):
-    rng = np.random.default_rng(5)
-    shape, folded = ScoreTable(2, 20, 31, 16), ScoreTable(8, 13, 16, 16)
-    # The margin holds the value of cells beyond the table.
-    table = np.full((2, 52, 63), 9, np.uint8)
-    table[:, 16:-16, 16:-16] = rng.integers(0, 256, (2, 20, 31))
-    quarters = rng.integers(-(2**31), 2**31, (2, 52, 63)).astype(np.int32)
-    losses = table // 8
-    first = np.array([0, 40, 40, 2700], np.int32)
-    point = rng.integers(-60, 90, (2700, 2)).astype(np.int32)
-    image = rng.integers(0, 2, 2700).astype(np.int32)
-    allowed = (rng.random((11, 21)) < 0.4).astype(np.uint8)
-    allowed[:8, :16] = 0
-    bounds = rng.integers(-1, 50, (3, 11, 21)).astype(np.int32)
-    block = np.column_stack([rng.integers(0, 3, 200), rng.integers(0, 11, (200, 2)), rng.integers(-1, 400_000, 200)])
-    block = block.astype(np.int32)
-    low = np.array([30], np.int32)
-    mask = (rng.random((6, 11)) < 0.6).astype(np.uint8)
-    end, start = rng.uniform(-40, 40, (30, 2)), rng.uniform(-9, 9, (2, 2))
-    heading = rng.uniform(-1, 1, (6, 2))
-    ends = np.array([0, 20, 40, 60, 70, 80, 90], np.int32)
-    made = [np.zeros(180, np.int32), np.zeros(180, np.int32), np.zeros(90, np.int32)]
-    counts = np.array([7, 0], np.int32)
-    best = np.column_stack([rng.integers(-1, 40, 66), rng.integers(0, 21, 66)]).astype(np.int32)
-    histogram = np.stack([np.bincount(part[part >= 0] >> 2, minlength=512) for part in best[:, 0].reshape(2, 33)])
-    histogram = histogram.astype(np.int32)
-    # The least scores of at least 9 and 40 rows of a scan, in steps of 4.
-    least = np.array([4 * (np.sort(part)[-9] >> 2) for part in best[:, 0].reshape(2, 33)]).repeat(3)[:, None]
-    number, every = ((best[:, 0].reshape(6, 11) >= limit).sum(axis=1).astype(np.int32) for limit in (least, 0))
-    blocks = (shape, 200, 12, 22, 11)
-    calls = [
-        ("pool_scores", (63, 52, 2), table, np.zeros_like(table), shape, 4),
-        ("fold_scores", (48, 45, 8), table, np.zeros(8 * 45 * 48, np.uint8), shape, folded, 4, 2, 9, 8),
-        ("pack_quarters", (63, 52, 2), table, np.zeros_like(quarters), shape, 4, 0),
-        ("pack_quarters", (63, 52, 2), table, np.zeros_like(quarters), shape, 4, 1),
-        ("place_ends", (20, 6), end, heading, start, ends, image[:90], *made, 0, 6, 3, 3, 2, 1, 18),
-        ("shift_scores", (21, 2, 3), losses, point, image, first, allowed, np.zeros(3 * 11 * 21, np.int32), shape,
-         0, 3, 11, 21, 8),
-        ("shift_scores", (21, 2, 3), table, point, image, first, allowed, np.zeros(3 * 11 * 21, np.int32), shape,
-         0, 3, 11, 21, 1),
-        ("row_maxima", (33,), bounds, np.zeros(66, np.int32), np.zeros(512, np.int32), 33, 21, 11, 3, 2),
-        ("count_promising", (6,), best, histogram, np.zeros(6, np.int32), 6, 11, 3, 2, 9),
-        ("pick_blocks", (6,), best, histogram, number, np.zeros(72, np.int32), 6, 11, 3, 1, 2, 9),
-        ("pick_blocks", (6,), best, histogram, every, np.zeros(320, np.int32), 6, 11, 3, 1, 2, 40),
-        ("raise_low", (200,), block, np.array([9, 3], np.int32), np.array([5, 399_000], np.int32), 200, 100),
-        ("choose_blocks", (33,), bounds, bounds.max(axis=2).repeat(2), low, np.zeros(4 * 693, np.int32), counts,
-         33, 11, 21, 3, 1, 693),
-        ("follow_blocks", (200,), quarters, point, image, first, mask, block, *blocks, 1, 2, 0),
-        ("follow_blocks", (200,), quarters, point, image, first, mask, block, *blocks, 1, 2, 1),
-        ("divide_blocks", (16,), quarters, point, image, first, mask, block, low, np.zeros(16 * 200, np.int32),
-         np.array([0, 0, 190], np.int32), shape, 10, 150, 800, 16, 3, 12, 22, 11, 3, 1, 2, 0),
-    ]  # fmt: skip
-    device = get_backend(needs(name))
-    for kernel, size, *values in calls:
-        wide = [frozenset({"IN_LANES"})] if kernel == "shift_scores" and name == "opencl" else []
-        expected = run(get_backend("numpy"), kernel, frozenset(), size, *values)
-        for flags in [frozenset(), *wide]:
-            got = run(device, kernel, flags, size, *values)
-            for output, numbers in expected.items():
-                assert numbers.any()
-                if output in ("block", "part"):
-                    # Their order is not certain.
-                    got[output], numbers = (np.sort(one.reshape(-1, 4).view("i4,i4,i4,i4"), axis=0)
-                                            for one in (got[output], numbers))  # fmt: skip
-                np.testing.assert_array_equal(got[output], numbers, err_msg=f"{kernel} {output} {flags}")
 
 
 def test_the_best_pose_of_a_room_is_found_by_few_evaluations():

@@ -89,24 +89,6 @@ def test_scripts_run(script: str, needs: Callable[[str], str], request: pytest.F
     assert check(run(script, *arguments, output=tmp_path / "report"))
 
 
-@pytest.mark.slow
-def test_trees_are_compared(needs: Callable[[str], str], tmp_path: Path) -> None:
-    """A tree has its own bits, and rows of both processes."""
-    arguments = ["--old", str(BENCH.parent), "--new", str(BENCH.parent), "--backend", needs("opencl"), "--limit", "50"]
-    arguments += ["--particles", "1000", "--beams", "8", "--size", "20", "--blocks", "2", "--turns", "2", "--bits"]
-    words = ["--rows", "field, tracking", "rays, global", "preparation", "scans", "step, field, 500"]
-    report = run_script(
-        "compare_trees.py", "speed", *arguments, "--seconds", "0.001", *words, output=tmp_path / "trees"
-    )
-    names = {row["what"] for row in report["rows"]}
-    assert {"rays, global, 1000 x 8", "field, tracking, 1000 x 8", "preparation, field"} <= names
-    assert {"field, tracking, 1000 x 60", "field, tracking, 1000 x 60, bound", "field, 20 scans of 500 x 60"} <= names
-    assert "filter step, field, 500 x 60" in names
-    for row in report["rows"]:
-        assert row["same_bits"] and not row["slower"] and len(row["blocks"]) == 2
-        assert row["quartiles"][0] <= row["ratio"] <= row["quartiles"][1] and row["old_s"] > 0 and row["new_s"] > 0
-
-
 def test_bits_of_trees_are_compared(
     needs: Callable[[str], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from gpusense.backends import Backend, get_backend
 from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.interface.signatures import KERNELS
-from gpusense.interface.structs import Caster, Cone, Crowd, MixtureTables, RangeScale, ScanBatch, Window
+from gpusense.interface.structs import Caster, Crowd, RangeScale, Window
 from gpusense.tables.rectangles import ROWS, Planes, empty_rectangles
 
 PRECISIONS = (np.float32, np.float64)
@@ -24,8 +24,6 @@ PLANES = (Planes(1), Planes(2), Planes(4))
 GROUPED = Planes(2, ROWS)
 SCALE = RangeScale(LIMIT, RESOLUTION, LIMIT * RESOLUTION)
 NO_CROWD = Crowd(0, 0, 0, 0, 0.0)
-# Particles of each scan and particles before a launch, not read for a single scan.
-ONE_SCAN = ScanBatch(1, 0)
 
 
 def run(
@@ -106,8 +104,6 @@ def adversarial_poses(occupied: np.ndarray, real: type, *, outside: bool) -> tup
 
 # The exact caster has no knobs.
 EXACT = Caster(0, 0.0, 0.0)
-# One ray a cone and no bins of incidence.
-LASER = (MixtureTables(1, 0, 0.0), Cone(1, 0.0))
 
 
 def window_of(cells: np.ndarray) -> Window:
@@ -118,10 +114,6 @@ def window_of(cells: np.ndarray) -> Window:
 def one_world(real: type) -> tuple[np.ndarray, np.ndarray]:
     """Return the arguments ``world`` and ``shapes``, which kernels of a single map do not read."""
     return np.zeros((1, 2), np.int32), np.zeros(1, real)
-
-
-def nothing(real: type, numbers: int = 1) -> np.ndarray:
-    return np.zeros((1, numbers) if numbers > 1 else 1, real)
 
 
 def scene_flags(real: type, *names: str) -> frozenset[str]:

@@ -55,28 +55,6 @@ def test_repeated_readings_know_no_more_than_one(needs) -> None:
     assert fit.range_bias_error == pytest.approx(once.range_bias_error, rel=1e-3)
 
 
-@pytest.mark.slow
-def test_errors_over_blocks_are_those_of_repeated_experiments(needs) -> None:
-    """The 20 readings of each of 60 scans share an error; sigma_hit and z_hit scatter so over 60 experiments."""
-    backend = needs("opencl")
-    values, claimed, independent = [], [], []
-    for seed in range(60):
-        rng = np.random.default_rng(seed)
-        expected = rng.uniform(2, 8, (60, 20))
-        z = expected + rng.normal(0, 1, (60, 1)) * 0.15 + rng.normal(0, 0.05, (60, 20))
-        lost = rng.uniform(size=(60, 20)) < rng.beta(0.5, 2, (60, 1))
-        z[lost] = rng.uniform(0, 10, int(lost.sum()))
-        labels = np.broadcast_to(np.arange(60)[:, None], (60, 20))
-        fit = gs.fit_beam_parameters(z, expected, RANGE_MAX, backend=backend, blocks=labels)
-        values.append([fit.parameters.z_hit, fit.parameters.sigma_hit])
-        claimed.append([fit.standard_errors[name] for name in ("z_hit", "sigma_hit")])
-        independent.append([fit.independent_errors[name] for name in ("z_hit", "sigma_hit")])
-    spread = np.std(values, axis=0, ddof=1)
-    # The spread of 60 values is known to 9 %.
-    assert (np.abs(np.median(claimed, axis=0) / spread - 1) < 0.3).all()
-    assert (np.median(independent, axis=0) < 0.6 * spread).all()
-
-
 def test_bins_of_incidence_have_errors_over_blocks() -> None:
     z, expected = draw(TYPICAL, 800, 5)
     angles = np.random.default_rng(0).uniform(0, 1.5, 800)

@@ -71,35 +71,6 @@ def test_an_empty_bin_keeps_the_pooled_parameters() -> None:
 
 
 @pytest.mark.long
-def test_bins_have_a_shape_of_hits_of_their_own(needs) -> None:
-    rng = np.random.default_rng(3)
-    truths = [
-        HEAD_ON.replace(hit="student", hit_dof=2.0),
-        GRAZING.replace(hit="student", hit_dof=8.0, z_hit=0.8, z_max=0.05),
-    ]
-    expected, angles = rng.uniform(2, 8, 2000), np.repeat([0.3, 1.2], 1000)
-    z = np.concatenate(
-        [sample_readings(e, RANGE_MAX, p, rng) for e, p in zip(np.split(expected, 2), truths, strict=True)]
-    )
-    options = dict(backend=needs("opencl"), hit="student")
-    fit = gs.fit_incidence_parameters(z, expected, angles, RANGE_MAX, bins=2, strength=0, **options)
-    assert fit.converged and "hit_dof" in str(fit)
-    for own, truth, chosen in zip(fit.fits, truths, (angles < 1, angles > 1), strict=True):
-        alone = gs.fit_beam_parameters(z[chosen], expected[chosen], RANGE_MAX, **options)
-        assert own.log_likelihood == pytest.approx(alone.log_likelihood, abs=1e-4)
-        found, error = own.parameters, own.standard_errors
-        assert abs(found.sigma_hit - truth.sigma_hit) < 4 * error["sigma_hit"]
-        # 1 / hit_dof is nearly normal, hit_dof is not.
-        assert abs(1 / found.hit_dof - 1 / truth.hit_dof) < 4 * error["hit_dof"] / found.hit_dof**2
-    # A bin without readings keeps the pooled parameters.
-    held = gs.fit_incidence_parameters(z[:400], expected[:400], angles[:400], RANGE_MAX, bins=2, **options)
-    for name, value in held.parameters.parameters[1].to_dict().items():
-        assert value == (pooled := getattr(held.pooled.parameters, name)) or value == pytest.approx(pooled, rel=1e-4), (
-            name
-        )
-
-
-@pytest.mark.long
 def test_beams_that_hit_nothing_have_parameters_of_their_own() -> None:
     z, expected, angles = scene((600, 300))
     nothing = np.concatenate([angles, np.full(50, np.nan)])

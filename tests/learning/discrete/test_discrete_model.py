@@ -273,27 +273,6 @@ def test_learning_finds_the_causes(truth):
     assert each == pytest.approx(fit.log_likelihood, rel=1e-12)
 
 
-@pytest.mark.slow
-def test_standard_errors_are_the_scatter_of_repetitions():
-    """16 repetitions give the deviation to 18 %; a factor of 2 is 3.9 times as much."""
-    truth, found, told = gs.DiscreteCauses(0.3, 0.05, 0.85, 0.3), [], []
-    for seed in range(16):
-        table = gs.DiscreteBeamModel.learn(*simulated(truth, 3000, 12, seed), RANGE, 12)
-        found.append([getattr(table.causes, name) for name in NAMES])
-        told.append([table.fit.standard_errors[name] for name in NAMES])
-    ratio = np.std(found, axis=0) / np.median(told, axis=0)
-    assert (ratio > 0.5).all() and (ratio < 2).all(), ratio
-
-
-@pytest.mark.slow
-def test_many_steps_are_learned_from_few():
-    z, expected = simulated(gs.DiscreteCauses(0.3, 0.05, 0.9, 0.05), 20_000, 300)
-    fine = gs.DiscreteBeamModel.learn(z, expected, RANGE, 300)
-    assert fine.fit.converged and fine.fit.log_likelihood > count_pairs(z, expected, RANGE, 300).log_likelihood(
-        gs.DiscreteCauses(0.3, 0.05, 0.9, 0.05)
-    )
-
-
 def test_readings_are_counted_by_class_and_step(monkeypatch):
     random = np.random.default_rng(1)
     z, expected = random.uniform(-1, 6, 500).astype(np.float32), random.uniform(0, 6, 500)

@@ -9,7 +9,6 @@ from support import landmark_scenes as scenes
 from support.selection import on_every_backend
 
 import gpusense as gs
-from gpusense.models import chunking
 from gpusense.models.landmark.features import check_features
 from gpusense.world.landmarks import make_buckets
 
@@ -164,19 +163,6 @@ def test_coincident_landmarks_are_the_first_of_them(backend):
     model, poses, features = scenes.model("ordinary", backend)
     which, _ = model.associate(poses[:1], features)
     assert which.tolist() == [list(scenes.SEEN)]
-
-
-@pytest.mark.long
-def test_pieces_have_the_same_bits(backend, monkeypatch):
-    landmarks, poses, features = forest(40, 30.0)
-    for options in (dict(), dict(association="sum"), dict(association="joint", negative=True)):
-        model = gs.LandmarkModel(landmarks, backend=backend, **options)
-        whole = model.log_likelihood(poses, features[:, :2]), *model.associate(poses, features[:, :2])
-        monkeypatch.setattr(chunking, "CHUNK", 30)
-        parts = model.log_likelihood(poses, features[:, :2]), *model.associate(poses, features[:, :2])
-        monkeypatch.undo()
-        for a, b in zip(whole, parts, strict=True):
-            np.testing.assert_array_equal(a, b)
 
 
 def test_temperature_multiplies_the_sum(backend):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -73,30 +71,3 @@ def test_nothing_beyond_the_end_changes_the_density(name, precision):
         near = log_mixture(2.0, 2.0 + 0.5 * offset - p.range_bias, range_max=RANGE, **p.to_dict())
         far = log_mixture(2.0, RANGE, range_max=RANGE, **p.to_dict())
         assert abs(near - far) > np.finfo(precision).eps or offset < 1e-5 * RANGE
-
-
-@pytest.mark.slow
-@pytest.mark.sampled(1, without="warp:cpu")
-def test_scenes_in_which_rays_do_not_end(backend):
-    """Try default parameters, repeated bearings, tables, bins of incidence, peers' weights, and casters by table."""
-    grid, scanner, poses, z = scene(5)
-    ends = PARAMETERS["no short"]
-    twice = gs.Scanner(np.repeat(scanner.bearings, 2), RANGE)
-    angles = gs.IncidenceParameters((0.0, 1.0, math.pi / 2), (ends, ends))
-    for model in (
-        gs.BeamModel(grid, scanner, backend=backend),
-        gs.BeamModel(grid, scanner, ends, sensor_table=0.1, backend=backend),
-        gs.BeamModel(grid, scanner, ends, caster="bresenham", backend=backend),
-        gs.BeamModel(grid, scanner, ends, caster=gs.casters.Lookup(30), backend=backend),
-        gs.BeamModel(grid, scanner, ends, specialize=False, backend=backend),
-        gs.BeamModel(grid, scanner, incidence=angles, backend=backend),
-        gs.BeamModel(grid, scanner, gs.BeamParameters(0.9, 0.0, 0.1, 0.0), backend=backend),
-        gs.BeamModel(grid, scanner, compat="amcl", backend=backend),
-    ):
-        model.log_likelihood(poses, z)
-        assert "STOPS" not in model._last.flags, model
-    shared = gs.BeamModel(grid, twice, ends, backend=backend)
-    shared.log_likelihood(poses, np.repeat(z, 2))
-    assert "STOPS" not in shared._last.flags
-    growing = gs.BeamParameters(0.8, 0.0, 0.1, 0.1, sigma_growth=0.2)
-    assert "STOPS" not in mixture_of((growing,), RANGE, np.dtype(np.float32), specialize=True, max_depends=False)[0]

@@ -7,11 +7,9 @@ import math
 import numpy as np
 import pytest
 from support.incidence_world import EDGES, INCIDENCE, KINDS, RANGE, RIGHT, P, place
-from support.selection import on_every_backend
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan
-from gpusense.models.scan import tiles
 from gpusense.models.scan.densities import log_mixture
 
 
@@ -66,45 +64,6 @@ def test_every_beam_has_the_parameters_of_its_angle(no_surface, backend):
         assert differing(model.log_likelihood(poses, z), log_p) == 0
         assert (np.ptp(parts[:, 4]) > 1) and (parts[:, [2, 9]] == 0).all()
         assert (" and for none" in model.explain()) == (no_surface is not None)
-
-
-@pytest.mark.long
-@pytest.mark.sampled(0.4)
-@on_every_backend(
-    on_warp=lambda weights: weights != (1, 0, 0, 0), weights=[(0.7, 0.1, 0.1, 0.1), (1, 0, 0, 0), (0.5, 0.5, 0, 0)]
-)
-def test_equal_bins_are_the_plain_model(weights, backend):
-    _, poses, _ = place()
-    parameters = P(*weights)
-    same = gs.IncidenceParameters(EDGES, (parameters,) * 3)
-    z = a_scan()
-    for precision in ("float32", "float64") if backend == "numpy" else ("float32",):
-        model = model_of(backend, incidence=same, precision=precision)
-        plain = model_of(backend, incidence=None, parameters=parameters, precision=precision)
-        found, parts = model.log_likelihood(poses, z, per_beam=True)
-        expected, plain_parts = plain.log_likelihood(poses, z, per_beam=True)
-        if "IN_LANES" in plain._last.flags:
-            # Functions of vectors may round differently.
-            assert (np.abs(parts - plain_parts) <= 2 * per_beam(plain_parts, precision)).all()
-            assert (np.abs(found - expected) <= 2 * per_scan(plain_parts, precision)).all()
-        else:
-            assert differing(parts, plain_parts) == 0 and differing(found, expected) == 0
-
-
-@pytest.mark.long
-def test_tiles_and_orders_change_nothing(as_gpu, backend, monkeypatch):
-    _, poses, _ = place()
-    model, z = model_of(as_gpu(False, scalar=True)), a_scan()
-    one_by_one, parts = model.log_likelihood(poses, z, per_beam=True)
-    assert "IN_LANES" not in model._last.flags
-    for least in (tiles.LEAST_ORDERED, (1, 1)):
-        monkeypatch.setattr(tiles, "LEAST_ORDERED", least)
-        tiled = model_of(as_gpu(True))
-        assert differing(tiled.log_likelihood(poses, z), one_by_one) == 0
-        assert "INCIDENCE" in tiled._last.flags
-    assert differing(tiled.log_likelihood(poses, z, per_beam=True)[1], parts) == 0
-    as_gpu(False, scalar=True)
-    assert differing(model.log_likelihood(poses[7:9], z), one_by_one[7:9]) == 0
 
 
 @pytest.mark.sampled(1, without="warp:cpu")

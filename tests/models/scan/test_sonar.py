@@ -16,7 +16,6 @@ from support.selection import on_every_backend
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan
 from gpusense.evaluation.worlds import simulate_scan
-from gpusense.models.scan import tiles
 from gpusense.models.scan.densities import log_mixture
 from gpusense.tables.casters import CASTERS, Lookup
 
@@ -120,31 +119,7 @@ def test_scores_are_the_mixture_at_what_a_sonar_hears(incidence, backend):
     assert "cones of 7 rays, no return beyond 0.6 rad of incidence" in title and "CONES" in model.explain()
 
 
-@pytest.mark.long
-def test_tiles_and_shared_cones_change_nothing(as_gpu, backend, monkeypatch):
-    """Two sensors that look the same way share a cone."""
-    grid, poses, _ = place()
-    scanner = gs.Scanner(np.append(RING, RING[3]), RANGE, mount=MOUNT, **SONAR)
-    z = np.append(a_scan(), 2.0)
-    expected, parts = gs.BeamModel(grid, scanner, backend=as_gpu(False, scalar=True)).log_likelihood(
-        poses, z, per_beam=True
-    )
-    monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
-    model = gs.BeamModel(grid, scanner, backend=as_gpu())
-    assert differing(model.log_likelihood(poses, z), expected) == 0
-    assert {"SHARED_RAYS", "CONES", "INCIDENCE"} <= model._last.flags
-    alone = gs.BeamModel(grid, ring(**SONAR), backend=as_gpu(False, scalar=True)).log_likelihood(
-        poses, a_scan(), per_beam=True
-    )[1]
-    assert differing(parts[:, :8], alone) == 0
-    assert differing(model.expected_ranges(poses)[:, 8], model.expected_ranges(poses)[:, 3]) == 0
-
-
 # ------------------------------------------------------------------------------------------------- laws of cones
-
-
-def expected(grid: gs.OccupancyGrid, poses: np.ndarray, **options) -> np.ndarray:
-    return gs.BeamModel(grid, ring(**options), backend="numpy", precision="float64").expected_ranges(poses)
 
 
 def test_a_cone_of_one_ray_is_a_laser(backend):

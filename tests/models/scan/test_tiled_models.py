@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from support.kernel_scenes import assert_near
+from support.scan_calls import INCIDENCE
 from support.selection import on_every_backend
 
 import gpusense as gs
@@ -94,23 +95,28 @@ def same_as_one_by_one(
     return code
 
 
-# Parts of a beam model's tiles that other tests only sample: options, and flags of the code.
+# Parts of a beam model's tiles that other tests only sample: options, cones, and flags of the code.
 PARTS = [
     (
         dict(parameters=gs.BeamParameters(range_bias=0.02, sigma_growth=0.01), outside="occupied"),
+        {},
         {"BIAS", "GROWTH", "OUTSIDE_OCCUPIED"},
     ),
-    (dict(parameters=gs.BeamParameters(0.8, 0.0, 0.1, 0.1, sigma_hit=0.01), caster="dda"), {"DDA", "STOPS"}),
-    (dict(compat="amcl"), {"CUBES"}),
+    (dict(parameters=gs.BeamParameters(0.8, 0.0, 0.1, 0.1, sigma_hit=0.01), caster="dda"), {}, {"DDA", "STOPS"}),
+    (dict(compat="amcl"), {}, {"CUBES"}),
+    (dict(incidence=INCIDENCE), {}, {"INCIDENCE"}),
+    ({}, dict(cone=0.3, cone_rays=3), {"CONES"}),
 ]
 
 
 @pytest.mark.sampled(1)
 @pytest.mark.long_on("warp")
-@pytest.mark.parametrize(("options", "flags"), PARTS, ids=["offset", "dda", "cubes"])
-def test_parts_of_beam_models(options, flags, as_gpu):
+@pytest.mark.parametrize(
+    ("options", "cones", "flags"), PARTS, ids=["offset", "dda", "cubes", "angles of incidence", "cones"]
+)
+def test_parts_of_beam_models(options, cones, flags, as_gpu):
     grid, _, z = world()
-    scanner = gs.Scanner(np.linspace(-3, 3, BEAMS), RANGE)
+    scanner = gs.Scanner(np.linspace(-3, 3, BEAMS), RANGE, **cones)
     code = same_as_one_by_one(
         lambda device: gs.BeamModel(grid, scanner, backend=device, **options), as_gpu, poses_of("inside"), z
     )
@@ -256,7 +262,8 @@ def test_batches(kind, ordered, as_gpu):
     grid, scanner, z = world()
     model = kind(grid, scanner, backend=as_gpu())
     several = np.stack([poses_of("all over"), poses_of("inside"), poses_of("inside") + 0.1])
-    scans = np.stack([z, np.roll(z, 3), np.full(BEAMS, np.nan)])
+    # The constant terms of the scans, of their max readings, differ.
+    scans = np.stack([z, np.where(np.arange(BEAMS) % 4, np.roll(z, 3), np.inf), np.full(BEAMS, np.nan)])
     found = model.log_likelihood(several, scans)
     out = np.empty((3, COUNT), np.float32)
     assert model.log_likelihood(several, scans, out=out) is out

@@ -23,7 +23,7 @@ SIZE, BEAMS, FIELD_OF_VIEW, RANGE_MAX, SIGMA_XY, SIGMA_THETA = (30.0, 20.0), 180
 BEAM, FIELD = "beam model", "likelihood field"
 PRECISION: Precision = "float32"
 # Most particles of the NumPy reference; total time of repeated calls [s]; most repeated calls.
-REFERENCE_PARTICLES, PATIENCE, REPETITIONS = 1000, 0.2, 3
+REFERENCE_PARTICLES, PATIENCE, REPETITIONS = 500, 0.2, 3
 
 Model = BeamModel | LikelihoodFieldModel
 

@@ -15,6 +15,7 @@ from gpusense._util.typing import Floats, Precision
 from gpusense.backends import Selection, get_backend
 from gpusense.evaluation.buildings import building
 from gpusense.models.scan.beam import BeamModel
+from gpusense.tables.distances import distance_transform
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.hit_shapes import shape_of
 from gpusense.world.parameters import BeamParameters
@@ -46,12 +47,12 @@ def free_pose(grid: OccupancyGrid, rng: Rng, clearance: float = 0.4) -> Floats:
         >>> gs.worlds.free_pose(gs.worlds.building(), np.random.default_rng(0)).shape
         (3,)
     """
-    from scipy.ndimage import distance_transform_edt
-
     # Distances are from centre to centre [cells]; the nearest points may be half a diagonal nearer on either side.
     _check(grid, rng)
     wanted = checks.real("clearance", clearance, low=0) / grid.resolution + math.sqrt(2)
-    rows, cols = np.nonzero(distance_transform_edt(np.pad(grid.free, 1))[1:-1, 1:-1] >= wanted)
+    edges = np.minimum.outer(*(np.minimum(np.arange(1, n + 1), np.arange(n, 0, -1)) for n in grid.shape))
+    nearest = np.minimum(distance_transform(~grid.free, backend="numpy"), edges)
+    rows, cols = np.nonzero(nearest >= wanted)
     if len(rows) == 0:
         raise ValueError(f"clearance: must be found somewhere in the map, got {clearance}")
     chosen = rng.integers(len(rows))

@@ -137,7 +137,8 @@ def rivals(rows: Sequence[Row], need: str, of: str) -> list[str]:
                 (row.method, row.setting, row.outside or "gpusense", time_text(row.seconds), whole, *errors, device)
             )
     columns = ("method", "setting", "version, threads", f"{of}, one core", "elapsed", *SHOWN[need], "processor")
-    return table(columns, lines, 3) if lines else ["(none in these reports)"]
+    missing = "None in these reports; an [earlier run](../bench/results/other_programs.md) has some."
+    return table(columns, lines, 3) if lines else [missing]
 
 
 def by_map(rows: Sequence[Row], devices: Sequence[str]) -> list[str]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import statistics
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +32,6 @@ WORDS_ONLY = (
 )
 TASK_MEASURES = {"median": "median error", "p95": "95 % error", "max": "largest error"}
 UNITS = {"%": "relative"}
-DISCRETE = "gs.DiscreteBeamModel(gs.BeamParameters(), range_max=scanner.range_max)"
 # The list and the version of each kind of report.
 LISTS = {"models": "points", "tasks": "rows"}
 SCHEMAS = {"models": 2, "tasks": 1}
@@ -224,19 +222,11 @@ def task_rows(report: Mapping[str, Any]) -> list[Row]:
         rows.append(
             Row(
                 one["need"], titles[one["backend"]], ALL, one["method"], one["setting"], one["precision"],
-                code_of(one["code"]), seconds, quartiles, errors, dict.fromkeys(errors, unit),
+                one["code"], seconds, quartiles, errors, dict.fromkeys(errors, unit),
                 outside=one.get("outside") or "", origin=origin, doubt=doubt(one),
             )
         )  # fmt: skip
     return rows
-
-
-def code_of(text: str) -> str:
-    """Return the code of a row; reports of 2026-11-26 and before name neither map nor laser."""
-    text = text.replace("gs.BeamModel(gs.BeamParameters, ", "gs.BeamModel(").replace(
-        "(gs.DiscreteBeamModel, ", f"({DISCRETE}, "
-    )
-    return re.sub(r"(gs\.(?:LikelihoodField|Beam)Model)\((?=beams|gs\.Discrete)", r"\1(grid, scanner, ", text)
 
 
 def doubt(row: Mapping[str, Any]) -> float:

@@ -280,8 +280,7 @@ def on_device(device: Any, array: np.ndarray) -> Any:
         return pyopencl.array.to_device(queue, array)
     import warp as wp
 
-    dtype = {"float32": wp.float32, "float64": wp.float64}[array.dtype.name]
-    return wp.array(array, dtype=dtype, device=device.info.selection.removeprefix("warp:"))
+    return wp.array(array, device=device.info.selection.removeprefix("warp:"))
 
 
 def on_host(array: Any) -> np.ndarray:

@@ -5,9 +5,10 @@
 
 Every world is a room of 256 x 256 cells with boxes in it, each with 16 robots of 360 beams. A single map has as many
 robots as the largest number of worlds, and either the size of a room or as many cells as all rooms, up to 4096 x 4096.
-Rates time whole calls. Poses and indices are in host memory, on CUDA in the device's. --kernels adds the time of each
-launch by the device's clock, and --tiles casts rays of worlds in tiles of poses and rays, as rays of one map. --peers
-casts lidars among discs in worlds without walls, and runs VMAS and ir-sim on the same scene where they are installed.
+Rates time whole calls and, after a slash, bound calls. Poses, indices and ranges are in a GPU's memory, for processors
+in the host's. --kernels adds the time of each launch by the device's clock, and --tiles casts rays of worlds in tiles
+of poses and rays, as rays of one map. --peers casts lidars among discs in worlds without walls, and runs VMAS and
+ir-sim on the same scene where they are installed.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ from gpusense.models.scan import tiles
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Recorder, add_repeats, make_parser, note, parse, publish, table
+from common import Recorder, add_repeats, make_parser, note, on_device, parse, publish, table
 
 SIDE, ROBOTS, RESOLUTION, RANGE_MAX = 256, 16, 0.05, 10.0
 BEARINGS = np.linspace(-np.pi, np.pi, 360, endpoint=False)
 COLUMNS = (
     "worlds",
     "shapes",
-    "M rays/s",
+    "M rays/s, whole call / bound call",
     "of one room",
     "of one map",
     "made [ms]",
@@ -79,17 +80,15 @@ def least(run: Callable[[], Any], backend: Any, repeats: int, seconds: float) ->
     return best
 
 
-def on_device(backend: Any, *arrays: np.ndarray) -> list[Any]:
-    """Return arrays on the device where PyTorch has it, else unchanged."""
-    if not backend.info.selection.startswith("warp:cuda"):
+def there(backend: Any, *arrays: np.ndarray) -> list[Any]:
+    """Return arrays in the memory of a GPU: of PyTorch where CUDA has it, else of the library that drives it."""
+    if backend.info.kind != "gpu":
         return list(arrays)
-    try:
+    if backend.info.backend == "warp" and importlib.util.find_spec("torch") is not None:
         import torch
-    except ImportError:
-        import warp as wp
 
-        return [wp.array(array, device=backend.info.selection.removeprefix("warp:")) for array in arrays]
-    return [torch.from_numpy(array).to(backend.info.selection.removeprefix("warp:")) for array in arrays]
+        return [torch.from_numpy(array).to(backend.info.selection.removeprefix("warp:")) for array in arrays]
+    return [on_device(backend, array) for array in arrays]
 
 
 def shapes_of(worlds: int, count: int, rng: np.random.Generator) -> gs.Shapes:
@@ -103,11 +102,11 @@ def shapes_of(worlds: int, count: int, rng: np.random.Generator) -> gs.Shapes:
 
 
 def rate_of_one(backend: Any, side: int, worlds: int, repeats: int, seconds: float) -> float:
-    """Return the rate of the robots of some worlds in a single map [rays/s]."""
+    """Return the rate of bound calls for the robots of some worlds in a single map [rays/s]."""
     rng = np.random.default_rng(0)
     caster = gs.RayCaster(gs.OccupancyGrid(rooms(1, rng, side)[0], RESOLUTION), RANGE_MAX, backend=backend)
-    (poses,) = on_device(backend, poses_in(worlds, rng, side))
-    rate = len(poses) * len(BEARINGS) / least(lambda: caster.cast(poses, BEARINGS), backend, repeats, seconds)
+    (poses,) = there(backend, poses_in(worlds, rng, side))
+    rate = len(poses) * len(BEARINGS) / least(caster.bind(poses, BEARINGS), backend, repeats, seconds)
     note(f"one map of {side} x {side}: {rate / 1e6:.0f} M rays/s")
     return rate
 
@@ -175,8 +174,8 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         caster = gs.RayCaster(worlds, RANGE_MAX, backend=recorder)
         index = np.arange(count, dtype=np.int32).repeat(ROBOTS)
         index = rng.permutation(index) if arguments.shuffled else index
-        poses, where = on_device(backend, poses_in(count, rng), index)
-        (new,), changed = on_device(backend, kinds), np.arange(len(kinds))
+        poses, where = there(backend, poses_in(count, rng), index)
+        (new,), changed = there(backend, kinds), np.arange(len(kinds))
 
         def cast(caster: Any = caster, poses: Any = poses, where: Any = where) -> None:
             caster.cast(poses, BEARINGS, world=where)
@@ -191,13 +190,16 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
             if shapes:
                 worlds.shapes = shapes_of(count, shapes, rng)
             rate, replaced = rays / least(cast, backend, repeats, seconds), least(replace, backend, repeats, seconds)
+            call = caster.bind(poses, BEARINGS, world=where)
+            call()
+            bound = rays / least(call, backend, repeats, seconds)
             rows.append(dict(
-                worlds=count, shapes=shapes, rate=rate, of_room=rate / room, of_map=rate / one, made=made,
-                replaced=replaced, bytes=worlds.nbytes / (count * SIDE * SIDE),
+                worlds=count, shapes=shapes, rate=rate, bound=bound, of_room=bound / room, of_map=bound / one,
+                made=made, replaced=replaced, bytes=worlds.nbytes / (count * SIDE * SIDE),
                 launches="; ".join(timed(recorder, run) for run in (cast, replace)),
             ))  # fmt: skip
             note(" | ".join(line_of(rows[-1])))
-        del worlds, caster, cast, replace
+        del worlds, caster, cast, replace, call
     return rows
 
 
@@ -281,9 +283,9 @@ obstacle:
 def line_of(row: dict[str, Any]) -> list[str]:
     """Return the cells of a row."""
     return [
-        str(row["worlds"]), str(row["shapes"]), f"{row['rate'] / 1e6:.0f}", f"{row['of_room']:.2f}",
-        f"{row['of_map']:.2f}", f"{1e3 * row['made']:.2f}", f"{1e3 * row['replaced']:.2f}", f"{row['bytes']:.1f}",
-        row["launches"],
+        str(row["worlds"]), str(row["shapes"]), f"{row['rate'] / 1e6:.0f} / {row['bound'] / 1e6:.0f}",
+        f"{row['of_room']:.2f}", f"{row['of_map']:.2f}", f"{1e3 * row['made']:.2f}", f"{1e3 * row['replaced']:.2f}",
+        f"{row['bytes']:.1f}", row["launches"],
     ]  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-// Expected ranges of poses and bearings by any caster.
+// Expected ranges of poses and bearings by any caster. A walk ends at the nearest moving shape.
 // requires: caster tiles shapes
 
 // Cast rays: one work-item takes a particle and ray.
@@ -11,12 +11,12 @@ kernel void cast_ranges(ARGUMENTS) {
 #else
     const Window seen = window;
 #endif
-    const real met = cast_ray(map_table, seen, pose_cell[n], pose[n], ray[k], scale.limit, caster);
 #if SHAPES
-    const real t = nearest_shape(shapes, world, crowd, n, pose_cell[n], pose[n], ray[k], met).x;
+    const real limit = nearest_shape(shapes, world, crowd, n, pose_cell[n], pose[n], ray[k], scale.limit).x;
 #else
-    const real t = met;
+    const real limit = scale.limit;
 #endif
+    const real t = cast_ray(map_table, seen, pose_cell[n], pose[n], ray[k], limit, caster);
     ranges[(long)n * rays + k] = expected_range(t, scale);
 }
 
@@ -39,12 +39,12 @@ kernel void cast_tiles(ARGUMENTS) {
     const Window seen = window;
 #endif
     for (int k = tile_ray(item, spread); k < rays; k += tile_step(spread)) {
-        const real met = cast_ray(map_table, seen, cell, sensor_pose, ray[k], scale.limit, caster);
 #if SHAPES
-        const real t = nearest_shape(shapes, world, crowd, n, cell, sensor_pose, ray[k], met).x;
+        const real limit = nearest_shape(shapes, world, crowd, n, cell, sensor_pose, ray[k], scale.limit).x;
 #else
-        const real t = met;
+        const real limit = scale.limit;
 #endif
+        const real t = cast_ray(map_table, seen, cell, sensor_pose, ray[k], limit, caster);
         ranges[n * rays + k] = expected_range(t, scale);
     }
 }

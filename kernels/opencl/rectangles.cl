@@ -123,9 +123,9 @@ kernel void free_rows(ARGUMENTS) {
 // Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a sector of
 // TALL cells of a column in a quadrant, from the far end on. height and width are the sides of the highest rectangle of
 // sufficient width, narrower is the width of a rectangle that is one row higher, and bound is the number of rows to the
-// nearest row with this width. From one cell to the next the height grows by one at most, and its rows without the new
-// row allow every smaller height. So the next cell's sides need no other row, unless the row that bounds the width is
-// left behind.
+// nearest row with this width; wider and nearer are the same of the rows before that one, wider is -1 where they are
+// unknown. From one cell to the next the height grows by one at most, and its rows without the new row allow every
+// smaller height. So the next cell's sides need no other row, unless both rows that bound the width are left behind.
 kernel void rectangles_scan(ARGUMENTS) {
     const int quadrant = get_global_id(2) & 3, w = get_global_id(2) >> 2;
     const int dx = quadrant & 1 ? -1 : 1, dy = quadrant & 2 ? -1 : 1;
@@ -138,7 +138,7 @@ kernel void rectangles_scan(ARGUMENTS) {
     out += (long)(quadrant * sectors + sector) * lines * (cols + 2);
     const int2 middle = slope(sectors, sector);
     const long line = (long)worlds * cols, step = dy * line;
-    int height = 0, width = LONGEST, narrower = 0, bound = 0, filled = 0;
+    int height = 0, width = LONGEST, narrower = 0, bound = 0, wider = LONGEST, nearer = 0, filled = 0;
     ulong four = 0;
     for (int i = 0; i < end - begin; ++i) {
         const int row = dy > 0 ? end - 1 - i : begin + i, room = min(dy > 0 ? rows - row : row + 1, LONGEST);
@@ -147,7 +147,7 @@ kernel void rectangles_scan(ARGUMENTS) {
             for (;;) {
                 narrower = height < room ? min(width, (int)run[height * step]) : 0;
                 if (narrower * middle.x < (height + 1) * middle.y) break;
-                bound = narrower < width ? height : bound;
+                if (narrower < width) wider = width, nearer = bound, bound = height;
                 width = narrower;
                 ++height;
             }
@@ -155,16 +155,19 @@ kernel void rectangles_scan(ARGUMENTS) {
             const int here = run[0], least = min(here, width);
             const int higher = height < room && least * middle.x >= (height + 1) * middle.y;
             bound = here <= width ? 0 : bound + 1;
-            const int left_behind = !higher && bound >= height && bound > 0;
+            nearer = here <= wider ? 0 : nearer + 1;
+            wider = here <= width ? LONGEST : min(here, wider);
             height = higher ? height + 1 : min(height, divided(here * middle.x, middle.y));
             narrower = height == room ? 0 : higher ? min(here, narrower) : least;
-            width = height > 0 && !left_behind ? least : LONGEST;
-            if (left_behind) {
-                bound = 0;
-                for (int j = 0; j < height; ++j) {
-                    const int other = run[j * step];
-                    bound = other < width ? j : bound;
-                    width = min(width, other);
+            width = height > 0 ? least : LONGEST;
+            if (height > 0 && bound >= height) {
+                width = wider, bound = nearer, wider = -1;
+                if (width < 0 || bound >= height) {
+                    width = LONGEST, bound = 0, wider = LONGEST;
+                    for (int j = 0; j < height; ++j) {
+                        const int other = run[j * step];
+                        if (other < width) wider = width, nearer = bound, width = other, bound = j;
+                    }
                 }
             }
         }

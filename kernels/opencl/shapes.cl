@@ -136,31 +136,35 @@ real2 nearest_shape(global const real *shapes, global const int2 *world, const C
                     const int2 cell, const real4 pose, const real2 ray, const real t) {
     const real2 direction = ray_direction(pose, ray);
     const real dx = direction.x, dy = direction.y;
-    global const real *first = shapes + (long)world[2 * n + 1].x * crowd.stride;
+    // Shape i of a kind begins i times its numbers behind these places.
+    global const real *disc = shapes + (long)world[2 * n + 1].x * crowd.stride;
+    global const real *box = disc + (DISC - BOX) * crowd.discs;
+    global const real *segment = box + (BOX - SEGMENT) * (crowd.discs + crowd.boxes);
     global const int *sights = (global const int *)(world + sight_at(crowd, n, (int)sight_of(dx, dy)));
     real2 nearest = (real2)(t, 2);
     for (int k = 0; k < 2 * crowd.pairs; ++k) {
         const uint seen = (uint)sights[k], discs = lowest_bits(crowd.discs - 32 * k);
         const uint boxes = lowest_bits(crowd.discs + crowd.boxes - 32 * k);
         for (uint left = seen & discs; left != 0; left &= left - 1) {
-            global const real *one = first + shape_at(crowd, 32 * k + lowest_bit(left));
-            const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
-            if (!(fabs(dx * y - dy * x) <= one[2]) || dx * x + dy * y - FARTHER * one[2] >= nearest.x) continue;
-            const real2 met = meet_disc(dx, dy, x, y, one[2]);
+            const real4 one = *(global const real4 *)(disc + DISC * (32 * k + lowest_bit(left)));
+            const real x = (one.x - cell.x) - pose.x, y = (one.y - cell.y) - pose.y;
+            if (!(fabs(dx * y - dy * x) <= one.z) || dx * x + dy * y - FARTHER * one.z >= nearest.x) continue;
+            const real2 met = meet_disc(dx, dy, x, y, one.z);
             if (met.x < nearest.x) nearest = met;
         }
         for (uint left = seen & boxes & ~discs; left != 0; left &= left - 1) {
-            global const real *one = first + shape_at(crowd, 32 * k + lowest_bit(left));
-            const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
+            global const real4 *both = (global const real4 *)(box + BOX * (32 * k + lowest_bit(left)));
+            const real4 one = both[0], rest = both[1];
+            const real x = (one.x - cell.x) - pose.x, y = (one.y - cell.y) - pose.y;
             const real along = dx * x + dy * y;
-            if (!(fabs(dx * y - dy * x) <= one[6]) || along - (FARTHER - 1) * along - one[6] >= nearest.x) continue;
-            const real2 met = meet_box(dx, dy, x, y, one[2], one[3], one[4], one[5]);
+            if (!(fabs(dx * y - dy * x) <= rest.z) || along - (FARTHER - 1) * along - rest.z >= nearest.x) continue;
+            const real2 met = meet_box(dx, dy, x, y, one.z, one.w, rest.x, rest.y);
             if (met.x < nearest.x) nearest = met;
         }
         for (uint left = seen & ~boxes; left != 0; left &= left - 1) {
-            global const real *one = first + shape_at(crowd, 32 * k + lowest_bit(left));
-            const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
-            const real end_x = (one[2] - cell.x) - pose.x, end_y = (one[3] - cell.y) - pose.y;
+            const real4 one = *(global const real4 *)(segment + SEGMENT * (32 * k + lowest_bit(left)));
+            const real x = (one.x - cell.x) - pose.x, y = (one.y - cell.y) - pose.y;
+            const real end_x = (one.z - cell.x) - pose.x, end_y = (one.w - cell.y) - pose.y;
             const real aside = dx * y - dy * x, end_aside = dx * end_y - dy * end_x;
             if ((aside > 0 && end_aside > 0) || (aside < 0 && end_aside < 0)) continue;
             if (dx * x + dy * y >= nearest.x && dx * end_x + dy * end_y >= nearest.x) continue;

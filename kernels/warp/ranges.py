@@ -1,4 +1,4 @@
-"""Expected ranges of poses and bearings by any caster."""
+"""Expected ranges of poses and bearings by any caster. A walk ends at the nearest moving shape."""
 
 import functools
 import importlib
@@ -47,9 +47,10 @@ def make(name, flags):
             table = rest_of(map_table, world_begin(world, n, PLANES))
             seen = world_window(world, n)
         cell = cell_at(pose_cell, n)
-        t = cast_ray(table, seen, cell, pose_at(pose, n), ray_at(ray, k), scale.limit, caster)
+        limit = scale.limit
         if SHAPES:
-            t = nearest_shape(shapes, world, crowd, n, cell, pose_at(pose, n), ray_at(ray, k), t).x
+            limit = nearest_shape(shapes, world, crowd, n, cell, pose_at(pose, n), ray_at(ray, k), limit).x
+        t = cast_ray(table, seen, cell, pose_at(pose, n), ray_at(ray, k), limit, caster)
         put(ranges, n * rays + k, expected_range(t, scale))
 
     @kernel(flags, entry=ENTRY)
@@ -74,9 +75,10 @@ def make(name, flags):
             seen = world_window(world, n)
         k = tile_ray(item, spread)
         while k < rays:
-            t = cast_ray(table, seen, cell, sensor_pose, ray_at(ray, k), scale.limit, caster)
+            limit = scale.limit
             if SHAPES:
-                t = nearest_shape(shapes, world, crowd, n, cell, sensor_pose, ray_at(ray, k), t).x
+                limit = nearest_shape(shapes, world, crowd, n, cell, sensor_pose, ray_at(ray, k), limit).x
+            t = cast_ray(table, seen, cell, sensor_pose, ray_at(ray, k), limit, caster)
             put(ranges, n * rays + k, expected_range(t, scale))
             k += tile_step(spread)
 

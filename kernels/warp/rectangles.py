@@ -197,9 +197,10 @@ def rectangles_scan(
 
     For GPUs: one work-item takes a sector of TALL cells of a column in a quadrant, from the far end on. height and
     width are the sides of the highest rectangle of sufficient width, narrower is the width of a rectangle that is one
-    row higher, and bound is the number of rows to the nearest row with this width. From one cell to the next the height
-    grows by one at most, and its rows without the new row allow every smaller height. So the next cell's sides need no
-    other row, unless the row that bounds the width is left behind.
+    row higher, and bound is the number of rows to the nearest row with this width; wider and nearer are the same of the
+    rows before that one, wider is -1 where they are unknown. From one cell to the next the height grows by one at most,
+    and its rows without the new row allow every smaller height. So the next cell's sides need no other row, unless both
+    rows that bound the width are left behind.
     """
     way, tile_item, col_item = wp.tid()
     quadrant = way & 3
@@ -221,6 +222,8 @@ def rectangles_scan(
     width = int(LONGEST)
     narrower = int(0)
     bound = int(0)
+    wider = int(LONGEST)
+    nearer = int(0)
     four = wp.uint64(0)
     filled = int(0)
     for i in range(end - begin):
@@ -235,7 +238,10 @@ def rectangles_scan(
                     narrower = wp.min(width, int(run_at(runs, run + height * step)))
                 fits = narrower * middle[0] >= (height + 1) * middle[1]
                 if fits:
-                    bound = wp.where(narrower < width, height, bound)
+                    if narrower < width:
+                        wider = width
+                        nearer = bound
+                        bound = height
                     width = narrower
                     height += 1
         else:
@@ -243,7 +249,8 @@ def rectangles_scan(
             least = wp.min(here, width)
             higher = height < room and least * middle[0] >= (height + 1) * middle[1]
             bound = wp.where(here <= width, 0, bound + 1)
-            left_behind = not higher and bound >= height and bound > 0
+            nearer = wp.where(here <= wider, 0, nearer + 1)
+            wider = wp.where(here <= width, LONGEST, wp.min(here, wider))
             if higher:
                 height += 1
                 narrower = wp.min(here, narrower)
@@ -252,13 +259,22 @@ def rectangles_scan(
                 narrower = least
             if height == room:
                 narrower = int(0)
-            width = wp.where(height > 0 and not left_behind, least, LONGEST)
-            if left_behind:
-                bound = int(0)
-                for j in range(height):
-                    other = int(run_at(runs, run + j * step))
-                    bound = wp.where(other < width, j, bound)
-                    width = wp.min(width, other)
+            width = wp.where(height > 0, least, LONGEST)
+            if height > 0 and bound >= height:
+                width = wider
+                bound = nearer
+                wider = int(-1)
+                if width < 0 or bound >= height:
+                    width = int(LONGEST)
+                    bound = int(0)
+                    wider = int(LONGEST)
+                    for j in range(height):
+                        other = int(run_at(runs, run + j * step))
+                        if other < width:
+                            wider = width
+                            nearer = bound
+                            width = other
+                            bound = j
         sides = wp.where(height > 0, width + 256 * height, OCCUPIED)
         if narrower * middle[0] > height * middle[1]:
             sides = narrower + 256 * (height + 1)

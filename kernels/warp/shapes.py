@@ -210,7 +210,10 @@ def functions(flags):
         direction = ray_direction(pose, ray)
         dx = direction.x
         dy = direction.y
-        shape = cell_at(world, 2 * n + 1).x * crowd.stride
+        # Shape i of a kind begins i times its numbers behind these places.
+        disc = cell_at(world, 2 * n + 1).x * crowd.stride
+        box = disc + (DISC - BOX) * crowd.discs
+        segment = box + (BOX - SEGMENT) * (crowd.discs + crowd.boxes)
         sights = sight_at(crowd, n, int(sight_of(dx, dy)))
         nearest = vec2(t, TWO)
         for k in range(2 * crowd.pairs):
@@ -220,7 +223,7 @@ def functions(flags):
             boxes = lowest_bits(crowd.discs + crowd.boxes - 32 * k)
             left = seen & discs
             while left != wp.uint32(0):
-                four = four_at(shapes, shape + shape_at(crowd, 32 * k + lowest_bit(left)))
+                four = four_at(shapes, disc + DISC * (32 * k + lowest_bit(left)))
                 left = left & (left - wp.uint32(1))
                 x = (four[0] - real(cell.x)) - pose.x
                 y = (four[1] - real(cell.y)) - pose.y
@@ -230,7 +233,7 @@ def functions(flags):
                         nearest = met
             left = seen & boxes & (discs ^ ALL_BITS)
             while left != wp.uint32(0):
-                one = shape + shape_at(crowd, 32 * k + lowest_bit(left))
+                one = box + BOX * (32 * k + lowest_bit(left))
                 left = left & (left - wp.uint32(1))
                 four = four_at(shapes, one)
                 rest = four_at(shapes, one + 4)
@@ -243,7 +246,7 @@ def functions(flags):
                         nearest = met
             left = seen & (boxes ^ ALL_BITS)
             while left != wp.uint32(0):
-                four = four_at(shapes, shape + shape_at(crowd, 32 * k + lowest_bit(left)))
+                four = four_at(shapes, segment + SEGMENT * (32 * k + lowest_bit(left)))
                 left = left & (left - wp.uint32(1))
                 x = (four[0] - real(cell.x)) - pose.x
                 y = (four[1] - real(cell.y)) - pose.y

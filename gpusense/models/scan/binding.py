@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Callable
 from typing import Any, cast
@@ -11,10 +12,12 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import arrays
 from gpusense.backends.arrays import Result
-from gpusense.models.scan.bound import BoundCall, RecordedCall
+from gpusense.models.scan.bound import BoundCall, RecordedCall, RecordedCast
+from gpusense.models.scan.map_caster import MapCaster
 from gpusense.models.scan.packed_call import LARGEST, MOST_CELLS, PackedCall, fits, host_task, is_short
 from gpusense.models.scan.pipeline import FLOATS, ScanPipeline
 from gpusense.tables.world_index import WorldIndex
+from gpusense.tables.world_map import index_of
 from gpusense.tables.worlds import Worlds
 
 
@@ -27,7 +30,7 @@ class WaitingCall(BoundCall):
 
     waits = True
 
-    def __init__(self, score: Callable[..., Any], bound: tuple[Any, Any], out: Any, reason: str) -> None:
+    def __init__(self, score: Callable[..., Any], bound: Any, out: Any, reason: str) -> None:
         self._score, self._bound, self.out, self._reason = score, bound, out, reason
         self.packed: PackedCall | None = None
         self._lock = threading.Lock()
@@ -63,7 +66,7 @@ def bind(
     ``score``: ``log_likelihood`` of the model; ``poses``: (N, 3) poses; ``ranges``: (K,) readings; ``out``: the array
     for the log-likelihoods, or None.
     """
-    on_device = _check_bound(poses, ranges)
+    on_device = _check_bound(poses=poses, ranges=ranges)
     backend, beams, obstacle = pipeline.backend, pipeline.scanner.count, host_task(pipeline)
     if all(on_device) and not obstacle and backend.info.kind == "gpu":
         return RecordedCall(pipeline, lock, poses, ranges, out)
@@ -100,7 +103,11 @@ def bind_worlds(
     backend, rules = pipeline.backend, pipeline.rules
     # Scans whose beams are chosen by their readings, or share rays, are prepared by the host.
     placed = rules.choice.every and rules.separate and pipeline.context.possible
-    if all(_check_bound(poses, ranges)) and backend.info.kind == "gpu" and (placed or len(ranges.shape) == 1):
+    if (
+        all(_check_bound(poses=poses, ranges=ranges))
+        and backend.info.kind == "gpu"
+        and (placed or len(ranges.shape) == 1)
+    ):
         inside = WorldIndex(worlds, indices["world"], indices["ignore"], int(poses.shape[0]), backend)
         return RecordedCall(pipeline, lock, poses, ranges, out, inside=inside.resident(backend))
 
@@ -112,6 +119,26 @@ def bind_worlds(
     return WaitingCall(
         scored, (poses, ranges), result, "poses or ranges are in host memory, or the host prepares the scans"
     )
+
+
+def bind_cast(
+    caster: MapCaster, cast_rays: Callable[..., Any], poses: Any, vectors: np.ndarray, out: Any, **indices: Any
+) -> BoundCall:
+    """Bind poses to a call of ``RayCaster.cast``, which ``cast_rays`` makes; ``indices`` are its ``world``, ``ignore``.
+
+    ``vectors``: (K, 2) ray vectors.
+    """
+    (on_device,) = _check_bound(poses=poses)
+    if not (on_device and caster.backend.info.kind == "gpu"):
+        result = cast_rays(poses, out=out, **indices)
+        call = functools.partial(cast_rays, **indices)
+        return WaitingCall(call, (poses,), result, "poses are in host memory, or the device is a processor")
+
+    def index(count: int) -> WorldIndex | None:
+        found = index_of(caster.grid, indices["world"], indices["ignore"], count, caster.backend)
+        return None if found is None else found.resident(caster.backend)
+
+    return RecordedCast(caster, poses, vectors, out, index)
 
 
 def bind_terms(pipeline: ScanPipeline, lock: threading.Lock, poses: Any, ranges: Any, out: Any) -> RecordedCall | None:
@@ -138,14 +165,14 @@ def _long_reason(pipeline: ScanPipeline, poses: Any, ranges: Any, out: Any) -> s
     return ""
 
 
-def _check_bound(poses: Any, ranges: Any) -> list[bool]:
-    """Refuse poses and ranges that are not arrays, or that cannot change; return which are on the device."""
-    for name, array in (("poses", poses), ("ranges", ranges)):
+def _check_bound(**named: Any) -> list[bool]:
+    """Refuse objects that are not arrays, or that cannot change; return which are on the device."""
+    for name, array in named.items():
         if not (isinstance(array, np.ndarray) or hasattr(array, "__dlpack__") or arrays.on_device(array)):
             raise TypeError(f"{name}: must be an array, whose numbers every call reads anew, got {checks.show(array)}")
         if type(array).__module__.startswith("jax"):
             raise TypeError(f"{name}: must be an array whose numbers can change, got one of JAX, where none do")
-    return [arrays.on_device(array) for array in (poses, ranges)]
+    return [arrays.on_device(array) for array in named.values()]
 
 
 def _shape_of(name: str, value: Any, shape: tuple[int | str, ...]) -> tuple[int, ...]:

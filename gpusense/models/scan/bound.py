@@ -9,21 +9,24 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from gpusense.backends import arrays
+from gpusense.backends import Backend, arrays
 from gpusense.backends.arrays import Result
 from gpusense.backends.base import Adopted, Buffer
 from gpusense.backends.workspace import POSE_STATUS, ProgramCache, RecordedProgram, Workspace
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.launches import Program
-from gpusense.models.chunking import finish
+from gpusense.models.chunking import chunk_of, finish
 from gpusense.models.poses import Poses
+from gpusense.models.scan.map_caster import MapCaster
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.readings import Readings, device_readings, device_scans
 from gpusense.models.scan.scoring import terms_of
+from gpusense.tables.reachable import ReachableMap
 from gpusense.tables.world_index import WorldIndex
 from gpusense.world.windows import Corners
 
@@ -31,10 +34,11 @@ _INT = np.dtype(np.int32)
 
 
 class BoundCall(ABC):
-    """A call of ``log_likelihood`` on arrays that stay in place, made by ``bind`` of a model.
+    """A call on arrays that stay in place, made by ``bind`` of a model or a ``RayCaster``.
 
     Attributes:
-        out: (N,) log-likelihoods, in the memory and of the library of the poses; every call writes them.
+        out: (N,) log-likelihoods, or (N, K) ranges of a caster, in the memory and of the library of the poses; every
+            call writes them.
         waits: True if a call has ended when it returns.
 
     Example:
@@ -52,7 +56,7 @@ class BoundCall(ABC):
 
     @abstractmethod
     def __call__(self, stream: Any = None) -> Any:
-        """Score the present contents of the arrays.
+        """Score, or cast, the present contents of the arrays.
 
         Args:
             stream: A stream of the GPU on which to work: of PyTorch, CuPy or Warp, or its address; with OpenCL a queue
@@ -79,18 +83,114 @@ class BoundCall(ABC):
         """
 
 
-class RecordedCall(BoundCall):
+class ReplayedCall(BoundCall):
     """A recorded program on arrays of the device, made anew when the map's table changes.
 
-    ``pipeline``: the stages of the model; ``lock``: held while the model's buffers are in use; ``poses``, ``ranges``,
-    ``out``: see ``ScanModel.bind``; ``status``: a shared buffer for the non-finite flag, which its owner inspects; None
-    for a private one; ``limits``: the type to which the scanner's limits are rounded; None for the type of the ranges;
-    ``corners``: corners of the box of the poses, where their owner knows them: the map's table may be cropped then;
-    ``inside``: the worlds of the poses, on the device; None in a single map. Ranges may then be (N, K); ``per_beam``:
-    whether to keep the term of each reading, for ``terms``; of few poses in a single map.
+    ``charted``: the map with its table; ``lock``: held while the buffers of its owner are in use; ``owners``: owners of
+    the memory that calls read and write; ``out``: the result; ``chunk``: the most poses of a piece.
     """
 
     waits = False
+
+    def __init__(
+        self, backend: Backend, charted: ReachableMap, lock: threading.Lock, poses: Poses, owners: object, out: Any,
+        space: Workspace, chunk: int,
+    ) -> None:  # fmt: skip
+        self._backend, self._map, self._lock, self._poses = backend, charted, lock, poses
+        self._owners, self.out, self._space = owners, out, space
+        # Pieces begin where parts of buffers can.
+        whole = max(backend.alignment // _INT.itemsize, 1)
+        self._chunk = -(-chunk // whole) * whole
+        # The program for the current map, by the version of the map's table.
+        self._programs = ProgramCache[RecordedProgram](1)
+        self._recorded()
+
+    def __call__(self, stream: Any = None) -> Any:
+        self._current().recording(stream)
+        return self.out
+
+    def explain(self) -> str:
+        for _, program in self._programs.items():
+            return program.recording.explain()
+        return "nothing is recorded: the map has changed, and its new table did not fit the device"
+
+    def check(self) -> None:
+        self._backend.check_process()
+        for _, program in self._programs.items():
+            program.recording.wait(elsewhere=True)
+        finish(self._space, on_device=True)
+
+    def _current(self) -> RecordedProgram:
+        """Return the program for the current map."""
+        self._backend.check_process()
+        program = self._programs.get(self._map.version)
+        if program is None:
+            # The map, or its table, has changed.
+            for _, last in self._programs.items():
+                last.recording.wait()
+            program = self._recorded()
+        return program
+
+    def _recorded(self) -> RecordedProgram:
+        """Make the table if it is missing, and record the program of a call; nothing is started."""
+        with self._lock:
+            # Keep the table, since another call of the model may replace it; free the last one first.
+            self._table = None
+            self._programs.clear()
+            state = self._poses.ensure_table(self._map, (0, self._poses.count), self._backend)
+            self._table, version = state.table, state.version
+            program = RecordedProgram(self._backend, self._program())
+        # Other streams may use the buffers of this one first.
+        self._backend.synchronize()
+        return self._programs.keep(version, program)
+
+    def _program(self) -> Program:
+        """Return all launches of a call."""
+        count = self._poses.count
+        parts = [(begin, min(begin + self._chunk, count)) for begin in range(0, count, self._chunk)]
+        return tuple(one for part in parts for one in self._piece(*part))
+
+    @abstractmethod
+    def _piece(self, begin: int, end: int) -> Program:
+        """Return the launches for some poses."""
+
+
+class RecordedCast(ReplayedCall):
+    """A call of ``RayCaster.cast``; see ``ReplayedCall``.
+
+    ``ray``: the (K,) ray vectors on the device; ``inside``: the worlds of the poses; None in a single map.
+    """
+
+    def __init__(
+        self, caster: MapCaster, poses: Any, vectors: np.ndarray, out: Any, index: Callable[[int], WorldIndex | None]
+    ) -> None:
+        backend, self._caster, self._rays = caster.backend, caster, len(vectors)
+        placed = Poses(poses, backend, in_place=True)
+        placed.inside = index(placed.count)
+        result = Result(poses, out, (placed.count, self._rays), caster.real, backend, on_device=True)
+        self._ranges, array = result.flat, result.user_array()
+        self._ray = backend.upload(vectors.astype(caster.real))
+        chunk = chunk_of(backend, self._rays + placed.sights, caster.real.itemsize)
+        super().__init__(backend, caster.map, caster.lock, placed, (poses, array), array, Workspace(backend), chunk)
+
+    def _piece(self, begin: int, end: int) -> Program:
+        caster, rays = self._caster, self._rays
+        if not rays:
+            return ()
+        ranges = self._backend.part(self._ranges, begin * rays, (end - begin) * rays, caster.real)
+        return caster.program(self._poses, (begin, end), self._ray, rays, ranges, self._space)
+
+
+class RecordedCall(ReplayedCall):
+    """A call of ``log_likelihood``; see ``ReplayedCall``.
+
+    ``pipeline``: the stages of the model; ``poses``, ``ranges``, ``out``: see ``ScanModel.bind``; ``status``: a shared
+    buffer for the non-finite flag, which its owner inspects; None for a private one; ``limits``: the type to which the
+    scanner's limits are rounded; None for the type of the ranges; ``corners``: corners of the box of the poses, where
+    their owner knows them: the map's table may be cropped then; ``inside``: the worlds of the poses, on the device;
+    None in a single map. Ranges may then be (N, K); ``per_beam``: whether to keep the term of each reading, for
+    ``terms``; of few poses in a single map.
+    """
 
     def __init__(
         self,
@@ -107,44 +207,27 @@ class RecordedCall(BoundCall):
         per_beam: bool = False,
     ) -> None:
         backend, real = pipeline.backend, pipeline.real
-        self._pipeline, self._lock, self._per_beam = pipeline, lock, per_beam
-        self._poses = Poses(poses, backend, in_place=True)
-        self._poses.hull = corners
-        count = self._poses.count
-        self._poses.inside = inside
+        self._pipeline, self._per_beam = pipeline, per_beam
+        placed = Poses(poses, backend, in_place=True)
+        placed.hull, placed.inside = corners, inside
         own_scans = inside is not None and len(ranges.shape) == 2
         beams = pipeline.scanner.count
-        shape = (count, beams) if own_scans else (beams,)
+        shape = (placed.count, beams) if own_scans else (beams,)
         adopted = arrays.adopt_readings(ranges, backend, shape, in_place=True)
-        result = Result(poses, out, (count,), real, backend, on_device=True)
-        self._log_p, self.out = result.flat, result.user_array()
-        # Owners of the memory that calls read and write.
-        self._owners = (poses, ranges, adopted, self.out)
+        result = Result(poses, out, (placed.count,), real, backend, on_device=True)
+        self._log_p, array = result.flat, result.user_array()
         # Private buffers: other calls of the model may come between.
         self._space = Workspace(backend)
         if status is not None:
             self._space.share(POSE_STATUS[0], status, 2, _INT)
         self._first: Program = ()
         if own_scans:
-            self._readings = self._placed_scans(adopted, count)
+            self._readings = self._placed_scans(adopted, placed.count)
         else:
             self._readings = self._placed_readings(adopted, adopted.dtype if limits is None else limits)
-        # Pieces begin where parts of buffers can.
-        whole = max(backend.alignment // _INT.itemsize, 1)
         chunk = pipeline.most_particles(self._readings.readings, inside, per_beam=per_beam)
-        self._chunk = -(-chunk // whole) * whole
-        # The program for the current map, by the version of the map's table.
-        self._programs = ProgramCache[RecordedProgram](1)
-        self._recorded()
-
-    def __call__(self, stream: Any = None) -> Any:
-        self._current().recording(stream)
-        return self.out
-
-    def explain(self) -> str:
-        for _, program in self._programs.items():
-            return program.recording.explain()
-        return "nothing is recorded: the map has changed, and its new table did not fit the device"
+        owners = (poses, ranges, adopted, array)
+        super().__init__(backend, pipeline.map, lock, placed, owners, array, self._space, chunk)
 
     def begin(self, corners: Corners | None = None) -> None:
         """Start the recording as part of this thread's batch; ``corners`` are those of the box of the poses."""
@@ -165,12 +248,6 @@ class RecordedCall(BoundCall):
         each = np.empty((self._poses.count, self._readings.readings), pipeline.real)
         each = pipeline.backend.download(self._parts, each)
         return terms_of(pipeline, each, pipeline.classed(ranges[None]))
-
-    def check(self) -> None:
-        self._pipeline.backend.check_process()
-        for _, program in self._programs.items():
-            program.recording.wait(elsewhere=True)
-        finish(self._space, on_device=True)
 
     def _placed_readings(self, adopted: Adopted, limits: np.dtype) -> Readings:
         """Return the readings as the kernel ``place_inputs`` places them."""
@@ -218,48 +295,17 @@ class RecordedCall(BoundCall):
             arguments["guard"] = guard
         return readings._replace(scans=end - begin, arguments=arguments)
 
-    def _wait(self) -> None:
-        for _, program in self._programs.items():
-            program.recording.wait()
-
-    def _current(self) -> RecordedProgram:
-        """Return the program for the current map."""
-        self._pipeline.backend.check_process()
-        program = self._programs.get(self._pipeline.map.version)
-        if program is None:
-            # The map, or its table, has changed.
-            self._wait()
-            program = self._recorded()
-        return program
-
-    def _recorded(self) -> RecordedProgram:
-        """Make the table if it is missing, and record the program of a call; nothing is started."""
-        backend, pipeline = self._pipeline.backend, self._pipeline
-        with self._lock:
-            # Keep the table, since another call of the model may replace it; free the last one first.
-            self._table = None
-            self._programs.clear()
-            state = self._poses.ensure_table(pipeline.map, (0, self._poses.count), pipeline.backend)
-            self._table, version = state.table, state.version
-            program = RecordedProgram(backend, self._program())
-        # Other streams may use the buffers of this one first.
-        backend.synchronize()
-        return self._programs.keep(version, program)
-
     def _program(self) -> Program:
-        """Return all launches of a call."""
-        pipeline, count = self._pipeline, self._poses.count
-        program = self._first
-        for begin in range(0, count, self._chunk):
-            part = (begin, min(begin + self._chunk, count))
-            readings = self._piece_of(*part)
-            # Readings stay where the first piece has placed them.
-            readings = readings if begin == 0 else readings._replace(placing=None)
-            placed, state = pipeline.place(self._poses, part, self._space)
-            log_p = pipeline.backend.part(self._log_p, begin, part[1] - begin, pipeline.real)
-            scoring = pipeline.scoring(
-                readings, placed, state.table, log_p, self._space, per_beam=self._per_beam, ordered=False
-            )
-            self._parts = pipeline.parts(scoring).buffer
-            program += pipeline.program(scoring)
-        return program
+        return self._first + super()._program()
+
+    def _piece(self, begin: int, end: int) -> Program:
+        pipeline, readings = self._pipeline, self._piece_of(begin, end)
+        # Readings stay where the first piece has placed them.
+        readings = readings if begin == 0 else readings._replace(placing=None)
+        placed, state = pipeline.place(self._poses, (begin, end), self._space)
+        log_p = pipeline.backend.part(self._log_p, begin, end - begin, pipeline.real)
+        scoring = pipeline.scoring(
+            readings, placed, state.table, log_p, self._space, per_beam=self._per_beam, ordered=False
+        )
+        self._parts = pipeline.parts(scoring).buffer
+        return pipeline.program(scoring)

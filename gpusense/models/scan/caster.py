@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,6 +21,9 @@ from gpusense.tables.worlds import Worlds
 from gpusense.world.frames import Mount, ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.plausible import look_at_bearings
+
+if TYPE_CHECKING:
+    from gpusense.models.scan.bound import BoundCall
 
 _NO_MOUNT: Mount = (0.0, 0.0, 0.0)
 
@@ -176,6 +179,45 @@ class RayCaster(Pickled):
             TypeError, ValueError: Arguments that are not finite numbers of these shapes.
         """
         return self._caster.cast(poses, self._vectors(bearings), out, world=world, ignore=ignore)
+
+    def bind(
+        self, poses: Any, bearings: AnyArray, *, world: Any = None, ignore: Any = None, out: Any = None
+    ) -> BoundCall:
+        """Bind arrays that stay in place to a call of ``cast``, for simulators that repeat it.
+
+        Each call reads the present poses and indices, and writes ``out``. Where poses are on the caster's GPU, a call
+        starts a CUDA graph, or launches of OpenCL whose arguments stay set: it checks nothing, allocates nothing and
+        does not wait; ``check`` waits, and reports poses that were not finite. Elsewhere it is the ordinary call.
+        Ranges have the bits of ``cast``.
+
+        Args:
+            poses: (N, 3) poses as for ``cast``, an array whose numbers every call reads anew.
+            bearings: (K,) directions relative to the heading [rad], which later calls repeat.
+            world: As for ``cast``; an array on the device is read anew by every call.
+            ignore: The same.
+            out: The array for the ranges, as for ``cast``.
+
+        Raises:
+            TypeError, ValueError: As for ``cast``; poses are no array, or one that cannot change.
+
+        Example:
+            >>> import gpusense as gs, numpy as np
+            >>> caster = gs.RayCaster(gs.OccupancyGrid([[0, 0, 0, 100]], 0.5), range_max=5.0, backend="numpy")
+            >>> poses = np.array([(0.25, 0.25, 0.0)])
+            >>> call = caster.bind(poses, [0.0])
+            >>> poses[0, 0] = 0.75
+            >>> call().tolist()
+            [[0.75]]
+        """
+        # Imported on use, since few programs bind calls.
+        from gpusense.models.scan.binding import bind_cast
+
+        vectors = self._vectors(bearings)
+
+        def cast_rays(poses: Any, **options: Any) -> Any:
+            return self._caster.cast(poses, vectors, **options)
+
+        return bind_cast(self._caster, cast_rays, poses, vectors, out, world=world, ignore=ignore)
 
     def incidence(
         self, poses: AnyArray, bearings: AnyArray, *, world: Any = None, ignore: Any = None, out: Any = None

@@ -23,7 +23,7 @@ from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.structs import RangeScale
 from gpusense.models.chunking import Piece, chunk_of, finish, run_pieces
-from gpusense.models.poses import PlacedPoses, Poses, place
+from gpusense.models.poses import Part, PlacedPoses, Poses, place
 from gpusense.models.scan import tiles
 from gpusense.models.scan.sampling import Drawing
 from gpusense.tables import casters
@@ -134,7 +134,7 @@ class MapCaster:
         self._precision_flags = flags_if(FLOAT64=real == np.float64)
         self._workspace = Workspace(backend)
         # Threads may share a caster: its buffers serve one call at a time.
-        self._lock = threading.Lock()
+        self.lock = threading.Lock()
 
     @property
     def grid(self) -> OccupancyGrid | Worlds:
@@ -200,7 +200,7 @@ class MapCaster:
         """Replace cells of the map, and return it."""
         if isinstance(self.method, casters.Lookup) and self.method.file is not None:
             raise ValueError(f"file: must be None where the map changes, got {checks.show(self.method.file)}")
-        with self._lock:
+        with self.lock:
             # Drop the normals first: an interrupt may come before the map has changed, but not between the map and its
             # normals.
             self._normals = None
@@ -209,12 +209,12 @@ class MapCaster:
     def prepare(self, poses: Poses) -> None:
         """Make the table for some poses."""
         if poses.count:
-            with self._lock:
+            with self.lock:
                 poses.ensure_table(self.map, (0, poses.count), self.backend)
 
     def save(self, path: Path, bins: int) -> None:
         """Write the look-up table."""
-        with self._lock:
+        with self.lock:
             state = self.map.ensure([self.grid.origin])
             entries = self.backend.download(state.table, np.empty(state.window.cells * bins, np.uint16))
             obstacles = state.window.cut(self.map.obstacles)
@@ -239,7 +239,7 @@ class MapCaster:
             checked.inside = index_of(self.grid, world, ignore, checked.count, self.backend)
         result = Result(poses, out, (checked.count, rays), self.real, self.backend, on_device=checked.on_device)
         if checked.count * rays:
-            with self._lock, self._workspace:
+            with self.lock, self._workspace:
                 ray = self._ray(vectors)
                 chunk = chunk_of(self.backend, rays * cones.rays + checked.sights, self.real.itemsize)
                 run_pieces(
@@ -262,7 +262,7 @@ class MapCaster:
         rays = len(vectors)
         if not poses.count * rays:
             return
-        with self._lock, self._workspace as space:
+        with self.lock, self._workspace as space:
             ray = self._ray(vectors)
             chunk = chunk_of(self.backend, rays * cones.rays + poses.sights, 2 * self.real.itemsize)
             # Random numbers depend on the index of a particle among all, so scans may be split.
@@ -277,7 +277,7 @@ class MapCaster:
     ) -> None:
         """Start drawing the readings of a piece."""
         space, count, info = self._workspace, piece.count, self.backend.info
-        placed, state = self._place(poses, piece)
+        placed, state = self._place(poses, piece.part, space)
         cosines = space.empty("cosines", count * rays if "INCIDENCE" in cones.flags else 1, self.real)
         result = PartialResult(space, "ranges", flat, piece.begin * rays, count * rays, self.real)
         self._run(placed, state, ray, rays, cones, self._flags(placed, cones) | {"COSINES"}, result.buffer, cosines)
@@ -292,19 +292,24 @@ class MapCaster:
 
     def _cast(self, poses: Poses, piece: Piece, ray: Buffer, rays: int, flat: Any, cones: Cones) -> None:
         space, count = self._workspace, piece.count
-        placed, state = self._place(poses, piece)
+        placed, state = self._place(poses, piece.part, space)
         result = PartialResult(space, "ranges", flat, piece.begin * rays, count * rays, self.real)
         other = space.empty("echoes", count * rays, self.real) if "INCIDENCE" in cones.flags else None
         both = (other, result.buffer) if cones.incidence else (result.buffer, other)
         self._run(placed, state, ray, rays, cones, self._flags(placed, cones), *both)
         result.deliver()
 
-    def _place(self, poses: Poses, piece: Piece) -> tuple[PlacedPoses, MapState]:
-        """Place the poses of a piece in a window of the map; also return the map with its table."""
-        space, backend = self._workspace, self.backend
-        corners = poses.corners(piece.part, backend, space)
+    def _place(self, poses: Poses, part: Part, space: Workspace) -> tuple[PlacedPoses, MapState]:
+        """Place some poses in a window of the map; also return the map with its table."""
+        corners = poses.corners(part, self.backend, space)
         state = self.map.ensure(corners or poses.hull)
-        return place(poses, piece.part, state.frame, backend, space, self.real, corners, sees=True), state
+        return place(poses, part, state.frame, self.backend, space, self.real, corners, sees=True), state
+
+    def program(self, poses: Poses, part: Part, ray: Buffer, rays: int, ranges: Buffer, space: Workspace) -> Program:
+        """Return the launches of a bound call that cast the rays of some poses to ranges."""
+        placed, state = self._place(poses, part, space)
+        flags, results = self._flags(placed, LASER), dict(ranges=ranges)
+        return *placed.launches(), *self._program(placed, state.table, ray, rays, LASER, flags, results, None)
 
     def _flags(self, placed: PlacedPoses, cones: Cones) -> frozenset[str]:
         """Return the flags that cast the rays of placed poses; the poses must have been placed."""

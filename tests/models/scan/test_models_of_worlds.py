@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 
 import gpusense as gs
 from gpusense.backends.base import Backend
+from gpusense.models.scan import bound
 
 SCANNER = gs.Scanner(np.linspace(-2, 2, 19), range_max=6.0, mount=(0.1, 0.0, 0.2))
 MODELS: dict[str, tuple[Any, dict[str, Any]]] = {
@@ -160,6 +162,50 @@ def test_bound_calls_on_a_gpu_are_recorded(
     world.assign(np.full(len(order), len(worlds), wide))
     call()
     with pytest.raises(ValueError, match=r"^world: every index must be one of the worlds"):
+        call.check()
+
+
+def test_bound_casts_read_arrays_anew(scene: dict[str, Any], backend: str) -> None:
+    caster = gs.RayCaster(gs.Worlds(scene["grids"], backend=backend), 4.0, backend=backend)
+    poses, world = scene["poses"].copy(), scene["world"].copy()
+    call = caster.bind(poses, SCANNER.bearings, world=world)
+    poses[:], world[:] = poses[::-1].copy(), world[::-1].copy()
+    assert call() is call.out
+    assert call.out.tobytes() == caster.cast(poses, SCANNER.bearings, world=world).tobytes()
+    call.check()
+    with pytest.raises(TypeError, match=r"^poses: must be an array, whose numbers every call reads anew"):
+        caster.bind(poses.tolist(), SCANNER.bearings, world=world)
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("most", [1 << 20, 8])
+def test_bound_casts_on_a_gpu_are_recorded(
+    most: int, scene: dict[str, Any], warp_as_gpu: Backend, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import warp as wp
+
+    monkeypatch.setattr(bound, "chunk_of", lambda *_: most)
+    worlds = gs.Worlds(scene["grids"], backend=warp_as_gpu)
+    caster = gs.RayCaster(worlds, 4.0, backend=warp_as_gpu)
+    poses, world = (wp.array(scene[key], device="cpu") for key in ("poses", "world"))
+    out = wp.zeros((len(scene["poses"]), SCANNER.count), dtype=wp.float32, device="cpu")
+    call = caster.bind(poses, SCANNER.bearings, world=world, out=out)
+    ordinary = functools.partial(caster.cast, scene["poses"], SCANNER.bearings, world=scene["world"])
+    assert call() is out
+    assert out.numpy().tobytes() == ordinary().tobytes()
+    # Shapes that appear and move, and rooms that are replaced, need no new call.
+    discs = np.concatenate([worlds.origins[:, None, :2] + 1.0, np.full((len(worlds), 1, 1), 0.7)], axis=2)
+    for move in (0.0, 0.2):
+        worlds.shapes = gs.Shapes(discs=discs + np.array([move, 0.0, 0.0]))
+        before = out.numpy().copy()
+        assert call().numpy().tobytes() == ordinary().tobytes() != before.tobytes()
+    worlds.replace([3], [np.ascontiguousarray(scene["grids"][3].cells[::-1])])
+    assert call().numpy().tobytes() == ordinary().tobytes()
+    call.check()
+    assert "launches" in call.explain()
+    poses.assign(np.full_like(scene["poses"], np.nan))
+    call()
+    with pytest.raises(ValueError, match=r"^poses: must be finite"):
         call.check()
 
 

@@ -161,7 +161,8 @@ def _make(
         rows_kernel((height, 4 * worlds), runs, place, stack, rectangles, *changed_part, worlds)
         return
     words, lines = -(-cols // 32), band * worlds
-    backend.compile("free_rows", _NO_FLAGS)((end - begin, lines), marked, runs, lines, cols, words, begin, end)
+    quads = -(-(end - begin) // 4)
+    backend.compile("free_rows", _NO_FLAGS)((quads, lines), marked, runs, lines, cols, words, begin, end)
     tiles = -(-min(bottom - top + RECTANGLE_REACH, rows) // _TALL)
     size = (min(right - left + RECTANGLE_REACH, cols), tiles * sectors, 4 * worlds)
     scan = backend.compile("rectangles_scan", _NO_FLAGS)

@@ -108,16 +108,21 @@ kernel void rectangles_rows(ARGUMENTS) {
 }
 
 // Count the free cells along rows, to the right (direction 0) and to the left (direction 1), for columns in [begin,
-// end). For GPUs: one work-item takes a cell.
+// end). For GPUs: one work-item takes four cells, whose counts differ by one until an occupied cell.
 kernel void free_rows(ARGUMENTS) {
-    const int col = begin + get_global_id(0), row = get_global_id(1);
-    if (row >= band || col >= end) return;
+    const int from = begin + 4 * get_global_id(0), row = get_global_id(1), last = min(from + 4, end) - 1;
+    if (row >= band || from >= end) return;
     global const int *line = bits + (long)row * words;
-    const long cell = (long)row * cols + col;
-    const int right = min(cells_right(line, words, col, LONGEST), cols - col);
-    const int left = min(cells_left(line, col, LONGEST), col + 1);
-    runs[cell] = (uchar)min(right, LONGEST);
-    runs[(long)band * cols + cell] = (uchar)min(left, LONGEST);
+    const long cell = (long)row * cols, other = (long)band * cols + cell;
+    int right = min(cells_right(line, words, last, LONGEST), cols - last);
+    int left = min(cells_left(line, from, LONGEST), from + 1);
+    for (int i = 0; i <= last - from; ++i) {
+        const int forward = from + i, back = last - i;
+        if (i > 0) right = line[back >> 5] >> (back & 31) & 1 ? 0 : right + 1;
+        if (i > 0) left = line[forward >> 5] >> (forward & 31) & 1 ? 0 : left + 1;
+        runs[cell + back] = (uchar)min(right, LONGEST);
+        runs[other + forward] = (uchar)min(left, LONGEST);
+    }
 }
 
 // Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a sector of

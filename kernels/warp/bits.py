@@ -34,6 +34,12 @@ def highest_bit(word: wp.uint32) -> wp.int32: ...
 
 
 @wp.func
+def occupied_at(bits: wp.array(dtype=wp.int32), begin: wp.int32, col: wp.int32):
+    """Return whether a cell is occupied. The row begins at index begin."""
+    return ((word_at(bits, begin + (col >> 5)) >> (col & 31)) & 1) != 0
+
+
+@wp.func
 def cells_right(bits: wp.array(dtype=wp.int32), begin: wp.int32, words: wp.int32, col: wp.int32, most: wp.int32):
     """Count the cells from a cell to the first occupied one to its right, itself included; NONE if none is within most
     cells. An occupied cell beyond most cells may also be returned. The row begins at index begin.

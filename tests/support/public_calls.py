@@ -195,7 +195,7 @@ def _add_models(s: SimpleNamespace, add: Any, made: Any) -> None:
             )
     made(gs.RayCaster, grid=s.grid, range_max=6.0, caster="exact", method=None, unknown="free", outside="free", **plain)
     cast = functools.partial(_method, gs.RayCaster, (s.grid, 6.0))
-    for method in ("cast", "incidence"):
+    for method in ("bind", "cast", "incidence"):
         add(f"RayCaster.{method}", cast(method), poses=s.poses, bearings=s.scanner.bearings, world=None, ignore=None,
             out=None)  # fmt: skip
     _add_worlds(s, add, made)

@@ -30,7 +30,7 @@ class WaitingCall(BoundCall):
 
     waits = True
 
-    def __init__(self, score: Callable[..., Any], bound: Any, out: Any, reason: str) -> None:
+    def __init__(self, score: Callable[..., Any], bound: tuple[Any, ...], out: Any, reason: str) -> None:
         self._score, self._bound, self.out, self._reason = score, bound, out, reason
         self.packed: PackedCall | None = None
         self._lock = threading.Lock()
@@ -41,7 +41,7 @@ class WaitingCall(BoundCall):
         if self.packed is not None:
             try:
                 with self._lock:
-                    if self.packed.score(*self._bound, self.out):
+                    if self.packed.score(*cast("tuple[Any, Any]", self._bound), self.out):
                         return self.out
             except MemoryError:
                 # This call would need the whole table of a changed map; the ordinary call needs only a part.

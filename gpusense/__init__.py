@@ -27,7 +27,7 @@ _NAMES = {
     "features.result": ("Features",),
     "learning.beam.fit": ("fit_beam_parameters",),
     "learning.beam.incidence": ("IncidenceFit", "fit_incidence_parameters"),
-    "learning.discrete.causes": ("DiscreteCauses", "DiscreteFit"),
+    "learning.discrete.probabilities": ("DiscreteCauses", "DiscreteFit"),
     "learning.discrete.table": ("DiscreteBeamModel",),
     "learning.fitted": ("BeamFit", "LandmarkFit", "PointFit"),
     "learning.landmark.fit": ("fit_landmark_parameters",),

@@ -2,12 +2,11 @@
 
 from gpusense.sweeps.cluster import DaskExecutor
 from gpusense.sweeps.executors import ProcessExecutor, SerialExecutor
-from gpusense.sweeps.job import Job
-from gpusense.sweeps.plan import read_plan
+from gpusense.sweeps.job import Job, Store
 from gpusense.sweeps.process import JobTimeout, WorkerDied
 from gpusense.sweeps.run import Sweep, SweepLost, run
-from gpusense.sweeps.store import Store
 from gpusense.sweeps.table import read_table
+from gpusense.sweeps.tasks import read_plan
 
 __all__ = [
     "DaskExecutor",

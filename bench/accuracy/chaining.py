@@ -45,9 +45,9 @@ from chaining_logs import BOTH, Log, load, references
 from chaining_peers import csm_steps, kiss_icp
 from common import make_parser, note, parse, publish, table
 
-from gpusense.chaining.agreement import _consistent, _groups, _supported
 from gpusense.chaining.chain import Chainer
 from gpusense.chaining.closing import Loops
+from gpusense.chaining.place_recognition import _consistent, _groups, _supported
 
 LOGS = ("intel", "fr079", "csail", "aces", "fhw", "seattle", "jarvis-s3000", "jarvis-nav350", BOTH, "olin")
 LENGTHS = (5, 20, 100)

@@ -33,11 +33,9 @@ import numpy as np
 import gpusense as gs
 from gpusense.backends import Backend, BackendInfo, get_backend
 from gpusense.backends.proxy import Proxy
-from gpusense.learning.beam.device_sums import DeviceSums
+from gpusense.learning.beam.device_sums import DeviceSums, make_bounds, open_device
 from gpusense.learning.beam.em import em_step
-from gpusense.learning.beam.options import make_bounds, open_device
-from gpusense.learning.beam.pairs import Pairs, make_pairs
-from gpusense.learning.beam.point import Point, first_guess, random_start
+from gpusense.learning.beam.pairs import Pairs, Point, first_guess, make_pairs, random_start
 from gpusense.learning.beam.problem import NO_PRIOR, Problem
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))

@@ -12,21 +12,27 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers, Precision
 from gpusense.backends import Selection, get_backend
-from gpusense.chaining.assembly import (
+from gpusense.chaining.closing import Loops
+from gpusense.chaining.front import LOCAL, Front
+from gpusense.chaining.graph import Solution, solve
+from gpusense.chaining.joint import (
     TEMPERATURE,
+    Joint,
     constant_motion_links,
     fitted_odometry,
     links_of_odometry,
     weighed,
 )
-from gpusense.chaining.closing import Loops
-from gpusense.chaining.front import LOCAL, Front
-from gpusense.chaining.graph import Solution, solve
-from gpusense.chaining.joint import Joint
-from gpusense.chaining.links import CLOSURE, Links
-from gpusense.chaining.matcher import Matcher, TeamMatcher, signed_duration
-from gpusense.chaining.motion import relative
-from gpusense.chaining.options import ChainOptions, check_durations, check_step, check_times
+from gpusense.chaining.links import CLOSURE, Links, relative
+from gpusense.chaining.matcher import (
+    ChainOptions,
+    Matcher,
+    TeamMatcher,
+    check_durations,
+    check_step,
+    check_times,
+    signed_duration,
+)
 from gpusense.chaining.place_recognition import place_points_of
 from gpusense.chaining.result import ScanChain, doubts_of
 from gpusense.chaining.selected import pose_covariances

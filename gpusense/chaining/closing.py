@@ -15,14 +15,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gpusense._util.typing import Flags, Floats, Integers
-from gpusense.chaining.agreement import EVIDENCE, EVIDENCE_OVER_WEAK, agreeing
 from gpusense.chaining.drift import Drift
-from gpusense.chaining.equations import Equations
-from gpusense.chaining.graph import KERNEL, Solution, solve
-from gpusense.chaining.links import CLOSURE, Links
+from gpusense.chaining.graph import KERNEL, Equations, Solution, solve
+from gpusense.chaining.links import CLOSURE, Links, relative
 from gpusense.chaining.matcher import BATCH, TeamMatcher
-from gpusense.chaining.motion import relative
-from gpusense.chaining.place_recognition import overlaps
+from gpusense.chaining.place_recognition import EVIDENCE, EVIDENCE_OVER_WEAK, agreeing, overlaps
 from gpusense.localization.pose_algebra import wrap_angle
 
 # Windows of searches [m, rad], with the least cell size of places [m] and the most candidates for each.

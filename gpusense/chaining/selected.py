@@ -15,8 +15,7 @@ import numpy as np
 
 from gpusense._util.typing import Floats, Integers
 from gpusense.chaining.drift import DAMPING
-from gpusense.chaining.equations import order_of
-from gpusense.chaining.graph import Solution, normal_equations
+from gpusense.chaining.graph import Solution, normal_equations, order_of
 
 
 def pose_covariances(solution: Solution) -> Floats:

@@ -84,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the jobs, and print a summary; after Ctrl-C, of the jobs so far."""
-    from gpusense.sweeps.plan import read_plan
+    from gpusense.sweeps.tasks import read_plan
 
     jobs = read_plan(args.plan)
     if args.list:
@@ -162,7 +162,7 @@ def _executor(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Iterator[Execu
     if args.dask is not None:
         with _dask(args, names) as cluster:
             if args.dask != LOCAL and not args.no_send:
-                from gpusense.sweeps.store import contents_of
+                from gpusense.sweeps.job import contents_of
 
                 cluster.send(contents_of(jobs, args.root))
             yield cluster

@@ -14,12 +14,10 @@ from gpusense._util.angles import wrapped
 from gpusense._util.typing import AnyArray
 from gpusense.backends import Selection, get_backend
 from gpusense.backends.base import Backend
-from gpusense.features.device import ScanDevice
-from gpusense.features.doors import find_doors
 from gpusense.features.lines import find_hallways, find_lines, scores_of, straight
-from gpusense.features.poles import find_poles
+from gpusense.features.objects import find_doors, find_poles
 from gpusense.features.result import KINDS, Features, Found, check_kinds, features_of, joined, nothing, turned_axes
-from gpusense.features.segments import NEIGHBOURS, Segments, beams_of, by_bearing, find_segments
+from gpusense.features.segments import NEIGHBOURS, ScanDevice, Segments, beams_of, by_bearing, find_segments
 from gpusense.matching.match import readings
 from gpusense.matching.noise import ASSUMED_NOISE, whole_noise
 from gpusense.matching.points import scan_points

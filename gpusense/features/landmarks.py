@@ -14,7 +14,7 @@ from gpusense._util.typing import Floats
 from gpusense.backends import Selection
 from gpusense.features.extract import extract_features
 from gpusense.features.feature_map import LANDMARK_KINDS, MAP_KINDS, FeatureMap, joined_maps
-from gpusense.features.line_clusters import lines_of
+from gpusense.features.lines import lines_of
 from gpusense.features.result import KIND_TYPE, Features, check_kinds
 from gpusense.models.scan.caster import RayCaster
 from gpusense.world.grid import OccupancyGrid

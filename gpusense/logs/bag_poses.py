@@ -10,11 +10,10 @@ import numpy as np
 
 from gpusense._util.notices import warn_user
 from gpusense._util.typing import Floats
-from gpusense.logs.bag_odometry import Track, bases_of, warn_of_tilt
-from gpusense.logs.bag_survey import frame_of
+from gpusense.logs.bag_survey import Track, bases_of, frame_of, warn_of_tilt
 from gpusense.logs.bags import ODOMETRY, TRANSFORMS, messages, topics_of
+from gpusense.logs.records import planar
 from gpusense.logs.transform_buffer import TransformBuffer, TransformError
-from gpusense.logs.transforms import planar
 from gpusense.world.messages import field, planar_part, stamp_of, tilt_of
 
 POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"

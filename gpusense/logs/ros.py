@@ -44,12 +44,10 @@ from gpusense._util.angles import wrapped
 from gpusense._util.notices import warn_user
 from gpusense._util.typing import Floats
 from gpusense.logs.bag_beams import Beams, shared_beams
-from gpusense.logs.bag_odometry import BASES, bases_of, odometry_pose
-from gpusense.logs.bag_survey import Bag, frame_of, scans_on, survey
+from gpusense.logs.bag_survey import BASES, Bag, bases_of, frame_of, odometry_pose, scans_on, survey
 from gpusense.logs.bags import ODOMETRY, Message, messages
-from gpusense.logs.records import Odometry, Pose, Scan
+from gpusense.logs.records import Odometry, Pose, Scan, planar_mount
 from gpusense.logs.transform_buffer import TransformError
-from gpusense.logs.transforms import planar_mount
 from gpusense.world.messages import LEVEL, stamp_of
 from gpusense.world.scanner import Scanner
 

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util.typing import Floats, Loss
-from gpusense.positions.closed_forms import EPS, ROUNDINGS, three_bearings, two_rays
-from gpusense.positions.fix import PositionFix
+from gpusense.positions.fix import EPS, ROUNDINGS, PositionFix, three_bearings, two_rays
 from gpusense.positions.problem import Problem, check_operands, make_problem, subsets
 from gpusense.positions.solver import in_line, solve
 
@@ -88,7 +87,7 @@ def triangulate_triangle(xy: ArrayLike, bearings: ArrayLike, *, sigma: ArrayLike
 
     The lectures solve the triangles robot-beacon-beacon by the law of cosines, D_ij^2 = z_i^2 + z_j^2 - 2 z_i z_j
     cos(b_j - b_i). This function solves linear equations for the same pose, without iterations or special cases for
-    beacons in line: see :func:`gpusense.positions.closed_forms.three_bearings`.
+    beacons in line: see :func:`gpusense.positions.fix.three_bearings`.
 
     Args:
         xy: (3, 2) positions of the beacons [m].

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense._util.typing import Floats
-from gpusense.positions.closed_forms import EPS, Complexes, wrap
-from gpusense.positions.fix import STATUSES, PositionFix
+from gpusense.positions.fix import EPS, STATUSES, Complexes, PositionFix, wrap
 from gpusense.world.plausible import look_at_bearings
 
 # rho(z), rho'(z) and rho''(z) of the squared residual z, by the names of scipy.optimize.least_squares.

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util.angles import wrapped
 from gpusense._util.typing import Floats, Loss
-from gpusense.positions.closed_forms import two_circles, wrap
-from gpusense.positions.fix import PositionFix
+from gpusense.positions.fix import PositionFix, two_circles, wrap
 from gpusense.positions.problem import Problem, check_operands, make_problem, subsets
 from gpusense.positions.solver import distinct, in_line, minima, pick, reflect, solve
 

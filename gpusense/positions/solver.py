@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gpusense._util.typing import Floats
-from gpusense.positions.closed_forms import wrap
+from gpusense.positions.fix import wrap
 from gpusense.positions.problem import LOSSES, Problem
 
 # Largest number of starts to follow, and the least distance between them, in spreads of the scene (or radians).

@@ -24,10 +24,8 @@ from typing import Any
 
 from gpusense._util import checks
 from gpusense._util.extras import library
-from gpusense.sweeps.executors import Terminable, device_names
-from gpusense.sweeps.on_worker import DEVICES, answer, one_start, processes
-from gpusense.sweeps.process import WorkerDied, result_of
-from gpusense.sweeps.worker import error_text
+from gpusense.sweeps.executors import DEVICES, Terminable, answer, device_names, one_start, processes
+from gpusense.sweeps.process import WorkerDied, error_text, result_of
 
 _LOG = logging.getLogger("gpusense")
 _LOOPBACK = "127.0.0.1"

@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 from gpusense._util import checks
 from gpusense.sweeps.executors import SerialExecutor
 from gpusense.sweeps.job import Job
-from gpusense.sweeps.process import JobTimeout, WorkerDied
+from gpusense.sweeps.process import JobTimeout, Outcome, WorkerDied, error_text, work
 from gpusense.sweeps.table import DONE, FAILED, Row, Table
-from gpusense.sweeps.worker import Outcome, error_text, work
 
 # Queued jobs per slot of an executor, to keep it busy.
 _QUEUED = 2

@@ -19,7 +19,7 @@ from gpusense._util import checks
 from gpusense._util.extras import library
 from gpusense._util.files import naming, write_whole
 from gpusense.sweeps.job import Job
-from gpusense.sweeps.worker import Outcome
+from gpusense.sweeps.process import Outcome
 
 Row = dict[str, str]
 # Columns of every table, before the columns of options, labels and results.

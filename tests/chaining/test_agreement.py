@@ -8,11 +8,10 @@ from support.matching_scenes import CORRIDOR, segments_scan, table_legs
 from support.selection import present
 
 import gpusense as gs
-from gpusense.chaining.agreement import EVIDENCE, EVIDENCE_OVER_WEAK, agreeing
 from gpusense.chaining.closing import joined_breaks
 from gpusense.chaining.links import CLOSURE, Links
-from gpusense.chaining.matcher import SURE, Matcher
-from gpusense.chaining.options import ChainOptions
+from gpusense.chaining.matcher import SURE, ChainOptions, Matcher
+from gpusense.chaining.place_recognition import EVIDENCE, EVIDENCE_OVER_WEAK, agreeing
 from gpusense.localization.pose_algebra import compose_poses, pose_difference
 
 FRONT = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / 180, count=181, range_max=12.0)

@@ -14,7 +14,7 @@ from support.command_line import error_of
 
 from gpusense._util.files import write_several, write_whole
 from gpusense.commands import cli
-from gpusense.sweeps.plan import jobs_of
+from gpusense.sweeps.tasks import jobs_of
 
 
 def run(arguments: str, streams: str, folder: Path) -> subprocess.CompletedProcess[str]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense.positions.closed_forms import EPS
+from gpusense.positions.fix import EPS
 
 mp.mp.dps = 50
 FAR = [(0.0, 0.0), (5e6, 4.5e5)]

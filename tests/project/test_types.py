@@ -14,7 +14,7 @@ from support.paths import ROOT
 
 from gpusense._util import typing as types
 from gpusense.interface.casters import ENTRIES
-from gpusense.learning.beam.options import METHODS
+from gpusense.learning.beam.device_sums import METHODS
 from gpusense.peers.weights import PEERS
 from gpusense.positions.problem import LOSSES
 

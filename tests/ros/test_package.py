@@ -13,7 +13,7 @@ import pytest
 from support.paths import ROOT
 
 import gpusense as gs
-from gpusense.ros import parameters
+from gpusense.ros import conversions
 
 PACKAGE = ROOT / "examples" / "ros2" / "gpusense_localization"
 NODES = ROOT / "gpusense" / "ros" / "nodes"
@@ -50,7 +50,7 @@ def test_the_launch_file_starts_nodes_with_parameters_that_exist(monkeypatch: py
     declared = {one.arguments[0]: one.options["default_value"] for one in found if "package" not in one.options}
     assert (PACKAGE / declared["parameters"].removeprefix(f"/share/{PACKAGE.name}/")).is_file()
     nodes = {one.options["executable"]: one.options for one in found if "package" in one.options}
-    names = {"localize": parameters.defaults(), "watch": parameters.WATCH}
+    names = {"localize": conversions.defaults(), "watch": conversions.WATCH}
     assert nodes.keys() == names.keys()
     for executable, options in nodes.items():
         (given,) = options["parameters"]

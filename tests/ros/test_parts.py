@@ -11,10 +11,10 @@ import pytest
 
 import gpusense as gs
 from gpusense.backends import get_backend
+from gpusense.logs.records import planar
 from gpusense.logs.transform_buffer import TransformError
-from gpusense.logs.transforms import planar
-from gpusense.ros import conversions, localizer, parameters, watcher
-from gpusense.ros.scan_queue import ScanQueue
+from gpusense.ros import conversions, localizer, watcher
+from gpusense.ros.localizer import ScanQueue
 from gpusense.world.messages import planar_pose
 
 from_nav2 = gs.compat.from_nav2
@@ -374,9 +374,9 @@ def test_the_first_scan_compiles_nothing(monkeypatch: pytest.MonkeyPatch, needs:
 
 
 def test_parameters_by_the_names_of_nav2() -> None:
-    values = parameters.defaults() | {"max_particles": 700, "save_pose_rate": 0.5, "max_beams": 30,
+    values = conversions.defaults() | {"max_particles": 700, "save_pose_rate": 0.5, "max_beams": 30,
                                       "set_initial_pose": True, "initial_pose.x": 2, "use_sim_time": True}  # fmt: skip
-    options, without = parameters.options_of(values)
+    options, without = conversions.options_of(values)
     assert options.particles == (500, 700) and options.initial_pose == (2.0, 0.0, 0.0)
     assert without == ("max_beams", "save_pose_rate")
 
@@ -388,7 +388,7 @@ def test_parameters_by_the_names_of_nav2() -> None:
 ])  # fmt: skip
 def test_parameters_that_break_a_rule(change: dict[str, Any], text: str) -> None:
     with pytest.raises((TypeError, ValueError, OSError), match=text):
-        parameters.options_of(parameters.defaults() | change)
+        conversions.options_of(conversions.defaults() | change)
 
 
 # ------------------------------------------------------------------------------------------------------- the queue

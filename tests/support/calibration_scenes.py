@@ -13,7 +13,7 @@ from gpusense._util.typing import Floats
 from gpusense.backends import Selection
 from gpusense.evaluation.buildings import building
 from gpusense.evaluation.worlds import cloud_uniform
-from gpusense.learning.discrete.causes import DiscreteCauses
+from gpusense.learning.discrete.probabilities import DiscreteCauses
 from gpusense.learning.discrete.table import DiscreteBeamModel
 from gpusense.models.landmark.lines import LineModel
 from gpusense.models.landmark.model import LandmarkModel

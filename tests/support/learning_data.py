@@ -6,10 +6,8 @@ import numpy as np
 
 from gpusense.backends import Backend, get_backend
 from gpusense.evaluation.worlds import sample_readings
-from gpusense.learning.beam.device_sums import DeviceSums
-from gpusense.learning.beam.options import make_bounds
-from gpusense.learning.beam.pairs import make_pairs
-from gpusense.learning.beam.point import Point, first_guess, random_start
+from gpusense.learning.beam.device_sums import DeviceSums, make_bounds
+from gpusense.learning.beam.pairs import Point, first_guess, make_pairs, random_start
 from gpusense.learning.beam.problem import NO_PRIOR, Prior, Problem
 from gpusense.world.hit_shapes import NORMAL, HitShape
 from gpusense.world.parameters import BeamParameters

@@ -108,6 +108,6 @@ def start_and_end(folder):
 
 def sent_text(name):
     """Return the text of a sent file."""
-    from gpusense.sweeps.worker import _SENT
+    from gpusense.sweeps.process import _SENT
 
     return Path(_SENT[name]).read_text()

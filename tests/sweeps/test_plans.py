@@ -10,8 +10,8 @@ import tracemalloc
 import pytest
 
 import gpusense as gs
+from gpusense.sweeps.process import Outcome
 from gpusense.sweeps.table import Table
-from gpusense.sweeps.worker import Outcome
 
 PLAN = """
 options: {every: 2, parameters: {sigma_hit: 0.1}}

@@ -17,8 +17,7 @@ from support.sweep_tasks import start_and_end, starts
 
 import gpusense as gs
 from gpusense.sweep import Job, ProcessExecutor, SweepLost, WorkerDied
-from gpusense.sweeps.process import death
-from gpusense.sweeps.worker import work
+from gpusense.sweeps.process import death, work
 
 LIMITS = dict(job_timeout=60)
 ENGINES = [

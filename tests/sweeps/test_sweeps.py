@@ -13,9 +13,9 @@ from gpusense.commands import cli
 from gpusense.evaluation.steps import read_steps
 from gpusense.evaluation.tracking import Track, follow, start, summary
 from gpusense.sweep import Job, ProcessExecutor, SerialExecutor, SweepLost
-from gpusense.sweeps.plan import jobs_of
-from gpusense.sweeps.store import contents_of
-from gpusense.sweeps.worker import work
+from gpusense.sweeps.job import contents_of
+from gpusense.sweeps.process import work
+from gpusense.sweeps.tasks import jobs_of
 
 SMALL = {"limit": 4, "particles": 100, "beams": 20, "range_max": 20}
 PLAN = {

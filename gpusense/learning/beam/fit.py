@@ -15,17 +15,21 @@ from gpusense._util import checks
 from gpusense._util.progress import progress as progress_bar
 from gpusense._util.typing import FitMethod, Precision
 from gpusense.backends import Selection
-from gpusense.learning.beam.device_sums import DeviceSums
-from gpusense.learning.beam.em import Climb, Watch, climb_em
-from gpusense.learning.beam.growth import fit_jointly
+from gpusense.learning.beam.device_sums import (
+    Callback,
+    DeviceSums,
+    Options,
+    check_options,
+    make_bounds,
+    open_device,
+    start_of,
+)
+from gpusense.learning.beam.em import Climb, Watch, climb_em, climb_genetic, climb_gradient, climb_hill
+from gpusense.learning.beam.growth import fit_jointly, fit_shape
 from gpusense.learning.beam.optimum import Search
-from gpusense.learning.beam.options import Callback, Options, check_options, make_bounds, open_device, start_of
-from gpusense.learning.beam.pairs import Pairs, make_pairs
-from gpusense.learning.beam.point import HIT, SHORT, Bounds, Point, first_guess, random_start
+from gpusense.learning.beam.pairs import HIT, SHORT, Bounds, Pairs, Point, first_guess, make_pairs, random_start
 from gpusense.learning.beam.problem import NO_PRIOR, Prior, Problem, Value
 from gpusense.learning.beam.report import report
-from gpusense.learning.beam.searches import climb_genetic, climb_gradient, climb_hill
-from gpusense.learning.beam.shapes import fit_shape
 from gpusense.learning.fitted import BeamFit
 from gpusense.world.hit_shapes import SHAPES, HitName
 from gpusense.world.parameters import BeamParameters

@@ -1,4 +1,8 @@
-"""Fit the growth of the deviation with range, jointly with all other parameters and the shape of hits.
+"""Fit the shape of hits, and the growth of their deviation with range, jointly with all other parameters.
+
+The shape alone is fitted on the device. Student's t is a normal with a random inverse variance. EM with its expected
+value, the weight of the shape, has the M-steps of a normal with weighted readings; as in ECME, the degrees of freedom
+move by Newton steps of the likelihood (Lange, Little and Taylor 1989; Liu and Rubin 1994, "The ECME algorithm").
 
 A correct range has the scale ``sigma_hit + sigma_growth z*``, but the device's sums have a single deviation. This
 search therefore computes the log p and gradient of every pair on the host in float64. Newton steps within bounds start
@@ -16,17 +20,85 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util.typing import Floats
-from gpusense.learning.beam.pairs import Pairs
-from gpusense.learning.beam.point import Bounds
-from gpusense.learning.beam.shapes import without_ranges
+from gpusense.learning.beam.device_sums import DeviceSums, Options
+from gpusense.learning.beam.em import Climb, climb_em
+from gpusense.learning.beam.pairs import Bounds, Pairs, Point
+from gpusense.learning.beam.problem import NO_PRIOR, Problem, Value
+from gpusense.learning.beam.report import report
 from gpusense.learning.fitted import BeamFit
+from gpusense.learning.point import problem as hosted
 from gpusense.learning.point.densities import by_shape, truncated
-from gpusense.learning.point.problem import Climb, Problem, climb, maximize, mix, of_weight, report
-from gpusense.world.hit_shapes import SHAPES, HitName, HitShape
+from gpusense.learning.point.problem import mix, of_weight
+from gpusense.world.hit_shapes import SHAPES, HitName, HitShape, shape_of
 from gpusense.world.hit_tables import TabulatedHit
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.range_causes import NoReturn, RandomDensity, ShortDensity
 from gpusense.world.scanner import Reading
+
+# Number of readings for ranking the starts, and the remaining gain [nats] that suffices for the ranking.
+_SAMPLE, _ROUGHLY = 20_000, 1e-2
+
+
+def fit_shape(
+    fit: BeamFit,
+    device: DeviceSums,
+    pairs: Pairs,
+    bounds: Bounds,
+    options: Options,
+    hit: HitName,
+    first: Point,
+    initial: BeamParameters | None,
+) -> BeamFit:
+    """Fit the shape of hits as well, from a fit with normal hits."""
+    kind = SHAPES[hit]
+    if not pairs.hits or not pairs.expected.any():
+        return without_ranges(fit, hit)
+    normal = Point.of(fit.parameters)
+    starts = [
+        bounds.hold(replace(normal, sigma=factor * normal.sigma, shape=kind.at(np.array(shape))))
+        for *shape, factor in kind.starts
+    ]
+    if initial is not None and initial.hit == hit:
+        starts.append(replace(first, shape=shape_of(initial)))
+    problem = Problem(device, pairs, bounds, NO_PRIOR, options.range_bias)
+    sample = _sampled(problem)
+    best = max((_climb(sample, start, options) for start in starts), key=lambda end: end.value.objective)
+    start, known = best.value.point, best.trace[:-1] if sample is problem else []
+
+    def watch(iteration: int, value: Value) -> None:
+        if options.callback is not None:
+            options.callback(fit.iterations + len(known) + iteration, value.log_likelihood, value.point.parameters())
+
+    end = climb_em(problem, start, max_iterations=options.max_iterations, tolerance=options.tolerance, watch=watch)
+    return report(problem, replace(end, trace=known + end.trace), options, start)
+
+
+def without_ranges(fit: BeamFit, hit: HitName, growth: bool = False) -> BeamFit:
+    """Return the fit of readings without a range: they determine neither the shape of hits nor its growth."""
+    new, reason = ("sigma_growth",) * growth + SHAPES[hit].fitted, "no range determines it"
+    return replace(
+        fit, parameters=fit.parameters.replace(hit=hit), status=f"{fit.status}; {', '.join(new)}: {reason}",
+        held=fit.held | dict.fromkeys(new, reason),
+    )  # fmt: skip
+
+
+def _sampled(problem: Problem) -> Problem:
+    """Return the problem of a sample of the readings if there are many."""
+    pairs = problem.pairs
+    every = len(pairs.kinds) // _SAMPLE
+    if every < 2:
+        return problem
+    some = pairs.subset(np.arange(len(pairs.kinds)) % every == 0)
+    return Problem(problem.device.of(some), some, problem.bounds, problem.prior, problem.fit_bias)
+
+
+def _climb(problem: Problem, start: Point, options: Options) -> Climb:
+    """Search from a start until the starts can be ranked."""
+    tolerance = max(options.tolerance, _ROUGHLY)
+    return climb_em(
+        problem, start, max_iterations=options.max_iterations, tolerance=tolerance, watch=lambda iteration, value: None
+    )
+
 
 # Shares of the deviation at the mean expected range that starts turn into growth; iterations of a search.
 _SHARES, _ITERATIONS = (0.02, 0.3, 0.7, 0.95), 200
@@ -36,7 +108,7 @@ _TOP, _RAND, _SHORT, _SIGMA, _GROWTH, _RATE, _BIAS = range(7)
 
 
 @dataclass(frozen=True, eq=False)
-class _Growing(Problem):
+class _Growing(hosted.Problem):
     """Likelihood by (z_max, share of rand, share of short in the rest, log sigma, growth, log rate[, bias][, shape]).
 
     The first three split the weights: z_rand is the share of rand times 1 - z_max, and so on. The coordinates of the
@@ -179,10 +251,10 @@ def fit_jointly(
         reading[known], expected[known], none, pairs.range_max, bounds, fit.parameters, fit.bias_fitted, reach,
         SHAPES[hit], growth,
     )  # fmt: skip
-    end = maximize(problem, _ITERATIONS, tolerance)
+    end = hosted.maximize(problem, _ITERATIONS, tolerance)
     blocks = None if pairs.block is None else pairs.block[known]
     values = problem.values(end.theta)
-    inner = report(problem, end, problem.parameters(end.theta, hit), blocks, fit.missing)
+    inner = hosted.report(problem, end, problem.parameters(end.theta, hit), blocks, fit.missing)
     names = (*fit.standard_errors, *new)
     if fit.bias_fitted:
         bias, error = values["range_bias"], inner.standard_errors["range_bias"]
@@ -200,17 +272,19 @@ def fit_jointly(
     )  # fmt: skip
 
 
-def _offset(problem: _Growing, end: Climb, tolerance: float, blocks: NDArray[np.int64] | None) -> tuple[float, float]:
+def _offset(
+    problem: _Growing, end: hosted.Climb, tolerance: float, blocks: NDArray[np.int64] | None
+) -> tuple[float, float]:
     """Fit the offset as well, and return it with its standard error; NaN if the search did not converge."""
     joint = replace(problem, fit_bias=True)
-    best = climb(joint, np.insert(end.theta, _BIAS, 0.0), _ITERATIONS, tolerance)
+    best = hosted.climb(joint, np.insert(end.theta, _BIAS, 0.0), _ITERATIONS, tolerance)
     if not best.converged:
         return math.nan, math.nan
-    errors = report(joint, best, problem.start, blocks, 0).standard_errors
+    errors = hosted.report(joint, best, problem.start, blocks, 0).standard_errors
     return float(best.theta[_BIAS]), errors["range_bias"]
 
 
-def _causes(problem: _Growing, end: Climb, known: NDArray[np.bool_]) -> Floats:
+def _causes(problem: _Growing, end: hosted.Climb, known: NDArray[np.bool_]) -> Floats:
     """Return the (n, 4) responsibilities of all readings; NaN for missing ones."""
     hit, short, rand = mix(problem.parts(end.theta)[0])[1]
     rows = np.full((len(known), 4), np.nan)

@@ -15,13 +15,11 @@ from gpusense._util import checks
 from gpusense._util.html import card
 from gpusense._util.typing import FitMethod, Precision
 from gpusense.backends import Selection
-from gpusense.learning.beam.device_sums import DeviceSums
+from gpusense.learning.beam.device_sums import Callback, DeviceSums, check_options, make_bounds, open_device, start_of
 from gpusense.learning.beam.fit import fit_pairs
-from gpusense.learning.beam.options import Callback, check_options, make_bounds, open_device, start_of
-from gpusense.learning.beam.pairs import Pairs, make_pairs
-from gpusense.learning.beam.point import Point, first_guess
+from gpusense.learning.beam.growth import fit_shape
+from gpusense.learning.beam.pairs import Pairs, Point, first_guess, make_pairs
 from gpusense.learning.beam.problem import Prior
-from gpusense.learning.beam.shapes import fit_shape
 from gpusense.learning.fitted import BeamFit, plain_fields
 from gpusense.world.hit_shapes import SHAPES, HitName
 from gpusense.world.parameters import BeamParameters, IncidenceParameters

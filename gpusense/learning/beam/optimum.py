@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from gpusense._util.typing import Floats
 from gpusense.learning.beam.em import Climb, Watch
-from gpusense.learning.beam.pairs import Pairs
-from gpusense.learning.beam.point import HIT, MAX, RAND, SHORT, Bounds, Point, possible_causes
+from gpusense.learning.beam.pairs import HIT, MAX, RAND, SHORT, Bounds, Pairs, Point, possible_causes
 from gpusense.learning.beam.problem import NOTHING, Problem, Value
 from gpusense.world.range_causes import RandomDensity, ShortDensity
 

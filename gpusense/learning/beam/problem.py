@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 
 from gpusense._util.typing import Floats
 from gpusense.learning.beam.device_sums import DeviceSums
-from gpusense.learning.beam.pairs import Pairs
-from gpusense.learning.beam.point import BIAS, FORM, HIT, MAX, RAND, RATE, SHORT, SIGMA, Bounds, Point
+from gpusense.learning.beam.pairs import BIAS, FORM, HIT, MAX, RAND, RATE, SHORT, SIGMA, Bounds, Pairs, Point
 from gpusense.world.hit_shapes import NORMAL, HitShape, NormalHit
 from gpusense.world.range_causes import NoReturn
 

@@ -20,12 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util.typing import Floats
-from gpusense.learning.beam.device_sums import DeviceSums
+from gpusense.learning.beam.device_sums import DeviceSums, Options
 from gpusense.learning.beam.em import Climb, Watch, climb_em
 from gpusense.learning.beam.optimum import Search
-from gpusense.learning.beam.options import Options
-from gpusense.learning.beam.pairs import Pairs
-from gpusense.learning.beam.point import BIAS, FORM, HIT, MAX, NAMES, RAND, RATE, SHORT, SIGMA, Point
+from gpusense.learning.beam.pairs import BIAS, FORM, HIT, MAX, NAMES, RAND, RATE, SHORT, SIGMA, Pairs, Point
 from gpusense.learning.beam.problem import NOTHING, Problem, Value
 from gpusense.learning.fitted import BeamFit
 from gpusense.learning.information import errors_of, notes_on_blocks, scatter_of

@@ -11,8 +11,14 @@ from scipy.optimize import minimize
 
 from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers
-from gpusense.learning.discrete.causes import DiscreteCauses, DiscreteFit
-from gpusense.learning.discrete.probabilities import MOST_BINS, bins_of, check_pairs, separate_causes
+from gpusense.learning.discrete.probabilities import (
+    MOST_BINS,
+    DiscreteCauses,
+    DiscreteFit,
+    bins_of,
+    check_pairs,
+    separate_causes,
+)
 from gpusense.learning.information import errors_of, notes_on_blocks, number_blocks, scatter_of
 
 NAMES = ("lambda_short", "lambda_rand", "p_detect", "sigma_hit")

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from gpusense._util import checks
-from gpusense.learning.discrete.causes import DiscreteCauses, DiscreteFit
-from gpusense.learning.discrete.probabilities import MOST_BINS, bins_of, check_pairs
+from gpusense.learning.discrete.probabilities import MOST_BINS, DiscreteCauses, DiscreteFit, bins_of, check_pairs
 from gpusense.peers.weights import check_weights
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.sensor_table import SensorTable

@@ -23,14 +23,12 @@ from rclpy.time import Time
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import Empty
 
-from gpusense.logs.records import Pose
+from gpusense.logs.records import Pose, planar
 from gpusense.logs.transform_buffer import BACK
-from gpusense.logs.transforms import planar
 from gpusense.ros import conversions
-from gpusense.ros.localizer import Localizer
+from gpusense.ros.conversions import defaults, mount_of, options_of
+from gpusense.ros.localizer import Localizer, ScanQueue
 from gpusense.ros.nodes.wiring import Guard, TFMessage, Transforms, diagnostic_array, latched, run, unreliable
-from gpusense.ros.parameters import defaults, mount_of, options_of
-from gpusense.ros.scan_queue import ScanQueue
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.map_files import read_map
 from gpusense.world.messages import stamp_of

@@ -18,8 +18,8 @@ from sensor_msgs.msg import LaserScan
 
 from gpusense.backends import get_backend
 from gpusense.logs.transform_buffer import TransformError
+from gpusense.ros.conversions import WATCH, check_watch, mount_of
 from gpusense.ros.nodes.wiring import Guard, Transforms, diagnostic_array, latched, run, unreliable
-from gpusense.ros.parameters import WATCH, check_watch, mount_of
 from gpusense.ros.watcher import Watcher
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.map_files import read_map

@@ -17,9 +17,8 @@ from nav_msgs.msg import Odometry
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from gpusense.logs.records import Pose
+from gpusense.logs.records import Pose, planar_mount
 from gpusense.logs.transform_buffer import TransformBuffer
-from gpusense.logs.transforms import planar_mount
 from gpusense.ros.conversions import ERROR, odometry_fields, pose_matrix
 from gpusense.world.messages import LEVEL
 

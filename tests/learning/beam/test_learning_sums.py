@@ -13,7 +13,7 @@ from support.kernel_scenes import PRECISIONS
 from support.learning_data import RANGE_MAX, TYPICAL, draw, point, problem_of
 
 from gpusense.evaluation.tolerances import TOLERANCES, per_beam
-from gpusense.learning.beam.point import BIAS, FORM, SIGMA, Point
+from gpusense.learning.beam.pairs import BIAS, FORM, SIGMA, Point
 from gpusense.learning.beam.problem import Prior
 from gpusense.models.scan.densities import log_mixture
 from gpusense.world.hit_shapes import StudentHit

@@ -11,7 +11,7 @@ import gpusense as gs
 from gpusense.evaluation.worlds import sample_readings
 from gpusense.learning.beam.em import Climb, Watch, climb_em
 from gpusense.learning.beam.optimum import Search
-from gpusense.learning.beam.point import Point
+from gpusense.learning.beam.pairs import Point
 from gpusense.learning.beam.problem import Problem
 from gpusense.models.scan.densities import log_mixture
 

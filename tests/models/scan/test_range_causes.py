@@ -20,8 +20,7 @@ from gpusense.evaluation.benchmark.accuracy import score_ranges
 from gpusense.evaluation.range_data import RangeData
 from gpusense.interface.structs import MixtureTerms
 from gpusense.learning.beam import growth, optimum, report
-from gpusense.learning.beam.device_sums import DeviceSums
-from gpusense.learning.beam.options import make_bounds
+from gpusense.learning.beam.device_sums import DeviceSums, make_bounds
 from gpusense.learning.beam.pairs import make_pairs
 from gpusense.learning.beam.problem import NO_PRIOR, Problem
 from gpusense.learning.point import beacons

@@ -23,9 +23,9 @@ from gpusense.features.result import Features as Features
 from gpusense.learning.beam.fit import fit_beam_parameters as fit_beam_parameters
 from gpusense.learning.beam.incidence import IncidenceFit as IncidenceFit
 from gpusense.learning.beam.incidence import fit_incidence_parameters as fit_incidence_parameters
+from gpusense.learning.discrete.probabilities import DiscreteCauses as DiscreteCauses
+from gpusense.learning.discrete.probabilities import DiscreteFit as DiscreteFit
 from gpusense.learning.discrete.table import DiscreteBeamModel as DiscreteBeamModel
-from gpusense.learning.discrete.table import DiscreteCauses as DiscreteCauses
-from gpusense.learning.discrete.table import DiscreteFit as DiscreteFit
 from gpusense.learning.fitted import BeamFit as BeamFit
 from gpusense.learning.fitted import LandmarkFit as LandmarkFit
 from gpusense.learning.fitted import PointFit as PointFit

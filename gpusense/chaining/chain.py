@@ -13,6 +13,7 @@ from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers, Precision
 from gpusense.backends import Selection, get_backend
 from gpusense.chaining.closing import Loops
+from gpusense.chaining.drift import pose_covariances
 from gpusense.chaining.front import LOCAL, Front
 from gpusense.chaining.graph import Solution, solve
 from gpusense.chaining.joint import (
@@ -35,7 +36,6 @@ from gpusense.chaining.matcher import (
 )
 from gpusense.chaining.place_recognition import place_points_of
 from gpusense.chaining.result import ScanChain, doubts_of
-from gpusense.chaining.selected import pose_covariances
 from gpusense.localization.motion import OdometryMotion
 from gpusense.localization.pose_algebra import compose_poses, pose_difference
 from gpusense.matching.match import readings

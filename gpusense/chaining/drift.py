@@ -1,4 +1,11 @@
-"""Compute the drift between scans: covariances of relative poses in a pose graph."""
+"""Compute covariances in a solved pose graph: of relative poses (the drift between scans), and of all poses.
+
+Covariances of all poses are diagonal blocks of the inverse of the sparse normal equations. The matrix of 3 x 3 blocks is
+eliminated front by front along the elimination tree (Duff and Reid 1983), successive columns with equal rows at once.
+The blocks of the inverse within each front follow from its parent's blocks, from the root down (Takahashi et al. 1973):
+for L the columns below pivots D, and Z the inverse, Z_sj = -Z_ss L and Z_jj = D^-1 + L' Z_ss L. Only these blocks are
+computed: time and memory equal the elimination's.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gpusense._util.typing import Flags, Floats, Integers
-from gpusense.chaining.graph import Solution, normal_equations, pose_jacobians
+from gpusense.chaining.graph import Solution, normal_equations, order_of, pose_jacobians
 from gpusense.chaining.links import CLOSURE, Links
 
 # Most poses with a kept joint covariance; in a longer graph each represents the poses up to the next. Largest share of
@@ -207,3 +214,108 @@ def _fixed(poses: Floats) -> Floats:
     result = np.tile(np.eye(3), (len(poses), 1, 1))
     result[:, 0, 2], result[:, 1, 2] = -poses[:, 1], poses[:, 0]
     return result
+
+
+def pose_covariances(solution: Solution) -> Floats:
+    """Return the covariances (N, 3, 3) of poses, given the first one.
+
+    A direction that no link observes has a variance of about 1e6 m^2 or rad^2.
+    """
+    count = len(solution.poses)
+    result = np.zeros((count, 3, 3))
+    if count > 1:
+        matrix, _ = normal_equations(solution.poses, solution.links, solution.links.weight, 0)
+        result[1:] = inverse_blocks(matrix, DAMPING)
+    return result
+
+
+def inverse_blocks(matrix: Any, damping: float) -> Floats:
+    """Return the diagonal blocks (N, 3, 3) of the inverse of a sparse positive definite matrix plus damping."""
+    blocks = matrix.tobsr((3, 3))
+    blocks.sort_indices()
+    count = blocks.shape[0] // 3
+    order = order_of(blocks.indices, np.repeat(np.arange(count), np.diff(blocks.indptr)))
+    parts = _parts_of(blocks, order)
+    home = np.repeat(np.arange(len(parts)), [end - begin for begin, end, _ in parts])
+    # Part of the first row below each part; -1 for a root.
+    parent = np.array([home[below[0]] if len(below) else -1 for _, _, below in parts])
+    factors = _eliminated(blocks, order, parts, parent, damping)
+    result, fronts = np.empty((count, 3, 3)), dict[int, tuple[Integers, Floats]]()
+    waiting = np.bincount(parent[parent >= 0], minlength=len(parts))
+    for k in range(len(parts) - 1, -1, -1):
+        (begin, end, below), (inverse, factor), size = parts[k], factors[k], 3 * (parts[k][1] - parts[k][0])
+        front = np.empty((size + 3 * len(below),) * 2)
+        front[:size, :size] = inverse
+        if len(below):
+            rows, whole = fronts[parent[k]]
+            at = _scalars(rows, below)
+            inner = whole[at[:, None], at]
+            across = -inner @ factor
+            front[size:, size:], front[size:, :size], front[:size, size:] = inner, across, across.T
+            front[:size, :size] -= factor.T @ across
+            waiting[parent[k]] -= 1
+            if not waiting[parent[k]]:
+                del fronts[parent[k]]
+        if waiting[k]:
+            fronts[k] = np.append(np.arange(begin, end), below), front
+        pivots = np.arange(end - begin)
+        result[order[begin:end]] = front[:size, :size].reshape(end - begin, 3, end - begin, 3)[pivots, :, pivots]
+    return 0.5 * (result + result.transpose(0, 2, 1))
+
+
+def _parts_of(blocks: Any, order: Integers) -> list[tuple[int, int, Integers]]:
+    """Return runs of elimination steps, each with its first step, its end, and the common rows below."""
+    count = len(order)
+    place = np.empty(count, np.int64)
+    place[order] = np.arange(count)
+    places, starts = place[blocks.indices].tolist(), blocks.indptr.tolist()
+    below: list[list[int]] = []
+    children: list[list[list[int]]] = [[] for _ in range(count)]
+    for k, step in enumerate(order.tolist()):
+        rows = sorted({row for row in places[starts[step] : starts[step + 1]] if row > k}.union(*children[k]))
+        children[k] = []
+        if rows:
+            children[rows[0]].append(rows[1:])
+        below.append(rows)
+    parts, begin = [], 0
+    for k in range(count):
+        rows = below[k]
+        if k + 1 == count or not len(rows) or rows[0] != k + 1 or len(rows) != len(below[k + 1]) + 1:
+            parts.append((begin, k + 1, np.array(rows, np.int64)))
+            begin = k + 1
+    return parts
+
+
+def _eliminated(
+    blocks: Any, order: Integers, parts: list[tuple[int, int, Integers]], parent: Integers, damping: float
+) -> list[tuple[Floats, Floats]]:
+    """Return the inverse pivots and the factor L of each part."""
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    places, starts = place[blocks.indices], blocks.indptr
+    factors, updates = [], dict[int, list[tuple[Integers, Floats]]]()
+    for k, (begin, end, below) in enumerate(parts):
+        rows, size = np.append(np.arange(begin, end), below), 3 * (end - begin)
+        split = np.zeros((len(rows), 3, len(rows), 3))
+        for column, step in enumerate(order[begin:end].tolist()):
+            entries = slice(starts[step], starts[step + 1])
+            later = places[entries] >= begin + column
+            at = np.searchsorted(rows, places[entries][later])
+            split[at, :, column] = blocks.data[entries][later].transpose(0, 2, 1)
+        front = split.reshape(3 * len(rows), -1)
+        for child, update in updates.pop(k, ()):
+            at = _scalars(rows, child)
+            front[at[:, None], at] += update
+        # Only the lower triangle of the pivots is used.
+        pivot, side = np.tril(front[:size, :size]), front[size:, :size]
+        inverse = np.asarray(np.linalg.inv(pivot + np.tril(pivot, -1).T + damping * np.eye(size)), np.float64)
+        factor: Floats = side @ inverse
+        factors.append((inverse, factor))
+        if len(below):
+            updates.setdefault(int(parent[k]), []).append((below, front[size:, size:] - factor @ side.T))
+    return factors
+
+
+def _scalars(rows: Integers, some: Integers) -> Integers:
+    """Return the places (3 R,) of the scalar rows of some (R,) ascending block rows."""
+    return (3 * np.searchsorted(rows, some)[:, None] + np.arange(3)).ravel()

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gpusense.chaining.drift import Drift
+from gpusense.chaining.drift import Drift, inverse_blocks, pose_covariances
 from gpusense.chaining.graph import KERNEL, Equations, normal_equations, pose_jacobians, solve
 from gpusense.chaining.links import CLOSURE, MATCH, Links, chained
-from gpusense.chaining.selected import inverse_blocks, pose_covariances
 from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
 
 

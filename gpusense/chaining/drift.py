@@ -1,10 +1,10 @@
 """Compute covariances in a solved pose graph: of relative poses (the drift between scans), and of all poses.
 
-Covariances of all poses are diagonal blocks of the inverse of the sparse normal equations. The matrix of 3 x 3 blocks is
-eliminated front by front along the elimination tree (Duff and Reid 1983), successive columns with equal rows at once.
-The blocks of the inverse within each front follow from its parent's blocks, from the root down (Takahashi et al. 1973):
-for L the columns below pivots D, and Z the inverse, Z_sj = -Z_ss L and Z_jj = D^-1 + L' Z_ss L. Only these blocks are
-computed: time and memory equal the elimination's.
+Covariances of all poses are diagonal blocks of the inverse of the sparse normal equations. The matrix of 3 x 3 blocks
+is eliminated front by front along the elimination tree (Duff and Reid 1983), successive columns with equal rows at
+once. The blocks of the inverse within each front follow from its parent's blocks, from the root down (Takahashi et al.
+1973): for L the columns below pivots D, and Z the inverse, Z_sj = -Z_ss L and Z_jj = D^-1 + L' Z_ss L. Only these
+blocks are computed: time and memory equal the elimination's.
 """
 
 from __future__ import annotations

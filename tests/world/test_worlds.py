@@ -294,17 +294,28 @@ def test_arrays_of_other_libraries_come_back_in_them(
 
 def test_a_vector_environment_takes_and_gives_arrays_of_a_library(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("gymnasium")
+    pytest.importorskip("warp")
     installed(monkeypatch)
     made = runpy.run_path(str(Path(__file__).parents[2] / "examples" / "many_worlds" / "navigation.py"))["Navigation"]
-    wrap = sys.modules["fakelib"].from_dlpack
-    plain, wrapped = (
-        made(rooms=4, beams=9, longest=3, backend="numpy"),
-        made(rooms=4, beams=9, longest=3, backend="numpy", wrap=wrap),
-    )
+    wrap, rng = sys.modules["fakelib"].from_dlpack, np.random.default_rng(0)
+    plain = made(rooms=4, beams=9, longest=3, backend="numpy")
+    wrapped = made(rooms=4, beams=9, longest=3, backend="numpy", wrap=wrap)
     same_bits(np.from_dlpack(wrapped.reset(seed=1)[0]), plain.reset(seed=1)[0])
-    for _ in range(4):
-        actions = plain.random.uniform(-1, 1, (4, 2)).astype(np.float32)
-        wrapped.random.uniform(-1, 1, (4, 2))
-        for found, given in zip(wrapped.step(wrap(actions))[:4], plain.step(actions)[:4], strict=True):
+    ages = []
+    for _ in range(6):
+        actions = rng.uniform(-1, 1, (4, 2)).astype(np.float32)
+        results = plain.step(actions)
+        for found, given in zip(wrapped.step(wrap(actions))[:4], results[:4], strict=True):
             assert type(found).__name__ == "Array"
             same_bits(np.from_dlpack(found), given)
+        observation, reward, terminated, truncated, _ = results
+        ages.append(plain.state["age"].numpy().copy())
+        np.testing.assert_array_equal(truncated, (ages[-1] == 3) & (terminated == 0))
+        # An episode begins at the step after the end of the last one, without a reward.
+        assert (reward[ages[-1] == 0] == 0).all()
+        poses = plain.state["poses"].numpy()
+        seen = gs.RayCaster(plain.worlds, 6.0, backend="numpy").cast(
+            poses, np.linspace(-np.pi, np.pi, 9, endpoint=False), world=range(4)
+        )
+        np.testing.assert_allclose(observation[:, :9], seen / np.float32(6), rtol=1e-6)
+    assert (np.array(ages) == 0).any()

@@ -407,13 +407,6 @@ def test_a_target_that_does_not_fit_the_library_ends_in_narrower_kernels(needs, 
     assert "kernels in vectors of 16 " in errors
 
 
-@pytest.mark.parametrize("name", ["numpy"])
-def test_a_variable_chooses_the_default_backend(needs, tmp_path, name):
-    needs(name)
-    found, _ = default_of(tmp_path, GPUSENSE_BACKEND=name)
-    assert found["selection"] == name
-
-
 def test_a_variable_that_names_nothing_is_an_error_that_names_it(monkeypatch):
     monkeypatch.setenv("GPUSENSE_BACKEND", "vulkan")
     with pytest.raises(ValueError, match=r"GPUSENSE_BACKEND: backend: must be 'auto'.* got 'vulkan'"):

@@ -257,16 +257,16 @@ reference_cast_ranges, envelope = ranges.cast_ranges, distance.distance_envelope
 score_beams, log_density = beam.score_beams, mixture.log_density
 
 
-@pytest.mark.sampled(0.1)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize(
     "module, name, broken, quantity",
     [
-        (ranges, "cast_ranges", shift_ranges, "float32 ranges"),
         (distance, "distance_envelope", add_to_squares, "distance transform"),
         (beam, "score_beams", add_to_scan, "float32 beam model, scans"),
         (beam, "score_beams", add_to_beam, "float32 beam model, beams"),
         (beam, "log_density", densities_of_another_mixture, "float32 beam model, beams"),
         (beam, "score_beams", add_without_parts, "float32 beam model, scans alone"),
+        (ranges, "cast_ranges", shift_ranges, "float32 ranges"),
         (beam, "incidence_terms", parameters_of_another_angle, "float64 sonar by incidence, beams"),
         (echo, "cast_echoes", turn_an_angle, "float32 angles of incidence"),
     ],

@@ -20,6 +20,7 @@ from gpusense.interface.sources import assemble, relevant
 
 # Kernel, the flag, further flags, and patterns of the flag's code in OpenCL and in Warp's C++.
 TRACES = [
+    ("sum_parts", "SCANS", (), r"\bcounts\[", r"address\(var_counts\b"),
     ("cast_ranges", "FLOAT64", (), r"\bdouble\b", r"\bfloat64\b"),
     ("cast_ranges", "ORIGINS_OUTSIDE", (), r"\benter_x\b", r"\bwp::neg\("),
     (
@@ -76,7 +77,6 @@ TRACES = [
     ("beam_tiles", "SCANS", ("RAND", "LINEAR"), r"\bstart\[", r"address\(var_start\b"),
     ("score_field", "SCANS", ("LOG_TABLE",), r"\bstart\[", r"address\(var_start\b"),
     ("field_blocks", "SCANS", ("LOG_TABLE",), r"\bstart\[", r"address\(var_start\b"),
-    ("sum_parts", "SCANS", (), r"\bcounts\[", r"address\(var_counts\b"),
     ("score_features", "RANGE", (), r"\brange_mass\(", r"range_mass_\d+\("),
     ("score_features", "BEARING", (), r"\bangle_pair\(", r"angle_pair_\d+\("),
     ("score_features", "SIGNATURE", (), r"\bSIGNATURE_AT\]", r"pair_product_\d+\("),

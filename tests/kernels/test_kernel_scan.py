@@ -131,6 +131,7 @@ def test_a_scan_of_each_robot_is_placed_like_a_single_one(
                     assert differing(part, alone[name][:size]) == 0, (name, scan, kind)
 
 
+@pytest.mark.long_on("warp")
 def test_readings_that_keep_their_places(device: Backend) -> None:
     """ALL_READINGS keeps readings in place; a table's ranges stay below its last bin, cones have several vectors."""
     (_, ranges, *_), count = scans(np.float32, 53), 53

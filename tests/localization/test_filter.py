@@ -126,6 +126,7 @@ def test_a_robot_in_a_room_is_tracked(backend, options):
     np.testing.assert_allclose(on_host(pf.weights), weights, rtol=1e-14, atol=0)
 
 
+@pytest.mark.long_on("warp")
 def test_the_same_seed_gives_the_same_bits_and_another_one_others(backend):
     one, two = tracked(backend)[0], tracked(backend)[0]
     assert np.array_equal(one.host_particles(), two.host_particles())

@@ -91,6 +91,7 @@ def test_a_delay_is_measured(backend, grid, run) -> None:
     assert "s later" in found.text
 
 
+@pytest.mark.long
 def test_wrong_maps_are_told_from_wrong_scales(backend, grid, run) -> None:
     scaled = gs.OccupancyGrid(grid.cells, grid.resolution / 1.25, grid.origin)
     found = diagnosed(backend, scaled, run)

@@ -83,6 +83,7 @@ def test_counts_are_those_of_a_walk_in_fractions(backend):
     np.testing.assert_array_equal(counted["misses"], misses)
 
 
+@pytest.mark.long_on("warp")
 def test_a_room_is_rebuilt(backend):
     cells = np.pad(np.zeros((30, 40), int), 1, constant_values=100)
     cells[15, 10:14] = 100

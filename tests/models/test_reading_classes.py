@@ -96,6 +96,7 @@ def test_functions_class_readings_by_limits_of_their_type(name):
     np.testing.assert_allclose(USERS[name](scan()), USERS[name](with_equal_classes()), rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("on_device", [False, True])
 @pytest.mark.parametrize("model", [gs.BeamModel, gs.LikelihoodFieldModel])
 def test_models_and_kernels_class_readings_alike(backend, model, on_device):

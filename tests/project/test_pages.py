@@ -8,7 +8,7 @@ from support.paths import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 # Pages whose blocks take seconds.
-DEAR = ("getting-started", "landmarks", "learning", "localization", "logs", "matching", "speed", "sweeps")
+DEAR = ("README", "getting-started", "landmarks", "learning", "localization", "logs", "matching", "speed", "sweeps")
 
 
 def name_of(page):

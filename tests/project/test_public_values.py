@@ -163,7 +163,7 @@ def check(name: str, chosen: list[tuple[str, str]], capfd: pytest.CaptureFixture
 def test_drawn_values_give_a_right_result_or_a_named_error(name: str, capfd: pytest.CaptureFixture[str]) -> None:
     every = trials(name, calls()[name])
     rng = np.random.default_rng([len(name), *name.encode()])
-    count = 1 if name in HEAVY else min(12, len(every))
+    count = 1 if name in HEAVY else min(30, len(every))
     check(name, [every[k] for k in rng.choice(len(every), count, replace=False)], capfd)
 
 

@@ -5,19 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 import gpusense as gs
 
 NAN, INF = float("nan"), float("inf")
 POSE = [[0.0, 0.0, 0.0]]
 GRID = gs.OccupancyGrid([[0, 100], [0, 0]], 1.0)
 POSITION = gs.PositionModel(gs.PositionParameters(sigma=1.0), backend="numpy")
-BARE = gs.PositionModel(gs.PositionParameters(), backend="numpy")
-HEADING = gs.HeadingModel(backend="numpy")
 BEACONS = gs.BeaconModel([[0.0, 0.0], [1.0, 1.0]], gs.BeaconParameters(range_max=20.0), backend="numpy")
 BUMPER = gs.BumperModel(GRID, 0.3, backend="numpy")
-SEGMENTS = gs.BumperModel(GRID, 0.3, segments=[(0, 1), (2, 3)], backend="numpy")
 
 
 def make(of: Callable[..., object], /, *given: Any, **changes: Any) -> Callable[[], object]:
@@ -53,54 +48,29 @@ CASES: list[tuple[Callable[[], object], type[Exception], str]] = [
      "(0, 0, 0, 1)"),
     (make(gs.HeadingModel, backend="numpy", temperature=0), V, WARM("0")),
     (make(P, sigma=1, z_hit=0.9), V, "z_hit + z_rand: must be 1 within 1e-06, got 0.9"),
-    (make(P, sigma=1, mount=(0, 0, 0)), V, "mount: shape must be (2,), got (3,)"),
-    (make(gs.PositionModel, 3), T, "parameters: must be PositionParameters, got 3"),
     (make(gs.PositionModel, P(sigma=1e-13), backend="numpy"), V, "sigma: " + LIMITS("1e-13")),
-    (score(POSITION, [1, 2, 3]), V, "fix: shape must be (2,), got (3,)"),
-    (score(BARE, [1, 2]), V, "covariance: must be given where the parameters have none, got None"),
-    (score(POSITION, [1, 2], covariance=[[1, 2], [2, 1]]), V,
-     "covariance: must be positive definite, got [[1.0, 2.0], [2.0, 1.0]]"),
-    (score(POSITION, [1, 2], covariance=[[1e-30, 0], [0, 1]]), V, "covariance: standard deviations " + LIMITS("1e-15")),
-    (score(POSITION, [1, 2], poses=[0, 0, 0]), V, "poses: shape must be (N, 3), got (3,); a single one is poses[None]"),
-    (make(H, sigma=-1), V, "sigma: must be finite and > 0, got -1"),
-    (make(H, kappa=-1), V, "kappa: must be finite and >= 0, got -1"),
-    (make(H, kind="normal"), V, "kind: must be one of 'wrapped_normal', 'von_mises', got 'normal'"),
-    (make(H, offset=NAN), V, "offset: must be finite, got nan"),
+    (score(gs.PositionModel(P(), backend="numpy"), [1, 2]), V,
+     "covariance: must be given where the parameters have none, got None"),
     (make(gs.HeadingModel, H(kind="von_mises", kappa=1e26), backend="numpy"), V,
      "kappa: 1 / sqrt(kappa) " + LIMITS("1e-13")),
-    (score(HEADING, [1.0]), V, "heading: shape must be (), got (1,)"),
-    (make(gs.BeaconModel, [1, 2], backend="numpy"), V, "xy: shape must be (M, 2), got (2,)"),
-    (make(B, kind="cauchy"), V, "kind: must be one of 'normal', 'student_t', 'mixture', got 'cauchy'"),
+    (score(POSITION, [1, 2], covariance=[[1, 2], [2, 1]]), V,
+     "covariance: must be positive definite, got [[1.0, 2.0], [2.0, 1.0]]"),
+    (make(H, kind="normal"), V, "kind: must be one of 'wrapped_normal', 'von_mises', got 'normal'"),
     (make(B, nu=0), V, "nu: must be >= 1 and <= 100, got 0"),
     (make(B, nu=2.5), T, "nu: must be an integer, got 2.5"),
-    (make(B, heavy_weight=1.5), V, "heavy_weight: must be finite and >= 0 and <= 1, got 1.5"),
-    (make(B, range_max=INF), V, "range_max: must be finite and > 0, got inf"),
     (make(gs.BeaconModel, [[0, 0], [1e30, 0]], backend="numpy"), V,
      "xy: must be within 1.2e+18 m of the middle, got 5e+29 m"),
-    (make(gs.BeaconModel, [[0, 0]], B(bias=-1e30), backend="numpy"), V, "bias: its size " + LIMITS("1e+30")),
     (make(B, bias=(0.1, NAN)), V, "bias: every value must be finite, got nan at index 1"),
     (make(gs.BeaconModel, [[0, 0]], B(bias=(0.1, 0.2)), backend="numpy"), V,
      "parameters: bias must be one for each of 1 beacons, got 2"),
-    (score(BEACONS, [1.0]), V, "ranges: shape must be (2,), got (1,)"),
     (score(BEACONS, [1.0], [2]), V, "ids: indices must be in [0, 2), got 2 at index 0"),
-    (score(BEACONS, [1.0, 2.0], [0]), V, "ranges: shape must be (1,), got (2,)"),
-    (make(C, p_contact=1.1), V, "p_contact: must be finite and >= 0 and <= 1, got 1.1"),
     (bumper(grid=3), T, "grid: must be an OccupancyGrid, got 3"),
-    (bumper(outline=0.0), V, "outline: must be finite and > 0, got 0.0"),
     (bumper(outline=True), T, "outline: must hold real numbers, got dtype bool"),
     (bumper(outline=[(0, 0), (1, 1)]), V, "outline: must have at least 3 corners, got 2"),
     (bumper(outline=1e6, segments=[(0, 1)]), V, "outline: must be at most 32768 cells long in each part, got 1e+06 m"),
     (bumper(outline=1e5), V,
      "grid: must have at most 32763 rows and columns with room for the outline, got 200004 x 200004"),
-    (bumper(unknown="wall"), V, "unknown: must be one of 'free', 'occupied', got 'wall'"),
-    (bumper(segments=[1, 2]), V, "segments: shape must be (B, 2), got (2,)"),
-    (bumper(segments=[[]]), V, "segments: shape must be (B, 2), got (1, 0)"),
     (bumper(outline=[(0, 0), (1, 0), (1, 1)], segments=[0, 2, 2]), V, NUMBERS("[0, 2, 2]")),
-    (bumper(outline=[(0, 0), (1, 0), (1, 1)], segments=[-1, -1, -1]), V, NUMBERS("[-1, -1, -1]")),
     (score(BUMPER, {True}), T, "pressed: must be True, False or nan, or a sequence of these, got {True}"),
     (score(BUMPER, 2), T, STATES("2")),
-    (score(BUMPER, 0.5), T, STATES("0.5")),
-    (score(SEGMENTS, True), V, "pressed: shape must be (2,), got (1,)"),
-    (score(SEGMENTS, ["a", True]), T, STATES("'a'")),
-    (score(SEGMENTS, np.ones((2, 2), bool)), V, "pressed: shape must be (2,), got (2, 2)"),
 ]  # fmt: skip

@@ -260,7 +260,7 @@ def test_certificates_of_the_page_are_valid(tmp_path):
 
 def test_a_cluster_of_this_machine_may_use_tls(tmp_path):
     own = write_certificates(tmp_path)
-    with gs.sweep.DaskExecutor(security=security(*own)) as executor:
+    with gs.sweep.DaskExecutor(devices=["numpy"], security=security(*own)) as executor:
         assert executor.address.startswith("tls://127.0.0.1:")
         assert all(address.startswith("tls://127.0.0.1:") for address in executor._workers())
         assert executor.submit(abs, -3).result(timeout=60) == 3

@@ -76,6 +76,7 @@ def line_to(end: tuple[int, int], last: int, straight: bool) -> list[tuple[int, 
     return cells
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("range_max", [0.6, 1.3, 14.8, 200.0])
 @pytest.mark.parametrize("lines", [None, "amcl", "beluga"])
 def test_leaps_land_on_the_cells_of_single_steps(lines, range_max, backend):

@@ -164,6 +164,7 @@ def value_of(formula: str, **names: int) -> float:
     return eval(code, {"__builtins__": {}})
 
 
+@pytest.mark.long_on("warp")
 def test_table_bytes_are_those_of_the_page(backend):
     grid, poses, bearings = place()
     rows, cols = grid.shape

@@ -194,6 +194,7 @@ def test_the_cell_is_the_one_where_the_walk_ends(family, backend):
 # ----------------------------------------------------------------------------------------------------------- casters
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("outside", ["free", "occupied"])
 def test_incidence_is_the_same_everywhere(outside, backend):
     grid, poses, bearings = place()

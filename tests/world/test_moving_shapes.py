@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -92,31 +93,39 @@ def compare(found: np.ndarray, wanted: np.ndarray) -> None:
     assert off.mean() < 0.002, np.argwhere(off)
 
 
+@functools.cache
+def near_scene() -> tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[gs.Shapes, bool, np.ndarray]]]:
+    """Return poses, their worlds, the shapes that they ignore, and for each call the shapes, whether some are ignored,
+    and the true ranges.
+    """
+    rng = np.random.default_rng(1)
+    shapes = some_shapes(rng)
+    index, ignore = np.arange(3).repeat(15), rng.integers(-1, 10, 45)
+    poses = np.column_stack([rng.uniform(-2, 8, (45, 2)), rng.uniform(-9, 9, 45)])
+    calls = [(shapes, True), (shapes, False), (some_shapes(rng), False)]
+    nothing = np.full(45, -1)
+    return poses, index, ignore, [(one, some, truth(one, poses, index, ignore if some else nothing))
+                                  for one, some in calls]  # fmt: skip
+
+
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_ranges_are_those_of_the_nearest_shape(precision: Any, backend: str) -> None:
-    rng = np.random.default_rng(1)
-    worlds, shapes = wall_free(backend), some_shapes(rng)
+    worlds, (poses, index, ignore, calls) = wall_free(backend), near_scene()
     caster = gs.RayCaster(worlds, RANGE, backend=backend, precision=precision)
-    index, ignore = np.arange(3).repeat(15), rng.integers(-1, 10, 45)
-    poses = np.column_stack([rng.uniform(-2, 8, (45, 2)), rng.uniform(-9, 9, 45)])
     assert (caster.cast(poses, BEARINGS, world=index) == RANGE).all()
-    worlds.shapes = shapes
-    compare(caster.cast(poses, BEARINGS, world=index, ignore=ignore), truth(shapes, poses, index, ignore))
-    nothing = np.full(45, -1)
-    compare(caster.cast(poses, BEARINGS, world=index), truth(shapes, poses, index, nothing))
-    moved = some_shapes(rng)
-    worlds.shapes = moved
-    compare(caster.cast(poses, BEARINGS, world=index), truth(moved, poses, index, nothing))
+    for shapes, some, wanted in calls:
+        worlds.shapes = shapes
+        compare(caster.cast(poses, BEARINGS, world=index, **({"ignore": ignore} if some else {})), wanted)
     worlds.shapes = gs.Shapes()
     assert (caster.cast(poses, BEARINGS, world=index) == RANGE).all()
 
 
-def test_shapes_with_far_ends_pass_where_float64_says(backend: str) -> None:
-    """Float32 holds no centimetres at ends that are hundreds of kilometres away."""
+@functools.cache
+def far_scene() -> tuple[np.ndarray, list[tuple[gs.Shapes, np.ndarray]]]:
+    """Return poses, and shapes with far ends, each with the true ranges."""
     rng = np.random.default_rng(4)
-    worlds = gs.Worlds(np.zeros((1, 120, 120), np.int8), 0.05, ORIGINS[1], backend=backend)
-    caster = gs.RayCaster(worlds, RANGE, backend=backend)
     poses, angle, sign = rng.uniform(-2, 8, (30, 3)), rng.uniform(-3, 3, 20), rng.choice([-1, 1], 20)
     through, way = rng.uniform(-2, 8, (20, 2)), np.stack([np.cos(angle), np.sin(angle)], axis=1)
     far = 10 ** rng.uniform(3, 5.7, (20, 1))
@@ -125,10 +134,18 @@ def test_shapes_with_far_ends_pass_where_float64_says(backend: str) -> None:
     # One face of each box passes through the point; the box lies on either side.
     across = (sign * far[:, 0] / 2)[:, None] * np.stack([-way[:, 1], way[:, 0]], axis=1)
     wide = np.column_stack([through + across, angle, far, far])
-    nothing = np.full(30, -1)
-    for shapes in (gs.Shapes(segments=long[None]), *(gs.Shapes(boxes=wide[None, k : k + 1]) for k in range(8))):
+    every = gs.Shapes(segments=long[None]), *(gs.Shapes(boxes=wide[None, k : k + 1]) for k in range(8))
+    return poses, [(shapes, truth(shapes, poses, np.zeros(30, int), np.full(30, -1))) for shapes in every]
+
+
+@pytest.mark.long_on("warp")
+def test_shapes_with_far_ends_pass_where_float64_says(backend: str) -> None:
+    """Float32 holds no centimetres at ends that are hundreds of kilometres away."""
+    worlds = gs.Worlds(np.zeros((1, 120, 120), np.int8), 0.05, ORIGINS[1], backend=backend)
+    caster, (poses, calls) = gs.RayCaster(worlds, RANGE, backend=backend), far_scene()
+    for shapes, wanted in calls:
         worlds.shapes = shapes
-        found, wanted = (caster.cast(poses, BEARINGS), truth(shapes, poses, np.zeros(30, int), nothing))
+        found = caster.cast(poses, BEARINGS)
         off = np.abs(found - wanted) > 2e-3
         assert off.mean() < 0.005, (shapes, np.abs(found - wanted).max())
     worlds.shapes = gs.Shapes(segments=[[[4.0, -3e5, 4.0, 9e5]]])

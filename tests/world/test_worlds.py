@@ -49,6 +49,7 @@ def grids() -> list[gs.OccupancyGrid]:
     return [gs.OccupancyGrid(some_cells(rng, *size), 0.1, at) for size, at in zip(sizes, origins, strict=True)]
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("options", [{}, {"unknown": "occupied", "outside": "occupied"}, {"precision": "float64"}])
 def test_ranges_and_incidence_have_the_bits_of_single_maps(

@@ -192,6 +192,7 @@ def test_tiles_and_orders_change_nothing(gpu, as_gpu):
     np.testing.assert_array_equal(found, np.tile(expected, 300))
 
 
+@pytest.mark.long_on("warp")
 def test_max_readings_depend_on_what_is_expected(backend):
     """A wall ahead makes no return unlikely; with and without a wall, the probability is the table's."""
     _, scanner, poses = scene()

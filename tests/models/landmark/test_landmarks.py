@@ -117,6 +117,7 @@ def test_false_positives_and_impossible_features(backend):
     assert np.isneginf(few.log_likelihood(poses, features)).all()
 
 
+@pytest.mark.long_on("warp")
 def test_joint_association_is_exclusive_where_the_nearest_is_not(backend):
     # Two features, both nearest to landmark 0; landmark 1 is a little farther from the second.
     landmarks = gs.LandmarkMap([[5.0, 0.0], [5.6, 0.0]])
@@ -165,6 +166,7 @@ def test_coincident_landmarks_are_the_first_of_them(backend):
     assert which.tolist() == [list(scenes.SEEN)]
 
 
+@pytest.mark.long_on("warp")
 def test_temperature_multiplies_the_sum(backend):
     model, poses, features = scenes.model("ordinary", backend)
     cool, _, _ = scenes.model("ordinary", backend, temperature=0.25)
@@ -193,6 +195,7 @@ def test_the_plan_names_what_is_left_out():
     assert "sigma_signature = None" in text and "it is a full circle" in text
 
 
+@pytest.mark.long_on("warp")
 def test_wrong_signatures_are_other_landmarks(backend):
     landmarks = gs.LandmarkMap([[5.0, 0.0], [5.0, 0.1]], [10.0, 20.0])
     model = gs.LandmarkModel(landmarks, gs.LandmarkParameters(sigma_signature=0.5), backend=backend)

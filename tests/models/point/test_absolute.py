@@ -86,6 +86,7 @@ def test_bumpers_by_brute_force(backend: str, precision: str, scene: str) -> Non
             assert_close(found[told], truth[told].sum(axis=1), precision, truth[told])
 
 
+@pytest.mark.long_on("warp")
 @each_precision
 def test_a_bumper_of_ten_nanometres(backend: str, precision: str) -> None:
     cells = np.zeros((5, 9), int)
@@ -205,6 +206,7 @@ def test_extreme_poses_are_never_nan(backend: str, precision: str) -> None:
         assert np.isfinite(found).all(), name
 
 
+@pytest.mark.long_on("warp")
 @each_precision
 def test_the_frame_does_not_matter(backend: str, precision: str) -> None:
     """The world is shifted and turned by half a turn; multiples of 2^-10 move exactly."""

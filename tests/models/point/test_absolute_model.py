@@ -42,6 +42,7 @@ def with_rand(kernel, flags, size, **arguments):
     return launch(kernel, frozenset(flags) | {"RAND"}, size, **arguments)
 
 
+@pytest.mark.long_on("warp")
 def test_without_outliers_the_code_for_them_changes_no_bit(backend, monkeypatch):
     """RAND with a weight of 0 adds exactly 0: code without RAND returns the same numbers."""
     given = {

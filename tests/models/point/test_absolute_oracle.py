@@ -107,6 +107,7 @@ def own_bias(p: gs.BeaconParameters, beacon: int) -> gs.BeaconParameters:
     return p.replace(bias=p.bias[beacon]) if isinstance(p.bias, tuple) else p
 
 
+@pytest.mark.long_on("warp")
 @each_precision
 def test_beacons(backend: str, precision: str) -> None:
     rng = np.random.default_rng(5)

@@ -52,6 +52,7 @@ def error_in_eps(found: float, mixture: Mixture, z: float, expected: float, eps:
 
 
 # Three sets of weights reach all of Warp's mixture code.
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.15)
 @on_every_backend(weights=WEIGHTS, on_warp=lambda weights: weights in ("all", "hit and short", "hardly any rand"))
 @pytest.mark.parametrize("precision", PRECISIONS)

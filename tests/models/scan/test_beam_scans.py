@@ -121,6 +121,7 @@ def used_beams(beams: object, parts: np.ndarray, scan: list[float], range_min: f
     return taken
 
 
+@pytest.mark.long_on("warp")
 def test_thinning_counts_informative_beams_only(backend):
     """If a scan has two informative readings, beams=2 must find both."""
     _, poses = room()

@@ -141,6 +141,7 @@ def refuse_memory(*arguments: Any) -> Any:
     raise MemoryError("no room for a table")
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("kind", MODELS)
 def test_arrays_of_the_host_on_every_backend(kind, backend):
     model = kind(GRID, NEAR, backend=backend)

@@ -85,6 +85,7 @@ def test_devices_agree_with_the_reference(device, precision, specialize):
             np.testing.assert_allclose(one, other, rtol=bound, atol=bound * np.abs(other).max())
 
 
+@pytest.mark.long_on("warp")
 def test_several_scans_are_single_scans(backend):
     grid, poses, ranges = scene(poses=6)
     model = field(grid, backend)
@@ -108,6 +109,7 @@ def test_vectors_hold_particles_of_one_scan(device):
             np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4 * np.abs(other).max())
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("name", ["opencl", "warp"])
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 def test_steps_of_climbs_are_those_of_the_reference(name, real, needs):

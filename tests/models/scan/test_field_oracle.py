@@ -138,6 +138,7 @@ def test_empty_full_and_unknown_maps(shape, filling, interpolation, backend):
         compare(field, model, poses, rng.uniform(0, 5, len(BEARINGS)), BEARINGS)
 
 
+@pytest.mark.long_on("warp")
 def test_all_max_and_all_missing(backend):
     grid, poses, _ = scene(0.25, (0.0, 0.0, 0.0))
     for z_max in (0.0, 0.2, 1.0):

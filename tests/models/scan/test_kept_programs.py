@@ -44,6 +44,7 @@ def test_the_bound_of_rounding_errors_follows_the_longest_reading(backend, gpu, 
     assert device.guards == pytest.approx(needed, rel=1e-15)
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("case", CASES)
 def test_scans_of_poses_that_stay_in_place_have_the_bits_of_ordinary_calls(case, backend, monkeypatch):

@@ -149,6 +149,7 @@ def test_a_mean_that_rounds_to_the_longest_range_has_half_of_its_mass(shape, bac
         assert far - 1e-3 <= log_p[0] <= near + 1e-3, (sigma, far, near)
 
 
+@pytest.mark.long_on("warp")
 def test_parameters_of_0_change_no_bit_and_are_left_out(backend):
     grid, scanner, poses, expected = scene("float32")
     plain = gs.BeamModel(grid, scanner, gs.BeamParameters(), backend=backend)

@@ -110,6 +110,7 @@ def test_readings_beyond_range_max():
     assert at_max == model.log_likelihood([(5.5, 1.5, 0.0)], [12.1])[0] == pytest.approx(math.log1p(0.55**3), rel=1e-12)
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("peer", ["amcl", "beluga"])
 def test_cells_in_mode_scale(peer, backend):
     """Cells of 1 to 99 per cent stop beams but are not obstacles of the field, at any threshold."""

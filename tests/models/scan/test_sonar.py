@@ -59,6 +59,7 @@ SONARS = {
 }
 
 
+@pytest.mark.long_on("warp")
 @on_every_backend(on_warp=lambda name: name in ("cone", "mirrors"), name=SONARS)
 def test_a_sonar_hears_the_nearest_ray_that_returns(name, backend):
     grid, poses, _ = place()

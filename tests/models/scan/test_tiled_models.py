@@ -257,6 +257,7 @@ def test_work_items_that_add_up_strands_change_nothing(precision, ordered, as_gp
     assert "STRANDED" not in code_of(shared)
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("kind", [gs.BeamModel, gs.LikelihoodFieldModel])
 def test_batches(kind, ordered, as_gpu):
     grid, scanner, z = world()
@@ -313,6 +314,7 @@ def border_poses(grid: gs.OccupancyGrid, reach: float) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.mark.long_on("warp")
 def test_end_points_at_the_border(as_gpu, backend):
     """The border is known to the cell: code with and without clamping gives equal results."""
     cells = world()[0].cells

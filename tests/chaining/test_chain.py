@@ -333,17 +333,9 @@ def test_a_run_that_is_interrupted_keeps_what_it_has(lap: tuple[np.ndarray, ...]
     ("changes", "message"),
     [
         ({"scans": np.ones((0, 181))}, "scans: must hold at least one scan"),
-        ({"scans": np.ones((2, 7))}, "scans"),
-        ({"odometry": np.zeros((3, 3))}, "odometry"),
-        ({"odometry": np.full((2, 3), np.nan)}, "odometry"),
         ({"times": [1.0, 0.5]}, r"times: must not decrease, got 0.5 after 1.0 at scan 1"),
-        ({"times": [1.0]}, "times"),
         ({"duration": 0.1}, "duration: must be 0 without times"),
-        ({"duration": -1.0}, "duration"),
-        ({"step": (0.1,)}, "step"),
         ({"step": (-0.1, 0.0)}, r"step\[0\]"),
-        ({"precision": "half"}, "precision"),
-        ({"backend": "abacus"}, "backend"),
     ],
 )
 def test_bad_values(changes: dict, message: str) -> None:

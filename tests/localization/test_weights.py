@@ -48,36 +48,6 @@ def test_an_impossible_scan_is_flagged_and_uniform():
     assert result.effective_sample_size == 4
 
 
-@pytest.mark.parametrize(
-    ("log_p", "message"),
-    [
-        ([], "log_p: must hold at least one log-likelihood, got shape (0,)"),
-        ([0.0, math.nan], "log_p: every value must be finite or -inf, got nan at index 1"),
-        ([math.inf], "log_p: every value must be finite or -inf, got inf at index 0"),
-        ([[0.0]], "log_p: shape must be (N,), got (1, 1)"),
-    ],
-)
-def test_bad_log_likelihoods(log_p, message):
-    with pytest.raises(ValueError) as caught:
-        normalize_weights(log_p)
-    assert str(caught.value) == message
-
-
-@pytest.mark.parametrize(
-    ("weights", "message"),
-    [
-        ([], "weights: must have a positive sum, got 0.0"),
-        ([0.0, 0.0], "weights: must have a positive sum, got 0.0"),
-        ([1.0, -0.5], "weights: must be >= 0, got -0.5 at index 1"),
-        ([1.0, math.nan], "weights: every value must be finite, got nan at index 1"),
-    ],
-)
-def test_bad_weights(weights, message):
-    with pytest.raises(ValueError) as caught:
-        resample(weights, 3, np.random.default_rng(0))
-    assert str(caught.value) == message
-
-
 @settings(max_examples=200, deadline=None)
 @given(
     st.lists(st.floats(0, 1e6), min_size=1, max_size=50).filter(lambda w: max(w) > 1e-3),

@@ -148,21 +148,11 @@ def test_the_extent_holds_all_rays_and_a_map_is_built_in_steps():
 def test_bad_arguments_are_named():
     scanner, good = gs.Scanner([0.0], range_max=5.0), ([[1.0]], [(0, 0, 0)])
     for options, name in [
-        ({"resolution": 0}, "resolution"), ({"origin": (0, 0, 0)}, "shape"), ({"shape": (3, 3)}, "origin"),
-        ({"origin": (0, 0, 0), "shape": (0, 3)}, "shape"), ({"p_hit": 0.5}, "p_hit"), ({"p_miss": 0.5}, "p_miss"),
-        ({"p_prior": 1}, "p_prior"), ({"range_limit": -1}, "range_limit"), ({"occupied_threshold": 0}, "occ"),
-        ({"resolution": 1e-5}, "resolution"),
+        ({"origin": (0, 0, 0)}, "shape"), ({"shape": (3, 3)}, "origin"), ({"p_hit": 0.5}, "p_hit"),
+        ({"p_miss": 0.5}, "p_miss"), ({"resolution": 1e-5}, "resolution"),
     ]:  # fmt: skip
         with pytest.raises(ValueError, match=f"^{name}"):
             gs.build_map(*good, scanner, backend="numpy", **options)
-    for arguments, name in [(([[np.nan]], [(0, 0, 0)]), "scans"), (([[1.0, 2.0]], [(0, 0, 0)]), "scans"),
-                            (([[1.0]], [(0, 0)]), "poses")]:  # fmt: skip
-        with pytest.raises(ValueError, match=f"^{name}"):
-            gs.build_map(*arguments, scanner, backend="numpy")
-    with pytest.raises(TypeError, match=r"^scanner:"):
-        gs.build_map(*good, None, backend="numpy")
-    with pytest.raises(TypeError, match=r"^clear_max:"):
-        gs.build_map(*good, scanner, backend="numpy", clear_max=1)
 
 
 def test_odd_scans_agree_with_the_map_of_the_even_ones(tmp_path, data_dir):

@@ -243,17 +243,6 @@ def test_maps_too_large_for_the_device_are_refused_before_their_tables_are_made(
 
 def test_bad_arguments_are_named():
     grid, ranges = house(), np.ones(SCANNER.count)
-    model = gs.LikelihoodFieldModel(grid, SCANNER, backend="numpy")
-    for options, name in [
-        ({"resolution": 0}, "resolution"), ({"angle": 0}, "angle"), ({"positions": "known"}, "positions"),
-        ({"modes": 0}, "modes"), ({"min_probability": 2}, "min_probability"),
-    ]:  # fmt: skip
-        with pytest.raises(ValueError, match=f"^{name}:"):
-            gs.locate_scan(model, ranges, **options)
-    with pytest.raises(ValueError, match=r"^ranges:"):
-        gs.locate_scan(model, ranges[1:])
-    with pytest.raises(TypeError, match=r"^model:"):
-        gs.locate_scan(gs.BeamModel(grid, SCANNER, backend="numpy"), ranges)
     with pytest.raises(ValueError, match=r"^model: must have compat=None"):
         gs.locate_scan(gs.LikelihoodFieldModel(grid, SCANNER, backend="numpy", compat="amcl"), ranges)
     unknown = gs.LikelihoodFieldModel(gs.OccupancyGrid(np.full((9, 9), -1)), SCANNER, backend="numpy")

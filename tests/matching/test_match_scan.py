@@ -192,31 +192,6 @@ def test_what_the_reference_did_not_see_neither_attracts_nor_repels():
     np.testing.assert_allclose(match.pose, (0.1, 0.1, 0.6), atol=5e-3)
 
 
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        (dict(guess=(0.0, 0.0)), ValueError, "guess"),
-        (dict(guess=(math.nan, 0.0, 0.0)), ValueError, "guess"),
-        (dict(guess=(1e9, 0.0, 0.0)), ValueError, "guess"),
-        (dict(method="csm"), ValueError, "method"),
-        (dict(noise=-1.0), ValueError, "noise"),
-        (dict(capture=0.0), ValueError, "capture"),
-        (dict(temperature=0.0), ValueError, "temperature"),
-        (dict(window=(1.0,)), ValueError, "window"),
-        (dict(window=(100.0, 0.1)), ValueError, "window"),
-        (dict(reference=np.ones(3)), ValueError, "reference"),
-        (dict(ranges=np.ones((2, 5))), ValueError, "ranges"),
-        (dict(reference=np.ones((3, 360)), ranges=np.ones((2, 360))), ValueError, "reference"),
-        (dict(scanner="laser"), TypeError, "scanner"),
-        (dict(ranges="scan"), TypeError, "ranges"),
-    ],
-)
-def test_bad_arguments_are_named(change, error, message):
-    arguments = dict(reference=np.ones(360), ranges=np.ones(360), scanner=RING) | change
-    with pytest.raises(error, match=message):
-        gs.match_scan(**arguments, backend="numpy")
-
-
 def test_no_scans_give_no_matches():
     match = gs.match_scan(np.ones((0, 360)), np.ones((0, 360)), RING, backend="numpy")
     assert len(match) == 0

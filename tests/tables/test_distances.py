@@ -31,16 +31,3 @@ def test_squares_are_integers(backend):
 def test_no_obstacle_is_infinitely_far(backend):
     assert (gs.distance_transform(np.zeros((3, 4), bool), backend=backend) == np.inf).all()
     assert (gs.distance_transform(np.zeros((3, 4), bool), squared=True, backend=backend) == 2**31 - 1).all()
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"resolution": 0}, ValueError, "resolution: must be finite and > 0, got 0"),
-        ({"resolution": "1"}, TypeError, "resolution: must be"),
-        ({"squared": 1}, TypeError, "squared: must be True or False, got 1"),
-    ],
-)
-def test_bad_options(options, error, message):
-    with pytest.raises(error, match=f"^{message}"):
-        gs.distance_transform(OBSTACLES, backend="numpy", **options)

@@ -126,19 +126,3 @@ def test_bad_values_are_refused(message: str) -> None:
     arguments = dict(ranges=[1.0, 2.0], expected=[1.5, 2.0], range_max=10.0, backend="numpy") | BAD[message]
     with pytest.raises(ValueError, match=message):
         gs.fit_beam_parameters(**arguments)
-
-
-@pytest.mark.parametrize(
-    ("message", "changed"),
-    [
-        ("ranges: must hold real numbers", dict(ranges=["a", "b"])),
-        ("initial: must be BeamParameters", dict(initial=0.5)),
-        ("callback: must be callable", dict(callback=3)),
-        ("range_bias: must be True or False", dict(range_bias=1)),
-        ("seed: must be an integer", dict(seed=0.5)),
-    ],
-)
-def test_bad_kinds_are_refused(message: str, changed: dict) -> None:
-    arguments = dict(ranges=[1.0, 2.0], expected=[1.5, 2.0], range_max=10.0, backend="numpy") | changed
-    with pytest.raises(TypeError, match=message):
-        gs.fit_beam_parameters(**arguments)

@@ -184,11 +184,5 @@ def test_options_and_their_refusals():
         gs.BeamModel(grid, scanner, compat=Amcl(prob=True), backend="numpy")
     with pytest.raises(ValueError, match="caster: must have ranges of at most range_max without compat, got Bres"):
         gs.BeamModel(grid, scanner, caster=gs.casters.Bresenham("amcl"), backend="numpy")
-    with pytest.raises(TypeError, match="prob: must be True or False, got 1"):
-        Amcl(prob=1)
-    with pytest.raises(TypeError, match="model_unknown_space: must be True or False, got None"):
-        Beluga(model_unknown_space=None)
-    with pytest.raises(TypeError, match="only_obstacle_boundaries: must be True or False, got 'no'"):
-        Beluga(only_obstacle_boundaries="no")
     with pytest.raises(ValueError, match="lines: must be one of 'amcl', 'beluga', got 'mrpt'"):
         gs.casters.Bresenham("mrpt")

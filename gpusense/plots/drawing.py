@@ -197,6 +197,7 @@ def add_colour_bar(ax: Axes, mappable: Any, label: str) -> None:
     """
     bar = ax.figure.colorbar(mappable, cax=ax.inset_axes((1.015, 0.0, 0.02, 1.0)), extend="min")
     bar.set_label(label)
+    bar.ax.set_title("", y=1.0)
     bar.outline.set_edgecolor(FRAME)
 
 

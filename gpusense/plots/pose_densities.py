@@ -164,17 +164,18 @@ def localization_figure(
     """
     figure = new_figure(15.0, 9.8)
     axes = figure.subplots(2, 2)
+    # With a height, Matplotlib does not measure all ticks to place a title.
     for ax in axes.flat:
         draw_map(ax, grid)
     drawn = draw_scan(axes[0, 0], grid, scanner, best, ranges)
-    axes[0, 0].set_title(f"The scan at the best particle: {drawn} ranges of {scanner.count} beams", loc="left")
+    axes[0, 0].set_title(f"The scan at the best particle: {drawn} ranges of {scanner.count} beams", loc="left", y=1.0)
     x, y, _ = checks.array("truth", truth, (3,)).tolist()
     _draw_zoomed_particles(axes[0, 1], grid, (x, y), poses, log_p)
     for ax, (title, density) in zip(axes[1], densities.items(), strict=True):
         image = draw_pose_density(ax, grid, density, extent)
         add_colour_bar(ax, image, "log P(z | x, m) below its maximum [nats]")
         draw_pose(ax, (x, y, 0.0), length=0.0)
-        ax.set_title(title, loc="left")
+        ax.set_title(title, loc="left", y=1.0)
     return figure
 
 
@@ -184,10 +185,12 @@ def _draw_zoomed_particles(
     """Draw particles onto a map, with an inset around the true position."""
     x, y = truth
     zoom = ax.inset_axes((0.735, 0.655, 0.255, 0.325))
+    zoom.set_in_layout(False)
+    zoom.set_title("", y=1.0)
     draw_map(zoom, grid)
     zoom.set(xlim=(x - 1.5, x + 1.5), ylim=(y - 1.3, y + 1.3), xticks=[], yticks=[], xlabel="", ylabel="")
     for each, size in ((ax, 2.0), (zoom, 3.0)):
         cloud = draw_particles(each, poses, log_p, size=size)
     ax.indicate_inset_zoom(zoom, edgecolor=ROBOT, alpha=1.0)
     add_colour_bar(ax, cloud, "log P(z | x, m) [nats]")
-    ax.set_title("The particles and their likelihood by the beam model", loc="left")
+    ax.set_title("The particles and their likelihood by the beam model", loc="left", y=1.0)

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
+from matplotlib.image import imread
 from support.feature_scenes import floor_plan
 
 import gpusense as gs
@@ -232,3 +233,19 @@ def test_a_track_is_titled_by_its_verdict_and_faint_before_convergence(converged
     figure = ax.figure
     figure.canvas.draw()
     assert ax.get_legend().get_window_extent().y1 < ax.get_window_extent().y0
+
+
+def test_a_saved_png_has_the_layout_of_matplotlib(tmp_path):
+    pictures = []
+    for ours in (True, False):
+        figure = gs.plots.new_figure(3.0, 2.0)
+        ax = figure.subplots()
+        gs.plots.draw_map(ax, gs.worlds.building(0, (12.0, 10.0)))
+        ax.set(title="a title", ylabel="a label\nof two lines")
+        engine = figure.get_layout_engine()
+        # Each time, the layout begins with the last one.
+        for _ in range(2):
+            gs.plots.save(figure, tmp_path / "a.png") if ours else figure.savefig(tmp_path / "a.png")
+            pictures.append(imread(tmp_path / "a.png"))
+        assert figure.get_layout_engine() is engine
+    assert np.array_equal(pictures[:2], pictures[2:]) and not np.array_equal(pictures[0], pictures[1])

@@ -89,11 +89,7 @@ def make(name, flags):
 
     @kernel(flags)
     def score_position(place, terms, log_p, particles, temperature):
-        """Score positions: one work-item takes a particle.
-
-        The exponent is (x_scale x)^2 + (shear x + y_scale y)^2, where (x, y) is the offset from the reading to the
-        sensor.
-        """
+        """Score positions: one work-item takes a particle."""
         n = wp.tid()
         if n >= particles:
             return

@@ -1,11 +1,4 @@
-"""Density of ranges to known beacons, each truncated to [0, range_max] and mixed with a uniform one.
-
-    p(z | d) = z_hit f(z - d - bias) / m  +  z_rand / range_max
-
-d is the distance to the beacon. f is normal, a Student t with nu degrees of freedom, or a sum of two normals, one of
-them wide. m is the mass of f on [0, range_max], with d + bias clamped to that interval. For an integer nu the mass of a
-t between 0 and t is a finite sum of positive terms (Abramowitz and Stegun, 26.7.3 and 26.7.4).
-"""
+"""Density of ranges to known beacons, each truncated to [0, range_max] and mixed with a uniform one."""
 
 import functools
 
@@ -102,10 +95,7 @@ def make(name, flags):
 
     @kernel(flags)
     def score_beacons(place, beacon, terms, series, log_p, particles, beacons, count, kind, temperature):
-        """Sum log p of the ranges over beacons: one work-item takes a particle.
-
-        The first count numbers of the series belong to a t.
-        """
+        """Sum log p of the ranges over beacons: one work-item takes a particle."""
         n = wp.tid()
         if n >= particles:
             return

@@ -1,7 +1,4 @@
-"""Beam model of a whole scan, log p(z | x, m): cast, evaluate the mixture and sum, in one launch (book table 6.1).
-
-Readings whose density does not depend on the pose are not passed in: their sum is the constant term.
-"""
+"""Beam model of a whole scan, log p(z | x, m): cast, evaluate the mixture and sum, in one launch (book table 6.1)."""
 
 import functools
 import math
@@ -140,10 +137,8 @@ def make(name, flags):
         constant_terms, log_p, parts, window, particles, rays, readings, tables, cone, caster, scale, crowd, score,
         batch,
     ):  # fmt: skip
-        """Score scans: one work-item takes a particle.
-
-        Where rays are shared, ray r has the readings first[r] to first[r + 1] - 1. SCANS: the rays of a scan begin at
-        start[scan], and first counts the readings of all scans. A launch has fewer than 2^31 parts.
+        """Score scans: one work-item takes a particle. Where rays are shared, ray r has the readings first[r] to
+        first[r + 1] - 1. A launch has fewer than 2^31 parts.
         """
         n = wp.tid()
         if n >= particles:
@@ -242,10 +237,7 @@ def make(name, flags):
         map_table, world, shapes, normals, pose_cell, pose, order, ray, first, reading, terms, masses, edges, sensor,
         start, parts, window, particles, rays, readings, tables, cone, caster, scale, crowd, spread, batch,
     ):  # fmt: skip
-        """Write the term of reading k to parts[place + k * particles], in tiles of particles and rays, for GPUs.
-
-        STRANDED: the number at place k is the sum of strand k, and a work-item takes whole strands.
-        """
+        """Write the term of reading k to parts[place + k * particles], in tiles of particles and rays, for GPUs."""
         item = work_item(wp.tid())
         place = tile_place(item, spread)
         if place >= particles:

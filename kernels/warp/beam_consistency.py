@@ -82,8 +82,7 @@ def walk_ray(
     rows: wp.int32, cols: wp.int32, occupied: wp.int32,
 ):  # fmt: skip
     """Return the distances along a ray to the first wall, and to the first unknown cell before it [cells]; infinite for
-    none. A pair of walls that share a corner stops a ray. The steps are those from begin to before end. The cells
-    are a part of the map, which begins at a column and a row of the map.
+    none.
     """
     wall = wp.float64(FOREVER)
     unknown = wp.float64(FOREVER)
@@ -166,10 +165,7 @@ def make(name, flags):
 
     @wp.func
     def deviations_of(estimate: wp.array(dtype=wp.float64)):
-        """Return the largest deviation of an estimated position over directions [m], and the heading's deviation [rad].
-
-        Both are infinite if the covariance is not finite; a variance is negative by rounding.
-        """
+        """Return the largest deviation of a position over directions [m], and the deviation of the heading [rad]."""
         xx = wp.max(estimate[3], ZERO)
         xy = estimate[4]
         yy = wp.max(estimate[6], ZERO)
@@ -182,11 +178,7 @@ def make(name, flags):
 
     @kernel(flags)
     def judge_beams(cells, estimate, scan, judged, frame, rules, rows, cols, beams):
-        """Judge the beams of an estimated pose: a work-item, or with IN_TEAMS a team of them, takes a beam.
-
-        The scan has their directions relative to the heading, in the map's frame, then their readings (NaN for no
-        beam). The result has their classes, then the distances to the first wall on the beam itself.
-        """
+        """Judge the beams of an estimated pose: a work-item, or with IN_TEAMS a team of them, takes a beam."""
         item = work_item(wp.tid())
         b = item // TEAM
         member = item - b * TEAM

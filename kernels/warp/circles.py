@@ -1,10 +1,4 @@
-"""Circles through parts of scans: poles, and walls that are round.
-
-Errors are range errors along beams. Their derivatives grow without bound where a beam grazes the circle, so the cosine
-of the angle of incidence is at least STEEPEST in them. The bearings of the edges of a pole, between its last beam and
-the next one, are measurements of asin(radius / distance). Levenberg's and Marquardt's steps minimise the sum of squares
-over centre and radius.
-"""
+"""Circles through parts of scans: poles, and walls that are round."""
 
 import functools
 from types import SimpleNamespace
@@ -135,11 +129,7 @@ def functions(flags):
 
     @wp.func
     def circle_sums(point: wp.array(dtype=vec4), mine: Part, side: real, circle: vec3, radial: wp.int32):
-        """Return the cost of a circle, its gradient and its information.
-
-        Beams meet its near side (-1) or its far side (1); a beam that passes the circle is compared with its nearest
-        point to it. Radial errors are distances from the circle.
-        """
+        """Return the cost of a circle, its gradient and its information."""
         sums = sums10()
         sigma = mine.sigma
         least = STEEPEST * circle[2] * (STEEPEST * circle[2])
@@ -240,11 +230,7 @@ def make(name, flags):
 
     @kernel(flags)
     def fit_circles(point, start, noise, part, scan, edge, circle, scans, points, parts):
-        """Fit circles to parts of scans, of a first point and a number of points.
-
-        Edges are the bearings of the right and the left edge and their deviations; a deviation of 0 marks an edge that
-        is not seen. One work-item takes a part.
-        """
+        """Fit circles to parts of scans, of a first point and a number of points."""
         k = wp.tid()
         if k >= parts:
             return

@@ -1,11 +1,4 @@
-"""Probability of contact from the distance of a robot's outline to the nearest obstacle.
-
-Each point of the outline falls into a cell of a table of squared distances to the nearest obstacle's centre; the
-nearest point of a segment counts. An obstacle begins half a cell before its centre. The error of outline and map is
-normal, so
-
-    P(touching) = Phi(-gap / sigma),    P(pressed) = p_contact P(touching) + p_false (1 - P(touching))
-"""
+"""Probability of contact from the distance of a robot's outline to the nearest obstacle."""
 
 import functools
 
@@ -83,10 +76,7 @@ def make(name, flags):
         table, pose_cell, pose, pose_low, point, point_low, start, pressed, terms, log_p, window, particles, segments,
         guard, temperature,
     ):  # fmt: skip
-        """Sum log p over segments: one work-item takes a particle.
-
-        Points start[s] to start[s + 1] - 1 belong to segment s; pressed[s] is not 0 where it is pressed.
-        """
+        """Sum log p over segments: one work-item takes a particle."""
         n = wp.tid()
         if n >= particles:
             return

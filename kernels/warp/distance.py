@@ -19,10 +19,7 @@ UNREACHABLE = wp.constant(0x7FFFFFFF)
 
 @kernel()
 def distance_lines(occupied, along, lines, length, line_stride, step):
-    """First pass: count the cells to the nearest occupied cell of the same line, NO_OBSTACLE without one.
-
-    One work-item takes a line.
-    """
+    """First pass: count the cells to the nearest occupied cell of the same line, NO_OBSTACLE without one."""
     line = wp.tid()
     if line >= lines:
         return
@@ -54,11 +51,7 @@ def parabola(i: wp.int32, j: wp.int32, across: wp.int32):
 
 @kernel()
 def distance_envelope(along, starts, squared, lines, length, line_stride, step):
-    """Second pass: evaluate the lower envelope of the parabolas of the first pass.
-
-    One work-item takes a line. The stack of vertices shares squared, overwritten from its far end: entry q of the stack
-    never passes the cell that reads it.
-    """
+    """Second pass: evaluate the lower envelope of the parabolas of the first pass."""
     line = wp.tid()
     if line >= lines:
         return
@@ -104,10 +97,7 @@ STEP_ROWS = wp.constant(4)
 
 @kernel()
 def distance_bits(bits, nearest, rows, cols, words, reach):
-    """First pass: count the cells to the nearest occupied cell of the same row, FAR where it is over reach.
-
-    One work-item takes a cell.
-    """
+    """First pass: count the cells to the nearest occupied cell of the same row, FAR where it is over reach."""
     row, col = wp.tid()
     if row >= rows or col >= cols:
         return
@@ -138,11 +128,7 @@ def squares_sum(a: wp.uint32, b: wp.uint32):
 
 @kernel()
 def distance_search(nearest, blocks, squared, rows, cols, count, most):
-    """Second pass: find the least sum of squares along the column of a cell, UNREACHABLE where it is over most.
-
-    One work-item takes a cell. Near rows are read singly. Farther away, the minima of blocks give an upper bound first,
-    and then the blocks that may hold less.
-    """
+    """Second pass: find the least sum of squares along the column of a cell, UNREACHABLE where it is over most."""
     row, col = wp.tid()
     if row >= rows or col >= cols:
         return
@@ -200,8 +186,7 @@ def make(name, flags):
     @kernel(flags)
     def fill_field(squared, density, table, rows, cols, cap, beyond, from_col, from_row, width, height, begin, stride):
         """Fill width x height cells of a field's table from squared distances: density has a value for each squared
-        distance up to the cap. The cells begin at index begin of the table and at cell (from_col, from_row) of the
-        grid; cells outside the grid get beyond.
+        distance up to the cap.
         """
         j, i = wp.tid()
         if i >= width or j >= height:

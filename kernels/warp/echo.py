@@ -1,9 +1,4 @@
-"""The nearest return among the rays of a sensor's cone (one ray for a laser), and its angle of incidence.
-
-The angle of incidence lies between the ray and the normal of the surface that it hits. The table of normals has a ring
-of cells around the map. It holds 0 for free cells and NaN for occupied cells without a normal, at which the cosine
-counts as 1.
-"""
+"""The nearest return among the rays of a sensor's cone (one ray for a laser), and its angle of incidence."""
 
 import functools
 import math
@@ -65,11 +60,7 @@ def functions(flags):
 
     @wp.func
     def hit_normal(normals: wp.array(dtype=vec2), window: types.Window, cell: wp.vec2i, r: Ray, t: real):
-        """Return the normal of the cell in which a ray ends at a distance t.
-
-        The distance determines the cell of the exact walk: it has crossed all boundaries in x up to t, and all
-        boundaries in y before t, or up to t after a step in y. At a corner it steps in x first.
-        """
+        """Return the normal of the cell in which a ray ends at a distance t."""
         if t == ZERO:
             start_normal = normal_at(normals, window, cell.x, cell.y)
             if is_wall(start_normal):
@@ -100,10 +91,7 @@ def functions(flags):
         pose: vec4, ray: wp.array(dtype=vec2), first: wp.int32, cone: types.Cone, limit: real, caster: types.Caster,
         shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32,
     ):  # fmt: skip
-        """Return the nearest return of a cone's rays, which begin at index first.
-
-        A ray whose angle of incidence has a cosine below critical has none: the surface reflects it like a mirror.
-        """
+        """Return the nearest return of a cone's rays, which begin at index first."""
         echo = Echo()
         echo.t = limit
         echo.cosine = TWO

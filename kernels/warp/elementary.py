@@ -1,9 +1,4 @@
-"""Exponential, logarithm and angle in float64 from +, -, *, / and sqrt alone, so that every device gives the same bits.
-
-exp x = 2^k exp r with r = x - k log 2, |r| <= log(2) / 2, by its power series. log x = e log 2 + 2 artanh s with x = m
-2^e, sqrt(1/2) <= m < sqrt 2 and s = (m - 1) / (m + 1). atan t with t <= 1 is 4 atan t'', where t' = t / (1 + sqrt(1 +
-t^2)) halves the angle. Errors are a few units in the last place.
-"""
+"""Exponential, logarithm and angle in float64 from +, -, *, / and sqrt alone, so that every device gives the same bits."""
 
 import warp as wp
 

@@ -1,8 +1,4 @@
-"""The cell of the likelihood field's table in which a beam's end point lies, and the point's place within that cell.
-
-Cells must be the same on every device and in every precision: an end point nearer to an edge than guard, the bound of
-its rounding errors, is recomputed with twice the digits.
-"""
+"""The cell of the likelihood field's table in which a beam's end point lies, and the point's place within that cell."""
 
 import functools
 from types import SimpleNamespace
@@ -56,11 +52,7 @@ def functions(flags):
 
     @wp.func
     def whole_cells(offset: vec2):
-        """Return the whole cells below an offset of two parts, the remainder in [0, 1), and 1 minus it.
-
-        Both are computed relative to the nearest edge, where small numbers keep their digits. An offset at most EDGE
-        below an edge counts as on it, so that end points on edges fall into the same cell in every precision.
-        """
+        """Return the whole cells below an offset of two parts, the remainder in [0, 1), and 1 minus it."""
         nearest = wp.floor(offset.x + HALF)
         past = vec2((offset.x - nearest) + offset.y, ZERO)
         if EXACT_EXPONENT:
@@ -87,8 +79,7 @@ def functions(flags):
     @wp.func
     def end_point(pose: vec4, pose_low: vec4, point: vec2, point_low: vec2, shift: real, guard: real):
         """Return the end point of a beam. point is the reading times the beam's (cos, sin), in cells; shift moves cell
-        centres onto corners. An end point nearer to a cell's edge than guard, the bound of its rounding errors, is
-        recomputed with twice the digits.
+        centres onto corners.
         """
         end = EndPoint()
         x = vec2((pose.x - shift) + (pose.z * point.x - pose.w * point.y), ZERO)
@@ -131,9 +122,8 @@ def functions(flags):
 
     @wp.func
     def rounded_cell(lowered: vec4, point: vec2):
-        """Nearest cell of an end point, plus ROUNDING_BITS: place, half a cell lower, is rounded to nearest.
-
-        The second number is the place's distance from the cell's centre.
+        """Nearest cell of an end point, plus ROUNDING_BITS: place, half a cell lower, is rounded to nearest. The second
+        number is the place's distance from the cell's centre.
         """
         x = multiply_add(lowered.z, point.x, multiply_add(-lowered.w, point.y, lowered.x))
         y = multiply_add(lowered.w, point.x, multiply_add(lowered.z, point.y, lowered.y))
@@ -144,11 +134,7 @@ def functions(flags):
 
     @wp.func
     def table_origin(origin: wp.vec2i, cols: wp.int32):
-        """Return the origin for table_cell, from the pose's cell.
-
-        Where no end point of the cloud leaves the table (INSIDE), an index is a sum and a product modulo 2^32, and
-        ROUNDING_BITS are subtracted once per pose.
-        """
+        """Return the origin for table_cell, from the pose's cell."""
         if INSIDE:
             stride = wp.uint32(cols + 2 * FIELD_RING)
             more = wp.uint32(FIELD_RING - ROUNDING_BITS)

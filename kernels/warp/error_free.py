@@ -72,11 +72,7 @@ def functions(flags):
 
     @wp.func
     def pair_sum(a: vec2, b: vec2):
-        """Add two numbers of two parts each, to about twice the working precision.
-
-        When the first parts cancel, their sum is at least the last bit of either, so its exponent is no smaller than
-        the second parts' exponent.
-        """
+        """Add two numbers of two parts each, to about twice the working precision."""
         total = two_sum(a.x, b.x)
         return ordered_sum(total.x, total.y + (a.y + b.y))
 

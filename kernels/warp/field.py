@@ -95,10 +95,7 @@ def make(name, flags):
 
     @wp.func
     def field_log(total: vec2, temperature: real):
-        """Return log p of a scan from its sum of two parts.
-
-        An impossible reading keeps the first at -inf and turns the second into nan.
-        """
+        """Return log p of a scan from its sum of two parts."""
         if CUBES:
             return temperature * wp.log(total.x + total.y)
         else:
@@ -113,10 +110,8 @@ def make(name, flags):
         parts: wp.array(dtype=real), window: types.Window,
         begin: wp.int32, size: wp.int32, first_part: wp.int32, before: vec2,
     ):  # fmt: skip
-        """Return the sum of the readings from begin on, in two parts, with that of total.
-
-        Places, distances, exponents and densities of a block are computed each in a loop: on processors the first and
-        the third become vector code.
+        """Return the sum of the readings from begin on, in two parts, with that of total. Places, distances, exponents
+        and densities of a block are computed each in a loop: on processors the first and the third become vector code.
         """
         total = before
         filled = wp.min(size, BLOCK_TERMS)
@@ -234,11 +229,7 @@ def make(name, flags):
         table, world, shapes, pose_cell, pose, pose_low, point, point_low, terms, guard, start, parts, window,
         particles, readings, spread, batch, crowd,
     ):  # fmt: skip
-        """Write the sums of blocks of readings to parts[n + block * particles], for GPUs.
-
-        One work-item takes a particle and every 2^spread-th block. Each block has a separate guard; with SCANS each
-        scan has as many guards as the longest one.
-        """
+        """Write the sums of blocks of readings to parts[n + block * particles], for GPUs."""
         item = work_item(wp.tid())
         n = ((item // GROUP) >> spread) * GROUP + item % GROUP
         if n >= particles:

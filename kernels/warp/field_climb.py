@@ -1,7 +1,4 @@
-"""Steps of damped Gauss-Newton (Levenberg) from poses to maxima of an interpolated likelihood field.
-
-Damping and the stopping rule are the same in all directions, so that ends turn with the map.
-"""
+"""Steps of damped Gauss-Newton (Levenberg) from poses to maxima of an interpolated likelihood field."""
 
 import functools
 
@@ -58,10 +55,7 @@ def make(name, flags):
 
     @kernel(flags)
     def climb_step(gradient, poses, climb, scans, parts, most, small, yaw_cos, yaw_sin):
-        """Judge the poses that were evaluated, and take the next step of each climb. Each scan has parts neighbouring
-        poses, all equal, whose numbers in the grid's frame are added. Poses of climbs that have ended stay. One
-        work-item takes a scan.
-        """
+        """Judge the poses that were evaluated, and take the next step of each climb."""
         n = wp.tid()
         if n >= scans:
             return

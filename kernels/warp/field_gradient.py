@@ -1,9 +1,4 @@
-"""Gradient and Gauss-Newton information of the interpolated likelihood field with respect to the pose.
-
-With d the distance of an end point, r its share of the hit density times the weight of its shape (1 for a normal), and
-J the derivatives of d: d log p / d pose = -(d / sigma^2) r J, and the information is the sum of r J J' / sigma^2, which
-leaves out second derivatives of d and of r.
-"""
+"""Gradient and Gauss-Newton information of the interpolated likelihood field with respect to the pose."""
 
 import functools
 from types import SimpleNamespace

@@ -1,8 +1,4 @@
-"""Term of one reading in the likelihood field (book table 6.3).
-
-log p of the distance from an end point to the nearest obstacle, looked up in the cell of the end point or interpolated
-between four cells.
-"""
+"""Term of one reading in the likelihood field (book table 6.3)."""
 
 import functools
 from types import SimpleNamespace
@@ -41,10 +37,7 @@ def functions(flags):
 
     @wp.func
     def between(weight_a: vec2, a: vec2, weight_b: vec2, b: vec2):
-        """Return the weighted sum of a and b, all of two parts.
-
-        No term is negative, so small values keep their digits.
-        """
+        """Return the weighted sum of a and b, all of two parts."""
         if EXACT_EXPONENT:
             return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b))
         else:
@@ -70,10 +63,7 @@ def functions(flags):
 
     @wp.func
     def field_square(distance: vec2, terms: wp.array(dtype=types.FieldTerms)):
-        """Return the exponent of a normal in two parts, since for a high peak exponent and log peak nearly cancel.
-
-        The numbers are FieldTerms of the signature table; hit_peak and rand_density are logarithms in the log domain.
-        """
+        """Return the exponent of a normal in two parts, since for a high peak exponent and log peak nearly cancel."""
         if EXACT_EXPONENT:
             return pair_product(
                 pair_product(distance, distance), vec2(terms[0].square_scale, terms[0].square_scale_low)
@@ -121,11 +111,7 @@ def functions(flags):
         terms: wp.array(dtype=types.FieldTerms), window: types.Window, guard: real, shapes: wp.array(dtype=real),
         world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32,
     ):  # fmt: skip
-        """Return the term of one reading.
-
-        The table holds log densities, or cubes of densities (CUBES), or, where it is interpolated, capped distances in
-        metres.
-        """
+        """Return the term of one reading."""
         if ALL_READINGS:
             if wp.isnan(point.x):
                 return ZERO
@@ -154,10 +140,7 @@ def functions(flags):
     def quick_value(
         table: wp.array(dtype=real), start_cell: wp.vec2i, lowered: vec4, to: vec2, far: real, window: types.Window
     ):
-        """Return the term of a reading by rounding alone, and the distance of the end point from the cell's centre.
-
-        A missing or max reading has no cell: the sensor's cell is read and not used. The term of a max reading is far.
-        """
+        """Return the term of a reading by rounding alone, and the distance of the end point from the cell's centre."""
         if ALL_READINGS:
             is_range = wp.isfinite(to.x)
             near, off = rounded_cell(lowered, wp.where(is_range, to, vec2(ZERO, ZERO)))

@@ -1,10 +1,4 @@
-"""Cosine and sine of a heading in float64 with +, - and * alone, so that every device gives the same bits.
-
-A heading is reduced to r + low, |r| <= pi/4, and a count of quarter turns modulo 4: up to 2^20 rad by subtracting the
-count times pi/2 in four parts (Cody and Waite), for larger headings by an integer product with the relevant bits of
-2/pi (Payne and Hanek). Then sin r = r + r z S(z) and cos r = 1 - z/2 + z^2 C(z) with z = r^2.
-``bench/derive/heading_constants.py`` derives the constants.
-"""
+"""Cosine and sine of a heading in float64 with +, - and * alone, so that every device gives the same bits."""
 
 import functools
 from types import SimpleNamespace

@@ -68,8 +68,7 @@ def functions(flags):
         others: wp.int32, guess: vec4, rules: MatchRules, member: wp.int32,
     ):  # fmt: skip
         """Refine a guess until steps are below the tolerance: pose, last step, sums of the last iteration over pairs
-        and blocks, iterations, and whether the last step was below ten tolerances. Every stride-th point and every
-        skip-th of the reference take part until capture radius and scale have shrunk, with thin also afterwards.
+        and blocks, iterations, and whether the last step was below ten tolerances.
         """
         pose = guess
         moved = vec4()

@@ -1,8 +1,4 @@
-"""Steps of point-to-line ICP that scalar bodies and bodies in lanes share: places among the bearings of a
-scan, the normal equations, sums of blocks of points, and sums over a team of work-items.
-
-Blocks: Flyvbjerg and Petersen (1989), "Error estimates on averages of correlated data".
-"""
+"""Steps of point-to-line ICP that scalar bodies and bodies in lanes share: places among the bearings of a"""
 
 import functools
 from types import SimpleNamespace

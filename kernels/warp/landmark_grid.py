@@ -92,11 +92,7 @@ def functions(flags):
 
     @wp.func
     def distance_mass(d: vec2, scale: real, signature: vec4, terms: wp.array(dtype=types.FeatureTerms)):
-        """Return the mass of the normal around a line's distance d on [0, range_max]; d is clamped to it.
-
-        A line that is seen from both sides has two forms, (alpha_j, d) and (alpha_j + pi, -d): together they have the
-        mass of d on [-range_max, range_max].
-        """
+        """Return the mass of the normal around a line's distance d on [0, range_max]; d is clamped to it."""
         lower = real(0.0)
         if signature[1] > ZERO:
             lower = -terms[0].range_max
@@ -164,9 +160,8 @@ def functions(flags):
     @wp.func
     def squared_reach(exponent: real, feature: wp.array(dtype=real), base: wp.int32):
         """Return the square of the radius around a feature's end point outside which exponents are larger than
-        exponent. Let r be the error of the range and b the error of the bearing: a landmark is sqrt(r^2 + 2 z (z +
-        r) (1 - cos b)) away, and 2 (1 - cos b) is at most b^2. A factor and SLACK cover rounding errors of such
-        distances.
+        exponent. Let r be the error of the range and b the error of the bearing: a landmark is sqrt(r^2 + 2 z (z + r)
+        (1 - cos b)) away, and 2 (1 - cos b) is at most b^2.
         """
         squared = real(0.0)
         if exponent > ZERO:

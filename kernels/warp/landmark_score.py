@@ -1,7 +1,4 @@
-"""Likelihood of a set of features for each particle, log p(f | x, m): the sum over features (tables 6.4 and 6.5).
-
-And negative information: landmarks that the sensor should see from a pose, but that match no feature.
-"""
+"""Likelihood of a set of features for each particle, log p(f | x, m): the sum over features (tables 6.4 and 6.5)."""
 
 import functools
 import math
@@ -32,12 +29,7 @@ def make(name, flags):
         landmark, normal, signature, start, pose_cell, pose, pose_low, feature, partner, terms, arcs, log_p, parts,
         which, buckets, landmarks, particles, features, share, score,
     ):  # fmt: skip
-        """Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one.
-
-        One work-item takes a particle. PER_BEAM: parts has the term of each feature, and which the index of its
-        likeliest landmark, -1 where a false positive is likelier. share is log(1 / landmarks), the prior of a landmark,
-        if MARGINAL, else 0.
-        """
+        """Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one."""
         n = wp.tid()
         if n >= particles:
             return
@@ -97,10 +89,7 @@ def make(name, flags):
 
     @kernel(flags)
     def count_unseen(landmark, start, pose_cell, pose, pose_low, which, log_p, buckets, particles, features, view):
-        """Add log_missed to log_p for every landmark in view that belongs to no feature.
-
-        One work-item takes a particle.
-        """
+        """Add log_missed to log_p for every landmark in view that belongs to no feature."""
         n = wp.tid()
         if n >= particles:
             return

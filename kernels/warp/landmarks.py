@@ -1,15 +1,4 @@
-"""Density of one feature (range, bearing, signature) at one landmark, book table 6.4, with normalised components.
-
-    p(f | j) = N(r; d, sigma_r) / m_r  *  N(b; b_j, sigma_b) / m_b  *  N(s; s_j, sigma_s) / m_s
-
-d and b_j are the landmark's distance and bearing from the sensor; differences of bearings are wrapped to (-pi, pi]. m
-is the mass of a component on the measurable interval: [0, range_max], the field of view, the span of signatures.
-Components that were not measured are left out. Positions, directions and quantities derived from them are sums of two
-numbers, since a relative error of eps in a distance of 20 m is too large for a deviation of 1 cm.
-
-A feature is FEATURE numbers, named below, in the same order in all three languages. A place is (x, its low part, y, its
-low part), and so are an offset and a direction. The sensor's numbers are FeatureTerms of the signature table.
-"""
+"""Density of one feature (range, bearing, signature) at one landmark, book table 6.4, with normalised components."""
 
 import functools
 from types import SimpleNamespace

@@ -1,23 +1,4 @@
-"""Sums over pairs of reading and expected range from which the beam model's parameters are learned (book table 6.2).
-
-``terms`` are in the log domain, with inverse_sigma and unit_peak. A pair whose reading is NaN is padding. The mean of
-p_hit is z* + range_bias, clamped to [0, range_max]; obstacles of p_short lie before z*. r are the responsibilities
-e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances x_0 = mean / sigma and x_1 =
-(range_max - mean) / sigma to the ends, phi the untruncated density, W = E' the weight of the shape of a hit (1 for a
-normal), B = -E'' / W^2 (0 for a normal), M the mass between the ends and
-
-    T = (x_0 phi_0 + x_1 phi_1) / M,    P = (phi_1 - phi_0) / M,    V = (W_0 x_0 phi_0 + W_1 x_1 phi_1) / M,
-    Q = (W_1 x_1^2 phi_1 - W_0 x_0^2 phi_0) / M + P T,    U = (W_0 x_0^3 phi_0 + W_1 x_1^3 phi_1) / M,
-
-log p_hit has the derivatives, by log sigma (s) and by the mean in units of sigma (m),
-
-    h_s = W u^2 - 1 + T,  h_m = W u + P,
-    h_ss = W u^2 (B W u^2 - 2) - T + U + T^2,  h_sm = W u (B W u^2 - 2) - P + Q,  h_mm = W (B W u^2 - 1) + V + P^2
-
-and log p_short, by log lambda with x = lambda z*, f = x / (1 - exp(-x)) and v = f - x,
-
-    s_l = 1 - v - lambda z,  s_ll = v (f - 1) - lambda z.
-"""
+"""Sums over pairs of reading and expected range from which the beam model's parameters are learned (book table 6.2)."""
 
 import functools
 import math
@@ -121,12 +102,7 @@ def make(name, flags):
         z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real),
         before: sums_type,
     ):  # fmt: skip
-        """Add the terms of a pair to the sums.
-
-        They are log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm, r_hit h_mm, r_short s_ll; r_hit W
-        u^2, r_short z. INFORMATION: 1 where rand is the likeliest cause; the upper triangle of y y' with y = (r_hit,
-        r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m, r_hit h_m^2, r_short s_l^2.
-        """
+        """Add the terms of a pair to the sums."""
         sums = before
         r = responsibilities(z, expected, terms, masses)
         hit = vec6()
@@ -172,10 +148,7 @@ def make(name, flags):
 
     @kernel(flags)
     def e_step(reading, expected, terms, masses, sums, blocks, readings, across, along, width):
-        """Sum over blocks of pairs: one work-item takes a block.
-
-        Pair k of a block is pair block * across + k * along.
-        """
+        """Sum over blocks of pairs: one work-item takes a block."""
         block = wp.tid()
         if block >= blocks:
             return

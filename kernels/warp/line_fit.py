@@ -18,9 +18,8 @@ def functions(flags):
     @wp.func
     def line_through(centre: vec4, total: vec2, xx: real, xy: real, yy: real, weight: real):
         """Return the line through a point and its neighbours, a unit normal, an offset, and 1 / (sum of squared
-        distances along the line), from sums of the neighbours' coordinates relative to the point and of their
-        products; weight is the number of points. A point without neighbours gets the line perpendicular to its beam,
-        and -1 instead of the sum.
+        distances along the line), from sums of the neighbours' coordinates relative to the point and of their products;
+        weight is the number of points.
         """
         mean_x = total.x / weight
         mean_y = total.y / weight
@@ -116,9 +115,7 @@ def make(name, flags):
     def fit_lines(point, start, which, line, scans, points, chosen, reach, most, ratio, slack, width, gap):
         """Fit a line to each point and reach neighbours on either side, up to most within a distance of width, none of
         them farther from the last one than slack plus ratio times its range, nor than gap in bearing: unit normal,
-        offset, and 1 / (sum of squared distances along the line). A point without neighbours has a line
-        perpendicular to its beam, -1 in place of that sum, and no pairs. One work-item takes a point of a chosen
-        scan.
+        offset, and 1 / (sum of squared distances along the line).
         """
         row, k = wp.tid()
         if row >= chosen:

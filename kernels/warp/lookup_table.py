@@ -19,10 +19,7 @@ def make(name, flags):
 
     @kernel(flags)
     def fill_lookup(rectangles, ray, lookup, window, bins, first_row, count, limit):
-        """Fill rows of the table: one work-item takes a bin and cell.
-
-        A hit is at most 65 534; 65 535 means no hit. The table has fewer than 2^31 entries.
-        """
+        """Fill rows of the table: one work-item takes a bin and cell. The table has fewer than 2^31 entries."""
         index, bin = wp.tid()
         if bin >= bins or index >= count * window.cols:
             return

@@ -1,11 +1,4 @@
-"""Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
-
-Causes are numbered as in the book: 1 correct range (hit), 2 unexpected object (short), 3 failure (max), 4 random
-measurement (rand). The density has 1, 2 and 4; the caller adds 3. The numbers are MixtureTerms of the signature table.
-In the linear domain hit_peak, z_short and rand_density are densities, in the log domain their logarithms. The mean of
-p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma is sigma_hit + sigma_growth z* (GROWTH). masses are
-tables of the masses of hits.
-"""
+"""Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom."""
 
 import functools
 import math
@@ -54,8 +47,7 @@ def functions(flags):
     @wp.func
     def hit_mass(before: real, after: real, erf_scale: real):
         """Return the mass of the untruncated normal from a distance before its mean to one after it, a sum of positive
-        terms. Most ranges are far from both ends, and nearly all from at least one; rays without an obstacle are at
-        one end.
+        terms.
         """
         below = before * erf_scale
         above = after * erf_scale
@@ -134,11 +126,7 @@ def functions(flags):
 
     @wp.func
     def normal_exponent(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
-        """Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers.
-
-        Exponent and log peak are large and nearly cancel where the density's peak is high; the second part keeps the
-        digits that remain.
-        """
+        """Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers."""
         off = hit_offset(z, expected, terms)
         if EXACT_EXPONENT:
             if GROWTH:
@@ -256,10 +244,7 @@ def functions(flags):
         def log_density(
             z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms), masses: wp.array(dtype=real)
         ):
-            """Return log p(z | z*).
-
-            Without a sufficient p_rand every component stays a logarithm; -inf only where the mixture is 0.
-            """
+            """Return log p(z | z*)."""
             hit = NEVER
             shorter = NEVER
             largest = NEVER
@@ -287,11 +272,8 @@ def functions(flags):
 
     @wp.func
     def compat_density(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
-        """Return the density to be cubed, whose cubes nav2_amcl and Beluga sum over the beams of a scan.
-
-        amcl's is without normalisers, Beluga's with both (book table 6.1). Terms are linear; hit_peak is z_hit alone
-        for amcl, and z_max is no logarithm. A reading of range_max is a max reading; amcl's longer readings are neither
-        random nor max readings.
+        """Return the density to be cubed, whose cubes nav2_amcl and Beluga sum over the beams of a scan. amcl's is
+        without normalisers, Beluga's with both (book table 6.1).
         """
         off = z - expected
         p = terms[0].hit_peak * wp.exp(-(off * (off * terms[0].square_scale)))

@@ -84,10 +84,7 @@ def make(name, flags):
 
 @kernel()
 def order_starts(bounds, bins):
-    """Replace the counts of bins by the indices at which they begin.
-
-    One work-item takes a stretch of neighbouring bins.
-    """
+    """Replace the counts of bins by the indices at which they begin."""
     stretch = work_item(wp.tid())
     if stretch >= ALL_BINS // STRETCH:
         return

@@ -70,11 +70,7 @@ def noise_of(
     reading: wp.array(dtype=wp.float64), first: wp.int32, weight: wp.array(dtype=wp.float64), places: wp.int32,
     padded: wp.int32, step: wp.int32, nearest: wp.float64, farthest: wp.float64, work: wp.array(dtype=wp.float64),
 ):  # fmt: skip
-    """Return the standard deviation of a scan's ranges, -1 where too few beams measure it.
-
-    Every step-th beam but the ends is a place; padded is their number as a multiple of 8. work has room for four lists
-    of it.
-    """
+    """Return the standard deviation of a scan's ranges, -1 where too few beams measure it."""
     number = int(0)
     for i in range(padded):
         work[i] = FOREVER
@@ -101,8 +97,7 @@ def noise_of(
 @wp.func
 def level_of(noise: wp.float64, level: wp.array(dtype=wp.float64), levels: wp.int32, assumed: wp.int32):
     """Return the level of noise of a pair: the first one whose largest noise is not exceeded, the last one beyond all
-    of them, or the assumed one where neither scan measures its noise. A level is its largest noise, and the slack of
-    its lines.
+    of them, or the assumed one where neither scan measures its noise.
     """
     number = int(0)
     while number < levels - 1 and noise > level[2 * number]:
@@ -122,10 +117,7 @@ def functions(flags):
         reading: wp.array(dtype=wp.float64), first: wp.int32, beam: wp.array(dtype=wp.float64), beams: wp.int32,
         nearest: wp.float64, farthest: wp.float64, point: wp.array(dtype=vec4), to: wp.int32,
     ):  # fmt: skip
-        """Write the points of a scan's hits from to on, and return their number and the sum of squared ranges.
-
-        A beam is its cosine and sine, its bearing in [0, 2 pi), and the place of its reading; beams come by bearing.
-        """
+        """Write the points of a scan's hits from to on, and return their number and the sum of squared ranges."""
         count = int(0)
         squares = wp.float64(0.0)
         for i in range(beams):

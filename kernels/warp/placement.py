@@ -1,7 +1,4 @@
-"""Placement of poses in a window of the grid, in float64: an integer cell, the fraction of it, and the heading.
-
-Only +, -, *, /, floor and comparisons are used, so that every device gives the same bits.
-"""
+"""Placement of poses in a window of the grid, in float64: an integer cell, the fraction of it, and the heading."""
 
 import functools
 from types import SimpleNamespace
@@ -41,8 +38,7 @@ def functions(flags):
     ):  # fmt: skip
         """Place a sensor: a pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low
         gets the rounding errors (low parts) of pose. pose_status, which the caller clears, becomes 1 at index 0 if a
-        pose is not finite, and at index 1 if a sensor is outside the window. A non-finite pose becomes the farthest
-        cell, fraction 0 and heading (1, 0): it sees nothing, and its indices stay in bounds.
+        pose is not finite, and at index 1 if a sensor is outside the window.
         """
         x = wp.float64(poses[3 * particle])
         y = wp.float64(poses[3 * particle + 1])
@@ -108,10 +104,7 @@ def make(name, flags):
 
     @kernel(flags)
     def bound_numbers(number, bounds, count, apart, items):
-        """Write the least of some numbers, and the largest of the numbers that lie apart from them; NaN remains.
-
-        One work-item takes every items-th number; items is a multiple of three, so that each sees one column of poses.
-        """
+        """Write the least of some numbers, and the largest of the numbers that lie apart from them; NaN remains."""
         i = wp.tid()
         if i >= items:
             return

@@ -1,7 +1,4 @@
-"""A ray on the grid and the walk along it, which all casters share.
-
-Distances of boundaries are (k + a) * inv with an integer count k of boundaries; they are never accumulated.
-"""
+"""A ray on the grid and the walk along it, which all casters share."""
 
 import functools
 from types import SimpleNamespace
@@ -102,10 +99,7 @@ def functions(flags):
 
     @wp.func
     def crossed(t: real, speed: real, a: real, inv: real, until: wp.bool):
-        """Count the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or with ``until`` at most t.
-
-        Only the boundary nearest to the coordinate at t can be in doubt.
-        """
+        """Count the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or with ``until`` at most t."""
         count = wp.max((t * speed - a) + COUNT, COUNT)
         here = ((count - COUNT) + a) * inv
         return wp.where(here < t or (until and here == t), count + ONE, count)

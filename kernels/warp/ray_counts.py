@@ -1,9 +1,4 @@
-"""Counts of hits and misses of cells, of which the log-odds of an occupancy grid are sums (book section 9.2).
-
-Start and end of a ray are cells with offsets in units of 1/4096 cell, and the walk from cell to cell compares products
-of integers, so that all backends visit the same cells. A ray misses each cell that it leaves. Its last cell is hit
-where the ray ends at an obstacle, and missed otherwise. A ray through a corner (a tie) steps in x first.
-"""
+"""Counts of hits and misses of cells, of which the log-odds of an occupancy grid are sums (book section 9.2)."""
 
 import warp as wp
 
@@ -28,10 +23,7 @@ def has_left(cell: wp.int32, step: wp.int32, cells: wp.int32):
 
 @wp.func
 def crossed_before(first: wp.int32, size: wp.int64, reached: wp.int64, other: wp.int64, ties: wp.int32):
-    """Return the number of boundaries of an axis that a ray crosses before a boundary of the other axis.
-
-    Products of lengths fit in 64 bits, since rays span at most 2^19 cells.
-    """
+    """Return the number of boundaries of an axis that a ray crosses before a boundary of the other axis."""
     room = reached * size - wp.int64(first) * other - wp.int64(1 - ties)
     crossed = wp.int64(0)
     if room >= wp.int64(0):

@@ -1,8 +1,4 @@
-"""Expected range z*: the exact distance from a beam's origin to the first occupied cell (book section 6.3).
-
-It is an Amanatides-Woo walk that crosses a whole empty rectangle at a time, with the same result. At ties (corners) it
-steps in x first.
-"""
+"""Expected range z*: the exact distance from a beam's origin to the first occupied cell (book section 6.3)."""
 
 import functools
 from types import SimpleNamespace
@@ -41,10 +37,7 @@ def functions(flags):
 
     @wp.func
     def sector_of(speed_x: real, speed_y: real):
-        """Return the sector of a direction within its quadrant, from flat to steep.
-
-        A wrong sector would cost steps, but not change the result.
-        """
+        """Return the sector of a direction within its quadrant, from flat to steep."""
         sector = int(0)
         if SECTORS_2:
             sector = wp.where(speed_y > speed_x, 1, 0)

@@ -1,7 +1,4 @@
-"""Class of a reading: a hit, a max reading, or missing (neither).
-
-The limits are those of range_limits in gpusense/world/scanner.py; NaN is missing by both comparisons.
-"""
+"""Class of a reading: a hit, a max reading, or missing (neither)."""
 
 import warp as wp
 

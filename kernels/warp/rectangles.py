@@ -62,10 +62,7 @@ def divided(dividend: wp.int32, divisor: wp.int32):
 
 @wp.func
 def reach_begin(way: wp.int32, low: wp.int32):
-    """Return the first cell along an axis whose rectangle can contain the cell low or one beyond it.
-
-    Rectangles extend to larger (way 1) or smaller (way -1) indices.
-    """
+    """Return the first cell along an axis whose rectangle can contain the cell low or one beyond it."""
     return wp.where(way > 0, wp.max(low - RECTANGLE_REACH, 0), low)
 
 
@@ -117,12 +114,7 @@ def free_columns(occupied, runs, band, cols, begin, end):
 def rectangles_rows(
     runs, place, stack, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds
 ):  # fmt: skip
-    """Find the rectangles along rows, from the far end of a row to its begin.
-
-    For processors: one work-item takes a row and quadrant of a world. The widest rectangle of sufficient height is at
-    most one column wider than its neighbour's. The stack has the columns that bound its height, each lower than all
-    before it: free cells in the upper 16 bits, and the last 16 bits of the column, which give the distance.
-    """
+    """Find the rectangles along rows, from the far end of a row to its begin."""
     way, item = wp.tid()
     quadrant = way & 3
     w = way >> 2
@@ -200,15 +192,7 @@ def free_rows(bits, runs, band, cols, words, begin, end):
 def rectangles_scan(
     runs, place, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds, lines, group
 ):  # fmt: skip
-    """Find the rectangles along columns: the higher a rectangle, the narrower.
-
-    For GPUs: one work-item takes a sector of TALL cells of a column in a quadrant, from the far end on. height and
-    width are the sides of the highest rectangle of sufficient width, narrower is the width of a rectangle that is one
-    row higher, and bound is the number of rows to the nearest row with this width; wider and nearer are the same of the
-    rows before that one, wider is -1 where they are unknown. From one cell to the next the height grows by one at most,
-    and its rows without the new row allow every smaller height. So the next cell's sides need no other row, unless both
-    rows that bound the width are left behind.
-    """
+    """Find the rectangles along columns: the higher a rectangle, the narrower."""
     way, tile_item, col_item = wp.tid()
     quadrant = way & 3
     w = way >> 2

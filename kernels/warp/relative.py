@@ -1,7 +1,4 @@
-"""Poses relative to a point and headings relative to an angle, in float64 as sums of two numbers, then rounded.
-
-Differences of large coordinates or of many turns are small, and small numbers keep their digits in any precision.
-"""
+"""Poses relative to a point and headings relative to an angle, in float64 as sums of two numbers, then rounded."""
 
 import functools
 
@@ -58,11 +55,7 @@ def make(name, flags):
 
     @kernel(flags)
     def place_relative(poses, place, pose_status, origin_x, origin_y, mount_x, mount_y, particles):
-        """Place sensors relative to an origin: x, its low part, y, its low part.
-
-        One work-item takes a particle. pose_status, which the caller clears, becomes 1 at index 0 if a pose is not
-        finite; its place is the origin.
-        """
+        """Place sensors relative to an origin: x, its low part, y, its low part."""
         n = wp.tid()
         if n >= particles:
             return
@@ -88,10 +81,7 @@ def make(name, flags):
 
     @kernel(flags)
     def wrap_headings(poses, residual, pose_status, target, target_low, particles):
-        """Subtract the target from headings and wrap to [-pi, pi], a sum of two numbers.
-
-        One work-item takes a particle. pose_status is as for place_relative.
-        """
+        """Subtract the target from headings and wrap to [-pi, pi], a sum of two numbers."""
         n = wp.tid()
         if n >= particles:
             return

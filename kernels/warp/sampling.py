@@ -251,9 +251,8 @@ def make(name, flags):
 
     @kernel(flags)
     def draw_readings(incidence, mixture, edges, chances, settings, ranges, particles, rays, tables, scale):
-        """Replace expected ranges by readings; incidence holds cosines, and edges the cosines between bins.
-
-        One work-item takes a particle and ray; a launch has fewer than 2^31.
+        """Replace expected ranges by readings; incidence holds cosines, and edges the cosines between bins. One
+        work-item takes a particle and ray; a launch has fewer than 2^31.
         """
         i, k = wp.tid()
         if k >= rays or i >= particles:

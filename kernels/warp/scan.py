@@ -1,9 +1,4 @@
-"""Placement of poses and readings in the device's memory.
-
-Readings are selected and placed as gpusense.models.scan.classed does it on the host. Uninformative readings are left
-out and the others move up, so that sums over blocks of readings have the same bits. The places that remain at the end
-get missing readings (nan), which add nothing.
-"""
+"""Placement of poses and readings in the device's memory."""
 
 import functools
 import math
@@ -77,9 +72,8 @@ def make(name, flags):
     def read_block(
         first: wp.int32, ranges: wp.array(dtype=measured), beam: wp.array(dtype=wp.int32), rules: ReadingRules
     ):
-        """Read the 16 readings from first on.
-
-        Return them, and the sets of ranges and of max readings: bit i is reading first + i.
+        """Read the 16 readings from first on. Return them, and the sets of ranges and of max readings: bit i is reading
+        first + i.
         """
         several = block_terms()
         for i in range(BLOCK_TERMS):
@@ -137,8 +131,7 @@ def make(name, flags):
         point_low: wp.array(dtype=vec2), guard: wp.array(dtype=real), resolution: wp.float64, guard_scale: wp.float64,
     ):  # fmt: skip
         """Fill a place with the end point of a reading: the reading times the vector of its beam, in cells, with the
-        rounding error in point_low. The guard of a block of places is guard_scale (longest + 2 cells), of its
-        longest reading.
+        rounding error in point_low.
         """
         cells = value / resolution
         length = wp.where(wp.isfinite(cells), cells, ZERO)
@@ -203,8 +196,7 @@ def make(name, flags):
         resolution: wp.float64, rules: ReadingRules,
     ):  # fmt: skip
         """Place one reading: find its place from all readings, and fill that place; an item beyond the readings fills a
-        place at the end. 16 readings are read before any is used. A max reading is inf. constant_term is that of max
-        readings without a place, -inf if there is a range where none is possible.
+        place at the end. 16 readings are read before any is used.
         """
         # Values that are needed last are read first, so that nothing waits for them.
         source = 2 * item * rules.rays_per_beam

@@ -22,8 +22,7 @@ def make(name, flags):
     ):  # fmt: skip
         """Place two scans of one scanner, a reference and a second one: points of their hits by bearing, with lines for
         the noise of the pair; the pair itself, with the row of its rules, which depends on its level of noise and on
-        the stride of its second scan; and its level, points and sums of squared ranges. One work-item takes the
-        pair.
+        the stride of its second scan; and its level, points and sums of squared ranges.
         """
         item = wp.tid()
         if item > 0:

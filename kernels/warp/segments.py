@@ -1,12 +1,4 @@
-"""Straight segments of scans: pieces of the sequence of points that a line explains up to the noise of ranges.
-
-On a line the inverse range is a cos(bearing) + b sin(bearing), linear in (a, b). Squared residuals, weighted by range^2
-/ sigma, are range residuals in standard deviations; their sum is the cost. A scan is split where two lines lower the
-cost most, until no split lowers it by penalty; neighbours are merged where a single line costs less than penalty more
-(split and merge, Pavlidis and Horowitz 1974), and ends are moved to where both lines together cost least. Lines are
-then fitted to ranges by Gauss-Newton steps for maximum likelihood. Rows are added by Givens rotations, which avoid
-cancellation in costs.
-"""
+"""Straight segments of scans: pieces of the sequence of points that a line explains up to the noise of ranges."""
 
 import functools
 from types import SimpleNamespace
@@ -97,10 +89,7 @@ def functions(flags):
         point: wp.array(dtype=vec4), first: wp.int32, last: wp.int32, cost: wp.array(dtype=real), sigma: real,
         penalty: real,
     ):  # fmt: skip
-        """Return the first point of the second line of the best split, the cost reduction, and the unsplit cost.
-
-        The point is -1 if no split can lower the cost by penalty.
-        """
+        """Return the first point of the second line of the best split, the cost reduction, and the unsplit cost."""
         rows = rows6()
         for i in range(first, last):
             rows = with_point(rows, point, i, first, last, sigma)
@@ -251,10 +240,7 @@ def make(name, flags):
 
     @kernel(flags)
     def split_scans(point, start, noise, cost, stop, scans, points, penalty, gap):
-        """Split scans into segments: stop is the end of the segment that begins at a point, -1 at all other points.
-
-        One work-item takes a scan.
-        """
+        """Split scans into segments: stop is the end of the segment that begins at a point, -1 at all other points."""
         scan = wp.tid()
         if scan >= scans:
             return

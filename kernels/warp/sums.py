@@ -25,14 +25,7 @@ def make(name, flags):
 
     @kernel(flags)
     def sum_parts(parts, order, counts, constant_terms, log_p, particles, count, block, score, batch):
-        """Sum count numbers, number k at parts[place + k * particles]: one work-item takes a particle.
-
-        They are sums of blocks or strands (block is 1), or single terms in blocks of BLOCK_TERMS; strands of a block
-        are first added without compensation. All are added to a compensated total. BLOCK_TERMS numbers are read before
-        any is added, so that a work-item waits once for all of them; numbers beyond the last count as 0, which changes
-        no sum. SCANS: each scan has a separate count. STRANDED: the count is of readings, and the numbers are sums of
-        their strands.
-        """
+        """Sum count numbers, number k at parts[place + k * particles]: one work-item takes a particle."""
         place = work_item(wp.tid())
         if place >= particles:
             return

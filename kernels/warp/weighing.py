@@ -133,10 +133,7 @@ def make(name, flags):
         score, before, highest, sums, joined, totals, settings, state, weight, ends, particles, block, blocks, fan,
         stage, stages,
     ):  # fmt: skip
-        """Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block.
-
-        The one after the last block writes the stage's state.
-        """
+        """Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block."""
         b = wp.tid()
         if b > blocks:
             return

@@ -51,9 +51,8 @@ def functions(flags):
 
     @wp.func
     def table_place(col: wp.int32, row: wp.int32, window: types.Window):
-        """Return the index of the cell of an end point in the padded table.
-
-        Both cells of the ring hold the same value, so four neighbours are read even beyond an edge.
+        """Return the index of the cell of an end point in the padded table. Both cells of the ring hold the same value,
+        so four neighbours are read even beyond an edge.
         """
         c = wp.clamp(col + FIELD_RING, 0, window.cols + (2 * FIELD_RING - 2))
         r = wp.clamp(row + FIELD_RING, 0, window.rows + (2 * FIELD_RING - 2))

@@ -216,10 +216,8 @@ def functions(flags):
         terms: wp.array(dtype=types.MixtureTerms),
         masses: wp.array(dtype=real),
     ):
-        """Return the terms of a block of readings in the sum.
-
-        Each stage is a loop, which becomes vector code; a hit's mass is computed where it may be less than 1 for some
-        reading of the block.
+        """Return the terms of a block of readings in the sum. Each stage is a loop, which becomes vector code; a hit's
+        mass is computed where it may be less than 1 for some reading of the block.
         """
         hits, results = block_numbers(), block_numbers()
         doubtful = int(0)

@@ -7,22 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface.constants import (
-    DRAW_STREAM,
-    DRAW_STREAMS,
-    FARTHEST_THETA,
-    FARTHEST_X,
-    INJECTED,
-    JITTER,
-    LEFT,
-    POOL,
-    RESAMPLED,
-    SCALE,
-    SEED,
-    STAGE,
-    STEP,
-    TOTAL,
-)
+from gpusense.interface import constants as c
 from gpusense.reference.motion import wrap_once
 from gpusense.reference.philox import random_words, uniform_of
 
@@ -61,7 +46,7 @@ def mark_of(fraction: np.ndarray, total: float) -> np.ndarray:
 
 def is_copied(own: np.ndarray, particles: int, drawn: int) -> bool:
     """Return whether particles are copied, because no resampling is due."""
-    return bool((own[RESAMPLED] == 0.0 and drawn == particles) or not own[TOTAL] > 0.0)
+    return bool((own[c.RESAMPLED] == 0.0 and drawn == particles) or not own[c.TOTAL] > 0.0)
 
 
 def copy_particle(
@@ -69,9 +54,9 @@ def copy_particle(
     after: np.ndarray, particles: int, n: np.ndarray,
 ) -> None:  # fmt: skip
     """Copy particles with their weights, relative to the mean weight."""
-    total, old = own[TOTAL], weight[n % particles]
+    total, old = own[c.TOTAL], weight[n % particles]
     target.reshape(-1, 3)[n] = source.reshape(-1, 3)[n % particles]
-    mean = total / (settings[SCALE] * particles)
+    mean = total / (settings[c.SCALE] * particles)
     after[n] = np.where(old > 0.0, np.maximum(old / mean, LEAST_WEIGHT), 0.0) if total > 0.0 else 1.0
 
 
@@ -80,11 +65,11 @@ def words_of(settings: np.ndarray, stage: int, index: np.ndarray, stream: int) -
     zero = np.zeros(np.shape(index), np.uint64)
     counter = (
         index,
-        zero + np.uint64(settings[STEP]),
-        zero + np.uint64(DRAW_STREAM + DRAW_STREAMS * stage + stream),
+        zero + np.uint64(settings[c.STEP]),
+        zero + np.uint64(c.DRAW_STREAM + c.DRAW_STREAMS * stage + stream),
         zero,
     )
-    return random_words(counter, int(settings[SEED]), int(settings[SEED + 1]))
+    return random_words(counter, int(settings[c.SEED]), int(settings[c.SEED + 1]))
 
 
 def start_of(settings: np.ndarray, stage: int, index: np.ndarray) -> np.ndarray:
@@ -98,24 +83,24 @@ def draw_particle(
 ) -> None:  # fmt: skip
     """Draw the particles of indices ``chosen``: move them by jitter where a stage follows, or inject poses."""
     poses = source[: 3 * particles].reshape(-1, 3)
-    pose, total = poses[chosen], state[stage * STAGE + TOTAL]
+    pose, total = poses[chosen], state[stage * c.STAGE + c.TOTAL]
     after[n] = 1.0
-    if state[stage * STAGE + LEFT] > 0.0:
+    if state[stage * c.STAGE + c.LEFT] > 0.0:
         words = words_of(settings, stage, n, 1)
         one = poses[found_at(ends, mark_of(uniform_of(words[0]), total), particles)]
         other = poses[found_at(ends, mark_of(uniform_of(words[1]), total), particles)]
         d = one - other
         d[:, 2] = wrap_once(d[:, 2])
-        far = np.maximum(np.abs(d[:, 0]), np.abs(d[:, 1])) / settings[FARTHEST_X]
-        far = np.maximum(np.maximum(far, np.abs(d[:, 2]) / settings[FARTHEST_THETA]), 1.0)
-        pose += (settings[JITTER] / far)[:, None] * d
+        far = np.maximum(np.abs(d[:, 0]), np.abs(d[:, 1])) / settings[c.FARTHEST_X]
+        far = np.maximum(np.maximum(far, np.abs(d[:, 2]) / settings[c.FARTHEST_THETA]), 1.0)
+        pose += (settings[c.JITTER] / far)[:, None] * d
         pose[:, 2] = wrap_once(pose[:, 2])
-    if stage == 0 and state[INJECTED] > 0.0 and settings[POOL] > 0.0:
+    if stage == 0 and state[c.INJECTED] > 0.0 and settings[c.POOL] > 0.0:
         words, more = words_of(settings, stage, n, 2), words_of(settings, stage, n, 3)
-        injected = uniform_of(words[0]) < state[INJECTED]
-        row = np.minimum(np.floor(uniform_of(words[1]) * settings[POOL]), settings[POOL] - 1.0).astype(np.int64)
+        injected = uniform_of(words[0]) < state[c.INJECTED]
+        row = np.minimum(np.floor(uniform_of(words[1]) * settings[c.POOL]), settings[c.POOL] - 1.0).astype(np.int64)
         for axis in range(3):
-            spread = (2.0 * uniform_of(more[axis]) - 1.0) * settings[POOL + 1 + axis]
+            spread = (2.0 * uniform_of(more[axis]) - 1.0) * settings[c.POOL + 1 + axis]
             value = pool[3 * row + axis] + spread
             pose[injected, axis] = (wrap_once(value) if axis == 2 else value)[injected]
     target.reshape(-1, 3)[n] = pose

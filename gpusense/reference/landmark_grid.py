@@ -23,27 +23,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import erf
 
+from gpusense.interface import feature_layout as at
 from gpusense.interface import structs
-from gpusense.interface.feature_layout import (
-    AXIS,
-    BEARING_SCALE,
-    BEARING_SCALE_LOW,
-    FARTHEST,
-    FIRST_END,
-    HOLE,
-    LAST_END,
-    MIXED_SCALE,
-    MIXED_SCALE_LOW,
-    PEAK,
-    PEAK_LOW,
-    RADIUS,
-    RANGE_AT,
-    RANGE_LOW,
-    RANGE_SCALE,
-    RANGE_SCALE_LOW,
-    RANGE_SPREAD,
-    REACH,
-)
 from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_sum
 from gpusense.reference.landmarks import across, add_square, along, angle_pair, at_places, log_detection
 from gpusense.reference.log_terms import Quad, offset
@@ -64,10 +45,10 @@ def overlaps(off: Quad, turned: Quad, feature: np.ndarray, normal: Quad, signatu
     """Return whether a feature has about the direction of lines of the map, and overlaps them."""
     cosine = normal[0] * turned[0] + normal[2] * turned[2]
     sine = normal[0] * turned[2] - normal[2] * turned[0]
-    foot = feature[RANGE_AT] * sine - (normal[0] * off[2] - normal[2] * off[0])
-    one, other = foot + feature[FIRST_END] * cosine, foot + feature[LAST_END] * cosine
+    foot = feature[at.RANGE_AT] * sine - (normal[0] * off[2] - normal[2] * off[0])
+    one, other = foot + feature[at.FIRST_END] * cosine, foot + feature[at.LAST_END] * cosine
     beside = (np.minimum(one, other) <= signature[:, 0]) & (np.maximum(one, other) >= -signature[:, 0])
-    return (cosine >= feature[AXIS]) & beside
+    return (cosine >= feature[at.AXIS]) & beside
 
 
 def distance_mass(d: Pair, scale: float, signature: np.ndarray, terms: structs.FeatureTerms) -> np.ndarray:
@@ -92,14 +73,14 @@ def log_line(
     zero = np.zeros(len(off[0]), real)
     da = angle_pair(across(turned, normal), along(turned, normal), arcs)
     d = along(off, normal)
-    dr = two_sum(feature[RANGE_AT], -d[0])
-    dr = two_sum(dr[0], dr[1] + (feature[RANGE_LOW] - d[1]))
-    mixed = pair_product(da, (np.asarray(feature[MIXED_SCALE]), np.asarray(feature[MIXED_SCALE_LOW])))
-    plain = pair_product(dr, (np.asarray(feature[RANGE_SCALE]), np.asarray(feature[RANGE_SCALE_LOW])))
-    exponent = add_square((zero, zero), da, feature[BEARING_SCALE], feature[BEARING_SCALE_LOW])
+    dr = two_sum(feature[at.RANGE_AT], -d[0])
+    dr = two_sum(dr[0], dr[1] + (feature[at.RANGE_LOW] - d[1]))
+    mixed = pair_product(da, (np.asarray(feature[at.MIXED_SCALE]), np.asarray(feature[at.MIXED_SCALE_LOW])))
+    plain = pair_product(dr, (np.asarray(feature[at.RANGE_SCALE]), np.asarray(feature[at.RANGE_SCALE_LOW])))
+    exponent = add_square((zero, zero), da, feature[at.BEARING_SCALE], feature[at.BEARING_SCALE_LOW])
     exponent = add_square(exponent, pair_sum(mixed, plain), real.type(1), real.type(0))
-    mass = distance_mass(d, feature[RANGE_SPREAD], signature, terms)
-    log_p = (feature[PEAK] - exponent[0]) + (feature[PEAK_LOW] - exponent[1])
+    mass = distance_mass(d, feature[at.RANGE_SPREAD], signature, terms)
+    log_p = (feature[at.PEAK] - exponent[0]) + (feature[at.PEAK_LOW] - exponent[1])
     return np.where(mass == 1, log_p, log_p - np.log(mass)).astype(real)
 
 
@@ -112,7 +93,7 @@ def candidates(
     start: np.ndarray, place: Quad, turned: Quad, feature: np.ndarray, buckets: structs.Buckets
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return runs of landmarks in the buckets that discs touch: (P, rows of buckets) first and last + 1."""
-    reach, radius = feature[REACH], feature[RADIUS]
+    reach, radius = feature[at.REACH], feature[at.RADIUS]
     x, y = place[0] + reach * turned[0], place[2] + reach * turned[2]
     left, right = bucket_at(x - radius, buckets.size, buckets.cols), bucket_at(x + radius, buckets.size, buckets.cols)
     low, high = bucket_at(y - radius, buckets.size, buckets.rows), bucket_at(y + radius, buckets.size, buckets.rows)
@@ -125,12 +106,12 @@ def candidates(
 
 def near(off: Quad, turned: Quad, feature: np.ndarray) -> np.ndarray:
     """Return whether landmarks are in a feature's disc, and within limits for components that it does not measure."""
-    reach, radius, hole = feature[REACH], feature[RADIUS], feature[HOLE]
+    reach, radius, hole = feature[at.REACH], feature[at.RADIUS], feature[at.HOLE]
     x, y = off[0] - reach * turned[0], off[2] - reach * turned[2]
     squared = off[0] * off[0] + off[2] * off[2]
     seen = (x * x + y * y <= radius * radius) & (squared >= hole * hole)
     d = np.sqrt(squared)
-    return seen & (d <= feature[FARTHEST]) & (turned[0] * off[0] + turned[2] * off[2] >= feature[AXIS] * d)
+    return seen & (d <= feature[at.FARTHEST]) & (turned[0] * off[0] + turned[2] * off[2] >= feature[at.AXIS] * d)
 
 
 def may_match(
@@ -164,7 +145,7 @@ def search(
     """
     real, particles = place[0].dtype, len(place[0])
     best, chosen = np.full(particles, -np.inf, real), np.full(particles, -1, np.int32)
-    if feature[RADIUS] < 0:
+    if feature[at.RADIUS] < 0:
         return best, best, chosen
     log_p = best.copy()
     first, last = candidates(start, place, turned, feature, buckets)

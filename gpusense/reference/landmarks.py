@@ -16,28 +16,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import erf
 
+from gpusense.interface import feature_layout as at
 from gpusense.interface import structs
-from gpusense.interface.feature_layout import (
-    ARC_STEPS,
-    BEARING_SCALE,
-    BEARING_SCALE_LOW,
-    COSINE,
-    COSINE_LOW,
-    PEAK,
-    PEAK_LOW,
-    RANGE_AT,
-    RANGE_LOW,
-    RANGE_SCALE,
-    RANGE_SCALE_LOW,
-    SIGNATURE_AT,
-    SIGNATURE_LOW,
-    SIGNATURE_SCALE,
-    SIGNATURE_SCALE_LOW,
-    SINE,
-    SINE_LOW,
-    UPPER,
-    UPPER_LOW,
-)
 from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_product, two_sum, where_pair
 from gpusense.reference.log_terms import Quad, distance_pair
 
@@ -67,7 +47,7 @@ def sensor_place(pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray, 
 def direction(pose: np.ndarray, pose_low: np.ndarray, feature: np.ndarray) -> Quad:
     """Return the direction of a feature in the world: the heading, turned by the bearing."""
     (cosine, sine), (cosine_low, sine_low) = pose[:, 2:].T, pose_low[:, 2:].T
-    c, s, c_low, s_low = feature[COSINE], feature[SINE], feature[COSINE_LOW], feature[SINE_LOW]
+    c, s, c_low, s_low = feature[at.COSINE], feature[at.SINE], feature[at.COSINE_LOW], feature[at.SINE_LOW]
     cc, ss, cs, sc = (two_product(a, b) for a, b in ((cosine, c), (sine, s), (cosine, s), (sine, c)))
     x, y = two_sum(cc[0], -ss[0]), two_sum(sc[0], cs[0])
     x_low = x[1] + ((cc[1] - ss[1]) + ((cosine * c_low + cosine_low * c) - (sine * s_low + sine_low * s)))
@@ -107,8 +87,8 @@ def angle_pair(side: Pair, ahead: Pair, arcs: np.ndarray) -> Pair:
     steep = b[0] > a[0]
     num, den = where_pair(steep, a, b), where_pair(steep, b, a)
     safe = np.where(den[0] > 0, den[0], 1).astype(arcs.dtype)
-    step = np.floor(num[0] / safe * real(ARC_STEPS) + real(0.5))
-    slope = step / real(ARC_STEPS)
+    step = np.floor(num[0] / safe * real(at.ARC_STEPS) + real(0.5))
+    slope = step / real(at.ARC_STEPS)
     less, more = two_product(slope, den[0]), two_product(slope, num[0])
     top, bottom = two_sum(num[0], -less[0]), two_sum(safe, more[0])
     top = two_sum(top[0], top[1] + ((num[1] - slope * den[1]) - less[1]))
@@ -119,7 +99,7 @@ def angle_pair(side: Pair, ahead: Pair, arcs: np.ndarray) -> Pair:
     base = arcs[step.astype(np.int32)]
     total = two_sum(base[:, 0], t)
     arc = two_sum(total[0], total[1] + (base[:, 1] + (t_low + t * arc_series(t))))
-    for when, whole in ((steep, arcs[ARC_STEPS + 1]), (np.signbit(ahead[0]), arcs[ARC_STEPS + 2])):
+    for when, whole in ((steep, arcs[at.ARC_STEPS + 1]), (np.signbit(ahead[0]), arcs[at.ARC_STEPS + 2])):
         arc = where_pair(when, pair_sum((whole[0], whole[1]), (-arc[0], -arc[1])), arc)
     return negative_where(np.signbit(side[0]), arc)
 
@@ -137,7 +117,7 @@ def field_mass(angle: Pair, upper: float, upper_low: np.floating, scale: np.floa
     The bearing is clamped to the ends of the field. Parts of the field more than half a turn away from the landmark are
     nearer in the other direction.
     """
-    half, whole = arcs[ARC_STEPS + 2, 0], 2 * arcs[ARC_STEPS + 2, 0]
+    half, whole = arcs[at.ARC_STEPS + 2, 0], 2 * arcs[at.ARC_STEPS + 2, 0]
     left = (upper - angle[0]) + (upper_low - angle[1])
     middle = terms.field_of_view / 2
     left = np.where(middle - left > half, left + whole, np.where(middle - left < -half, left - whole, left))
@@ -166,25 +146,27 @@ def log_detection(
     zero = np.zeros(len(off[0]), real)
     exponent, mass, norm = (zero, zero), np.ones(len(zero), real), zero
     d = distance_pair(off)
-    if "RANGE" in flags and feature[RANGE_SCALE] > 0:
-        r = two_sum(d[0], -feature[RANGE_AT])
-        r = two_sum(r[0], r[1] + (d[1] - feature[RANGE_LOW]))
-        exponent = add_square(exponent, r, feature[RANGE_SCALE], feature[RANGE_SCALE_LOW])
-        mass = mass * range_mass(d, feature[RANGE_SCALE], terms)
-    if "BEARING" in flags and feature[BEARING_SCALE] > 0:
+    if "RANGE" in flags and feature[at.RANGE_SCALE] > 0:
+        r = two_sum(d[0], -feature[at.RANGE_AT])
+        r = two_sum(r[0], r[1] + (d[1] - feature[at.RANGE_LOW]))
+        exponent = add_square(exponent, r, feature[at.RANGE_SCALE], feature[at.RANGE_SCALE_LOW])
+        mass = mass * range_mass(d, feature[at.RANGE_SCALE], terms)
+    if "BEARING" in flags and feature[at.BEARING_SCALE] > 0:
         angle = angle_pair(across(off, turned), along(off, turned), arcs)
-        squared = add_square(exponent, angle, feature[BEARING_SCALE], feature[BEARING_SCALE_LOW])
+        squared = add_square(exponent, angle, feature[at.BEARING_SCALE], feature[at.BEARING_SCALE_LOW])
         # At zero range the density is 1 / field: the peak times zero_range_density and the scale.
         has_bearing = d[0] > real.type(ZERO_RANGE)
         exponent = where_pair(has_bearing, squared, exponent)
         mass_in_field = real.type(1)
         if "FIELD" in flags:
-            mass_in_field = field_mass(angle, feature[UPPER], feature[UPPER_LOW], feature[BEARING_SCALE], terms, arcs)
-        mass = mass * np.where(has_bearing, mass_in_field, terms.zero_range_density * feature[BEARING_SCALE])
-    if "SIGNATURE" in flags and feature[SIGNATURE_SCALE] > 0:
-        s = two_sum(feature[SIGNATURE_AT], -signature[:, 0])
-        s = two_sum(s[0], s[1] + (feature[SIGNATURE_LOW] - signature[:, 1]))
-        exponent = add_square(exponent, s, feature[SIGNATURE_SCALE], feature[SIGNATURE_SCALE_LOW])
+            mass_in_field = field_mass(
+                angle, feature[at.UPPER], feature[at.UPPER_LOW], feature[at.BEARING_SCALE], terms, arcs
+            )
+        mass = mass * np.where(has_bearing, mass_in_field, terms.zero_range_density * feature[at.BEARING_SCALE])
+    if "SIGNATURE" in flags and feature[at.SIGNATURE_SCALE] > 0:
+        s = two_sum(feature[at.SIGNATURE_AT], -signature[:, 0])
+        s = two_sum(s[0], s[1] + (feature[at.SIGNATURE_LOW] - signature[:, 1]))
+        exponent = add_square(exponent, s, feature[at.SIGNATURE_SCALE], feature[at.SIGNATURE_SCALE_LOW])
         norm = signature[:, 2]
-    log_p = (feature[PEAK] - exponent[0]) + ((feature[PEAK_LOW] - exponent[1]) + norm)
+    log_p = (feature[at.PEAK] - exponent[0]) + ((feature[at.PEAK_LOW] - exponent[1]) + norm)
     return np.where(mass == 1, log_p, log_p - np.log(mass)).astype(real)

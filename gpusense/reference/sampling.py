@@ -20,20 +20,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface.constants import (
-    DRAW_FIRST,
-    DRAW_MARGIN,
-    DRAW_PER_SCAN,
-    DRAW_RANGE_MAX,
-    DRAW_SEED,
-    DRAW_STEP,
-    DRAW_TERMS,
-    DRAW_TOP,
-    READING_STREAM,
-    TABLE_CELLS,
-    TABLE_PER_LOG,
-    TABLE_POWERS,
-)
+from gpusense.interface import constants as c
 from gpusense.reference.elementary import SQRT_HALF, exp_of, log_of
 from gpusense.reference.philox import random_words
 from gpusense.reference.sensor_table import range_bin
@@ -44,7 +31,7 @@ HALF_WORD, FINE = 1048576.0, 2.220446049250313e-16
 # 1 / sqrt(2 pi); the largest number below one half.
 NORMAL_PEAK, MOST_HALF = 0.3989422804014327, 0.49999999999999994
 # Tables of shapes; beyond FARTHEST_HIT scales the mass is one half.
-DRAW_CELLS, DRAW_PER_LOG, DRAW_POWERS = TABLE_CELLS[8], TABLE_PER_LOG[8], TABLE_POWERS[8]
+DRAW_CELLS, DRAW_PER_LOG, DRAW_POWERS = c.TABLE_CELLS[8], c.TABLE_PER_LOG[8], c.TABLE_POWERS[8]
 FARTHEST_HIT = 1e16
 # Change from the series of the mass to the continued fraction; median.
 SERIES_END, SERIES_TERMS, FRACTION_TERMS, HALF_FROM = 4.0, 48, 24, 9.0
@@ -178,7 +165,7 @@ def reading_of(
     that choose the reading; ``expected``: expected ranges in [0, range_max]; ``mixture``: numbers of the mixtures; see
     above.
     """
-    terms = (mixture[DRAW_TERMS * bins + i] for i in range(DRAW_TERMS))
+    terms = (mixture[c.DRAW_TERMS * bins + i] for i in range(c.DRAW_TERMS))
     hit, short, none, rand, sigma, growth, bias, decay, place = terms
     short = np.where(expected > 0.0, short, 0.0)
     first, second = hit, hit + short
@@ -216,19 +203,19 @@ def cell_reading_of(
 
 def draw_readings(flags, incidence, mixture, edges, chances, settings, ranges, particles, rays, tables, scale):
     """Replace expected ranges by readings; ``incidence`` holds cosines, and ``edges`` the cosines between bins."""
-    count, limit, top = particles * rays, settings[DRAW_RANGE_MAX], settings[DRAW_TOP]
+    count, limit, top = particles * rays, settings[c.DRAW_RANGE_MAX], settings[c.DRAW_TOP]
     for begin in range(0, count, BLOCK):
         part = slice(begin, min(begin + BLOCK, count))
         place = np.arange(part.start, part.stop)
-        n, stream = int(settings[DRAW_FIRST]) + place // rays, READING_STREAM + place % rays
-        scan, particle = np.divmod(n, int(settings[DRAW_PER_SCAN]))
-        counter = particle, scan + int(settings[DRAW_STEP]), stream, np.zeros_like(n)
-        words = random_words(counter, int(settings[DRAW_SEED]), int(settings[DRAW_SEED + 1]))
+        n, stream = int(settings[c.DRAW_FIRST]) + place // rays, c.READING_STREAM + place % rays
+        scan, particle = np.divmod(n, int(settings[c.DRAW_PER_SCAN]))
+        counter = particle, scan + int(settings[c.DRAW_STEP]), stream, np.zeros_like(n)
+        words = random_words(counter, int(settings[c.DRAW_SEED]), int(settings[c.DRAW_SEED + 1]))
         u, v = fine_uniform(words[0], words[1]), fine_uniform(words[2], words[3])
         z = ranges[part]
         if "SENSOR_TABLE" in flags:
             column = range_bin(z, tables.per_metre, tables.cells, scale.range_max)
-            drawn = cell_reading_of(u, v, column, chances, tables.cells, limit, settings[DRAW_MARGIN])
+            drawn = cell_reading_of(u, v, column, chances, tables.cells, limit, settings[c.DRAW_MARGIN])
         else:
             bins = np.zeros(len(n), np.int64)
             if "INCIDENCE" in flags:

@@ -1,4 +1,4 @@
-"""Expected range by a compressed directional distance transform (Walsh and Karaman 2018). For each angle bin the map is"""
+"""Expected range by a compressed directional distance transform (Walsh and Karaman 2018)."""
 
 import functools
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""Exponential, logarithm and angle in float64 from +, -, *, / and sqrt alone, so that every device gives the same bits."""
+"""Exponential, logarithm and angle in float64 from +, -, *, / and sqrt alone: every device gives the same bits."""
 
 import warp as wp
 

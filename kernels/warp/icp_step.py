@@ -1,4 +1,6 @@
-"""Steps of point-to-line ICP that scalar bodies and bodies in lanes share: places among the bearings of a"""
+"""Steps of point-to-line ICP that scalar bodies and bodies in lanes share: places among the bearings of a scan, the
+normal equations, sums of blocks of points, and sums over a team of work-items.
+"""
 
 import functools
 from types import SimpleNamespace

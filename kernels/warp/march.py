@@ -1,4 +1,6 @@
-"""Expected range by marching through the distance field (sphere tracing): each step is the distance from the current"""
+"""Expected range by marching through the distance field (sphere tracing): each step is the distance from the current
+cell's centre to the nearest obstacle's centre less slack, and at least tolerance.
+"""
 
 import functools
 from types import SimpleNamespace

@@ -17,29 +17,11 @@ _NEVER: dict[str, frozenset[str]] = {
     "score_field": frozenset({"ALL_READINGS", "WORLDS"}),
     "score_features": _SCALAR | {"LINE"},
 }
-_NEEDED: dict[str, tuple[set[str], ...]] = {
-    "cast_ranges": (set(),),
-    "count_unseen": (set(),),
-    "draw_particles": (set(),),
-    "e_step": (set(),),
-    "field_gradient": ({"LINEAR"},),
-    "fit_lines": (set(),),
-    "match_scans": (set(),),
-    "move_particles": (set(),),
-    "place_pair": (set(),),
-    "place_poses": (set(),),
-    "score_beacons": (set(),),
-    "score_beams": (set(),),
-    "score_contact": (set(),),
-    "score_features": ({"RANGE"}, {"BEARING"}),
-    "score_field": (set(),),
-    "score_heading": (set(),),
-    "score_position": (set(),),
-    "set_weights": (set(),),
-    "shift_scores": (set(),),
-    "sum_poses": (set(),),
-    "weigh_particles": (set(),),
-}
+_NEEDED: dict[str, tuple[set[str], ...]] = dict.fromkeys((
+    "cast_ranges", "count_unseen", "draw_particles", "e_step", "fit_lines", "match_scans", "move_particles",
+    "place_pair", "place_poses", "score_beacons", "score_beams", "score_contact", "score_field", "score_heading",
+    "score_position", "set_weights", "shift_scores", "sum_poses", "weigh_particles",
+), (set(),)) | {"field_gradient": ({"LINEAR"},), "score_features": ({"RANGE"}, {"BEARING"})}  # fmt: skip
 # By kernel: flags with which its body in lanes computes in float64 where real numbers are float32.
 _DOUBLE: dict[str, frozenset[str]] = {"score_field": frozenset({"BILINEAR"})}
 # By kernel: flags with which Warp's body has no loops that become vectors, and flags that it requires.

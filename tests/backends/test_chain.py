@@ -239,11 +239,12 @@ def test_a_failed_look_is_not_kept(machine, monkeypatch):
 def test_opencl_lists_its_devices_once(needs, monkeypatch):
     """PoCL's description of a device is searched in memory for the name of its processor."""
     needs("opencl")
-    from gpusense.backends.opencl import devices, pocl
+    from gpusense.backends.opencl import pocl
+    from gpusense.backends.opencl.library import LIBRARY
 
-    found = devices.list_devices()
+    found = LIBRARY.list_devices()
     monkeypatch.setattr(pocl, "_find_name", lambda device: pytest.fail("it looks again"))
-    assert devices.list_devices() == found and devices.list_devices() is not found
+    assert LIBRARY.list_devices() == found and LIBRARY.list_devices() is not found
 
 
 _CALLS = """

@@ -219,7 +219,7 @@ def test_which_devices_are_asked_for_lanes(platform, kind, width, lanes, needs):
     needs("opencl")
     import pyopencl as cl
 
-    from gpusense.backends.opencl.devices import _lanes
+    from gpusense.backends.opencl.library import _lanes
 
     device = SimpleNamespace(
         platform=SimpleNamespace(name=platform), type=getattr(cl.device_type, kind), native_vector_width_float=width

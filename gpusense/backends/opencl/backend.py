@@ -18,9 +18,17 @@ from gpusense.backends import processor
 from gpusense.backends.base import Adopted, Backend, BackendInfo, Buffer, ProcessBound
 from gpusense.backends.cache import BinaryCache
 from gpusense.backends.opencl import memory, pocl, pocl_kernels
-from gpusense.backends.opencl.devices import group_multiple, shares_memory
 from gpusense.backends.opencl.launch import Launch, OpenCLRecording, new_kernel, watch, without_caches
-from gpusense.backends.opencl.memory import SHARED, DeviceBuffer, SharedBuffer, driver_errors, raise_clearly, slots_of
+from gpusense.backends.opencl.memory import (
+    SHARED,
+    DeviceBuffer,
+    SharedBuffer,
+    driver_errors,
+    group_multiple,
+    raise_clearly,
+    shares_memory,
+    slots_of,
+)  # fmt: skip
 from gpusense.backends.recycled import ResultMemory
 from gpusense.backends.staging import Staging
 from gpusense.interface.launches import Program

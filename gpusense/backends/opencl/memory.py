@@ -241,3 +241,27 @@ def wrapped(buffer: cl.Buffer, queue: cl.CommandQueue, shape: tuple[int, ...], d
     import pyopencl.array
 
     return pyopencl.array.Array(queue, shape, dtype, data=buffer if math.prod(shape) else None)
+
+
+# ---- properties of devices
+
+
+def shares_memory(device: cl.Device) -> bool:
+    """Return whether host and device may access the same memory between commands, and both are near it."""
+    try:
+        if not device.type & cl.device_type.CPU or not device.host_unified_memory:
+            return False
+        return bool(device.svm_capabilities & cl.device_svm_capabilities.FINE_GRAIN_BUFFER)
+    except cl.Error:
+        return False
+
+
+def group_multiple(kernel: cl.Kernel, device: cl.Device) -> int:
+    """Return the number of which the size of a kernel's work-groups must be a multiple.
+
+    Mesa's llvmpipe computes work-items in vectors. A loop goes on while it would in a lane without a work-item, where
+    reads return 0; such a loop may never end, and uses up the iterations of all loops of its group.
+    """
+    if not device.name.startswith("llvmpipe"):
+        return 1
+    return int(kernel.get_work_group_info(cl.kernel_work_group_info.PREFERRED_WORK_GROUP_SIZE_MULTIPLE, device))

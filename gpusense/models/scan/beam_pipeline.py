@@ -101,12 +101,8 @@ class BeamPipeline(ScanPipeline):
         )  # fmt: skip
 
     def sensing(self) -> ReadingLayout:
-        rules = self.rules
-        vectors = rules.vectors[:, None] if self.cones.rays == 1 else self.cone_vectors
-        return ReadingLayout(
-            self.scanner, rules.beams, vectors, rules.z_max, end_points=False, max_depends=rules.max_depends,
-            possible=self.context.possible, specialize=self.specialize, top=self._top, guard_scale=0.0, real=self.real,
-        )  # fmt: skip
+        vectors = self.rules.vectors[:, None] if self.cones.rays == 1 else self.cone_vectors
+        return ReadingLayout(self.context, vectors, end_points=False, top=self._top)
 
     def place_arguments(self, filled: dict[str, Buffer]) -> dict[str, Buffer]:
         return dict(ray=filled["point"], reading=filled["reading"])

@@ -255,32 +255,25 @@ class RecordedCall(ReplayedCall):
         sensing = pipeline.sensing()
         placing, filled = device_readings(sensing, adopted.buffer, adopted.dtype, limits, space)
         places, constant_term = sensing.places, filled.pop("constant_term")
-        counts = -(-places // BLOCK_TERMS) if sensing.end_points else places
+        counts = space.upload("counts", np.array([sensing.numbers(places)], _INT))
         return Readings(
-            1, places, places, frozenset({"ALL_READINGS"}),
-            pipeline.place_arguments(filled),
-            dict(counts=space.upload("counts", np.array([counts], _INT)), constant_terms=constant_term),
-            0.0,
-            constants_there=sensing.constants_there, placing=placing,
+            1, places, places, frozenset({"ALL_READINGS"}), pipeline.place_arguments(filled),
+            dict(counts=counts, constant_terms=constant_term), 0.0, constants_there=sensing.constants_there,
+            placing=placing,
         )  # fmt: skip
 
     def _placed_scans(self, adopted: Adopted, count: int) -> Readings:
         """Return a scan of each pose as the kernel ``place_scans`` places them."""
         pipeline, space = self._pipeline, self._space
-        sensing = pipeline.sensing()
-        placing, filled = device_scans(
-            sensing, adopted.buffer, adopted.dtype, count, pipeline.map.grid.resolution, space
-        )
+        sensing, resolution = pipeline.sensing(), pipeline.map.grid.resolution
+        placing, filled = device_scans(sensing, adopted.buffer, adopted.dtype, count, resolution, space)
         self._first, places = (placing,), len(sensing.columns)
         starts = space.upload("start", np.arange(count + 1, dtype=_INT) * _INT.type(places))
-        each = -(-places // BLOCK_TERMS) if sensing.end_points else places
-        constants = np.full(count, pipeline.context.constant_term, pipeline.real)
+        counts = space.upload("counts", np.full(count, sensing.numbers(places), _INT))
+        constants = space.upload("constants", np.full(count, pipeline.context.constant_term, pipeline.real))
         return Readings(
             count, places, places, frozenset({"ALL_READINGS", "SCANS"}),
-            pipeline.place_arguments(filled) | {"start": starts},
-            dict(counts=space.upload("counts", np.full(count, each, _INT)),
-                 constant_terms=space.upload("constants", constants)),
-            0.0,
+            pipeline.place_arguments(filled) | {"start": starts}, dict(counts=counts, constant_terms=constants), 0.0,
         )  # fmt: skip
 
     def _piece_of(self, begin: int, end: int) -> Readings:

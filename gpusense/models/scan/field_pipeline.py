@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, cast
 
 import numpy as np
@@ -153,12 +152,7 @@ class FieldPipeline(ScanPipeline):
         return padded.reshape(scans.scans, blocks, BLOCK_TERMS).max(axis=2)
 
     def sensing(self) -> ReadingLayout:
-        rules = self.rules
-        return ReadingLayout(
-            self.scanner, rules.beams, rules.vectors[:, None], rules.z_max, end_points=True, max_depends=False,
-            possible=self.context.possible, specialize=self.specialize, top=math.inf, guard_scale=self.guard,
-            real=self.real,
-        )  # fmt: skip
+        return ReadingLayout(self.context, self.rules.vectors[:, None], end_points=True, guard_scale=self.guard)
 
     def place_arguments(self, filled: dict[str, Buffer]) -> dict[str, Buffer]:
         return dict(point=filled["point"], point_low=filled["point_low"], guard=filled["guard"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -15,9 +16,9 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Launch, Program, launch
 from gpusense.interface.structs import ReadingRules
 from gpusense.models.poses import PlacedPoses
-from gpusense.models.scan.rules import BeamChoice, Beams
+from gpusense.models.scan.rules import ModelContext
 from gpusense.world.range_causes import NoReturn
-from gpusense.world.scanner import Scanner, range_limits
+from gpusense.world.scanner import range_limits
 
 _INT = np.dtype(np.int32)
 # The kernel places readings in whole groups of work-items, so that the work-items of poses begin a new group.
@@ -64,79 +65,87 @@ class Placing:
 class ReadingLayout:
     """Rules for readings that are on the device."""
 
-    scanner: Scanner  # the scanner's geometry
-    beams: Beams  # the beams that are used
+    context: ModelContext
     vectors: np.ndarray = field(repr=False)  # (K, C, 2) float64 cosines and sines of the rays of each beam
-    z_max: float  # probability of a max reading
     end_points: bool  # whether readings become end points
-    max_depends: bool  # whether the probability of a max reading depends on the pose
-    possible: bool  # true if some range is possible
-    specialize: bool  # false leaves nothing out
-    top: float  # largest range below a max reading
-    guard_scale: float  # bound of the rounding errors of end points per cell of range
-    real: np.dtype  # precision of the model
-
-    @property
-    def choice(self) -> BeamChoice:
-        """The beams that are used."""
-        return BeamChoice.of(self.beams, self.scanner.count)
+    top: float = math.inf  # largest range below a max reading
+    guard_scale: float = 0.0  # bound of the rounding errors of end points per cell of range
 
     @property
     def columns(self) -> np.ndarray:
         """Beams whose readings are read."""
-        return self.choice.columns
+        return self.context.rules.choice.columns
 
     @property
     def places(self) -> int:
         """Places of readings; those at the end may be missing (nan)."""
-        return self.choice.most if self.specialize else len(self.choice.columns)
+        return self.context.rules.choice.most if self.context.rules.specialize else len(self.columns)
 
     @property
     def max_readings(self) -> int:
         """Treatment of max readings: left out, in the constant term, or in a place."""
-        if self.z_max <= 0:
+        rules = self.context.rules
+        if rules.z_max <= 0:
             return MAX_LEFT_OUT
-        return MAX_PLACED if self.max_depends or not self.specialize else MAX_FIXED
+        return MAX_FIXED if rules.max_is_constant else MAX_PLACED
 
     @property
     def constants_there(self) -> bool:
         """Return whether readings without a place may add a constant term."""
-        return self.max_readings == MAX_FIXED or not self.possible
+        return self.max_readings == MAX_FIXED or not self.context.possible
+
+    def numbers(self, places: int) -> int:
+        """Return how many numbers the sum over a scan's places adds: blocks of end points, or single readings."""
+        return -(-places // BLOCK_TERMS) if self.end_points else places
+
+    def buffers(self, scans: int, places: int, space: Workspace) -> dict[str, Buffer]:
+        """Allocate places for the readings of scans, by the arguments of the kernels that fill them."""
+        real, count, blocks = self.context.real, scans * places, scans * -(-places // BLOCK_TERMS)
+        return dict(
+            point=space.empty("point", 2 * count * self.vectors.shape[1], real),
+            point_low=space.empty("point_low", 2 * count if self.end_points else 2, real),
+            reading=space.empty("reading", 1 if self.end_points else count, real),
+            guard=space.empty("guard", blocks if self.end_points else 1, real),
+        )
+
+    def sources(self, space: Workspace) -> dict[str, Buffer]:
+        """Upload the beams whose readings are read, and their rays, by the arguments of these kernels."""
+        columns = self.columns
+        beam, vector = space.upload("beam", columns.astype(_INT)), space.upload("vector", self.vectors[columns])
+        return dict(beam=beam, vector=vector)
+
+    def struct(self, limits: np.dtype, log_max: float, places: int, chosen: int, kind: int, able: int) -> ReadingRules:
+        """Return the rules as these kernels take them; ``limits`` is the type to which the limits are rounded."""
+        scanner = self.context.rules.scanner
+        near_far = range_limits(limits, scanner.range_min, scanner.range_max)
+        rest = len(self.columns), self.vectors.shape[1], places, chosen, kind, able
+        return ReadingRules(*near_far, log_max, self.top, self.guard_scale, *rest)
+
+    def flags(self, dtype: np.dtype) -> frozenset[str]:
+        """Return the flags of these kernels for readings of a type."""
+        return flags_if(
+            END_POINTS=self.end_points, FLOAT64=self.context.real == np.float64, RANGES_FLOAT32=dtype == np.float32
+        )
 
 
 def device_readings(
     sensing: ReadingLayout, ranges: Buffer, dtype: np.dtype, limits: np.dtype, space: Workspace
 ) -> tuple[Placing, dict[str, Buffer]]:
-    """Allocate places for readings that are on the device, and describe the launch that fills them.
-
-    ``ranges``: (K,) readings.
+    """Allocate places for (K,) readings that are on the device, and describe the launch that fills them.
 
     Returns:
         The launch, and the buffers that it fills by name.
     """
-    real, places, columns = sensing.real, sensing.places, sensing.columns
-    each, end_points = sensing.vectors.shape[1], sensing.end_points
-    filled = dict(
-        point=space.empty("point", 2 * places * each, real),
-        point_low=space.empty("point_low", 2 * places if end_points else 2, real),
-        reading=space.empty("reading", 1 if end_points else places, real),
-        guard=space.empty("guard", -(-places // BLOCK_TERMS) if end_points else 1, real),
-        constant_term=space.empty("constant_term", 1, real),
+    columns, kind, rules = sensing.columns, sensing.max_readings, sensing.context.rules
+    filled = sensing.buffers(1, sensing.places, space)
+    filled["constant_term"] = space.empty("constant_term", 1, sensing.context.real)
+    flags = sensing.flags(dtype) | flags_if(
+        ALL_READINGS=not rules.specialize, SOME_BEAMS=len(columns) < rules.scanner.count
     )
-    flags = flags_if(
-        END_POINTS=end_points, FLOAT64=real == np.float64, ALL_READINGS=not sensing.specialize,
-        RANGES_FLOAT32=dtype == np.float32, SOME_BEAMS=len(columns) < sensing.scanner.count,
-    )  # fmt: skip
-    nearest, farthest = range_limits(limits, sensing.scanner.range_min, sensing.scanner.range_max)
-    chosen = sensing.choice.most
-    kind = sensing.max_readings
+    log_max = float(NoReturn(rules.z_max).log_mass) if kind == MAX_FIXED else 0.0
     arguments = dict(
-        filled, ranges=ranges, beam=space.upload("beam", columns.astype(_INT)),
-        vector=space.upload("vector", sensing.vectors[columns]), head=-(-max(len(columns), 1) // _GROUP) * _GROUP,
-        rules=ReadingRules(
-            nearest, farthest, float(NoReturn(sensing.z_max).log_mass) if kind == MAX_FIXED else 0.0, sensing.top,
-            sensing.guard_scale, len(columns), each, places, chosen, kind, int(sensing.possible),
-        ),
+        filled, ranges=ranges, **sensing.sources(space), head=-(-max(len(columns), 1) // _GROUP) * _GROUP,
+        rules=sensing.struct(limits, log_max, sensing.places, rules.choice.most, kind, int(sensing.context.possible)),
     )  # fmt: skip
     return Placing(flags, arguments), filled
 
@@ -144,33 +153,19 @@ def device_readings(
 def device_scans(
     sensing: ReadingLayout, ranges: Buffer, dtype: np.dtype, scans: int, resolution: float, space: Workspace
 ) -> tuple[Launch, dict[str, Buffer]]:
-    """Allocate places for a scan of each particle on the device, and return the launch that fills them.
+    """Allocate places for (S, K) readings on the device, one scan a particle, and return the launch that fills them.
 
-    Every reading has a place; a missing one adds nothing.
-
-    ``ranges``: (S, K) readings; ``resolution``: side of a cell [m].
+    Every reading has a place; a missing one adds nothing. ``resolution``: side of a cell [m].
 
     Returns:
         The launch, and the buffers that it fills by name.
     """
-    real, columns, each = sensing.real, sensing.columns, sensing.vectors.shape[1]
-    count, blocks, end_points = len(columns), -(-len(columns) // BLOCK_TERMS), sensing.end_points
-    filled = dict(
-        point=space.empty("point", 2 * scans * count * each, real),
-        point_low=space.empty("point_low", 2 * scans * count if end_points else 2, real),
-        reading=space.empty("reading", 1 if end_points else scans * count, real),
-        guard=space.empty("guard", scans * blocks if end_points else 1, real),
-    )
-    flags = flags_if(END_POINTS=end_points, FLOAT64=real == np.float64, RANGES_FLOAT32=dtype == np.float32)
-    nearest, farthest = range_limits(dtype, sensing.scanner.range_min, sensing.scanner.range_max)
-    rules = ReadingRules(
-        nearest, farthest, 0.0, sensing.top, sensing.guard_scale, count, each, count, count,
-        MAX_LEFT_OUT if sensing.z_max <= 0 else MAX_PLACED, 1,
-    )  # fmt: skip
-    beam, vector = space.upload("beam", columns.astype(_INT)), space.upload("vector", sensing.vectors[columns])
+    rules, count = sensing.context.rules, len(sensing.columns)
+    filled, kind = sensing.buffers(scans, count, space), MAX_LEFT_OUT if rules.z_max <= 0 else MAX_PLACED
     placing = launch(
-        "place_scans", flags, (scans * count,), ranges=ranges, beam=beam, vector=vector, **filled, scans=scans,
-        head=sensing.scanner.count, blocks=blocks, resolution=resolution, rules=rules,
+        "place_scans", sensing.flags(dtype), (scans * count,), ranges=ranges, **sensing.sources(space), **filled,
+        scans=scans, head=rules.scanner.count, blocks=-(-count // BLOCK_TERMS), resolution=resolution,
+        rules=sensing.struct(dtype, 0.0, count, count, kind, 1),
     )  # fmt: skip
     return placing, filled
 

@@ -122,7 +122,7 @@ def by_events(device: Any, launches: list[Callable[[], None]]) -> list[tuple[str
         return [(result.name, result.elapsed * 1e-3) for result in wp.timing_end(synchronize=True)]
     import pyopencl as cl
 
-    from gpusense.backends.opencl.pocl_kernels import source_name
+    from gpusense.backends.opencl.pocl import source_name
 
     before, found = device._queue, []
     device._queue = cl.CommandQueue(device._context, properties=cl.command_queue_properties.PROFILING_ENABLE)

@@ -8,7 +8,7 @@ import numpy as np
 
 # Kernel file error_free: terms of a block of a compensated sum, and strands that are summed side by side in a block.
 BLOCK_TERMS, STRANDS = 16, 4
-# Kernel file tiles: rays and particles of a tile.
+# Kernel file ray: rays and particles of a tile.
 TILE_RAYS, TILE_PARTICLES = 4, 16
 TILE = TILE_RAYS * TILE_PARTICLES
 # Kernel file order: bins of an axis and of all three, and bins that a work-item of order_starts sums.

@@ -18,9 +18,8 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.interface import structs
 from gpusense.interface.casters import ENTRIES, CasterEntry
-from gpusense.tables.cells import chebyshev_distances, check_size
 from gpusense.tables.directional import directional_table
-from gpusense.tables.distances import NO_OBSTACLE, squared_distances
+from gpusense.tables.distances import NO_OBSTACLE, chebyshev_distances, check_size, squared_distances
 from gpusense.tables.lookup_files import read_lookup
 from gpusense.tables.rectangles import Planes, empty_rectangles, planes_of
 from gpusense.world import windows

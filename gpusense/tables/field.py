@@ -10,8 +10,7 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.interface.launches import launch
 from gpusense.peers.weights import OVERLAID, Beluga, Peer
-from gpusense.tables.cells import check_size
-from gpusense.tables.distances import NO_OBSTACLE, squared_distances, squared_of_stack
+from gpusense.tables.distances import NO_OBSTACLE, check_size, squared_distances, squared_of_stack
 from gpusense.tables.world_stack import Stack, Table
 from gpusense.tables.worlds import Worlds
 from gpusense.world.field_density import FieldDensity

@@ -18,8 +18,6 @@ from gpusense._util.files import write_whole
 _LONGEST_HEADER = 4096
 _DTYPE = np.dtype("<u2")
 _FORMAT = "gpusense lookup 2"
-# First line of the old format without a checksum.
-_OLD_FORMAT = "gpusense lookup 1"
 
 
 def describe(obstacles: np.ndarray, limit: float, outside: str, bins: int) -> dict[str, object]:
@@ -84,12 +82,7 @@ def _header(line: bytes, path: Path) -> dict[str, Any]:
         header = json.loads(line)
     except (ValueError, RecursionError):
         header = None
-    kind = header.get("format") if isinstance(header, dict) else None
-    if kind == _OLD_FORMAT:
-        raise ValueError(
-            f"file: must be a look-up table with a checksum, {_FORMAT!r}, got {kind!r} in {path}: save the table again"
-        )
-    if not isinstance(header, dict) or kind != _FORMAT:
+    if not isinstance(header, dict) or header.get("format") != _FORMAT:
         raise ValueError(f"file: must be a look-up table that gpusense wrote, got {path}")
     return header
 

@@ -1,6 +1,6 @@
 // Beam model of a whole scan, log p(z | x, m): cast, evaluate the mixture and sum, in one launch (book table 6.1).
 // Readings whose density does not depend on the pose are not passed in: their sum is the constant term.
-// requires: error_free caster echo tiles mixture sensor_table
+// requires: error_free caster echo mixture sensor_table
 
 // Return the distance in cells to which the ray of a reading is cast.
 real ray_limit(const real z, global const MixtureTerms *terms, const RangeScale scale) {

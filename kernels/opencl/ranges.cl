@@ -1,5 +1,5 @@
 // Expected ranges of poses and bearings by any caster. A walk ends at the nearest moving shape.
-// requires: caster tiles shapes
+// requires: caster shapes
 
 // Cast rays: one work-item takes a particle and ray.
 kernel void cast_ranges(ARGUMENTS) {

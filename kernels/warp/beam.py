@@ -12,8 +12,8 @@ from .error_free import BLOCK_TERMS, STRANDS
 from .lanes import mixture as lane_mixture
 from .prelude import behind, kernel, precision, reader, work_item, writer
 from .ranges import caster_of
+from .ray import TILE_RAYS, tile_group, tile_place, tile_ray, tile_step
 from .shapes import world_begin, world_window
-from .tiles import TILE_RAYS, tile_group, tile_place, tile_ray, tile_step
 
 
 @functools.cache

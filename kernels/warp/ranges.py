@@ -10,8 +10,8 @@ from gpusense.interface.casters import caster_file
 from . import ray as ray_file
 from . import shapes as shapes_file
 from .prelude import behind, kernel, precision, reader, work_item, writer
+from .ray import tile_place, tile_ray, tile_step
 from .shapes import world_begin, world_window
-from .tiles import tile_place, tile_ray, tile_step
 
 
 def caster_of(flags):

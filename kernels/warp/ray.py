@@ -7,6 +7,11 @@ import warp as wp
 
 from .prelude import precision
 
+# Tiles of work-items for GPUs: a work-group takes a tile of neighbouring particles and rays with similar paths.
+TILE_RAYS = wp.constant(4)
+TILE_PARTICLES = wp.constant(16)
+TILE = wp.constant(64)
+
 
 @wp.func
 def off_grid(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
@@ -160,3 +165,27 @@ def functions(flags):
         return wp.where(t >= scale.limit, scale.range_max, wp.min(t * scale.resolution, scale.range_max))
 
     return SimpleNamespace(**locals())
+
+
+@wp.func
+def tile_place(item: wp.int32, spread: wp.int32):
+    """Return the place of a work-item's particle in the order."""
+    return ((item // TILE) >> spread) * TILE_PARTICLES + item % TILE // TILE_RAYS
+
+
+@wp.func
+def tile_group(item: wp.int32, spread: wp.int32):
+    """Return a work-item's group within its tile of particles."""
+    return (item // TILE) & ((1 << spread) - 1)
+
+
+@wp.func
+def tile_ray(item: wp.int32, spread: wp.int32):
+    """Return the first ray of a work-item."""
+    return ((item // TILE) & ((1 << spread) - 1)) * TILE_RAYS + item % TILE_RAYS
+
+
+@wp.func
+def tile_step(spread: wp.int32):
+    """Return the step from one ray of a work-item to its next."""
+    return TILE_RAYS << spread

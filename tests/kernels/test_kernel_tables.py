@@ -24,7 +24,7 @@ from support.kernel_scenes import (
 
 from gpusense.backends import Backend, get_backend
 from gpusense.reference.rectangles import OCCUPIED, slope
-from gpusense.tables.cells import packed
+from gpusense.tables.distances import packed
 from gpusense.tables.rectangles import Planes, empty_rectangles
 from gpusense.world.windows import Window
 

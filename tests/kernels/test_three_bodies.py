@@ -125,7 +125,7 @@ ON_PURPOSE = [
     Purpose("segments", "add_row", KERNELS_ONLY, "points come one after another, added by rotations"),
     Purpose("segments", "with_point", (WARP,), "OpenCL's functions take pointers to rows"),
     Purpose("segments", "running_costs rows_of _solve", REFERENCE_ONLY, ARRAYS),
-    Purpose("tiles", "tile_place tile_group tile_ray tile_step", KERNELS_ONLY, TILES),
+    Purpose("ray", "tile_place tile_group tile_ray tile_step", KERNELS_ONLY, TILES),
 ]  # fmt: skip
 
 CONCEPTS = sorted(path.stem for path in (kernel_root() / "opencl").glob("*.cl"))

@@ -10,7 +10,7 @@ from scipy.ndimage import distance_transform_cdt
 
 import gpusense as gs
 from gpusense.tables import casters
-from gpusense.tables.cells import chebyshev_distances
+from gpusense.tables.distances import chebyshev_distances
 
 
 @pytest.mark.long_on("warp")

@@ -17,7 +17,7 @@ import pyopencl as cl
 from gpusense.backends import processor
 from gpusense.backends.base import Adopted, Backend, BackendInfo, Buffer, ProcessBound
 from gpusense.backends.cache import BinaryCache
-from gpusense.backends.opencl import memory, pocl, pocl_kernels
+from gpusense.backends.opencl import memory, pocl
 from gpusense.backends.opencl.launch import Launch, OpenCLRecording, new_kernel, watch, without_caches
 from gpusense.backends.opencl.memory import (
     SHARED,
@@ -82,7 +82,7 @@ class OpenCLBackend(ProcessBound, Backend):
         self._programs: dict[tuple[str, frozenset[str]], tuple[cl.Program, str]] = {}
         self._keys = BinaryCache(info)
         self._cache = _binary_cache(info, device)
-        self._pocl = pocl_kernels.pocl_kernels() if pocl.is_pocl(device) else None
+        self._pocl = pocl.pocl_kernels() if pocl.is_pocl(device) else None
         self._of_bitcode = pocl.takes_bitcode(device)
         # The last launch, if its groups leave a processor to the calling thread.
         self._most_watched = processor.threads() - 1 if self._pocl is not None else 0
@@ -266,7 +266,7 @@ class OpenCLBackend(ProcessBound, Backend):
             self._programs[file, flags] = self._build(file, flags)
         program, key = self._programs[file, flags]
         first = None if self._pocl is None else functools.partial(self._pocl.mark, key)
-        name = pocl_kernels.own_name(kernel, key) if self._of_bitcode else kernel
+        name = pocl.own_name(kernel, key) if self._of_bitcode else kernel
         compiled = new_kernel(program, name)
         limit = compiled.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, self._device)
         return Launch(self, compiled, row, flags, limit, first, group_multiple(compiled, self._device))
@@ -298,9 +298,9 @@ class OpenCLBackend(ProcessBound, Backend):
             self._cache.store(source, self.options, binaries[devices.index(self._device)])
         return program, key
 
-    def _built_of_bitcode(self, compiled: pocl_kernels.PoclKernels, file: str, source: str, key: str) -> cl.Program:
+    def _built_of_bitcode(self, compiled: pocl.PoclKernels, file: str, source: str, key: str) -> cl.Program:
         """Return a program of a kernel file, with unique kernel names."""
-        names = {name: pocl_kernels.own_name(name, key) for name, row in KERNELS.items() if row.file == file}
+        names = {name: pocl.own_name(name, key) for name, row in KERNELS.items() if row.file == file}
         options = [*self.options, *(f"-D{name}={other}" for name, other in names.items())]
         return compiled.built(
             key,

@@ -24,7 +24,7 @@ from gpusense._util import notices
 from gpusense._version import __version__
 from gpusense.backends import probe_process
 from gpusense.backends.cache import discard_entry, load_entry, store_entry
-from gpusense.backends.opencl import pocl_kernels
+from gpusense.backends.opencl import pocl
 from gpusense.backends.processor import fingerprint
 from gpusense.backends.scratch import scratch_folder
 
@@ -240,7 +240,7 @@ def _pocl_folder(*, kernels: bool) -> Path:
     """Return the folder that keeps PoCL out of other folders; without kernels it takes part in no run."""
     if kernels:
         with contextlib.suppress(OSError):
-            return pocl_kernels.pocl_kernels().folder
+            return pocl.pocl_kernels().folder
     return scratch_folder(executable=False) / "try"
 
 

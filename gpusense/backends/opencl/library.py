@@ -8,7 +8,7 @@ from typing import Any
 import pyopencl as cl
 
 from gpusense.backends.base import Backend, BackendInfo
-from gpusense.backends.opencl import drivers, pocl, pocl_kernels
+from gpusense.backends.opencl import drivers, pocl
 from gpusense.backends.opencl.backend import OpenCLBackend
 from gpusense.backends.opencl.memory import check_in_order
 from gpusense.backends.proof import remedy_for, with_remedy
@@ -42,7 +42,7 @@ def silence_of_pocl() -> str:
     if chosen := os.environ.get("POCL_DEVICES"):
         return f"PoCL offers no device with POCL_DEVICES={chosen}: unset this variable"
     try:
-        pocl_kernels.pocl_kernels()
+        pocl.pocl_kernels()
     except OSError as error:
         return str(error)
     return "PoCL offers no device: set POCL_DEBUG=all to see why"
@@ -120,10 +120,10 @@ class OpenCLLibrary(Library):
             return ""
         if absent := pocl.lacking_for(handle):
             return f"PoCL's library for this processor uses {', '.join(absent)}, which it lacks"
-        if drivers.pocl_came_first() and (unsafe := pocl_kernels.trouble_of_own_folder()):
+        if drivers.pocl_came_first() and (unsafe := pocl.trouble_of_own_folder()):
             return unsafe
         try:
-            pocl_kernels.pocl_kernels()
+            pocl.pocl_kernels()
         except OSError as error:
             return str(error)
         return ""

@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import Floats
 from gpusense.learning.landmark.pairs import Limits, Point, evaluate, make_pairs, sensor_poses
-from gpusense.models.landmark.features import check_correspondence, check_features
-from gpusense.models.landmark.tables import span_of
+from gpusense.models.landmark.features import check_correspondence, check_features, span_of
 from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.parameters import LandmarkParameters
 

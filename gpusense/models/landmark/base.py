@@ -20,8 +20,13 @@ from gpusense.interface.launches import Launch, Program, launch
 from gpusense.interface.plan import Omission, share
 from gpusense.interface.structs import Buckets as BucketSizes
 from gpusense.interface.structs import Score
-from gpusense.models.landmark.features import PreparedFeatures, check_correspondence, look_at_feature_angles
-from gpusense.models.landmark.tables import LandmarkTables, full_circle
+from gpusense.models.landmark.features import (
+    LandmarkTables,
+    PreparedFeatures,
+    check_correspondence,
+    full_circle,
+    look_at_feature_angles,
+)
 from gpusense.models.point.base import PointModel
 from gpusense.models.poses import Part, PlacedPoses, Poses, place
 from gpusense.world.frames import Mount

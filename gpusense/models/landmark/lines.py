@@ -18,9 +18,8 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.plan import Omission
 from gpusense.interface.structs import FeatureTerms
 from gpusense.models.landmark.base import JOINT_FEATURES, FeatureModel, common_omissions
-from gpusense.models.landmark.features import PreparedFeatures, in_two_parts
+from gpusense.models.landmark.features import PreparedFeatures, in_two_parts, uploaded
 from gpusense.models.landmark.sampling import draw_lines
-from gpusense.models.landmark.tables import uploaded
 from gpusense.models.point.sampling import draws_at
 from gpusense.world.frames import Mount, split
 from gpusense.world.landmarks import LandmarkMap, make_buckets

@@ -21,11 +21,13 @@ from gpusense.interface.structs import Buckets, SensorView
 from gpusense.models.landmark.base import FeatureModel, parameter_omissions
 from gpusense.models.landmark.features import (
     PreparedFeatures,
+    describe,
+    full_circle,
     possible_features,
     prepare_features,
+    upload_tables,
 )
 from gpusense.models.landmark.sampling import draw_features
-from gpusense.models.landmark.tables import describe, full_circle, upload_tables
 from gpusense.models.point.sampling import draws_at
 from gpusense.models.poses import PlacedPoses
 from gpusense.world.landmarks import LandmarkMap, make_buckets

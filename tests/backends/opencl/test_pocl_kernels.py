@@ -9,16 +9,16 @@ import pytest
 def kernels(needs, tmp_path, monkeypatch):
     needs("opencl")
     from gpusense.backends import cache
-    from gpusense.backends.opencl import pocl_kernels
+    from gpusense.backends.opencl import pocl
 
     stored: dict[str, bytes] = {}
     monkeypatch.setattr(cache, "load_entry", stored.get)
     monkeypatch.setattr(cache, "store_entry", stored.__setitem__)
-    monkeypatch.setattr(pocl_kernels.atexit, "register", lambda _: None)
+    monkeypatch.setattr(pocl.atexit, "register", lambda _: None)
 
     def new(folder):
         (tmp_path / folder).mkdir()
-        return pocl_kernels.PoclKernels(tmp_path / folder)
+        return pocl.PoclKernels(tmp_path / folder)
 
     return new
 
@@ -49,7 +49,7 @@ def test_where_pocl_writes_elsewhere_the_compiled_program_is_used(kernels):
 
 def test_kernels_of_different_programs_have_different_names(needs):
     needs("opencl")
-    from gpusense.backends.opencl.pocl_kernels import own_name
+    from gpusense.backends.opencl.pocl import own_name
 
     names = {own_name(kernel, key) for kernel in ("score", "cast") for key in ("source 1", "source 2")}
     assert len(names) == 4

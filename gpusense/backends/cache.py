@@ -189,30 +189,12 @@ def _shrink(folder: Path) -> None:
             _evict(Path(path))
 
 
-class BinaryCache:
-    """Compiled programs of one device."""
-
-    def __init__(self, info: BackendInfo) -> None:
-        parts = ["program", info.backend, info.name, info.driver, __version__]
-        # Programs for GPUs do not depend on the host.
-        self._device = "\n".join([*parts, fingerprint() if info.kind == "cpu" else ""])
-
-    def key(self, source: str, options: Sequence[str]) -> str:
-        """Return the key of a program's entry."""
-        return "\0".join([self._device, *options, source])
-
-    def load(self, source: str, options: Sequence[str]) -> bytes | None:
-        """Return the compiled program, or None if it is absent or damaged."""
-        return load_entry(self.key(source, options))
-
-    def store(self, source: str, options: Sequence[str], payload: bytes) -> None:
-        """Store a compiled program."""
-        if payload:
-            store_entry(self.key(source, options), payload)
-
-    def discard(self, source: str, options: Sequence[str]) -> None:
-        """Remove a program that the driver refuses."""
-        discard_entry(self.key(source, options))
+def program_key(info: BackendInfo, source: str, options: Sequence[str]) -> str:
+    """Return the key of the entry of a program that is compiled for a device."""
+    # Programs for GPUs do not depend on the host.
+    host = fingerprint() if info.kind == "cpu" else ""
+    device = "\n".join(["program", info.backend, info.name, info.driver, __version__, host])
+    return "\0".join([device, *options, source])
 
 
 # ---- files of a folder as the contents of one entry of the cache, and back

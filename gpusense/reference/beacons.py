@@ -52,9 +52,7 @@ def log_student_t(
     return (terms.peak - terms.power * (np.log(x[0]) + x[1] / x[0])) - np.log(mass)
 
 
-def log_range(
-    flags: frozenset[str], d: Pair, beacon: np.ndarray, terms: structs.BeaconTerms, series: np.ndarray, kind: int
-) -> np.ndarray:
+def log_range(flags, d, beacon, terms, series, kind):
     """Return log p of one range at each distance."""
     r = two_sum(d[0], -beacon[4])
     r = two_sum(r[0], r[1] + (d[1] - beacon[5]))

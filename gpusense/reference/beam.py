@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from gpusense.interface import structs
@@ -16,20 +14,14 @@ from gpusense.reference.sensor_table import tabulated_density
 from gpusense.reference.sums import particles_of_scans
 
 
-def ray_limit(
-    flags: frozenset[str], z: np.ndarray, terms: structs.MixtureTerms, scale: structs.RangeScale
-) -> np.ndarray:
+def ray_limit(flags, z, terms, scale):
     """Return the distances in cells to which the rays of readings are cast."""
     if "STOPS" not in flags:
         return np.full_like(z, scale.limit)
     return np.fmin(last_range(z, terms) / scale.resolution, scale.limit)
 
 
-def cast_beam(
-    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
-    ray: np.ndarray, rays: int, window: structs.Window, cone: structs.Cone, caster: structs.Caster,
-    scale: structs.RangeScale, shapes: np.ndarray, world: np.ndarray, crowd: structs.Crowd,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def cast_beam(flags, map_table, normals, pose_cell, pose, ray, rays, window, cone, caster, scale, shapes, world, crowd):
     """Return the (N * R,) expected ranges of rays or cones [m], and the cosines of incidence of cones; none of rays."""
     if "CONES" in flags:
         t, cosine, _ = echoes(
@@ -44,10 +36,7 @@ def cast_beam(
     return ranges, np.empty(0, pose.dtype)
 
 
-def reading_term(
-    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms, sensor: np.ndarray,
-    tables: structs.MixtureTables, range_max: float,
-) -> np.ndarray:  # fmt: skip
+def reading_term(flags, z, expected, terms, sensor, tables, range_max):
     """Return the terms of the scan's sum: log densities of readings, or cubes of densities."""
     if "CUBES" in flags:
         term = compat_density(flags, z, expected, terms) ** 3
@@ -62,14 +51,12 @@ def reading_term(
     return term
 
 
-def scan_log(flags: frozenset[str], total: np.ndarray) -> np.ndarray:
+def scan_log(flags, total):
     """Return the scan's logarithm from its sum."""
     return np.log(total) if "CUBES" in flags else total
 
 
-def readings_of_scan(
-    flags: frozenset[str], scan: int, start: np.ndarray, first: np.ndarray, reading: np.ndarray
-) -> tuple[int, int, np.ndarray, np.ndarray]:
+def readings_of_scan(flags, scan, start, first, reading):
     """Return one of several scans: its first ray, its number of rays, the first reading of each ray, its readings."""
     begin, rays = int(start[scan]), int(start[scan + 1] - start[scan])
     if "SHARED_RAYS" not in flags:
@@ -158,9 +145,7 @@ def beam_tiles(
     parts[places[:, None] + np.arange(term.shape[1]) * particles] = term
 
 
-def sum_terms(
-    flags: frozenset[str], term: np.ndarray, score: structs.Score, plainly: Callable[[np.ndarray], np.ndarray]
-) -> np.ndarray:
+def sum_terms(flags, term, score, plainly):
     """Sum (M, K) terms and a constant term in the order of the beams; -inf where any term is -inf.
 
     ``plainly`` is block_sums or strand_sums; their results are added to a compensated total.

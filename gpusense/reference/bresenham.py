@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface import structs
 from gpusense.reference.ray import make_ray, off_grid, start_casts
 from gpusense.reference.rectangles import padded
 
@@ -21,10 +20,7 @@ from gpusense.reference.rectangles import padded
 EDGE = 255
 
 
-def cast_ray(
-    flags: frozenset[str], map_table: np.ndarray, window: structs.Window, cell: np.ndarray, pose: np.ndarray,
-    ray: np.ndarray, limit: float, caster: structs.Caster,
-) -> np.ndarray:  # fmt: skip
+def cast_ray(flags, map_table, window, cell, pose, ray, limit, caster):
     """Return the distance in cells from the origin's cell to the first occupied cell of the line, limit without one.
 
     The arguments are those of ``dda.cast_ray``, with Chebyshev distances as ``map_table``.

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface import structs
 from gpusense.reference.ray import angle_bin, off_grid, ray_direction
 
 ENTRY_UNIT = 1024.0
@@ -21,10 +20,7 @@ COSINE_UNIT = 2.0**-30
 FARTHEST = 1048576.0
 
 
-def cast_ray(
-    flags: frozenset[str], map_table: np.ndarray, window: structs.Window, cell: np.ndarray, pose: np.ndarray,
-    ray: np.ndarray, limit: float, caster: structs.Caster,
-) -> np.ndarray:  # fmt: skip
+def cast_ray(flags, map_table, window, cell, pose, ray, limit, caster):
     """Return the distance in cells to the first obstacle of the line, limit where none is nearer.
 
     The arguments are those of ``dda.cast_ray``, with the table above and the angle bins of a full turn in ``caster``.

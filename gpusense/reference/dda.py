@@ -7,15 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface import structs
 from gpusense.reference.ray import make_ray, start_casts
 from gpusense.reference.rectangles import padded
 
 
-def cast_ray(
-    flags: frozenset[str], map_table: np.ndarray, window: structs.Window, cell: np.ndarray, pose: np.ndarray,
-    ray: np.ndarray, limit: float, caster: structs.Caster,
-) -> np.ndarray:  # fmt: skip
+def cast_ray(flags, map_table, window, cell, pose, ray, limit, caster):
     """Return the distance in cells to the first occupied cell, limit where none is nearer.
 
     ``flags``: flags of the signature table; ``cell``: (M, 2) integer column and row of each origin; ``pose``: (M, 4)

@@ -11,7 +11,7 @@ import numpy as np
 
 from gpusense.interface import structs
 from gpusense.reference.ranges import BLOCK, caster_of
-from gpusense.reference.ray import Ray, crossed, expected_range, make_ray, off_grid
+from gpusense.reference.ray import crossed, expected_range, make_ray, off_grid
 from gpusense.reference.raycast import sectors_of
 from gpusense.reference.shapes import nearest_shape, particles_of_worlds, world_begin, world_window
 
@@ -21,9 +21,7 @@ def is_wall(normal: np.ndarray) -> np.ndarray:
     return (normal != 0).any(axis=1)
 
 
-def normal_at(
-    flags: frozenset[str], normals: np.ndarray, window: structs.Window, col: np.ndarray, row: np.ndarray
-) -> np.ndarray:
+def normal_at(flags, normals, window, col, row):
     """Return (M, 2) normals of cells."""
     beyond = off_grid(np.stack([col + 1, row + 1]), window.rows + 2, window.cols + 2)
     normal = normals[np.where(beyond, 0, (row + 1) * (window.cols + 2) + col + 1)]
@@ -31,9 +29,7 @@ def normal_at(
     return normal
 
 
-def hit_normal(
-    flags: frozenset[str], normals: np.ndarray, window: structs.Window, cell: np.ndarray, r: Ray, t: np.ndarray
-) -> np.ndarray:
+def hit_normal(flags, normals, window, cell, r, t):
     """Return the normals of the cells in which M rays end at distances t.
 
     The distance determines the cell of the exact walk: it has crossed all boundaries in x up to t, and all boundaries
@@ -59,11 +55,7 @@ def incidence_terms(
     return structs.MixtureTerms(*(np.asarray(column)[bins] for column in terms))
 
 
-def nearest_echo(
-    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, window: structs.Window, cell: np.ndarray,
-    pose: np.ndarray, ray: np.ndarray, critical: float, limit: float, caster: structs.Caster, shapes: np.ndarray,
-    world: np.ndarray, crowd: structs.Crowd,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+def nearest_echo(flags, map_table, normals, window, cell, pose, ray, critical, limit, caster, shapes, world, crowd):
     """Return the nearest returns of M cones.
 
     A ray whose angle of incidence has a cosine below critical has no return: the surface reflects it like a mirror.
@@ -122,11 +114,7 @@ def cast_echoes(
             incidence[entries] = cosine if "COSINES" in flags else angle
 
 
-def echoes(
-    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, window: structs.Window, cell: np.ndarray,
-    pose: np.ndarray, ray: np.ndarray, rays: int, cone: structs.Cone, limit: float, caster: structs.Caster,
-    shapes: np.ndarray, world: np.ndarray, crowd: structs.Crowd,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+def echoes(flags, map_table, normals, window, cell, pose, ray, rays, cone, limit, caster, shapes, world, crowd):
     """Return ``nearest_echo`` of all cones at all poses, (N * rays,) each."""
     if "WORLDS" in flags:
         found = np.empty((3, len(pose), rays), pose.dtype)

@@ -33,7 +33,7 @@ def careful_offset(frac: Pair, a: Pair, b: Pair, c: Pair, d: Pair, sign: int) ->
     return total[0], ((ab[1] + sign * cd[1]) + (products[1] + frac[1])) + (low + total[1])
 
 
-def whole_cells(flags: frozenset[str], offset: Pair) -> tuple[np.ndarray, Pair, Pair]:
+def whole_cells(flags, offset):
     """Return the whole cells below an offset of two parts, the remainder in [0, 1), and 1 minus it.
 
     Both are computed relative to the nearest edge, where small numbers keep their digits. An offset at most EDGE below
@@ -67,9 +67,7 @@ class EndPoint:
     to_next_y: Pair
 
 
-def end_point(
-    flags: frozenset[str], pose: np.ndarray, pose_low: np.ndarray, point: np.ndarray, point_low: np.ndarray
-) -> EndPoint:
+def end_point(flags, pose, pose_low, point, point_low):
     """Return the end points of (M, 1, 4) poses and (1, K, 2) points, readings times the beams' (cos, sin) in cells."""
     real = pose.dtype.type
     shift = real(0.5) if "BILINEAR" in flags else real(0)

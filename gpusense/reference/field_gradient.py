@@ -12,15 +12,15 @@ import numpy as np
 from gpusense.interface import structs
 from gpusense.interface.constants import GRADIENT_NUMBERS
 from gpusense.reference.beam import sum_terms
-from gpusense.reference.end_point import EndPoint, end_point, field_cell
-from gpusense.reference.error_free import Pair, block_sums
+from gpusense.reference.end_point import end_point, field_cell
+from gpusense.reference.error_free import block_sums
 from gpusense.reference.field import BLOCK
 from gpusense.reference.field_term import bilinear, field_exponent, field_square, log_field
 from gpusense.reference.hit_shape import shape_weight
 from gpusense.reference.sums import particles_of_scans
 
 
-def hit_share(flags: frozenset[str], distance: Pair, terms: structs.FieldTerms) -> np.ndarray:
+def hit_share(flags, distance, terms):
     """Return the share of the hit density in the density at distances."""
     exponent, low = field_exponent(flags, distance, terms)
     if "LINEAR" not in flags:
@@ -33,9 +33,7 @@ def hit_share(flags: frozenset[str], distance: Pair, terms: structs.FieldTerms) 
     return hit / (hit + terms.rand_density)
 
 
-def distance_slope(
-    flags: frozenset[str], table: np.ndarray, col: np.ndarray, row: np.ndarray, end: EndPoint, window: structs.Window
-) -> tuple[Pair, np.ndarray, np.ndarray]:
+def distance_slope(flags, table, col, row, end, window):
     """Return the distances at end points, and their derivatives in x and y, in metres per cell."""
     a, b = table[field_cell(col, row, window)], table[field_cell(col + 1, row, window)]
     c, d = table[field_cell(col, row + 1, window)], table[field_cell(col + 1, row + 1, window)]

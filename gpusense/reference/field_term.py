@@ -9,22 +9,20 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.interface import structs
-from gpusense.reference.end_point import EndPoint, end_point, field_cell
-from gpusense.reference.error_free import Pair, pair_product, pair_sum
+from gpusense.reference.end_point import end_point, field_cell
+from gpusense.reference.error_free import pair_product, pair_sum
 from gpusense.reference.hit_shape import shape_exponent
 from gpusense.reference.shapes import shape_distance
 
 
-def between(flags: frozenset[str], weight_a: Pair, a: Pair, weight_b: Pair, b: Pair) -> Pair:
+def between(flags, weight_a, a, weight_b, b):
     """Return the weighted sum of a and b, all of two parts. No term is negative, so small values keep their digits."""
     if "EXACT_EXPONENT" in flags:
         return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b))
     return weight_a[0] * a[0] + weight_b[0] * b[0], np.zeros_like(weight_a[0])
 
 
-def bilinear(
-    flags: frozenset[str], table: np.ndarray, col: np.ndarray, row: np.ndarray, end: EndPoint, window: structs.Window
-) -> Pair:
+def bilinear(flags, table, col, row, end, window):
     """Interpolate the distance between the four cell centres around an end point, in two parts."""
     zero = np.zeros_like(end.rest_x[0])
     a = table[field_cell(col, row, window)], zero
@@ -36,7 +34,7 @@ def bilinear(
     return between(flags, end.to_next_y, low, end.rest_y, high)
 
 
-def field_square(flags: frozenset[str], distance: Pair, terms: structs.FieldTerms) -> Pair:
+def field_square(flags, distance, terms):
     """Return the exponent of a normal in two parts, since for a high peak exponent and log peak nearly cancel.
 
     ``hit_peak`` and ``rand_density`` are logarithms in the log domain.
@@ -46,12 +44,12 @@ def field_square(flags: frozenset[str], distance: Pair, terms: structs.FieldTerm
     return distance[0] * (distance[0] * terms.square_scale), np.zeros_like(distance[0])
 
 
-def field_exponent(flags: frozenset[str], distance: Pair, terms: structs.FieldTerms) -> Pair:
+def field_exponent(flags, distance, terms):
     """Return the exponent of the density of a hit in two parts."""
     return shape_exponent(flags, field_square(flags, distance, terms), terms.shape_power, terms.shape_rate)
 
 
-def log_field(flags: frozenset[str], distance: Pair, terms: structs.FieldTerms) -> np.ndarray:
+def log_field(flags, distance, terms):
     """Return log p of distances from end points to the nearest obstacle."""
     exponent, low = field_exponent(flags, distance, terms)
     if "LINEAR" not in flags:
@@ -83,11 +81,7 @@ def _near(
     return (pose.dtype.type(crowd.side) * away).reshape(count, readings)
 
 
-def reading_value(
-    flags: frozenset[str], table: np.ndarray, origin: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
-    point: np.ndarray, point_low: np.ndarray, terms: structs.FieldTerms, window: structs.Window, shapes: np.ndarray,
-    world: np.ndarray, crowd: structs.Crowd,
-) -> np.ndarray:  # fmt: skip
+def reading_value(flags, table, origin, pose, pose_low, point, point_low, terms, window, shapes, world, crowd):
     """Return the terms of readings: (M, 1, ...) poses and their cells with (1, K, 2) points give (M, K) terms."""
     end = end_point(flags, pose, pose_low, point, point_low)
     col, row = end.col + origin[..., 0], end.row + origin[..., 1]

@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import betainc
 
-from gpusense.reference.error_free import Pair, two_product
+from gpusense.reference.error_free import two_product
 
 
-def shape_exponent(flags: frozenset[str], t: Pair, power: np.ndarray, rate: np.ndarray) -> Pair:
+def shape_exponent(flags, t, power, rate):
     """Return the exponent E as a sum of two numbers."""
     if "STUDENT" not in flags:
         return t
@@ -26,19 +26,19 @@ def shape_exponent(flags: frozenset[str], t: Pair, power: np.ndarray, rate: np.n
     return high, low + power * ((exact[1] + rate * t[1]) / (1 + more))
 
 
-def shape_weight(flags: frozenset[str], t: np.ndarray, power: np.ndarray, rate: np.ndarray) -> np.ndarray:
+def shape_weight(flags, t, power, rate):
     """Return the weight E'(t)."""
     if "STUDENT" not in flags:
         return np.ones_like(t)
     return power * rate / (1 + rate * t)
 
 
-def shape_bend(flags: frozenset[str], square: np.ndarray, power: np.ndarray) -> np.ndarray:
+def shape_bend(flags, square, power):
     """Return ``-u^2 E''(t) / E'(t)`` from ``square = u^2 E'(t)``."""
     return square * (1 / power) if "STUDENT" in flags else np.zeros_like(square)
 
 
-def half_mass(flags: frozenset[str], b: np.ndarray, power: np.ndarray, rate: np.ndarray) -> np.ndarray:
+def half_mass(flags, b, power, rate):
     """Return the mass between the mean and a distance; kernels need no formula for it."""
     if "STUDENT" not in flags:
         raise ValueError(f"flags: must be those of a shape with a mass, got {sorted(flags)}")

@@ -114,31 +114,21 @@ def near(off: Quad, turned: Quad, feature: np.ndarray) -> np.ndarray:
     return seen & (d <= feature[at.FARTHEST]) & (turned[0] * off[0] + turned[2] * off[2] >= feature[at.AXIS] * d)
 
 
-def may_match(
-    flags: frozenset[str], off: Quad, turned: Quad, feature: np.ndarray, normal: np.ndarray, signature: np.ndarray,
-    j: np.ndarray,
-) -> np.ndarray:  # fmt: skip
+def may_match(flags, off, turned, feature, normal, signature, j):
     """Return whether features may be landmarks j: near an end point, or for lines of like direction and overlapping."""
     if "LINE" in flags:
         return overlaps(off, turned, feature, facing(normal[j], signature[j], turned), signature[j])
     return near(off, turned, feature)
 
 
-def log_match(
-    flags: frozenset[str], off: Quad, turned: Quad, feature: np.ndarray, normal: np.ndarray, signature: np.ndarray,
-    j: np.ndarray, terms: structs.FeatureTerms, arcs: np.ndarray,
-) -> np.ndarray:  # fmt: skip
+def log_match(flags, off, turned, feature, normal, signature, j, terms, arcs):
     """Return ``log(z_detect p(f | j))`` of one feature at the offsets of landmarks j."""
     if "LINE" in flags:
         return log_line(off, turned, feature, facing(normal[j], signature[j], turned), signature[j], terms, arcs)
     return log_detection(flags, off, turned, feature, signature[j], terms, arcs)
 
 
-def search(
-    flags: frozenset[str], landmark: np.ndarray, normal: np.ndarray, signature: np.ndarray, start: np.ndarray,
-    place: Quad, turned: Quad, feature: np.ndarray, terms: structs.FeatureTerms, arcs: np.ndarray,
-    buckets: structs.Buckets,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+def search(flags, landmark, normal, signature, start, place, turned, feature, terms, arcs, buckets):
     """Return per particle the log density, the log density of the likeliest landmark, and its index.
 
     The log density belongs to the likeliest landmark or, if MARGINAL, to all landmarks.

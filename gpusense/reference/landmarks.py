@@ -137,10 +137,7 @@ def add_square(total: Pair, residual: Pair, scale: float, scale_low: np.floating
     return more[0], np.where(np.isfinite(more[1]), more[1], 0).astype(more[1].dtype)
 
 
-def log_detection(
-    flags: frozenset[str], off: Quad, turned: Quad, feature: np.ndarray, signature: np.ndarray,
-    terms: structs.FeatureTerms, arcs: np.ndarray,
-) -> np.ndarray:  # fmt: skip
+def log_detection(flags, off, turned, feature, signature, terms, arcs):
     """Return ``log(z_detect p(f | j))`` of one feature at each offset; signature is (s_j, low part, -log m_s, 0)."""
     real = off[0].dtype
     zero = np.zeros(len(off[0]), real)

@@ -38,9 +38,7 @@ from gpusense.reference.mixture import (
 )
 
 
-def responsibilities(
-    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def responsibilities(flags, z, expected, terms):
     """Return log p(z | z*) and the responsibilities of hit, short and rand, 0 where the density is 0."""
     hit, shorter = log_hit(flags, z, expected, terms), log_short(z, expected, terms)
     largest = np.maximum(np.maximum(hit, shorter), terms.rand_density)
@@ -50,7 +48,7 @@ def responsibilities(
     return largest + np.log(p), p_hit / p, p_short / p, p_rand / p
 
 
-def hit_phi(flags: frozenset[str], x: np.ndarray, terms: structs.MixtureTerms) -> np.ndarray:
+def hit_phi(flags, x, terms):
     """Return the untruncated density of a hit at a distance of x scales, times sigma."""
     t = x.dtype.type(0.5) * x * x
     exponent = shape_exponent(flags, (t, np.zeros_like(t)), terms.shape_power, terms.shape_rate)[0]
@@ -58,9 +56,7 @@ def hit_phi(flags: frozenset[str], x: np.ndarray, terms: structs.MixtureTerms) -
     return density
 
 
-def hit_slopes(
-    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def hit_slopes(flags, z, expected, terms):
     """Return W u^2, and the derivatives h_s, h_m, h_ss, h_sm and h_mm of log p_hit of pairs."""
     mean, above = mean_range(flags, expected, terms), above_mean(flags, expected, terms)
     power, rate, half, scale = terms.shape_power, terms.shape_rate, z.dtype.type(0.5), terms.inverse_sigma
@@ -94,9 +90,7 @@ def short_slopes(z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerm
     return 1 - v - terms.lambda_short * z, v * (f - 1) - terms.lambda_short * z
 
 
-def add_pair(
-    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms, sums: np.ndarray
-) -> None:
+def add_pair(flags, z, expected, terms, sums):
     """Return the terms of pairs in the sums, (S, pairs).
 
     log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm, r_hit h_mm, r_short s_ll; r_hit W u^2, r_short

@@ -8,14 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface import structs
 from gpusense.reference.ray import angle_bin, make_ray, start_casts
 
 
-def cast_ray(
-    flags: frozenset[str], map_table: np.ndarray, window: structs.Window, cell: np.ndarray, pose: np.ndarray,
-    ray: np.ndarray, limit: float, caster: structs.Caster,
-) -> np.ndarray:  # fmt: skip
+def cast_ray(flags, map_table, window, cell, pose, ray, limit, caster):
     """Return the distance in cells from the table, limit where no obstacle is nearer.
 
     The arguments are those of ``dda.cast_ray``, with (rows * cols * bins) ranges as ``map_table`` and the angle bins of

@@ -10,16 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface import structs
 from gpusense.reference.ray import make_ray, off_grid, start_walk
 
 LEAST_STEP = 2.0**-22
 
 
-def cast_ray(
-    flags: frozenset[str], map_table: np.ndarray, window: structs.Window, cell: np.ndarray, pose: np.ndarray,
-    ray: np.ndarray, limit: float, caster: structs.Caster,
-) -> np.ndarray:  # fmt: skip
+def cast_ray(flags, map_table, window, cell, pose, ray, limit, caster):
     """Return the distance in cells to a point in an occupied cell, limit where none is nearer.
 
     The arguments are those of ``dda.cast_ray``, with distances between cell centres [cells] as ``map_table``. The

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import erf
 
 from gpusense.interface import structs
-from gpusense.reference.error_free import Pair, pair_sum, rest_of, two_product, two_sum
+from gpusense.reference.error_free import pair_sum, rest_of, two_product, two_sum
 from gpusense.reference.hit_shape import half_mass, shape_exponent
 
 TINY = 1e-30
@@ -33,9 +33,7 @@ def hit_mass(before: np.ndarray, after: np.ndarray, erf_scale: float | np.ndarra
     return half * (erf(before * erf_scale) + erf(after * erf_scale))
 
 
-def mass_within(
-    flags: frozenset[str], mean: np.ndarray, above: np.ndarray, scale: np.ndarray, terms: structs.MixtureTerms
-) -> np.ndarray:
+def mass_within(flags, mean, above, scale, terms):
     """Return the mass of a hit of any shape on [0, range_max], given its mean and the distance to range_max."""
     if "MASS_TABLE" not in flags:
         return hit_mass(mean, above, scale)
@@ -45,12 +43,12 @@ def mass_within(
     return below + above_mass
 
 
-def mean_range(flags: frozenset[str], expected: np.ndarray, terms: structs.MixtureTerms) -> np.ndarray:
+def mean_range(flags, expected, terms):
     """Return the mean of p_hit."""
     return np.clip(expected + terms.range_bias, 0, terms.range_max) if "BIAS" in flags else expected
 
 
-def above_mean(flags: frozenset[str], expected: np.ndarray, terms: structs.MixtureTerms) -> np.ndarray:
+def above_mean(flags, expected, terms):
     """Return the distance from the mean of p_hit to range_max, which keeps its digits where it is short."""
     if "BIAS" not in flags:
         return terms.range_max - expected
@@ -58,7 +56,7 @@ def above_mean(flags: frozenset[str], expected: np.ndarray, terms: structs.Mixtu
     return np.clip((last - expected) + (rest - terms.range_bias_low), 0, terms.range_max)
 
 
-def hit_offset(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms) -> Pair:
+def hit_offset(flags, z, expected, terms):
     """Return z minus the mean of p_hit as a sum of two numbers; z, z* and the bias nearly cancel."""
     off = z - expected
     none = np.zeros_like(off)
@@ -70,7 +68,7 @@ def hit_offset(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms
     return np.where(moved, high, z - mean), np.where(moved, low, none)
 
 
-def hit_scale(flags: frozenset[str], expected: np.ndarray, terms: structs.MixtureTerms) -> Pair:
+def hit_scale(flags, expected, terms):
     """Return sigma_hit / sigma at ranges: the first number times (1 + the second)."""
     one, none = np.ones_like(expected), np.zeros_like(expected)
     if "GROWTH" not in flags:
@@ -84,9 +82,7 @@ def hit_scale(flags: frozenset[str], expected: np.ndarray, terms: structs.Mixtur
     return share, rest_of(total, share, one) + excess * share
 
 
-def normal_exponent(
-    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms
-) -> tuple[np.ndarray, np.ndarray]:
+def normal_exponent(flags, z, expected, terms):
     """Return ``(z - mean)^2 / (2 sigma^2)`` as a sum of two numbers.
 
     Exponent and log peak are large and nearly cancel where the density's peak is high; the second part keeps the digits
@@ -106,14 +102,12 @@ def normal_exponent(
     return product[0], product[1] + (square_low * terms.square_scale + square * terms.square_scale_low)
 
 
-def hit_exponent(
-    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms
-) -> tuple[np.ndarray, np.ndarray]:
+def hit_exponent(flags, z, expected, terms):
     """Return the exponent of a hit's density as a sum of two numbers."""
     return shape_exponent(flags, normal_exponent(flags, z, expected, terms), terms.shape_power, terms.shape_rate)
 
 
-def log_hit(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms) -> np.ndarray:
+def log_hit(flags, z, expected, terms):
     """Return ``log(z_hit p_hit(z | z*))``; terms are in the log domain."""
     exponent = hit_exponent(flags, z, expected, terms)
     scale = hit_scale(flags, expected, terms)[0]
@@ -143,7 +137,7 @@ def log_short(z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms) 
     return np.where(inside, log_p, -np.inf)
 
 
-def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms) -> np.ndarray:
+def log_density(flags, z, expected, terms):
     """Return log p(z | z*) of readings in [0, range_max) given expected ranges of the same shape."""
     if "LINEAR" in flags:
         # p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm suffices.
@@ -173,9 +167,7 @@ def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, term
     return np.logaddexp.reduce(parts, axis=0).astype(z.dtype)
 
 
-def compat_density(
-    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: structs.MixtureTerms
-) -> np.ndarray:
+def compat_density(flags, z, expected, terms):
     """Return the density to be cubed, whose cubes nav2_amcl and Beluga sum over the beams of a scan.
 
     amcl's is without normalisers, Beluga's with both (book table 6.1). Terms are linear; hit_peak is z_hit alone for

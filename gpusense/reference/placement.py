@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface import structs
 from gpusense.reference.heading import cos_sin
 
 # Coordinates are clamped to this many cells: no range reaches so far, and the sum of two fits int32.
@@ -20,10 +19,7 @@ def within_reach(position: np.ndarray) -> np.ndarray:
     return np.fmin(np.fmax(position, -FARTHEST), FARTHEST)
 
 
-def place_pose(
-    flags: frozenset[str], poses: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
-    pose_status: np.ndarray, frame: structs.Frame, window: structs.Window,
-) -> None:  # fmt: skip
+def place_pose(flags, poses, pose_cell, pose, pose_low, pose_status, frame, window):
     """Place sensors: (M, 3) poses times the scanner's mount, without its yaw, which belongs to the bearings.
 
     ``pose_low`` gets the rounding errors (low parts) of ``pose``. ``pose_status``, which the caller clears, becomes 1

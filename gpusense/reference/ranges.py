@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import importlib
-from types import ModuleType
 
 import numpy as np
 
-from gpusense.interface import structs
 from gpusense.interface.casters import caster_file
 from gpusense.reference.ray import expected_range
 from gpusense.reference.raycast import sectors_of
@@ -16,15 +14,12 @@ from gpusense.reference.shapes import nearest_shape, particles_of_worlds, world_
 BLOCK = 1 << 15
 
 
-def caster_of(flags: frozenset[str]) -> ModuleType:
+def caster_of(flags):
     """Return the module of the caster of a set of flags."""
     return importlib.import_module(f"gpusense.reference.{caster_file(flags)}")
 
 
-def cast_in_worlds(
-    flags: frozenset[str], map_table: np.ndarray, world: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
-    ray: np.ndarray, window: structs.Window, rays: int, limit: float, caster: structs.Caster,
-) -> np.ndarray:  # fmt: skip
+def cast_in_worlds(flags, map_table, world, pose_cell, pose, ray, window, rays, limit, caster):
     """Return the (N * R,) distances in cells of all rays of some particles, each in its world."""
     cast_ray, count = caster_of(flags).cast_ray, len(pose)
     if "WORLDS" not in flags:

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpusense.interface import structs
-
 TINY = 1e-30
 # Abramowitz and Stegun 4.4.49 for the arc tangent, in turns.
 _TURNS = (0.15913362, -0.05256880, 0.02867033, -0.01354934, 0.00331601)
@@ -65,9 +63,7 @@ def crossed(t: np.ndarray, speed: np.ndarray, a: np.ndarray, inv: np.ndarray, un
     return k + np.where(until, here <= t, here < t)
 
 
-def start_walk(
-    flags: frozenset[str], r: Ray, cell: np.ndarray, window: structs.Window, limit: float
-) -> tuple[np.ndarray, np.ndarray]:
+def start_walk(flags, r, cell, window, limit):
     """Return boundaries crossed (2, M) and distance (M,) at the ray's origin, or at the first cell inside the grid.
 
     The distance is limit where a ray from outside does not meet the grid before limit.
@@ -93,9 +89,7 @@ def start_walk(
     return k, t
 
 
-def start_casts(
-    flags: frozenset[str], r: Ray, cell: np.ndarray, window: structs.Window, limit: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def start_casts(flags, r, cell, window, limit):
     """Return the start of all walks, and the ranges that are known before any cell is read.
 
     Returns:
@@ -133,7 +127,7 @@ def angle_bin(direction: np.ndarray, bins: int) -> np.ndarray:
     return np.where(index >= bins, index - bins, index)
 
 
-def expected_range(flags: frozenset[str], t: np.ndarray, scale: structs.RangeScale) -> np.ndarray:
+def expected_range(flags, t, scale):
     """Convert distances in cells to metres: exactly range_max where no obstacle is nearer, or none with AMCL_LINES."""
     if "AMCL_LINES" in flags:
         return np.where(t == scale.limit, scale.range_max, t * scale.resolution)

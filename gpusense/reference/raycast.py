@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface import structs
 from gpusense.reference.ray import crossed, make_ray, start_casts
 from gpusense.reference.rectangles import OCCUPIED, padded_in_groups
 
@@ -16,7 +15,7 @@ from gpusense.reference.rectangles import OCCUPIED, padded_in_groups
 GROUP = 8
 
 
-def sectors_of(flags: frozenset[str]) -> int:
+def sectors_of(flags):
     """Return the sectors of each quadrant."""
     return 4 if "SECTORS_4" in flags else 2 if "SECTORS_2" in flags else 1
 
@@ -35,10 +34,7 @@ def sector_of(sectors: int, speed_x: np.ndarray, speed_y: np.ndarray) -> np.ndar
     return 2 * steep + (speed_y > bound * speed_x)
 
 
-def cast_ray(
-    flags: frozenset[str], map_table: np.ndarray, window: structs.Window, cell: np.ndarray, pose: np.ndarray,
-    ray: np.ndarray, limit: float, caster: structs.Caster,
-) -> np.ndarray:  # fmt: skip
+def cast_ray(flags, map_table, window, cell, pose, ray, limit, caster):
     """Return the distance in cells to the first occupied cell, limit where none is nearer.
 
     The arguments are those of ``dda.cast_ray``, with padded planes of empty rectangles, flat, as ``map_table``.

@@ -155,10 +155,7 @@ def short_of(u: np.ndarray, expected: np.ndarray, decay: np.ndarray) -> np.ndarr
     return np.minimum(drawn, expected)
 
 
-def reading_of(
-    flags: frozenset[str], u: np.ndarray, v: np.ndarray, expected: np.ndarray, mixture: np.ndarray, bins: np.ndarray,
-    range_max: float,
-) -> np.ndarray:  # fmt: skip
+def reading_of(flags, u, v, expected, mixture, bins, range_max):
     """Return readings drawn from the mixture; infinity without return, NaN where no reading is possible.
 
     ``flags``: flags of the shape of hits; ``u``: numbers in (0, 1) that choose the component; ``v``: numbers in (0, 1)

@@ -25,7 +25,7 @@ def is_chosen(rank: np.ndarray, informative: int, chosen: int) -> np.ndarray:
     return nearest * informative // chosen == rank
 
 
-def reading_of(flags: frozenset[str], ranges: np.ndarray, beam: np.ndarray, beams: int) -> np.ndarray:
+def reading_of(flags, ranges, beam, beams):
     """Return (beams,) readings, of some beams, in float64."""
     return ranges[beam[:beams] if "SOME_BEAMS" in flags else slice(beams)].astype(np.float64)
 
@@ -63,11 +63,7 @@ def fill_rays(
     reading[count : rules.places] = np.nan
 
 
-def place_reading(
-    flags: frozenset[str], ranges: np.ndarray, beam: np.ndarray, vector: np.ndarray, point: np.ndarray,
-    point_low: np.ndarray, reading: np.ndarray, guard: np.ndarray, constant_term: np.ndarray, resolution: float,
-    rules: structs.ReadingRules,
-) -> None:  # fmt: skip
+def place_reading(flags, ranges, beam, vector, point, point_low, reading, guard, constant_term, resolution, rules):
     """Put readings of some beams in their places.
 
     A max reading is inf. ``constant_term`` is that of max readings without a place, -inf with a range where none is
@@ -100,7 +96,7 @@ def place_inputs(
     place_poses(flags, poses, pose_cell, pose, pose_low, pose_status, frame, window, particles)  # fmt: skip
 
 
-def placed_value(flags: frozenset[str], z: np.ndarray, rules: structs.ReadingRules) -> np.ndarray:
+def placed_value(flags, z, rules):
     """Return readings as ranges, infinity for max readings that count, else nan."""
     far = is_max(z, rules.farthest) & (rules.max_readings != MAX_LEFT_OUT)
     return np.where(is_hit(z, rules.nearest, rules.farthest), z, np.where(far, np.inf, np.nan))

@@ -16,7 +16,7 @@ import pytest
 from support.cache_folders import BLOCKED, blocked, contents, entries_in
 
 from gpusense.backends import BackendInfo, cache, scratch
-from gpusense.backends.cache import BinaryCache, discard_entry, load_entry, pack, store_entry, unpack, write_files
+from gpusense.backends.cache import discard_entry, load_entry, pack, program_key, store_entry, unpack, write_files
 
 
 @pytest.mark.parametrize(
@@ -53,19 +53,18 @@ def alarm():
 
 
 def test_a_program_is_kept_and_found_again(place):
-    programs = BinaryCache(INFO)
-    assert programs.load("source", ["-a"]) is None
-    programs.store("source", ["-a"], b"binary")
-    assert programs.load("source", ["-a"]) == b"binary"
+    assert load_entry("key") is None
+    store_entry("key", b"binary")
+    assert load_entry("key") == b"binary"
     assert [path.name for path in place.iterdir()] == [scratch.OWN]
     assert stat.S_IMODE((place / scratch.OWN).stat().st_mode) == 0o700
     assert sorted(path.suffix for path in (place / scratch.OWN).iterdir()) == [".TAG", ".gpusense"]
 
 
 @pytest.mark.parametrize("other", ["source", "options", "driver", "device", "processor"])
-def test_entries_are_keyed_by_device_driver_options_and_source(place, monkeypatch, other):
+def test_programs_are_keyed_by_device_driver_options_and_source(monkeypatch, other):
     base = dataclasses.replace(INFO, kind="cpu") if other == "processor" else INFO
-    BinaryCache(base).store("source", ["-a"], b"binary")
+    kept = program_key(base, "source", ["-a"])
     if other == "processor":
         monkeypatch.setattr(cache, "fingerprint", lambda: "another")
     info = {
@@ -73,18 +72,17 @@ def test_entries_are_keyed_by_device_driver_options_and_source(place, monkeypatc
         "device": BackendInfo("opencl:0:0", "opencl", "Other device", "gpu", "Driver 1", 1, 1, True),
     }.get(other, base)
     source = "changed" if other == "source" else "source"
-    assert BinaryCache(info).load(source, ["-b" if other == "options" else "-a"]) is None
+    assert program_key(info, source, ["-b" if other == "options" else "-a"]) != kept
 
 
 @pytest.mark.parametrize("damage", [b"", b"short", b"gpusense entry 3\n" + bytes(64) + b"binary"])
 def test_a_damaged_entry_is_none_and_is_written_again(place, damage):
-    programs = BinaryCache(INFO)
-    programs.store("source", [], b"binary")
+    store_entry("source", b"binary")
     (entry,) = entries_in(place)
     entry.write_bytes(damage)
-    assert programs.load("source", []) is None
-    programs.store("source", [], b"binary")
-    assert programs.load("source", []) == b"binary" and entries_in(place) == [entry]
+    assert load_entry("source") is None
+    store_entry("source", b"binary")
+    assert load_entry("source") == b"binary" and entries_in(place) == [entry]
 
 
 def test_two_entries_that_were_exchanged_are_none(place):
@@ -179,14 +177,13 @@ def test_an_entry_of_another_user_is_none(place):
 
 def test_the_cache_is_bounded_and_evicts_the_oldest(place, monkeypatch):
     monkeypatch.setattr(cache, "MAX_ENTRIES", 3)
-    programs = BinaryCache(INFO)
     for number in range(5):
-        programs.store(f"source {number}", [], b"binary")
+        store_entry(f"source {number}", b"binary")
         for entry in entries_in(place):
             os.utime(entry, (entry.stat().st_atime, entry.stat().st_mtime - 10))
-    assert [programs.load(f"source {number}", []) for number in range(5)] == [None, None, *[b"binary"] * 3]
+    assert [load_entry(f"source {number}") for number in range(5)] == [None, None, *[b"binary"] * 3]
     monkeypatch.setattr(cache, "MAX_BYTES", 200)
-    programs.store("large", [], bytes(60))
+    store_entry("large", bytes(60))
     assert len(entries_in(place)) == 1
 
 
@@ -234,9 +231,9 @@ def test_unfinished_files_of_killed_processes_are_removed(place):
 
 def test_the_cache_can_be_switched_off(place, monkeypatch):
     monkeypatch.setenv("GPUSENSE_CACHE", "off")
-    BinaryCache(INFO).store("source", [], b"binary")
+    store_entry("source", b"binary")
     assert not place.exists()
-    assert BinaryCache(INFO).load("source", []) is None
+    assert load_entry("source") is None
 
 
 def test_a_folder_that_is_removed_meanwhile_is_made_again(place):

@@ -16,7 +16,7 @@ import pyopencl as cl
 
 from gpusense.backends import processor
 from gpusense.backends.base import Adopted, Backend, BackendInfo, Buffer, ProcessBound
-from gpusense.backends.cache import BinaryCache
+from gpusense.backends.cache import discard_entry, load_entry, program_key, store_entry
 from gpusense.backends.opencl import memory, pocl
 from gpusense.backends.opencl.launch import Launch, OpenCLRecording, new_kernel, watch, without_caches
 from gpusense.backends.opencl.memory import (
@@ -41,15 +41,6 @@ _CLEARED_WORDS = 1 << 28
 # Copies to a GPU of these sizes [bytes] take NVIDIA's driver nearly twice as long if they do not block.
 _SLOW = (64 << 10, 256 << 10)
 _ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
-
-
-def _binary_cache(info: BackendInfo, device: cl.Device) -> BinaryCache | None:
-    """Return the cache of programs; None for PoCL: its kernels are kept singly.
-
-    For a binary, PoCL would compile every kernel of the program for work-groups of any size, which takes three times as
-    long as the rest of the build.
-    """
-    return None if pocl.is_pocl(device) else BinaryCache(info)
 
 
 class OpenCLBackend(ProcessBound, Backend):
@@ -80,8 +71,6 @@ class OpenCLBackend(ProcessBound, Backend):
         self._launchers: dict[tuple[str, frozenset[str]], Launch] = {}
         # Programs with the keys of their entries in the cache.
         self._programs: dict[tuple[str, frozenset[str]], tuple[cl.Program, str]] = {}
-        self._keys = BinaryCache(info)
-        self._cache = _binary_cache(info, device)
         self._pocl = pocl.pocl_kernels() if pocl.is_pocl(device) else None
         self._of_bitcode = pocl.takes_bitcode(device)
         # The last launch, if its groups leave a processor to the calling thread.
@@ -279,10 +268,11 @@ class OpenCLBackend(ProcessBound, Backend):
             raise ValueError(f"{file}.cl: computes in float64, which {self.info.name} does not have")
         source = assemble(file, flags)
         # Bitcode belongs to the version of LLVM, which the platform's version names.
-        key = self._keys.key(
-            source, [*self.options, self._device.platform.version] if self._of_bitcode else self.options
-        )
-        if (program := self._kept(source)) is not None:
+        version = [self._device.platform.version] if self._of_bitcode else []
+        key = program_key(self.info, source, [*self.options, *version])
+        # PoCL's kernels are kept singly. For a binary, it would compile every kernel of the program for work-groups of
+        # any size, which takes three times as long as the rest of the build.
+        if self._pocl is None and (program := self._kept(key)) is not None:
             return program, key
         try:
             if self._pocl is not None and self._of_bitcode:
@@ -292,10 +282,11 @@ class OpenCLBackend(ProcessBound, Backend):
         except cl.RuntimeError as error:
             log = with_places(str(error), source)
             raise RuntimeError(f"{file}.cl did not compile on {self.info.name}: {log}") from error
-        if self._cache is not None:
+        if self._pocl is None:
             binaries: Any = program.get_info(cl.program_info.BINARIES)
             devices: Any = program.get_info(cl.program_info.DEVICES)
-            self._cache.store(source, self.options, binaries[devices.index(self._device)])
+            if binary := binaries[devices.index(self._device)]:
+                store_entry(key, binary)
         return program, key
 
     def _built_of_bitcode(self, compiled: pocl.PoclKernels, file: str, source: str, key: str) -> cl.Program:
@@ -309,15 +300,15 @@ class OpenCLBackend(ProcessBound, Backend):
             lambda bitcode: self._built(cl.Program(self._context, [self._device], [bitcode]), options),
         )
 
-    def _kept(self, source: str) -> cl.Program | None:
+    def _kept(self, key: str) -> cl.Program | None:
         """Return the program that an earlier run compiled; None if the driver accepts no stored one."""
-        binary = None if self._cache is None else self._cache.load(source, self.options)
-        if self._cache is None or binary is None:
+        binary = load_entry(key)
+        if binary is None:
             return None
         try:
             return self._built(cl.Program(self._context, [self._device], [binary]))
         except cl.Error:
-            self._cache.discard(source, self.options)
+            discard_entry(key)
             return None
 
     def _built(self, program: cl.Program, options: list[str] | None = None) -> cl.Program:

@@ -12,11 +12,8 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Precision
 from gpusense.backends import Selection, arrays
-from gpusense.backends.base import Buffer
 from gpusense.interface.constants import NEARBY, NEGLIGIBLE, SERIES, VON_MISES, WAVES, WRAPS, log_weight
 from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import with_lanes_flag
-from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.structs import HeadingTerms, PositionTerms, packed
 from gpusense.models.point.base import (
@@ -32,7 +29,6 @@ from gpusense.models.point.base import (
     two_parts,
 )
 from gpusense.models.point.sampling import HEADING, POSITION, draws_at, mounted, standard_normal, von_mises
-from gpusense.models.poses import Part, Poses
 from gpusense.reference.relative import wrapped_difference
 from gpusense.world.sensor_parameters import HeadingParameters, PositionParameters, check_covariance
 
@@ -118,18 +114,9 @@ class PositionModel(PointModel):
         left_out = [rand_omission("the fix is outside the region")] if impossible and self.parameters.z_rand else []
 
         mount_x, mount_y = self.parameters.mount
-
-        def program(some: Poses, part: Part, log_p: Buffer) -> Program:
-            fix = dict(origin_x=x, origin_y=y, mount_x=mount_x, mount_y=mount_y)
-            place, placing = self._relative(some, part, "place_relative", fix)
-            count, in_lanes = part[1] - part[0], with_lanes_flag(self._backend.info.lanes, "score_position", flags)
-            score = launch(
-                "score_position", in_lanes, (count,), place=place,
-                terms=self._workspace.upload("terms", packed([terms], self._real)), log_p=log_p, particles=count,
-                temperature=self.temperature,
-            )  # fmt: skip
-            return (*placing, score)
-
+        numbers = dict(origin_x=x, origin_y=y, mount_x=mount_x, mount_y=mount_y)
+        uploads = dict(terms=packed([terms], self._real))
+        program = self._programmer("place_relative", numbers, "score_position", flags, uploads)
         return cast(np.ndarray, self._score(poses, out, program, left_out))
 
     def sample(
@@ -266,17 +253,8 @@ class HeadingModel(PointModel):
         turned = wrapped_difference(np.array([self.parameters.offset]), (zero, zero))
         high, low = wrapped_difference(np.array([reading]), turned)
         target = dict(target=float(high[0]), target_low=float(low[0]))
-
-        def program(some: Poses, part: Part, log_p: Buffer) -> Program:
-            residual, wrapping = self._relative(some, part, "wrap_headings", target)
-            flags = with_lanes_flag(self._backend.info.lanes, "score_heading", self._flags)
-            count = part[1] - part[0]
-            score = launch(
-                "score_heading", flags, (count,), residual=residual, terms=self._terms_buffer, waves=self._waves_buffer,
-                log_p=log_p, particles=count, kind=self._kind, temperature=self.temperature,
-            )  # fmt: skip
-            return (*wrapping, score)
-
+        density = dict(terms=self._terms_buffer, waves=self._waves_buffer, kind=self._kind)
+        program = self._programmer("wrap_headings", target, "score_heading", self._flags, {}, **density)
         return cast(np.ndarray, self._score(poses, out, program, []))
 
     def sample(self, poses: AnyArray, seed: int = 0, *, step: int = 0) -> np.ndarray:

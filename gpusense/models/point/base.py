@@ -18,6 +18,7 @@ from gpusense.backends.arrays import Result
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import PartialResult, Workspace
 from gpusense.interface.flags import flags_if
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, flags_of, launch
 from gpusense.interface.plan import ORDINARY_HEADINGS, Omission, Plan
 from gpusense.models.arguments import Pickled, real_dtype
@@ -27,6 +28,8 @@ from gpusense.reference import relative
 
 Programmer = Callable[[Poses, Part, Buffer], Program]
 """Function that makes the program that writes log p of some poses into a buffer."""
+# By the kernel of the file ``relative``: the name of its result, and numbers for each pose.
+_PLACED = {"place_relative": ("place", 4), "wrap_headings": ("residual", 2)}
 ORIGIN = dict(origin_x=0.0, origin_y=0.0, mount_x=0.0, mount_y=0.0)
 MISSING = Omission("reading", "it is not finite, so it is missing", "everything but a look at the poses")
 
@@ -145,13 +148,35 @@ class PointModel(Pickled):
             finish(space, on_device)
         return result.user_array()
 
+    def _programmer(
+        self, place: str, numbers: dict[str, float], kernel: str, flags: frozenset[str], uploads: dict[str, np.ndarray],
+        **arguments: Any,
+    ) -> Programmer:  # fmt: skip
+        """Return the function that makes the program of a kernel that scores places or residuals; see ``_relative``.
+
+        ``uploads``: arrays to copy with each part, by the kernel's arguments; ``arguments``: its other arguments.
+        """
+        flags = with_lanes_flag(self._backend.info.lanes, kernel, flags)
+
+        def program(poses: Poses, part: Part, log_p: Buffer) -> Program:
+            placed, placing = self._relative(poses, part, place, numbers)
+            count, space = part[1] - part[0], self._workspace
+            given = {_PLACED[place][0]: placed} | {name: space.upload(name, one) for name, one in uploads.items()}
+            score = launch(
+                kernel, flags, (count,), **given, **arguments, log_p=log_p, particles=count,
+                temperature=self.temperature,
+            )  # fmt: skip
+            return (*placing, score)
+
+        return program
+
     def _relative(self, poses: Poses, part: Part, kernel: str, numbers: dict[str, float]) -> tuple[Buffer, Program]:
         """Return the places or residuals of some poses, and the launch of the file ``relative`` that computes them.
 
         ``part``: the first of them and the one after the last; ``kernel``: ``"place_relative"`` or ``"wrap_headings"``.
         """
         backend, space, count = self._backend, self._workspace, part[1] - part[0]
-        name, width = {"place_relative": ("place", 4), "wrap_headings": ("residual", 2)}[kernel]
+        name, width = _PLACED[kernel]
         flags, source = poses.flags(poses.corners(part, backend, space)), poses.buffer(backend, space, part)
         if source is None:
             assert poses.host is not None

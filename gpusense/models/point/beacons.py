@@ -12,11 +12,8 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Precision
 from gpusense.backends import Selection, arrays
-from gpusense.backends.base import Buffer
 from gpusense.interface.constants import BEACON, FARTHEST, NORMAL, STUDENT_T, TWO_NORMALS
 from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import with_lanes_flag
-from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
 from gpusense.interface.structs import BeaconTerms, packed
 from gpusense.models.point.base import (
@@ -31,7 +28,6 @@ from gpusense.models.point.base import (
     two_parts,
 )
 from gpusense.models.point.sampling import BEACONS, draws_at, mounted, normal_within, within
-from gpusense.models.poses import Part, Poses
 from gpusense.world.range_causes import RandomDensity
 from gpusense.world.sensor_parameters import BeaconParameters
 
@@ -120,20 +116,11 @@ class BeaconModel(PointModel):
             return cast(np.ndarray, self._score(poses, out, None, left_out))
 
         (origin_x, origin_y), (mount_x, mount_y) = self._origin, self.parameters.mount
-        flags = with_lanes_flag(self._backend.info.lanes, "score_beacons", self._flags)
-
-        def program(some: Poses, part: Part, log_p: Buffer) -> Program:
-            middle = dict(origin_x=origin_x, origin_y=origin_y, mount_x=mount_x, mount_y=mount_y)
-            place, placing = self._relative(some, part, "place_relative", middle)
-            particles = part[1] - part[0]
-            score = launch(
-                "score_beacons", flags, (particles,), place=place,
-                beacon=self._workspace.upload("beacon", beacon), terms=self._terms_buffer, series=self._series_buffer,
-                log_p=log_p, particles=particles, beacons=count, count=self._count, kind=self._kind,
-                temperature=self.temperature,
-            )  # fmt: skip
-            return (*placing, score)
-
+        program = self._programmer(
+            "place_relative", dict(origin_x=origin_x, origin_y=origin_y, mount_x=mount_x, mount_y=mount_y),
+            "score_beacons", self._flags, dict(beacon=beacon), terms=self._terms_buffer, series=self._series_buffer,
+            beacons=count, count=self._count, kind=self._kind,
+        )  # fmt: skip
         return cast(np.ndarray, self._score(poses, out, program, left_out, items=count))
 
     def _arguments(self) -> dict[str, Any]:

@@ -108,7 +108,7 @@ def test_reference_kernels_have_the_arguments_of_their_row(kernel: str) -> None:
 
 def warp_types(precision: type) -> Any:
     """Return the types of Warp's kernels in a precision."""
-    return importlib.import_module(f"{warp_module('tiles').__package__}.prelude").precision(
+    return importlib.import_module(f"{warp_module('ray').__package__}.prelude").precision(
         frozenset({"FLOAT64"} if precision is np.float64 else ())
     )
 

@@ -37,6 +37,7 @@ FLAGS = {
     "IN_LANES": "a work-item computes 16 particles or beams at once: vectors on PoCL, loops on Warp's processor device",
     "IN_TEAMS": "the work-items of a group share one item, as matches of scans do on GPUs",
     "SMALL_TEAMS": "an eighth of them share it, where an item has few points or groups hold fewer work-items",
+    "READ_AHEAD": "cells of several points are read at once, since GPUs wait for each read",
     "SHARED_RAYS": "several readings have the same bearing",
     "ALL_READINGS": "missing (nan) and max (inf) readings are evaluated too, as they are when nothing is left out",
     "HUGE_HEADINGS": "some heading is beyond 2^20 rad",

@@ -42,24 +42,44 @@ _TILES, _MOST_TABLE_CELLS = (4, 2, 1), 1 << 25
 _MOST_BLOCKS = {"cpu": 1 << 25, "gpu": 1 << 27}
 # Rounding of a log-likelihood, in steps for each hit.
 _ROUNDING = 2e-3
+# Larger than the number of any pose.
+_FAR = np.iinfo(np.int64).max
 
 
 class Candidates(NamedTuple):
-    """Poses that a search found, in falling order of score, and the index of the likeliest.
+    """Poses that a search found for S scans, one scan after the other, in falling order of score.
 
     Attributes:
         poses: (M, 3) in the world.
         score: (M,) from 0 to 1, the mean of the end points.
         log_p: (M,) log-likelihoods by the model, NaN where they were not computed.
-        best: Index of the likeliest.
+        first: (S,) row of the first pose of each scan.
+        best: (S,) row of the likeliest pose of each scan.
         evaluated: Poses and blocks of poses that were evaluated, on average over the scans of a search.
     """
 
     poses: np.ndarray
     score: np.ndarray
     log_p: np.ndarray
-    best: int
+    first: np.ndarray
+    best: np.ndarray
     evaluated: int
+
+    @property
+    def scan(self) -> np.ndarray:
+        """(M,) scan of each pose."""
+        return np.arange(len(self.first)).repeat(np.diff(self.first, append=len(self.poses)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Candidates]) -> Candidates:
+        """Return the poses of several searches, at least one."""
+        if len(parts) == 1:
+            return parts[0]
+        begins = np.cumsum([0, *(len(part.poses) for part in parts[:-1])])
+        values = [np.concatenate([getattr(part, name) for part in parts]) for name in ("poses", "score", "log_p")]
+        rows = [np.concatenate([begin + getattr(part, name) for begin, part in zip(begins, parts, strict=True)])
+                for name in ("first", "best")]  # fmt: skip
+        return cls(*values, *rows, sum(part.evaluated * len(part.first) for part in parts) // len(rows[0]))
 
 
 class FieldSearch:
@@ -121,16 +141,18 @@ class FieldSearch:
     def _step(self) -> float:
         return max(self._high - self._low, 1e-300)
 
-    def is_free(self, pose: np.ndarray) -> bool:
-        """Return whether a pose is in a free cell."""
-        col, row = np.floor(self.grid.world_to_cells(pose[None, :2])[0]).astype(int)
-        inside = 0 <= row < self.grid.shape[0] and 0 <= col < self.grid.shape[1]
-        return bool(inside and self._free[row, col])
+    def is_free(self, poses: np.ndarray) -> np.ndarray:
+        """Return (S,) whether poses (S, 3) are in free cells."""
+        col, row = np.floor(self.grid.world_to_cells(poses[:, :2])).T.astype(int)
+        rows, cols = self.grid.shape
+        inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
+        inside[inside] = self._free[row[inside], col[inside]]
+        return inside
 
     def find(
         self, ranges: np.ndarray, points: Sequence[np.ndarray], searched: PoseGrid, allowed: np.ndarray | None,
         depth: float,
-    ) -> list[Candidates]:  # fmt: skip
+    ) -> Candidates:  # fmt: skip
         """Return the poses of each scan down to ``depth`` below the best score, and the likeliest by the model.
 
         ``ranges`` are (S, K) readings [m], ``points`` (M, 2) end points of the hits of each scan on the robot [m], at
@@ -141,47 +163,41 @@ class FieldSearch:
         cells = [part / self.grid.resolution for part in points]
         most = [math.ceil(depth * TOP * len(part)) for part in points]
         if self._tiles:
-            return [
+            return Candidates.joined([
                 self._find_between(model, scan, part, searched, allowed, slack)
                 for scan, part, slack in zip(ranges, cells, most, strict=True)
-            ]
+            ])  # fmt: skip
         level = self._search.first_level(cells, searched)
         most_blocks = _MOST_BLOCKS[self._search.tables.backend.info.kind]
         each = max(most_blocks // max(searched.count >> 2 * level, 1), 1)
         parts = [slice(begin, begin + each) for begin in range(0, len(points), each)]
-        return [
-            one
-            for part in parts
-            for one in self._find_on(model, ranges[part], cells[part], most[part], searched, allowed)
-        ]
+        return Candidates.joined([
+            self._find_on(model, ranges[part], cells[part], most[part], searched, allowed) for part in parts
+        ])  # fmt: skip
 
     def _find_on(
         self, model: LikelihoodFieldModel, ranges: np.ndarray, cells: Sequence[np.ndarray], most: Sequence[int],
         searched: PoseGrid, allowed: np.ndarray | None,
-    ) -> list[Candidates]:  # fmt: skip
+    ) -> Candidates:  # fmt: skip
         """Return the best poses of scans in a field of the nearest cell's distance."""
-        scans, hits = len(cells), np.array([len(part) for part in cells])
-        start, headings = searched.start.repeat(scans, axis=0), searched.headings.repeat(scans, axis=0)
+        scans, hits = len(cells), np.array([*map(len, cells)])
+        start, headings = (
+            np.broadcast_to(part, (scans, part.shape[1])) for part in (searched.start, searched.headings)
+        )
         grid = PoseGrid(start, headings, searched.height, searched.width)
         found = self._search.find(cells, grid, slack=np.maximum(hits, most), allowed=allowed)
-        poses = to_world(self.grid, grid.poses(found, self.stride))
-        first = np.append(found.best, len(poses))
+        poses, first = to_world(self.grid, grid.poses(found, self.stride)), found.best
         # Rounding moves a score by half a step for each hit.
-        near = [
-            np.flatnonzero(found.score[begin:end] >= found.score[begin] - count) + begin
-            for begin, end, count in zip(first[:-1], first[1:], hits, strict=True)
-        ]
-        log_p = log_likelihoods_of(model, [poses[rows] for rows in near], ranges)
+        near = found.score >= (found.score[first] - hits)[found.scan]
+        rows = padded_rows(first, np.add.reduceat(near, first, dtype=np.intp))
+        log_p = log_likelihoods_of(model, poses, rows, ranges)
         known = np.full(len(poses), np.nan)
-        for rows, values in zip(near, log_p, strict=True):
-            known[rows] = values
-        return [
-            Candidates(
-                poses[begin:end], found.score[begin:end] / (TOP * count), known[begin:end],
-                int(rows[_first_of_largest(values, found, rows)] - begin), found.evaluated // scans,
-            )
-            for begin, end, count, rows, values in zip(first[:-1], first[1:], hits, near, log_p, strict=True)
-        ]  # fmt: skip
+        known[rows] = log_p
+        # The first of equal ones by row, then column, then heading.
+        place = (found.row.astype(np.int64) * grid.width + found.col) * headings.shape[1] + found.heading
+        likeliest = np.where(log_p == log_p.max(axis=1, keepdims=True), place[rows], _FAR).argmin(axis=1)
+        score = found.score / (TOP * hits)[found.scan]
+        return Candidates(poses, score, known, first, rows[np.arange(scans), likeliest], found.evaluated // scans)
 
     def _find_between(
         self, model: LikelihoodFieldModel, ranges: np.ndarray, cells: np.ndarray, searched: PoseGrid,
@@ -218,7 +234,9 @@ class FieldSearch:
         score = self._steps(model, ranges, len(cells), poses)
         order = np.lexsort((heading, col, row, -score))
         order = order[score[order] >= score.max() - most]
-        return Candidates(poses[order], score[order] / (TOP * len(cells)), np.full(len(order), np.nan), 0, evaluated)
+        first = np.zeros(1, np.intp)
+        unknown = np.full(len(order), np.nan)
+        return Candidates(poses[order], score[order] / (TOP * len(cells)), unknown, first, first, evaluated)
 
     def _steps(self, model: LikelihoodFieldModel, ranges: np.ndarray, hits: int, poses: np.ndarray) -> np.ndarray:
         """Return the log-likelihoods of the hits at poses as scores."""
@@ -231,13 +249,23 @@ class FieldSearch:
         return steps
 
 
+def padded_rows(first: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Return (S, N) rows of poses of S scans: each ``count`` of them from ``first`` on, the last one repeatedly.
+
+    N is a power of two, so that calls of a model repeat their sizes.
+    """
+    most = 1 << (int(count.max()) - 1).bit_length()
+    rows: np.ndarray = first[:, None] + np.minimum(np.arange(most), count[:, None] - 1)
+    return rows
+
+
 def log_likelihoods_of(
-    model: LikelihoodFieldModel, poses: Sequence[np.ndarray], ranges: np.ndarray
-) -> list[np.ndarray]:
-    """Return the log-likelihoods of the poses (M_s, 3) of each of S scans, by one call."""
-    longest = max(map(len, poses))
-    padded = np.stack([np.concatenate([part, part[:1].repeat(longest - len(part), axis=0)]) for part in poses])
-    return [values[: len(part)] for values, part in zip(model.log_likelihood(padded, ranges), poses, strict=True)]
+    model: LikelihoodFieldModel, poses: np.ndarray, rows: np.ndarray, ranges: np.ndarray
+) -> np.ndarray:
+    """Return the log-likelihoods of some rows (S, N) of poses (M, 3), of each of S scans."""
+    if len(rows) == 1:
+        return model.log_likelihood(poses[rows[0]], ranges[0])[None]
+    return model.log_likelihood(poses[rows], ranges)
 
 
 def _complete(run: Callable[[slice, int], Found], headings: slice, floor: int) -> Iterator[tuple[slice, Found]]:
@@ -279,13 +307,6 @@ def field_search(model: LikelihoodFieldModel, stride: int) -> FieldSearch:
     if search is None:
         search = kept[stride] = FieldSearch(model, stride)
     return search
-
-
-def _first_of_largest(log_p: np.ndarray, found: Found, rows: np.ndarray) -> int:
-    """Return the index of the largest log-likelihood; ties by row, then column, then heading."""
-    likeliest = np.flatnonzero(log_p == log_p.max())
-    chosen = rows[likeliest]
-    return int(likeliest[np.lexsort((found.heading[chosen], found.col[chosen], found.row[chosen]))[0]])
 
 
 def _tile_numbers(points: np.ndarray, headings: np.ndarray, start: np.ndarray, tiles: int) -> np.ndarray:

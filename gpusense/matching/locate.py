@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any, Literal, overload
@@ -11,14 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense._util.angles import wrapped
-from gpusense.matching.field_search import Candidates, FieldSearch, field_search, log_likelihoods_of, searchable
-from gpusense.matching.location import NAMES, Location, PoseMode, Status, location_evidence, probability_right
+from gpusense.matching.field_search import (
+    Candidates,
+    field_search,
+    log_likelihoods_of,
+    padded_rows,
+    searchable,
+)
+from gpusense.matching.location import NAMES, Location, PoseMode, Status, location_evidence, probabilities_right
 from gpusense.matching.pose_grid import PoseGrid, distinct_poses
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.models.scan.rules import BeamChoice
 from gpusense.tables.world_map import check_one_map
-from gpusense.world.frames import ray_vectors
 from gpusense.world.scanner import Reading, classify, float64_readings
 
 # Modes are searched down to this share of the largest score below the best pose.
@@ -136,77 +141,54 @@ def locate_scan(
     rows, cols = (-(-size // stride) for size in model.grid.shape)
     headings = 2 * math.pi / turns * np.arange(turns)[None]
     searched = PoseGrid(np.array([[0.5, 0.5]]), headings, rows, cols)
-    hits, points = end_points_of(model, values)
-    options = dict(resolution=stride * cell, angle=2 * math.pi / turns, poses=searched.count)
-    located: list[Location] = [_nothing(options)] * len(values)
-    chosen = [number for number, part in enumerate(points) if len(part)]
-    if chosen:
+    is_hit, points = end_points_of(model, values)
+    options: dict[str, Any] = dict(
+        resolution=stride * cell, angle=2 * math.pi / turns, poses=searched.count, evaluated=0
+    )  # fmt: skip
+    located = [_nothing(options)] * len(values)
+    chosen = np.array([number for number, part in enumerate(points) if len(part)], np.intp)
+    if len(chosen):
+        values, is_hit = values[chosen], is_hit[chosen]
         with search.lock:
             found = search.find(
-                values[chosen], [points[n] for n in chosen], searched, search.free if positions == "free" else None,
-                _DEPTH,
-            )  # fmt: skip
-        best = _modes(model, values[chosen], [hits[n] for n in chosen], search, found, modes)
-        poses = np.array([one[0].pose for one in best])
+                values, [points[n] for n in chosen], searched, search.free if positions == "free" else None, _DEPTH
+            )
+        radius = max(_MODE_RADIUS, 2 * stride * cell)
+        scan = found.scan
+        rows = distinct_poses(found.poses, modes, radius, _MODE_ANGLE, scan, found.best)
+        refined = None
         if refine:
-            near = _refined(search.smooth, values[chosen], poses, 2 * stride * cell, 4 * math.pi / turns)
-            kept = [positions == "all" or search.is_free(pose) for pose in near]
-            poses = np.where(np.array(kept)[:, None], near, poses)
-        for number, pose, said, result in zip(chosen, poses, best, found, strict=True):
-            located[number] = _location(pose if refine else said[0].pose, said, min_probability, result, options)
+            poses = found.poses[found.best]
+            near = _refined(search.smooth, values, poses, 2 * stride * cell, 4 * math.pi / turns)
+            refined = np.where((search.is_free(near) | (positions == "all"))[:, None], near, poses)
+        first = np.searchsorted(scan[rows], np.arange(len(chosen)))
+        numbers = _mode_numbers(model, values, is_hit, search.caster, found, rows, first)
+        options["evaluated"] = found.evaluated
+        results = _locations(numbers, found.poses[rows], first, refined, min_probability, options)
+        for number, result in zip(chosen, results, strict=True):
+            located[number] = result
     return tuple(located) if several else located[0]
 
 
 def _nothing(options: dict[str, Any]) -> Location:
     """Return the result of a scan without hits."""
     none = np.full(len(NAMES), np.nan)
-    return Location(np.full(3, np.nan), 0.0, 0.0, 0.0, (), 0.0, none, "no match", evaluated=0, **options)
+    return Location(np.full(3, np.nan), 0.0, 0.0, 0.0, (), 0.0, none, "no match", **options)
 
 
-def _location(
-    pose: np.ndarray, modes: tuple[PoseMode, ...], least: float, found: Candidates, options: dict[str, Any]
-) -> Location:
-    """Return the result of a scan with modes."""
-    top = modes[0]
-    return Location(
-        pose, top.score, top.log_likelihood, top.agreement, modes, *_said(modes, least), evaluated=found.evaluated,
-        **options,
-    )  # fmt: skip
-
-
-def end_points_of(model: LikelihoodFieldModel, ranges: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return the indices of the hits of (S, K) readings that the model uses, and their (M, 2) end points on the robot.
+def end_points_of(model: LikelihoodFieldModel, ranges: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return which of (S, K) readings are hits that the model uses, and their (M, 2) end points on the robot, by scan.
 
     Points are in metres.
     """
-    scanner = model.scanner
+    scanner, rules = model.scanner, model._context.rules
     scanner._first_scans.look_at("ranges", ranges, math.hypot(model.grid.width, model.grid.height))
-    choice, vectors = BeamChoice.of(model.beams, scanner.count), ray_vectors(scanner.bearings, scanner.mount)
-    mount = np.array(scanner.mount[:2])
     is_hit = classify(ranges, scanner) == Reading.HIT
-    hits = [(hit if choice.every else choice.used(hit)).nonzero()[0] for hit in is_hit]
-    return hits, [scan[hit, None] * vectors[hit] + mount for scan, hit in zip(ranges, hits, strict=True)]
-
-
-def _modes(
-    model: LikelihoodFieldModel, ranges: np.ndarray, hits: Sequence[np.ndarray], search: FieldSearch,
-    found: Sequence[Candidates], most: int,
-) -> list[tuple[PoseMode, ...]]:  # fmt: skip
-    """Return the best pose of each scan and the other local maxima among its poses, by falling score."""
-    radius = max(_MODE_RADIUS, 2 * search.stride * search.grid.resolution)
-    chosen = [distinct_poses(one.poses, most, radius, _MODE_ANGLE, one.best) for one in found]
-    poses = [one.poses[rows] for one, rows in zip(found, chosen, strict=True)]
-    log_p = [one.log_p[rows] for one, rows in zip(found, chosen, strict=True)]
-    if any(np.isnan(values).any() for values in log_p):
-        log_p = log_likelihoods_of(model, poses, ranges)
-    shares = _shares(model, ranges, hits, search.caster, poses)
-    return [
-        tuple(
-            PoseMode(pose, float(one.score[row]), float(value), *map(float, share))
-            for row, pose, value, share in zip(rows, *parts, strict=True)
-        )
-        for one, rows, *parts in zip(found, chosen, poses, log_p, shares, strict=True)
-    ]
+    if not rules.choice.every:
+        is_hit = np.array([rules.choice.used(hit) for hit in is_hit]).reshape(is_hit.shape)
+    scan, beam = is_hit.nonzero()
+    points = ranges[scan, beam, None] * rules.vectors[beam] + np.array(scanner.mount[:2])
+    return is_hit, np.split(points, np.searchsorted(scan, np.arange(1, len(ranges))))
 
 
 def _refined(
@@ -214,42 +196,59 @@ def _refined(
 ) -> np.ndarray:
     """Return (S, 3) poses of maximal likelihood near starts, or starts that are too far from the maximum [m, rad]."""
     near: np.ndarray = smooth._climb(poses, ranges)[0]
-    near[:, 2] = [math.remainder(heading, 2 * math.pi) for heading in near[:, 2]]
-    off = near - poses
-    kept = (np.hypot(off[:, 0], off[:, 1]) <= farthest) & (np.abs(wrapped(off[:, 2])) <= most)
+    off, turn = near[:, :2] - poses[:, :2], wrapped(near[:, 2] - poses[:, 2])
+    near[:, 2] = wrapped(near[:, 2])
+    kept = ((off * off).sum(axis=1) <= farthest * farthest) & (np.abs(turn) <= most)
     return np.where(kept[:, None], near, poses)
 
 
-def _shares(
-    model: LikelihoodFieldModel, ranges: np.ndarray, hits: Sequence[np.ndarray], caster: RayCaster,
-    poses: Sequence[np.ndarray],
-) -> list[np.ndarray]:  # fmt: skip
-    """Return shares (M, 3) of each scan's hits at poses: as long as expected ranges, longer, and shorter."""
+def _mode_numbers(
+    model: LikelihoodFieldModel, ranges: np.ndarray, is_hit: np.ndarray, caster: RayCaster, found: Candidates,
+    rows: np.ndarray, first: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Return the numbers (R, 5) of the modes of scans, by the fields of :class:`PoseMode`.
+
+    ``rows`` (R,) are the modes among the poses that were found, ``first`` (S,) the first mode of each scan.
+    """
+    count = np.diff(first, append=len(rows))
+    scan, poses, log_p = np.arange(len(first)).repeat(count), found.poses[rows], found.log_p[rows]
+    if np.isnan(log_p).any():
+        at = padded_rows(first, count)
+        log_p[at] = log_likelihoods_of(model, poses, at, ranges)
     x, y, yaw = model.scanner.mount
-    everywhere = np.concatenate(poses)
-    cos, sin = np.cos(everywhere[:, 2]), np.sin(everywhere[:, 2])
-    sensors = everywhere + np.stack([cos * x - sin * y, sin * x + cos * y, np.full(len(cos), yaw)], axis=1)
-    each = [len(part) for part in poses]
-    scan, used = np.arange(len(poses)).repeat(each), np.unique(np.concatenate(hits))
-    is_hit = np.zeros((len(poses), ranges.shape[1]), bool)
-    is_hit[np.arange(len(hits)).repeat([*map(len, hits)]), np.concatenate(hits)] = True
-    off = ranges[:, used][scan] - caster.cast(sensors, model.scanner.bearings[used])
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    sensors = poses + np.stack([cos * x - sin * y, sin * x + cos * y, np.full(len(cos), yaw)], axis=1)
+    # A number of poses that other calls repeat.
+    padded = padded_rows(np.zeros(1, np.intp), np.array([len(rows)]))[0]
+    off = ranges[scan] - caster.cast(sensors[padded], model.scanner.bearings)[: len(rows)]
     tolerance = max(_AGREE_SIGMAS * model.parameters.sigma_hit, _AGREE_CELLS * model.grid.resolution)
-    is_hit = is_hit[:, used][scan]
-    longer, shorter = (np.count_nonzero(far & is_hit, axis=1) / np.count_nonzero(is_hit, axis=1)
+    hits = is_hit[scan]
+    longer, shorter = (np.count_nonzero(far & hits, axis=1) / np.count_nonzero(hits, axis=1)
                        for far in (off > tolerance, off < -tolerance))  # fmt: skip
-    return np.split(np.stack([1 - longer - shorter, longer, shorter], axis=1), np.cumsum(each)[:-1])
+    return np.stack([found.score[rows], log_p, 1 - longer - shorter, longer, shorter], axis=1)
 
 
-def _said(modes: tuple[PoseMode, ...], least: float) -> tuple[float, np.ndarray, Status]:
-    """Return the probability that the first mode is right, the evidence, and the status."""
-    evidence = location_evidence(modes, _DEPTH)
-    p_right = probability_right(evidence)
-    if p_right >= least:
-        return p_right, evidence, "found"
-    # Evaluate the pose as if it had no rival.
-    alone = probability_right(location_evidence(modes[:1], _DEPTH))
-    return p_right, evidence, "ambiguous" if alone >= least else "no match"
+def _locations(
+    numbers: np.ndarray, poses: np.ndarray, first: np.ndarray, refined: np.ndarray | None, least: float,
+    options: dict[str, Any],
+) -> list[Location]:  # fmt: skip
+    """Return the results of scans from the poses (R, 3) and numbers (R, 5) of their modes.
+
+    ``first`` (S,) are the rows of the first modes, ``refined`` (S, 3) the poses of results; None: the first modes.
+    """
+    evidence = location_evidence(numbers, first, _DEPTH)
+    p_right, alone = probabilities_right(evidence)
+    modes = [PoseMode(pose, *values) for pose, values in zip(poses, numbers.tolist(), strict=True)]
+    located = []
+    for n, (begin, end) in enumerate(itertools.pairwise([*first.tolist(), len(modes)])):
+        top = modes[begin]
+        # Evaluate a doubtful pose as if it had no rival.
+        status: Status = "found" if p_right[n] >= least else "ambiguous" if alone[n] >= least else "no match"
+        located.append(Location(
+            top.pose if refined is None else refined[n], top.score, top.log_likelihood, top.agreement,
+            tuple(modes[begin:end]), float(p_right[n]), evidence[n], status, **options,
+        ))  # fmt: skip
+    return located
 
 
 def likely_poses(model: LikelihoodFieldModel, ranges: NDArray[np.float64], count: int) -> NDArray[np.float64]:
@@ -269,5 +268,5 @@ def likely_poses(model: LikelihoodFieldModel, ranges: NDArray[np.float64], count
     rows, columns = (-(-size // stride) for size in grid.shape)
     searched = PoseGrid(np.array([[0.5, 0.5]]), 2 * math.pi / turns * np.arange(turns)[None], rows, columns)
     with search.lock:
-        poses = search.find(ranges[None], [points], searched, search.free, _LIKELY_DEPTH)[0].poses
+        poses = search.find(ranges[None], [points], searched, search.free, _LIKELY_DEPTH).poses
     return poses[distinct_poses(poses, count, _MODE_RADIUS, _MODE_ANGLE)]

@@ -8,8 +8,6 @@ on the maps of the same and of other places; right and wrong poses have equal we
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -121,12 +119,19 @@ _RIVAL_WEIGHTS = (1.87, 5.22)
 _LEAST = (3e-3, 1e-2, 1e-2)
 
 
-def location_evidence(modes: Sequence[PoseMode], depth: float) -> np.ndarray:
-    """Return the evidence (5,) on the first mode, see :data:`NAMES`; modes are searched down to ``depth``."""
-    best = modes[0]
-    rivals = [np.array([(best.score - mode.score) / depth, best.agreement - mode.agreement]) for mode in modes[1:]]
-    strongest = min(rivals, key=rival_odds, default=np.array([math.inf, best.agreement]))
-    return np.array([1 - best.score, best.through, best.short, *strongest])
+def location_evidence(modes: np.ndarray, first: np.ndarray, depth: float) -> np.ndarray:
+    """Return the evidence (S, 5) on the first mode of each scan, see :data:`NAMES`.
+
+    ``modes`` (R, 5) are numbers of :class:`PoseMode` in the order of its fields, ``first`` (S,) the rows of the scans'
+    first modes; modes are searched down to ``depth``.
+    """
+    scan = np.arange(len(first)).repeat(np.diff(first, append=len(modes)))
+    rivals = modes[first[scan]][:, [0, 2]] - modes[:, [0, 2]]
+    rivals[:, 0] /= depth
+    # A mode alone leads by its agreement.
+    rivals[first] = np.column_stack([np.full(len(first), np.inf), modes[first, 2]])
+    strongest = np.lexsort((_rival_odds(rivals), scan))[first]
+    return np.column_stack([1 - modes[first, 0], modes[first, 3:], rivals[strongest]])
 
 
 def explained_logs(evidence: np.ndarray) -> np.ndarray:
@@ -135,17 +140,18 @@ def explained_logs(evidence: np.ndarray) -> np.ndarray:
     return logs
 
 
-def rival_odds(gap_and_ahead: np.ndarray) -> float:
-    """Return the log odds of the first mode against another mode."""
-    gap, ahead = gap_and_ahead
-    return math.inf if math.isinf(gap) else float(_RIVAL_WEIGHTS[0] * gap + _RIVAL_WEIGHTS[1] * ahead)
+def _rival_odds(gap_and_ahead: np.ndarray) -> np.ndarray:
+    """Return the log odds (R,) of first modes against other modes."""
+    odds: np.ndarray = (_RIVAL_WEIGHTS * gap_and_ahead).sum(axis=-1)
+    return odds
 
 
-def probability_right(evidence: np.ndarray) -> float:
-    """Return the probability that a pose is right."""
-    explained = _CONSTANT + float(explained_logs(evidence) @ _WEIGHTS)
-    return _logistic(explained) * _logistic(rival_odds(evidence[3:]))
+def probabilities_right(evidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the probabilities (S,) that poses are right, and that they would be right without other modes."""
+    alone = _logistic(_CONSTANT + (explained_logs(evidence) * _WEIGHTS).sum(axis=-1))
+    return alone * _logistic(_rival_odds(evidence[..., 3:])), alone
 
 
-def _logistic(x: float) -> float:
-    return 1 / (1 + math.exp(-min(max(x, -50.0), 50.0)))
+def _logistic(x: np.ndarray) -> np.ndarray:
+    result: np.ndarray = 1 / (1 + np.exp(-np.clip(x, -50.0, 50.0)))
+    return result

@@ -86,18 +86,26 @@ def end_places(points: np.ndarray, headings: np.ndarray, start: np.ndarray) -> n
     return np.stack([start[0] + (cos * x - sin * y), start[1] + (sin * x + cos * y)], axis=-1)
 
 
-def distinct_poses(poses: np.ndarray, count: int, radius: float, angle: float, first: int = 0) -> list[int]:
-    """Return at most ``count`` indices of poses (M, 3) by falling score, each farther from better ones than a limit.
+def distinct_poses(
+    poses: np.ndarray, count: int, radius: float, angle: float, scan: np.ndarray | None = None,
+    best: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Return the rows of at most ``count`` poses of each scan, each farther from better ones than a limit.
 
-    The best pose has the index ``first``. Poses within ``radius`` [m] and ``angle`` [rad] of a better one are left out.
+    Poses (M, 3) of S scans, (M,) ascending in ``scan``, come by falling score; the best ones are in the rows ``best``
+    (S,), None for the first row alone. Poses within ``radius`` [m] and ``angle`` [rad] of a better one are left out.
     """
-    chosen: list[int] = []
-    left, (x, y, heading) = np.arange(len(poses)), poses.T
-    following = first
+    chosen = [np.arange(len(poses))[:1] if best is None else best]
+    left, of, columns = np.arange(len(poses)), scan, poses.T
     while len(left) and len(chosen) < count:
-        chosen.append(following)
-        at = poses[following]
-        far = np.flatnonzero((np.hypot(x - at[0], y - at[1]) > radius) | (np.abs(wrapped(heading - at[2])) > angle))
-        left, x, y, heading = left[far], x[far], y[far], heading[far]
-        following = int(left[0]) if len(left) else -1
-    return chosen
+        # The last choice of each scan; scans without one have no poses left.
+        at = poses[chosen[-1]].T
+        if of is not None:
+            at = at[:, np.searchsorted(scan[chosen[-1]], of)]  # type: ignore[index]
+        x, y, heading = columns - at
+        far = np.flatnonzero((x * x + y * y > radius * radius) | (np.abs(wrapped(heading)) > angle))
+        left, columns = left[far], columns[:, far]
+        of = None if of is None else of[far]
+        chosen.append(left[:1] if of is None else left[np.flatnonzero(np.diff(of, prepend=-1))])
+    rows = np.concatenate(chosen)
+    return rows if scan is None else rows[np.argsort(scan[rows], kind="stable")]

@@ -16,6 +16,7 @@ import numpy as np
 from gpusense.backends import get_backend
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.matching.pose_grid import Found, PoseGrid
 from gpusense.matching.score_tables import SHIFT_ROWS, TOP, ScoreTables
@@ -121,6 +122,7 @@ class _Run:
         room = _PARTS[self._backend.info.kind]
         self._parts = room + room // 16 * scans
         self._evaluated = 0
+        self._ahead = flags_if(READ_AHEAD=self._backend.info.kind == "gpu")
 
     def _launch(self, kernel: str, size: tuple[int, ...], *arguments: Any, flags: frozenset[str] = _NO_FLAGS) -> None:
         self._backend.compile(kernel, flags)(size, *arguments)
@@ -134,7 +136,10 @@ class _Run:
         # Buffers are never empty.
         self._most, total = max(*each, 1), max(int(first[-1]), 1)
         ends = np.concatenate([*(part[order] for part, order in zip(points, orders, strict=True)), np.zeros((1, 2))])
-        turned = np.stack([np.cos(grid.headings), np.sin(grid.headings)], axis=-1)
+        # The scans of a broadcast array share their headings.
+        headings = grid.headings if grid.headings.strides[0] else grid.headings[:1]
+        turned = np.stack([np.cos(headings), np.sin(headings)], axis=-1)
+        turned = np.broadcast_to(turned, (*grid.headings.shape, 2))
         given = [ends, turned, grid.start.astype(np.float64), first]
         if images is not None or self._tables.shape.tables > 1:
             images = [np.full(count, scan) for scan, count in enumerate(each)] if images is None else images
@@ -211,6 +216,11 @@ class _Run:
             self._turns, self._shift,
         )  # fmt: skip
 
+    def _is_top(self, level: int) -> bool:
+        """Return whether blocks of the next level have bounds that are larger than the sums of their tables."""
+        folded = self._tables.folded(self._level)
+        return level == self._level - 1 and (folded.step > 1 or folded.unit > 1)
+
     def _follow(self) -> None:
         """Raise lower bounds: follow the best parts of promising blocks down to poses."""
         most = min(_FOLLOWED, self._turns * self._height)
@@ -222,11 +232,12 @@ class _Run:
         self._launch("pick_blocks", (self._items,), self._maxima, self._histogram, number, blocks, *numbers,
                      self._level, self._shift, most)  # fmt: skip
         for level in reversed(range(self._level)):
-            top = level == self._level - 1
+            top = self._is_top(level)
             self._launch(
                 "follow_blocks", (count,), self._tables.quarters(level, top=top), *self._ends, self._allowed[level],
                 blocks, self._tables.shape, count, self._grid.height, self._grid.width, -(-self._grid.width >> level),
                 level, self._tables.stride, int(top),
+                flags=self._ahead,
             )  # fmt: skip
         self._launch("raise_low", (count,), blocks, self._space.upload("slack", self._slack), self._low, count, most)
         self._evaluated += 4 * self._level * count
@@ -246,12 +257,14 @@ class _Run:
         """Divide chosen blocks from ``begin`` on, but at most ``some``, down to poses."""
         (workers, run), blocks = _WORKERS[self._backend.info.kind], self._chosen
         for level in reversed(range(self._level)):
-            top, parts = level == self._level - 1, self._space.empty(f"parts {level}", 4 * self._parts, _INT)
+            top, parts = self._is_top(level), self._space.empty(f"parts {level}", 4 * self._parts, _INT)
+            first = level == self._level - 1
             self._launch(
                 "divide_blocks", (workers,), self._tables.quarters(level, top=top), *self._ends, self._allowed[level],
-                blocks, self._low, parts, self._counts, self._tables.shape, begin if top else 0,
-                min(some, self._room) if top else self._parts, self._parts, workers, run, self._grid.height,
+                blocks, self._low, parts, self._counts, self._tables.shape, begin if first else 0,
+                min(some, self._room) if first else self._parts, self._parts, workers, run, self._grid.height,
                 self._grid.width, -(-self._grid.width >> level), self._turns, level, self._tables.stride, int(top),
+                flags=self._ahead,
             )  # fmt: skip
             blocks = parts
         self._poses = blocks
@@ -302,8 +315,12 @@ class _Run:
         """Return poses by scan, falling score, row, column and heading."""
         scan, heading = np.divmod(poses[:, 0].astype(np.int64), self._turns)
         place = (poses[:, 1].astype(np.int64) * self._grid.width + poses[:, 2]) * self._turns + heading
-        # Scores have 31 bits.
-        ordered: np.ndarray = poses[np.lexsort((place, (scan << 32) - poses[:, 3]))]
+        places = self._grid.height * self._grid.width * self._turns
+        loss = int(poses[:, 3].max(initial=0)) - poses[:, 3].astype(np.int64)
+        rank = scan * (int(loss.max(initial=0)) + 1) + loss
+        # A single number is sorted faster than two keys, where 64 bits suffice.
+        single = (int(rank.max(initial=0)) + 1) * places < 1 << 63
+        ordered: np.ndarray = poses[np.argsort(rank * places + place) if single else np.lexsort((place, rank))]
         return ordered
 
     def found(self) -> Found:

@@ -69,6 +69,9 @@ int4 divided(global const int *quarters, global const int2 *point, global const 
         const int stop = end - k > STEP ? k + STEP : end;
         // Two sums of 16 bits in a number.
         int even = 0, odd = 0;
+#if READ_AHEAD
+#pragma unroll 8
+#endif
         for (; k < stop; ++k) {
             const int four = quarters[image[k] * size + block_index(scores, point[k].y + row, point[k].x + col, 0, 0)];
             even += four & 0xff00ff;
@@ -95,7 +98,9 @@ kernel void shift_scores(ARGUMENTS) {
             table + image[k] * size + block_index(scores, point[k].y + row, point[k].x + col, SHIFT_ROWS - 1, 0);
         for (int i = 0; i < SHIFT_ROWS; ++i) total[i] += cells[i * stride];
     }
-    for (int i = 0; i < SHIFT_ROWS && row + i < height; ++i) {
+    // A loop of SHIFT_ROWS steps keeps the sums in registers.
+    for (int i = 0; i < SHIFT_ROWS; ++i) {
+        if (row + i >= height) continue;
         const int n = (row + i) * width + col;
         score[item * height * width + n] = allowed[n] ? TOP * (last - first[item]) - unit * total[i] : -1;
     }

@@ -20,8 +20,9 @@ from .score_cells import SHIFT_ROWS, TOP, ScoreTable, block_index, padded_lines,
 byte_at, number_at, cell_at = reader(wp.uint8), reader(wp.int32), reader(wp.vec2i)
 # Sums of neighbouring rows.
 Rows = wp.types.vector(length=SHIFT_ROWS, dtype=wp.int32)
-# Points after which sums are compared.
+# Points after which sums are compared, and points that are read together.
 STEP = 48
+AT_ONCE = 8
 # Numbers that count the rows of a scan by their scores.
 BINS = 512
 
@@ -107,12 +108,16 @@ def divided(
         even = int(0)
         odd = int(0)
         while k < stop:
-            cell = cell_at(point, k)
-            begins = number_at(image, k) * size
-            four = number_at(quarters, begins + block_index(scores, cell.y + row, cell.x + col, 0, 0))
-            even = even + (four & 0xFF00FF)
-            odd = odd + ((four >> 8) & 0xFF00FF)
-            k = k + 1
+            for i in range(AT_ONCE):
+                n = wp.min(k + i, stop - 1)
+                cell = cell_at(point, n)
+                begins = number_at(image, n) * size
+                four = number_at(quarters, begins + block_index(scores, cell.y + row, cell.x + col, 0, 0))
+                if k + i >= stop:
+                    four = int(0)
+                even = even + (four & 0xFF00FF)
+                odd = odd + ((four >> 8) & 0xFF00FF)
+            k = k + AT_ONCE
         total = total - wp.vec4i(even & 0xFFFF, odd & 0xFFFF, even >> 16, odd >> 16)
         if wp.max(total) < least:
             k = end

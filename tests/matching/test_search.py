@@ -123,7 +123,9 @@ def test_of_equal_poses_beyond_the_memory_the_first_are_kept(monkeypatch, level)
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-@pytest.mark.parametrize("limits", [{"_MOST_ITEMS": 4}, {"_ROOM": 3, "_READ": 2}, {"_PARTS": {"cpu": 16}}])
+@pytest.mark.parametrize(
+    "limits", [{"_MOST_ITEMS": 4}, {"_ROOM": 3, "_READ": 2}, {"_PARTS": dict.fromkeys(("cpu", "gpu"), 16)}]
+)
 def test_the_poses_are_the_same_in_several_launches(name, limits, monkeypatch, needs):
     scores, points, grid = scene(3)
     tables = ScoreTables(get_backend(needs(name)), scores, levels=2)
@@ -139,10 +141,12 @@ def test_the_poses_are_the_same_in_several_launches(name, limits, monkeypatch, n
 @pytest.mark.parametrize("name", BACKENDS)
 def test_exact_bounds_as_on_gpus_divide_fewer_blocks(name, monkeypatch, needs):
     scores, points, grid = scene(3)
-    rounded = Search(ScoreTables(get_backend(needs(name)), scores, levels=3)).find(points, grid, slack=50)
-    monkeypatch.setattr("gpusense.matching.score_tables._STEP", {"cpu": 8})
-    monkeypatch.setattr("gpusense.matching.score_tables._UNIT", {"cpu": 1})
-    exact = Search(ScoreTables(get_backend(needs(name)), scores, levels=3)).find(points, grid, slack=50)
+    results = []
+    for step, unit in ((2, 8), (8, 1)):
+        for limit, value in (("_STEP", step), ("_UNIT", unit)):
+            monkeypatch.setattr(f"gpusense.matching.score_tables.{limit}", dict.fromkeys(("cpu", "gpu"), value))
+        results.append(Search(ScoreTables(get_backend(needs(name)), scores, levels=3)).find(points, grid, slack=50))
+    rounded, exact = results
     for field in ("scan", "row", "col", "heading", "score"):
         np.testing.assert_array_equal(getattr(exact, field), getattr(rounded, field))
     assert exact.evaluated < rounded.evaluated

@@ -53,7 +53,7 @@ class Candidates(NamedTuple):
         poses: (M, 3) in the world.
         score: (M,) from 0 to 1, the mean of the end points.
         log_p: (M,) log-likelihoods by the model, NaN where they were not computed.
-        first: (S,) row of the first pose of each scan.
+        scan: (M,) scan of each pose.
         best: (S,) row of the likeliest pose of each scan.
         evaluated: Poses and blocks of poses that were evaluated, on average over the scans of a search.
     """
@@ -61,25 +61,21 @@ class Candidates(NamedTuple):
     poses: np.ndarray
     score: np.ndarray
     log_p: np.ndarray
-    first: np.ndarray
+    scan: np.ndarray
     best: np.ndarray
     evaluated: int
-
-    @property
-    def scan(self) -> np.ndarray:
-        """(M,) scan of each pose."""
-        return np.arange(len(self.first)).repeat(np.diff(self.first, append=len(self.poses)))
 
     @classmethod
     def joined(cls, parts: Sequence[Candidates]) -> Candidates:
         """Return the poses of several searches, at least one."""
         if len(parts) == 1:
             return parts[0]
-        begins = np.cumsum([0, *(len(part.poses) for part in parts[:-1])])
-        values = [np.concatenate([getattr(part, name) for part in parts]) for name in ("poses", "score", "log_p")]
-        rows = [np.concatenate([begin + getattr(part, name) for begin, part in zip(begins, parts, strict=True)])
-                for name in ("first", "best")]  # fmt: skip
-        return cls(*values, *rows, sum(part.evaluated * len(part.first) for part in parts) // len(rows[0]))
+        begins, scans = (np.cumsum([0, *map(len, column)]).tolist()
+                         for column in ([part.poses for part in parts], [part.best for part in parts]))  # fmt: skip
+        poses, score, log_p = (np.concatenate([part[k] for part in parts]) for k in range(3))
+        scan, best = (np.concatenate([part[k] + begin for begin, part in zip(offsets, parts, strict=False)])
+                      for k, offsets in ((3, scans), (4, begins)))  # fmt: skip
+        return cls(poses, score, log_p, scan, best, sum(part.evaluated * len(part.best) for part in parts) // scans[-1])
 
 
 class FieldSearch:
@@ -181,10 +177,10 @@ class FieldSearch:
     ) -> Candidates:  # fmt: skip
         """Return the best poses of scans in a field of the nearest cell's distance."""
         scans, hits = len(cells), np.array([*map(len, cells)])
-        start, headings = (
-            np.broadcast_to(part, (scans, part.shape[1])) for part in (searched.start, searched.headings)
-        )
-        grid = PoseGrid(start, headings, searched.height, searched.width)
+        grid, turns = searched, searched.headings.shape[1]
+        if scans > 1:
+            headings = np.broadcast_to(searched.headings, (scans, turns))
+            grid = PoseGrid(searched.start.repeat(scans, axis=0), headings, searched.height, searched.width)
         found = self._search.find(cells, grid, slack=np.maximum(hits, most), allowed=allowed)
         poses, first = to_world(self.grid, grid.poses(found, self.stride)), found.best
         # Rounding moves a score by half a step for each hit.
@@ -194,10 +190,11 @@ class FieldSearch:
         known = np.full(len(poses), np.nan)
         known[rows] = log_p
         # The first of equal ones by row, then column, then heading.
-        place = (found.row.astype(np.int64) * grid.width + found.col) * headings.shape[1] + found.heading
+        place = (found.row.astype(np.int64) * grid.width + found.col) * turns + found.heading
         likeliest = np.where(log_p == log_p.max(axis=1, keepdims=True), place[rows], _FAR).argmin(axis=1)
         score = found.score / (TOP * hits)[found.scan]
-        return Candidates(poses, score, known, first, rows[np.arange(scans), likeliest], found.evaluated // scans)
+        best = rows[np.arange(scans), likeliest]
+        return Candidates(poses, score, known, found.scan, best, found.evaluated // scans)
 
     def _find_between(
         self, model: LikelihoodFieldModel, ranges: np.ndarray, cells: np.ndarray, searched: PoseGrid,
@@ -234,9 +231,9 @@ class FieldSearch:
         score = self._steps(model, ranges, len(cells), poses)
         order = np.lexsort((heading, col, row, -score))
         order = order[score[order] >= score.max() - most]
-        first = np.zeros(1, np.intp)
-        unknown = np.full(len(order), np.nan)
-        return Candidates(poses[order], score[order] / (TOP * len(cells)), unknown, first, first, evaluated)
+        scan = np.zeros(len(order), np.intp)
+        return Candidates(poses[order], score[order] / (TOP * len(cells)), np.full(len(order), np.nan), scan, scan[:1],
+                          evaluated)  # fmt: skip
 
     def _steps(self, model: LikelihoodFieldModel, ranges: np.ndarray, hits: int, poses: np.ndarray) -> np.ndarray:
         """Return the log-likelihoods of the hits at poses as scores."""

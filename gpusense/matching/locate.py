@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, overload
+from typing import Any, Literal, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util import checks
 from gpusense._util.angles import wrapped
 from gpusense.matching.field_search import (
-    Candidates,
     field_search,
     log_likelihoods_of,
     padded_rows,
@@ -153,19 +152,21 @@ def locate_scan(
             found = search.find(
                 values, [points[n] for n in chosen], searched, search.free if positions == "free" else None, _DEPTH
             )
-        radius = max(_MODE_RADIUS, 2 * stride * cell)
-        scan = found.scan
-        rows = distinct_poses(found.poses, modes, radius, _MODE_ANGLE, scan, found.best)
         refined = None
         if refine:
             poses = found.poses[found.best]
             near = _refined(search.smooth, values, poses, 2 * stride * cell, 4 * math.pi / turns)
             refined = np.where((search.is_free(near) | (positions == "all"))[:, None], near, poses)
-        first = np.searchsorted(scan[rows], np.arange(len(chosen)))
-        numbers = _mode_numbers(model, values, is_hit, search.caster, found, rows, first)
+        several_scans = found.scan if len(chosen) > 1 else None
+        radius = max(_MODE_RADIUS, 2 * stride * cell)
+        distinct = distinct_poses(found.poses, modes, radius, _MODE_ANGLE, several_scans, found.best)
+        scan = found.scan[distinct]
+        best = _Modes(scan, scan.searchsorted(np.arange(len(chosen))), found.poses[distinct])
+        numbers = _mode_numbers(
+            model, values, is_hit, search.caster, best, found.score[distinct], found.log_p[distinct]
+        )
         options["evaluated"] = found.evaluated
-        results = _locations(numbers, found.poses[rows], first, refined, min_probability, options)
-        for number, result in zip(chosen, results, strict=True):
+        for number, result in zip(chosen, _locations(best, numbers, refined, min_probability, options), strict=True):
             located[number] = result
     return tuple(located) if several else located[0]
 
@@ -202,51 +203,54 @@ def _refined(
     return np.where(kept[:, None], near, poses)
 
 
-def _mode_numbers(
-    model: LikelihoodFieldModel, ranges: np.ndarray, is_hit: np.ndarray, caster: RayCaster, found: Candidates,
-    rows: np.ndarray, first: np.ndarray,
-) -> np.ndarray:  # fmt: skip
-    """Return the numbers (R, 5) of the modes of scans, by the fields of :class:`PoseMode`.
+class _Modes(NamedTuple):
+    """Modes of S scans: their scans (R,), the rows of the scans' first modes (S,), and poses (R, 3)."""
 
-    ``rows`` (R,) are the modes among the poses that were found, ``first`` (S,) the first mode of each scan.
-    """
-    count = np.diff(first, append=len(rows))
-    scan, poses, log_p = np.arange(len(first)).repeat(count), found.poses[rows], found.log_p[rows]
+    scan: np.ndarray
+    first: np.ndarray
+    poses: np.ndarray
+
+
+def _mode_numbers(
+    model: LikelihoodFieldModel, ranges: np.ndarray, is_hit: np.ndarray, caster: RayCaster, modes: _Modes,
+    score: np.ndarray, log_p: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Return the numbers (R, 5) of modes, by the fields of :class:`PoseMode`; ``log_p`` (R,) may be NaN."""
+    scan, first, poses = modes
     if np.isnan(log_p).any():
-        at = padded_rows(first, count)
-        log_p[at] = log_likelihoods_of(model, poses, at, ranges)
+        rows = padded_rows(first, np.bincount(scan))
+        log_p[rows] = log_likelihoods_of(model, poses, rows, ranges)
     x, y, yaw = model.scanner.mount
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    sensors = poses + np.stack([cos * x - sin * y, sin * x + cos * y, np.full(len(cos), yaw)], axis=1)
+    sensors = poses + np.array([cos * x - sin * y, sin * x + cos * y, np.full(len(cos), yaw)]).T
     # A number of poses that other calls repeat.
-    padded = padded_rows(np.zeros(1, np.intp), np.array([len(rows)]))[0]
-    off = ranges[scan] - caster.cast(sensors[padded], model.scanner.bearings)[: len(rows)]
+    padded = padded_rows(np.zeros(1, np.intp), np.array([len(scan)]))[0]
+    off = ranges[scan] - caster.cast(sensors[padded], model.scanner.bearings)[: len(scan)]
     tolerance = max(_AGREE_SIGMAS * model.parameters.sigma_hit, _AGREE_CELLS * model.grid.resolution)
     hits = is_hit[scan]
-    longer, shorter = (np.count_nonzero(far & hits, axis=1) / np.count_nonzero(hits, axis=1)
-                       for far in (off > tolerance, off < -tolerance))  # fmt: skip
-    return np.stack([found.score[rows], log_p, 1 - longer - shorter, longer, shorter], axis=1)
+    longer, shorter, used = (np.add.reduce(part & hits, axis=1) for part in (off > tolerance, off < -tolerance, hits))
+    longer, shorter = longer / used, shorter / used
+    return np.array([score, log_p, 1 - longer - shorter, longer, shorter]).T
 
 
 def _locations(
-    numbers: np.ndarray, poses: np.ndarray, first: np.ndarray, refined: np.ndarray | None, least: float,
-    options: dict[str, Any],
-) -> list[Location]:  # fmt: skip
-    """Return the results of scans from the poses (R, 3) and numbers (R, 5) of their modes.
+    best: _Modes, numbers: np.ndarray, refined: np.ndarray | None, least: float, options: dict[str, Any]
+) -> list[Location]:
+    """Return the results of scans from their modes and the modes' numbers (R, 5).
 
-    ``first`` (S,) are the rows of the first modes, ``refined`` (S, 3) the poses of results; None: the first modes.
+    ``refined`` (S, 3) are the poses of the results; None: the poses of the first modes.
     """
-    evidence = location_evidence(numbers, first, _DEPTH)
-    p_right, alone = probabilities_right(evidence)
-    modes = [PoseMode(pose, *values) for pose, values in zip(poses, numbers.tolist(), strict=True)]
+    evidence = location_evidence(numbers, best.scan, best.first, _DEPTH)
+    p_right, alone = (part.tolist() for part in probabilities_right(evidence))
+    modes = [PoseMode(pose, *values) for pose, values in zip(best.poses, numbers.tolist(), strict=True)]
     located = []
-    for n, (begin, end) in enumerate(itertools.pairwise([*first.tolist(), len(modes)])):
+    for n, (begin, end) in enumerate(itertools.pairwise([*best.first.tolist(), len(modes)])):
         top = modes[begin]
         # Evaluate a doubtful pose as if it had no rival.
         status: Status = "found" if p_right[n] >= least else "ambiguous" if alone[n] >= least else "no match"
         located.append(Location(
             top.pose if refined is None else refined[n], top.score, top.log_likelihood, top.agreement,
-            tuple(modes[begin:end]), float(p_right[n]), evidence[n], status, **options,
+            tuple(modes[begin:end]), p_right[n], evidence[n], status, **options,
         ))  # fmt: skip
     return located
 

@@ -119,19 +119,19 @@ _RIVAL_WEIGHTS = (1.87, 5.22)
 _LEAST = (3e-3, 1e-2, 1e-2)
 
 
-def location_evidence(modes: np.ndarray, first: np.ndarray, depth: float) -> np.ndarray:
+def location_evidence(modes: np.ndarray, scan: np.ndarray, first: np.ndarray, depth: float) -> np.ndarray:
     """Return the evidence (S, 5) on the first mode of each scan, see :data:`NAMES`.
 
-    ``modes`` (R, 5) are numbers of :class:`PoseMode` in the order of its fields, ``first`` (S,) the rows of the scans'
-    first modes; modes are searched down to ``depth``.
+    ``modes`` (R, 5) are numbers of :class:`PoseMode` in the order of its fields, ``scan`` (R,) their scans, ``first``
+    (S,) the rows of the scans' first modes; modes are searched down to ``depth``.
     """
-    scan = np.arange(len(first)).repeat(np.diff(first, append=len(modes)))
-    rivals = modes[first[scan]][:, [0, 2]] - modes[:, [0, 2]]
-    rivals[:, 0] /= depth
+    lead = modes[first[scan]] - modes
+    gap, ahead = lead[:, 0] / depth, lead[:, 2]
     # A mode alone leads by its agreement.
-    rivals[first] = np.column_stack([np.full(len(first), np.inf), modes[first, 2]])
+    gap[first], ahead[first] = np.inf, modes[first, 2]
+    rivals = np.array([gap, ahead]).T
     strongest = np.lexsort((_rival_odds(rivals), scan))[first]
-    return np.column_stack([1 - modes[first, 0], modes[first, 3:], rivals[strongest]])
+    return np.concatenate([1 - modes[first, :1], modes[first, 3:], rivals[strongest]], axis=1)
 
 
 def explained_logs(evidence: np.ndarray) -> np.ndarray:
@@ -142,7 +142,7 @@ def explained_logs(evidence: np.ndarray) -> np.ndarray:
 
 def _rival_odds(gap_and_ahead: np.ndarray) -> np.ndarray:
     """Return the log odds (R,) of first modes against other modes."""
-    odds: np.ndarray = (_RIVAL_WEIGHTS * gap_and_ahead).sum(axis=-1)
+    odds: np.ndarray = (gap_and_ahead * _RIVAL_WEIGHTS).sum(axis=-1)
     return odds
 
 

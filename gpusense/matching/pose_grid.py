@@ -103,9 +103,9 @@ def distinct_poses(
         if of is not None:
             at = at[:, np.searchsorted(scan[chosen[-1]], of)]  # type: ignore[index]
         x, y, heading = columns - at
-        far = np.flatnonzero((x * x + y * y > radius * radius) | (np.abs(wrapped(heading)) > angle))
+        far = ((x * x + y * y > radius * radius) | (np.abs(wrapped(heading)) > angle)).nonzero()[0]
         left, columns = left[far], columns[:, far]
         of = None if of is None else of[far]
-        chosen.append(left[:1] if of is None else left[np.flatnonzero(np.diff(of, prepend=-1))])
+        chosen.append(left[:1] if of is None else left[np.append(True, of[1:] != of[:-1])[: len(of)]])
     rows = np.concatenate(chosen)
     return rows if scan is None else rows[np.argsort(scan[rows], kind="stable")]

@@ -51,6 +51,7 @@ class Search:
     def __init__(self, tables: ScoreTables) -> None:
         self.tables = tables
         self.space = Workspace(tables.backend)
+        self.launcher = functools.cache(tables.backend.compile)
         self.room = 0
         self._masks: tuple[np.ndarray | None, tuple[int, ...], list[Buffer]] = (None, (), [])
 
@@ -125,7 +126,7 @@ class _Run:
         self._ahead = flags_if(READ_AHEAD=self._backend.info.kind == "gpu")
 
     def _launch(self, kernel: str, size: tuple[int, ...], *arguments: Any, flags: frozenset[str] = _NO_FLAGS) -> None:
-        self._backend.compile(kernel, flags)(size, *arguments)
+        self._search.launcher(kernel, flags)(size, *arguments)
 
     def place(self, points: Sequence[np.ndarray], images: Sequence[np.ndarray] | None) -> None:
         """Place the end points of all scans at all headings on the device."""
@@ -139,7 +140,7 @@ class _Run:
         # The scans of a broadcast array share their headings.
         headings = grid.headings if grid.headings.strides[0] else grid.headings[:1]
         turned = np.stack([np.cos(headings), np.sin(headings)], axis=-1)
-        turned = np.broadcast_to(turned, (*grid.headings.shape, 2))
+        turned = turned if len(turned) == len(each) else turned.repeat(len(each), axis=0)
         given = [ends, turned, grid.start.astype(np.float64), first]
         if images is not None or self._tables.shape.tables > 1:
             images = [np.full(count, scan) for scan, count in enumerate(each)] if images is None else images

@@ -29,8 +29,9 @@ from gpusense.reference.field_climb import CALM, DAMPING, ENDED, START, STEPS
 
 # Flags of the mixture that have no meaning for the kernel.
 _OTHERS = {"LOG_TABLE", "CUBES"}
-# Steps of a climb at most, steps between two reads, and how far a climb leads from its start, and a little more [m].
-_MOST_STEPS, _STEPS_AT_ONCE, _FARTHEST = 50, 4, 5.5
+# Steps of a climb at most, how far a climb leads from its start, and a little more [m], and steps between two reads by
+# kind of device.
+_MOST_STEPS, _FARTHEST, _STEPS_AT_ONCE = 50, 5.5, {"gpu": 6, "cpu": 4}
 # Length and turn of a step that end a climb [m, rad], by the bytes of a number.
 _SMALL = {4: 3e-4, 8: 1e-4}
 # Parts of a scan in a climb, by kind of device.
@@ -153,7 +154,7 @@ class Climbs(Gradients):
             there = space.upload("climb", end)
             step = launch("climb_step", flags, (count,), gradient=gradient, poses=placed.source, climb=there, **numbers)
             while not end[:, ENDED].all():
-                backend.run((*program, step) * _STEPS_AT_ONCE)
+                backend.run((*program, step) * _STEPS_AT_ONCE[backend.info.kind])
                 space.read(there, end)
             return
         climb_step = get_backend("numpy").compile("climb_step", flags)

@@ -10,11 +10,14 @@ of a door or a grazed wall is no evidence. A beam
   reading.
 
 The walk needs only grid and pose, and costs the same for every model: a few thousand look-ups per scan, on the map's
-device or on the host. A diagonal pair of walls stops a ray, as in the casters.
+device or on the host. A diagonal pair of walls stops a ray, as in the casters. The kernel ``judge_beams`` reads pose
+and covariance from the results of ``finish_estimate``, so that its launch can follow a correction's estimate at once,
+and one copy reads both.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -22,14 +25,37 @@ from typing import NamedTuple
 import numpy as np
 
 from gpusense._util.typing import Floats
-from gpusense.interface.constants import AGREES, NOTHING, SHORT, THROUGH
-from gpusense.localization.map_judge import BESIDE, MapJudge, chosen_beams, judged_on_host
+from gpusense.backends import arrays
+from gpusense.backends.base import Backend, Buffer
+from gpusense.backends.workspace import Workspace
+from gpusense.interface.constants import AGREES, MOMENTS, NOTHING, SHORT, THROUGH
+from gpusense.interface.lanes import with_teams_flags
+from gpusense.interface.launches import Program, launch
+from gpusense.interface.structs import BeamRules, Frame
+from gpusense.reference.beam_consistency import STEP, judge_beams
+from gpusense.world.frames import frame_of
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.scanner import Scanner
+from gpusense.world.scanner import Scanner, float64_readings, range_limits
 
-# Largest distance of close agreement [m].
-_CLOSE = 0.1
-_STILL = np.zeros((3, 3))
+# Most judged beams of a scan; longest walk [m]. Twice the middles of as many parts of a scan.
+BEAMS, _FARTHEST = 32, 20.0
+_MIDDLES = np.arange(BEAMS) * 2 + 1
+# Offset [m] and divergence [rad] of companion rays; both grow with the deviations of the pose, up to these limits.
+BESIDE, _APART, _MOST_BESIDE, _MOST_APART = 0.08, 0.025, 0.3, 0.1
+# Tolerance of a range: relative, and least values [m] and [cells]; largest distance of close agreement [m].
+_PART, _LEAST, _LEAST_CELLS, _CLOSE = 0.02, 0.2, 2.0, 0.1
+# Numbers of a judgement.
+JUDGED = 2 * BEAMS
+_DOUBLE, _PLAIN, _STILL = np.dtype(np.float64), frozenset[str](), np.zeros((3, 3))
+# Version numbers of map parts on devices, keys of recorded launches.
+_VERSIONS = itertools.count(1)
+
+
+class Beams(NamedTuple):
+    """Judged beams of a scan."""
+
+    bearing: Floats  # (B,) bearings [rad]
+    reading: Floats  # (B,) readings [m]
 
 
 class BeamConsistency(NamedTuple):
@@ -39,8 +65,8 @@ class BeamConsistency(NamedTuple):
     distance: Floats  # (B,) range to the first mapped wall before the beam's end, inf without one [m]
     bearing: Floats  # (B,) bearing from the scanner [rad]
     reading: Floats  # (B,) its reading [m]
-    origin: tuple[float, float]  # origin of the beams [m]
-    heading: float  # direction of bearing 0 in the world [rad]
+    pose: Floats  # (3,) pose of the robot
+    mount: tuple[float, float, float]  # pose of the scanner on the robot
     near: float  # largest distance of close agreement [m]
     inside: bool  # true if the pose is inside solid cells
     off: bool  # true if the pose is in unknown cells or off the map
@@ -48,16 +74,11 @@ class BeamConsistency(NamedTuple):
     @property
     def wall(self) -> Floats:
         """(B, 2) first mapped wall on each beam, NaN without one before its end [m]."""
+        (x, y, theta), (mount_x, mount_y, turn) = self.pose.tolist(), self.mount
+        c, s = math.cos(theta), math.sin(theta)
         distance = np.where(self.distance < np.inf, self.distance, np.nan)[:, None]
-        direction = self.heading + self.bearing
-        return np.asarray(self.origin + distance * np.column_stack([np.cos(direction), np.sin(direction)]))
-
-    @property
-    def close(self) -> int:
-        """Number of beams in close agreement."""
-        # Python's numbers are faster than short arrays.
-        beams = zip(self.kind.tolist(), self.reading.tolist(), self.distance.tolist(), strict=True)
-        return sum([abs(reading - distance) < self.near for kind, reading, distance in beams if kind == AGREES])
+        direction, origin = theta + turn + self.bearing, (x + c * mount_x - s * mount_y, y + s * mount_x + c * mount_y)
+        return np.asarray(origin + distance * np.column_stack([np.cos(direction), np.sin(direction)]))
 
     def count(self, kind: int) -> int:
         """Return the number of beams of a class."""
@@ -80,9 +101,12 @@ class Counts(NamedTuple):
 
 
 def counts_of(scans: Sequence[BeamConsistency]) -> Counts:
-    """Return the counts of several scans."""
-    kinds = [kind for one in scans for kind in one.kind.tolist()]
-    close = sum(one.close for one in scans)
+    """Return the counts of several scans; Python's numbers are faster than short arrays."""
+    kinds, close = list[float](), 0
+    for one in scans:
+        kinds += one.kind.tolist()
+        for kind, reading, distance in zip(one.kind.tolist(), one.reading.tolist(), one.distance.tolist(), strict=True):
+            close += kind == AGREES and abs(reading - distance) < one.near
     return Counts(kinds.count(AGREES), close, kinds.count(THROUGH), kinds.count(SHORT), kinds.count(NOTHING))
 
 
@@ -96,22 +120,12 @@ def beam_consistency(
 ) -> BeamConsistency:
     """Judge the beams of a scan (K,) at a (3,) pose with a (3, 3) covariance, by the map on a device or on the host."""
     if judge is None:
-        beams = chosen_beams(scanner, ranges)
-        judged = judged_on_host(grid, scanner, pose, covariance, beams)
+        beams = _chosen_beams(scanner, ranges)
+        kind, distance = _judged_on_host(grid, scanner, pose, covariance, beams)
     else:
-        beams, judged = judge(scanner, pose, covariance, ranges)
-    count = len(beams.bearing)
-    return BeamConsistency(
-        judged[:count], judged[count:], *beams, *_origin_of(pose, scanner.mount), max(_CLOSE, grid.resolution),
-        *_place_of(grid, pose),
-    )  # fmt: skip
-
-
-def _origin_of(pose: Floats, mount: tuple[float, float, float]) -> tuple[tuple[float, float], float]:
-    """Return the origin of the beams, and the direction of bearing 0."""
-    (x, y, theta), (mount_x, mount_y, turn) = pose.tolist(), mount
-    c, s = math.cos(theta), math.sin(theta)
-    return (x + c * mount_x - s * mount_y, y + s * mount_x + c * mount_y), theta + turn
+        beams, kind, distance = judge(scanner, pose, covariance, ranges)
+    near = max(_CLOSE, grid.resolution)
+    return BeamConsistency(kind, distance, *beams, pose, scanner.mount, near, *_place_of(grid, pose))
 
 
 def _place_of(grid: OccupancyGrid, pose: Floats) -> tuple[bool, bool]:
@@ -132,3 +146,234 @@ def _place_of(grid: OccupancyGrid, pose: Floats) -> tuple[bool, bool]:
         return False, True
     solid = bool((cells >= grid.occupied_threshold).all())
     return solid, not solid and bool((cells < 0).all())
+
+
+def _chosen_beams(scanner: Scanner, ranges: Floats) -> Beams:
+    """Return the judged beams of a scan (K,): hits and max readings, evenly."""
+    nearest, _ = range_limits(ranges.dtype, scanner.range_min, scanner.range_max)
+    chosen = (ranges >= nearest).nonzero()[0]
+    if len(chosen) > BEAMS:
+        chosen = chosen[_MIDDLES * len(chosen) // JUDGED]
+    return Beams(scanner.bearings[chosen], ranges[chosen])
+
+
+def _judged_on_host(
+    grid: OccupancyGrid, scanner: Scanner, pose: Floats, covariance: Floats, beams: Beams
+) -> tuple[Floats, Floats]:
+    """Compute the results of the kernel ``judge_beams`` on the host: classes and distances."""
+    setting, count = _setting_of(grid, scanner), len(beams.bearing)
+    scan = np.concatenate([beams.bearing + setting.turn, beams.reading])
+    estimate, judged = np.array(_numbers_of(pose, covariance)), np.empty(2 * count)
+    cells = grid.cells.reshape(-1).view(np.uint8)
+    if count:
+        judge_beams(_PLAIN, cells, estimate, scan, judged, setting.frame, setting.rules, *grid.shape, count)
+    return judged[:count], judged[count:]
+
+
+class _Setting(NamedTuple):
+    """A scanner in a map, or in a part of it.
+
+    Attributes:
+        scanner: The scanner.
+        turn: Direction of bearing 0 relative to the robot's heading [rad].
+        frame: The map's frame.
+        rules: The rules of the kernel.
+        rows: Least and largest row of a scanner whose beams stay within the part.
+        cols: Least and largest column.
+    """
+
+    scanner: Scanner
+    turn: float
+    frame: Frame
+    rules: BeamRules
+    rows: tuple[float, float]
+    cols: tuple[float, float]
+
+
+class _Expected(NamedTuple):
+    """Scan to be judged by a correction, its judged beams, and the version of the part of the map."""
+
+    scanner: Scanner
+    ranges: Floats
+    beams: Beams
+    version: int
+
+
+class MapJudge:
+    """Cells of a map around the last pose on a device, for judging beams.
+
+    Args:
+        backend: The device.
+        grid: The map.
+
+    Attributes:
+        grid: The map.
+        version: Unique number of the part of the map on the device; 0 before.
+    """
+
+    def __init__(self, backend: Backend, grid: OccupancyGrid) -> None:
+        self.grid, self.version = grid, 0
+        self._backend, self._space = backend, Workspace(backend)
+        # First and last row and column of the cells on the device.
+        self._part = (0, 0), (0, 0)
+        self._cells: Buffer = None
+        self._context: _Setting | None = None
+        # The estimate, then the scan.
+        align = max(backend.alignment // _DOUBLE.itemsize, 1)
+        begin = -(-MOMENTS // align) * align
+        self._given, self._begin = backend.upload(np.zeros(begin + JUDGED)), begin
+        self._estimate = backend.part(self._given, 0, MOMENTS, _DOUBLE)
+        self._scan = backend.part(self._given, begin, JUDGED, _DOUBLE)
+        # Scan to be judged by a correction; later with its pose and covariance, classes and distances.
+        self._expected: _Expected | None = None
+        self._known: tuple[_Expected, list[float], Floats, Floats] | None = None
+        self._uploaded: Floats | None = None
+
+    def __call__(
+        self, scanner: Scanner, pose: Floats, covariance: Floats, ranges: Floats
+    ) -> tuple[Beams, Floats, Floats]:
+        """Return the judged beams of a scan (K,) on host or device, their classes, and distances of walls."""
+        numbers, setting = _numbers_of(pose, covariance), self._covering(scanner, pose)
+        if self._known is not None:
+            expected, at, kind, distance = self._known
+            # Readings that a correction has judged are the same object.
+            if expected.ranges is ranges and expected.version == self.version and at == numbers:
+                return expected.beams, kind, distance
+        on_host = np.asarray(arrays.copied_to_host(ranges, self._backend, "ranges"))
+        beams = _chosen_beams(scanner, float64_readings(on_host, scanner))
+        count, space = len(beams.bearing), self._space
+        result = np.empty(2 * count)
+        if count:
+            given = np.empty(self._begin + 2 * count)
+            given[:MOMENTS] = numbers
+            np.add(beams.bearing, setting.turn, out=given[self._begin : self._begin + count])
+            given[self._begin + count :] = beams.reading
+            self._expected, self._uploaded = None, given
+            self._backend.upload(given, self._given, wait=False)
+            judged = space.empty("judged", 2 * count, _DOUBLE)
+            (top, bottom), (left, right) = self._part
+            changing = dict(
+                cells=self._cells, frame=setting.frame, rules=setting.rules, rows=bottom - top, cols=right - left
+            )
+            space.run(
+                count, changing, lambda: self._launches(setting, self._estimate, self._scan, judged, count), version=0
+            )
+            space.read(judged, result)
+        return beams, result[:count], result[count:]
+
+    def expects(self, scanner: Scanner, ranges: Floats, scan: Floats) -> bool:
+        """Prepare for judging a scan (K,) in a correction at its estimated pose, and write it to ``scan`` (JUDGED,).
+
+        Return False without beams, or without cells of the map on the device.
+        """
+        self._expected = self._known = None
+        if self._cells is None:
+            return False
+        beams, turn = _chosen_beams(scanner, float64_readings(ranges, scanner)), self._set(scanner).turn
+        count = len(beams.bearing)
+        if count < BEAMS:
+            # NaN marks unused beams.
+            scan[:] = np.nan
+        np.add(beams.bearing, turn, out=scan[:count])
+        scan[BEAMS : BEAMS + count] = beams.reading
+        self._expected = _Expected(scanner, ranges, beams, self.version)
+        return count > 0
+
+    def launches(self, estimate: Buffer, scan: Buffer, judged: Buffer) -> Program:
+        """Return the launch that judges the expected scan at an estimate; ``version`` is its key."""
+        if self._expected is None:
+            raise RuntimeError("launches: needs a scan that is expected")
+        return self._launches(self._set(self._expected.scanner), estimate, scan, judged, BEAMS)
+
+    def receive(self, estimate: Floats, judged: Floats) -> None:
+        """Keep the judgement of the expected scan.
+
+        Args:
+            estimate: The results of ``finish_estimate``.
+            judged: The result of ``judge_beams``.
+        """
+        expected, self._expected = self._expected, None
+        if expected is not None:
+            count, numbers = len(expected.beams.bearing), _finished(estimate[:MOMENTS].tolist())
+            self._known = expected, numbers, judged[:count], judged[BEAMS : BEAMS + count]
+
+    def _launches(self, setting: _Setting, estimate: Buffer, scan: Buffer, judged: Buffer, beams: int) -> Program:
+        (top, bottom), (left, right) = self._part
+        info, steps = self._backend.info, int(setting.rules.limit / setting.frame.resolution / STEP)
+        flags, team = with_teams_flags(info.kind, "judge_beams", _PLAIN, steps, self._backend.largest_group)
+        return (
+            launch(
+                "judge_beams", flags, (team * beams,), cells=self._cells, estimate=estimate, scan=scan,
+                judged=judged, frame=setting.frame, rules=setting.rules, rows=bottom - top, cols=right - left,
+                beams=beams,
+            ),
+        )  # fmt: skip
+
+    def _set(self, scanner: Scanner) -> _Setting:
+        """Return the setting of a scanner in the present part of the map."""
+        if self._context is None or self._context.scanner is not scanner:
+            self._context = _setting_of(self.grid, scanner, *self._part)
+        return self._context
+
+    def _covering(self, scanner: Scanner, pose: Floats) -> _Setting:
+        """Return the setting of a scanner; copy another part of the map if it lacks cells within reach of a pose."""
+        setting, (x, y, theta) = self._set(scanner), pose.tolist()
+        frame, (top, bottom), (left, right) = setting.frame, setting.rows, setting.cols
+        c, s = math.cos(theta), math.sin(theta)
+        x += c * frame.mount_x - s * frame.mount_y - frame.origin_x
+        y += s * frame.mount_x + c * frame.mount_y - frame.origin_y
+        row = (frame.yaw_cos * y - frame.yaw_sin * x) / frame.resolution
+        col = (frame.yaw_cos * x + frame.yaw_sin * y) / frame.resolution
+        if self._cells is not None and top <= row < bottom and left <= col < right:
+            return setting
+        # Add a margin, so that a moving robot seldom needs another part.
+        reach, (rows, cols) = 1.5 * _reach_of(setting.rules, frame), self.grid.shape
+        self._part = (top, bottom), (left, right) = _span_of(row, reach, rows), _span_of(col, reach, cols)
+        part = np.ascontiguousarray(self.grid.cells[top:bottom, left:right])
+        self._cells = self._space.upload("cells", part.reshape(-1).view(np.uint8))
+        self.version, self._context = next(_VERSIONS), None
+        return self._set(scanner)
+
+
+def _span_of(place: float, reach: float, size: int) -> tuple[int, int]:
+    """Return the rows or columns within a distance of a position [cells], at least one, of a map of a size."""
+    low = int(min(max(place - reach, 0.0), size - 1.0))
+    return low, int(min(max(place + reach, low), size - 1.0)) + 1
+
+
+def _reach_of(rules: BeamRules, frame: Frame) -> float:
+    """Return the farthest distance of a walk [cells]."""
+    return (rules.limit + rules.most_beside) / frame.resolution + 2
+
+
+def _numbers_of(pose: Floats, covariance: Floats) -> list[float]:
+    """Return a pose and its covariance in the order of the kernels' estimate."""
+    x, y, theta = pose.tolist()
+    (xx, xy, xt), (_, yy, yt), (_, _, tt) = covariance.tolist()
+    # Headings within half a turn are exact.
+    return _finished([x, y, math.remainder(theta, math.tau), xx, xy, xt, yy, yt, tt])
+
+
+def _finished(numbers: list[float]) -> list[float]:
+    """Clear an estimate's variances that rounding made negative."""
+    for place in (3, 6, 8):
+        numbers[place] = max(numbers[place], 0.0)
+    return numbers
+
+
+def _setting_of(
+    grid: OccupancyGrid, scanner: Scanner, rows: tuple[int, int] = (0, 0), cols: tuple[int, int] = (0, 0)
+) -> _Setting:
+    """Return the setting of a scanner in a map, or in a part between first and last rows and columns."""
+    side, frame = grid.resolution, frame_of(grid, scanner.mount)
+    rules = BeamRules(
+        max(BESIDE, side), max(_MOST_BESIDE, side), _APART, _MOST_APART, scanner.cone / 2,
+        max(_LEAST, _LEAST_CELLS * side), _PART, min(_FARTHEST, scanner.range_max), scanner.range_max,
+        grid.occupied_threshold, cols[0], rows[0],
+    )  # fmt: skip
+    turn, reach = math.remainder(scanner.mount[2] - grid.origin[2], math.tau), _reach_of(rules, frame)
+    covered = [
+        (-math.inf if begin == 0 else begin + reach, math.inf if end >= size else end - reach)
+        for (begin, end), size in zip((rows, cols), grid.shape, strict=True)
+    ]
+    return _Setting(scanner, turn, frame, rules, *covered)

@@ -17,8 +17,8 @@ from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.workspace import ProgramCache, RecordedProgram, RepeatedPrograms
 from gpusense.interface.constants import ESTIMATE, FAR_SHARE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
+from gpusense.localization.beam_consistency import MapJudge
 from gpusense.localization.cloud_state import Contents, Snapshot, Summary, deeper, is_starved, meaningful, summary_of
-from gpusense.localization.map_judge import MapJudge
 from gpusense.localization.particles import BufferSlots, Particles, Stage
 
 _DOUBLE = np.dtype(np.float64)
@@ -42,14 +42,15 @@ class Cloud(Particles):
         self._results: np.ndarray | None = None
         self._summary: tuple[np.ndarray, int, Summary] | None = None
         self._estimated_of: Hashable = None
+        self._refined_of: Hashable = None
         self._known: tuple[Hashable, np.ndarray] | None = None
-        self._far: tuple[Hashable, float] | None = None
         self._snapshots: list[weakref.ref[Snapshot]] = []
         # Consecutive corrections with a read estimate; whether the last one's was read; whether the stages of the
-        # present one compute the estimate.
+        # present one compute the estimate; the same for the second pass, of one correction.
         self._asked, self._was_asked, self._estimates_too = 0, False, False
+        self._was_refined, self._refines_too = False, False
         # Function that prepares judges of scans; judges of the last correction until they receive the result.
-        self._prepared: Callable[[], list[tuple[MapJudge, np.ndarray]]] | None = None
+        self._prepared: Callable[[], list[MapJudge]] | None = None
         self._judges: Sequence[MapJudge] = ()
         # Inputs of a recorded correction that are not yet on the device, and readings of other arrays of the device;
         # work of the host while the device runs a stage.
@@ -95,7 +96,7 @@ class Cloud(Particles):
 
     def _begin_change(self) -> None:
         """Invalidate the results on the host, and save the particles that the change may overwrite."""
-        self._results = self._known = self._estimated_of = self._far = None
+        self._results = self._known = self._estimated_of = self._refined_of = None
         self._judges, self._prepared, self._given, self._adopted = (), None, None, ()
         for one in self._snapshots:
             snapshot = one()
@@ -118,7 +119,7 @@ class Cloud(Particles):
 
     def run_stages(
         self, settings: np.ndarray, stages: list[Stage], drawn: int, sensors: int, score: Callable[[Stage], None],
-        judges: Callable[[], list[tuple[MapJudge, np.ndarray]]] | None = None,
+        judges: Callable[[], list[MapJudge]] | None = None,
         meanwhile: Callable[[], None] | None = None, given: Callable[[], None] | None = None,
     ) -> None:  # fmt: skip
         """Run a correction: stages until the temperature is used up.
@@ -129,8 +130,7 @@ class Cloud(Particles):
             drawn: Particles of the next step.
             sensors: Number of sensors, the first ones of ``log_p``.
             score: Runs a stage: motion if it is the first one, log-likelihoods, and weighing.
-            judges: Prepares and returns the judges of scans at the estimated pose, with their scans; called if the pose
-                is estimated.
+            judges: Prepares and returns the judges of scans at the estimated pose; called if the pose is estimated.
             meanwhile: Called while the device works on the first stage.
             given: Sets the inputs of a recorded correction, which its first stage copies to the device.
         """
@@ -139,6 +139,7 @@ class Cloud(Particles):
         self._prepared, self._meanwhile = judges, meanwhile
         self._asked, self._was_asked = self._asked + 1 if self._was_asked else 0, False
         self._estimates_too = self._asked >= _ASKED
+        self._refines_too, self._was_refined = self._estimates_too and self._was_refined, False
         if given is None:
             self.upload_settings(settings)
         else:
@@ -162,6 +163,7 @@ class Cloud(Particles):
                 break
         places = stage.places
         self._estimated_of = (places, self.count) if self._estimates_too else None
+        self._refined_of = (places, self.count) if self._refines_too else None
         self.set_particles(places, drawn)
 
     def _deepen(self, stage: Stage, settings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -177,9 +179,12 @@ class Cloud(Particles):
 
     def _weighing(self, stage: Stage) -> Program:
         """Return the launches of a stage after its scores, including the estimate if it is expected."""
-        if not self._estimates_too:
-            return self.weighing(stage)
-        return self.weighing(stage) + self._estimating(stage.places, self.count, 0)
+        program = self.weighing(stage)
+        if self._estimates_too:
+            program += self._estimating(stage.places, self.count)
+        if self._refines_too:
+            program += self._estimating(stage.places, self.count, self.refined)
+        return program
 
     def _judging(self) -> Program:
         """Return the launches for judging scans at the estimate."""
@@ -191,13 +196,7 @@ class Cloud(Particles):
         if not self._estimates_too:
             return ()
         if self._prepared is not None:
-            prepared, self._prepared = self._prepared(), None
-            for place, (_, scan) in enumerate(prepared):
-                if self._given is None:
-                    self.backend.refill(self._held(scan), self.scans[place])
-                else:
-                    self._given[self.inputs.spans[1 + len(self.readings) + place]] = scan
-            self._judges = [judge for judge, _ in prepared]
+            self._judges, self._prepared = self._prepared(), None
         return tuple([judge.version for judge in self._judges])
 
     def _use_wait(self) -> None:
@@ -206,10 +205,10 @@ class Cloud(Particles):
         if meanwhile is not None:
             meanwhile()
 
-    def _estimating(self, places: BufferSlots, count: int, second_pass: int) -> Program:
-        """Return the launches of a pass of the estimate."""
+    def _estimating(self, places: BufferSlots, count: int, refined: Buffer | None = None) -> Program:
+        """Return the launches of the estimate, or of its second pass."""
         poses, weights = self.poses[places.shown], self.weights[places.weight]
-        return self.sums.estimate(poses, weights, self.estimated, count, second_pass)
+        return self.sums.estimate(poses, weights, self.estimated, count, refined)
 
     def _copy_state(self, source: int, target: int) -> None:
         if self.backend.info.kind == "gpu":
@@ -224,7 +223,7 @@ class Cloud(Particles):
 
     def weigh(self, stage: Stage) -> None:
         """Run the launches of a stage after its scores."""
-        key = (stage.key, self.count, self._sensors, self._estimates_too)
+        key = (stage.key, self.count, self._sensors, self._estimates_too, self._refines_too)
         self._stages.run(key, lambda: self._weighing(stage))
         # Prepare scans while the device works.
         versions = self._prepare_judges()
@@ -237,7 +236,7 @@ class Cloud(Particles):
 
     def replay(self, stage: Stage, key: Hashable, scoring: Callable[[int], tuple[Program, object]]) -> None:
         """Run a stage as one recorded program; ``scoring`` makes the sensors' part for a buffer of poses."""
-        whole = (key, stage, self.count, self._estimates_too, self._prepare_judges())
+        whole = (key, stage, self.count, self._estimates_too, self._refines_too, self._prepare_judges())
         recorded = self._recordings.get(whole)
         if recorded is None:
             move = () if stage.kind is None else self.motion(stage.origin, stage.source, stage.kind)
@@ -291,7 +290,7 @@ class Cloud(Particles):
     def device_shares(self, count: int) -> Buffer:
         """Return a new buffer with the normalised weights of the shown particles."""
         out, weight = self.backend.empty_external(count, _DOUBLE), self.weights[self.places.weight]
-        program = self.sums.estimate(self.poses[self.places.shown], weight, self.estimated, count)
+        program = self._estimating(self.places, count)
         program += self.sums.launch("normalize_weights", count, weight=weight, estimate=self.estimated, share=out,
                                     particles=count)  # fmt: skip
         self.backend.run(program)
@@ -303,9 +302,9 @@ class Cloud(Particles):
             return self.estimate(count)[:MOMENTS]
         out = self.backend.empty_external(ESTIMATE, _DOUBLE)
         poses, weights = self.poses[self.places.shown], self.weights[self.places.weight]
-        for second_pass in (0, 1):
+        for refined in (None, out):
             # The second pass is correct for any headings.
-            self.backend.run(self.sums.estimate(poses, weights, out, count, second_pass))
+            self.backend.run(self.sums.estimate(poses, weights, out, count, refined))
         return self._lent(out, (MOMENTS,))
 
     def particles(self, count: int) -> Any:
@@ -315,19 +314,19 @@ class Cloud(Particles):
         return self._lent(self.poses[self.places.shown], (count, 3))
 
     def estimate(self, count: int) -> np.ndarray:
-        """Return mean, covariance and sum of weights of the shown particles from the kernels."""
+        """Return mean, covariance and sum of weights of the shown particles from the kernels; not to be changed."""
         self._was_asked, key = True, (self.places, count)
         if self._known is None or self._known[0] != key:
-            numbers = self._estimate(count, 0)
-            self._known = key, self._estimate(count, 1) if numbers[WIDE_HEADINGS] else numbers
-        return self._known[1].copy()
+            numbers = self._estimate(count)
+            if numbers[WIDE_HEADINGS]:
+                numbers = np.concatenate([numbers[:3], self._refined(count)[3:MOMENTS], numbers[MOMENTS:]])
+            self._known = key, numbers
+        return self._known[1]
 
     def far_share(self, count: int) -> float:
-        """Return the share of the shown particles beyond 1 m or 0.5 rad of the mean that ``estimate`` has returned."""
-        key = self.places, count
-        if self._far is None or self._far[0] != key:
-            self._far = key, float(self._estimate(count, 1)[FAR_SHARE])
-        return self._far[1]
+        """Return the share of the shown particles beyond 1 m or 0.5 rad of the mean."""
+        self.estimate(count)
+        return float(self._refined(count)[FAR_SHARE])
 
     def snapshot(self, count: int) -> Snapshot:
         """Return the function that copies the shown particles of now to the host, at any later time."""
@@ -335,22 +334,31 @@ class Cloud(Particles):
         self._snapshots.append(weakref.ref(made))
         return made
 
-    def _estimate(self, count: int, second_pass: int) -> np.ndarray:
-        """Return the result of a pass of the estimate; run the pass unless the last correction did."""
+    def _estimate(self, count: int) -> np.ndarray:
+        """Return the estimate; compute it unless the last correction did."""
         places = self.places
-        if second_pass or self._estimated_of != (places, count):
-            self._results = self._estimated_of = None
-            self._judges = ()
+        if self._estimated_of != (places, count):
+            self._results, self._judges = None, ()
             # Clouds of varying size rarely repeat a size.
-            self._estimates.run(
-                (places.shown, places.weight, count, second_pass), lambda: self._estimating(places, count, second_pass)
-            )
-        numbers, (first, *spans) = self._read_results(), self.results.spans[2:]
+            self._estimates.run((places.shown, places.weight, count), lambda: self._estimating(places, count))
+            self._estimated_of = places, count
+        numbers, (first, _, *spans) = self._read_results(), self.results.spans[2:]
         estimate = numbers[first]
         for judge, span in zip(self._judges, spans, strict=False):
             judge.receive(estimate, numbers[span])
         self._judges = ()
         return estimate
+
+    def _refined(self, count: int) -> np.ndarray:
+        """Return the second pass of the present estimate; compute it unless the last correction did."""
+        places, self._was_refined = self.places, True
+        if self._refined_of != (places, count):
+            self._results = None
+            self._estimates.run(
+                (places.shown, places.weight, count, "refined"), lambda: self._estimating(places, count, self.refined)
+            )
+            self._refined_of = places, count
+        return self._read_results()[self.results.spans[3]]
 
     def _state_of(self, index: int) -> np.ndarray:
         """Return a state."""

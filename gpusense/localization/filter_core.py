@@ -111,7 +111,8 @@ class FilterCore:
         if not used:
             return
         tracker, verdict, share = self.tracker, self.verdict, self.options.beam_skip
-        everything = dict(used)
+        # Copies, since the caller may reuse the arrays for the next readings; the verdict compares their identity.
+        everything = {index: tuple(map(copied, reading)) for index, reading in used}
         if verdict.watches(everything):
             verdict.predicted(*tracker.moved_particles(), everything)
         if share is not None:
@@ -125,13 +126,12 @@ class FilterCore:
         tracker.learn(used, self.recovery.is_doubted)
         self.recovery.corrected(used, self.last)
 
-    def _use_wait(self, readings: Mapping[int, tuple[Any, ...]]) -> None:
+    def _use_wait(self, readings: dict[int, tuple[Any, ...]]) -> None:
         """Learn from the scans of the last correction, unless they contradict the pose, and count this one."""
         doubted = self.recovery.is_doubted()
         for sensor in self.sensors:
             sensor.learn(doubted=doubted)
-        # The caller may reuse the arrays for the next readings.
-        self.last = {index: tuple(map(copied, reading)) for index, reading in readings.items()}
+        self.last = readings
         self.verdict.corrected()
 
     def reset(self) -> None:

@@ -61,9 +61,18 @@ class MotionModel(Protocol):
         """Return the numbers of one step."""
 
 
-def _difference(before: np.ndarray, after: np.ndarray) -> tuple[float, float, float]:
+def _odometer(name: str, pose: object) -> tuple[float, float, float]:
+    """Return a checked pose of an odometer; arrays of three numbers would take most of the time of a step's motion."""
+    plain = type(pose) is np.ndarray and pose.shape == (3,) and pose.dtype == np.float64
+    x, y, theta = (pose if plain else checks.array(name, pose, (3,), largest=checks.FARTHEST)).tolist()
+    if not (abs(x) <= checks.FARTHEST and abs(y) <= checks.FARTHEST and abs(theta) <= checks.FARTHEST):
+        checks.array(name, pose, (3,), largest=checks.FARTHEST)
+    return x, y, theta
+
+
+def _difference(before: Sequence[float], after: Sequence[float]) -> tuple[float, float, float]:
     """Return the pose ``after`` in the frame of ``before``, without the cost of arrays."""
-    (x0, y0, theta0), (x1, y1, theta1) = before.tolist(), after.tolist()
+    (x0, y0, theta0), (x1, y1, theta1) = before, after
     x, y, cosine, sine = x1 - x0, y1 - y0, math.cos(theta0), math.sin(theta0)
     return cosine * x + sine * y, cosine * y - sine * x, math.remainder(theta1 - theta0, math.tau)
 
@@ -86,13 +95,10 @@ def odometry_turns(before: object, after: object) -> tuple[float, float, float]:
         >>> gs.odometry_turns((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
         (0.0, -1.0, 0.0)
     """
-    return turns_between(
-        checks.array("before", before, (3,), largest=checks.FARTHEST),
-        checks.array("after", after, (3,), largest=checks.FARTHEST),
-    )
+    return turns_between(_odometer("before", before), _odometer("after", after))
 
 
-def turns_between(before: np.ndarray, after: np.ndarray) -> tuple[float, float, float]:
+def turns_between(before: Sequence[float], after: Sequence[float]) -> tuple[float, float, float]:
     """Return the motion between checked poses of an odometer; see :func:`odometry_turns`."""
     x, y, turn = _difference(before, after)
     trans = math.hypot(x, y)
@@ -226,11 +232,7 @@ class OmniMotion:
         """Return the numbers of a step from the odometer's poses before and after it."""
         if len(arguments) != 2:
             raise TypeError(f"predict: must have the odometry before and after the step, got {len(arguments)} values")
-        before, after = (
-            checks.array(n, v, (3,), largest=checks.FARTHEST)
-            for n, v in zip(("before", "after"), arguments, strict=True)
-        )
-        x, y, turn = _difference(before, after)
+        x, y, turn = _difference(_odometer("before", arguments[0]), _odometer("after", arguments[1]))
         trans = math.hypot(x, y)
         direction = math.atan2(y, x) if trans > 0 else 0.0
         a1, a2, a3, a4, a5 = self.alpha

@@ -137,7 +137,7 @@ def fit_odometry_motion(odometry: AnyArray, poses: AnyArray, *, systematic: bool
     if len(reported) < 3:
         raise ValueError(f"odometry: must hold at least 3 poses, got {len(reported)}")
     reference, at = _references(poses, len(reported))
-    turns = np.array([turns_between(a, b) for a, b in itertools.pairwise(reported[at[0] : at[-1] + 1])])
+    turns = np.array([turns_between(a, b) for a, b in itertools.pairwise(reported[at[0] : at[-1] + 1].tolist())])
     at = at - at[0]
     travelled, turned = float(np.abs(turns[:, 1]).sum()), float(np.abs(turns[:, [0, 2]]).sum())
     if travelled < REST[0] and turned < REST[1]:

@@ -18,7 +18,7 @@ from gpusense.backends.base import Backend
 from gpusense.interface.constants import ESTIMATE, SETTINGS, STATE
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
-from gpusense.localization.map_judge import JUDGED
+from gpusense.localization.beam_consistency import JUDGED
 from gpusense.localization.sums import Sums, weight_block
 
 _DOUBLE = np.dtype(np.float64)
@@ -142,7 +142,7 @@ class Particles:
         kept: Buffers at the beginning of a call of the filter, which steps never overwrite.
         pool_size: Number of poses for recovery to inject.
         inputs: Settings of a step, and of each sensor the readings and the scan to judge.
-        results: Two states of corrections, the estimate, and the judged beams of each sensor.
+        results: Two states of corrections, the estimate and its second pass, and the judged beams of each sensor.
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("count", "block", "places", "pool", "pool_size")
@@ -164,8 +164,8 @@ class Particles:
         self.inputs = Packed(backend, (SETTINGS, *readings, *[JUDGED] * count))
         self.settings, *more = self.inputs.parts
         self.readings, self.scans = more[:count], more[count:]
-        self.results = Packed(backend, (STATE, STATE, ESTIMATE, *[JUDGED] * count))
-        first, second, self.estimated, *self.judged = self.results.parts
+        self.results = Packed(backend, (STATE, STATE, ESTIMATE, ESTIMATE, *[JUDGED] * count))
+        first, second, self.estimated, self.refined, *self.judged = self.results.parts
         self.states = [first, second]
         self.pool, self.pool_size = backend.upload(np.zeros(3)), 0
         # Cumulative numbers of certain copies.

@@ -12,9 +12,9 @@ from gpusense._util import checks
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import ProgramCache
 from gpusense.interface.launches import Program
+from gpusense.localization.beam_consistency import JUDGED, MapJudge
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.cloud_state import SensorReadings, Step
-from gpusense.localization.map_judge import MapJudge
 from gpusense.localization.particles import Stage
 from gpusense.localization.sensors import Sensor
 
@@ -96,14 +96,16 @@ class FilterCloud(Cloud):
                 adopted.append((source, target, self._scored[index].readings * _DOUBLE.itemsize))
         self._adopted = adopted
 
-    def _judges_of(self, judged: Sequence[SensorReadings]) -> list[tuple[MapJudge, np.ndarray]]:
-        """Prepare and return the judges of scans, with their scans."""
-        result = []
+    def _judges_of(self, judged: Sequence[SensorReadings]) -> list[MapJudge]:
+        """Prepare and return the judges of scans, whose beams become inputs of the correction."""
+        result = list[MapJudge]()
         for index, (ranges, *_) in judged:
-            judge = self._scored[index].judge()
-            scan = judge.expects(self._scored[index].model.scanner, ranges)
-            if scan is not None:
-                result.append((judge, scan))
+            judge, place, given = self._scored[index].judge(), len(result), self._given
+            scan = np.empty(JUDGED) if given is None else given[self.inputs.spans[1 + len(self.readings) + place]]
+            if judge.expects(self._scored[index].model.scanner, ranges, scan):
+                result.append(judge)
+                if given is None:
+                    self.backend.refill(self._held(scan), self.scans[place])
         return result
 
     def _call(self, readings: Sequence[SensorReadings], stage: Stage) -> None:

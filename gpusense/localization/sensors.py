@@ -14,8 +14,8 @@ from gpusense.backends import arrays
 from gpusense.backends.base import Backend, Buffer
 from gpusense.interface.constants import DEPTH, TEMPERATURE
 from gpusense.interface.launches import Program
+from gpusense.localization.beam_consistency import MapJudge
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.map_judge import MapJudge
 from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around
 from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.point.base import PointModel

@@ -101,8 +101,11 @@ class Sums:
                          fan=reduction_fans(blocks)[0], drawn=drawn, stage=stage, **numbers),
         )  # fmt: skip
 
-    def estimate(self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, second_pass: int = 0) -> Program:
-        """Return the launches that write the estimate of a cloud, or of its second pass."""
+    def estimate(
+        self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, refined: Buffer | None = None
+    ) -> Program:
+        """Return the launches that write the estimate of a cloud, or by a second pass the numbers in ``refined``."""
+        second_pass, target_of_pass = (0, estimate) if refined is None else (1, refined)
         info, block = self._backend.info, block_of(count)
         # In a kernel with lanes, a work-item processes all lanes.
         lanes = ESTIMATE_LANES if info.kind == "cpu" or info.lanes > 1 else 1
@@ -117,7 +120,7 @@ class Sums:
             launches, groups = self._join(source, target, (groups, ESTIMATE_SUMS), fan)
             program += launches
             source, target = target, source
-        return program + self.launch("finish_estimate", 1, poses=poses, sums=source, estimate=estimate,
+        return program + self.launch("finish_estimate", 1, poses=poses, sums=source, estimate=target_of_pass,
                                      groups=groups, second_pass=second_pass)  # fmt: skip
 
     def _weight_totals(self, blocks: int) -> Program:

@@ -37,6 +37,7 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray
+from gpusense.matching.columns import axes_of_one
 from gpusense.models.scan.model import ScanModel
 
 # Independent beams of a scan before any data.
@@ -61,16 +62,22 @@ _FIRST_STEPS = (0.05, 0.05, 0.0125)
 
 def axes_of(covariance: np.ndarray) -> np.ndarray:
     """Return steps as columns of a (3, 3) array: deviations along the axes of a (3, 3) covariance, 0.1 mm to 10 cm."""
-    units = np.array([1.0, 1.0, _TURN])
-    values, vectors = np.linalg.eigh(covariance / np.outer(units, units))
-    lengths = np.minimum(np.maximum(np.sqrt(np.maximum(values, 0.0)), _STEPS[0]), _STEPS[1])
-    axes: np.ndarray = units[:, None] * vectors * lengths
-    return axes
+    (xx, xy, xt), (_, yy, yt), (_, _, tt) = covariance.tolist()
+    steps = []
+    # A few numbers of Python take a fraction of the time of LAPACK between steps of a filter.
+    for variance, (x, y, theta) in axes_of_one((xx, xy, xt / _TURN, yy, yt / _TURN, tt / _TURN**2)):
+        length = min(max(math.sqrt(max(variance, 0.0)), _STEPS[0]), _STEPS[1])
+        steps.append((length * x, length * y, length * _TURN * theta))
+    return np.array(steps).T
 
 
 def poses_around(pose: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """Return the (7, 3) poses for measuring scores: the pose, and steps forward and back along each axis."""
-    return np.vstack([pose, pose + _FAR * axes.T, pose - _FAR * axes.T])
+    poses, steps = np.empty((7, 3)), _FAR * axes.T
+    poses[:] = pose
+    poses[1:4] += steps
+    poses[4:] -= steps
+    return poses
 
 
 class _Scores(NamedTuple):
@@ -97,11 +104,15 @@ class _Scores(NamedTuple):
         outer = sums[:, 3:].reshape(-1, 3, 3)
         return sums[:, :3] - outer @ self.fit, outer
 
-    def variances(self, count: int) -> tuple[float, float]:
-        """Return the variance of ``count`` blocks' scores after a fit, measured and for independent beams."""
-        blocks, outer = self.fitted(self.blocks.reshape(count, -1, 12).sum(axis=1))
-        taken = float((outer @ self.inverse * outer).sum())
-        return float((blocks * blocks).sum()), float(self.outer.trace()) - taken
+    def variances(self) -> tuple[float, float, float, float]:
+        """Return the variances of scores after a fit, of long and of short blocks, measured and if independent."""
+        short, outer = self.fitted(self.blocks)
+        long, outer_of_long = short.reshape(_LONG, -1, 3).sum(axis=1), outer.reshape(_LONG, -1, 3, 3).sum(axis=1)
+        trace = float(self.outer.trace())
+        return (
+            float((long * long).sum()), trace - float((outer_of_long @ self.inverse * outer_of_long).sum()),
+            float((short * short).sum()), trace - float((outer @ self.inverse * outer).sum()),
+        )  # fmt: skip
 
 
 def _scores_of(parts: np.ndarray) -> _Scores:
@@ -117,8 +128,18 @@ def _scores_of(parts: np.ndarray) -> _Scores:
     total = blocks.sum(axis=0)
     outer = total[3:].reshape(3, 3)
     outer = outer + 1e-9 * max(float(outer.trace()), 1e-30) * _IDENTITY
-    inverse = np.linalg.inv(outer)
+    inverse = _inverse_of(outer)
     return _Scores(numbers, (6 * at - sum(around)) / _FAR**2, blocks, inverse @ total[:3], outer, inverse)
+
+
+def _inverse_of(matrix: np.ndarray) -> np.ndarray:
+    """Return the inverse of a (3, 3) matrix by its cofactors."""
+    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
+    one, two, three = e * i - f * h, f * g - d * i, d * h - e * g
+    cofactors = [
+        (one, c * h - b * i, b * f - c * e), (two, a * i - c * g, c * d - a * f), (three, b * g - a * h, a * e - b * d),
+    ]  # fmt: skip
+    return np.array(cofactors) / (a * one + b * two + c * three)
 
 
 def _places_of(block: np.ndarray) -> np.ndarray:
@@ -148,6 +169,8 @@ class BeamCorrelation:
         # Products and squares of consecutive scans; share of a pose's information that a scan contributes.
         self._products, self._pairs, self._gain = np.zeros(2), 0, 0.0
         self._previous: tuple[np.ndarray, np.ndarray] | None = None
+        # Number of sectors of the world for comparing scans; 0 before the first scan.
+        self._around = 0
 
     def add(self, parts: AnyArray, axes: AnyArray, directions: AnyArray | None = None, *, follows: bool = True) -> None:
         """Add a scan.
@@ -169,7 +192,7 @@ class BeamCorrelation:
         scores = _scores_of(values[:, used])
         gain = min(max(self.temperature(count) * scores.curvature / 3, 0.0), 1.0)
         independent = float(scores.outer.trace()) * count / (count - 3)
-        found = np.array([scores.curvature, independent, *scores.variances(_LONG), *scores.variances(_SHORT)])
+        found = np.array([scores.curvature, independent, *scores.variances()])
         keep = 1 - 1 / min(self.scans + 1, _MEMORY)
         self._sums = keep * self._sums + (1 - keep) * found
         self._gain = keep * self._gain + (1 - keep) * gain
@@ -183,18 +206,20 @@ class BeamCorrelation:
         self, scores: _Scores, axes: np.ndarray, directions: np.ndarray, used: np.ndarray, follows: bool
     ) -> None:
         """Correlate a scan's blocks with the last scan's blocks in the same directions."""
-        # Sectors of the world, an eighth of a scan wide, a whole number per turn.
-        ahead = np.mod(directions, 2 * np.pi)
-        ordered = np.sort(ahead)
-        gap = max(float(np.max(ordered[1:] - ordered[:-1])), float(ordered[0] + 2 * np.pi - ordered[-1]))
-        around = max(round(_SECTORS * 2 * np.pi / max(2 * np.pi - gap, 0.1)), 1)
-        block = (ahead[used] * (around / (2 * np.pi))).astype(np.int64) % around
+        ahead = np.mod(directions, math.tau)
+        if not self._around:
+            # Sectors of the world, an eighth of a scan wide, a whole number per turn; the same for all scans.
+            ordered = np.sort(ahead)
+            gap = max(float(np.max(ordered[1:] - ordered[:-1])), float(ordered[0] + math.tau - ordered[-1]))
+            self._around = max(round(_SECTORS * math.tau / max(math.tau - gap, 0.1)), 1)
+        around = self._around
+        block = (ahead[used] * (around / math.tau)).astype(np.int64) % around
         sums = np.bincount(_places_of(block), scores.numbers, 12 * around).reshape(around, 12)
         blocks, _ = scores.fitted(sums)
         # Gradients in the world, times this scan's root of the covariance.
-        world = np.linalg.solve(axes.T, blocks.T).T
+        world = blocks @ _inverse_of(axes)
         seen = np.bincount(block, minlength=around) > 0
-        if follows and self._previous is not None and len(self._previous[1]) == around:
+        if follows and self._previous is not None:
             both = seen & self._previous[1]
             now, then = blocks[both], self._previous[0][both] @ axes
             keep = 1 - 1 / min(self._pairs + 1, _MEMORY)

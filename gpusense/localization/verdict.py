@@ -19,7 +19,6 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.backends import arrays
 from gpusense.localization.beam_consistency import BeamConsistency, beam_consistency
 from gpusense.localization.belief import Belief, motion_between
 from gpusense.localization.motion import STILL, SampledMotion
@@ -27,7 +26,6 @@ from gpusense.localization.scan_evidence import evidence_of_scan, ratio_of_featu
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.spread import TRACKING, spread_of
 from gpusense.models.landmark.base import FeatureModel
-from gpusense.world.scanner import float64_readings
 
 # Random poses.
 _RANDOM = 64
@@ -219,7 +217,7 @@ class Verdict:
             # The model checks, and refuses or converts, other types.
             plain = type(ranges) is np.ndarray and ranges.dtype.kind == "f"
             if sensor.calibrates and plain and ranges.shape == (sensor.model.scanner.count,):
-                scans.append((index, (ranges.astype(np.float64, copy=False),)))
+                scans.append((index, (ranges,)))
         return scans
 
     def _is_near(self, pose: np.ndarray | Sequence[float], later: int = 0) -> bool:
@@ -283,10 +281,8 @@ def sightings(
     for index, reading in readings.items():
         sensor = sensors[index]
         if sensor.calibrates:
-            grid, scanner = sensor.model.grid, sensor.model.scanner
-            on_host = np.asarray(arrays.copied_to_host(reading[0], sensor.backend, "ranges"))
-            ranges = float64_readings(on_host, scanner)
-            result.append(beam_consistency(grid, scanner, pose, ranges, covariance, sensor.judge()))
+            judge = sensor.judge()
+            result.append(beam_consistency(judge.grid, sensor.model.scanner, pose, reading[0], covariance, judge))
     return result
 
 

@@ -5,6 +5,7 @@ Tests of models cover interrupts in models and devices; these cover the filter's
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -138,16 +139,16 @@ class FailingError(Exception):
     """An error of a model."""
 
 
-def test_a_model_that_fails_in_any_call_changes_nothing(backend, monkeypatch):
-    pf = begun(FILTERS["field"](backend))
+def fail_in_every_call(name: str, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let each call of a correction that scores fail in turn: of models, or on GPUs the start of a recorded step."""
+    pf = begun(FILTERS[name](backend))
     pf.predict(*odometry(3))
     start, before = pf.state(), everything(pf)
     pf.correct(readings(pf, 3))
-    after = everything(pf)
-    model, count = pf.models[0], [0]
-    # GPUs score in a recorded program.
-    for owner, name in ((model, "start_scoring"), (model, "log_likelihood"), (RecordedProgram, "start")):
-        inner = getattr(owner, name)
+    after, count = everything(pf), [0]
+    owners = [(one, call) for one in pf.models for call in ("start_scoring", "log_likelihood") if hasattr(one, call)]
+    for owner, call in (*owners, (RecordedProgram, "__call__")):
+        inner = getattr(owner, call)
 
         def failing(*arguments, inner=inner, **options):
             count[0] -= 1
@@ -155,8 +156,8 @@ def test_a_model_that_fails_in_any_call_changes_nothing(backend, monkeypatch):
                 raise FailingError
             return inner(*arguments, **options)
 
-        monkeypatch.setattr(owner, name, failing)
-    for fails in range(1, 10):
+        monkeypatch.setattr(owner, call, failing)
+    for fails in range(1, 20):
         pf.restore(start)
         count[0] = fails
         try:
@@ -172,6 +173,18 @@ def test_a_model_that_fails_in_any_call_changes_nothing(backend, monkeypatch):
         assert everything(pf) == after
     else:
         pytest.fail("no correction without the failure")
+
+
+@pytest.mark.sampled(0.4)
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_model_that_fails_in_any_call_changes_nothing(name, backend, monkeypatch):
+    fail_in_every_call(name, backend, monkeypatch)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_recorded_step_that_fails_in_any_call_changes_nothing(name, device, monkeypatch):
+    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1, vector_loops=False))
+    fail_in_every_call(name, device.info.selection, monkeypatch)
 
 
 @pytest.mark.parametrize("late", ["corrected", "begin_lesson"])

@@ -12,9 +12,8 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.interface.constants import AGREES, NOTHING, SHORT, THROUGH, VANISHED
 from gpusense.localization import belief as constants
-from gpusense.localization.beam_consistency import beam_consistency
+from gpusense.localization.beam_consistency import MapJudge, beam_consistency
 from gpusense.localization.belief import ALIKE, ALIKE_CHOSEN, FOUND, LENGTH, PER_METRE, PER_SCAN, STAYS, Belief
-from gpusense.localization.map_judge import MapJudge
 from gpusense.localization.scan_evidence import LIMITS, evidence_of_scan, ratio_of_scan
 from gpusense.localization.spread import share_off, share_off_of, verdict_label
 

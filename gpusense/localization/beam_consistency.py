@@ -44,8 +44,9 @@ _MIDDLES = np.arange(BEAMS) * 2 + 1
 BESIDE, _APART, _MOST_BESIDE, _MOST_APART = 0.08, 0.025, 0.3, 0.1
 # Tolerance of a range: relative, and least values [m] and [cells]; largest distance of close agreement [m].
 _PART, _LEAST, _LEAST_CELLS, _CLOSE = 0.02, 0.2, 2.0, 0.1
-# Numbers of a judgement.
+# Numbers of a judgement; classes as the kernel writes them.
 JUDGED = 2 * BEAMS
+_AGREES, *_OTHERS = map(float, (AGREES, THROUGH, SHORT, NOTHING))
 _DOUBLE, _PLAIN, _STILL = np.dtype(np.float64), frozenset[str](), np.zeros((3, 3))
 # Version numbers of map parts on devices, keys of recorded launches.
 _VERSIONS = itertools.count(1)
@@ -101,13 +102,16 @@ class Counts(NamedTuple):
 
 
 def counts_of(scans: Sequence[BeamConsistency]) -> Counts:
-    """Return the counts of several scans; Python's numbers are faster than short arrays."""
+    """Return the counts of several scans."""
     kinds, close = list[float](), 0
     for one in scans:
-        kinds += one.kind.tolist()
-        for kind, reading, distance in zip(one.kind.tolist(), one.reading.tolist(), one.distance.tolist(), strict=True):
-            close += kind == AGREES and abs(reading - distance) < one.near
-    return Counts(kinds.count(AGREES), close, kinds.count(THROUGH), kinds.count(SHORT), kinds.count(NOTHING))
+        # Python's numbers are faster than short arrays.
+        these = one.kind.tolist()
+        kinds += these
+        for kind, reading, distance in zip(these, one.reading.tolist(), one.distance.tolist(), strict=True):
+            if kind == _AGREES and -one.near < reading - distance < one.near:
+                close += 1
+    return Counts(kinds.count(_AGREES), close, *[kinds.count(kind) for kind in _OTHERS])
 
 
 def beam_consistency(

@@ -268,7 +268,8 @@ class ParticleFilter(Transactional):
             RuntimeError: the filter is not initialised.
             ValueError: another method.
         """
-        checks.choice("method", method, ("mean", "cluster", "best"))
+        if method != "mean":
+            checks.choice("method", method, ("mean", "cluster", "best"))
         self._moved()
         return self._parts.estimate(method)
 
@@ -290,7 +291,8 @@ class ParticleFilter(Transactional):
     @consistent
     def mean_and_covariance(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the weighted mean (3,) and the covariance (3, 3), without the verdict of :meth:`estimate`."""
-        return self._moved().mean_and_covariance()
+        mean, covariance = self._moved().mean_and_covariance()
+        return mean.copy(), covariance.copy()
 
     @property
     def models(self) -> tuple[Any, ...]:

@@ -150,7 +150,9 @@ class FilterCore:
         tracker, verdict, rival = self.tracker, self.verdict, self.recovery.rival
         cloud, shown = tracker.cloud, tracker.shown
         mean, covariance = tracker.mean_and_covariance()
-        pose, about, summary = mean, covariance, cloud.summary()
+        # Copies, which belong to the caller.
+        pose, covariance, summary = mean.copy(), covariance.copy(), cloud.summary()
+        about = covariance
         if method == "best":
             pose = tracker.host_particles()[int(np.argmax(cloud.host_weights(shown)))]
         elif method == "cluster":

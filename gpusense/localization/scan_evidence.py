@@ -48,7 +48,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from gpusense.localization.beam_consistency import BeamConsistency, Counts, counts_of
+from gpusense.localization.beam_consistency import BeamConsistency, counts_of
 
 BIAS, SLOPE, BLUNT, NOTHING, FEW = 3.34, 1.74, 0.48, 0.58, 4.0
 CAUTION, SOLID, UNKNOWN, LIMITS = 0.9, 2.0, 1.0, (-4.0, 5.0)
@@ -68,22 +68,15 @@ def evidence_of_scan(scans: Sequence[BeamConsistency]) -> tuple[float, float]:
     """Return the ratio of simultaneous scans, and the agreeing share of their explainable beams; NaN without any."""
     if not scans:
         return math.nan, math.nan
-    counts = counts_of(scans)
-    informative_count = counts.informative_count
-    return _ratio_of(counts, scans), counts.agree / informative_count if informative_count else math.nan
-
-
-def _ratio_of(counts: Counts, scans: Sequence[BeamConsistency]) -> float:
-    """Return the ratio of scans with these counts."""
-    place = SOLID * any(one.inside for one in scans) + UNKNOWN * any(one.off for one in scans)
-    informative_count = counts.informative_count
-    if not informative_count and not place:
-        return math.nan
-    ratio = BIAS - CAUTION + SLOPE * _odds(counts.through, counts.agree)
-    ratio += BLUNT * _odds(counts.agree - counts.close, counts.close) + NOTHING * _odds(
-        counts.nothing, informative_count
-    )
-    return min(max(informative_count / (informative_count + FEW) * ratio + place, LIMITS[0]), LIMITS[1])
+    agree, close, through, short, nothing = counts_of(scans)
+    informative = agree + through + short
+    place = SOLID * any([one.inside for one in scans]) + UNKNOWN * any([one.off for one in scans])
+    if not informative:
+        return (min(max(place, LIMITS[0]), LIMITS[1]) if place else math.nan), math.nan
+    ratio = BIAS - CAUTION + SLOPE * _odds(through, agree)
+    ratio += BLUNT * _odds(agree - close, close) + NOTHING * _odds(nothing, informative)
+    ratio = informative / (informative + FEW) * ratio + place
+    return min(max(ratio, LIMITS[0]), LIMITS[1]), agree / informative
 
 
 def _odds(one: int, other: int) -> float:

@@ -67,6 +67,8 @@ class Tracker:
         self._models = [sensor.model for sensor in sensors]
         self.started, self.progress, self.shown, self.wide = False, Progress(), options.most, 0
         self.together, self.corrections = False, 0
+        # An estimate from the kernels, with its mean and covariance.
+        self._moments: tuple[np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
         self.pool: tuple[int, starts.Spread] = 0, (0.0, 0.0, 0.0)
 
     def changing(self) -> tuple[Any, ...]:
@@ -127,9 +129,11 @@ class Tracker:
         return weights / weights.sum()
 
     def mean_and_covariance(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and covariance of the shown particles."""
-        numbers = self.cloud.estimate(self.shown)
-        return numbers[:3].copy(), covariance_of(numbers)
+        """Return mean and covariance of the shown particles, arrays that do not change."""
+        numbers, known = self.cloud.estimate(self.shown), self._moments
+        if known is None or known[0] is not numbers:
+            known = self._moments = numbers, (numbers[:3], covariance_of(numbers))
+        return known[1]
 
     # ---- state
 

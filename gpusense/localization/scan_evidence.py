@@ -70,7 +70,7 @@ def evidence_of_scan(scans: Sequence[BeamConsistency]) -> tuple[float, float]:
         return math.nan, math.nan
     agree, close, through, short, nothing = counts_of(scans)
     informative = agree + through + short
-    place = SOLID * any([one.inside for one in scans]) + UNKNOWN * any([one.off for one in scans])
+    place = SOLID * (True in [one.inside for one in scans]) + UNKNOWN * (True in [one.off for one in scans])
     if not informative:
         return (min(max(place, LIMITS[0]), LIMITS[1]) if place else math.nan), math.nan
     ratio = BIAS - CAUTION + SLOPE * _odds(through, agree)

@@ -77,9 +77,9 @@ def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -
     means = [float(np.minimum(kept, 4 * np.median(kept)).mean()) for kept in (late, verdict, default)]
     pf = filters[0]
     in_a_row = with_estimate = None
-    # First stages, without and with the estimate (the last but one part of a key), which the first steps launch by
+    # First stages, without and with the estimate (the fourth part of a key), which the first steps launch by
     # themselves.
-    recorded = {key[-2]: kept.recording for key, kept in pf._cloud._recordings.items() if key[1].number == 0}
+    recorded = {key[3]: kept.recording for key, kept in pf._cloud._recordings.items() if key[1].number == 0}
     if recorded:
         in_a_row, with_estimate = (_in_a_row(pf, steps, recorded[estimates]) for estimates in (False, True))
     return dict(

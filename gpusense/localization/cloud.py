@@ -1,44 +1,60 @@
-"""Run the steps of a filter's particle cloud on a device, and copy its results to the host.
+"""Run the steps of a filter's particles on the device of its sensors, and copy results to the host.
 
-A correction runs stages until the temperature is used up. On a GPU motion, scores and weights of a stage are one
-recorded program.
+A correction runs stages until the temperature is used up. On a GPU motion, scores, weights, the estimate and the beams
+to judge are one recorded program of a stage: one copy writes all of its inputs, and one reads all of its results. In
+CUDA the copies are part of its graph. Estimate and judgement are part of it where the last corrections' were read.
 """
 
 from __future__ import annotations
 
-import math
+import functools
 import weakref
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any
 
 import numpy as np
 
-from gpusense.backends.base import Backend, Buffer
+from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import ProgramCache, RecordedProgram, RepeatedPrograms
 from gpusense.interface.constants import ESTIMATE, FAR_SHARE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
-from gpusense.localization.beam_consistency import MapJudge
-from gpusense.localization.cloud_state import Contents, Snapshot, Summary, deeper, is_starved, meaningful, summary_of
+from gpusense.localization.beam_consistency import JUDGED, MapJudge
+from gpusense.localization.cloud_state import (
+    Contents,
+    Snapshot,
+    Step,
+    Summary,
+    deeper,
+    is_starved,
+    meaningful,
+    summary_of,
+)
 from gpusense.localization.particles import BufferSlots, Particles, Stage
+from gpusense.localization.sensors import Sensor, SensorReadings
 
 _DOUBLE = np.dtype(np.float64)
-_MOST_RECORDED, _MOST_STAGES = 64, 48
+# Most recorded steps, other programs, and programs of sensors.
+_MOST_RECORDED, _MOST_STAGES, _MOST_PROGRAMS = 64, 48, 8
 # Consecutive corrections with a read estimate after which corrections compute the estimate.
 _ASKED = 3
 
 
 class Cloud(Particles):
-    """Particles with recorded steps."""
+    """Particles of a filter on the device of its sensors.
 
-    def __init__(
-        self, backend: Backend, capacity: int, readings: Sequence[int], precision: np.dtype, *, residual: bool = False
-    ) -> None:
-        super().__init__(backend, capacity, readings, precision, residual=residual)
+    Steps never write buffers named in ``kept``, and finally name the new buffers in ``places``. Restoring the
+    attributes in ``MEMORY`` therefore undoes an interrupted call of a filter.
+    """
+
+    def __init__(self, sensors: Sequence[Sensor], capacity: int, *, residual: bool = False) -> None:
+        readings = [sensor.readings for sensor in sensors]
+        super().__init__(sensors[0].backend, capacity, readings, sensors[0].precision, residual=residual)
+        self._scored = sensors
         self._recordings = ProgramCache[RecordedProgram](_MOST_RECORDED)
-        self._estimates, self._stages = RepeatedPrograms(backend, 8), RepeatedPrograms(backend, _MOST_STAGES)
-        self._uploads: list[np.ndarray] = []
-        # Results on the host while they are valid; buffers and number of particles behind the estimate on the device,
-        # and behind the final estimate on the host.
+        self._programs = ProgramCache[tuple[Program, object]](_MOST_PROGRAMS)
+        self._estimates, self._stages = RepeatedPrograms(self.backend, 8), RepeatedPrograms(self.backend, _MOST_STAGES)
+        # Results on the host while they are valid; buffers and number of particles behind the estimate and its second
+        # pass on the device, and behind the final estimate on the host.
         self._results: np.ndarray | None = None
         self._summary: tuple[np.ndarray, int, Summary] | None = None
         self._estimated_of: Hashable = None
@@ -49,28 +65,22 @@ class Cloud(Particles):
         # present one compute the estimate; the same for the second pass, of one correction.
         self._asked, self._was_asked, self._estimates_too = 0, False, False
         self._was_refined, self._refines_too = False, False
-        # Function that prepares judges of scans; judges of the last correction until they receive the result.
-        self._prepared: Callable[[], list[MapJudge]] | None = None
-        self._judges: Sequence[MapJudge] = ()
-        # Inputs of a recorded correction that are not yet on the device, and readings of other arrays of the device;
-        # work of the host while the device runs a stage.
+        # The present correction while it runs; scans to judge until judges expect them; judges until they receive the
+        # result.
+        self._step: Step | None = None
+        self._expected: Sequence[SensorReadings] = ()
+        self._judges: list[MapJudge] = []
+        # Inputs of a recorded correction that are not yet on the device, and readings of other arrays of the device.
         self._given: np.ndarray | None = None
         self._adopted: Sequence[tuple[Buffer, Buffer, int]] = ()
-        self._meanwhile: Callable[[], None] | None = None
 
     def place(self, poses: np.ndarray) -> None:
         """Replace all particles by (N, 3) poses of equal weight, and reset the state of corrections."""
         count, places = len(poses), self.places.placed(self.kept)
-        self._fill((self.poses[places.shown], poses), (self.weights[places.weight], np.ones(count)),
+        self._begin_change()
+        self.fill((self.poses[places.shown], poses), (self.weights[places.weight], np.ones(count)),
                    (self.states[places.state], np.zeros(STATE)))  # fmt: skip
         self.set_particles(places, count)
-
-    def _fill(self, *arrays: tuple[Buffer, np.ndarray]) -> None:
-        """Copy arrays to buffers that earlier steps may still use."""
-        self._begin_change()
-        self.backend.synchronize()
-        for buffer, array in arrays:
-            self.backend.upload(np.ascontiguousarray(array, np.float64), buffer)
 
     def set_pool(self, poses: np.ndarray) -> None:
         """Upload poses for recovery to inject."""
@@ -78,26 +88,10 @@ class Cloud(Particles):
         self._stages.clear()
         self.pool, self.pool_size = self.backend.upload(np.ascontiguousarray(poses, np.float64)), len(poses)
 
-    def upload_settings(self, settings: np.ndarray) -> None:
-        """Copy the settings of a step to the device."""
-        self.backend.upload(self._held(settings), self.settings, wait=False)
-
-    def _held(self, array: np.ndarray) -> np.ndarray:
-        """Return an array, kept alive until the device has read it."""
-        if len(self._uploads) > 64:
-            self.wait()
-        self._uploads.append(array)
-        return array
-
-    def wait(self) -> None:
-        """Wait until the device is idle."""
-        self.backend.synchronize()
-        self._uploads.clear()
-
     def _begin_change(self) -> None:
         """Invalidate the results on the host, and save the particles that the change may overwrite."""
         self._results = self._known = self._estimated_of = self._refined_of = None
-        self._judges, self._prepared, self._given, self._adopted = (), None, None, ()
+        self._step, self._expected, self._judges, self._given, self._adopted = None, (), [], None, ()
         for one in self._snapshots:
             snapshot = one()
             if snapshot is not None and snapshot.places.free() != self.kept.free():
@@ -117,46 +111,38 @@ class Cloud(Particles):
     def _move(self, origin: int, target: int, kind: int) -> None:
         self._stages.run((origin, target, kind, self.count, "move"), lambda: self.motion(origin, target, kind))
 
-    def run_stages(
-        self, settings: np.ndarray, stages: list[Stage], drawn: int, sensors: int, score: Callable[[Stage], None],
-        judges: Callable[[], list[MapJudge]] | None = None,
-        meanwhile: Callable[[], None] | None = None, given: Callable[[], None] | None = None,
-    ) -> None:  # fmt: skip
-        """Run a correction: stages until the temperature is used up.
-
-        Args:
-            settings: Settings of the step.
-            stages: The stages.
-            drawn: Particles of the next step.
-            sensors: Number of sensors, the first ones of ``log_p``.
-            score: Runs a stage: motion if it is the first one, log-likelihoods, and weighing.
-            judges: Prepares and returns the judges of scans at the estimated pose; called if the pose is estimated.
-            meanwhile: Called while the device works on the first stage.
-            given: Sets the inputs of a recorded correction, which its first stage copies to the device.
-        """
-        self._sensors = sensors
+    def correct(self, step: Step) -> None:
+        """Run a correction: stages until the temperature is used up."""
+        settings, indices = step.settings, [index for index, _ in step.readings]
         self._begin_change()
-        self._prepared, self._meanwhile = judges, meanwhile
+        self._step, self._expected = step, step.judged
         self._asked, self._was_asked = self._asked + 1 if self._was_asked else 0, False
         self._estimates_too = self._asked >= _ASKED
         self._refines_too, self._was_refined = self._estimates_too and self._was_refined, False
-        if given is None:
-            self.upload_settings(settings)
+        recorded = self.backend.info.kind == "gpu"
+        for index, reading in step.readings:
+            recorded = recorded and self._scored[index].records(reading)
+        if recorded:
+            self._give(step)
         else:
-            given()
+            self.upload_settings(settings)
+        stages = self.places.stages(self.kept, step.stages, step.drawn, step.kind, same=step.drawn == self.count)
         if settings[SLOW_RATE] > 0:
             # Keep the averages of the likelihood.
-            self._copy_state(self.places.state, stages[0].state)
+            self.copy_state(self.places.state, stages[0].state)
         for stage in stages:
             last, deep = stage.most == 1, settings
             self._results = None
-            score(stage)
+            if recorded:
+                self._replay(indices, stage)
+            else:
+                self._call(step.readings, stage)
             self._use_wait()
             if not last:
                 numbers, deep = self._deepen(stage, settings)
                 last = numbers[stage.number * STAGE + LEFT] == 0.0
                 if not stage.drawn:
-                    self._draw(stage, drawn if last else self.count)
+                    self._draw(stage, step.drawn if last else self.count)
             if deep is not settings:
                 self.upload_settings(settings)
             if last:
@@ -164,7 +150,59 @@ class Cloud(Particles):
         places = stage.places
         self._estimated_of = (places, self.count) if self._estimates_too else None
         self._refined_of = (places, self.count) if self._refines_too else None
-        self.set_particles(places, drawn)
+        self.set_particles(places, step.drawn)
+
+    def _give(self, step: Step) -> None:
+        """Set the inputs of a recorded correction."""
+        self._given, adopted = np.empty(self.inputs.size), []
+        self._given[self.inputs.spans[0]] = step.settings
+        for index, reading in step.readings:
+            target = self.readings[index]
+            source = self._scored[index].place(reading, self._given[self.inputs.spans[1 + index]], target)
+            if source is not None:
+                adopted.append((source, target, self._scored[index].readings * _DOUBLE.itemsize))
+        self._adopted = adopted
+
+    def _call(self, readings: Sequence[SensorReadings], stage: Stage) -> None:
+        """Start the log-likelihoods of a stage call by call, and weigh."""
+        poses = self.poses_of(stage.source)
+        before = None if stage.kind is None else functools.partial(self._move, stage.origin, stage.source, stage.kind)
+        for place, (index, reading) in enumerate(readings):
+            self._scored[index].score(poses, reading, self.log_p_of(place), before=before)
+            before = None
+        key = (stage.key, self.count, len(readings), self._estimates_too, self._refines_too)
+        self._stages.run(key, lambda: self._weighing(stage))
+        # Prepare scans while the device works.
+        versions = self._prepare_judges()
+        if versions:
+            self._stages.run((versions, "judge"), self._judging)
+
+    def _replay(self, indices: list[int], stage: Stage) -> None:
+        """Run a stage of a correction by sensors ``indices`` as one recorded program."""
+        sensors = tuple([(index, self._scored[index].version) for index in indices])
+        key = (sensors, stage, self.count, self._estimates_too, self._refines_too, self._prepare_judges())
+        recorded = self._recordings.get(key)
+        if recorded is None:
+            move = () if stage.kind is None else self.motion(stage.origin, stage.source, stage.kind)
+            program, owners = self._program((sensors, self.count, stage.source), indices, stage.source)
+            program = move + program + self._weighing(stage) + self._judging()
+            recorded = self._recordings.keep(key, RecordedProgram(self.backend, program, owners))
+        self._start(recorded, read=stage.most > 1 or self._estimates_too)
+
+    def _program(self, key: Hashable, indices: list[int], source: int) -> tuple[Program, object]:
+        """Return the launches that score the poses of a buffer, and the owners of their memory."""
+        kept = self._programs.get(key)
+        if kept is not None:
+            return kept
+        program: Program = ()
+        owners: list[object] = []
+        poses = self.poses_of(source)
+        for place, index in enumerate(indices):
+            out = self.log_p_of(place)
+            launches, owner = self._scored[index].program(poses, self.readings[index], out)
+            program += launches
+            owners.append((poses, out, owner))
+        return self._programs.keep(key, (program, owners))
 
     def _deepen(self, stage: Stage, settings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Repeat a stage's weighing on lower rungs while too few particles have weight; return state and settings."""
@@ -179,7 +217,8 @@ class Cloud(Particles):
 
     def _weighing(self, stage: Stage) -> Program:
         """Return the launches of a stage after its scores, including the estimate if it is expected."""
-        program = self.weighing(stage)
+        assert self._step is not None
+        program = self.weighing(stage, len(self._step.readings))
         if self._estimates_too:
             program += self._estimating(stage.places, self.count)
         if self._refines_too:
@@ -192,64 +231,42 @@ class Cloud(Particles):
         return tuple(one for judge, *buffers in triples for one in judge.launches(self.estimated, *buffers))
 
     def _prepare_judges(self) -> Hashable:
-        """Prepare the judges of a correction that estimates the pose; return the key of their launches."""
+        """Let judges expect the scans of a correction that estimates the pose; return the key of their launches.
+
+        The beams are inputs of a recorded correction, or are copied to the device.
+        """
         if not self._estimates_too:
             return ()
-        if self._prepared is not None:
-            self._judges, self._prepared = self._prepared(), None
+        expected, self._expected, given = self._expected, (), self._given
+        for index, (ranges, *_) in expected:
+            judge, place = self._scored[index].judge(), len(self._judges)
+            scan = np.empty(JUDGED) if given is None else given[self.inputs.spans[1 + len(self.readings) + place]]
+            if judge.expects(self._scored[index].model.scanner, ranges, scan):
+                self._judges.append(judge)
+                if given is None:
+                    self.backend.refill(self.held(scan), self.scans[place])
         return tuple([judge.version for judge in self._judges])
 
     def _use_wait(self) -> None:
         """Do the host's work of a correction while the device runs its first stage."""
-        meanwhile, self._meanwhile = self._meanwhile, None
-        if meanwhile is not None:
-            meanwhile()
+        if self._step is not None and self._step.meanwhile is not None:
+            self._step.meanwhile()
+            self._step = self._step._replace(meanwhile=None)
 
     def _estimating(self, places: BufferSlots, count: int, refined: Buffer | None = None) -> Program:
         """Return the launches of the estimate, or of its second pass."""
         poses, weights = self.poses[places.shown], self.weights[places.weight]
         return self.sums.estimate(poses, weights, self.estimated, count, refined)
 
-    def _copy_state(self, source: int, target: int) -> None:
-        if self.backend.info.kind == "gpu":
-            self.backend.copy(self.states[source], self.states[target], STATE * _DOUBLE.itemsize)
-        else:
-            self.backend.upload(self._read(self.states[source], STATE), self.states[target])
-
-    def begin(self, stage: Stage) -> None:
-        """Start the motion of a correction."""
-        if stage.kind is not None:
-            self._move(stage.origin, stage.source, stage.kind)
-
-    def weigh(self, stage: Stage) -> None:
-        """Run the launches of a stage after its scores."""
-        key = (stage.key, self.count, self._sensors, self._estimates_too, self._refines_too)
-        self._stages.run(key, lambda: self._weighing(stage))
-        # Prepare scans while the device works.
-        versions = self._prepare_judges()
-        if versions:
-            self._stages.run((versions, "judge"), self._judging)
-
     def _draw(self, stage: Stage, drawn: int) -> None:
         """Draw into the other buffer."""
         self._stages.run((stage.key, drawn, self.count, "draw"), lambda: self.draw(stage, drawn))
-
-    def replay(self, stage: Stage, key: Hashable, scoring: Callable[[int], tuple[Program, object]]) -> None:
-        """Run a stage as one recorded program; ``scoring`` makes the sensors' part for a buffer of poses."""
-        whole = (key, stage, self.count, self._estimates_too, self._refines_too, self._prepare_judges())
-        recorded = self._recordings.get(whole)
-        if recorded is None:
-            move = () if stage.kind is None else self.motion(stage.origin, stage.source, stage.kind)
-            program, owners = scoring(stage.source)
-            program = move + program + self._weighing(stage) + self._judging()
-            recorded = self._recordings.keep(whole, RecordedProgram(self.backend, program, owners))
-        self._start(recorded, read=stage.most > 1 or self._estimates_too)
 
     def _start(self, recorded: RecordedProgram, *, read: bool) -> None:
         """Start a stage, and copy a correction's inputs and results with it: one graph of a CUDA device."""
         backend, given, self._given = self.backend, self._given, None
         if given is not None:
-            self._held(given)
+            self.held(given)
         backend.begin_batch()
         try:
             if given is not None:
@@ -305,13 +322,13 @@ class Cloud(Particles):
         for refined in (None, out):
             # The second pass is correct for any headings.
             self.backend.run(self.sums.estimate(poses, weights, out, count, refined))
-        return self._lent(out, (MOMENTS,))
+        return self.lent(out, (MOMENTS,))
 
     def particles(self, count: int) -> Any:
         """Return the shown poses: on a GPU an array of the device's library."""
         if self.backend.info.kind != "gpu":
             return self.host_poses(self.places.shown, count)
-        return self._lent(self.poses[self.places.shown], (count, 3))
+        return self.lent(self.poses[self.places.shown], (count, 3))
 
     def estimate(self, count: int) -> np.ndarray:
         """Return mean, covariance and sum of weights of the shown particles from the kernels; not to be changed."""
@@ -338,7 +355,7 @@ class Cloud(Particles):
         """Return the estimate; compute it unless the last correction did."""
         places = self.places
         if self._estimated_of != (places, count):
-            self._results, self._judges = None, ()
+            self._results, self._judges = None, []
             # Clouds of varying size rarely repeat a size.
             self._estimates.run((places.shown, places.weight, count), lambda: self._estimating(places, count))
             self._estimated_of = places, count
@@ -346,7 +363,7 @@ class Cloud(Particles):
         estimate = numbers[first]
         for judge, span in zip(self._judges, spans, strict=False):
             judge.receive(estimate, numbers[span])
-        self._judges = ()
+        self._judges = []
         return estimate
 
     def _refined(self, count: int) -> np.ndarray:
@@ -370,14 +387,6 @@ class Cloud(Particles):
             self._results = self._read(self.results.buffer, self.results.size)
         return self._results
 
-    def host_poses(self, index: int, count: int) -> np.ndarray:
-        """Return a copy of the poses of a buffer."""
-        return self._read(self.poses[index], 3 * count).reshape(count, 3)
-
-    def host_weights(self, count: int, index: int | None = None) -> np.ndarray:
-        """Return a copy of the unnormalised weights of a buffer, by default of the shown particles."""
-        return self._read(self.weights[self.places.weight if index is None else index], count)
-
     def contents(self, count: int) -> Contents:
         """Return a copy of all particles; ``count`` of them are shown."""
         places, weighed = self.places, self.places.shown != self.places.next
@@ -394,13 +403,7 @@ class Cloud(Particles):
         if contents.pool is not None:
             self.set_pool(contents.pool)
         places, arrays = contents.places_and_arrays(self.kept)
-        self._fill(*((getattr(self, name)[index], array) for name, index, array in arrays),
+        self._begin_change()
+        self.fill(*((getattr(self, name)[index], array) for name, index, array in arrays),
                    (self.states[places.state], contents.state))  # fmt: skip
         self.set_particles(places, contents.next_count)
-
-    def _read(self, buffer: Buffer, count: int) -> np.ndarray:
-        return self.backend.download(buffer, np.empty(count))
-
-    def _lent(self, buffer: Buffer, shape: tuple[int, ...]) -> Any:
-        """Return the head of a buffer as an array of the device's library."""
-        return self.backend.wrap_external(self.backend.part(buffer, 0, math.prod(shape), _DOUBLE), shape, _DOUBLE)

@@ -11,6 +11,7 @@ import numpy as np
 
 from gpusense.interface import constants as c
 from gpusense.localization.particles import BufferSlots
+from gpusense.localization.sensors import SensorReadings
 from gpusense.reference.tempering import left_of
 
 # Lowest depth of a ladder: distances of a million deviations differ by 2^-39 on its last rung.
@@ -19,8 +20,6 @@ _DEEPEST = c.LOWEST**5
 _FEWEST = 10.0
 # Jitter of a stage on a deeper ladder: the peak is beyond the particles, which must not contract before reaching it.
 _WIDE_JITTER = 0.7
-# Index of a sensor, and its readings.
-SensorReadings = tuple[int, tuple[Any, ...]]
 
 
 class Step(NamedTuple):

@@ -10,13 +10,13 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 from gpusense.backends import BackendInfo
 from gpusense.localization import options
+from gpusense.localization.cloud import Cloud
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.diagnosis import Diagnosis, diagnose
 from gpusense.localization.estimates import Estimate
 from gpusense.localization.filter_core import FilterCore
 from gpusense.localization.journal import Transactional, atomic, consistent
 from gpusense.localization.motion import MotionModel, OdometryMotion, SampledMotion
-from gpusense.localization.scoring import FilterCloud
 from gpusense.localization.sensors import grid_of, sensors_of
 from gpusense.localization.state import FilterState, check_state, constructor_options, model_names
 from gpusense.localization.tracker import Tracker
@@ -94,7 +94,7 @@ class ParticleFilter(Transactional):
         if self.options.recovery == "augmented" and grid_of(self._sensors) is None:
             raise ValueError("recovery: 'augmented' needs a model with a map, got none")
         self._begin_journals()
-        self._cloud = FilterCloud(self._sensors, self.options.most, residual=self.options.resampling == "residual")
+        self._cloud = Cloud(self._sensors, self.options.most, residual=self.options.resampling == "residual")
         self._parts = FilterCore(self._sensors, self.options, self._cloud)
 
     def _changing(self) -> tuple[Any, ...]:
@@ -268,7 +268,7 @@ class ParticleFilter(Transactional):
             RuntimeError: the filter is not initialised.
             ValueError: another method.
         """
-        if method != "mean":
+        if type(method) is not str or method != "mean":
             checks.choice("method", method, ("mean", "cluster", "best"))
         self._moved()
         return self._parts.estimate(method)

@@ -12,7 +12,8 @@ import numpy as np
 from gpusense._util.typing import AnyArray
 from gpusense.backends import arrays
 from gpusense.localization import starts
-from gpusense.localization.cloud_state import Contents, SensorReadings
+from gpusense.localization.cloud import Cloud
+from gpusense.localization.cloud_state import Contents
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.estimates import Estimate, clustered
 from gpusense.localization.journal import plain_state, set_state
@@ -21,8 +22,7 @@ from gpusense.localization.options import Options
 from gpusense.localization.pose_algebra import compose_poses, wrap_angle
 from gpusense.localization.protection import Distances, margins_of
 from gpusense.localization.rival import Recovery
-from gpusense.localization.scoring import FilterCloud, copied, readings_of
-from gpusense.localization.sensors import Sensor, grid_of
+from gpusense.localization.sensors import Sensor, SensorReadings, copied, grid_of, readings_of
 from gpusense.localization.spread import share_off, share_off_of, spread_of, verdict_label
 from gpusense.localization.tracker import Tracker, is_together
 from gpusense.localization.verdict import Verdict
@@ -43,7 +43,7 @@ class FilterCore:
 
     MEMORY: ClassVar[tuple[str, ...]] = ("last",)
 
-    def __init__(self, sensors: Sequence[Sensor], options: Options, cloud: FilterCloud) -> None:
+    def __init__(self, sensors: Sequence[Sensor], options: Options, cloud: Cloud) -> None:
         self.sensors, self.options = sensors, options
         self.tracker = Tracker(sensors, options, cloud)
         self.verdict = Verdict(sensors, self.tracker.random_poses, seed=options.seed)

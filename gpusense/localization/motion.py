@@ -63,8 +63,10 @@ class MotionModel(Protocol):
 
 def _odometer(name: str, pose: object) -> tuple[float, float, float]:
     """Return a checked pose of an odometer; arrays of three numbers would take most of the time of a step's motion."""
-    plain = type(pose) is np.ndarray and pose.shape == (3,) and pose.dtype == np.float64
-    x, y, theta = (pose if plain else checks.array(name, pose, (3,), largest=checks.FARTHEST)).tolist()
+    values = pose
+    if not (type(values) is np.ndarray and values.shape == (3,) and values.dtype == np.float64):
+        values = checks.array(name, pose, (3,))
+    x, y, theta = values.tolist()
     if not (abs(x) <= checks.FARTHEST and abs(y) <= checks.FARTHEST and abs(theta) <= checks.FARTHEST):
         checks.array(name, pose, (3,), largest=checks.FARTHEST)
     return x, y, theta

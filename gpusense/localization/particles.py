@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from gpusense.backends.base import Backend
+from gpusense.backends.base import Backend, Buffer
 from gpusense.interface.constants import ESTIMATE, SETTINGS, STATE
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
@@ -22,6 +23,8 @@ from gpusense.localization.beam_consistency import JUDGED
 from gpusense.localization.sums import Sums, weight_block
 
 _DOUBLE = np.dtype(np.float64)
+# Most views of buffers.
+_MOST_VIEWS = 32
 
 
 class BufferSlots(NamedTuple):
@@ -150,7 +153,7 @@ class Particles:
     def __init__(
         self, backend: Backend, capacity: int, readings: Sequence[int], precision: np.dtype, *, residual: bool = False
     ) -> None:
-        self.backend, self.capacity, self.precision, self._sensors = backend, capacity, precision, len(readings)
+        self.backend, self.capacity, self.precision = backend, capacity, precision
         self.count, self.places, self.kept = capacity, BufferSlots(), BufferSlots()
         self.block = weight_block(backend, capacity)
         # Other libraries get no memory that a processor shares with the host.
@@ -168,6 +171,9 @@ class Particles:
         first, second, self.estimated, self.refined, *self.judged = self.results.parts
         self.states = [first, second]
         self.pool, self.pool_size = backend.upload(np.zeros(3)), 0
+        # Arrays that the device may still read; views of buffers for models, by the number of particles.
+        self._uploads: list[np.ndarray] = []
+        self._views: dict[tuple[str, int, int], Any] = {}
         # Cumulative numbers of certain copies.
         self._copies = backend.empty(capacity, _DOUBLE) if residual else None
 
@@ -207,15 +213,15 @@ class Particles:
             for sensor, log_p in enumerate(self.log_p[:sensors])
         )  # fmt: skip
 
-    def weighing(self, stage: Stage) -> Program:
-        """Return the launches of a stage after its scores: weights, and the draw if the number is known."""
+    def weighing(self, stage: Stage, sensors: int) -> Program:
+        """Return the launches of a stage after scores by sensors: weights, and the draw if the number is known."""
         find, *scored = self.sums.highest(self.blocks)
         found = scored[0], scored[1]
         numbers, out = self.numbers(stage), (self.weights[stage.weight], self.ends)
         weights = self.sums.weigh(numbers, found, stage.number)
         weights += self.sums.set_weights(numbers, (stage.number, stage.most), out)
         draw = self.draw(stage, stage.drawn) if stage.drawn else ()
-        return self.scoring(self._sensors) + find + weights + draw
+        return self.scoring(sensors) + find + weights + draw
 
     def draw(self, stage: Stage, drawn: int) -> Program:
         """Return the launches that draw into the second buffer of the bank."""
@@ -230,3 +236,64 @@ class Particles:
             after=self.weights[stage.after], particles=self.count, drawn=drawn, stage=stage.number,
         )  # fmt: skip
         return copies + draw
+
+    # ---- copies and views
+
+    def fill(self, *arrays: tuple[Buffer, np.ndarray]) -> None:
+        """Copy arrays to buffers that earlier steps may still use."""
+        self.backend.synchronize()
+        for buffer, array in arrays:
+            self.backend.upload(np.ascontiguousarray(array, np.float64), buffer)
+
+    def upload_settings(self, settings: np.ndarray) -> None:
+        """Copy the settings of a step to the device."""
+        self.backend.upload(self.held(settings), self.settings, wait=False)
+
+    def held(self, array: np.ndarray) -> np.ndarray:
+        """Return an array, kept alive until the device has read it."""
+        if len(self._uploads) > 64:
+            self.wait()
+        self._uploads.append(array)
+        return array
+
+    def wait(self) -> None:
+        """Wait until the device is idle."""
+        self.backend.synchronize()
+        self._uploads.clear()
+
+    def copy_state(self, source: int, target: int) -> None:
+        if self.backend.info.kind == "gpu":
+            self.backend.copy(self.states[source], self.states[target], STATE * _DOUBLE.itemsize)
+        else:
+            self.backend.upload(self._read(self.states[source], STATE), self.states[target])
+
+    def host_poses(self, index: int, count: int) -> np.ndarray:
+        """Return a copy of the poses of a buffer."""
+        return self._read(self.poses[index], 3 * count).reshape(count, 3)
+
+    def host_weights(self, count: int, index: int | None = None) -> np.ndarray:
+        """Return a copy of the unnormalised weights of a buffer, by default of the shown particles."""
+        return self._read(self.weights[self.places.weight if index is None else index], count)
+
+    def _read(self, buffer: Buffer, count: int) -> np.ndarray:
+        return self.backend.download(buffer, np.empty(count))
+
+    def lent(self, buffer: Buffer, shape: tuple[int, ...]) -> Any:
+        """Return the head of a buffer as an array of the device's library."""
+        return self.backend.wrap_external(self.backend.part(buffer, 0, math.prod(shape), _DOUBLE), shape, _DOUBLE)
+
+    def poses_of(self, source: int) -> Any:
+        key = ("poses", source, self.count)
+        return self._views.get(key) or self._view(key, self.poses[source], (self.count, 3), _DOUBLE)
+
+    def log_p_of(self, place: int) -> Any:
+        """Return the array for a sensor's log-likelihoods."""
+        key = ("log_p", place, self.count)
+        return self._views.get(key) or self._view(key, self.log_p[place], (self.count,), self.precision)
+
+    def _view(self, key: tuple[str, int, int], buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> Any:
+        """Return a cached view of a buffer; clouds of one size have few views."""
+        if len(self._views) >= _MOST_VIEWS:
+            self._views.clear()
+        self._views[key] = self.backend.view(buffer, shape, dtype)
+        return self._views[key]

@@ -27,12 +27,13 @@ import numpy as np
 
 from gpusense.localization import starts
 from gpusense.localization.belief import correlation, motion_between, new_part
-from gpusense.localization.cloud_state import Contents, SensorReadings
+from gpusense.localization.cloud import Cloud
+from gpusense.localization.cloud_state import Contents
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.rival_search import RivalSearch, are_apart, can_search, drawn
 from gpusense.localization.scan_evidence import ratio_of_scan
-from gpusense.localization.scoring import FilterCloud
+from gpusense.localization.sensors import SensorReadings
 from gpusense.localization.spread import FAR, FAR_TURN, WIDE, deviations
 from gpusense.localization.tracker import Progress, Tracker
 from gpusense.localization.verdict import Verdict, sightings
@@ -303,7 +304,7 @@ class Recovery:
             options = tracker.options._replace(
                 least=PARTICLES, most=PARTICLES, seed=tracker.options.seed ^ _RIVAL, recovery=None, beam_skip=None
             )
-            cloud = FilterCloud(tracker.sensors, PARTICLES, residual=options.resampling == "residual")
+            cloud = Cloud(tracker.sensors, PARTICLES, residual=options.resampling == "residual")
             self.rival = Rival(Tracker(tracker.sensors, options, cloud))
         return self.rival
 

@@ -17,10 +17,9 @@ import numpy as np
 
 from gpusense.backends import arrays
 from gpusense.localization import starts
-from gpusense.localization.cloud_state import SensorReadings
 from gpusense.localization.pose_algebra import wrap_angle
 from gpusense.localization.scan_evidence import ratio_of_places, ratio_of_scan
-from gpusense.localization.sensors import Sensor
+from gpusense.localization.sensors import Sensor, SensorReadings
 from gpusense.localization.spread import FAR, FAR_TURN, deviations
 from gpusense.localization.verdict import sightings
 from gpusense.matching.locate import likely_poses

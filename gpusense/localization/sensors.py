@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +25,8 @@ from gpusense.tables.world_map import check_one_map
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import float64_readings
 
+# Index of a sensor, and its readings.
+SensorReadings = tuple[int, tuple[Any, ...]]
 _DOUBLE = np.dtype(np.float64)
 # Most queued calls before the host waits.
 _MOST_STARTED = 64
@@ -288,3 +290,38 @@ def sensors_of(models: Any) -> list[Sensor]:
 def grid_of(sensors: Sequence[Sensor]) -> OccupancyGrid | None:
     """Return the map of the first sensor that has one."""
     return next((sensor.model.grid for sensor in sensors if hasattr(sensor.model, "grid")), None)
+
+
+def readings_of(readings: Any, sensors: Sequence[Sensor]) -> list[SensorReadings]:
+    """Return the valid readings in the order of the sensors.
+
+    A tuple that begins with an array holds several arguments of a reading; any other tuple is an array.
+    """
+    if type(readings) is np.ndarray and len(sensors) == 1:
+        return [(0, (readings,))]
+    if isinstance(readings, Mapping):
+        index = {id(sensor.model): i for i, sensor in enumerate(sensors)}
+        for model in readings:
+            if id(model) not in index:
+                raise KeyError(f"readings: must be of the filter's models, got those of {checks.show(model)}")
+        pairs = sorted((index[id(model)], value) for model, value in readings.items() if value is not None)
+    elif len(sensors) > 1:
+        raise TypeError(f"readings: must be a mapping from models to their readings, got {checks.show(readings)}")
+    else:
+        pairs = [] if readings is None else [(0, readings)]
+    several = [(i, value if _is_several(value) else (value,)) for i, value in pairs]
+    # Convert lists to arrays, to refuse ragged ones by name.
+    return [
+        (i, tuple(checks.as_array("readings", part, masked=True) if isinstance(part, list) else part for part in value))
+        for i, value in several
+    ]
+
+
+def _is_several(value: Any) -> bool:
+    """Return whether a reading is a tuple of arguments: its first item is an array, not a number."""
+    return isinstance(value, tuple) and len(value) > 0 and (isinstance(value[0], list) or np.ndim(value[0]) > 0)
+
+
+def copied(part: Any) -> Any:
+    """Return a copy of a NumPy array, and any other part of a reading unchanged."""
+    return part.copy() if isinstance(part, np.ndarray) else part

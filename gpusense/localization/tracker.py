@@ -13,14 +13,14 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.localization import starts
-from gpusense.localization.cloud_state import Contents, SensorReadings, Step
+from gpusense.localization.cloud import Cloud
+from gpusense.localization.cloud_state import Contents, Step
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.estimates import covariance_of, sample_size_of
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import STILL, SampledMotion
 from gpusense.localization.options import Options, settings_of_step
-from gpusense.localization.scoring import FilterCloud
-from gpusense.localization.sensors import Sensor
+from gpusense.localization.sensors import Sensor, SensorReadings
 from gpusense.localization.spread import WIDE
 
 # Bins of the cloud [m, rad], error bound of its density, and normal quantile of the bound's probability.
@@ -62,7 +62,7 @@ class Tracker:
         "started", "progress", "shown", "wide", "together", "pool", "corrections",
     )  # fmt: skip
 
-    def __init__(self, sensors: Sequence[Sensor], options: Options, cloud: FilterCloud) -> None:
+    def __init__(self, sensors: Sequence[Sensor], options: Options, cloud: Cloud) -> None:
         self.sensors, self.options, self.cloud = sensors, options, cloud
         self._models = [sensor.model for sensor in sensors]
         self.started, self.progress, self.shown, self.wide = False, Progress(), options.most, 0

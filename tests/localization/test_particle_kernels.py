@@ -16,6 +16,7 @@ from gpusense.localization.cloud import Cloud
 from gpusense.localization.cloud_state import Contents
 from gpusense.localization.estimates import covariance_of
 from gpusense.localization.motion import settings_of
+from gpusense.localization.sensors import Sensor
 from gpusense.localization.sums import Sums
 from gpusense.reference.drawing import draw_particles
 from gpusense.reference.elementary import angle_of, exp_of, log_of
@@ -267,7 +268,7 @@ def test_estimates_are_the_moments_of_the_cloud(backend, name):
     poses[:, 2] = (poses[:, 2] + np.pi) % (2 * np.pi) - np.pi
     weights = rng.exponential(size=len(poses))
     weights[0] = 1e-6
-    cloud = Cloud(get_backend(backend), len(poses), (), np.dtype(np.float32))
+    cloud = Cloud([Sensor(gs.HeadingModel(backend=backend))], len(poses))
     cloud.restore(Contents(poses, weights, None, None, np.zeros(c.STATE), None))
     for _ in range(3):
         # The third one is a recording.

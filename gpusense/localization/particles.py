@@ -262,6 +262,7 @@ class Particles:
         self._uploads.clear()
 
     def copy_state(self, source: int, target: int) -> None:
+        """Start copying a state of corrections to the place of another."""
         if self.backend.info.kind == "gpu":
             self.backend.copy(self.states[source], self.states[target], STATE * _DOUBLE.itemsize)
         else:
@@ -283,6 +284,7 @@ class Particles:
         return self.backend.wrap_external(self.backend.part(buffer, 0, math.prod(shape), _DOUBLE), shape, _DOUBLE)
 
     def poses_of(self, source: int) -> Any:
+        """Return the poses of a buffer for models."""
         key = ("poses", source, self.count)
         return self._views.get(key) or self._view(key, self.poses[source], (self.count, 3), _DOUBLE)
 

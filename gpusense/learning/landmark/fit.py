@@ -1,6 +1,7 @@
 """Fit standard deviations and weights of the landmark model to features at known poses.
 
-``pairs`` computes the log-likelihood, ``em`` maximises it, ``report`` and ``result`` describe the result.
+``pairs`` computes the log-likelihood of features. The search is the one for sensors at known poses, see
+``gpusense.learning.point.problem``.
 """
 
 from __future__ import annotations
@@ -15,23 +16,103 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers
 from gpusense.learning.fitted import LandmarkFit
-from gpusense.learning.information import errors_of
-from gpusense.learning.landmark.em import NOTHING, SIGMAS, bounds_of, climb, first_guess, free
 from gpusense.learning.landmark.pairs import (
-    BEARING_BIAS,
-    ODDS,
+    FALSE,
+    RANGE,
     RANGE_BIAS,
+    SIGNATURE,
     Limits,
     Pairs,
     Value,
-    hessian,
+    evaluate,
     in_view,
     make_pairs,
     sensor_poses,
 )
+from gpusense.learning.point.problem import Climb, Problem, free_coordinates, maximize, of_weight, standard_errors
 from gpusense.models.landmark.features import check_correspondence, check_features
 from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.parameters import LandmarkParameters
+
+SIGMAS = ("sigma_range", "sigma_bearing", "sigma_signature")
+_BIASES = ("range_bias", "bearing_bias")
+# A cause that accounts for fewer features than this counts as absent.
+_NOTHING = 1e-3
+# Smallest standard deviation as a share of range_max, of a radian, and of the signatures' span.
+_SMALLEST = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class _Features(Problem):
+    """Likelihood of features by the coordinates of ``pairs``; parts that no feature has keep their start."""
+
+    pairs: Pairs
+    start: Floats
+    fit_bias: bool
+
+    @property
+    def readings(self) -> int:
+        return len(self.pairs.uniform)
+
+    def part(self, every: int) -> _Features:
+        return replace(self, pairs=self.pairs.every(every))
+
+    def bounds(self) -> tuple[Floats, Floats]:
+        low, high = np.full(6, -math.inf), np.full(6, math.inf)
+        (low[:FALSE], high[:FALSE]), (low[FALSE], high[FALSE]) = np.log(_limits(self.pairs)), (0.0, 1.0)
+        fixed = np.append(~np.array(self.pairs.measured), [not len(self.pairs.feature), not self.fit_bias])
+        fixed = np.append(fixed, not self.fit_bias)
+        return np.where(fixed, self.start, low), np.where(fixed, self.start, high)
+
+    def scales(self, theta: Floats) -> Floats:
+        return np.array([1.0, 1.0, 1.0, of_weight(theta[FALSE]), *np.exp(theta[:2])])
+
+    def starts(self) -> list[Floats]:
+        return [self.start]
+
+    def log_p(self, theta: Floats) -> tuple[Floats, Floats]:
+        value = evaluate(self.pairs, theta)
+        return value.log_p, value.gradient
+
+    def values(self, theta: Floats) -> dict[str, float]:
+        values = dict(zip(SIGMAS, np.exp(theta[:FALSE]).tolist(), strict=True))
+        values |= {"z_detect": 1 - float(theta[FALSE]), "z_false": float(theta[FALSE])}
+        return values | dict(zip(_BIASES, theta[RANGE_BIAS:].tolist(), strict=True))
+
+
+def _limits(pairs: Pairs) -> tuple[Floats, Floats]:
+    """Return the (3,) smallest and (3,) largest standard deviations."""
+    limits = pairs.limits
+    lengths = np.array([limits.range_max, 1.0, limits.span[1] - limits.span[0]])
+    return _SMALLEST * lengths, np.array([lengths[0], math.pi, lengths[2]])
+
+
+def _first_guess(pairs: Pairs, initial: LandmarkParameters | None) -> Floats:
+    """Make the start from the user's parameters, or from the typical residual of each feature's nearest landmark.
+
+    The default assumes one false positive in ten features.
+    """
+    low, high = _limits(pairs)
+    if initial is not None:
+        start = [getattr(initial, name) for name in SIGMAS]
+        sigma = [float(np.clip(h / 10 if s is None else s, b, h)) for s, b, h in zip(start, low, high, strict=True)]
+        false = 1 - min(max(initial.z_detect, 1e-6), 1 - 1e-6)
+        return np.array([*np.log(sigma), false if len(pairs.feature) else 1.0, 0.0, 0.0])
+    # Convert residuals across the line of sight to metres, the unit along it.
+    distance = np.minimum(np.nan_to_num(pairs.means), pairs.limits.range_max)[:, RANGE]
+    size = np.nan_to_num(pairs.residuals)
+    size[:, 1] *= np.maximum(distance, 0.1)
+    size[:, SIGNATURE] *= pairs.limits.range_max / max(high[SIGNATURE], 1e-300)
+    order = np.lexsort(((size**2).sum(axis=1), pairs.feature))
+    nearest = order[np.diff(pairs.feature[order], prepend=-1) > 0]
+    with np.errstate(invalid="ignore"):
+        typical = [
+            1.4826 * float(np.median(np.abs(column[~np.isnan(column)]))) if (~np.isnan(column)).any() else high[k] / 10
+            for k, column in enumerate(pairs.residuals[nearest].T)
+        ]
+    return np.array(
+        [*np.log(np.clip(typical, np.maximum(low, 1e-3 * high), high)), 0.1 if len(pairs.feature) else 1.0, 0.0, 0.0]
+    )
 
 
 @dataclass(frozen=True)
@@ -107,11 +188,11 @@ def fit_landmark_parameters(
     least = checks.real("tolerance", tolerance, above=0)
     base = LandmarkParameters(range_max=range_max, field_of_view=field_of_view, signature_span=signature_span)
     sightings = _sightings(poses, features, landmarks, correspondence, scan, base, mount)
-    start = first_guess(sightings.pairs, initial)
-    pairs, value, trace, converged = climb(sightings.pairs, start, bias, most, least)
-    counts = None if scan is None else _count_detected(replace(sightings, pairs=pairs), landmarks, value)
+    problem = _Features(sightings.pairs, _first_guess(sightings.pairs, initial), bias)
+    end = maximize(problem, most, least)
     base = base if initial is None else replace(base, p_detect=initial.p_detect)
-    return report(pairs, sightings.indices, sightings.total, value, trace, converged, bias, base, counts)
+    counts = None if scan is None else _count_detected(sightings, landmarks, evaluate(problem.pairs, end.theta))
+    return _report(problem, end, sightings, base, counts)
 
 
 def _sightings(
@@ -157,60 +238,38 @@ def _count_detected(sightings: Sightings, landmarks: LandmarkMap, value: Value) 
     return total, float((-np.expm1(log_missed)).sum())
 
 
-def report(
-    pairs: Pairs, indices: Integers, total: int, value: Value, trace: list[float], converged: bool, bias: bool,
-    base: LandmarkParameters, counts: tuple[int, float] | None,
-) -> LandmarkFit:  # fmt: skip
-    """Build the fit from the end of a search."""
-    second = hessian(pairs, value.point)
-    held = _held(pairs, value)
-    errors = _standard_errors(pairs, value, second, bias, held)
+def _report(
+    problem: _Features, end: Climb, sightings: Sightings, base: LandmarkParameters, counts: tuple[int, float] | None
+) -> LandmarkFit:
+    """Build the fit from the end of a search; ``counts`` are the landmarks in view, and the detected ones."""
+    pairs, values, value = problem.pairs, problem.values(end.theta), evaluate(problem.pairs, end.theta)
+    held = _held(pairs, values, value)
+    errors = standard_errors(problem, end.theta, end.free)
+    held |= {name: "the features do not determine it" for name in errors if errors[name] == math.inf}
     p_detect, errors["p_detect"] = _p_detect(counts, base.p_detect, held)
-    (range_bias, range_error), (bearing_bias, bearing_error) = _biases(pairs, value, second, bias)
+    # Offsets have errors even if they are not fitted.
+    joint = replace(problem, fit_bias=True)
+    offset_errors = standard_errors(joint, end.theta, free_coordinates(joint, end.theta))
+    offsets: dict[str, float] = {}
+    for part, name in enumerate(_BIASES):
+        known = pairs.measured[part] and value.responsibility.sum() > _NOTHING
+        offset = values[name] if problem.fit_bias else _mean(pairs, value, part)
+        offsets |= {name: offset if known else math.nan, f"{name}_error": offset_errors[name] if known else math.nan}
+        del errors[name]
     expected, detected = counts or (0, 0.0)
-    false = np.full(total, np.nan)
-    false[indices] = value.false
+    false = np.full(sightings.total, np.nan)
+    false[sightings.indices] = value.false
+    sigmas: dict[str, Any] = {name: values[name] if pairs.present[k] else None for k, name in enumerate(SIGMAS)}
+    span = pairs.limits.span if pairs.present[SIGNATURE] else base.signature_span
+    weights = {name: values[name] for name in ("z_detect", "z_false")}
     return LandmarkFit(
-        parameters=_parameters(pairs, value, base, p_detect),
-        log_likelihood=value.log_likelihood,
-        trace=np.array(trace),
-        converged=converged,
-        status="; ".join(_notes(pairs, value, converged, held)),
-        standard_errors=errors,
-        held=held,
-        range_bias=range_bias,
-        range_bias_error=range_error,
-        bearing_bias=bearing_bias,
-        bearing_bias_error=bearing_error,
-        bias_fitted=bias,
-        iterations=len(trace) - 1,
-        features=len(value.false),
-        missing=total - len(value.false),
-        false_positives=float(value.false.sum()),
-        expected=expected,
-        detected=detected,
-        false=false,
-    )
-
-
-def _parameters(pairs: Pairs, value: Value, base: LandmarkParameters, p_detect: float) -> LandmarkParameters:
-    """Return the parameters of the model; a standard deviation is None if no feature has this part."""
-    point = value.point
-    values: dict[str, Any] = {name: point.sigma[k] if pairs.present[k] else None for k, name in enumerate(SIGMAS)}
-    span = pairs.limits.span if pairs.present[2] else base.signature_span
-    return replace(
-        base, **values, z_detect=point.z_detect, z_false=1 - point.z_detect, p_detect=p_detect, signature_span=span
-    )
-
-
-def _standard_errors(pairs: Pairs, value: Value, second: Floats, bias: bool, held: dict[str, str]) -> dict[str, float]:
-    """Return the standard errors of the fitted parameters by name; add the reasons of infinite ones to ``held``."""
-    point, parts = value.point, pairs.measured
-    along = _errors(second, free(pairs, value, bias))
-    errors = {name: float(along[k] * point.sigma[k]) if parts[k] else math.nan for k, name in enumerate(SIGMAS)}
-    errors["z_detect"] = errors["z_false"] = float(along[ODDS] * point.z_detect * (1 - point.z_detect))
-    held |= {name: "the features do not determine it" for name, error in errors.items() if error == math.inf}
-    return errors
+        parameters=replace(base, **sigmas, **weights, p_detect=p_detect, signature_span=span),
+        log_likelihood=end.value, trace=np.array(end.trace), converged=end.converged,
+        status=_status(pairs, value, end.converged, held), standard_errors=errors, held=held, **offsets,
+        bias_fitted=problem.fit_bias, iterations=len(end.trace) - 1, features=len(value.false),
+        missing=sightings.total - len(value.false), false_positives=float(value.false.sum()), expected=expected,
+        detected=detected, false=false,
+    )  # fmt: skip
 
 
 def _p_detect(counts: tuple[int, float] | None, start: float, held: dict[str, str]) -> tuple[float, float]:
@@ -223,39 +282,20 @@ def _p_detect(counts: tuple[int, float] | None, start: float, held: dict[str, st
     return p, math.sqrt(p * (1 - p) / expected)
 
 
-def _biases(pairs: Pairs, value: Value, second: Floats, bias: bool) -> list[tuple[float, float]]:
-    """Return the offsets of ranges and of bearings with their standard errors; NaN if not measured."""
-    errors = _errors(second, free(pairs, value, True))
-    biases = []
-    for k, column in enumerate((RANGE_BIAS, BEARING_BIAS)):
-        if pairs.measured[k] and value.responsibility.sum() > NOTHING:
-            biases.append((value.point.bias[k] if bias else _mean(pairs, value, k), float(errors[column])))
-        else:
-            biases.append((math.nan, math.nan))
-    return biases
-
-
-def _errors(second: Floats, places: Integers) -> Floats:
-    """Return (6,) standard errors along the coordinates; NaN outside ``places``, infinite without information."""
-    errors = np.full(6, np.nan)
-    errors[places] = errors_of(-second[np.ix_(places, places)], np.eye(len(places)))
-    return errors
-
-
 def _mean(pairs: Pairs, value: Value, part: int) -> float:
-    """Return the mean residual of features from landmarks: the offset of EM's next step."""
+    """Return the mean residual of features from landmarks."""
     measured = ~np.isnan(pairs.residuals[:, part])
     weight = value.responsibility[measured]
     return float(weight @ pairs.residuals[measured, part] / weight.sum()) if weight.sum() > 0 else math.nan
 
 
-def _held(pairs: Pairs, value: Value) -> dict[str, str]:
+def _held(pairs: Pairs, values: dict[str, float], value: Value) -> dict[str, str]:
     """Return the reasons why parameters have no standard error, by name."""
     held = {}
-    low, high = bounds_of(pairs)
-    detections = value.responsibility.sum() > NOTHING
+    low, high = _limits(pairs)
+    detections = value.responsibility.sum() > _NOTHING
     for k, name in enumerate(SIGMAS):
-        sigma = value.point.sigma[k]
+        sigma = values[name]
         if not pairs.present[k]:
             held[name] = "no feature has this part"
         elif not detections:
@@ -266,15 +306,15 @@ def _held(pairs: Pairs, value: Value) -> dict[str, str]:
             held[name] = f"at its lower bound {low[k]:.3g}: the residuals are zero"
         elif sigma >= high[k] * (1 - 1e-9):
             held[name] = f"at its upper bound {high[k]:.3g}: the residuals are as large as the limits of the sensor"
-    z = value.point.z_detect
+    z = values["z_detect"]
     if z in (0.0, 1.0):
         reason = "no feature is a false positive" if z == 1 else "every feature is a false positive"
         held["z_detect"] = held["z_false"] = reason
     return held
 
 
-def _notes(pairs: Pairs, value: Value, converged: bool, held: dict[str, str]) -> list[str]:
-    """Return the parts of the status."""
+def _status(pairs: Pairs, value: Value, converged: bool, held: dict[str, str]) -> str:
+    """Return the status in words."""
     notes = ["converged" if converged else "stopped: more iterations are needed"]
     used = np.unique(pairs.landmark[value.responsibility > 0.5])
     if len(used) == 1:
@@ -283,4 +323,4 @@ def _notes(pairs: Pairs, value: Value, converged: bool, held: dict[str, str]) ->
     if len(value.false) < count:
         notes.append(f"{len(value.false)} features cannot determine {count} parameters")
     notes += [f"{name}: {reason}" for name, reason in held.items() if reason != "no feature has this part"]
-    return notes
+    return "; ".join(notes)

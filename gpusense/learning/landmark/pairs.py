@@ -16,32 +16,16 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from gpusense._util.typing import Floats, Integers
+from gpusense.learning.point.problem import mix
 from gpusense.models.landmark.features import wrapped
 from gpusense.world.frames import Mount
 
-RANGE, BEARING, SIGNATURE, ODDS, RANGE_BIAS, BEARING_BIAS = range(6)
+# Coordinates of a search: logarithms of three standard deviations, weight of a false positive, and two offsets.
+RANGE, BEARING, SIGNATURE, FALSE, RANGE_BIAS, BEARING_BIAS = range(6)
 # Distance below which a landmark has no bearing [m].
 _NO_BEARING = 1e-6
 # Pairs of poses and landmarks per pass.
 _BLOCK = 1 << 20
-
-
-@dataclass(frozen=True)
-class Point:
-    """Parameters during a search."""
-
-    sigma: tuple[float, float, float]  # standard deviations of range [m], bearing [rad] and signature
-    z_detect: float  # weight of a feature that comes from a landmark
-    bias: tuple[float, float]  # offsets of range [m] and bearing [rad]
-
-    def moved(self, step: Floats) -> Point:
-        """Return the point after a step in log sigma, log odds of z_detect, and offsets."""
-        sigma = [s * math.exp(d) for s, d in zip(self.sigma, step[:ODDS], strict=True)]
-        z = self.z_detect
-        if 0 < z < 1:
-            z = float(1 / (1 + (1 - z) / z * math.exp(-step[ODDS])))
-        bias = self.bias[0] + float(step[RANGE_BIAS]), self.bias[1] + float(step[BEARING_BIAS])
-        return replace(self, sigma=(sigma[0], sigma[1], sigma[2]), z_detect=z, bias=bias)
 
 
 @dataclass(frozen=True)
@@ -78,19 +62,20 @@ class Pairs:
         measured: NDArray[np.bool] = np.any(~np.isnan(self.residuals), axis=0)
         return bool(measured[0]), bool(measured[1]), bool(measured[2])
 
-    def part(self, mask: NDArray[np.bool]) -> Pairs:
-        """Return the pairs in ``mask`` (P,), with all features."""
-        names = ("feature", "landmark", "prior", "residuals", "means", "in_view")
-        return replace(self, **{name: getattr(self, name)[mask] for name in names})
+    def every(self, step: int) -> Pairs:
+        """Return the pairs of every ``step``-th feature."""
+        some = self.feature % step == 0
+        names = ("landmark", "prior", "residuals", "means", "in_view")
+        chosen = {name: getattr(self, name)[some] for name in names}
+        return replace(self, feature=self.feature[some] // step, uniform=self.uniform[::step], **chosen)
 
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """The log-likelihood at a point and its parts."""
+    """The log-likelihoods of features and their parts."""
 
-    point: Point
-    log_likelihood: float  # log-likelihood of all features
-    gradient: Floats  # (6,) derivatives by the steps of :meth:`Point.moved`
+    log_p: Floats  # (F,) log-likelihoods
+    gradient: Floats  # (F, 6) their derivatives by the coordinates
     responsibility: Floats  # (P,) probability of each pair
     false: Floats  # (F,) probability that each feature is a false positive
 
@@ -159,47 +144,36 @@ def make_pairs(
     )  # fmt: skip
 
 
-def evaluate(pairs: Pairs, point: Point) -> Value:
-    """Evaluate ``sum_f log(z_detect sum_j prior_j p(f | j) + z_false p_uniform(f))`` and its gradient."""
+def evaluate(pairs: Pairs, theta: Floats) -> Value:
+    """Evaluate ``log((1 - z_false) sum_j prior_j p(f | j) + z_false p_uniform(f))`` of each feature at coordinates."""
     log_p, score = pairs.prior.copy(), np.zeros((len(pairs.prior), 6))
-    for part, column in enumerate((RANGE, BEARING, SIGNATURE)):
-        add, by_sigma, by_bias = _part(pairs, point, part)
+    for part in (RANGE, BEARING, SIGNATURE):
+        add, by_sigma, by_bias = _part(pairs, theta, part)
         log_p += add
-        score[:, column] = by_sigma
+        score[:, part] = by_sigma
         if part < 2:
             score[:, RANGE_BIAS + part] = by_bias
-    z = point.z_detect
-    detected = log_p + (math.log(z) if z > 0 else -math.inf)
-    none = pairs.uniform + (math.log1p(-z) if z < 1 else -math.inf)
-    top = none.copy()
-    np.maximum.at(top, pairs.feature, detected)
+    count = len(pairs.uniform)
+    top = np.full(count, -math.inf)
+    np.maximum.at(top, pairs.feature, log_p)
     base = np.where(np.isfinite(top), top, 0)
-    exact = np.exp(detected - base[pairs.feature])
-    rest = np.exp(none - base)
-    total = np.bincount(pairs.feature, exact, len(none)) + rest
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log_f = base + np.log(total)
-        responsibility, false = exact / total[pairs.feature], rest / total
-    gradient = responsibility @ score
-    gradient[ODDS] = responsibility.sum() - z * len(none)
-    return Value(point, float(log_f.sum()), gradient, responsibility, false)
+    exact = np.exp(log_p - base[pairs.feature])
+    total = np.bincount(pairs.feature, exact, count)
+    with np.errstate(divide="ignore"):
+        detected = base + np.log(total)
+    log_f, (share, false), ratios = mix([(1 - theta[FALSE], detected), (float(theta[FALSE]), pairs.uniform)])
+    responsibility = share[pairs.feature] * exact / np.maximum(total[pairs.feature], 1e-300)
+    gradient = np.zeros((count, 6))
+    for column, each in enumerate(score.T):
+        gradient[:, column] = np.bincount(pairs.feature, responsibility * each, count)
+    gradient[:, FALSE] = ratios[1] - ratios[0]
+    return Value(log_f, gradient, responsibility, false)
 
 
-def hessian(pairs: Pairs, point: Point) -> Floats:
-    """Compute the (6, 6) second derivatives by central differences of the gradient."""
-    second = np.zeros((6, 6))
-    for k in range(6):
-        step = np.zeros(6)
-        step[k] = 1e-4 * (point.sigma[k - RANGE_BIAS] if k >= RANGE_BIAS else 1)
-        above, below = (evaluate(pairs, point.moved(sign * step)).gradient for sign in (1, -1))
-        second[k] = (above - below) / (2 * step[k])
-    return (second + second.T) / 2
-
-
-def _part(pairs: Pairs, point: Point, part: int) -> tuple[Floats, Floats, Floats]:
+def _part(pairs: Pairs, theta: Floats, part: int) -> tuple[Floats, Floats, Floats]:
     """Return the log densities of one part of the features, and their derivatives by log sigma and by the offset."""
-    sigma, limits = point.sigma[part], pairs.limits
-    bias = point.bias[part] if part < 2 else 0.0
+    sigma, limits = math.exp(theta[part]), pairs.limits
+    bias = float(theta[RANGE_BIAS + part]) if part < 2 else 0.0
     u, mean = pairs.residuals[:, part] - bias, pairs.means[:, part]
     if part == BEARING:
         u, ends = wrapped(u), (-limits.half_field, limits.half_field)
@@ -223,7 +197,7 @@ def _part(pairs: Pairs, point: Point, part: int) -> tuple[Floats, Floats, Floats
         by_mean = np.zeros_like(center)
     measured = ~np.isnan(u)
     x = np.where(measured, u, 0) / sigma
-    mass = np.where(measured, mass, 1)
+    mass = np.where(measured, np.maximum(mass, 1e-300), 1)
     log_p = -0.5 * x * x - math.log(sigma * math.sqrt(2 * math.pi)) - np.log(mass)
     slope = x * x - 1 - by_sigma / mass
     return measured * log_p, np.where(measured, slope, 0), np.where(measured, (x - by_mean / mass) / sigma, 0)
@@ -232,4 +206,6 @@ def _part(pairs: Pairs, point: Point, part: int) -> tuple[Floats, Floats, Floats
 def _mass(low: Floats, high: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the mass of a standard normal on [low, high], its derivative by log sigma, and by the mean times sigma."""
     below, above = (np.exp(-0.5 * end * end) / math.sqrt(2 * math.pi) for end in (low, high))
-    return ndtr(high) - ndtr(low), low * below - high * above, below - above
+    # Tails keep their digits on the negative side.
+    mass = np.where(low > 0, ndtr(-low) - ndtr(-high), ndtr(high) - ndtr(low))
+    return mass, low * below - high * above, below - above

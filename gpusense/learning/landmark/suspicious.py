@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense._util.typing import Floats
-from gpusense.learning.landmark.pairs import Limits, Point, evaluate, make_pairs, sensor_poses
+from gpusense.learning.landmark.pairs import Limits, evaluate, make_pairs, sensor_poses
 from gpusense.models.landmark.features import check_correspondence, check_features, span_of
 from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.parameters import LandmarkParameters
@@ -147,12 +147,12 @@ def _scores(
 ) -> tuple[Floats, Floats]:  # fmt: skip
     """Return (M, M) log-likelihoods of the row's features at the column's position, and the shares that agree."""
     limits = Limits(p.range_max, p.field_of_view / 2, (0.0, 1.0))
-    sigma = tuple(1.0 if s is None else s for s in (p.sigma_range, p.sigma_bearing, None))
+    sigma = [1.0 if s is None else s for s in (p.sigma_range, p.sigma_bearing, None)]
     measured = features.copy()
     for column, deviation in enumerate((p.sigma_range, p.sigma_bearing)):
         if deviation is None:
             measured[:, column] = np.nan
-    point = Point((sigma[0], sigma[1], 1.0), float(np.clip(p.z_detect, 1e-3, 1 - 1e-3)), (0.0, 0.0))
+    theta = np.array([*np.log(sigma), 1 - np.clip(p.z_detect, 1e-3, 1 - 1e-3), 0.0, 0.0])
     size = len(landmarks)
     log_p, agree = np.zeros((size, size)), np.zeros((size, size))
     order = np.argsort(known, kind="stable")
@@ -162,6 +162,6 @@ def _scores(
         for k in range(size):
             landmark = np.full(len(rows), k)
             pairs = make_pairs(sensors[rows], measured[rows], landmarks.xy, None, landmark, limits)
-            value = evaluate(pairs, point)
-            log_p[j, k], agree[j, k] = value.log_likelihood, float(np.mean(value.false < 0.5))
+            value = evaluate(pairs, theta)
+            log_p[j, k], agree[j, k] = float(value.log_p.sum()), float(np.mean(value.false < 0.5))
     return log_p, agree

@@ -156,7 +156,7 @@ def maximize(problem: Problem, max_iterations: int, tolerance: float) -> Climb:
     if np.array_equal(theta, end.theta):
         return end
     # Rounding decides which of several equal maxima a search reaches.
-    return replace(end, theta=theta, free=_free(theta, problem.total(theta)[1], *problem.bounds()))
+    return replace(end, theta=theta, free=free_coordinates(problem, theta))
 
 
 def _best_end(problem: Problem, max_iterations: int, tolerance: float) -> Climb:
@@ -190,6 +190,11 @@ def climb(problem: Problem, start: Floats, max_iterations: int, tolerance: float
         theta, value, gradient = moved
         trace.append(value)
     return Climb(theta, value, trace, converged, _free(theta, gradient, low, high))
+
+
+def free_coordinates(problem: Problem, theta: Floats) -> NDArray[np.bool_]:
+    """Return the mask (k,) of the coordinates that are not held at a bound."""
+    return _free(theta, problem.total(theta)[1], *problem.bounds())
 
 
 def _free(theta: Floats, gradient: Floats, low: Floats, high: Floats) -> NDArray[np.bool_]:
@@ -236,8 +241,8 @@ def report(problem: Problem, end: Climb, parameters: Q, blocks: Integers | None,
     """Build the fit from the end of a search."""
     values = problem.values(end.theta)
     count = 0 if blocks is None else int(blocks.max()) + 1
-    independent = _errors(problem, end, None)
-    errors = dict(independent) if blocks is None else _errors(problem, end, blocks)
+    independent = standard_errors(problem, end.theta, end.free)
+    errors = dict(independent) if blocks is None else standard_errors(problem, end.theta, end.free, blocks)
     touched = _blocks_of(problem, end, blocks)
     held = {}
     for name, error in independent.items():
@@ -277,17 +282,18 @@ def _list(names: list[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def _errors(problem: Problem, end: Climb, blocks: Integers | None) -> dict[str, float]:
+def standard_errors(
+    problem: Problem, theta: Floats, free: NDArray[np.bool_], blocks: Integers | None = None
+) -> dict[str, float]:
     """Return the standard errors by name; NaN for parameters that depend only on coordinates at bounds."""
-    free = end.free
-    rows = problem.jacobian(end.theta)[:, free]
+    rows = problem.jacobian(theta)[:, free]
     scatter = None
     if blocks is not None:
-        size, gradients = int(blocks.max()) + 1, problem.log_p(end.theta)[1][:, free]
+        size, gradients = int(blocks.max()) + 1, problem.log_p(theta)[1][:, free]
         scatter = scatter_of(np.stack([np.bincount(blocks, column, size) for column in gradients.T], axis=1))
-    errors = errors_of(-problem.hessian(end.theta, free), rows, scatter, _NEGATIVE)
+    errors = errors_of(-problem.hessian(theta, free), rows, scatter, _NEGATIVE)
     errors[~rows.any(axis=1)] = math.nan
-    return dict(zip(problem.values(end.theta), errors.tolist(), strict=True))
+    return dict(zip(problem.values(theta), errors.tolist(), strict=True))
 
 
 def _blocks_of(problem: Problem, end: Climb, blocks: Integers | None) -> dict[str, int]:

@@ -89,12 +89,13 @@ def test_gradient_is_the_slope(view, known):
         seen.poses[seen.scan], features, seen.xy, np.arange(12.0), seen.ids if known else None, limits
     )
     # Deviations as large as the limits make truncation matter.
-    for point in (inner.Point((3.0, 0.9, 2.0), 0.8, (0.2, -0.1)), inner.Point((0.1, 0.04, 0.3), 0.9, (0.0, 0.0))):
-        value = inner.evaluate(pairs, point)
+    for sigma, *rest in (((3.0, 0.9, 2.0), 0.2, 0.2, -0.1), ((0.1, 0.04, 0.3), 0.1, 0.0, 0.0)):
+        theta = np.array([*np.log(sigma), *rest])
+        value = inner.evaluate(pairs, theta)
         for k in range(6):
             step = 1e-5 * np.eye(6)[k]
-            above, below = (inner.evaluate(pairs, point.moved(s * step)).log_likelihood for s in (1, -1))
-            assert value.gradient[k] == pytest.approx((above - below) / 2e-5, rel=2e-5, abs=1e-3), k
+            above, below = (inner.evaluate(pairs, theta + s * step).log_p for s in (1, -1))
+            assert value.gradient[:, k] == pytest.approx((above - below) / 2e-5, rel=2e-5, abs=1e-4), k
 
 
 def test_signatures_are_learned():

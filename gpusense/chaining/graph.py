@@ -46,8 +46,9 @@ class Equations:
         if ordered:
             self.rows = self.rows[order_of(*self._slots(place)[:2])]
             place[self.rows] = np.arange(count - 1)
-        row, column, self._slot = self._slots(place)
-        self._lay_out(row, column)
+        self._row, column, self._slot = self._slots(place)
+        self._starts = np.searchsorted(column, np.arange(count))
+        self._diagonal = np.flatnonzero(self._row == column)
 
     def _slots(self, place: Integers) -> tuple[Integers, Integers, Integers]:
         """Return rows and columns of the blocks, column by column, and the number of each of the links' four blocks.
@@ -63,21 +64,6 @@ class Equations:
         numbers = numbers[numbers < size * size]
         return numbers % size, numbers // size, slot[: len(row)]
 
-    def _lay_out(self, row: Integers, column: Integers) -> None:
-        """Find the place of each number of the blocks in the arrays of a compressed matrix."""
-        size, k = len(self.rows), np.arange(3)
-        begin = np.searchsorted(column, np.arange(size + 1))
-        each = np.diff(begin)
-        rank = np.arange(len(row)) - begin[column]
-        # Numbers in row m and column k of a block are numbered 3 m + k.
-        place = 9 * begin[column] + 3 * rank + 3 * each[column] * k[None, :, None] + k[:, None, None]
-        self._gather = np.empty(9 * len(row), np.int64)
-        self._gather[place.ravel()] = np.arange(9 * len(row))
-        self._indices = np.empty(9 * len(row), np.int32)
-        self._indices[place.ravel()] = np.broadcast_to(3 * row + k[:, None, None], place.shape).ravel()
-        self._starts = np.append((9 * begin[:-1, None] + 3 * each[:, None] * k).ravel(), 9 * len(row)).astype(np.int32)
-        self._diagonal = np.flatnonzero(row == column)
-
     def at(self, poses: Floats, information: Floats, pull: Floats, damping: float | Floats = 0.0) -> tuple[Any, Floats]:
         """Return the sparse matrix (3 N - 3, 3 N - 3) and the gradient (3 N - 3,) at (N, 3) poses.
 
@@ -87,12 +73,14 @@ class Equations:
         from scipy import sparse
 
         turned, pull, lever = _turned(poses, self.first, self.second, information, pull)
-        blocks = _sums(self._slot, _blocks_of(turned, lever), len(self._indices) // 9 + 1)[:, :-1]
+        blocks = _sums(self._slot, _blocks_of(turned, lever), len(self._row) + 1)[:, :-1]
         blocks[::4, self._diagonal] += damping
         ends = np.stack([-pull[0], -pull[1], lever[1] * pull[0] - lever[0] * pull[1] - pull[2]])
         gradient = _sums(self.first, ends, len(poses)) + _sums(self.second, pull, len(poses))
         size = 3 * len(self.rows)
-        matrix = sparse.csc_matrix((blocks.ravel()[self._gather], self._indices, self._starts), shape=(size, size))
+        # Rows of the transposed matrix are the columns of the symmetric one.
+        transposed = blocks.reshape(3, 3, -1).transpose(2, 1, 0)
+        matrix = sparse.bsr_matrix((transposed, self._row, self._starts), shape=(size, size)).tocsr().T
         return matrix, gradient[:, self.rows].T.ravel()
 
     def step(self, matrix: Any, gradient: Floats) -> Floats:

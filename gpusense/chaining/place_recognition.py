@@ -23,8 +23,6 @@ from gpusense.world.sensor_scans import SensorScans
 _SHARE = 0.3
 # Key scans per pass.
 _ROWS = 512
-# Most cells of a plane with a table.
-_DENSE = 1 << 22
 # Largest distance of useful points [rms ranges]; farther points hardly characterise a place.
 _FAR = 2.0
 # Passages per direction through a place to compare with later ones, number of directions, key scans of a scanner
@@ -92,26 +90,13 @@ def _cells_of(places: list[Floats], poses: Floats, cell: float) -> tuple[Integer
     cells = np.floor(np.stack([px + c * x - s * y, py + s * x + c * y]) / cell).astype(np.int64)
     # Neighbouring points mostly share a cell, which leaves little to sort.
     new = np.append(True, (np.diff(owner) != 0) | (np.diff(cells) != 0).any(axis=0))[: len(owner)]
-    owner, number = owner[new], _numbered(cells[:, new].T)
+    owner, cells = owner[new], cells[:, new]
+    low = cells.min(axis=1, initial=0)
+    columns = int(cells[1].max(initial=0) - low[1]) + 1
+    _, number = np.unique((cells[0] - low[0]) * columns + cells[1] - low[1], return_inverse=True)
     count = int(number.max(initial=0)) + 1
     both = np.unique(owner * count + number)
     return both // count, both % count
-
-
-def _numbered(cells: Integers) -> Integers:
-    """Return the number (C,) of each cell (C, 2) among the distinct cells, row by row."""
-    if not len(cells):
-        return np.zeros(0, np.int64)
-    low = cells.min(axis=0)
-    rows, cols = (cells.max(axis=0) - low + 1).tolist()
-    if rows * cols > max(_DENSE, len(cells)):
-        _, number = np.unique((cells - low) @ np.array([cols, 1]), return_inverse=True)
-        return number
-    number = (cells - low) @ np.array([cols, 1])
-    seen = np.zeros(rows * cols, bool)
-    seen[number] = True
-    numbers: Integers = np.cumsum(seen)[number] - 1
-    return numbers
 
 
 def _first_passages(table: Any, poses: Floats, sequence: tuple[Integers, Integers]) -> Integers:

@@ -136,9 +136,7 @@ def fit_beam_parameters(
     fit = fit_pairs(device, pairs, bounds, start, options, chosen=initial is not None)
     if not sigma_growth:
         return fit if hit == "normal" else fit_shape(fit, device, pairs, bounds, options, hit, start, initial)
-    return fit_jointly(
-        fit, pairs, bounds, options.tolerance, options.responsibilities, growth=bool(sigma_growth), hit=hit
-    )
+    return fit_jointly(fit, pairs, bounds, options.tolerance, options.responsibilities, hit)
 
 
 def fit_pairs(

@@ -52,7 +52,7 @@ def fit_shape(
     """Fit the shape of hits as well, from a fit with normal hits."""
     kind = SHAPES[hit]
     if not pairs.hits or not pairs.expected.any():
-        return without_ranges(fit, hit)
+        return _without_ranges(fit, hit, kind.fitted)
     normal = Point.of(fit.parameters)
     starts = [
         bounds.hold(replace(normal, sigma=factor * normal.sigma, shape=kind.at(np.array(shape))))
@@ -73,9 +73,9 @@ def fit_shape(
     return report(problem, replace(end, trace=known + end.trace), options, start)
 
 
-def without_ranges(fit: BeamFit, hit: HitName, growth: bool = False) -> BeamFit:
-    """Return the fit of readings without a range: they determine neither the shape of hits nor its growth."""
-    new, reason = ("sigma_growth",) * growth + SHAPES[hit].fitted, "no range determines it"
+def _without_ranges(fit: BeamFit, hit: HitName, new: tuple[str, ...]) -> BeamFit:
+    """Return the fit of readings without a range, which do not determine the parameters ``new``."""
+    reason = "no range determines it"
     return replace(
         fit, parameters=fit.parameters.replace(hit=hit), status=f"{fit.status}; {', '.join(new)}: {reason}",
         held=fit.held | dict.fromkeys(new, reason),
@@ -125,12 +125,10 @@ class _Growing(hosted.Problem):
     fit_bias: bool
     reach: float
     kind: type[HitShape]
-    fit_growth: bool
 
     def bounds(self) -> tuple[Floats, Floats]:
         sigma, rate = (tuple(np.log(pair)) for pair in (self.limits.sigma, self.limits.rate))
-        growth = (0.0, 1.0 if self.fit_growth else 0.0)
-        pairs = [(0.0, 1.0)] * 3 + [sigma, growth, rate] + [(-self.limits.bias, self.limits.bias)] * self.fit_bias
+        pairs = [(0.0, 1.0)] * 3 + [sigma, (0.0, 1.0), rate] + [(-self.limits.bias, self.limits.bias)] * self.fit_bias
         pairs += self.kind.limits
         low, high = np.array(pairs).T
         return low, high
@@ -156,7 +154,7 @@ class _Growing(hosted.Problem):
                 rate, *bias, *shape,
             ])
             for *shape, factor in self.kind.starts
-            for f in (_SHARES if self.fit_growth else (0.0,))
+            for f in _SHARES
         ]  # fmt: skip
 
     def _shape_at(self, theta: Floats) -> Floats:
@@ -218,8 +216,8 @@ class _Growing(hosted.Problem):
         values = {
             "z_hit": rest * (1 - rand) * (1 - short), "z_short": rest * (1 - rand) * short, "z_max": float(theta[_TOP]),
             "z_rand": rest * rand, "sigma_hit": math.exp(theta[_SIGMA]), "lambda_short": math.exp(theta[_RATE]),
+            "sigma_growth": float(theta[_GROWTH]),
         }  # fmt: skip
-        values |= {"sigma_growth": float(theta[_GROWTH])} if self.fit_growth else {}
         values |= {"range_bias": float(theta[_BIAS])} if self.fit_bias else {}
         return values | self.kind.at(self._shape_at(theta)).values()
 
@@ -234,14 +232,12 @@ def fit_jointly(
     bounds: Bounds,
     tolerance: float,
     responsibilities: bool,
-    *,
-    growth: bool,
     hit: HitName,
 ) -> BeamFit:
     """Fit the growth of the deviation, and the shape of hits, from a normal fit without growth."""
-    new = ("sigma_growth",) * growth + SHAPES[hit].fitted
+    new = ("sigma_growth", *SHAPES[hit].fitted)
     if not pairs.hits or not pairs.expected.any():
-        return without_ranges(fit, hit, growth)
+        return _without_ranges(fit, hit, new)
     known = pairs.kinds != Reading.MISSING
     reading, expected = np.zeros(len(known)), np.full(len(known), 0.5 * pairs.range_max)
     reading[pairs.places], expected[pairs.places] = pairs.reading, pairs.expected
@@ -249,7 +245,7 @@ def fit_jointly(
     reach = float(np.mean(pairs.expected, dtype=np.float64))
     problem = _Growing(
         reading[known], expected[known], none, pairs.range_max, bounds, fit.parameters, fit.bias_fitted, reach,
-        SHAPES[hit], growth,
+        SHAPES[hit],
     )  # fmt: skip
     end = hosted.maximize(problem, _ITERATIONS, tolerance)
     blocks = None if pairs.block is None else pairs.block[known]

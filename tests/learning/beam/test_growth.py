@@ -26,8 +26,8 @@ def draw(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("bias", [False, True])
 def test_gradients_are_those_of_differences(bias: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Any] = []
-    real = growth.maximize
-    monkeypatch.setattr(growth, "maximize", lambda p, *rest: seen.append(p) or real(p, *rest))
+    real = growth.hosted.maximize
+    monkeypatch.setattr(growth.hosted, "maximize", lambda p, *rest: seen.append(p) or real(p, *rest))
     z, expected = draw(500, 1)
     gs.fit_beam_parameters(z, expected, 10.0, sigma_growth=True, range_bias=bias, backend="numpy")
     theta = np.array([0.1, 0.2, 0.15, np.log(0.1), 0.02, np.log(0.5), *([0.05] if bias else [])])

@@ -91,7 +91,7 @@ def learned(at):
     hit, short, top, rand = at.weights
     joint = growth._Growing(
         np.where(WITH_MAX < RANGE, WITH_MAX, 0.0), EXPECTED, WITH_MAX >= RANGE, RANGE, bounds, BASE, False, 4.0,
-        growth.SHAPES["normal"], True,
+        growth.SHAPES["normal"],
     )  # fmt: skip
     rest = 1 - top
     theta = np.array([top, rand / rest, short / (hit + short), math.log(at.sigma), 0.01, math.log(at.rate)])

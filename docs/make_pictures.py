@@ -15,6 +15,7 @@ import numpy as np
 from PIL import Image
 
 import gpusense as gs
+from gpusense.plots.judgements import judgement_figure
 
 WIDTH, COLOURS = 1100, 256
 TARGET = Path(__file__).parent / "img" / "demo.png"
@@ -46,7 +47,7 @@ def draw_judgement() -> None:
     target = TARGET.with_name("judge.png")
     with tempfile.TemporaryDirectory() as folder:
         drawn = Path(folder, "judge.png")
-        gs.plots.save(gs.plots.judgement_figure(grid, found, rated, errors), drawn)
+        gs.plots.save(judgement_figure(grid, found, rated, errors), drawn)
         _shrink(drawn, target)
     print(found, rated, f"{target}: {target.stat().st_size} bytes", sep="\n")
 

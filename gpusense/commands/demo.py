@@ -170,18 +170,18 @@ def _score_all(
 
 def draw(scene: Scene, scores: list[Score], path: Path) -> None:
     """Draw the scan at the best pose, the particles, and P(z | x, m) at the best heading by both models."""
-    from gpusense import plots
+    from gpusense.plots import drawing, pose_densities
 
     beam = _fastest(scores, BEAM)
     best = beam.best
-    poses, free, extent = plots.pose_lattice(scene.grid, LATTICE, float(best[2]))
+    poses, free, extent = pose_densities.pose_lattice(scene.grid, LATTICE, float(best[2]))
     densities = {}
     for name in (BEAM, FIELD):
         density = np.full(free.shape, np.nan)
         density[free] = _fastest(scores, name).model.log_likelihood(poses[free.ravel()], scene.ranges)
         densities[f"{name.capitalize()}: every position at the best heading; ring: the truth"] = density
     shown = slice(None, None, -(-len(scene.poses) // DRAWN_PARTICLES))
-    figure = plots.localization_figure(
+    figure = pose_densities.localization_figure(
         scene.grid,
         scene.scanner,
         scene.ranges,
@@ -195,7 +195,7 @@ def draw(scene: Scene, scores: list[Score], path: Path) -> None:
     title = f"Where is the robot?   P(z | x, m) of one scan, {scene.beams} of its {BEAMS} beams, by gpusense"
     figure.suptitle(title, fontsize=15)
     figure.supxlabel(NOTE, fontsize=9, color="#52606d")
-    plots.save(figure, path)
+    drawing.save(figure, path)
 
 
 def _fastest(scores: list[Score], name: str) -> Score:

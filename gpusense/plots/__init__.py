@@ -10,14 +10,11 @@ from gpusense.plots.drawing import (
     new_figure,
     save,
 )
-from gpusense.plots.features import draw_features, draw_landmarks, features_figure, landmarks_figure
-from gpusense.plots.judgements import draw_stanford, judgement_figure
-from gpusense.plots.pose_densities import draw_particles, draw_pose_density, localization_figure, pose_lattice
+from gpusense.plots.features import draw_features, draw_landmarks
+from gpusense.plots.pose_densities import draw_particles
 from gpusense.plots.pose_maps import (
     draw_likelihood_field,
     draw_pose_likelihood,
-    draw_scan_field,
-    pose_likelihood_figure,
 )
 from gpusense.plots.positions import (
     draw_beacons,
@@ -28,12 +25,10 @@ from gpusense.plots.positions import (
     set_view,
     tile_centers,
 )
-from gpusense.plots.runs import chain_figure, match_figure
 
 __all__ = [
     "add_colour_bar",
     "add_legend",
-    "chain_figure",
     "colours",
     "draw_beacons",
     "draw_features",
@@ -43,21 +38,11 @@ __all__ = [
     "draw_map",
     "draw_particles",
     "draw_pose",
-    "draw_pose_density",
     "draw_pose_likelihood",
     "draw_position_density",
     "draw_scan",
-    "draw_scan_field",
-    "features_figure",
-    "landmarks_figure",
     "draw_solution_set",
-    "draw_stanford",
-    "judgement_figure",
-    "localization_figure",
-    "match_figure",
     "new_figure",
-    "pose_lattice",
-    "pose_likelihood_figure",
     "position_log_density",
     "save",
     "set_view",

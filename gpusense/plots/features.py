@@ -116,20 +116,7 @@ def draw_landmarks(ax: Axes, landmarks: FeatureMap) -> None:
 
 
 def features_figure(features: Features, ranges: ArrayLike, scanner: Scanner) -> Figure:
-    """Draw a scan and its features, with a legend, as a figure.
-
-    Args:
-        features: Features of this scan.
-        ranges: (K,) readings [m].
-        scanner: The scanner.
-
-    Example:
-        >>> import gpusense as gs, numpy as np
-        >>> scanner = gs.Scanner([-0.5, 0.0, 0.5], range_max=9.0)
-        >>> features = gs.extract_features(np.ones(3), scanner, backend="numpy")
-        >>> gs.plots.features_figure(features, np.ones(3), scanner).get_size_inches().tolist()
-        [8.0, 6.0]
-    """
+    """Draw (K,) readings and the features of their scan, with a legend."""
     figure = new_figure(8.0, 6.0)
     ax = figure.subplots()
     draw_features(ax, features, ranges, scanner)
@@ -138,19 +125,7 @@ def features_figure(features: Features, ranges: ArrayLike, scanner: Scanner) -> 
 
 
 def landmarks_figure(landmarks: FeatureMap, grid: OccupancyGrid | None = None) -> Figure:
-    """Draw landmarks as a figure, over a map if any.
-
-    Args:
-        landmarks: The landmarks.
-        grid: The map, or None.
-
-    Example:
-        >>> import gpusense as gs, numpy as np
-        >>> grid = gs.OccupancyGrid(np.zeros((40, 40), np.int8), resolution=0.05)
-        >>> figure = gs.plots.landmarks_figure(gs.landmarks_of_map(grid, backend="numpy"), grid)
-        >>> len(figure.axes)
-        1
-    """
+    """Draw landmarks, over a map if any."""
     figure = new_figure(8.0, 8.0)
     ax = figure.subplots()
     if grid is not None:

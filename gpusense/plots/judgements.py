@@ -38,18 +38,8 @@ def judgement_figure(
 ) -> Figure:
     """Draw the track on the map coloured by p_lost, likelier places of lost poses, and p_lost and radius over time.
 
-    Args:
-        grid: The map.
-        found: The judgement.
-        rated: Integrity by a truth, for the Stanford diagram; None for none.
-        errors: (N,) errors of the poses [m], NaN where unknown; None for none.
-
-    Example:
-        >>> import gpusense as gs, numpy as np
-        >>> n = np.arange(3.0)
-        >>> judged = gs.Judgement(3, n.astype(int), n, np.zeros((3, 3)), n / 9, ("tracking",) * 3, n, n, 0.05, ())
-        >>> len(gs.plots.judgement_figure(gs.worlds.building(), judged).axes)
-        3
+    ``rated``: Integrity by a truth, for the Stanford diagram. ``errors``: (N,) errors of the poses, NaN where unknown
+    [m].
     """
     rows: Any = [["map", "p_lost"], ["map", "radius"]]
     if rated is not None:
@@ -124,19 +114,7 @@ def _draw_radius(
 
 
 def draw_stanford(ax: Axes, rated: Integrity) -> None:
-    """Draw the Stanford diagram: the radius of each pose against its error, and the share of each class.
-
-    Args:
-        ax: Axes to draw onto.
-        rated: The integrity.
-
-    Example:
-        >>> import gpusense as gs
-        >>> ax = gs.plots.new_figure(6.0, 4.0).subplots()
-        >>> gs.plots.draw_stanford(ax, gs.integrity([0.1, 0.4], [0.3, 0.3], alert_limit=0.5))
-        >>> ax.get_xlabel()
-        'error [m]'
-    """
+    """Draw the Stanford diagram: the radius of each pose against its error, and the share of each class."""
     limit = rated.alert_limit
     top = 2 * limit
     error, radius = np.minimum(rated.errors, 0.99 * top), np.minimum(rated.radii, 0.99 * top)

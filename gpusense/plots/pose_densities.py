@@ -64,26 +64,13 @@ def draw_particles(
 def pose_lattice(
     grid: OccupancyGrid, spacing: float, theta: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool], tuple[float, float]]:
-    """Make a lattice of poses with one heading over a map, along the grid's axes.
+    """Make a lattice of poses with one heading ``theta`` over a map, along the grid's axes.
 
-    Args:
-        grid: The map.
-        spacing: Distance between neighbours [m], > 0; rounded to whole cells.
-        theta: The heading of all poses in the world [rad].
+    ``spacing``: Distance between neighbours, rounded to whole cells [m].
 
     Returns:
         (R C, 3) poses row by row, (R, C) whether the pose's tile has a free cell, and the lattice's extent (W, H)
-        along the grid's axes [m], for :func:`draw_pose_density`. A pose is in the free cell nearest to the middle of
-        its tile.
-
-    Raises:
-        TypeError, ValueError: an argument is not of the kind described, or breaks its rule.
-
-    Example:
-        >>> import gpusense as gs
-        >>> poses, free, extent = gs.plots.pose_lattice(gs.worlds.building(), 0.5, theta=0.0)
-        >>> poses.shape, free.shape, extent
-        ((2400, 3), (40, 60), (30.0, 20.0))
+        along the grid's axes [m]. A pose is in the free cell nearest to the middle of its tile.
     """
     step = max(round(checks.real("spacing", spacing, above=0) / grid.resolution), 1)
     rows, cols = (-(-count // step) for count in grid.shape)
@@ -103,24 +90,9 @@ def pose_lattice(
 def draw_pose_density(
     ax: Axes, grid: OccupancyGrid, log_p: ArrayLike, extent: tuple[float, float], *, depth: float | None = None
 ) -> AxesImage:
-    """Draw P(z | x, m) over a lattice of poses with one heading, as log-likelihood below the best.
+    """Draw (R, C) log-likelihoods over a :func:`pose_lattice` relative to the best; NaN stays blank.
 
-    Args:
-        ax: Axes to draw onto, usually after :func:`draw_map`.
-        grid: The map; the lattice has its frame.
-        log_p: (R, C) log-likelihoods from the grid's first row and column on, natural logarithm; NaN stays blank.
-        extent: (W, H) of the lattice along the grid's axes [m], from :func:`pose_lattice`.
-        depth: Extent of the colour scale below the best value [nats]; the default covers half of the values.
-
-    Returns:
-        The image, for :func:`add_colour_bar`.
-
-    Example:
-        >>> import gpusense as gs
-        >>> import numpy as np
-        >>> ax, grid = gs.plots.new_figure(6.0, 4.0).subplots(), gs.worlds.building()
-        >>> _, free, extent = gs.plots.pose_lattice(grid, 0.5, theta=0.0)
-        >>> image = gs.plots.draw_pose_density(ax, grid, np.where(free, -1.0, np.nan), extent)
+    ``depth``: Extent of the colour scale [nats]; the default covers half of the values.
     """
     value = checks.array("log_p", log_p, ("R", "C"), finite=False)
     low, high = _scale(value[~np.isnan(value)], depth)
@@ -151,16 +123,8 @@ def localization_figure(
 ) -> Figure:
     """Draw four maps: a scan at the best pose, particles with an inset around the truth, and two densities.
 
-    Args:
-        grid: The map.
-        scanner: The scanner's geometry.
-        ranges: (K,) readings [m].
-        truth: (3,) the robot's true pose in the world [m, m, rad].
-        best: (3,) the pose for drawing the scan [m, m, rad].
-        poses: (N, 3) particles [m, m, rad].
-        log_p: (N,) log-likelihoods of the particles.
-        densities: Two (R, C) log-likelihoods over a :func:`pose_lattice`, by title.
-        extent: (W, H) of that lattice [m].
+    ``truth``, ``best``: (3,) poses. ``poses``, ``log_p``: N particles and their log-likelihoods. ``densities``: Two
+    (R, C) log-likelihoods over a :func:`pose_lattice` of this extent, by title.
     """
     figure = new_figure(15.0, 9.8)
     axes = figure.subplots(2, 2)

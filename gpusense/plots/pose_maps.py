@@ -7,7 +7,6 @@ import os
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense.matching.pose_likelihood import PoseLikelihood
@@ -17,7 +16,6 @@ from gpusense.plots.drawing import (
     colours,
     draw_map,
     draw_pose,
-    end_points,
     new_figure,
     save,
 )
@@ -26,14 +24,10 @@ from gpusense.tables.distances import distance_transform
 from gpusense.world.field_density import FieldDensity
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import LikelihoodFieldParameters
-from gpusense.world.scanner import Scanner
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
-
-# Margin of cells around the end points of a scan's field.
-_MARGIN = 10
 
 
 def draw_pose_likelihood(ax: Axes, likelihood: PoseLikelihood, *, depth: float | None = None) -> AxesImage:
@@ -66,12 +60,7 @@ def draw_pose_likelihood(ax: Axes, likelihood: PoseLikelihood, *, depth: float |
 
 
 def pose_likelihood_figure(likelihood: PoseLikelihood, path: str | os.PathLike[str]) -> None:
-    """Draw likelihoods over the map's outlines, with all modes near the best one, and write the picture.
-
-    Args:
-        likelihood: A result of :func:`gpusense.pose_likelihood`.
-        path: A path that ends in .png, .pdf, .svg or another format that Matplotlib writes.
-    """
+    """Draw likelihoods over the map's outlines, with all modes near the best one, and write the picture."""
     grid = likelihood.grid
     figure = new_figure(8.0, 8.0 * min(max(grid.height / grid.width, 0.3), 2.0))
     ax = figure.subplots()
@@ -115,46 +104,3 @@ def draw_likelihood_field(
     x_min, y_min, x_max, y_max = grid.bounds()
     ax.set(xlim=(x_min, x_max), ylim=(y_min, y_max), xlabel="x [m]", ylabel="y [m]")
     return image
-
-
-def draw_scan_field(
-    ax: Axes,
-    ranges: ArrayLike,
-    scanner: Scanner,
-    parameters: LikelihoodFieldParameters | None = None,
-    *,
-    resolution: float = 0.05,
-) -> AxesImage:
-    """Draw the likelihood field of a scan, with end points as obstacles, in the robot's frame (figure 6.9).
-
-    Args:
-        ax: Axes to draw onto.
-        ranges: (K,) readings [m].
-        scanner: The scanner's geometry.
-        parameters: Parameters of the field.
-        resolution: Side of a cell [m].
-
-    Returns:
-        The image, for :func:`add_colour_bar`.
-
-    Raises:
-        ValueError: no reading has a range.
-
-    Example:
-        >>> import gpusense as gs
-        >>> ax, scanner = gs.plots.new_figure(6.0, 4.0).subplots(), gs.Scanner([0.0, 0.5], range_max=9.0)
-        >>> gs.plots.draw_scan_field(ax, [1.0, 2.0], scanner).get_array().shape
-        (40, 36)
-    """
-    z = checks.array("ranges", ranges, (scanner.count,), finite=False, dtype=None)
-    ends, cell = end_points(z, scanner), checks.real("resolution", resolution, above=0)
-    if not len(ends):
-        raise ValueError("ranges: must have a range, got none")
-    place = np.floor(ends / cell).astype(int)
-    low = place.min(axis=0) - _MARGIN
-    cols, rows = (place.max(axis=0) + _MARGIN + 1 - low).tolist()
-    cells = np.zeros((rows, cols), np.int8)
-    cells[place[:, 1] - low[1], place[:, 0] - low[0]] = 100
-    x, y = (low * cell).tolist()
-    field = OccupancyGrid(cells, cell, (x, y, 0.0))
-    return draw_likelihood_field(ax, field, parameters, range_max=scanner.range_max)

@@ -103,20 +103,7 @@ _ELLIPSES = 40
 
 
 def chain_figure(grid: OccupancyGrid, chain: ScanChain) -> Figure:
-    """Draw the map and the trajectory with closures, doubtful stretches and ellipses of one deviation.
-
-    Args:
-        grid: The map of the scans.
-        chain: The chain.
-
-    Example:
-        >>> import gpusense as gs, numpy as np
-        >>> scanner = gs.Scanner([-0.5, 0.0, 0.5], range_max=9.0)
-        >>> chain = gs.chain_scans(np.ones((2, 3)), scanner, backend="numpy")
-        >>> figure = gs.plots.chain_figure(gs.OccupancyGrid([[0]], 1.0), chain)
-        >>> figure.axes[0].get_xlabel()
-        'x [m]'
-    """
+    """Draw the map and the trajectory with closures, doubtful stretches and ellipses of one deviation."""
     from matplotlib.collections import LineCollection
 
     figure = new_figure(9.0, 8.0)
@@ -153,22 +140,7 @@ def _ellipse(ax: object, pose: np.ndarray, covariance: np.ndarray, largest: floa
 def match_figure(
     reference: ArrayLike | OccupancyGrid, ranges: ArrayLike, scanner: Scanner, guess: ArrayLike, pose: ArrayLike
 ) -> Figure:
-    """Draw the reference, and the second scan at the guess and at the matched pose.
-
-    Args:
-        reference: (K,) readings of the earlier scan [m], or the map.
-        ranges: (K,) readings of the second scan [m].
-        scanner: The scanner of both.
-        guess: (3,) pose before the match [m, m, rad].
-        pose: (3,) pose of the match.
-
-    Example:
-        >>> import gpusense as gs, numpy as np
-        >>> scanner = gs.Scanner([-0.5, 0.0, 0.5], range_max=9.0)
-        >>> figure = gs.plots.match_figure(np.ones(3), np.ones(3), scanner, (0.2, 0, 0), (0, 0, 0))
-        >>> [axes.get_title() for axes in figure.axes]
-        ['before: 0.20 m, 0.00 m, 0.0 degrees', 'after: 0.00 m, 0.00 m, 0.0 degrees']
-    """
+    """Draw the (K,) reference readings or the map, and the second scan at the guess and at the matched (3,) pose."""
     figure = new_figure(11.0, 5.5)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
     for ax, title, at in zip(axes, ("before", "after"), (guess, pose), strict=True):

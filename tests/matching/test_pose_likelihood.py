@@ -118,16 +118,11 @@ def test_pictures_are_written(tmp_path):
     assert image.argmax() == best.argmax() and image.max() == 0 and image.min() >= -5
 
 
-def test_fields_of_maps_and_scans_are_drawn():
+def test_fields_of_maps_are_drawn():
     ax = gs.plots.new_figure(4.0, 3.0).subplots()
     grid = room()
     field = gs.plots.draw_likelihood_field(ax, grid).get_array()
     np.testing.assert_array_equal(field == field.max(), grid.occupied)
-    scan = gs.plots.draw_scan_field(ax, np.full(13, 1.0), SCANNER, resolution=0.1).get_array()
-    ends = np.floor(np.stack([np.cos(SCANNER.bearings), np.sin(SCANNER.bearings)], axis=1) / 0.1)
-    assert np.count_nonzero(scan == scan.max()) == len({tuple(end) for end in ends})
-    with pytest.raises(ValueError, match=r"^ranges: must have a range"):
-        gs.plots.draw_scan_field(ax, np.full(13, np.inf), SCANNER)
 
 
 def test_too_many_poses_are_refused():

@@ -13,7 +13,8 @@ from support.feature_scenes import floor_plan
 import gpusense as gs
 from gpusense import plots
 from gpusense.evaluation import worlds
-from gpusense.plots import drawing
+from gpusense.plots import drawing, pose_densities
+from gpusense.plots.features import features_figure, landmarks_figure
 
 
 def test_all_kinds_are_drawn_with_one_label_each():
@@ -23,7 +24,7 @@ def test_all_kinds_are_drawn_with_one_label_each():
     features = gs.extract_features(scans, scanner, backend="numpy")
     k = int(np.argmax([len(set(features.of_scan(k).kind)) for k in range(12)]))
     one = features.of_scan(k)
-    figure = gs.plots.features_figure(one, scans[k], scanner)
+    figure = features_figure(one, scans[k], scanner)
     _, labels = figure.axes[0].get_legend_handles_labels()
     assert sorted(labels) == sorted({"readings", *one.kind.tolist()})
     assert len(figure.axes[0].patches) >= (one.kind == "pole").sum()
@@ -36,7 +37,7 @@ def test_landmarks_are_drawn_where_they_are():
     cells[[0, -1]] = cells[:, [0, -1]] = 100
     grid = gs.OccupancyGrid(cells, resolution=0.05)
     landmarks = gs.landmarks_of_map(grid, backend="numpy")
-    (ax,) = gs.plots.landmarks_figure(landmarks, grid).axes
+    (ax,) = landmarks_figure(landmarks, grid).axes
     (dots,) = [line for line in ax.lines if line.get_label() == "corner"]
     np.testing.assert_allclose(np.column_stack(dots.get_data()), landmarks.landmarks("corner").xy)
     drawn = [np.column_stack(line.get_data()).ravel() for line in ax.lines if len(line.get_xdata()) == 2]
@@ -126,7 +127,7 @@ def test_particles_without_differences_have_a_scale(log_p):
 def test_lattice_stands_on_free_cells(spacing):
     grid = worlds.building(1, (16.0, 12.0), 0.1)
     grid = gs.OccupancyGrid(grid.cells, 0.1, TURNED)
-    poses, free, extent = plots.pose_lattice(grid, spacing, 0.3)
+    poses, free, extent = pose_densities.pose_lattice(grid, spacing, 0.3)
     step = round(spacing / 0.1)
     assert free.shape == (-(-120 // step), -(-160 // step))
     assert extent == pytest.approx((free.shape[1] * step * 0.1, free.shape[0] * step * 0.1))
@@ -141,13 +142,13 @@ def test_lattice_stands_on_free_cells(spacing):
 
 def test_density_is_drawn_where_its_poses_are():
     grid = gs.OccupancyGrid(np.zeros((20, 30), np.int8), 0.1, TURNED)
-    poses, free, extent = plots.pose_lattice(grid, 0.2, 0.0)
+    poses, free, extent = pose_densities.pose_lattice(grid, 0.2, 0.0)
     log_p = np.full(free.shape, -50.0)
     log_p[2:4, 11:13] = -10.0
     log_p[7, 4] = np.nan
     figure, ax = new_axes()
     plots.draw_map(ax, grid)
-    image = plots.draw_pose_density(ax, grid, log_p, extent, depth=40)
+    image = pose_densities.draw_pose_density(ax, grid, log_p, extent, depth=40)
     assert image.get_clim() == (-40.0, 0.0)
     x, y = poses.reshape(*free.shape, 3)[2:4, 11:13, :2].mean(axis=(0, 1))
     assert colour_at(figure, ax, x, y) == pytest.approx(to_rgb(drawing.SCALE[-1]), abs=0.02)

@@ -6,7 +6,7 @@ import argparse
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gpusense._util.extras import check_library
 from gpusense._util.files import check_writable
@@ -15,7 +15,11 @@ from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
     from gpusense.backends import Backend
+    from gpusense.models.scan.beam import BeamModel
+    from gpusense.models.scan.field import LikelihoodFieldModel
+    from gpusense.world.grid import OccupancyGrid
     from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
+    from gpusense.world.scanner import Scanner
 
 BACKEND_HELP = (
     "device: auto (the fastest one present), gpu, cpu, cuda, numpy, opencl, opencl:<part of a name>, warp:cpu or "
@@ -107,53 +111,28 @@ def whole_number(*, low: int, high: int | None = None) -> Callable[[str], int]:
     return convert
 
 
-def positive_number(text: str) -> float:
-    """Convert an argument to a finite number above 0."""
-    number = _finite(text)
-    if not number > 0:
-        raise argparse.ArgumentTypeError(f"must be a finite number > 0, got {text!r}")
-    return number
+def real_number(rule: str, keeps: Callable[[float], bool] = lambda number: True) -> Callable[[str], float]:
+    """Make a type for ``add_argument``: a number that keeps a rule."""
+
+    def convert(text: str) -> float:
+        try:
+            number = float(text)
+        except ValueError:
+            number = None
+        if number is None or not keeps(number):
+            raise argparse.ArgumentTypeError(f"must be {rule}, got {text!r}")
+        return number
+
+    return convert
 
 
-def range_number(text: str) -> float:
-    """Convert an argument to a valid range of a scanner [m]."""
-    number = _finite(text)
-    if not 0 < number <= _LONGEST_RANGE:
-        raise argparse.ArgumentTypeError(f"must be a number > 0 and <= {_LONGEST_RANGE:g} (metres), got {text!r}")
-    return number
-
-
-def not_negative_number(text: str) -> float:
-    """Convert an argument to a finite number of at least 0."""
-    number = _finite(text)
-    if not number >= 0:
-        raise argparse.ArgumentTypeError(f"must be a finite number >= 0, got {text!r}")
-    return number
-
-
-def finite_number(text: str) -> float:
-    """Convert an argument to a finite number."""
-    value = _finite(text)
-    if math.isnan(value):
-        raise argparse.ArgumentTypeError(f"must be a finite number, got {text!r}")
-    return value
-
-
-def number(text: str) -> float:
-    """Convert an argument to a number."""
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be a number, got {text!r}") from None
-
-
-def _finite(text: str) -> float:
-    """Convert a text to a finite number, else NaN."""
-    try:
-        value = float(text)
-    except ValueError:
-        return math.nan
-    return value if math.isfinite(value) else math.nan
+number = real_number("a number")
+finite_number = real_number("a finite number", math.isfinite)
+positive_number = real_number("a finite number > 0", lambda number: 0 < number < math.inf)
+not_negative_number = real_number("a finite number >= 0", lambda number: 0 <= number < math.inf)
+range_number = real_number(
+    f"a number > 0 and <= {_LONGEST_RANGE:g} (metres)", lambda number: 0 < number <= _LONGEST_RANGE
+)
 
 
 class Output:
@@ -195,10 +174,11 @@ def check_writer(suffix: str) -> None:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
-def add_model(parser: argparse.ArgumentParser) -> None:
-    """Add ``--model`` and ``--precision``."""
+def add_model(parser: argparse.ArgumentParser, default: str = "beam") -> None:
+    """Add ``--model``, ``--precision`` and ``--beams``."""
     add = parser.add_argument
-    add("--model", choices=("beam", "field"), default="beam", help="measurement model (default: %(default)s)")
+    add("--model", choices=("beam", "field"), default=default, help="measurement model (default: %(default)s)")
+    add("--beams", type=whole_number(low=1), metavar="B", help="thin each scan evenly to B beams (default: all)")
     add("--precision", choices=PRECISIONS, default="float32", help="precision (default: %(default)s)")
 
 
@@ -234,6 +214,21 @@ def parameters_of(args: argparse.Namespace) -> BeamParameters | LikelihoodFieldP
 
         beam = read_beam_parameters(args.parameters)
     return beam.replace(**changes)
+
+
+def scan_model(
+    args: argparse.Namespace, grid: OccupancyGrid, scanner: Scanner, **options: Any
+) -> BeamModel | LikelihoodFieldModel:
+    """Make the model that ``--model``, its parameters, ``--precision``, ``--beams`` and ``--backend`` choose."""
+    from gpusense.models.scan.beam import BeamModel
+    from gpusense.models.scan.field import LikelihoodFieldModel
+    from gpusense.world.parameters import BeamParameters
+
+    parameters = parameters_of(args)
+    options |= {"backend": args.backend, "precision": args.precision, "beams": args.beams}
+    if isinstance(parameters, BeamParameters):
+        return BeamModel(grid, scanner, parameters, **options)
+    return LikelihoodFieldModel(grid, scanner, parameters, **options)
 
 
 def _option(name: str) -> str:

@@ -21,7 +21,6 @@ from gpusense.evaluation.machine import machine, machine_line
 if TYPE_CHECKING:
     from gpusense.evaluation.benchmark.runner import Plan
 
-NAME = "bench"
 HELP = "Measure error against run time of every caster and model, and name the fastest method within an error."
 FIRST = ("quick", "html", "map", "max_error", "max_time")
 

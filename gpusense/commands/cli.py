@@ -14,6 +14,7 @@ import sys
 import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
+from types import ModuleType
 from typing import Any, NoReturn
 
 from gpusense._util.extras import explained
@@ -27,6 +28,8 @@ COMMANDS = (
 )  # fmt: skip
 ALIASES = {"localise": "localize"}
 
+# Meanings of the exit codes where a command states none.
+_CODES = {0: "success", 2: "bad input", 130: "interrupted", 143: "terminated"}
 BAD_INPUT = 2
 BROKEN_PIPE = 141
 # Environment variable that lets exceptions through with their traceback, for developers.
@@ -264,13 +267,21 @@ def _build(names: Sequence[str]) -> Parser:
     for name in names:
         module = importlib.import_module(f"gpusense.commands.{name.replace('-', '_')}")
         command = commands.add_parser(
-            module.NAME, help=module.HELP, description=module.HELP, epilog=module.EPILOG, formatter_class=layout,
+            name, help=module.HELP, description=module.HELP, epilog=_epilog(module), formatter_class=layout,
             allow_abbrev=False,
         )  # fmt: skip
         module.add_arguments(command)
         command.group_options(module.FIRST)
         command.set_defaults(run=module.run)
     return parser
+
+
+def _epilog(module: ModuleType) -> str:
+    """Return the text below a command's options: its notes, exit codes and examples."""
+    notes, _, examples = module.EPILOG.partition("examples:")
+    codes = _CODES | getattr(module, "CODES", {})
+    text = ", ".join(f"{code} {codes[code]}" for code in sorted(codes))
+    return f"{notes}Exit codes: {text}.\n\nexamples:{examples}"
 
 
 def _message(error: Exception) -> str:

@@ -36,9 +36,9 @@ from gpusense.commands.output import grouped
 from gpusense.commands.signals import held
 from gpusense.evaluation.machine import machine
 
-NAME = "demo"
 HELP = "Localise a robot in a generated building with every backend, compare them, and draw the result."
 FIRST = ("particles", "backend", "output")
+CODES = {1: "a device failed (the report has its error)"}
 
 _DESCRIPTION = """\
 Generate a building and a noisy laser scan in it, and compute for many poses how likely the scan is: log P(z | x, m)
@@ -50,9 +50,7 @@ EPILOG = """\
 examples:
   gpusense demo
   gpusense demo --particles 1000000 --backend opencl --backend warp:cuda:0
-  gpusense demo --no-plot --json > demo.json
-
-Exit codes: 0 success, 1 a device failed (the report has its error), 2 bad input."""
+  gpusense demo --no-plot --json > demo.json"""
 
 # Distance between poses of the pictures [m]; most particles drawn.
 LATTICE, DRAWN_PARTICLES = 0.1, 20_000

@@ -13,7 +13,6 @@ from gpusense.evaluation.machine import machine_line
 if TYPE_CHECKING:
     from gpusense.backends import Device
 
-NAME = "devices"
 HELP = "List the devices that gpusense can use, with remedies for absent or unusable devices."
 FIRST = ()
 
@@ -59,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     rows = [
         (device.selection or "-", device.kind, device.name, driver_text(device), _status(device)) for device in listed
     ]
-    print_table(("selection", "kind", "name", "driver", "status"), rows, optional=() if args.verbose else ("driver",))
+    print_table(("selection", "kind", "name", "driver", "status"), rows)
     print()
     for device in listed:
         if device.reason:

@@ -13,7 +13,7 @@ from gpusense.commands.arguments import (
     add_model,
     add_parameters,
     add_seed,
-    parameters_of,
+    scan_model,
     whole_number,
 )
 from gpusense.commands.output import counted, print_fact, print_report, print_result
@@ -23,12 +23,9 @@ if TYPE_CHECKING:
     import numpy as np
 
     from gpusense.interface.plan import Plan
-    from gpusense.models.scan.beam import BeamModel
-    from gpusense.models.scan.field import LikelihoodFieldModel
     from gpusense.world.grid import OccupancyGrid
     from gpusense.world.scanner import Scanner
 
-NAME = "explain"
 HELP = "Report the parts that the kernels omit, keep or could omit for a scene, with reasons."
 FIRST = ("map", "log", "model", "parameters", "measure")
 
@@ -39,8 +36,6 @@ default map is the building of 'gpusense demo'; the default scan is drawn by the
 The report lists the omitted parts; with -v also, after +, parts that the scene needs, and, after ?, parts that another
 choice would omit. --measure times each part that a kernel's flag restores, with and without it, on this device.
 Differences below a few percent of the call are noise.
-
-Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
 examples:
   gpusense explain
@@ -56,7 +51,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_log(parser, "a log with scans, of the robot in the map", required=False)
     add("--scan", type=whole_number(low=0), metavar="I", help="index of the log's scan (default: 0)")
     add_range_max(parser)
-    add("--beams", type=whole_number(low=1), metavar="B", help="thin the scan evenly to B beams (default: all)")
     add_model(parser)
     add("--caster", choices=get_args(CasterName), help="method of the expected ranges; beam model only")
     add("--measure", action="store_true", help="time the scene with and without each part")
@@ -69,10 +63,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Score the scene, and print the report of its model."""
-    grid, scanner, ranges = _scene(args)
-    model = _model(args, grid, scanner)
     from gpusense.models.scan.savings import poses_on
 
+    grid, scanner, ranges = _scene(args)
+    if args.caster is not None and args.model == "field":
+        raise ValueError(f"--caster: must be left out with the field, got {args.caster}")
+    model = scan_model(args, grid, scanner, **({} if args.caster is None else {"caster": args.caster}))
     model.log_likelihood(poses_on(grid), ranges)
     plan = model.plan(measure=args.measure)
     texts = model.sources() if args.sources else {}
@@ -119,21 +115,6 @@ def _scene(args: argparse.Namespace) -> tuple[OccupancyGrid, Scanner, np.ndarray
     rng = np.random.default_rng(args.seed)
     truth = worlds.free_pose(grid, rng)
     return grid, scanner, worlds.simulate_scan(grid, scanner, truth, BeamParameters(), rng)
-
-
-def _model(args: argparse.Namespace, grid: OccupancyGrid, scanner: Scanner) -> BeamModel | LikelihoodFieldModel:
-    """Return the model that the options choose."""
-    from gpusense.models.scan.beam import BeamModel
-    from gpusense.models.scan.field import LikelihoodFieldModel
-    from gpusense.world.parameters import BeamParameters
-
-    options: dict[str, Any] = {"backend": args.backend, "precision": args.precision, "beams": args.beams}
-    parameters = parameters_of(args)
-    if not isinstance(parameters, BeamParameters):
-        if args.caster is not None:
-            raise ValueError(f"--caster: must be left out with the field, got {args.caster}")
-        return LikelihoodFieldModel(grid, scanner, parameters, **options)
-    return BeamModel(grid, scanner, parameters, caster=args.caster, **options)
 
 
 def _document(plan: Plan) -> dict[str, Any]:

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from gpusense.features.result import Features
     from gpusense.logs import Scan
 
-NAME = "features"
 HELP = "Extract lines, corners, doors, hallways, poles and reflectors from the scans of a log."
 FIRST = ("log", "reference", "kinds", "map_out", "plot")
 
@@ -44,8 +43,6 @@ EPILOG = """\
 Each scan is split into lines, which form corners, doors, hallways and poles (docs/landmarks.md). --map-out makes a map
 of the lines, corners, doors, poles and reflectors of all scans, at the poses of the log or of --reference; --map-in
 makes a map from an occupancy grid instead. Reflectors need a log with intensities.
-
-Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
 examples:
   gpusense features --log run.log.gz --limit 300 --plot scan.png

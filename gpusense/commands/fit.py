@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from gpusense.evaluation.range_data import RangeData
     from gpusense.localization.motion_fit import MotionFit
 
-NAME = "fit"
 HELP = "Fit the beam model's parameters to a recorded log in a map, or to pairs of readings and expected ranges."
 FIRST = ("map", "log", "reference", "holdout", "out")
+CODES = {1: "the fit did not converge"}
 
 _DESCRIPTION = """\
 How good is a range finder? gpusense fit estimates the six parameters of the beam model from your sensor's data: weight
@@ -47,14 +47,11 @@ density.png, trace.png, surface.png, and incidence.png for fitted angles of inci
 
 Ctrl-C ends the fit and prints the best parameters so far.
 
-Exit codes: 0 success, 1 the fit did not converge, 2 bad input, 130 interrupted, 143 terminated.
-
 examples:
   gpusense fit --map map.yaml --log run.log.gz --every 2 --offset 1 --holdout \\
       --fit-motion --out fitted
   gpusense fit --pairs readings.csv --range-max 8 --range-bias"""
 
-UNFINISHED = 1
 # Pictures of --out.
 _PICTURES = ("readings.png", "density.png", "trace.png", "surface.png")
 _PAIRS_BLOCK = 100
@@ -114,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
             sys.stderr.write(f"gpusense: {DOUBT}\n")
     else:
         print_fit(result, files, verbose=args.verbose, paired=args.pairs is not None)
-    return 0 if result.fit.converged else UNFINISHED
+    return int(not result.fit.converged)
 
 
 def _check_sources(args: argparse.Namespace) -> None:

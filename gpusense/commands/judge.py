@@ -34,11 +34,10 @@ if TYPE_CHECKING:
     from gpusense.models.scan.model import ScanModel
     from gpusense.world.grid import OccupancyGrid
 
-NAME = "judge"
 HELP = "Judge the poses of any localiser in a recording: when they were right, when lost, and why."
 FIRST = ("map", "log", "poses", "plot", "truth")
+CODES = {0: "the poses were not lost", 1: "they were, or no scan had a reading to judge by"}
 
-LOST = 1
 # Suffixes of trajectories.
 _TRAJECTORIES = (".tum", ".txt")
 
@@ -55,11 +54,6 @@ the probability --risk. The whole map is searched for some of the scans of each 
 --truth adds the integrity: a pose is available if its radius is at most --alert-limit. It is then misleading if its
 error exceeds the radius but not the alert limit, and hazardously misleading if it exceeds the alert limit. The time to
 alert is counted from the first scan with an error above the limit to the first radius above it.
-
-Ctrl-C ends the run with the results so far.
-
-Exit codes: 0 the poses were not lost, 1 they were, or no scan had a reading to judge by, 2 bad input, 130 interrupted,
-143 terminated.
 
 examples:
   gpusense judge --map map.yaml --log run.bag
@@ -116,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
     _report(args, grid, found, source, [one.scan for one in posed[: len(judge)]], truth)
     if stops:
         raise stops[0]
-    return 0 if found.informed and not found.lost else LOST
+    return int(found.lost or not found.informed)
 
 
 def _source(text: str) -> str | Path:

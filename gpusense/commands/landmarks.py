@@ -37,11 +37,10 @@ if TYPE_CHECKING:
     from gpusense.learning.landmark.suspicious import Suspicions
     from gpusense.logs.records import LandmarkRun
 
-NAME = "landmarks"
 HELP = "Fit the noise of landmark readings in a recorded run, check the map, and localise the robot."
 FIRST = ("folder", "robot", "known", "particles", "drift")
+CODES = {1: "lost at the end"}
 
-LOST = 1
 _UNITS = {"sigma_range": "m", "sigma_bearing": "rad"}
 
 EPILOG = """\
@@ -61,10 +60,6 @@ small one the robot gets lost.
 
 The final verdict needs no logged poses: it is 'lost' if the particles predict the last readings hardly better than
 poses anywhere among the landmarks, as on a wrong map.
-
-Ctrl-C ends the run with the results so far.
-
-Exit codes: 0 success, 1 lost at the end, 2 bad input, 130 interrupted, 143 terminated.
 
 examples:
   gpusense landmarks --folder MRCLAM_Dataset1 --robot 1
@@ -136,7 +131,7 @@ def run(args: argparse.Namespace) -> int:
         )
     if stops:
         raise stops[0]
-    return LOST if track.verdict == "lost" else 0
+    return int(track.verdict == "lost")
 
 
 def _left_out(run: LandmarkRun) -> str:

@@ -11,8 +11,11 @@ from gpusense._util.progress import progress
 from gpusense.commands.arguments import (
     add_backend,
     add_json,
+    add_model,
+    add_parameters,
     output_path,
     positive_number,
+    scan_model,
     whole_number,
 )
 from gpusense.commands.output import (
@@ -31,7 +34,6 @@ from gpusense.commands.signals import held
 if TYPE_CHECKING:
     import numpy as np
 
-NAME = "likelihood-map"
 HELP = "Draw the likelihood of a scan over all positions and headings of a map."
 FIRST = ("map", "log", "scan", "out", "model")
 
@@ -47,8 +49,6 @@ than the grid's best one shows that the grid is too coarse for the model. The en
 
 Ctrl-C ends the run; the picture then shows the positions so far.
 
-Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
-
 examples:
   gpusense likelihood-map --map map.yaml --log run.log.gz --scan 101 \\
       --out likelihood.png
@@ -63,15 +63,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_log(parser, "a log with scans")
     add("--scan", type=whole_number(low=0), default=0, metavar="I", help="index of the scan (default: 0)")
     add("--out", required=True, type=output_path(".png", ".pdf", ".svg"), metavar="FILE", help="the picture")
-    add("--model", choices=("beam", "field"), default="field", help="measurement model (default: %(default)s)")
+    add_model(parser, "field")
     add("--resolution", type=positive_number, default=0.1, metavar="M",
         help="distance between neighbouring positions, at least a cell [m] (default: %(default)s)")  # fmt: skip
     add("--headings", type=whole_number(low=1), default=72, metavar="A", help="headings (default: %(default)s)")
     add("--positions", choices=("free", "all"), default="free", help="cells that are evaluated (default: %(default)s)")
-    add("--beams", type=whole_number(low=1), metavar="B", help="thin the scan evenly to B beams (default: all)")
     add("--temperature", type=positive_number, default=1.0, metavar="T",
         help="factor of log-likelihoods in (0, 1] (default: %(default)s, the plain product over beams)")  # fmt: skip
     add_range_max(parser)
+    add_parameters(parser)
     add_backend(parser)
     add_json(parser, verbose=True)
 
@@ -79,14 +79,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Compute and draw the likelihoods; after Ctrl-C, the tiles so far."""
     from gpusense.matching.pose_likelihood import prepare_tiles, refine_modes
-    from gpusense.models.scan.beam import BeamModel
-    from gpusense.models.scan.field import LikelihoodFieldModel
     from gpusense.world.map_files import read_map
 
     grid = read_map(args.map)
     scan = read_scan(args)
-    kind = BeamModel if args.model == "beam" else LikelihoodFieldModel
-    model = kind(grid, scan.scanner, backend=args.backend, beams=args.beams, temperature=args.temperature)
+    model = scan_model(args, grid, scan.scanner, temperature=args.temperature)
     result, tiles = prepare_tiles(
         model, scan.ranges, resolution=args.resolution, headings=args.headings, positions=args.positions
     )

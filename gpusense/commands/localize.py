@@ -38,11 +38,10 @@ if TYPE_CHECKING:
     from gpusense.localization.nav2 import Nav2Options
     from gpusense.world.grid import OccupancyGrid
 
-NAME = "localize"
 HELP = "Localise a robot along a recorded log with a particle filter."
 FIRST = ("map", "log", "everywhere", "start", "plot")
+CODES = {0: "the verdict is 'tracking'", 1: "uncertain or lost at the end, or no reading there to judge by"}
 
-LOST = 1
 
 EPILOG = """\
 The filter starts at --start or at the first reference pose, with deviations of 0.5 m and 0.26 rad, or with --global
@@ -61,9 +60,6 @@ A file of nav2 sets amcl's model, beams, particles, noise of the odometry, recov
 command take precedence. Its frames, topics and gates (update_min_d, update_min_a, resample_interval) have no effect.
 
 Ctrl-C ends the run with the results so far, and writes the files.
-
-Exit codes: 0 the verdict is 'tracking', 1 uncertain or lost at the end, or no reading there to judge by, 2 bad input,
-130 interrupted, 143 terminated.
 
 examples:
   gpusense localize --map map.yaml --log run.log.gz
@@ -150,7 +146,7 @@ def run(args: argparse.Namespace) -> int:
     found = report(args, pf, track, len(steps), recorders)
     if stops:
         raise stops[0]
-    return 0 if found["verdict"] == "tracking" and found["explained_at_end"] is not None else LOST
+    return int(found["verdict"] != "tracking" or found["explained_at_end"] is None)
 
 
 def _recorders(args: argparse.Namespace, pf: ParticleFilter, scans: int) -> dict[Path, Recorder]:

@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
     Scans = list[tuple[int, Scan]]
 
-NAME = "map"
 HELP = "Build an occupancy grid from the scans of a log."
 FIRST = ("log", "out", "plot", "chain", "resolution")
 
@@ -64,8 +63,6 @@ A chain begins at 0 0 0 of its map: 'gpusense localize' follows the same log fro
 
 Ctrl-C ends the chain and writes the map of the scans so far, or ends the map with some of the scans. A map of more than
 four million cells is built in bands of rows; an interrupted one holds the finished bands, and some scans of the next.
-
-Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
 examples:
   gpusense map --log run.bag --out map.yaml --tum run.tum --plot map.png

@@ -42,17 +42,12 @@ if TYPE_CHECKING:
     from gpusense.logs import Scan
     from gpusense.world.grid import OccupancyGrid
 
-NAME = "match"
 HELP = "Match the scans of a recorded log to each other, or to a map."
 FIRST = ("log", "map", "reference", "tum", "plot")
 
 EPILOG = """\
 Each scan is matched to the one before, from the odometry's guess; with --map to the map, from its logged pose. Errors
 are those against the logged poses, where the log has them. A match is wrong beyond 0.2 m or 5 degrees.
-Ctrl-C ends the run with the results so far.
-
-Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
-
 examples:
   gpusense match --log run.log.gz --limit 300
   gpusense match --log run.log.gz --guess identity --plot worst.png

@@ -115,37 +115,12 @@ def _wrapped(text: str, width: int, indent: str = "") -> str:
     return textwrap.fill(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
 
 
-def print_table(
-    columns: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[str] = (), optional: Sequence[str] = ()
-) -> None:
-    """Print a table by rich on a terminal, otherwise as plain text.
-
-    On a narrow terminal, each row becomes a paragraph with one value per line.
-    """
+def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[str] = ()) -> None:
+    """Print a table; on a terminal that is too narrow, each row becomes a paragraph with one value per line."""
     lines = table_lines(columns, rows, right=right)
-    if not is_terminal(sys.stdout):
-        print(*lines, sep="\n")
-        return
-    # Rich puts three columns between two cells, and one at each end.
-    for name in optional:
-        if max(map(len, lines)) + len(columns) + 1 > terminal_width():
-            kept = [place for place, column in enumerate(columns) if column != name]
-            columns, rows = [columns[k] for k in kept], [[row[k] for k in kept] for row in rows]
-            lines = table_lines(columns, rows, right=right)
-    if max(map(len, lines)) + len(columns) + 1 > terminal_width():
-        print(*paragraph_lines(columns, rows), sep="\n")
-        return
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for column in columns:
-        table.add_column(Text(column), justify="right" if column in right else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*(Text(text) for text in row))
-    Console().print(table)
+    if is_terminal(sys.stdout) and max(map(len, lines)) > terminal_width():
+        lines = paragraph_lines(columns, rows)
+    print(*lines, sep="\n")
 
 
 def terminal_width() -> int:

@@ -12,9 +12,9 @@ from gpusense._util.documents import read_mapping
 from gpusense.commands.arguments import add_backend, finite_number
 from gpusense.localization.nav2_file import FITTED
 
-NAME = "ros"
 HELP = "Localise inside ROS 2, in the place of nav2_amcl, or watch another localiser."
 FIRST = ("map", "params_file", "start", "anywhere", "odom_topic")
+CODES = {0: "interrupted or terminated", 1: "the node could not start (its log has the reason)"}
 
 _ROS = "--ros-args"
 
@@ -26,8 +26,6 @@ starts active.
 'gpusense ros watch' judges the poses of nav2_amcl, or of any node that publishes amcl_pose, and writes /diagnostics.
 
 Options of ROS 2 follow --ros-args: remappings, namespaces and parameters, as for every node.
-
-Exit codes: 0 interrupted or terminated, 1 the node could not start (its log has the reason), 2 bad input.
 
 examples:
   gpusense ros --map map.yaml --params-file nav2_params.yaml

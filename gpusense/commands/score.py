@@ -17,7 +17,7 @@ from gpusense.commands.arguments import (
     add_temperature,
     not_negative_number,
     output_path,
-    parameters_of,
+    scan_model,
     whole_number,
 )
 from gpusense.commands.output import (
@@ -26,27 +26,23 @@ from gpusense.commands.output import (
     draw,
     grouped,
     length,
+    print_details,
     print_fact,
     print_files,
     print_interrupted,
     print_report,
     print_result,
-    print_table,
 )
 from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans
 from gpusense.commands.signals import held
-from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
-    from gpusense.evaluation.scoring import Fitness, LogScore, Model, ScanScore
-    from gpusense.logs import Scan
-    from gpusense.world.grid import OccupancyGrid
+    from gpusense.evaluation.scoring import Fitness, LogScore, Model
 
-NAME = "score"
 HELP = "Score particles with the scans of a recorded log, and rank the logged poses among them."
 FIRST = ("map", "log", "reference", "parameters", "plot")
+CODES = {0: "the log fits the map", 1: "it does not or the verdict is uncertain"}
 
-DIFFERENT = 1
 
 EPILOG = """\
 Each scan is scored for N particles: the logged pose, half of the others around it, half uniform over the free cells.
@@ -58,17 +54,10 @@ correlation of beams at the logged poses of the first 100 chosen scans. --temper
 The verdict is whether the logged poses explain the beams of their scans. On a wrong map beams pass through walls: the
 message states their share and the place of most of them. Cases in between are uncertain.
 
--v also prints a row for each scan. Ctrl-C ends the run with the results so far.
-
-Exit codes: 0 the log fits the map, 1 it does not or the verdict is uncertain, 2 bad input, 130 interrupted, 143
-terminated.
-
-examples:
+--json lists all scans. examples:
   gpusense score --map map.yaml --log run.log.gz --model field --particles 20000
   gpusense score --map map.yaml --log run.log.gz \\
       --parameters fitted/parameters.yaml"""
-
-_COLUMNS = ("scan", "rank", "percentile", "error [m]", "error [rad]", "effective", "beams")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -85,7 +74,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--sigma-heading", type=not_negative_number, default=0.25, metavar="RAD",
         help="deviation of their heading [rad] (default: %(default)s)")  # fmt: skip
     add_choice(parser)
-    add("--beams", type=whole_number(low=1), metavar="B", help="thin each scan evenly to B beams (default: all)")
     add_temperature(parser, "auto: calibrated from the chosen scans")
     add_parameters(parser)
     add_seed(parser)
@@ -96,14 +84,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Score the scans and print the results; after Ctrl-C, the results so far."""
-    from gpusense.evaluation.scoring import FitnessOfLog, LogScoring, ParticleSampler
+    from gpusense.evaluation.scoring import FitnessOfLog, LogScoring, ParticleSampler, temperature_of_log
     from gpusense.plots.runs import scores_figure
     from gpusense.world.map_files import read_map
 
     sampler = ParticleSampler(args.particles, args.sigma_position, args.sigma_heading, args.seed)
     grid = read_map(args.map)
     scans = read_scans(args)
-    model = make_model(args, grid, scans)
+    scanner, temperature = scans[0][1].scanner, args.temperature
+    if temperature == "auto":
+        temperature = temperature_of_log(scan_model(args, grid, scanner), scans)
+    model = scan_model(args, grid, scanner, temperature=temperature)
     scoring, fitness = LogScoring(model, sampler), FitnessOfLog(model)
     with held(scoring) as stops, progress(len(scans)) as step:
         for index, scan in scans:
@@ -116,31 +107,7 @@ def run(args: argparse.Namespace) -> int:
     draw(args.plot, lambda: scores_figure(grid, score, pose_name(args)))
     if not args.json:
         print_files(args.plot)
-    return 0 if fit.fits else DIFFERENT
-
-
-def _row(scan: ScanScore) -> tuple[str, ...]:
-    position, heading = (number_text(value, "none: all -inf") for value in (scan.error_position, scan.error_heading))
-    return (str(scan.index), f"{scan.rank:g}", f"{scan.percentile:.3f}", position, heading,
-            number_text(scan.effective), str(scan.beams))  # fmt: skip
-
-
-def make_model(args: argparse.Namespace, grid: OccupancyGrid, scans: list[tuple[int, Scan]]) -> Model:
-    """Make the model, by default with the temperature of the scans."""
-    from gpusense.evaluation.scoring import temperature_of_log
-    from gpusense.models.scan.beam import BeamModel
-    from gpusense.models.scan.field import LikelihoodFieldModel
-    from gpusense.world.parameters import BeamParameters
-
-    parameters, scanner = parameters_of(args), scans[0][1].scanner
-
-    def make(temperature: float) -> Model:
-        common = dict(backend=args.backend, precision=args.precision, temperature=temperature, beams=args.beams)
-        if isinstance(parameters, BeamParameters):
-            return BeamModel(grid, scanner, parameters, **common)
-        return LikelihoodFieldModel(grid, scanner, parameters, **common)
-
-    return make(temperature_of_log(make(1.0), scans) if args.temperature == "auto" else args.temperature)
+    return int(not fit.fits)
 
 
 def _report(args: argparse.Namespace, model: Model, score: LogScore, fitness: Fitness, chosen: int) -> None:
@@ -158,8 +125,16 @@ def _report(args: argparse.Namespace, model: Model, score: LogScore, fitness: Fi
     print_result(_fitness(fitness, pose_name(args)))
     _print(score, pose_name(args))
     print_interrupted(len(score.scans), chosen)
-    if args.verbose:
-        _print_details(args, model, score)
+    values = ", ".join(f"{name} {value}" for name, value in model.parameters.to_dict().items())
+    how = "calibrated from the scans" if args.temperature == "auto" else "given"
+    s = {name: number_text(value) for name, value in summary(score).items()}
+    print_details(
+        args,
+        f"{args.model} model, {args.precision}: {values}, range_max {model.scanner.range_max:.6g} m\n"
+        f"temperature {model.temperature:.4g}, {how}\n"
+        f"effective sample size: median {s['effective_median']}; scans with all particles at -inf: {s['degenerate']}; "
+        f"{s['particle_beams_per_second']} particle-beams/s of whole calls, NumPy in and out",
+    )
 
 
 def pose_name(args: argparse.Namespace) -> str:
@@ -184,26 +159,6 @@ def _print(score: LogScore, pose: str) -> None:
                    f"{degrees(s['error_heading_median'])} degrees, 90 % below "
                    f"{length(s['error_position_90'])} and {degrees(s['error_heading_90'])} "
                    "degrees")  # fmt: skip
-
-
-def _print_details(args: argparse.Namespace, model: Model, score: LogScore) -> None:
-    """Print a row for each scan, parameters, temperature, effective sample size and rate."""
-    from gpusense.evaluation.scoring import summary
-
-    print()
-    print_table(
-        _COLUMNS, [_row(scan) for scan in score.scans], right=_COLUMNS, optional=("beams", "effective", "error [rad]")
-    )
-    values = ", ".join(f"{name} {value}" for name, value in model.parameters.to_dict().items())
-    print(f"\n{args.model} model, {args.precision}: {values}, range_max {model.scanner.range_max:.6g} m")
-    how = "calibrated from the scans" if args.temperature == "auto" else "given"
-    print(f"temperature {model.temperature:.4g}, {how}")
-    s = {name: number_text(value) for name, value in summary(score).items()}
-    print(
-        f"effective sample size: median {s['effective_median']}; scans with all particles at -inf: {s['degenerate']}; "
-        f"{s['particle_beams_per_second']} particle-beams/s of whole calls, NumPy in and out"
-    )
-    print(machine_line())
 
 
 def _fitness(fitness: Fitness, pose: str) -> str:

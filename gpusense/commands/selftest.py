@@ -20,11 +20,10 @@ if TYPE_CHECKING:
     from gpusense.backends import Backend
     from gpusense.evaluation.tolerances import Check
 
-NAME = "selftest"
 HELP = "Check that the backends present agree with the float64 truth and with each other."
 FIRST = ("backend", "stiff")
+CODES = {0: "every difference is within its tolerance", 1: "one is not", 2: "bad input or an absent device"}
 
-BREACH = 1
 
 EPILOG = """\
 In a generated building, every backend present computes distance transforms, expected ranges, angles of incidence and
@@ -32,8 +31,6 @@ log-likelihoods of a laser and of a ring of sonars, in both precisions. 'truth' 
 backend's rounded inputs and expected ranges; 'SciPy' is its distance transform; 'specialize=False' is the same model
 without specialisation; 'float64' is the same backend's other precision. The tolerances and their reasons are in
 gpusense.evaluation.tolerances, and in the JSON document.
-
-Exit codes: 0 every difference is within its tolerance, 1 one is not, 2 bad input or an absent device.
 
 --stiff compares the catalogue of stiff and extreme cases with the truth instead, on each backend and in each precision:
 sigma from 1e-8 to 1e6 of range_max, lambda up to 1e6, weights of exactly 0 and 1, extreme maps, resolutions, poses and
@@ -97,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
             print(f"\n{machine_line()}")
     if stops:
         raise stops[0]
-    return BREACH if breaches else 0
+    return int(bool(breaches))
 
 
 def _run_stiff(backends: Sequence[Backend], checks: list[Check]) -> None:

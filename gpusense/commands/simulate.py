@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from gpusense.world.grid import OccupancyGrid
     from gpusense.world.parameters import BeamParameters
 
-NAME = "simulate"
 HELP = "Make the log of a robot that drives through a map, with noise, people and changes of the world."
 FIRST = ("world", "map", "log_out", "map_out", "scans")
 
@@ -39,8 +38,6 @@ options and seed make the same log on every device.
 
 A CARMEN log contains the laser's true poses, for comparison by 'gpusense localize', 'score', 'fit' and 'match'. Bags
 contain LaserScan, Odometry and transforms; --tum writes the robot's true poses for --reference.
-
-Exit codes: 0 success, 2 bad input.
 
 examples:
   gpusense simulate --world office --map-out office.yaml --log-out run.log

@@ -22,11 +22,10 @@ if TYPE_CHECKING:
     from gpusense.sweeps.job import Job
     from gpusense.sweeps.run import Sweep
 
-NAME = "sweep"
 HELP = "Run many jobs from a plan, on processes or a Dask cluster, into a table that survives crashes."
 FIRST = ("table", "processes", "device", "resume", "plot")
+CODES = {1: "some jobs failed", 2: "bad input, or the cluster ended"}
 
-FAILED = 1
 LOCAL = "local"
 _TLS = {
     "ca": "certificate of the authority that has signed the cluster's certificates",
@@ -43,8 +42,6 @@ exceeds --job-timeout fails alone. After a crash or Ctrl-C, --resume runs the jo
 Jobs run in a separate process; --processes or several --device start several processes, one per device, and --dask uses
 a Dask cluster. The cluster 'local' listens on the loopback only. Everyone who reaches the ports of a Dask cluster can
 execute code there: use a trusted network or TLS. Maps and logs are sent to the workers once.
-
-Exit codes: 0 success, 1 some jobs failed, 2 bad input, or the cluster ended, 130 interrupted, 143 terminated.
 
 examples:
   gpusense sweep examples/sweep_logs.yaml --root data --table sweep.csv \\
@@ -96,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
     begin = time.perf_counter()
     ended = _swept(args, jobs)
     _report(args, ended, time.perf_counter() - begin)
-    return FAILED if ended.failed else 0
+    return int(ended.failed > 0)
 
 
 def _list(jobs: tuple[Job, ...], *, as_json: bool) -> int:

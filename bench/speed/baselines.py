@@ -159,7 +159,7 @@ def numba_field(kind: str) -> Callable[[Scene, None, str], Runner]:
         cells, bearings = scene.readings[chosen] / scene.grid.resolution, scene.scanner.bearings[chosen]
         points = cells[:, None] * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
         score = {"log grid": score_logs, "log of products": score_products, "sum of cubes": score_cubes}[kind]
-        return Runner(lambda poses: score(grid, beyond, in_cells(scene, poses), points))
+        return lambda poses: score(grid, beyond, in_cells(scene, poses), points)
 
     return make
 
@@ -185,7 +185,7 @@ def numba_march(bins: int) -> Callable[[Scene, None, str], Runner]:
             placed[:, :2] *= side
             return march(distances, side, placed, scanner.bearings, cosines, sines, scanner.range_max)
 
-        return Runner(run)
+        return run
 
     return make
 
@@ -200,7 +200,7 @@ def range_libc_caster(library: Any, kind: str, bins: int) -> Callable[[Scene, No
         def run(poses: np.ndarray) -> np.ndarray:
             return caster.cast(in_cells(scene, poses), scene.scanner.bearings) * scene.grid.resolution
 
-        return Runner(run)
+        return run
 
     return make
 
@@ -227,7 +227,7 @@ def f1tenth_scan(module: Any, bins: int) -> Callable[[Scene, None, str], Runner]
             turned = poses + np.array([0.0, 0.0, middle])
             return np.minimum(np.array([simulator.scan(pose, *noise) for pose in turned]), limit)
 
-        return Runner(run)
+        return run
 
     return make
 

@@ -46,7 +46,7 @@ def runner_of(compiled: compiled_peers.Compiled, scene: Scene, problem: str, mod
         with np.errstate(divide="ignore"):
             return np.log(weigh(moved, scene.readings))
 
-    return Runner(run)
+    return run
 
 
 def load(name: str) -> tuple[compiled_peers.Compiled | None, str, str]:

@@ -20,11 +20,7 @@ from gpusense.commands.demo_scene import (
     BEAM,
     BEAMS,
     FIELD,
-    FIELD_OF_VIEW,
-    PRECISION,
     RANGE_MAX,
-    SIGMA_THETA,
-    SIGMA_XY,
     SIZE,
     Scene,
     Score,
@@ -93,8 +89,6 @@ def run(args: argparse.Namespace) -> int:
         prepared = other.submit(_prepare, args)
         backends, failures = arguments.open_backends(args.backend)
         scene, references = prepared.result()
-    if args.verbose:
-        _describe(scene, args.seed, backends)
     scores: list[Score] = []
     written = None
     with held(scores) as stops, progress(2 * len(backends) + 1) as shown:
@@ -114,7 +108,6 @@ def run(args: argparse.Namespace) -> int:
     else:
         _report(scene, scores, failures, written)
     if args.verbose:
-        _explain(scores)
         print("\nSeconds: " + ", ".join(f"{name} {seconds:.2f}" for name, seconds in parts.seconds.items()))
     if stops:
         raise stops[0]
@@ -227,29 +220,6 @@ def _report(scene: Scene, scores: list[Score], failures: list[str], written: Pat
     print("".join(f"\nfailed: {failure}\n" for failure in failures), end="")
     if written is not None:
         output.print_files(written)
-
-
-def _describe(scene: Scene, seed: int, backends: list[Backend]) -> None:
-    """Print the scene."""
-    rows, cols = scene.grid.shape
-    hits = int((scene.ranges < RANGE_MAX).sum())
-    print(f"""\
-building   {SIZE[0]:g} x {SIZE[1]:g} m, {cols} x {rows} cells of {scene.grid.resolution:g} m, seed {seed}
-scan       {BEAMS} beams over {FIELD_OF_VIEW:g} degrees up to {RANGE_MAX:g} m, drawn from the beam model:
-           {hits} ranges, {BEAMS - hits} without return
-particles  {grouped(len(scene.poses) - 1)}: half over all free cells, half around the true pose
-           (standard deviations {SIGMA_XY:g} m and {SIGMA_THETA:g} rad)
-models     {scene.beams} of the beams, {PRECISION}, default parameters
-devices    {", ".join(f"{backend.info.selection} ({backend.info.name})" for backend in backends)}
-""", flush=True)  # fmt: skip
-
-
-def _explain(scores: list[Score]) -> None:
-    """Print the rank of the true pose, and the work that the fastest device's kernels omit."""
-    for name in dict.fromkeys(score.name for score in scores):
-        fastest = _fastest(scores, name)
-        print(f"\nRank of the true pose by the {name}: {grouped(fastest.rank)} (1: no particle scores better)")
-        print(f"Specialisation of the kernels: {fastest.model.explain()}")
 
 
 def _document(

@@ -41,7 +41,7 @@ def test_quick_run_writes_whole_files(needs, tmp_path, capsys):
         assert set(point) == POINT_KEYS
         assert point["status"] == "ok", point["reason"]
         assert set(point["time"]) == TIMES
-        kinds = set(ERRORS) - ({"ranges"} if point["problem"] == "field" else set())
+        kinds = {"ranges"} if point["problem"] == "ranges" else {"log_p", "comparable"}
         known = {k: ERRORS[k] for k in kinds}
         if point["cloud"] == "tracking" and point["problem"] != "ranges":
             known["fine"] = ERRORS["comparable"]

@@ -69,8 +69,6 @@ def test_demo_as_text(tmp_path, monkeypatch, capsys):
 def test_demo_prints_details_on_request(capsys):
     assert cli.main([*SMALL, "--backend", "numpy", "--no-plot", "-v"]) == 0
     out = capsys.readouterr().out
-    assert "particles  400: half over all free cells" in out
-    assert out.count("Specialisation of the kernels: ") == 2
     assert re.search(r"\nSeconds: devices, scene and references \d+\.\d\d, beam model on numpy \d+\.\d\d, ", out)
 
 

@@ -35,7 +35,7 @@ def candidate(run, problem="ranges", **changes):
     """Return a candidate whose runner calls ``run(scene, poses)``."""
 
     def make(scene, backend, precision):
-        return candidates.Runner(lambda poses: run(scene, poses))
+        return lambda poses: run(scene, poses)
 
     return candidates.Candidate(problem, "made up", make, **changes)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -22,20 +22,12 @@ from gpusense.localization.weights import normalize_weights
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.models.scan.mixture import mixture_of
-from gpusense.reference.mixture import log_density
-from gpusense.world.parameters import BeamParameters
-from gpusense.world.range_causes import NoReturn
-from gpusense.world.scanner import Reading, Scanner, classify
 
 SHARING = 0.1
 """Effective sample size of the tempered posterior, as a share of the particles."""
 _HALVINGS = 60
 MOST_FACTOR = 1e6
 """Largest factor of log-likelihoods that is tried to make weights as sharp as the exact ones."""
-
-# Particles per piece when the host scores ranges.
-_PIECE = 256
 # Of a fine grid of poses: half widths of the first one [m, m, rad], and poses along each axis. A grid is fine enough if
 # each deviation is at least this many spacings; the next one spans this many deviations on each side.
 _HALF, _SIDE, _FINE, _SPAN, _ROUNDS = (0.3, 0.3, 0.15), 13, 1.0, 5.0, 10
@@ -70,7 +62,7 @@ class FinePosterior:
     deviation: Floats
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Truth:
     """Exact results for the first particles of a cloud.
 
@@ -81,22 +73,14 @@ class Truth:
     scene: Scene
     poses: Floats
     device: Backend
+    _log_p: dict[str, Floats] = field(default_factory=dict)
+    _fine: dict[str, FinePosterior] = field(default_factory=dict)
 
     @functools.cached_property
     def ranges(self) -> Floats:
         """Compute (M, K) exact expected ranges [m]."""
         caster = RayCaster(self.scene.grid, self.scene.scanner.range_max, backend=self.device, precision="float64")
         return caster.cast(self.poses, self.scene.scanner.bearings)
-
-    @functools.cached_property
-    def beam(self) -> Floats:
-        """Compute (M,) log-likelihoods of the beam model."""
-        return self._model("beam").log_likelihood(self.poses, self.scene.readings)
-
-    @functools.cached_property
-    def field(self) -> Floats:
-        """Compute (M,) log-likelihoods of the likelihood field."""
-        return self._model("field").log_likelihood(self.poses, self.scene.readings)
 
     def _model(self, problem: str) -> BeamModel | LikelihoodFieldModel:
         scene = self.scene
@@ -105,27 +89,18 @@ class Truth:
             return LikelihoodFieldModel(scene.grid, scene.scanner, scene.field, **options)
         return BeamModel(scene.grid, scene.scanner, scene.beam, **options)
 
-    @functools.cached_property
-    def _fine(self) -> dict[str, FinePosterior]:
-        return {}
+    def log_p(self, problem: str) -> Floats:
+        """Return (M,) log-likelihoods of a problem's model."""
+        if problem not in self._log_p:
+            self._log_p[problem] = self._model(problem).log_likelihood(self.poses, self.scene.readings)
+        return self._log_p[problem]
 
     def fine(self, problem: str) -> FinePosterior:
         """Return the posterior of a problem's model on a fine grid of poses around the true one."""
-        name = "field" if problem == "field" else "beam"
-        if name not in self._fine:
-            model, readings = self._model(name), self.scene.readings
-            self._fine[name] = fine_posterior(lambda poses: model.log_likelihood(poses, readings), self.scene.pose)
-        return self._fine[name]
-
-    def log_p(self, problem: str) -> Floats:
-        """Return (M,) log-likelihoods of a problem's model; for the problem ``"ranges"``, of the beam model."""
-        return self.field if problem == "field" else self.beam
-
-    @functools.cached_property
-    def temperatures(self) -> dict[str, float]:
-        """Compute the temperature of each problem's tempered posterior; see :func:`temperature_of`."""
-        beam = temperature_of(self.beam)
-        return {"ranges": beam, "beam": beam, "field": temperature_of(self.field)}
+        if problem not in self._fine:
+            model, readings = self._model(problem), self.scene.readings
+            self._fine[problem] = fine_posterior(lambda poses: model.log_likelihood(poses, readings), self.scene.pose)
+        return self._fine[problem]
 
 
 def temperature_of(log_p: Floats) -> float:
@@ -162,36 +137,23 @@ def factor_for(log_p: Floats, size: float, most: float = MOST_FACTOR) -> float:
 
 
 def errors(
-    truth: Truth,
-    problem: str,
-    *,
-    ranges: NDArray[np.floating] | None,
-    log_p: NDArray[np.floating] | None,
-    temperature: float = 1.0,
+    truth: Truth, problem: str, result: NDArray[np.floating], temperature: float = 1.0
 ) -> dict[str, dict[str, float]]:
-    """Compute all errors of a point.
-
-    ``problem``: ``"ranges"``, ``"beam"`` or ``"field"``. ``ranges``: (M, K) the candidate's ranges [m], or None.
-    ``log_p``: (M,) the candidate's log-likelihoods; if None, the float64 mixture computes them from the ranges.
+    """Compute all errors of a point from its (M, K) ranges [m] or (M,) log-likelihoods.
 
     Returns:
-        Errors by kind: ``"ranges"`` if ranges are passed, ``"log_p"``, and ``"comparable"``: the posterior at the
-        temperature that gives the candidate the effective sample size of the exact tempered posterior.
+        Errors by kind: ``"ranges"``; or ``"log_p"``, and ``"comparable"``: the posterior at the temperature that gives
+        the candidate the effective sample size of the exact tempered posterior.
     """
-    scene, kinds = truth.scene, {}
-    if ranges is not None:
-        kinds["ranges"] = range_errors(_checked("ranges", ranges, truth.ranges), truth.ranges, scene.grid.resolution)
-        if log_p is None:
-            log_p = score_ranges(ranges, scene.readings, scene.scanner, scene.beam)
-    if log_p is None:
-        raise UnstableError("nothing was computed")
+    if problem == "ranges":
+        right = truth.ranges
+        return {"ranges": range_errors(_checked("ranges", result, right), right, truth.scene.grid.resolution)}
     right = truth.log_p(problem)
-    scores = temperature * _checked("log-likelihoods", log_p, right)
-    kinds["log_p"] = log_p_errors(scores, right)
-    factor = truth.temperatures[problem]
+    scores = temperature * _checked("log-likelihoods", result, right)
+    factor = temperature_of(right)
     size = normalize_weights(factor * right).effective_sample_size
-    kinds["comparable"] = posterior_errors(factor_for(scores, size) * scores, factor * right, truth.poses)
-    return kinds
+    comparable = posterior_errors(factor_for(scores, size) * scores, factor * right, truth.poses)
+    return {"log_p": log_p_errors(scores, right), "comparable": comparable}
 
 
 def fine_errors(truth: Truth, problem: str, log_p: NDArray[np.floating], temperature: float = 1.0) -> dict[str, float]:
@@ -267,27 +229,3 @@ def posterior_errors(computed: Floats, right: Floats, poses: Floats) -> dict[str
 def _log_sum(values: Floats) -> float:
     largest = float(values.max())
     return largest + math.log(float(np.sum(np.exp(values - largest))))
-
-
-def score_ranges(
-    ranges: NDArray[np.floating], readings: Floats, scanner: Scanner, parameters: BeamParameters
-) -> Floats:
-    """Score expected ranges with the beam model, in float64 on the host.
-
-    ``ranges``: (M, K) expected ranges, clipped to [0, range_max] here [m]. ``readings``: (K,) the scan.
-
-    Returns:
-        (M,) log-likelihoods; ``log z_max`` for each max reading where z_max > 0.
-    """
-    kinds, p, limit = classify(readings, scanner), parameters, scanner.range_max
-    hit = np.flatnonzero(kinds == Reading.HIT)
-    log_p = np.full(
-        len(ranges), np.count_nonzero(kinds == Reading.MAX) * NoReturn(p.z_max).number if p.z_max > 0 else 0.0
-    )
-    flags, terms, _ = mixture_of((p,), limit, np.dtype(np.float64), specialize=True, max_depends=False)
-    for begin in range(0, len(ranges), _PIECE):
-        expected = np.clip(np.asarray(ranges[begin : begin + _PIECE, hit], np.float64), 0, limit)
-        z = np.broadcast_to(readings[hit], expected.shape)
-        with np.errstate(under="ignore"):
-            log_p[begin : begin + _PIECE] += log_density(flags, z, expected, terms).sum(axis=1)
-    return log_p

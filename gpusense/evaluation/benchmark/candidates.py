@@ -26,19 +26,8 @@ PROBLEMS = ("ranges", "beam", "field")
 """Expected ranges; log-likelihoods of the beam model; log-likelihoods of the likelihood field."""
 
 
-@dataclass(frozen=True)
-class Runner:
-    """A candidate made for a scene.
-
-    Attributes:
-        run: Computes (N, K) ranges or (N,) log-likelihoods of (N, 3) poses.
-        ranges: Computes the (N, K) expected ranges of a beam model; None for other candidates.
-    """
-
-    run: Callable[[np.ndarray], np.ndarray]
-    ranges: Callable[[np.ndarray], np.ndarray] | None = None
-
-
+# Computes (N, K) ranges or (N,) log-likelihoods of (N, 3) poses.
+Runner = Callable[[np.ndarray], np.ndarray]
 # Makes a runner from a scene, a device (None for outside candidates) and a precision.
 Make = Callable[[Scene, Any, Any], Runner]
 
@@ -170,7 +159,7 @@ def _ranges(caster: Caster, scene: Scene, backend: Backend, precision: Precision
     """Make a runner that casts rays."""
     limit, bearings = scene.scanner.range_max, scene.scanner.bearings
     ray_caster = RayCaster(scene.grid, limit, caster=caster, backend=backend, precision=precision)
-    return Runner(lambda poses: ray_caster.cast(poses, bearings))
+    return lambda poses: ray_caster.cast(poses, bearings)
 
 
 def _scores(kind: type[BeamModel] | type[LikelihoodFieldModel], share: int = 1, **options: Any) -> Make:
@@ -182,8 +171,7 @@ def _scores(kind: type[BeamModel] | type[LikelihoodFieldModel], share: int = 1, 
         model = kind(
             scene.grid, scene.scanner, parameters, backend=backend, precision=precision, beams=beams, **options
         )
-        ranges = model.expected_ranges if isinstance(model, BeamModel) else None
-        return Runner(lambda poses: model.log_likelihood(poses, scene.readings), ranges)
+        return lambda poses: model.log_likelihood(poses, scene.readings)
 
     return make
 

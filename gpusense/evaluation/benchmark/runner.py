@@ -180,11 +180,14 @@ def point_of(
         if made is None:
             begin = time.perf_counter()
             made = candidate.make(scene, backend, job.precision)
-            made.run(poses)
+            made(poses)
             first = time.perf_counter() - begin
         runner = made
-        point["time"] = {"first_s": first} | call_times(lambda: runner.run(poses), plan.repeats, plan.seconds)
-        point["errors"] = _errors(truth, candidate, made, fine=cloud == FINE_CLOUD)
+        point["time"] = {"first_s": first} | call_times(lambda: runner(poses), plan.repeats, plan.seconds)
+        problem, factor = candidate.problem, candidate.temperature
+        point["errors"] = errors(truth, problem, made(truth.poses), factor)
+        if cloud == FINE_CLOUD and problem != "ranges":
+            point["errors"]["fine"] = fine_errors(truth, problem, made(truth.fine(problem).poses), factor)
     except LeftOutError as error:
         point |= {"status": "left out", "reason": str(error)}
     except UnstableError as error:
@@ -192,18 +195,6 @@ def point_of(
     except Exception as error:
         point |= {"status": "failed", "reason": " ".join(f"{type(error).__name__}: {error}".split())}
     return point, made
-
-
-def _errors(truth: Truth, candidate: Candidate, runner: Runner, *, fine: bool) -> dict[str, dict[str, float]]:
-    result, problem = runner.run(truth.poses), candidate.problem
-    if problem == "ranges":
-        return errors(truth, problem, ranges=result, log_p=None)
-    ranges = runner.ranges(truth.poses) if problem == "beam" and runner.ranges else None
-    factor = candidate.temperature
-    found = errors(truth, problem, ranges=ranges, log_p=result, temperature=factor)
-    if fine:
-        found["fine"] = fine_errors(truth, problem, runner.run(truth.fine(problem).poses), factor)
-    return found
 
 
 def _left_out(plan: Plan, job: Job, scene: Scene, pace: float | None, spent: float) -> str:

@@ -114,11 +114,8 @@ def test_thinned_beams_count_as_often_as_they_stand_for():
     scene = quick_scene("building", beams=360, particles=200)
     truth = accuracy.Truth(scene, scene.clouds["tracking"], get_backend("numpy"))
     (made,) = [one for one in candidates.candidates(["field"]) if one.variant == "fewer beams" and one.value == 4]
-    log_p = made.make(scene, truth.device, "float64").run(truth.poses)
-    scaled, plain = (
-        accuracy.errors(truth, "field", ranges=None, log_p=log_p, temperature=factor)
-        for factor in (made.temperature, 1.0)
-    )
+    log_p = made.make(scene, truth.device, "float64")(truth.poses)
+    scaled, plain = (accuracy.errors(truth, "field", log_p, factor) for factor in (made.temperature, 1.0))
     assert scaled["comparable"]["kl"] < 0.15 and scaled["log_p"]["rms"] < plain["log_p"]["rms"] / 2
     assert scaled["comparable"] == pytest.approx(plain["comparable"], rel=1e-6)
 
@@ -130,16 +127,6 @@ def test_fine_posterior_of_a_normal_density():
     np.testing.assert_allclose(fine.deviation, sigma, rtol=0.01)
     weights = gs.normalize_weights(fine.log_p).weights
     np.testing.assert_allclose(weights @ fine.poses, mean, atol=1e-4)
-
-
-def test_scored_ranges_are_the_beam_models():
-    scene = quick_scene("building")
-    readings = scene.readings.copy()
-    readings[2], readings[5] = np.inf, np.nan
-    model = gs.BeamModel(scene.grid, scene.scanner, scene.beam, backend="numpy", precision="float64")
-    poses = scene.clouds["global"]
-    found = accuracy.score_ranges(model.expected_ranges(poses), readings, scene.scanner, scene.beam)
-    np.testing.assert_allclose(found, model.log_likelihood(poses, readings), rtol=1e-11)
 
 
 @pytest.mark.long

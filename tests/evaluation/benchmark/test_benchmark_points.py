@@ -146,9 +146,7 @@ def test_numba_computes_the_stated_scores(baselines):
     for one in baselines:
         if not one.method.startswith("numba") or one.value in (500, 8000):
             continue
-        result = one.make(scene, None, one.precision).run(truth.poses)
-        ranges, log_p = (result, None) if one.problem == "ranges" else (None, result)
-        found[one.label] = accuracy.errors(truth, one.problem, ranges=ranges, log_p=log_p)
+        found[one.label] = accuracy.errors(truth, one.problem, one.make(scene, None, one.precision)(truth.poses))
     assert found["numba field, log grid"]["log_p"]["max"] < 1e-3
     assert found["numba field, log of products"]["log_p"]["max"] < 1e-3
     # The weight of another package is not a likelihood.

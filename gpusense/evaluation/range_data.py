@@ -6,10 +6,12 @@ neighbouring scans are correlated, so data are grouped in blocks, and every othe
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -138,25 +140,19 @@ def data_of_pairs(
 
 def _chosen_rows(file: Any, every: int, offset: int, limit: int | None) -> Floats:
     """Read (n, 2) or (n, 3) numbers: every ``every``-th row from ``offset``, at most ``limit`` rows."""
-    parts, seen, kept = [], 0, 0
-    for rows in _number_rows(file):
-        first = max(offset - seen, 0) if seen <= offset else (offset - seen) % every
-        chosen = rows[first::every]
-        if limit is not None:
-            chosen = chosen[: limit - kept]
-        parts.append(chosen)
-        seen, kept = seen + len(rows), kept + len(chosen)
-        if limit is not None and kept >= limit:
-            break
-    if not kept:
-        raise ValueError(f"pairs: must hold a pair of index {offset}, the first one chosen, got {seen} pairs in {file}")
+    last = None if limit is None else offset + every * limit
+    chosen = itertools.islice(_rows(file), offset, last, every)
+    parts: list[Floats] = []
+    while lines := list(itertools.islice(chosen, _LINES)):
+        parts.append(_numbers(file, lines, parts[0].shape[1] if parts else lines[0][1].count(",") + 1))
+    if not parts:
+        raise ValueError(f"pairs: must hold a pair of index {offset}, the first one chosen, got fewer pairs in {file}")
     return np.concatenate(parts)
 
 
-def _number_rows(file: Any) -> Iterator[Floats]:
-    """Yield (n, 2) or (n, 3) numbers of a file, one block of lines at a time."""
-    columns, header = 0, True
-    lines: list[tuple[int, str]] = []
+def _rows(file: Any) -> Iterator[tuple[int, str]]:
+    """Yield the numbered rows of a file, without a header, empty lines and comments."""
+    header = True
     for number, line in numbered_lines(file):
         if len(line) > _LONGEST_LINE:
             raise ValueError(f"{file}: line {number}: must have at most {_LONGEST_LINE} bytes, got more")
@@ -164,23 +160,15 @@ def _number_rows(file: Any) -> Iterator[Floats]:
         if not text or text.startswith("#"):
             continue
         if not header or any(_number(word) is not None for word in text.split(",")):
-            columns = columns or text.count(",") + 1
-            lines.append((number, text))
+            yield number, text
         header = False
-        if len(lines) == _LINES:
-            yield _numbers(file, lines, columns)
-            lines = []
-    if lines:
-        yield _numbers(file, lines, columns)
 
 
 def _numbers(file: Any, lines: list[tuple[int, str]], columns: int) -> Floats:
     """Parse numbered lines of ``columns`` numbers each."""
     if columns in (2, 3) and all(text.count(",") == columns - 1 for _, text in lines):
-        try:
+        with contextlib.suppress(ValueError):
             return np.array(",".join(text for _, text in lines).split(","), np.float64).reshape(-1, columns)
-        except ValueError:
-            pass
     for number, text in lines:
         words = text.split(",")
         wrong = next((word for word in words if _number(word) is None), None)
@@ -265,20 +253,28 @@ def compare_held_out(
         raise ValueError("holdout: must hold out a reading that is not missing, got none")
     data = data.chosen(known)
     _, place = np.unique(data.block, return_inverse=True)
-    baseline = log_densities(fitted, data)
-    scored = [("fitted", fitted, baseline)]
-    if np.isneginf(baseline).any():
-        soft = softened(fitted, readings)
-        baseline = log_densities(soft, data)
-        scored.append(("fitted, softened", soft, baseline))
-    rows = [_row(*each, baseline, place) for each in scored]
+
+    def score(name: str, parameters: Any, soften: Callable[[], Any]) -> list[tuple[str, Any, Floats]]:
+        log_p = log_densities(parameters, data)
+        if not np.isneginf(log_p).any():
+            return [(name, parameters, log_p)]
+        soft = soften()
+        return [(name, parameters, log_p), (f"{name}, softened", soft, log_densities(soft, data))]
+
+    scored = score("fitted", fitted, lambda: softened(fitted, readings))
+    baseline = scored[-1][2]
     if incidence is not None:
-        rows += _incidence_rows(incidence, data, baseline, place)
-    rows += [
-        _row(name, parameters, log_densities(parameters, data), baseline, place)
-        for name, parameters in peer_parameters().items()
-    ]
-    return rows
+        scored += score("fitted by incidence", incidence.parameters, lambda: _softened_bins(incidence))
+    scored += [(name, peer, log_densities(peer, data)) for name, peer in peer_parameters().items()]
+    return [_row(*each, baseline, place) for each in scored]
+
+
+def _softened_bins(fit: IncidenceFit) -> IncidenceParameters:
+    """Return the parameters of a fit by angles of incidence, each softened by its readings."""
+    bins = zip(fit.parameters.parameters, fit.counts, strict=True)
+    none = fit.parameters.no_surface
+    other = None if none is None else softened(none, fit.no_surface_count)
+    return IncidenceParameters(fit.parameters.edges, tuple(softened(each, count) for each, count in bins), other)
 
 
 def _row(
@@ -295,39 +291,21 @@ def _row(
     return HeldOut(name, parameters, *block_mean(log_p, place), *block_mean(gain, place), impossible)
 
 
-def _incidence_rows(fit: IncidenceFit, data: RangeData, baseline: Floats, place: NDArray[np.intp]) -> list[HeldOut]:
-    """Return the score of a fit by angles of incidence, and of the softened fit if a reading is impossible."""
-    log_p = incidence_log_densities(fit, data)
-    rows = [_row("fitted by incidence", fit.parameters, log_p, baseline, place)]
-    if np.isneginf(log_p).any():
-        bins = zip(fit.parameters.parameters, fit.counts, strict=True)
-        parameters = tuple(softened(each, count) for each, count in bins)
-        none = fit.parameters.no_surface
-        other = None if none is None else softened(none, fit.no_surface_count)
-        soft = IncidenceParameters(fit.parameters.edges, parameters, other)
-        log_p = incidence_log_densities(replace(fit, parameters=soft), data)
-        rows.append(_row("fitted by incidence, softened", soft, log_p, baseline, place))
-    return rows
+def log_densities(parameters: BeamParameters | IncidenceParameters, data: RangeData) -> Floats:
+    """Return (n,) log p of readings that are not missing: densities [1/m] of ranges, probabilities of no return.
 
-
-def incidence_log_densities(fit: IncidenceFit, data: RangeData) -> Floats:
-    """Return (n,) log p of readings that are not missing, each with the parameters and the fitted offset of its bin.
-
-    A beam that hits no surface has the parameters for such beams or, without them, of the first bin, as in a model.
+    Parameters by angles of incidence: a beam that hits no surface has the parameters for such beams or, without them,
+    of the first bin, as in a model.
     """
-    assert data.incidence is not None
-    edges, bins = fit.parameters.edges, len(fit.parameters.parameters)
-    place = np.digitize(data.incidence, edges[1:-1])
-    place[np.isnan(data.incidence)] = bins
-    sets = [*fit.parameters.parameters, fit.parameters.no_surface or fit.parameters.parameters[0]]
-    log_p = np.zeros(len(data.ranges))
-    for number, parameters in enumerate(sets):
-        log_p[place == number] = log_densities(parameters, data.chosen(place == number))
-    return log_p
-
-
-def log_densities(parameters: BeamParameters, data: RangeData) -> Floats:
-    """Return (n,) log p of readings that are not missing: densities [1/m] of ranges, probabilities of no return."""
+    if isinstance(parameters, IncidenceParameters):
+        assert data.incidence is not None
+        place = np.digitize(data.incidence, parameters.edges[1:-1])
+        place[np.isnan(data.incidence)] = len(parameters.parameters)
+        sets = [*parameters.parameters, parameters.no_surface or parameters.parameters[0]]
+        by_bin = np.zeros(len(data.ranges))
+        for number, one in enumerate(sets):
+            by_bin[place == number] = log_densities(one, data.chosen(place == number))
+        return by_bin
     from gpusense.models.scan.densities import log_mixture  # loads SciPy
 
     z, top = data.ranges, data.range_max

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -162,6 +163,28 @@ def output_path(*suffixes: str) -> Output:
         return path
 
     return Output(convert)
+
+
+def output_folder(*suffixes: str) -> Callable[[str], Path]:
+    """Make a type for ``add_argument``: a folder that can be written to, or created, for files of some suffixes."""
+
+    def convert(text: str) -> Path:
+        folder = Path(text)
+        for suffix in suffixes:
+            check_writer(suffix)
+        try:
+            # The folder is created after the work.
+            there = next(each for each in (folder, *folder.absolute().parents) if os.path.lexists(each))
+            if not there.is_dir():
+                raise ValueError("not a folder")
+            check_writable(there / "new")
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+            rule = "must be a folder that can be written to"
+            raise argparse.ArgumentTypeError(f"{rule}, got {text!r}: {reason}") from None
+        return folder
+
+    return convert
 
 
 def check_writer(suffix: str) -> None:

@@ -9,11 +9,18 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpusense._util.files import check_writable, write_whole
+from gpusense._util.files import write_whole
 from gpusense._util.progress import progress
 from gpusense._util.typing import PRECISIONS
-from gpusense.commands.arguments import BACKEND_HELP, add_json, open_backends, positive_number, whole_number
-from gpusense.commands.output import print_json, print_result, print_table
+from gpusense.commands import output
+from gpusense.commands.arguments import (
+    BACKEND_HELP,
+    open_backends,
+    output_folder,
+    output_path,
+    positive_number,
+    whole_number,
+)
 from gpusense.commands.signals import held
 from gpusense.evaluation.benchmark.choice import Wish, choices, parse_error, parse_time
 from gpusense.evaluation.machine import machine, machine_line
@@ -23,6 +30,7 @@ if TYPE_CHECKING:
 
 HELP = "Measure error against run time of every caster and model, and name the fastest method within an error."
 FIRST = ("quick", "html", "map", "max_error", "max_time")
+SHARED = ("json",)
 
 PROBLEMS = ("ranges", "beam", "field")
 # Fields of the plan of a quick run that differ: 40 s of measuring, 20 ms of calls a point.
@@ -61,8 +69,9 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
-    add("--output", type=Path, metavar="DIR", help="folder for the report, created if absent")
-    add("--html", type=Path, metavar="FILE", help="interactive page of the measurement, one file that works offline")
+    add("--output", type=output_folder(), metavar="DIR", help="folder for the report, created if absent")
+    add("--html", type=output_path(".html"), metavar="FILE",
+        help="interactive page of the measurement, one file that works offline")  # fmt: skip
     add("--quick", action="store_true",
         help="small maps, few values of the knobs, float32: half a minute plus compiling")  # fmt: skip
     add("--scene", action="append", metavar="NAME", help="a scene; may be repeated (default: all)")
@@ -90,7 +99,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--max-time", type=_limit(parse_time), metavar="T",
         help="recommend the most exact method whose call takes at most this time, such as '1 ms'")  # fmt: skip
     add("--seed", type=whole_number(low=0), metavar="N", help="seed of maps, scans and particles (default: 0)")
-    add_json(parser)
 
 
 def _limit(parse: Callable[[str], Any]) -> Callable[[str], Any]:
@@ -111,10 +119,6 @@ def run(args: argparse.Namespace) -> int:
     from gpusense.evaluation.benchmark.runner import Outcome, steps
     from gpusense.evaluation.benchmark.runner import run as run_plan
 
-    if args.output is not None:
-        _check_folder(args.output)
-    if args.html is not None:
-        check_writable(args.html)
     plan, absent = make_plan(args)
     outcome = Outcome([], [])
     with held(outcome.points) as stops, progress(steps(plan)) as step:
@@ -125,7 +129,7 @@ def run(args: argparse.Namespace) -> int:
     if args.html is not None:
         write_page(args.html, report)
     if args.json:
-        print_json(report)
+        output.document(report)
     else:
         _print(report, Wish(dict(args.max_error), args.max_time), args.output)
     if stops:
@@ -178,18 +182,11 @@ def command_of(words: Sequence[str]) -> str:
     return shlex.join(["gpusense", *(Path(word).name if Path(word).is_absolute() else word for word in words)])
 
 
-def _check_folder(folder: Path) -> None:
-    """Check that the report can be written, without creating a file."""
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"--output: must be a folder, got a file: {folder}")
-    check_writable((folder if folder.exists() else folder.parent) / "report.json")
-
-
 def write_report(folder: Path, report: Mapping[str, Any]) -> None:
     """Write the report as JSON atomically; create the folder if missing."""
     from gpusense.evaluation.benchmark.report import to_json
 
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / "report.json", lambda stream: stream.write(to_json(report).encode()))
 
 
@@ -207,11 +204,11 @@ def _print(report: Mapping[str, Any], wish: Wish, folder: Path | None) -> None:
     points = report["points"]
     found = list(choices(points, wish))
     for choice in found:
-        print_result(choice.answer)
+        output.result(choice.answer)
     for backend in dict.fromkeys(choice.backend for choice in found):
         rows = [row for choice in found if choice.backend == backend for row in choice.rows]
         print(f"\nbest methods on {backend}")
-        print_table(["problem", "method", "error", "time"], rows, right=["error", "time"])
+        output.table(["problem", "method", "error", "time"], rows, right=["error", "time"])
     print()
     for point in points:
         if point["status"] in ("failed", "unstable"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import difflib
+import functools
 import importlib
 import io
 import itertools
@@ -13,13 +14,13 @@ import re
 import sys
 import textwrap
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from types import ModuleType
 from typing import Any, NoReturn
 
 from gpusense._util.extras import explained
 from gpusense._version import __version__
-from gpusense.commands import signals
+from gpusense.commands import arguments, scans, signals
 
 # Modules of gpusense.commands, in the order of the help.
 COMMANDS = (
@@ -28,6 +29,13 @@ COMMANDS = (
 )  # fmt: skip
 ALIASES = {"localise": "localize"}
 
+# Options of many commands; the attribute ``SHARED`` of a command names them.
+_SHARED: dict[str, Callable[[argparse.ArgumentParser], None]] = {
+    "reference": scans.add_reference, "choice": scans.add_choice, "range": scans.add_range_max,
+    "model": arguments.add_model, "parameters": arguments.add_parameters, "backend": arguments.add_backend,
+    "seed": arguments.add_seed, "json": arguments.add_json,
+    "verbose": functools.partial(arguments.add_json, verbose=True),
+}  # fmt: skip
 # Meanings of the exit codes where a command states none.
 _CODES = {0: "success", 2: "bad input", 130: "interrupted", 143: "terminated"}
 BAD_INPUT = 2
@@ -103,10 +111,8 @@ class Parser(argparse.ArgumentParser):
         files = [(action, os.path.realpath(value)) for action, value in values if isinstance(value, os.PathLike)]
         if not files:
             return
-        from gpusense.commands.arguments import Output
-
         for action, file in files:
-            for other, same in files if isinstance(action.type, Output) else ():
+            for other, same in files if isinstance(action.type, arguments.Output) else ():
                 if other is not action and same == file:
                     name = other.option_strings[0]
                     self.error(
@@ -271,6 +277,8 @@ def _build(names: Sequence[str]) -> Parser:
             allow_abbrev=False,
         )  # fmt: skip
         module.add_arguments(command)
+        for option in getattr(module, "SHARED", ()):
+            _SHARED[option](command)
         command.group_options(module.FIRST)
         command.set_defaults(run=module.run)
     return parser

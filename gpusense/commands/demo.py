@@ -34,6 +34,7 @@ from gpusense.evaluation.machine import machine
 
 HELP = "Localise a robot in a generated building with every backend, compare them, and draw the result."
 FIRST = ("particles", "backend", "output")
+SHARED = ("seed", "verbose")
 CODES = {1: "a device failed (the report has its error)"}
 
 _DESCRIPTION = """\
@@ -64,7 +65,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--beams", type=arguments.whole_number(low=1, high=BEAMS), default=60, metavar="K",
         help=f"number of the scan's {BEAMS} beams that the models use (default: %(default)s)",
     )  # fmt: skip
-    arguments.add_seed(parser)
     parser.add_argument(
         "--backend", action="append", metavar="DEVICE",
         help=f"{arguments.BACKEND_HELP}; may be repeated to compare devices (default: every device present)",
@@ -74,7 +74,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE", help="file of the picture (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument("--no-plot", action="store_true", help="draw no picture")
-    arguments.add_json(parser, verbose=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -104,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
             written = args.output
     parts.begin("report")
     if args.json:
-        output.print_json(_document(scene, args.seed, scores, failures, written) | {"seconds": parts.seconds})
+        output.document(_document(scene, args.seed, scores, failures, written) | {"seconds": parts.seconds})
     else:
         _report(scene, scores, failures, written)
     if args.verbose:
@@ -201,7 +200,7 @@ def _report(scene: Scene, scores: list[Score], failures: list[str], written: Pat
         text = (
             f"{name}: the likeliest of {particles} poses is {metres:.2f} m and {degrees:.1f} degrees off the true pose"
         )
-        output.print_result(f"{text[0].upper()}{text[1:]}.")
+        output.result(f"{text[0].upper()}{text[1:]}.")
     columns = ["backend", "model", "first call [s]", "next call [s]", "rate [M/s]", "error"]
     rows = [
         [
@@ -211,15 +210,15 @@ def _report(scene: Scene, scores: list[Score], failures: list[str], written: Pat
         for score in scores
     ]  # fmt: skip
     print()
-    output.print_table(columns, rows, right=columns[2:])
+    output.table(columns, rows, right=columns[2:])
     print()
-    output.print_fact("rate", "particle-beams a second of whole calls, NumPy arrays in and out")
-    output.print_fact("error", "largest error of log p [nats], by the NumPy reference in float64 at one pose in "
+    output.fact("rate", "particle-beams a second of whole calls, NumPy arrays in and out")
+    output.fact("error", "largest error of log p [nats], by the NumPy reference in float64 at one pose in "
                       f"{scene.checked.step}; NumPy scores these poses alone")  # fmt: skip
-    output.print_fact("poses", "half all over the building, half around the true one")
+    output.fact("poses", "half all over the building, half around the true one")
     print("".join(f"\nfailed: {failure}\n" for failure in failures), end="")
     if written is not None:
-        output.print_files(written)
+        output.files(written)
 
 
 def _document(

@@ -6,8 +6,8 @@ import argparse
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
-from gpusense.commands.arguments import add_json
-from gpusense.commands.output import driver_text, print_fact, print_report, print_result, print_table
+from gpusense.commands import output
+from gpusense.commands.output import driver_text
 from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 HELP = "List the devices that gpusense can use, with remedies for absent or unusable devices."
 FIRST = ()
+SHARED = ("verbose",)
 
 EPILOG = """\
 The column 'selection' is the value for --backend of the other commands and for backend= of the library.
@@ -37,7 +38,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--prove", action="store_true", help="prove all devices anew, as after a change to the machine or its drivers"
     )
-    add_json(parser, verbose=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -49,20 +49,20 @@ def run(args: argparse.Namespace) -> int:
     listed = _with_failures(listed)
     if args.json:
         documents = [asdict(device) | {"auto": device.available and device.selection == auto} for device in listed]
-        print_report({"auto": auto, "auto_error": auto_error, "devices": documents})
+        output.report({"auto": auto, "auto_error": auto_error, "devices": documents})
         return 0
     chosen = next((device for device in listed if device.available and device.selection == auto), None)
-    print_result(f"NO DEVICE: 'auto' does not work: {auto_error}" if chosen is None else
-                 f"'auto' is {chosen.selection}: {chosen.name}, a {chosen.kind.upper()}")  # fmt: skip
+    output.result(f"NO DEVICE: 'auto' does not work: {auto_error}" if chosen is None else
+                  f"'auto' is {chosen.selection}: {chosen.name}, a {chosen.kind.upper()}")  # fmt: skip
     print()
     rows = [
         (device.selection or "-", device.kind, device.name, driver_text(device), _status(device)) for device in listed
     ]
-    print_table(("selection", "kind", "name", "driver", "status"), rows)
+    output.table(("selection", "kind", "name", "driver", "status"), rows)
     print()
     for device in listed:
         if device.reason:
-            print_fact(device.selection or device.backend, device.reason)
+            output.fact(device.selection or device.backend, device.reason)
     if args.verbose:
         print(machine_line())
     return 0

@@ -7,17 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from gpusense._util.typing import CasterName
-from gpusense.commands.arguments import (
-    add_backend,
-    add_json,
-    add_model,
-    add_parameters,
-    add_seed,
-    scan_model,
-    whole_number,
-)
-from gpusense.commands.output import counted, print_fact, print_report, print_result
-from gpusense.commands.scans import OPTIONS, add_log, add_range_max, read_scan
+from gpusense.commands import output
+from gpusense.commands.arguments import scan_model, whole_number
+from gpusense.commands.output import counted
+from gpusense.commands.scans import OPTIONS, add_log, read_scan
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,6 +21,7 @@ if TYPE_CHECKING:
 
 HELP = "Report the parts that the kernels omit, keep or could omit for a scene, with reasons."
 FIRST = ("map", "log", "model", "parameters", "measure")
+SHARED = ("range", "model", "parameters", "backend", "seed", "verbose")
 
 EPILOG = """\
 The scene is a map, a scan of a log, the model's parameters, and 2000 particles in the free cells of the map. The
@@ -50,15 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--map", type=Path, metavar="YAML", help="a map_server map (default: the building of 'gpusense demo')")
     add_log(parser, "a log with scans, of the robot in the map", required=False)
     add("--scan", type=whole_number(low=0), metavar="I", help="index of the log's scan (default: 0)")
-    add_range_max(parser)
-    add_model(parser)
     add("--caster", choices=get_args(CasterName), help="method of the expected ranges; beam model only")
     add("--measure", action="store_true", help="time the scene with and without each part")
     add("--sources", action="store_true", help="also print the text of the kernels as compiled for the scene")
-    add_parameters(parser)
-    add_seed(parser)
-    add_backend(parser)
-    add_json(parser, verbose=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -73,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     plan = model.plan(measure=args.measure)
     texts = model.sources() if args.sources else {}
     if args.json:
-        print_report(_document(plan) | ({"sources": texts} if args.sources else {}))
+        output.report(_document(plan) | ({"sources": texts} if args.sources else {}))
         return 0
     _print(plan)
     if args.verbose:
@@ -85,10 +73,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _print(plan: Plan) -> None:
     """Print the numbers of parts, and the omitted parts with reasons and savings."""
-    print_result(f"{counted(len(plan.omissions), 'part')} left out, {len(plan.kept)} kept, {len(plan.could_go)} that "
-                 f"another choice would leave out: {plan.title}")  # fmt: skip
+    output.result(f"{counted(len(plan.omissions), 'part')} left out, {len(plan.kept)} kept, {len(plan.could_go)} that "
+                  f"another choice would leave out: {plan.title}")  # fmt: skip
     for part in plan.omissions:
-        print_fact(f"- {part.what}:", f"{part.why}; saves {part.saves}{plan.saving(part)}")
+        output.fact(f"- {part.what}:", f"{part.why}; saves {part.saves}{plan.saving(part)}")
 
 
 def _scene(args: argparse.Namespace) -> tuple[OccupancyGrid, Scanner, np.ndarray]:

@@ -10,19 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import add_backend, add_json, output_path, positive_number, whole_number
-from gpusense.commands.output import (
-    counted,
-    draw,
-    print_details,
-    print_fact,
-    print_files,
-    print_interrupted,
-    print_report,
-    print_result,
-    write_table,
-)
-from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans
+from gpusense.commands import output
+from gpusense.commands.arguments import output_path, positive_number, whole_number
+from gpusense.commands.output import counted, draw, write_table
+from gpusense.commands.scans import add_log, read_scans
 from gpusense.commands.signals import held
 
 if TYPE_CHECKING:
@@ -32,6 +23,7 @@ if TYPE_CHECKING:
 
 HELP = "Extract lines, corners, doors, hallways, poles and reflectors from the scans of a log."
 FIRST = ("log", "reference", "kinds", "map_out", "plot")
+SHARED = ("reference", "choice", "backend", "verbose")
 
 _COLUMNS = (
     "scan", "kind", "x", "y", "theta", "deviation_x", "deviation_y", "deviation_theta", "size", "score",
@@ -55,17 +47,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
     add_log(parser, "a log with scans", required=False)
-    add_reference(parser)
     add("--map-in", type=Path, metavar="YAML", help="a map_server map from which landmarks are made, instead of a log")
     add("--kinds", nargs="+", choices=("line", "corner", "door", "hallway", "pole", "reflector"),
         metavar="KIND", help="line, corner, door, hallway, pole, reflector (default: all)")  # fmt: skip
     add("--noise", type=positive_number, metavar="M",
         help="standard deviation of ranges [m] (default: that of each scan)")  # fmt: skip
-    add_choice(parser)
     add("--least", type=whole_number(low=1), default=2, metavar="N",
         help="smallest number of scans that must show a landmark (default: %(default)s)")  # fmt: skip
-    add_backend(parser)
-    add_json(parser, verbose=True)
     add("--out", type=output_path(".csv"), metavar="CSV", help="write all features")
     add("--map-out", type=output_path(".csv"), metavar="CSV", help="write landmarks")
     picture = output_path(".png", ".pdf", ".svg")
@@ -123,9 +111,9 @@ def _of_map(args: argparse.Namespace) -> int:
     landmarks = landmarks_of_map(grid, kinds=_landmark_kinds(args), backend=args.backend)
     _write_landmarks(args, landmarks, grid)
     if args.json:
-        print_report({"landmarks": _landmark_rows(landmarks)}, args)
+        output.report({"landmarks": _landmark_rows(landmarks)}, args)
         return 0
-    print_result(f"{counted(len(landmarks.kind), 'landmark')} in the map: {_kinds(landmarks.kind)}")
+    output.result(f"{counted(len(landmarks.kind), 'landmark')} in the map: {_kinds(landmarks.kind)}")
     _print_files(args)
     return 0
 
@@ -154,17 +142,17 @@ def _report(
     if args.json:
         rows = None if landmarks is None else _landmark_rows(landmarks)
         facts = {"scans": done, "counts": counts, "milliseconds_each": 1e3 * seconds / done, "landmarks": rows}
-        print_report(facts, args)
+        output.report(facts, args)
         return
-    print_result(f"{counted(len(features.kind), 'feature')} in {counted(done, 'scan')}: "
-                 f"{len(features.kind) / done:.2g} a scan")  # fmt: skip
+    output.result(f"{counted(len(features.kind), 'feature')} in {counted(done, 'scan')}: "
+                  f"{len(features.kind) / done:.2g} a scan")  # fmt: skip
     if counts:
-        print_fact("a scan", ", ".join(f"{kind} {count / done:.2g}" for kind, count in counts.items()))
+        output.fact("a scan", ", ".join(f"{kind} {count / done:.2g}" for kind, count in counts.items()))
     if landmarks is not None:
-        print_fact("landmarks", f"{len(landmarks.kind)}, each in {args.least} scans or more: {_kinds(landmarks.kind)}")
-    print_interrupted(done, len(scans))
+        output.fact("landmarks", f"{len(landmarks.kind)}, each in {args.least} scans or more: {_kinds(landmarks.kind)}")
+    output.interrupted(done, len(scans))
     _print_files(args)
-    print_details(args, f"{1e3 * seconds / done:.3g} ms each with the first call's compilation")
+    output.details(args, f"{1e3 * seconds / done:.3g} ms each with the first call's compilation")
 
 
 def _kinds(kinds: np.ndarray) -> str:
@@ -174,7 +162,7 @@ def _kinds(kinds: np.ndarray) -> str:
 
 
 def _print_files(args: argparse.Namespace) -> None:
-    print_files(args.out, args.map_out, args.plot, args.map_plot)
+    output.files(args.out, args.map_out, args.plot, args.map_plot)
 
 
 def _landmark_rows(landmarks: FeatureMap) -> list[dict[str, Any]]:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpusense._util.files import check_writable, write_whole
+from gpusense._util.files import write_whole
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import add_backend, add_json, add_seed, check_writer, whole_number
+from gpusense.commands import output
+from gpusense.commands.arguments import output_folder, whole_number
 from gpusense.commands.fit_results import DOUBT, FitResult, PartialFit, is_doubtful, print_fit
-from gpusense.commands.output import print_report
-from gpusense.commands.scans import OPTIONS, add_choice, add_log, add_reference, read_chosen_steps, read_scans
+from gpusense.commands.scans import OPTIONS, add_choice, add_log, read_chosen_steps, read_scans
 
 if TYPE_CHECKING:
     from gpusense.evaluation.range_data import RangeData
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
 
 HELP = "Fit the beam model's parameters to a recorded log in a map, or to pairs of readings and expected ranges."
 FIRST = ("map", "log", "reference", "holdout", "out")
+SHARED = ("reference", "backend", "seed", "verbose")
 CODES = {1: "the fit did not converge"}
 
 _DESCRIPTION = """\
@@ -65,7 +65,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--map", type=Path, metavar="YAML", help="a map_server map; needs --log")
     add_log(parser, "a log with corrected poses, or any with --reference; needs --map", required=False)
-    add_reference(parser)
     add("--pairs", type=Path, metavar="CSV",
         help="a file of columns separated by commas instead: reading [m], expected range [m] and, optionally, angle of "
         "incidence [rad]; needs --range-max")  # fmt: skip
@@ -79,20 +78,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--fit-motion", action="store_true", help="also learn the noise of the log's odometry from its poses")
     add("--incidence", type=whole_number(low=1, high=90), metavar="BINS",
         help="also fit parameters for BINS bins of the angle of incidence")  # fmt: skip
-    add(
-        "--restarts",
-        type=whole_number(low=0, high=10_000),
-        default=0,
-        metavar="N",
-        help="further random starts (default: 0)",
-    )
+    add("--restarts", type=whole_number(low=0, high=10_000), default=0, metavar="N",
+        help="further random starts (default: 0)")  # fmt: skip
     add("--holdout", action="store_true", help="hold out every other block, and score it with other programs' defaults")
     add("--block", type=whole_number(low=1), metavar="B",
         help=f"neighbouring scans or pairs per block (default: 1 scan, {_PAIRS_BLOCK} pairs)")  # fmt: skip
-    add_backend(parser)
-    add_seed(parser)
-    add_json(parser, verbose=True)
-    add("--out", type=_folder, metavar="DIR", help="folder for parameters.yaml and pictures, created if absent")
+    add(
+        "--out",
+        type=output_folder(".png"),
+        metavar="DIR",
+        help="folder for parameters.yaml and pictures, created if absent",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -106,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
         raise
     files = _write(args.out, result) if args.out is not None else []
     if args.json:
-        print_report(_document(result, files), args)
+        output.report(_document(result, files), args)
         if is_doubtful(result.fit):
             sys.stderr.write(f"gpusense: {DOUBT}\n")
     else:
@@ -238,19 +234,3 @@ def _write(folder: Path, result: FitResult) -> list[Path]:
         save(figure, folder / name)
         written.append(folder / name)
     return written
-
-
-def _folder(text: str) -> Path:
-    """Convert an argument to a folder that can be written to, or created."""
-    check_writer(".png")
-    folder = Path(text)
-    try:
-        # The folder is created after the fit.
-        there = next(each for each in (folder, *folder.absolute().parents) if os.path.lexists(each))
-        if not there.is_dir():
-            raise ValueError("not a folder")
-        check_writable(there / "parameters.yaml")
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise argparse.ArgumentTypeError(f"must be a folder that can be written to, got {text!r}: {reason}") from None
-    return folder

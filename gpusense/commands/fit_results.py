@@ -7,16 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gpusense.commands.output import (
-    length,
-    print_fact,
-    print_files,
-    print_json,
-    print_parameters,
-    print_result,
-    print_table,
-    rounded,
-)
+from gpusense.commands import output
+from gpusense.commands.output import length, rounded
 from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
@@ -78,7 +70,7 @@ class PartialFit:
             return
         if json:
             fit = None if self.fit is None else self.fit.to_dict()
-            print_json({"interrupted": True, "parameters": best.to_dict(), "fit": fit})
+            output.document({"interrupted": True, "parameters": best.to_dict(), "fit": fit})
         elif self.fit is not None:
             print(f"{self.fit}\ninterrupted: this fit had ended, the rest had not")
         else:
@@ -93,21 +85,21 @@ def print_fit(result: FitResult, files: list[Path], *, verbose: bool, paired: bo
     readings = fit.hits + fit.max_readings
     unexplained, doubtful = fit.outliers / readings if readings else 0.0, is_doubtful(fit)
     verdict = "NOT CONVERGED" if not fit.converged else "DOUBTFUL" if doubtful else "FITTED"
-    print_result(
+    output.result(
         f"{verdict}: {100 * p.z_hit:.0f} % of the readings are correct, with a deviation of "
         f"{length(p.sigma_hit)}; {100 * unexplained:.2g} % are unexplained"
     )
     source = "the expected ranges" if paired else "the poses or the map"
     if doubtful:
-        print_fact("doubt", DOUBT)
+        output.fact("doubt", DOUBT)
     elif unexplained > _USUAL_UNEXPLAINED:
-        print_fact("many", f"recorded lasers leave 5 to 11 % unexplained; look for people, or places where {source} "
-                   "are wrong, in readings.png (--out)")  # fmt: skip
+        output.fact("many", f"recorded lasers leave 5 to 11 % unexplained; look for people, or places where {source} "
+                    "are wrong, in readings.png (--out)")  # fmt: skip
     if not fit.converged or fit.held:
-        print_fact("status", fit.status)
+        output.fact("status", fit.status)
     _print_bias(fit)
     errors = fit.standard_errors | ({"range_bias": fit.range_bias_error} if fit.bias_fitted else {})
-    print_parameters(p, errors, _UNITS)
+    output.parameters(p, errors, _UNITS)
     if result.incidence is not None:
         print(f"\n{result.incidence}")
     if result.motion is not None:
@@ -116,7 +108,7 @@ def print_fit(result: FitResult, files: list[Path], *, verbose: bool, paired: bo
         _print_held_out(result)
     if files:
         print()
-    print_files(*files)
+    output.files(*files)
     if verbose:
         print(f"\n{fit}\nrange_max {result.data.range_max:.6g} m, {len(result.data.ranges)} readings\n{machine_line()}")
 
@@ -134,24 +126,24 @@ def _print_bias(fit: BeamFit) -> None:
         return
     if abs(bias) > _SURE * error and abs(bias) > _NOTABLE * sigma:
         sides = "long" if bias > 0 else "short"
-        print_fact("bias", f"ranges are {length(abs(bias))} too {sides} (error {length(error)}): --range-bias takes "
-                   "this into the parameters; walls that the map draws too thick look the same")  # fmt: skip
+        output.fact("bias", f"ranges are {length(abs(bias))} too {sides} (error {length(error)}): --range-bias takes "
+                    "this into the parameters; walls that the map draws too thick look the same")  # fmt: skip
 
 
 def _print_held_out(result: FitResult) -> None:
     print(f"\nheld out: {result.held_out_readings} readings, mean log-likelihood of a reading [nats]")
     columns = ("parameters", "log-likelihood", "gain of the fit", "std. error")
     rows = [(row.name, f"{row.per_beam:.4f}", *rounded(row.gain, row.gain_error)) for row in result.held_out]
-    print_table(columns, rows, right=columns[1:])
+    output.table(columns, rows, right=columns[1:])
     for row in result.held_out:
         if row.impossible:
-            print_fact("", f"{row.name}: {row.impossible} held-out readings are impossible; softened: half a reading "
-                       "added to each cause, with which the other rows are compared")  # fmt: skip
+            output.fact("", f"{row.name}: {row.impossible} held-out readings are impossible; softened: half a reading "
+                        "added to each cause, with which the other rows are compared")  # fmt: skip
 
 
 def _print_motion(fit: MotionFit) -> None:
     path = f"{fit.travelled:.1f} m and {fit.turned:.1f} rad"
     print()
-    print_fact("odometry", f"{fit.motion}, from {fit.steps} steps ({path}) with {fit.references} reference poses")
+    output.fact("odometry", f"{fit.motion}, from {fit.steps} steps ({path}) with {fit.references} reference poses")
     if fit.undetermined:
-        print_fact("", f"at most the default, because the log does not determine them: {', '.join(fit.undetermined)}")
+        output.fact("", f"at most the default, because the log does not determine them: {', '.join(fit.undetermined)}")

@@ -12,18 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import add_backend, add_json, output_path, positive_number
-from gpusense.commands.output import (
-    counted,
-    draw,
-    length,
-    print_fact,
-    print_files,
-    print_report,
-    print_result,
-    write_table,
-)
-from gpusense.commands.scans import add_choice, add_log, options_named, read_chosen_steps
+from gpusense.commands import output
+from gpusense.commands.arguments import output_path, positive_number
+from gpusense.commands.output import counted, draw, length, write_table
+from gpusense.commands.scans import add_log, options_named, read_chosen_steps
 from gpusense.commands.signals import held
 
 if TYPE_CHECKING:
@@ -36,6 +28,7 @@ if TYPE_CHECKING:
 
 HELP = "Judge the poses of any localiser in a recording: when they were right, when lost, and why."
 FIRST = ("map", "log", "poses", "plot", "truth")
+SHARED = ("choice", "backend", "json")
 CODES = {0: "the poses were not lost", 1: "they were, or no scan had a reading to judge by"}
 
 # Suffixes of trajectories.
@@ -80,9 +73,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a TUM trajectory of true poses on the map, for errors, integrity and the Stanford diagram")  # fmt: skip
     add("--alert-limit", type=positive_number, default=0.5, metavar="M",
         help="with --truth: largest error that is safe [m] (default: %(default)s)")  # fmt: skip
-    add_choice(parser)
-    add_backend(parser)
-    add_json(parser)
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
         help="draw the track on the map coloured by p_lost, p_lost and radius over time, and errors")  # fmt: skip
     add("--csv", type=output_path(".csv"), metavar="FILE", help="write a row for each pose")
@@ -154,14 +144,14 @@ def _report(
     if args.record is not None:
         Recording(grid, "judge").write_judgement(found, scans, args.record)
     if args.json:
-        print_report(_document(found, source, rated, errors), args)
+        output.report(_document(found, source, rated, errors), args)
         return
-    print_result(headline(found))
-    print_fact("poses", f"{len(found.times)} of {counted(found.scans, 'scan')}, by {source}")
+    output.result(headline(found))
+    output.fact("poses", f"{len(found.times)} of {counted(found.scans, 'scan')}, by {source}")
     print_stretches(found.stretches, float(found.times[0]), found.risk)
     if rated is not None:
         _print_integrity(rated, found.risk)
-    print_files(args.plot, args.csv, args.record)
+    output.files(args.plot, args.csv, args.record)
 
 
 def headline(found: Judgement) -> str:
@@ -199,19 +189,19 @@ def _seconds(time: float, *, unit: bool = True) -> str:
 
 
 def _print_integrity(rated: Integrity, risk: float) -> None:
-    print_fact(
+    output.fact(
         "integrity",
         f"hazardously misleading {100 * rated.hazardous:.3g} %, misleading {100 * rated.misleading:.3g} %, available "
         f"{100 * rated.available:.3g} % of {counted(len(rated.errors), 'pose')} with a truth, at risk {risk:g} and "
         f"alert limit {rated.alert_limit:g} m",
     )
-    print_fact("error", f"median {length(float(np.median(rated.errors)))}; above the radius in "
-               f"{100 * rated.exceeded:.3g} % of the poses")  # fmt: skip
+    output.fact("error", f"median {length(float(np.median(rated.errors)))}; above the radius in "
+                f"{100 * rated.exceeded:.3g} % of the poses")  # fmt: skip
     delays = rated.times_to_alert
     if len(delays):
         alerted = delays[np.isfinite(delays)]
         longest = f", after at most {alerted.max():.2g} s" if len(alerted) else ""
-        print_fact("alerts", f"{len(alerted)} of {counted(len(delays), 'error')} above the alert limit{longest}")
+        output.fact("alerts", f"{len(alerted)} of {counted(len(delays), 'error')} above the alert limit{longest}")
 
 
 def _document(found: Judgement, source: str, rated: Integrity | None, errors: np.ndarray) -> dict[str, Any]:
@@ -236,13 +226,13 @@ def print_stretches(stretches: Sequence[Stretch], begin: float, risk: float) -> 
     order = {"lost": 0, "uncertain": 1, "tracking": 2}
     chosen = sorted(stretches, key=lambda one: (order[one.verdict], -one.duration))[:_MOST]
     for one in sorted(chosen, key=lambda one: one.first):
-        print_fact(one.verdict, _summary(one, begin, risk))
+        output.fact(one.verdict, _summary(one, begin, risk))
         if one.place is not None:
-            print_fact("", _place(one))
+            output.fact("", _place(one))
         if one.diagnosis is not None:
-            print_fact("", one.diagnosis.text)
+            output.fact("", one.diagnosis.text)
     if len(chosen) < len(stretches):
-        print_fact("", f"and {len(stretches) - len(chosen)} shorter ones; --json lists all")
+        output.fact("", f"and {len(stretches) - len(chosen)} shorter ones; --json lists all")
 
 
 def _summary(one: Stretch, begin: float, risk: float) -> str:

@@ -9,26 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import (
-    add_backend,
-    add_json,
-    add_seed,
-    not_negative_number,
-    positive_number,
-    range_number,
-    whole_number,
-)
-from gpusense.commands.output import (
-    counted,
-    degrees,
-    length,
-    print_details,
-    print_fact,
-    print_interrupted,
-    print_parameters,
-    print_report,
-    print_result,
-)
+from gpusense.commands import output
+from gpusense.commands.arguments import not_negative_number, positive_number, range_number, whole_number
+from gpusense.commands.output import counted, degrees, length
 from gpusense.commands.signals import held
 from gpusense.localization.defaults import DEFAULTS
 
@@ -39,6 +22,7 @@ if TYPE_CHECKING:
 
 HELP = "Fit the noise of landmark readings in a recorded run, check the map, and localise the robot."
 FIRST = ("folder", "robot", "known", "particles", "drift")
+SHARED = ("backend", "seed", "verbose")
 CODES = {1: "lost at the end"}
 
 _UNITS = {"sigma_range": "m", "sigma_bearing": "rad"}
@@ -87,9 +71,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the sensor's largest range [m] (default: the next metre above the largest reading)")  # fmt: skip
     add("--field-of-view", type=positive_number, metavar="RAD",
         help="the sensor's field of view [rad] (default: 5 %% more than the readings' span)")  # fmt: skip
-    add_backend(parser)
-    add_seed(parser)
-    add_json(parser, verbose=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -118,13 +99,13 @@ def run(args: argparse.Namespace) -> int:
             step(f"scan {one.index}" + (", lost" if track.verdicts[-1] == "lost" else ""))
     figures = summary(track) | {"gain": pf.gain}
     if args.json:
-        print_report(_document(recorded, fit, doubts) | {
+        output.report(_document(recorded, fit, doubts) | {
             "association": agreement, "motion": asdict(motion), "filter": figures, "device": model.device.selection,
         }, args)  # fmt: skip
     else:
         _print(args, recorded, fit, doubts, agreement, figures)
         alpha = " ".join(f"{value:.3g}" for value in motion.alpha)
-        print_details(
+        output.details(
             args,
             f"{fit}\n\nleft out of the recording: {_left_out(recorded)}\nmotion noise {alpha}, reverse "
             f"{motion.reverse:.2g}, random walk {motion.drift:.2g} m and {motion.drift_heading:.2g} rad per sqrt(s)",
@@ -155,17 +136,17 @@ def _print(
 ) -> None:  # fmt: skip
     kind = "known" if args.known else "unknown"
     count = len(doubts.exchanged) + len(doubts.misplaced)
-    print_result(f"{_verdict(figures)}; {counted(count, 'suspicion')} about landmarks")
-    print_interrupted(figures["scans"], len(run.time))
-    print_fact("error", f"median {length(figures['error_median'])}, 95 % below {length(figures['error_95'])}; heading "
-               f"{degrees(figures['heading_median'])} and {degrees(figures['heading_95'])} degrees")  # fmt: skip
+    output.result(f"{_verdict(figures)}; {counted(count, 'suspicion')} about landmarks")
+    output.interrupted(figures["scans"], len(run.time))
+    output.fact("error", f"median {length(figures['error_median'])}, 95 % below {length(figures['error_95'])}; heading "
+                f"{degrees(figures['heading_median'])} and {degrees(figures['heading_95'])} degrees")  # fmt: skip
     _print_suspicions(run, doubts)
     right, wrong, none = (f"{100 * agreement[name]:.1f} %" for name in ("right", "wrong", "none"))
-    print_fact("likeliest", f"landmark at the logged pose: right {right}, wrong {wrong}, taken for false "
-               f"positives {none}")  # fmt: skip
-    print_fact("readings", f"{len(run.ids)} of {len(run.landmarks)} landmarks in {len(run.time)} scans, "
-               f"{args.particles} particles, {kind} landmarks")  # fmt: skip
-    print_parameters(fit.parameters, fit.standard_errors, _UNITS)
+    output.fact("likeliest", f"landmark at the logged pose: right {right}, wrong {wrong}, taken for false "
+                f"positives {none}")  # fmt: skip
+    output.fact("readings", f"{len(run.ids)} of {len(run.landmarks)} landmarks in {len(run.time)} scans, "
+                f"{args.particles} particles, {kind} landmarks")  # fmt: skip
+    output.parameters(fit.parameters, fit.standard_errors, _UNITS)
 
 
 def _verdict(figures: dict[str, Any]) -> str:
@@ -185,10 +166,10 @@ def _print_suspicions(run: LandmarkRun, suspicions: Suspicions) -> None:
     for pair in suspicions.exchanged:
         a, b = labels[pair.first], labels[pair.second]
         before, after = (" and ".join(f"{100 * each:.0f} %" for each in both) for both in (pair.before, pair.after))
-        print_fact("SUSPICIOUS", f"landmarks {a} and {b} fit better exchanged: {before} of their readings agree with "
-                   f"the map, {after} with both exchanged")  # fmt: skip
+        output.fact("SUSPICIOUS", f"landmarks {a} and {b} fit better exchanged: {before} of their readings agree with "
+                    f"the map, {after} with both exchanged")  # fmt: skip
     for each in suspicions.misplaced:
-        print_fact("SUSPICIOUS", f"landmark {labels[each.landmark]}: {100 * each.agree:.0f} % of its readings agree "
-                   "with its place")  # fmt: skip
+        output.fact("SUSPICIOUS", f"landmark {labels[each.landmark]}: {100 * each.agree:.0f} % of its readings agree "
+                    "with its place")  # fmt: skip
     if not (suspicions.exchanged or suspicions.misplaced):
-        print_fact("map", "no landmark is suspicious")
+        output.fact("map", "no landmark is suspicious")

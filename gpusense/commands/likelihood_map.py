@@ -8,27 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import (
-    add_backend,
-    add_json,
-    add_model,
-    add_parameters,
-    output_path,
-    positive_number,
-    scan_model,
-    whole_number,
-)
-from gpusense.commands.output import (
-    grouped,
-    print_details,
-    print_fact,
-    print_files,
-    print_interrupted,
-    print_report,
-    print_result,
-    print_table,
-)
-from gpusense.commands.scans import add_log, add_range_max, read_scan
+from gpusense.commands import output
+from gpusense.commands.arguments import add_model, output_path, positive_number, scan_model, whole_number
+from gpusense.commands.output import grouped
+from gpusense.commands.scans import add_log, read_scan
 from gpusense.commands.signals import held
 
 if TYPE_CHECKING:
@@ -36,6 +19,7 @@ if TYPE_CHECKING:
 
 HELP = "Draw the likelihood of a scan over all positions and headings of a map."
 FIRST = ("map", "log", "scan", "out", "model")
+SHARED = ("range", "parameters", "backend", "verbose")
 
 # Number of printed modes.
 _MODES = 5
@@ -70,10 +54,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--positions", choices=("free", "all"), default="free", help="cells that are evaluated (default: %(default)s)")
     add("--temperature", type=positive_number, default=1.0, metavar="T",
         help="factor of log-likelihoods in (0, 1] (default: %(default)s, the plain product over beams)")  # fmt: skip
-    add_range_max(parser)
-    add_parameters(parser)
-    add_backend(parser)
-    add_json(parser, verbose=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -94,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     result.plot(args.out)
     poses, log_p, gain = refine_modes(model, scan.ranges, result, _MODES)
     if args.json:
-        print_report({
+        output.report({
             "picture": str(args.out), "done": done, "rows": result.log_p.shape[0], "cols": result.log_p.shape[1],
             "headings": result.log_p.shape[2], "resolution": result.resolution, "entropy": result.entropy,
             "log_evidence": result.log_evidence, "gain_of_refinement": gain, "modes": [
@@ -103,9 +83,9 @@ def run(args: argparse.Namespace) -> int:
         })  # fmt: skip
     else:
         _print(args, poses, log_p, gain)
-        print_interrupted(round(100 * done), 100, "per cent of the positions")
-        print_details(args, f"{grouped(result.log_p.size)} poses, entropy {result.entropy:.2f} nats; refinement gains "
-                      f"{gain:.2g} nats")  # fmt: skip
+        output.interrupted(round(100 * done), 100, "per cent of the positions")
+        output.details(args, f"{grouped(result.log_p.size)} poses, entropy {result.entropy:.2f} nats; refinement gains "
+                       f"{gain:.2g} nats")  # fmt: skip
     if stops:
         raise stops[0]
     return 0
@@ -114,23 +94,23 @@ def run(args: argparse.Namespace) -> int:
 def _print(args: argparse.Namespace, poses: np.ndarray, log_p: np.ndarray, gain: float) -> None:
     """Print the likeliest pose with its lead over others, and the table of poses."""
     if not len(poses):
-        print_result("NO PLACE: the scan is impossible everywhere")
+        output.result("NO PLACE: the scan is impossible everywhere")
     else:
         best = f"{poses[0, 0]:.2f} m, {poses[0, 1]:.2f} m, {math.degrees(poses[0, 2]):.1f} degrees"
         near = int((log_p > log_p[0] - _EQUAL).sum())
         lead = f", {log_p[0] - log_p[1]:.3g} nats above the next" if len(poses) > 1 else ""
-        print_result(f"ONE PLACE: {best}{lead}" if near == 1 else
-                     f"{near} PLACES within {_EQUAL:g} nats of the best: {best}")  # fmt: skip
+        output.result(f"ONE PLACE: {best}{lead}" if near == 1 else
+                      f"{near} PLACES within {_EQUAL:g} nats of the best: {best}")  # fmt: skip
         if gain > _COARSE:
-            print_fact("grid", f"too coarse for the model: the refined pose is {gain:.3g} nats likelier than the "
-                       f"grid's best, so peaks may be missed; try --resolution {args.resolution / 2:g} --headings "
-                       f"{2 * args.headings}, or a --temperature below {args.temperature:g}")  # fmt: skip
+            output.fact("grid", f"too coarse for the model: the refined pose is {gain:.3g} nats likelier than the "
+                        f"grid's best, so peaks may be missed; try --resolution {args.resolution / 2:g} --headings "
+                        f"{2 * args.headings}, or a --temperature below {args.temperature:g}")  # fmt: skip
         columns = ("x [m]", "y [m]", "heading [degrees]", "below the best [nats]")
         rows = [
             (f"{x:.2f}", f"{y:.2f}", f"{math.degrees(theta):.1f}", f"{log_p[0] - value:.1f}")
             for (x, y, theta), value in zip(poses, log_p, strict=True)
         ]
         print()
-        print_table(columns, rows, right=columns)
+        output.table(columns, rows, right=columns)
         print()
-    print_files(args.out)
+    output.files(args.out)

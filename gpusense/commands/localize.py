@@ -13,9 +13,6 @@ import numpy as np
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import (
-    add_backend,
-    add_json,
-    add_seed,
     add_temperature,
     finite_number,
     not_negative_number,
@@ -24,7 +21,7 @@ from gpusense.commands.arguments import (
     whole_number,
 )
 from gpusense.commands.parameter_files import Localization, read_localization
-from gpusense.commands.scans import add_choice, add_log, options_named, read_chosen_steps
+from gpusense.commands.scans import add_log, options_named, read_chosen_steps
 from gpusense.commands.signals import held
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.world.scanner import Scanner
@@ -40,6 +37,7 @@ if TYPE_CHECKING:
 
 HELP = "Localise a robot along a recorded log with a particle filter."
 FIRST = ("map", "log", "everywhere", "start", "plot")
+SHARED = ("choice", "backend", "seed", "verbose")
 CODES = {0: "the verdict is 'tracking'", 1: "uncertain or lost at the end, or no reading there to judge by"}
 
 
@@ -109,10 +107,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"anywhere, or neither (default: {DEFAULTS.recovery})")  # fmt: skip
     add("--beam-skip", type=positive_number, metavar="P",
         help="skip beams, such as on people, that less than this share of the particles explains")  # fmt: skip
-    add_choice(parser)
-    add_backend(parser)
-    add_seed(parser)
-    add_json(parser, verbose=True)
     add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the trajectory for evo")
     add("--tum-from", choices=("tracking", "start"), default="tracking",
         help="where the trajectory begins: at the first scan whose verdict is 'tracking', or at the first one "

@@ -9,17 +9,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gpusense.commands import output
 from gpusense.commands.judge import print_stretches, stretch_rows
-from gpusense.commands.output import (
-    degrees,
-    draw,
-    length,
-    print_fact,
-    print_files,
-    print_interrupted,
-    print_report,
-    print_result,
-)
+from gpusense.commands.output import degrees, draw, length
 from gpusense.commands.scans import scan_times
 from gpusense.evaluation.machine import machine_line
 from gpusense.localization.spread import WIDE, WIDE_TURN
@@ -62,15 +54,15 @@ def report(
         document = {"filter": repr(pf), "summary": result, "scans_chosen": chosen}
         times = [step.scan.time for step in track.steps]
         document |= {"poses": poses, "times": times, "stretches": stretch_rows(stretches), "risk": RISK}
-        print_report(document, args)
+        output.report(document, args)
         return result
     _print(pf, result, chosen, track)
     if len(stretches) > 1:
         print_stretches(stretches, track.steps[0].scan.time, RISK)
-    print_files(args.plot, *recorders, args.tum)
+    output.files(args.plot, *recorders, args.tum)
     if args.tum is not None and first:
-        print_fact("", f"without the first {first} of {len(track.poses)} scans, before the verdict is 'tracking'; "
-                   "--tum-from start writes them")  # fmt: skip
+        output.fact("", f"without the first {first} of {len(track.poses)} scans, before the verdict is 'tracking'; "
+                    "--tum-from start writes them")  # fmt: skip
     if args.verbose:
         _print_details(pf, result)
     return result
@@ -98,18 +90,18 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track
     known = result["error_median"] is not None and not result["references_repeat_odometry"]
     settled = result["settled_median"] if known else None
     error = "" if settled is None else f"; median error {length(settled)}"
-    print_result(_verdict(result, deviations) + error)
-    print_interrupted(result["scans"], chosen)
+    output.result(_verdict(result, deviations) + error)
+    output.interrupted(result["scans"], chosen)
     if result["verdict"] == "tracking" and result["evidence"] is not None:
-        print_fact("but", result["evidence"]["text"])
-    print_fact("last pose", f"{_pose(track.poses[-1])}; deviations {_deviations(deviations)}")
+        output.fact("but", result["evidence"]["text"])
+    output.fact("last pose", f"{_pose(track.poses[-1])}; deviations {_deviations(deviations)}")
     milliseconds = float(f"{sum(result[f'ms_{part}'] for part in _PARTS):.2g}")
-    print_fact("scans", f"{result['scans']}, {milliseconds:g} ms each")
+    output.fact("scans", f"{result['scans']}, {milliseconds:g} ms each")
     if result["scans"] > 1 and not result["odometry_moves"]:
-        print_fact("odometry", "does not move: absent, unreadable, at other times than the scans, or the robot stands")
+        output.fact("odometry", "does not move: absent, unreadable, at other times than the scans, or the robot stands")
     if result["references_repeat_odometry"]:
         away = length(result["error_median"])
-        print_fact("reference", f"none: the logged poses are the odometry's own, {away} away in the median")
+        output.fact("reference", f"none: the logged poses are the odometry's own, {away} away in the median")
     elif known:
         _print_errors(result)
     sys.stdout.flush()
@@ -119,15 +111,15 @@ def _print_errors(result: dict[str, Any]) -> None:
     """Print the errors of poses, separately before and after convergence."""
     some = "" if result["references"] == result["scans"] else f" (reference poses of {result['references']} scans)"
     if result["converged_at"] is None:
-        print_fact("error", f"never within 1 m and 20 degrees for long; median {length(result['error_median'])}{some}")
+        output.fact("error", f"never within 1 m and 20 degrees for long; median {length(result['error_median'])}{some}")
         return
     start = result["converged_at"]
     since = f"from scan {start} on: " if start else ""
     turns = f"{degrees(result['settled_heading_median'])} and {degrees(result['settled_heading_95'])}"
-    print_fact("error", f"{since}median {length(result['settled_median'])}, 95 % below {length(result['settled_95'])}; "
-               f"heading {turns} degrees{some}")  # fmt: skip
+    output.fact("error", f"{since}median {length(result['settled_median'])}, 95 % below {length(result['settled_95'])}"
+                f"; heading {turns} degrees{some}")  # fmt: skip
     if start:
-        print_fact("", f"before: median {length(result['early_median'])}")
+        output.fact("", f"before: median {length(result['early_median'])}")
 
 
 def _print_details(pf: ParticleFilter, result: dict[str, Any]) -> None:

@@ -12,26 +12,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import (
-    add_backend,
-    add_json,
-    number,
-    output_path,
-    positive_number,
-)
-from gpusense.commands.output import (
-    counted,
-    draw,
-    grouped,
-    print_details,
-    print_fact,
-    print_files,
-    print_interrupted,
-    print_report,
-    print_result,
-    write_table,
-)
-from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans_of_lasers, scan_times, scanners_of
+from gpusense.commands import output
+from gpusense.commands.arguments import number, output_path, positive_number
+from gpusense.commands.output import counted, draw, grouped, write_table
+from gpusense.commands.scans import add_log, read_scans_of_lasers, scan_times, scanners_of
 from gpusense.commands.signals import held
 from gpusense.world.map_greys import MODES
 
@@ -45,6 +29,7 @@ if TYPE_CHECKING:
 
 HELP = "Build an occupancy grid from the scans of a log."
 FIRST = ("log", "out", "plot", "chain", "resolution")
+SHARED = ("reference", "choice", "backend", "verbose")
 
 # Scans per step of the progress bar.
 _SCANS = 64
@@ -78,7 +63,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
     add_log(parser, "a log with scans", several="lasers of the map")
-    add_reference(parser)
     _add_chain(parser)
     add("--out", required=True, type=output_path(".yaml"), metavar="YAML", help="the map, next to its image")
     add("--mode", choices=MODES, default="trinary",
@@ -90,9 +74,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--clear-max", action="store_true", help="clear cells along 'no return' readings, up to --range-limit")
     add("--p-hit", type=number, default=0.85, metavar="P", help="occupancy after one hit (default: %(default)s)")
     add("--p-miss", type=number, default=0.45, metavar="P", help="occupancy after one miss (default: %(default)s)")
-    add_choice(parser)
-    add_backend(parser)
-    add_json(parser, verbose=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -148,7 +129,7 @@ def _report(
     rows, cols = grid.shape
     free, occupied = int(grid.free.sum()), int(grid.occupied.sum())
     if args.json:
-        print_report({
+        output.report({
             "map": str(args.out), "image": str(image), "mode": args.mode, "scans": scans[0],
             "scans_chosen": scans[1], "rays": builder.rays, "rows": rows, "cols": cols,
             "resolution": grid.resolution, "origin": grid.origin, "free": free, "occupied": occupied,
@@ -156,17 +137,17 @@ def _report(
         })  # fmt: skip
         return
     if chained is None:
-        print_result(f"MAPPED: {counted(scans[0], 'scan')} at {'reference' if args.reference else 'logged'} poses")
+        output.result(f"MAPPED: {counted(scans[0], 'scan')} at {'reference' if args.reference else 'logged'} poses")
     else:
         _print_chain(chained)
     size = f"{cols * grid.resolution:.0f} x {rows * grid.resolution:.0f} m, cells of {grid.resolution:g} m"
-    print_fact("map", f"{size}: {grouped(occupied)} occupied, {grouped(free)} free")
-    print_interrupted(*scans, "scans" if builder.bands == 1 else "scans' worth of rays")
-    print_files(args.out, image, args.plot, args.tum, args.poses)
+    output.fact("map", f"{size}: {grouped(occupied)} occupied, {grouped(free)} free")
+    output.interrupted(*scans, "scans" if builder.bands == 1 else "scans' worth of rays")
+    output.files(args.out, image, args.plot, args.tum, args.poses)
     start = " --start 0 0 0" if chained is not None else ""
     print(f"next       gpusense localize --map {args.out} --log {args.log}{start}")
     chain = "" if chained is None else f"{chained.chain.explain()}\nchained in {chained.seconds:.1f} s\n"
-    print_details(args, f"{chain}{counted(builder.rays, 'ray')} of {counted(scans[0], 'scan')}, {rows} x {cols} cells")
+    output.details(args, f"{chain}{counted(builder.rays, 'ray')} of {counted(scans[0], 'scan')}, {rows} x {cols} cells")
 
 
 # Steps of the progress bar during the search for loops.
@@ -309,16 +290,16 @@ def _print_chain(chained: ChainedScans) -> None:
     share = chain.doubtful.mean() if len(chain.poses) else 0.0
     verdict = "CONSISTENT" if not chain.doubts else f"DOUBTFUL in {counted(len(chain.doubts), 'stretch', 'stretches')}"
     doubt = f", {100 * share:.2g} % of them in doubt" if chain.doubts else ""
-    print_result(f"{verdict}: chained {counted(len(chain.poses), 'scan')} over {way:.0f} m{doubt}")
+    output.result(f"{verdict}: chained {counted(len(chain.poses), 'scan')} over {way:.0f} m{doubt}")
     if len(chain.corrections):
-        print_fact("loops", f"{len(chain.corrections)} closed, moving scans by {np.median(chain.corrections):.2f} m in "
-                   f"the median, {chain.corrections.max():.2f} m at most")  # fmt: skip
+        output.fact("loops", f"{len(chain.corrections)} closed, moving scans by {np.median(chain.corrections):.2f} m "
+                    f"in the median, {chain.corrections.max():.2f} m at most")  # fmt: skip
     else:
-        print_fact("loops", "none closed, since no place was seen again with certainty: the map bends by the drift of "
-                   "the whole way")  # fmt: skip
+        output.fact("loops", "none closed, since no place was seen again with certainty: the map bends by the drift of "
+                    "the whole way")  # fmt: skip
     for reason, meaning in REASONS.items():
         some = [doubt for doubt in chain.doubts if doubt.reason == reason]
         if some:
             spans = ", ".join(f"{doubt.first} to {doubt.last}" for doubt in some[:5])
             more = f" and {len(some) - 5} more" if len(some) > 5 else ""
-            print_fact("doubt", f"scans {spans}{more}: {meaning}")
+            output.fact("doubt", f"scans {spans}{more}: {meaning}")

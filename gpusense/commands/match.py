@@ -11,28 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import (
-    add_backend,
-    add_json,
-    add_seed,
-    not_negative_number,
-    output_path,
-    positive_number,
-)
-from gpusense.commands.output import (
-    counted,
-    degrees,
-    draw,
-    length,
-    print_details,
-    print_fact,
-    print_files,
-    print_interrupted,
-    print_report,
-    print_result,
-    write_table,
-)
-from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans, scan_times
+from gpusense.commands import output
+from gpusense.commands.arguments import not_negative_number, output_path, positive_number
+from gpusense.commands.output import counted, degrees, draw, length, write_table
+from gpusense.commands.scans import add_log, read_scans, scan_times
 from gpusense.commands.signals import held
 
 if TYPE_CHECKING:
@@ -44,6 +26,7 @@ if TYPE_CHECKING:
 
 HELP = "Match the scans of a recorded log to each other, or to a map."
 FIRST = ("log", "map", "reference", "tum", "plot")
+SHARED = ("reference", "choice", "backend", "seed", "verbose")
 
 EPILOG = """\
 Each scan is matched to the one before, from the odometry's guess; with --map to the map, from its logged pose. Errors
@@ -64,7 +47,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
     add_log(parser, "a log with scans")
-    add_reference(parser)
     add("--map", type=Path, metavar="YAML", help="a map_server map to which all scans are matched")
     add("--guess", choices=("odometry", "logged", "identity"),
         help="the guess of each match (default: odometry, with --map logged)")  # fmt: skip
@@ -76,10 +58,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="method of match_scan (default: %(default)s)")  # fmt: skip
     add("--noise", type=positive_number, metavar="M",
         help="standard deviation of ranges [m] (default: that of match_scan)")  # fmt: skip
-    add_choice(parser)
-    add_backend(parser)
-    add_seed(parser)
-    add_json(parser, verbose=True)
     add("--out", type=output_path(".csv"), metavar="CSV", help="write poses, deviations and statuses")
     add("--tum", type=output_path(".tum", ".txt"), metavar="FILE",
         help="write the trajectory: matches chained from the first scan on, or poses in the map; a match that failed "
@@ -133,13 +111,13 @@ def _report(
         _write_tum(args.tum, scans, matches)
     draw(args.plot, lambda: _worst(grid, dict(scans), matches))
     if args.json:
-        print_report(_document(matches, total, len(scans)), args)
+        output.report(_document(matches, total, len(scans)), args)
         return
     _print(total)
-    print_interrupted(len(matches.match), len(scans) - (grid is None), "matches")
-    print_files(args.out, args.plot, args.tum)
-    print_details(args, f"score: median {total['score_median']:.3f}\n{total['milliseconds_each']:.3g} ms each with the "
-                  "first call's compilation")  # fmt: skip
+    output.interrupted(len(matches.match), len(scans) - (grid is None), "matches")
+    output.files(args.out, args.plot, args.tum)
+    output.details(args, f"score: median {total['score_median']:.3f}\n{total['milliseconds_each']:.3g} ms each with "
+                   "the first call's compilation")  # fmt: skip
 
 
 def _print(total: dict[str, Any]) -> None:
@@ -155,14 +133,14 @@ def _print(total: dict[str, Any]) -> None:
         for name in ("median", "p95")
     )
     verdict = "MATCHED" if good == count else "PARTLY MATCHED" if good else "NO MATCH"
-    print_result(f"{verdict}: {good} of {counted(count, 'scan')} agree; median {kind} {median}")
-    print_fact(kind, f"95 % below {most}" + (f"; {total['wrong']} wrong, beyond 0.2 m or 5 degrees" if known else ""))
+    output.result(f"{verdict}: {good} of {counted(count, 'scan')} agree; median {kind} {median}")
+    output.fact(kind, f"95 % below {most}" + (f"; {total['wrong']} wrong, beyond 0.2 m or 5 degrees" if known else ""))
     if known:
-        print_fact("guesses", f"median error {length(total['guess_position_median'])} and "
-                   f"{degrees(total['guess_heading_median'])} degrees")  # fmt: skip
+        output.fact("guesses", f"median error {length(total['guess_position_median'])} and "
+                    f"{degrees(total['guess_heading_median'])} degrees")  # fmt: skip
     for status, number in statuses.items():
         if status != "converged":
-            print_fact("status", f"{number} {status}: {STATUSES[status]}")
+            output.fact("status", f"{number} {status}: {STATUSES[status]}")
 
 
 def _document(matches: LogMatches, total: dict[str, Any], chosen: int) -> dict[str, Any]:

@@ -30,18 +30,18 @@ _WIDTH, _INDENT = 80, 11
 _OPENERS = {".rrd": "rerun", ".tum": "evo_traj tum"}
 
 
-def print_json(document: dict[str, Any]) -> None:
+def document(document: dict[str, Any]) -> None:
     """Print one JSON document; NaN and infinities become null."""
     print(json.dumps(_plain(document), indent=2, allow_nan=False))
 
 
-def print_report(facts: dict[str, Any], args: argparse.Namespace | None = None) -> None:
+def report(facts: dict[str, Any], args: argparse.Namespace | None = None) -> None:
     """Print facts as a JSON document, between the options of a command and the machine."""
     from gpusense.evaluation.machine import machine
 
     hidden = ("run", "command", "json")
     options = {} if args is None else {"options": {k: v for k, v in vars(args).items() if k not in hidden}}
-    print_json({**options, **facts, "machine": machine()})
+    document({**options, **facts, "machine": machine()})
 
 
 def _plain(value: Any) -> Any:
@@ -57,7 +57,7 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, os.PathLike) else value
 
 
-def print_result(text: str) -> None:
+def result(text: str) -> None:
     """Print the result of a command: in one line, on a terminal wrapped and in bold."""
     if is_terminal(sys.stdout):
         text = _wrapped(text, min(terminal_width(), _WIDTH))
@@ -65,18 +65,18 @@ def print_result(text: str) -> None:
     print(text, flush=True)
 
 
-def print_fact(name: str, text: str) -> None:
+def fact(name: str, text: str) -> None:
     """Print a named fact below the result, wrapped to 80 columns."""
     print(_wrapped(f"{name:<{_INDENT - 1}} {text}", _WIDTH, " " * _INDENT))
 
 
-def print_interrupted(done: int, total: int, noun: str = "scans") -> None:
+def interrupted(done: int, total: int, noun: str = "scans") -> None:
     """Print the share of the work that an interrupted command did."""
     if done < total:
         print(f"interrupted: results of {done} of {total} {noun}")
 
 
-def print_details(args: argparse.Namespace, text: str) -> None:
+def details(args: argparse.Namespace, text: str) -> None:
     """Print details and the machine, with ``--verbose``."""
     if args.verbose:
         from gpusense.evaluation.machine import machine_line
@@ -84,7 +84,7 @@ def print_details(args: argparse.Namespace, text: str) -> None:
         print(f"\n{text}\n{machine_line()}")
 
 
-def print_files(*paths: os.PathLike[str] | None) -> None:
+def files(*paths: os.PathLike[str] | None) -> None:
     """Print the files that a command wrote, with the command that opens each; None is left out."""
     for path in filter(None, paths):
         opener = _OPENERS.get(os.path.splitext(path)[1].lower())
@@ -115,7 +115,7 @@ def _wrapped(text: str, width: int, indent: str = "") -> str:
     return textwrap.fill(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
 
 
-def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[str] = ()) -> None:
+def table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[str] = ()) -> None:
     """Print a table; on a terminal that is too narrow, each row becomes a paragraph with one value per line."""
     lines = table_lines(columns, rows, right=right)
     if is_terminal(sys.stdout) and max(map(len, lines)) > terminal_width():
@@ -178,7 +178,7 @@ def rounded(value: float, error: float) -> tuple[str, str]:
     return f"{value:.{digits}f}", f"{error:.{digits}f}"
 
 
-def print_parameters(parameters: Any, errors: Mapping[str, float], units: Mapping[str, str]) -> None:
+def parameters(parameters: Any, errors: Mapping[str, float], units: Mapping[str, str]) -> None:
     """Print a table of parameters with their standard errors."""
     rows = [
         (name, *rounded(value, error), units.get(name, ""))
@@ -186,7 +186,7 @@ def print_parameters(parameters: Any, errors: Mapping[str, float], units: Mappin
         if (value := getattr(parameters, name)) is not None
     ]
     print()
-    print_table(("parameter", "value", "std. error", "unit"), rows, right=("value", "std. error"))
+    table(("parameter", "value", "std. error", "unit"), rows, right=("value", "std. error"))
 
 
 def grouped(number: int) -> str:

@@ -9,11 +9,12 @@ from typing import Any
 
 from gpusense._util import checks
 from gpusense._util.documents import read_mapping
-from gpusense.commands.arguments import add_backend, finite_number
+from gpusense.commands.arguments import finite_number
 from gpusense.localization.nav2_file import FITTED
 
 HELP = "Localise inside ROS 2, in the place of nav2_amcl, or watch another localiser."
 FIRST = ("map", "params_file", "start", "anywhere", "odom_topic")
+SHARED = ("backend",)
 CODES = {0: "interrupted or terminated", 1: "the node could not start (its log has the reason)"}
 
 _ROS = "--ros-args"
@@ -54,7 +55,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--odom-topic", metavar="TOPIC", help="read odometry from nav_msgs/Odometry (default: by /tf)")
     add("--base-frame", metavar="FRAME", help="frame of the robot's base (default: base_footprint)")
     add("--no-autostart", action="store_true", help="leave it to a lifecycle manager to configure and activate")
-    add_backend(parser)
     add(_ROS, nargs=argparse.REMAINDER, default=[], metavar="ARGUMENT", help="arguments of ROS 2")
 
 

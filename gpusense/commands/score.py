@@ -8,32 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import (
-    add_backend,
-    add_json,
-    add_model,
-    add_parameters,
-    add_seed,
-    add_temperature,
-    not_negative_number,
-    output_path,
-    scan_model,
-    whole_number,
-)
-from gpusense.commands.output import (
-    counted,
-    degrees,
-    draw,
-    grouped,
-    length,
-    print_details,
-    print_fact,
-    print_files,
-    print_interrupted,
-    print_report,
-    print_result,
-)
-from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans
+from gpusense.commands import output
+from gpusense.commands.arguments import add_temperature, not_negative_number, output_path, scan_model, whole_number
+from gpusense.commands.output import counted, degrees, draw, grouped, length
+from gpusense.commands.scans import add_log, read_scans
 from gpusense.commands.signals import held
 
 if TYPE_CHECKING:
@@ -41,6 +19,7 @@ if TYPE_CHECKING:
 
 HELP = "Score particles with the scans of a recorded log, and rank the logged poses among them."
 FIRST = ("map", "log", "reference", "parameters", "plot")
+SHARED = ("reference", "choice", "model", "parameters", "backend", "seed", "verbose")
 CODES = {0: "the log fits the map", 1: "it does not or the verdict is uncertain"}
 
 
@@ -65,19 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
     add_log(parser, "a log with corrected poses, or any with --reference")
-    add_reference(parser)
-    add_model(parser)
-    add_backend(parser)
     add("--particles", type=whole_number(low=2), default=20_000, metavar="N", help="per scan (default: %(default)s)")
     add("--sigma-position", type=not_negative_number, default=0.5, metavar="M",
         help="deviation of the particles around the logged pose, in x and in y [m] (default: %(default)s)")  # fmt: skip
     add("--sigma-heading", type=not_negative_number, default=0.25, metavar="RAD",
         help="deviation of their heading [rad] (default: %(default)s)")  # fmt: skip
-    add_choice(parser)
     add_temperature(parser, "auto: calibrated from the chosen scans")
-    add_parameters(parser)
-    add_seed(parser)
-    add_json(parser, verbose=True)
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
         help="draw map, logged and estimated poses, and errors")  # fmt: skip
 
@@ -106,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
         raise stops[0]
     draw(args.plot, lambda: scores_figure(grid, score, pose_name(args)))
     if not args.json:
-        print_files(args.plot)
+        output.files(args.plot)
     return int(not fit.fits)
 
 
@@ -120,15 +92,15 @@ def _report(args: argparse.Namespace, model: Model, score: LogScore, fitness: Fi
             "range_max": model.scanner.range_max, **asdict(score), "summary": summary(score), "scans_chosen": chosen,
             "fitness": asdict(fitness) | {"fits": fitness.fits, "verdict": fitness.verdict},
         }  # fmt: skip
-        print_report(facts, args)
+        output.report(facts, args)
         return
-    print_result(_fitness(fitness, pose_name(args)))
+    output.result(_fitness(fitness, pose_name(args)))
     _print(score, pose_name(args))
-    print_interrupted(len(score.scans), chosen)
+    output.interrupted(len(score.scans), chosen)
     values = ", ".join(f"{name} {value}" for name, value in model.parameters.to_dict().items())
     how = "calibrated from the scans" if args.temperature == "auto" else "given"
     s = {name: number_text(value) for name, value in summary(score).items()}
-    print_details(
+    output.details(
         args,
         f"{args.model} model, {args.precision}: {values}, range_max {model.scanner.range_max:.6g} m\n"
         f"temperature {model.temperature:.4g}, {how}\n"
@@ -147,18 +119,18 @@ def _print(score: LogScore, pose: str) -> None:
     from gpusense.evaluation.scoring import summary
 
     s = summary(score)
-    print_fact("device", f"{score.device.selection} ({score.device.name}): {counted(len(score.scans), 'scan')}, "
-               f"{grouped(score.particles)} particles each")  # fmt: skip
-    print_fact("rank", f"of the {pose} among them: median {number_text(s['rank_median'])}, better than "
-               f"{number_text(s['percentile_median'])} % in the median, {number_text(s['percentile_min'])} % at "
-               "least")  # fmt: skip
+    output.fact("device", f"{score.device.selection} ({score.device.name}): {counted(len(score.scans), 'scan')}, "
+                f"{grouped(score.particles)} particles each")  # fmt: skip
+    output.fact("rank", f"of the {pose} among them: median {number_text(s['rank_median'])}, better than "
+                f"{number_text(s['percentile_median'])} % in the median, {number_text(s['percentile_min'])} % at "
+                "least")  # fmt: skip
     if s["error_position_median"] is None:
-        print_fact("error", "none: every particle is impossible in every scan")
+        output.fact("error", "none: every particle is impossible in every scan")
     else:
-        print_fact("error", f"of the weighted mean: median {length(s['error_position_median'])} and "
-                   f"{degrees(s['error_heading_median'])} degrees, 90 % below "
-                   f"{length(s['error_position_90'])} and {degrees(s['error_heading_90'])} "
-                   "degrees")  # fmt: skip
+        output.fact("error", f"of the weighted mean: median {length(s['error_position_median'])} and "
+                    f"{degrees(s['error_heading_median'])} degrees, 90 % below "
+                    f"{length(s['error_position_90'])} and {degrees(s['error_heading_90'])} "
+                    "degrees")  # fmt: skip
 
 
 def _fitness(fitness: Fitness, pose: str) -> str:

@@ -9,8 +9,9 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import BACKEND_HELP, add_json
-from gpusense.commands.output import driver_text, print_fact, print_report, print_result, print_table
+from gpusense.commands import output
+from gpusense.commands.arguments import BACKEND_HELP
+from gpusense.commands.output import driver_text
 from gpusense.commands.signals import held
 from gpusense.evaluation.machine import machine_line
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 HELP = "Check that the backends present agree with the float64 truth and with each other."
 FIRST = ("backend", "stiff")
+SHARED = ("verbose",)
 CODES = {0: "every difference is within its tolerance", 1: "one is not", 2: "bad input or an absent device"}
 
 
@@ -54,7 +56,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stiff", action="store_true", help="run the stiff and extreme cases on each backend and in each precision"
     )
-    add_json(parser, verbose=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -76,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     seconds, breaches = time.perf_counter() - begin, [check for check in checks if not check.passed]
     absent = [device for device in devices() if not device.available]
     if args.json:
-        print_report({
+        output.report({
             "passed": not breaches and not stops, "backends": [asdict(backend.info) for backend in backends],
             "absent": [asdict(device) for device in absent],
             "checks": [asdict(check) | {"passed": check.passed} for check in checks], "seconds": seconds,
@@ -86,10 +87,10 @@ def run(args: argparse.Namespace) -> int:
             len(checks), len(breaches), backends, f"INTERRUPTED after {len(checks)}" if stops else "", seconds
         )
         for device in absent if args.verbose else ():
-            print_fact("absent", f"{device.name}: {device.reason}")
+            output.fact("absent", f"{device.name}: {device.reason}")
         if shown := checks if args.verbose else breaches:
             print()
-            print_table(_COLUMNS, [_row(check) for check in shown], right=("largest difference", "tolerance"))
+            output.table(_COLUMNS, [_row(check) for check in shown], right=("largest difference", "tolerance"))
         if args.verbose:
             print(f"\n{machine_line()}")
     if stops:
@@ -114,14 +115,14 @@ def _print_result(count: int, breaches: int, backends: Sequence[Backend], interr
     from gpusense.backends import devices
 
     if breaches:
-        print_result(f"FAILED: {breaches} of {count} comparisons beyond tolerance")
+        output.result(f"FAILED: {breaches} of {count} comparisons beyond tolerance")
     else:
         verdict = interrupted or f"PASSED: all {count}"
-        print_result(f"{verdict} comparisons within tolerance, in {seconds:.0f} s")
+        output.result(f"{verdict} comparisons within tolerance, in {seconds:.0f} s")
     reasons = {device.selection: device.reason for device in devices()}
     for info in (backend.info for backend in backends):
         reason = reasons.get(info.selection)
-        print_fact(info.selection, f"{info.name} ({driver_text(info)}){f': {reason}' if reason else ''}")
+        output.fact(info.selection, f"{info.name} ({driver_text(info)}){f': {reason}' if reason else ''}")
 
 
 def _row(check: Check) -> tuple[str, ...]:

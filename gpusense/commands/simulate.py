@@ -7,11 +7,10 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gpusense.commands import output
 from gpusense.commands.arguments import (
     Output,
     add_backend,
-    add_json,
-    add_seed,
     finite_number,
     not_negative_number,
     output_path,
@@ -19,7 +18,7 @@ from gpusense.commands.arguments import (
     range_number,
     whole_number,
 )
-from gpusense.commands.output import counted, print_fact, print_files, print_json, print_result
+from gpusense.commands.output import counted
 
 if TYPE_CHECKING:
     from gpusense.evaluation.simulation.run import SimulatedRun
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
 
 HELP = "Make the log of a robot that drives through a map, with noise, people and changes of the world."
 FIRST = ("world", "map", "log_out", "map_out", "scans")
+SHARED = ("seed", "json")
 
 EPILOG = """\
 The robot drives between random places, or along the poses of --path. Its readings are drawn from the beam model around
@@ -66,8 +66,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_world(parser)
     _add_sensors(parser)
     add_backend(parser, default="numpy")
-    add_seed(parser)
-    add_json(parser)
 
 
 def _add_run(parser: argparse.ArgumentParser) -> None:
@@ -211,19 +209,19 @@ def _report(args: argparse.Namespace, made: SimulatedRun) -> None:
     changed = int(np.count_nonzero(made.world.occupied != made.grid.occupied)) if args.true_map is None else None
     none = float(np.mean(np.isinf(made.scans))) if made.scans.size else 0.0
     if args.json:
-        print_json({
+        output.document({
             "log": str(args.log_out), "format": args.format, "scans": len(made.times), "beams": made.scanner.count,
             "length_m": length, "no_return": none, "hidden": float(made.hidden.mean()), "cells_changed": changed,
             "kidnapped_at": np.flatnonzero(made.kidnapped), "seed": args.seed, "first_pose": made.poses[0],
             "last_pose": made.poses[-1], "last_odometry": made.odometry[-1],
         })  # fmt: skip
         return
-    print_result(f"SIMULATED: {counted(len(made.times), 'scan')} of {counted(made.scanner.count, 'beam')} over "
-                 f"{length:.0f} m")  # fmt: skip
-    print_fact("readings", f"{100 * none:.1f} % without return, {100 * made.hidden.mean():.1f} % hidden by people")
+    output.result(f"SIMULATED: {counted(len(made.times), 'scan')} of {counted(made.scanner.count, 'beam')} over "
+                  f"{length:.0f} m")  # fmt: skip
+    output.fact("readings", f"{100 * none:.1f} % without return, {100 * made.hidden.mean():.1f} % hidden by people")
     if made.kidnapped.any():
         scans = ", ".join(map(str, np.flatnonzero(made.kidnapped).tolist()))
-        print_fact("kidnaps", f"carried elsewhere before scans {scans}")
-    print_files(args.map_out, args.world_out, args.log_out, args.tum)
+        output.fact("kidnaps", f"carried elsewhere before scans {scans}")
+    output.files(args.map_out, args.world_out, args.log_out, args.tum)
     if grid := args.map_out or args.map:
         print(f"next       gpusense localize --map {grid} --log {args.log_out} --global")

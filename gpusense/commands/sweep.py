@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from gpusense._util import checks
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import BACKEND_HELP, add_json, output_path, positive_number, whole_number
-from gpusense.commands.output import counted, print_fact, print_files, print_json, print_report, print_result
+from gpusense.commands import output
+from gpusense.commands.arguments import BACKEND_HELP, output_path, positive_number, whole_number
+from gpusense.commands.output import counted
 from gpusense.evaluation.machine import machine_line
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 HELP = "Run many jobs from a plan, on processes or a Dask cluster, into a table that survives crashes."
 FIRST = ("table", "processes", "device", "resume", "plot")
+SHARED = ("verbose",)
 CODES = {1: "some jobs failed", 2: "bad input, or the cluster ended"}
 
 LOCAL = "local"
@@ -74,7 +76,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--job-timeout", type=positive_number, metavar="SECONDS",
         help="longest time of a job, which then fails, and its worker is replaced (default: none)")  # fmt: skip
     add("--list", action="store_true", help="print the jobs with their keys, and run none")
-    add_json(parser, verbose=True)
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
         help="draw error against run time, with a point for each job")  # fmt: skip
 
@@ -98,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _list(jobs: tuple[Job, ...], *, as_json: bool) -> int:
     if as_json:
-        print_json({"jobs": [{"key": job.key, **_fields(job)} for job in jobs]})
+        output.document({"jobs": [{"key": job.key, **_fields(job)} for job in jobs]})
         return 0
     for job in jobs:
         texts = [f"{name}={value}" for name, value in job.labels]
@@ -193,16 +194,16 @@ def _report(args: argparse.Namespace, ended: Sweep, seconds: float) -> None:
         args.plot = None
     if args.json:
         figures = {name: getattr(ended, name) for name in ("jobs", "done", "failed", "skipped", "repeated")}
-        print_report({"table": args.table, "plot": args.plot, **figures, "seconds": seconds})
+        output.report({"table": args.table, "plot": args.plot, **figures, "seconds": seconds})
         return
     verdict = "DONE" if not ended.failed else f"{ended.failed} FAILED"
     before = f", {ended.skipped} were in the table before" if ended.skipped else ""
-    print_result(f"{verdict}: {ended.done} of {counted(ended.jobs, 'job')} ran in {seconds:.0f} s{before}")
+    output.result(f"{verdict}: {ended.done} of {counted(ended.jobs, 'job')} ran in {seconds:.0f} s{before}")
     if ended.failed:
-        print_fact("failed", "column 'error' of the table has the reasons; --resume --retry-failed runs them again")
+        output.fact("failed", "column 'error' of the table has the reasons; --resume --retry-failed runs them again")
     if ended.repeated:
-        print_fact("repeated", f"{ended.repeated} runs ended with their worker and were started again")
-    print_files(args.table, args.plot)
+        output.fact("repeated", f"{ended.repeated} runs ended with their worker and were started again")
+    output.files(args.table, args.plot)
     if args.verbose:
         print(f"\n{machine_line()}")
 

@@ -116,8 +116,8 @@ def test_a_map_alone_is_the_only_scene(tmp_path, capsys):
         ),
         (["--max-error", "0 cm"], "argument --max-error: must be a number > 0 with a unit of"),
         (["--max-time", "5"], "argument --max-time: must be a number > 0 with a unit of s, ms, us, got '5'"),
-        (["--output", "TEXT"], "--output: must be a folder, got a file: TEXT"),
-        (["--output", "absent/folder"], "absent: No such file or directory"),
+        (["--output", "TEXT"], "argument --output: must be a folder that can be written to, got 'TEXT': not a folder"),
+        (["--html", "page.txt"], "argument --html: must end in .html, got 'page.txt'"),
     ],
 )
 def test_bad_options_are_one_line(argv, message, tmp_path, monkeypatch, capsys):

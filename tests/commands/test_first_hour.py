@@ -134,12 +134,12 @@ def test_a_table_does_not_fold_on_a_narrow_terminal(capsys, monkeypatch):
     names = ("selection", "kind", "name", "driver", "status")
     rows = [("opencl:0:0", "cpu", "an accelerator with a long name", "PoCL 3.0, 16 lanes", "available"), ("", *"abcd")]
     narrow(monkeypatch, 60)
-    output.print_table(names, rows)
+    output.table(names, rows)
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "selection  opencl:0:0" and lines[2] == "name       an accelerator with a long name"
     assert lines[5:7] == ["", "kind       a"]
     narrow(monkeypatch, 160)
-    output.print_table(names, rows)
+    output.table(names, rows)
     wide = capsys.readouterr().out.splitlines()
     assert any("selection" in line and "driver" in line for line in wide) and len(wide) < len(lines)
 
@@ -147,7 +147,7 @@ def test_a_table_does_not_fold_on_a_narrow_terminal(capsys, monkeypatch):
 @pytest.mark.parametrize("width", range(26, 36))
 def test_no_width_folds_a_table(capsys, monkeypatch, width):
     narrow(monkeypatch, width)
-    output.print_table(("name", "error [m]", "time"), [("a longer name", "0.25", "1.5 ms")])
+    output.table(("name", "error [m]", "time"), [("a longer name", "0.25", "1.5 ms")])
     lines = [line.rstrip() for line in re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out).splitlines()]
     lines = [line for line in lines if line]
     table = lines[0].split() == ["name", "error", "[m]", "time"]

@@ -54,7 +54,7 @@ def test_write_whole_refuses_what_is_no_regular_file(tmp_path):
 
 def test_json_has_no_numbers_that_json_does_not_know(capsys):
     values = {"a": np.float32(np.inf), "b": [float("nan"), 1], "c": np.array([1.5, -np.inf]), "d": Path("x"), "e": None}
-    output.print_json(values)
+    output.document(values)
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, 1], "c": [1.5, None], "d": "x", "e": None}
 
 
@@ -66,7 +66,7 @@ def test_plain_table_is_aligned():
 def test_terminal_gets_a_table_and_a_progress_bar(monkeypatch, capsys):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    output.print_table(["name", "s"], [["[bold]numpy", "1.25"]], right=["s"])
+    output.table(["name", "s"], [["[bold]numpy", "1.25"]], right=["s"])
     with progress(2) as step:
         step("one")
         step("two")

@@ -14,7 +14,7 @@ import mpmath as mp
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from derive.remez import polynomial, remez
+from derive.lane_constants import polynomial, remez
 
 # 2/pi is needed to 1184 bits.
 mp.mp.dps = 400

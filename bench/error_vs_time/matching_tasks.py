@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from common import note
-from matchers import Matcher, matchers
+from rivals import Matcher, matchers
 from task_settings import Setting, Steps
 
 PAIRS = 60

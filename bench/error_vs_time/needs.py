@@ -1,7 +1,7 @@
 """Measure error against time of whole tasks: localisation, matching, learning, landmarks.
 
-    python bench/error_vs_time/needs.py --backend opencl --output NAME
-    python bench/error_vs_time/needs.py --backend opencl --need localisation --seconds 20 --longest 0.05   # quick
+    python bench/error_vs_time/measure.py --backend opencl --no-models --output NAME
+    python bench/error_vs_time/measure.py --backend opencl --no-models --need localisation --seconds 20 --output NAME
 
 *Localisation*: a robot with a laser of 1080 beams over 270 degrees drives through a generated building. People hide a
 fifth of the beams, and 2 % of the walls have moved since the map was made. Each setting of particles, beams, model,
@@ -34,17 +34,17 @@ from typing import Any
 import numpy as np
 
 import gpusense as gs
-from gpusense.backends import Backend, get_backend
+from gpusense.backends import Backend
 from gpusense.evaluation.benchmark.accuracy import factor_for, posterior_errors, temperature_of
-from gpusense.evaluation.benchmark.report import commit, plain, to_json
+from gpusense.evaluation.benchmark.report import plain
 from gpusense.evaluation.machine import machine
 from gpusense.evaluation.simulation.changes import surface_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-import rival_filters
-from common import command_line, make_parser, note, parse, table
+import rivals as other_programs
+from common import note
 from matching_tasks import between_scans, in_a_map, rivals
 from recordings import BEAM
 from speed.learning import TYPICAL, values
@@ -128,7 +128,9 @@ def localisation(device: Backend) -> Iterator[Setting]:
     grid = [(kind, n, k, "float32", {}) for kind, (ns, ks) in sizes.items() for n, k in itertools.product(ns, ks)]
     # Settings for comparison with the filters of other programs.
     grid += [
-        (kind, n, rival_filters.BEAMS, "float32", {}) for kind in ("field", "beam") for n in rival_filters.PARTICLES[:2]
+        (kind, n, other_programs.BEAMS, "float32", {})
+        for kind in ("field", "beam")
+        for n in other_programs.PARTICLES[:2]
     ]
     varied: list[tuple[str, int, int, str, dict[str, Any]]] = [
         (kind, 1000, 60, precision, options)
@@ -215,7 +217,7 @@ SETTINGS: dict[str, Callable[[Backend], Iterator[Setting]]] = dict(
 )
 
 RIVALS: dict[str, Callable[[Backend], Iterator[Setting]]] = {
-    "localisation": lambda device: rival_filters.rivals(simulated(device), START, SETTLING), "matching": rivals,
+    "localisation": lambda device: other_programs.rivals(simulated(device), START, SETTLING), "matching": rivals,
 }  # fmt: skip
 
 # ---- all
@@ -245,23 +247,6 @@ def measure(need: str, device: Backend, arguments: argparse.Namespace, *, peers:
     return [one.row(device) for one in settings]
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
-    """Format the rows that ran."""
-    columns = ("need", "device", "method", "setting", "precision", "ms (quartiles)", "processor ms", "error", "95 %")
-    lines = []
-    for row in rows:
-        if row["seconds"] is None:
-            continue
-        times = ", ".join(f"{1e3 * row['seconds'][name]:.3g}" for name in ("q1", "median", "q3"))
-        error, scale = row["error"], {"m": 100, "%": 100}.get(row["unit"], 1)
-        unit = {"m": "cm"}.get(row["unit"], row["unit"])
-        lines.append([
-            row["need"], row["backend"], row["method"], row["setting"], row["precision"], times,
-            f"{1e3 * row['processor_s']:.3g}", f"{scale * error['median']:.3g} {unit}", f"{scale * error['p95']:.3g}",
-        ])  # fmt: skip
-    return table(columns, lines)
-
-
 def add_options(parser: argparse.ArgumentParser, seconds: float = 120.0) -> None:
     """Add the options of :func:`measure`."""
     parser.add_argument("--need", action="append", choices=NEEDS, help="repeatable; default: all")
@@ -271,24 +256,6 @@ def add_options(parser: argparse.ArgumentParser, seconds: float = 120.0) -> None
         "--rounds", type=int, default=3, help="runs of each setting, each with its own seed; more of small drives"
     )
     parser.add_argument("--no-peers", action="store_true", help="without other implementations")
-
-
-def main() -> None:
-    """Measure the needs, print their tables and write the report."""
-    parser = make_parser(__doc__, backend="kernels")
-    add_options(parser)
-    arguments = parse(parser)
-    report = report_of(arguments, arguments.backend, command_line("bench/error_vs_time/needs.py"))
-    print(markdown(report["rows"]))
-    if arguments.output:
-        arguments.output.with_suffix(".json").write_text(to_json(report), encoding="utf-8")
-
-
-def report_of(arguments: argparse.Namespace, backends: Sequence[str], command: str) -> dict[str, Any]:
-    """Measure the needs and return the report."""
-    stated, devices = arguments.commit or commit(), [get_backend(name) for name in backends]
-    rows = [row for need in arguments.need or NEEDS for row in measured(need, devices, arguments)]
-    return document(rows, stated, command)
 
 
 def measured(need: str, devices: Sequence[Backend], arguments: argparse.Namespace) -> list[dict[str, Any]]:
@@ -306,7 +273,3 @@ def document(rows: Sequence[dict[str, Any]], stated: str | None, command: str) -
         "schema": SCHEMA, "kind": "needs", "date": time.strftime("%Y-%m-%d"), "commit": stated, "command": command,
         "machine": machine(), "rows": list(rows),
     })  # fmt: skip
-
-
-if __name__ == "__main__":
-    main()

@@ -17,11 +17,14 @@ They get the whole map in cells, without its yaw. ``filters.py`` adds the models
 
 from __future__ import annotations
 
+import ctypes
 import importlib.util
 import inspect
 import math
 import os
+import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -31,12 +34,13 @@ from scipy.ndimage import distance_transform_edt
 
 from gpusense._util.extras import install_command
 from gpusense.evaluation.benchmark.candidates import Candidate, Runner
+from gpusense.evaluation.benchmark.runner import LeftOutError
 from gpusense.evaluation.benchmark.scenes import Scene
 from gpusense.world.scanner import Reading, classify
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from speed import filters, range_libc
+from speed import filters
 
 THETA_BINS = (2000,)
 CDDT_BINS = (108, 720)
@@ -70,8 +74,8 @@ def hits(scene: Scene) -> np.ndarray:
 if numba is not None:
 
     @numba.njit(parallel=True, cache=True)
-    def score_logs(grid, beyond, poses, points):
-        """Sum a grid of log densities over the end points of each pose."""
+    def sum_grid(grid, beyond, poses, points):
+        """Sum a grid over the end points of each pose."""
         rows, cols = grid.shape
         found = np.empty(len(poses))
         for i in numba.prange(len(poses)):
@@ -99,22 +103,6 @@ if numba is not None:
                 if k % BLOCK == BLOCK - 1:
                     total, product = total + math.log(product), 1.0
             found[i] = total + math.log(product)
-        return found
-
-    @numba.njit(parallel=True, cache=True)
-    def score_cubes(grid, beyond, poses, points):
-        """Take the logarithm of the weight 1 + sum of cubed densities."""
-        rows, cols = grid.shape
-        found = np.empty(len(poses))
-        for i in numba.prange(len(poses)):
-            c, s, total = math.cos(poses[i, 2]), math.sin(poses[i, 2]), 1.0
-            for k in range(len(points)):
-                col = math.floor(poses[i, 0] + c * points[k, 0] - s * points[k, 1])
-                row = math.floor(poses[i, 1] + s * points[k, 0] + c * points[k, 1])
-                inside = 0 <= col < cols and 0 <= row < rows
-                p = grid[row, col] if inside else beyond
-                total += p * p * p
-            found[i] = math.log(total)
         return found
 
     @numba.njit(parallel=True, cache=True)
@@ -155,11 +143,16 @@ def numba_field(kind: str) -> Callable[[Scene, None, str], Runner]:
         values, beyond = density(distance), float(density(p.max_distance))
         if kind == "log grid":
             values, beyond = np.log(values), math.log(beyond)
+        elif kind == "sum of cubes":
+            values, beyond = values**3, beyond**3
         grid = values.astype(precision)
         cells, bearings = scene.readings[chosen] / scene.grid.resolution, scene.scanner.bearings[chosen]
         points = cells[:, None] * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
-        score = {"log grid": score_logs, "log of products": score_products, "sum of cubes": score_cubes}[kind]
-        return lambda poses: score(grid, beyond, in_cells(scene, poses), points)
+        if kind == "log of products":
+            return lambda poses: score_products(grid, beyond, in_cells(scene, poses), points)
+        # The weight of nav2_amcl and Beluga is 1 + sum of cubed densities.
+        after = np.log1p if kind == "sum of cubes" else np.asarray
+        return lambda poses: after(sum_grid(grid, beyond, in_cells(scene, poses), points))
 
     return make
 
@@ -190,12 +183,83 @@ def numba_march(bins: int) -> Callable[[Scene, None, str], Runner]:
     return make
 
 
+SOURCE = "RANGE_LIBC"
+CODE = Path(__file__).resolve().parents[1] / "accuracy" / "peer_code" / "range_libc.cpp"
+KINDS = ("BL", "RM", "CDDT", "PCDDT", "GLT")
+# range_libc's release options.
+_FLAGS = ("-w", "-std=c++11", "-march=native", "-ffast-math", "-fno-math-errno", "-O3", "-fPIC", "-shared")
+# Rays of the look-up table, of one thread: at some millions a second.
+_MOST_RAYS = 100_000_000
+_kept: list[tempfile.TemporaryDirectory[str]] = []
+
+
+def load_range_libc() -> tuple[ctypes.CDLL | None, str]:
+    """Compile range_libc; return the library, or the reason where it fails."""
+    source = os.environ.get(SOURCE, "")
+    if not source:
+        return None, f"not compiled: {SOURCE} must name a copy of its sources"
+    _kept.append(tempfile.TemporaryDirectory())
+    library = Path(_kept[-1].name) / "range_libc.so"
+    # lodepng is a header and a source.
+    sources = [str(CODE), str(Path(source) / "vendor" / "lodepng" / "lodepng.cpp")]
+    command = ["g++", *_FLAGS, f"-I{source}", "-DUSE_CUDA=0", "-o", str(library), *sources]
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        reason = (getattr(error, "stderr", "") or str(error)).strip().splitlines()
+        return None, f"not compiled: {reason[0] if reason else error}"
+    loaded = ctypes.CDLL(str(library))
+    loaded.make.restype = ctypes.c_void_p
+    return loaded, ""
+
+
+class RangeLibc:
+    """A caster of range_libc on a map in cells."""
+
+    def __init__(self, library: ctypes.CDLL, kind: str, occupied: np.ndarray, range_max: float, bins: int) -> None:
+        rows, cols = occupied.shape
+        if kind == "GLT" and rows * cols * bins > _MOST_RAYS:
+            raise LeftOutError(f"its table of {rows * cols * bins:.1e} rays would take too long on one thread")
+        self._library, self._kind = library, KINDS.index(kind)
+        cells = np.ascontiguousarray(occupied, np.uint8)
+        # It prints while it builds tables.
+        sys.stdout.flush()
+        with open(os.devnull, "w") as silent:
+            shown = os.dup(1)
+            os.dup2(silent.fileno(), 1)
+            try:
+                self._caster = ctypes.c_void_p(
+                    library.make(self._kind, _pointer(cells), cols, rows, ctypes.c_float(range_max), bins)
+                )
+            finally:
+                os.dup2(shown, 1)
+                os.close(shown)
+
+    def cast(self, poses: np.ndarray, angles: np.ndarray) -> np.ndarray:
+        """Return (N, K) ranges of (N, 3) poses, all in cells."""
+        placed, turned = np.ascontiguousarray(poses, np.float32), np.ascontiguousarray(angles, np.float32)
+        found = np.empty((len(placed), len(turned)), np.float32)
+        self._library.cast(
+            self._kind, self._caster, _pointer(placed), ctypes.c_long(len(placed)), _pointer(turned),
+            ctypes.c_long(len(turned)), _pointer(found),
+        )  # fmt: skip
+        return found
+
+    def __del__(self) -> None:
+        if hasattr(self, "_caster"):
+            self._library.destroy(self._kind, self._caster)
+
+
+def _pointer(array: np.ndarray) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
 def range_libc_caster(library: Any, kind: str, bins: int) -> Callable[[Scene, None, str], Runner]:
     """Make a runner of a range_libc method, in cells and in the frame of the grid."""
 
     def make(scene: Scene, backend: None, precision: str) -> Runner:
         limit = scene.scanner.range_max / scene.grid.resolution
-        caster = range_libc.Caster(library, kind, scene.grid.occupied, limit, bins)
+        caster = RangeLibc(library, kind, scene.grid.occupied, limit, bins)
 
         def run(poses: np.ndarray) -> np.ndarray:
             return caster.cast(in_cells(scene, poses), scene.scanner.bearings) * scene.grid.resolution
@@ -270,7 +334,7 @@ def candidates() -> list[Candidate]:
         Candidate("ranges", "numba march", numba_march(bins), "", "headings", bins, precision="float64", **own)
         for bins in THETA_BINS
     ]
-    library, missing = range_libc.load()
+    library, missing = load_range_libc()
     own = {"outside": "range_libc, 1 thread", "missing": missing}
     casters = [("BL", None), ("RM", None), *(("CDDT", bins) for bins in CDDT_BINS), ("PCDDT", CDDT_BINS[0]),
                ("GLT", TABLE_BINS)]  # fmt: skip

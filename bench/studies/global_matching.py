@@ -7,8 +7,7 @@
 another building, which must not be found. ``window``: 41 x 41 x 61 poses, 360 end points, by brute force and by branch
 and bound. ``large``: a map of 2000 x 2000 cells. ``maps``: ``build_map`` of even scans beside the derived map: share of
 odd end points near an obstacle, and mean log-likelihoods of odd scans. ``match``: local maps of 20 odd scans in the
-global map. ``olin``: scans of a robot with a turned scanner in its map. ``circular``: ranks of the true poses by
-circular correlation of ranges with rays from each position.
+global map. ``olin``: scans of a robot with a turned scanner in its map.
 """
 
 from __future__ import annotations
@@ -193,38 +192,6 @@ def match(backend: str, arguments: Any) -> list[dict[str, Any]]:
     return rows
 
 
-def circular(backend: str, arguments: Any) -> list[dict[str, Any]]:
-    """Rank true poses by the beams whose ranges agree with rays from positions 0.4 m apart, at all headings at once."""
-    turns, edges, rows = 360, np.geomspace(0.3, 20.0, 25), []
-    for place in ("intel", "csail", "seattle"):
-        grid, odd = odd_scans(arguments.data, place)
-        step, scanner = round(0.4 / grid.resolution), odd[0][1].scanner
-        row, col = np.nonzero(grid.free[::step, ::step])
-        positions = grid.cell_centers(row * step, col * step)
-        caster = gs.RayCaster(grid, edges[-1], backend=backend)
-        bins = np.digitize(
-            caster.cast(np.pad(positions, ((0, 0), (0, 1))), 2 * np.pi / turns * np.arange(turns)), edges
-        )
-        beams = np.round(scanner.bearings / (2 * np.pi / turns)).astype(int) % turns
-        ranks = []
-        for _, scan in evenly(odd, arguments.scans):
-            used = (scan.ranges > 0) & (scan.ranges < edges[-1])
-            agreeing = np.zeros(bins.shape)
-            for number in range(len(edges) + 1):
-                mine = np.zeros(turns)
-                mine[beams[used & (np.digitize(scan.ranges, edges) == number)]] = 1
-                seen = np.fft.rfft(np.abs(bins - number) <= 1, axis=1)
-                agreeing += np.fft.irfft(seen * np.conj(np.fft.rfft(mine)), turns, axis=1)
-            near = np.hypot(*(positions - scan.pose[:2]).T) < 0.3 * np.sqrt(2)
-            right = agreeing[near][:, (round(np.degrees(scan.pose[2])) + np.arange(-2, 3)) % turns]
-            if right.size:
-                ranks.append(np.count_nonzero(agreeing > right.max() + 1e-6))
-        rows.append({"map": place, "scans": len(ranks), "poses": bins.size, "rank_median": float(np.median(ranks))}
-                    | {f"first_{most}": float(np.mean(np.array(ranks) < most)) for most in (1, 128, 1024)})  # fmt: skip
-        note(f"{backend} circular correlation in {place}")
-    return rows
-
-
 def olin(backend: str, arguments: Any) -> list[dict[str, Any]]:
     """Localise scans of the Olin bag in its map."""
     recording = recordings.load("olin")
@@ -234,8 +201,7 @@ def olin(backend: str, arguments: Any) -> list[dict[str, Any]]:
     return [{"log": "olin", "map": "olin"} | located(model, chosen)]
 
 
-PARTS = {"locate": locate, "window": window, "large": large, "maps": maps, "match": match, "olin": olin,
-         "circular": circular}  # fmt: skip
+PARTS = {"locate": locate, "window": window, "large": large, "maps": maps, "match": match, "olin": olin}
 
 
 def shown(value: Any) -> str:

@@ -62,7 +62,7 @@ def test_other_matchers_find_the_motion(
         row = one.row(device)
         assert (row["backend"], row["kind"], row["outside"]) == ("outside", "cpu", one.outside)
         assert "1 thread" in one.outside and row["error"]["median"] < 0.06 and row["processor_s"] > 0
-    names = {one.method for one in importlib.import_module("matchers").matchers()}
+    names = {one.method for one in importlib.import_module("rivals").matchers()}
     assert names == {"small_gicp icp", "small_gicp gicp", "csm"} >= {one.method for one in settings}
 
 
@@ -72,8 +72,8 @@ def test_tasks_are_measured(
     """Known correspondences of landmarks are true, the likeliest ones are not; the rows have all times."""
     tasks, selection = importlib.import_module("needs"), needs("opencl")
     monkeypatch.setattr(tasks, "PARTICLES", 300)
-    given = argparse.Namespace(need=["landmarks"], rounds=2, seconds=99.0, longest=99.0, commit="abc", no_peers=True)
-    report = tasks.report_of(given, [selection], "python bench/error_vs_time/needs.py")
+    given = argparse.Namespace(rounds=2, seconds=99.0, longest=99.0, no_peers=True)
+    report = tasks.document(tasks.measured("landmarks", [get_backend(selection)], given), "abc", "measure.py")
     measure.write(tmp_path / "x", "tasks", report)
     assert measure.reports.read(tmp_path / "x_tasks.json", "tasks") == report
     assert (report["kind"], report["commit"]) == ("needs", "abc")
@@ -82,4 +82,3 @@ def test_tasks_are_measured(
     for row in rows.values():
         assert (row["runs"], row["reason"], row["unit"]) == (2, "", "nats")
         assert 0 < row["seconds"]["min"] <= row["seconds"]["q1"] <= row["seconds"]["q3"] and row["processor_s"] > 0
-    assert tasks.markdown(report["rows"]).count("landmarks") == len(rows)

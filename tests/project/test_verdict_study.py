@@ -47,7 +47,7 @@ def test_closures_are_compared_with_references_by_end_points(script: ModuleType,
 
 def test_the_study_of_the_verdict_counts_alarms_and_misses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "bench"))
-    report = importlib.import_module("verdict_report")
+    report = importlib.import_module("studies.verdict")
     job = dict.fromkeys(report.FIELDS, 0.0) | {"case": "own"}
     rows = np.zeros((60, 9))
     # The robot is carried away after 20 scans, and the filter notices it 30 scans later; one alarm is false.

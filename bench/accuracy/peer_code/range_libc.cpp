@@ -1,4 +1,4 @@
-// range_libc's casters as C functions; bench/speed/range_libc.py compiles it against a copy of range_libc.
+// range_libc's casters as C functions; bench/speed/baselines.py compiles it against a copy of range_libc.
 #include "includes/RangeLib.h"
 
 namespace {

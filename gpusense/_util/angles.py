@@ -3,18 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, overload
-
-import numpy as np
-from numpy.typing import NDArray
-
-
-@overload
-def wrapped(angle: float) -> float: ...
-
-
-@overload
-def wrapped(angle: NDArray[np.floating]) -> NDArray[np.float64]: ...
+from typing import Any
 
 
 def wrapped(angle: Any) -> Any:

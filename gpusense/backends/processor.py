@@ -6,8 +6,12 @@ import functools
 import hashlib
 import os
 import platform
-from collections.abc import Sequence
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 if TYPE_CHECKING:
     from concurrent.futures import Future, ThreadPoolExecutor
@@ -89,3 +93,126 @@ def finish(helpers: Sequence[Future[Any]]) -> None:
             interrupted = error
     if interrupted is not None:
         raise interrupted
+
+
+# ---- large copies between host arrays and a GPU: in pieces, through page-locked memory, by several threads
+
+
+# Size of a slot [bytes], number of slots, and number of slots that threads fill or empty while the device works on the
+# rest.
+SLOT, SLOTS, _AHEAD = 4 << 20, 16, 12
+# Least sizes of a copy for which pieces pay, and of a piece [bytes]; pieces of a copy that needs no more slots:
+# each piece costs the calling thread some 0.05 ms.
+LEAST, _LEAST_PIECE, _FEWEST = 8 << 20, 1 << 20, 6
+# Threads below which a driver's own copy is faster.
+_LEAST_THREADS = 4
+
+
+class Slot(ABC):
+    """A piece of page-locked memory."""
+
+    bytes: np.ndarray  # the memory as an array of the host
+
+    @abstractmethod
+    def to_device(self, buffer: Any, first: int, size: int) -> None:
+        """Start copying ``size`` bytes of the slot into a buffer, from its byte ``first`` on."""
+
+    @abstractmethod
+    def to_host(self, buffer: Any, first: int, size: int) -> None:
+        """Start copying ``size`` bytes of a buffer, from its byte ``first`` on, into the slot."""
+
+    @abstractmethod
+    def wait(self) -> None:
+        """Wait until the last copy of the slot has ended."""
+
+
+class Staging:
+    """Slots of a device, which serve one copy at a time.
+
+    ``make``: allocates the slots, given their number and bytes, when they are needed first.
+    """
+
+    def __init__(self, make: Callable[[int, int], Sequence[Slot]]) -> None:
+        self._make, self._slots = make, list[Slot]()
+        self._lock = threading.Lock()
+
+    def upload(self, array: np.ndarray, buffer: Any) -> bool:
+        """Copy a C-contiguous array to the head of a buffer; the array may change afterwards.
+
+        Returns:
+            False if a plain copy is faster; nothing was copied then.
+        """
+        return self._run(array, buffer, _send)
+
+    def download(self, buffer: Any, out: np.ndarray) -> bool:
+        """Copy the head of a buffer into a C-contiguous array, full on return.
+
+        Returns:
+            False if a plain copy is faster; nothing was copied then.
+        """
+        return self._run(out, buffer, _receive)
+
+    def _run(self, array: np.ndarray, buffer: Any, copy: Callable[..., None]) -> bool:
+        """Copy an array by a function, if that pays and no other thread uses the slots."""
+        if array.nbytes < LEAST or threads() < _LEAST_THREADS or not self._lock.acquire(blocking=False):
+            return False
+        started: list[Future[None]] = []
+        try:
+            if not self._slots:
+                self._slots = list(self._make(SLOTS, SLOT))
+            copy(self._slots, array.reshape(-1).view(np.uint8), buffer, started)
+        finally:
+            # No thread may use slots or array any more, not even after an error.
+            try:
+                finish(started)
+            finally:
+                self._lock.release()
+        return True
+
+
+def _pieces(size: int) -> list[tuple[int, int]]:
+    """Return the first byte and the bytes of each piece."""
+    piece = min(max(-(-size // _FEWEST), _LEAST_PIECE), SLOT)
+    return [(first, min(piece, size - first)) for first in range(0, size, piece)]
+
+
+def _send(slots: Sequence[Slot], source: np.ndarray, buffer: Any, started: list[Any]) -> None:
+    """Copy an array to a device."""
+    workers, pieces = pool(os.getpid()), _pieces(source.size)
+
+    def fill(number: int) -> None:
+        (first, size), slot = pieces[number], slots[number % len(slots)]
+        slot.wait()
+        started.append(workers.submit(np.copyto, slot.bytes[:size], source[first : first + size]))
+
+    for number in range(1, min(_AHEAD, len(pieces))):
+        fill(number)
+    # The calling thread also works.
+    slots[0].wait()
+    np.copyto(slots[0].bytes[: pieces[0][1]], source[: pieces[0][1]])
+    for number, (first, size) in enumerate(pieces):
+        if number + _AHEAD < len(pieces):
+            fill(number + _AHEAD)
+        if number:
+            started[number - 1].result()
+        slots[number % len(slots)].to_device(buffer, first, size)
+
+
+def _receive(slots: Sequence[Slot], out: np.ndarray, buffer: Any, started: list[Any]) -> None:
+    """Copy from a device to an array."""
+    workers, pieces = pool(os.getpid()), _pieces(out.size)
+    for slot, piece in zip(slots, pieces, strict=False):
+        # The device may still read what an earlier call has sent.
+        slot.wait()
+        slot.to_host(buffer, *piece)
+    for number, (first, size) in enumerate(pieces):
+        slot = slots[number % len(slots)]
+        slot.wait()
+        started.append(workers.submit(np.copyto, out[first : first + size], slot.bytes[:size]))
+        # The slot of an earlier piece takes a later one.
+        emptied = number - _AHEAD
+        if emptied >= 0 and emptied + len(slots) < len(pieces):
+            started[emptied].result()
+            slots[emptied % len(slots)].to_host(buffer, *pieces[emptied + len(slots)])
+    for helper in started:
+        helper.result()

@@ -29,8 +29,8 @@ from gpusense.localization.temperature import BeamCorrelation, learn_from_scan
 from gpusense.localization.weights import normalize_weights
 from gpusense.logs import Pose, Scan
 from gpusense.models.scan.beam import BeamModel
+from gpusense.models.scan.classed import choose_beams
 from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.models.scan.rules import choose_beams
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, classify
 from gpusense.world.sensor_table import SensorTable

@@ -52,10 +52,7 @@ def real_dtype(precision: str, backend: Backend) -> np.dtype:
 
 
 def check_absent(where: str, **options: object) -> None:
-    """Refuse options that must be None.
-
-    ``where``: when they must be, in words of the message.
-    """
+    """Refuse options that must be None (``where``: when they must be, in words of the message)."""
     for name, value in options.items():
         if value is not None:
             raise ValueError(f"{name}: must be None {where}, got {checks.show(value)}")

@@ -25,10 +25,7 @@ _ROUND = 256
 
 
 def chunk_of(backend: Backend, beams: int, itemsize: float = 0) -> int:
-    """Return the largest number of particles of a launch.
-
-    ``beams``: beams of each particle; 0 counts as 1.
-    """
+    """Return the largest number of particles of a launch (``beams``: beams of each particle; 0 counts as 1)."""
     chunk, beams = CHUNK, max(beams, 1)
     if itemsize:
         info = backend.info

@@ -1,7 +1,5 @@
 """Beam model of a whole scan, log p(z | x, m): cast, evaluate the mixture and sum (book table 6.1)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gpusense.interface import structs

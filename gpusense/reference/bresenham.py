@@ -9,8 +9,6 @@ many cells at once. n cells along a line of l cells that ends s cells aside, it 
 rounded down; straight ahead (2 n s + l - 1) / (2 l).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from gpusense.reference.ray import make_ray, off_grid, start_casts

@@ -9,8 +9,6 @@ Table of integers: number of lines of a bin; for each bin its cosine and sine in
 where it is occupied; then the obstacles in 2^-10 cells.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from gpusense.reference.ray import angle_bin, off_grid, ray_direction

@@ -3,8 +3,6 @@
 It is exact, with the same bits as the exact caster. The table holds 1 for occupied cells in a ring of twos.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from gpusense.reference.ray import make_ray, start_casts

@@ -8,8 +8,6 @@ cloud (differential evolution: ter Braak 2006); differences between separate clu
 from a pool: free cells, or the modes of a likelihood map.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from gpusense.interface.constants import RESIDUAL, STAGE, STRATIFIED, TOTAL, WEIGHT_SUMS

@@ -3,8 +3,6 @@
 A ring of two cells around the table represents everything outside the grid, so no look-up needs a bounds test.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from gpusense.interface import structs

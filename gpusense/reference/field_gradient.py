@@ -5,8 +5,6 @@ J the derivatives of d: ``d log p / d pose = -(d / sigma^2) r J``, and the infor
 sigma^2``, which leaves out second derivatives of d and of r.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from gpusense.interface import structs

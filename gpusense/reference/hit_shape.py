@@ -6,8 +6,6 @@ with nu degrees of freedom has E = power log(1 + rate t), power = (nu + 1) / 2, 
 (MASS_TABLE); here it is the incomplete beta function.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.special import betainc
 

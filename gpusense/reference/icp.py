@@ -1,7 +1,5 @@
 """Scan matching by point-to-line ICP with exact nearest points; see icp_pairs.py and icp_match.py."""
 
-from __future__ import annotations
-
 from gpusense.interface.constants import MATCH_RESULT, MATCH_RULES
 from gpusense.reference.icp_match import match_in_turns, rules_of
 

@@ -4,8 +4,6 @@ The table has, for each cell and bin, the range from the cell's centre in the bi
 535.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from gpusense.reference.ray import angle_bin, make_ray, start_casts

@@ -1,7 +1,5 @@
 """The look-up table of expected ranges, filled by the exact caster from the centres of cells, some rows at a time."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gpusense.interface import structs

@@ -6,8 +6,6 @@ tolerance, and an obstacle is missed only where the ray's path through it is sho
 other programs, any step may pass obstacles.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from gpusense.reference.ray import make_ray, off_grid, start_walk

@@ -1,7 +1,5 @@
 """Expected ranges of poses and bearings by any caster."""
 
-from __future__ import annotations
-
 import importlib
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A pair of scans, from their readings: noise, points and lines, for match_scans of icp.py."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gpusense.reference.line_fit import fit_scan

@@ -1,7 +1,5 @@
 """End points of scans at all headings, as cells of tables of scores; see ``search``."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

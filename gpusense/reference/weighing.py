@@ -6,8 +6,6 @@ previous one is taken; the rest of b is left to the next stage of the correction
 sampling*, 2001). Weights are rounded to integers below 2^53 / N, so that their sums are exact in any order.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from gpusense.interface.constants import (

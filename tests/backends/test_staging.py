@@ -7,10 +7,10 @@ import gc
 import numpy as np
 import pytest
 
-from gpusense.backends import arrays, processor, recycled, staging
+from gpusense.backends import arrays, processor, recycled
 
 
-class _Slot(staging.Slot):
+class _Slot(processor.Slot):
     """A slot that copies only at a wait, as late as a device may copy."""
 
     def __init__(self, size: int) -> None:
@@ -36,30 +36,30 @@ class _Slot(staging.Slot):
 @pytest.fixture
 def slots(monkeypatch):
     """Use small slots on a host with several threads."""
-    monkeypatch.setattr(staging, "SLOT", 4096)
-    monkeypatch.setattr(staging, "LEAST", 100)
-    monkeypatch.setattr(staging, "_LEAST_PIECE", 512)
+    monkeypatch.setattr(processor, "SLOT", 4096)
+    monkeypatch.setattr(processor, "LEAST", 100)
+    monkeypatch.setattr(processor, "_LEAST_PIECE", 512)
     monkeypatch.setattr(processor, "threads", lambda: 4)
-    return [_Slot(4096) for _ in range(staging.SLOTS)]
+    return [_Slot(4096) for _ in range(processor.SLOTS)]
 
 
-@pytest.mark.parametrize("size", [100, 8192, 4096 * staging.SLOTS, 4096 * 41 + 7])
+@pytest.mark.parametrize("size", [100, 8192, 4096 * processor.SLOTS, 4096 * 41 + 7])
 def test_large_copies(slots, size):
     """Copy arrays smaller than a slot, as large as all slots, and larger, in both directions."""
     made = []
-    large = staging.Staging(lambda number, size: made.append((number, size)) or slots)
+    large = processor.Staging(lambda number, size: made.append((number, size)) or slots)
     array = np.random.default_rng(size).integers(256, size=size).astype(np.uint8)
     there, back = np.zeros(size + 8, np.uint8), np.zeros(size, np.uint8)
     assert large.upload(array, there)
     [slot.wait() for slot in slots]
     assert large.download(there, back)
-    assert made == [(staging.SLOTS, 4096)]
+    assert made == [(processor.SLOTS, 4096)]
     assert np.array_equal(there[:size], array) and np.array_equal(back, array) and not there[size:].any()
 
 
 def test_plain_copies(slots, monkeypatch):
     """The driver copies small arrays, on hosts of few threads, and in a second thread."""
-    large = staging.Staging(lambda number, size: slots)
+    large = processor.Staging(lambda number, size: slots)
     array, there = np.zeros(1000, np.uint8), np.zeros(1000, np.uint8)
     assert not large.upload(array[:99], there)
     with large._lock:
@@ -71,7 +71,7 @@ def test_plain_copies(slots, monkeypatch):
 
 def test_a_failed_copy_leaves_the_slots_to_the_next(slots):
     """An error of the device propagates, and later copies work."""
-    large = staging.Staging(lambda number, size: slots)
+    large = processor.Staging(lambda number, size: slots)
     array, there = np.arange(40000, dtype=np.uint8), np.zeros(40000, np.uint8)
     slots[3].to_device = lambda *_: (_ for _ in ()).throw(MemoryError("no"))
     with pytest.raises(MemoryError):

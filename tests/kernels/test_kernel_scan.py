@@ -14,8 +14,7 @@ from gpusense.backends import Backend
 from gpusense.evaluation.tolerances import differing
 from gpusense.interface.constants import BLOCK_TERMS, MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
 from gpusense.interface.structs import Frame, ReadingRules, Window
-from gpusense.models.scan.classed import class_scans
-from gpusense.models.scan.rules import BeamSelection, choose_beams
+from gpusense.models.scan.classed import BeamSelection, choose_beams, class_scans
 from gpusense.reference.scan import is_chosen
 from gpusense.world.frames import frame_of, ray_vectors, split
 from gpusense.world.scanner import Reading

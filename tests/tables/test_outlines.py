@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense.tables.outlines import REACH, Outlines
+from gpusense.tables.normals import REACH, Outlines
 
 TURNS = (0.0, 0.05, 0.2, 0.4, 0.55, math.pi / 4, 1.1, 1.4)
 

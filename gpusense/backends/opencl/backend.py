@@ -29,8 +29,8 @@ from gpusense.backends.opencl.memory import (
     shares_memory,
     slots_of,
 )  # fmt: skip
+from gpusense.backends.processor import Staging
 from gpusense.backends.recycled import ResultMemory
-from gpusense.backends.staging import Staging
 from gpusense.interface.launches import Program
 from gpusense.interface.signatures import KERNELS
 from gpusense.interface.sources import assemble, relevant, uses_double, with_places

@@ -16,7 +16,7 @@ from gpusense._util.checks import show
 from gpusense._util.interrupts import undisturbed
 from gpusense._util.memory import prefer_large_pages
 from gpusense.backends.base import Adopted, Buffer
-from gpusense.backends.staging import Slot
+from gpusense.backends.processor import Slot
 
 if TYPE_CHECKING:
     import pyopencl.array
@@ -95,7 +95,7 @@ class driver_errors:
             raise_clearly(error)
 
 
-# ---- page-locked memory for large copies; see :mod:`gpusense.backends.staging`
+# ---- page-locked memory for large copies; see :mod:`gpusense.backends.processor`
 
 
 class OpenCLSlot(Slot):

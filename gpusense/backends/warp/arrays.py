@@ -10,7 +10,7 @@ import warp as wp
 
 from gpusense._util.checks import check_gradients, show
 from gpusense.backends.base import Adopted, Buffer
-from gpusense.backends.staging import Slot
+from gpusense.backends.processor import Slot
 
 
 def has_protocol(array: object) -> bool:
@@ -64,7 +64,7 @@ def _flat(address: int, count: int, dtype: Any, device: str) -> Buffer:
     return wp.array(ptr=address, dtype=dtype, shape=(count,), device=device)
 
 
-# ---- page-locked memory for large copies; see :mod:`gpusense.backends.staging`
+# ---- page-locked memory for large copies; see :mod:`gpusense.backends.processor`
 
 
 class WarpSlot(Slot):

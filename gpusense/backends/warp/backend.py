@@ -16,8 +16,8 @@ import warp as wp
 
 from gpusense._util.memory import prefer_large_pages
 from gpusense.backends.base import Adopted, Backend, BackendInfo, ProcessBound, Recording
+from gpusense.backends.processor import Staging
 from gpusense.backends.recycled import ResultMemory
-from gpusense.backends.staging import Staging
 from gpusense.backends.warp.arrays import adopted, has_protocol, slots_of
 from gpusense.backends.warp.graphs import GraphCache, WarpRecording
 from gpusense.backends.warp.launch import SCALARS, Launch, host_view

@@ -15,10 +15,10 @@ from gpusense.backends.arrays import Result
 from gpusense.interface.plan import SceneNotes
 from gpusense.models.arguments import check_absent, check_discrete
 from gpusense.models.scan.beam_pipeline import BeamPipeline, scene_notes
+from gpusense.models.scan.classed import Beams
 from gpusense.models.scan.map_caster import MapCaster, cones_of, require_exact
 from gpusense.models.scan.mixture import density_of, mixture_on_device
 from gpusense.models.scan.model import ScanModel
-from gpusense.models.scan.rules import Beams
 from gpusense.models.scan.sampling import drawing_of, poses_to_draw_at
 from gpusense.peers.weights import Peer, check_weights, choose
 from gpusense.tables import casters

@@ -24,12 +24,11 @@ from gpusense.interface.plan import (
 )
 from gpusense.interface.structs import MixtureTables
 from gpusense.models.poses import PlacedPoses
-from gpusense.models.scan.classed import ClassedScans
+from gpusense.models.scan.classed import ClassedScans, ModelContext
 from gpusense.models.scan.map_caster import Cones, MapCaster
 from gpusense.models.scan.mixture import BeamDensity, Mixture, hit_peak
 from gpusense.models.scan.pipeline import ScanLaunch, ScanPipeline, Tiles
 from gpusense.models.scan.readings import ReadingLayout, Readings
-from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.scoring import LastCall
 from gpusense.models.scan.tiles import LEAST_ORDERED, stranded, sum_launch, tiles_of
 from gpusense.world.frames import ray_vectors
@@ -37,10 +36,7 @@ from gpusense.world.parameters import BeamParameters, IncidenceParameters
 
 
 class BeamPipeline(ScanPipeline):
-    """The stages of a beam model.
-
-    ``max_evaluated``: True if max readings are evaluated by the mixture.
-    """
+    """The stages of a beam model (``max_evaluated``: True if max readings are evaluated by the mixture)."""
 
     orders = True
     kernel_names = ("score_beams",), ("beam_tiles", "sum_parts")

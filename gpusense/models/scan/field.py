@@ -16,11 +16,11 @@ from gpusense.backends import Selection
 from gpusense.interface.constants import HIGH_PEAK
 from gpusense.interface.plan import Note, Omission, SceneNotes, component_notes, launch_omissions, precision_notes
 from gpusense.models.chunking import finish
+from gpusense.models.scan.classed import Beams
 from gpusense.models.scan.field_gradient import Climbs, Differentiable, Gradients, in_world
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.model import ScanModel
 from gpusense.models.scan.pipeline import make_request
-from gpusense.models.scan.rules import Beams
 from gpusense.peers.weights import Peer, check_weights, choose
 from gpusense.tables.world_map import check_no_worlds
 from gpusense.tables.worlds import Worlds

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -39,25 +39,18 @@ _PARTS = {"gpu": 16, "cpu": 1}
 
 
 class Gradients:
-    """Log p, its gradient (3) and the information (9) of S scans at poses, (S N, 13) in the grid's frame.
-
-    The scans of all calls are equal: they are classed once, and copied once if one program evaluates them.
-    """
+    """Log p, its gradient (3) and the information (9) of S scans at poses, (S N, 13) in the grid's frame."""
 
     def __init__(self, pipeline: FieldPipeline, space: Workspace) -> None:
         self._pipeline, self._space = pipeline, space
-        self._groups: Sequence[tuple[Piece, ClassedScans]] | None = None
-        # The piece whose readings are on the device.
-        self._copied: tuple[tuple[int, int] | None, Readings | None] = None, None
 
     def __call__(self, request: Request) -> np.ndarray:
         pipeline = self._pipeline
         result = np.zeros((request.scans * request.per_scan, GRADIENT_NUMBERS), pipeline.real)
-        if self._groups is None:
-            self._groups = [group for group in pipeline.groups(request) if group[0].count]
-        for particles, scans in self._groups:
-            most = pipeline.most_particles(4 * scans.most_readings, None)
-            run_pieces(self._space, particles, most, partial(self._score, request, particles, scans, result))
+        for particles, scans in pipeline.groups(request):
+            if particles.count:
+                most = pipeline.most_particles(4 * scans.most_readings, None)
+                run_pieces(self._space, particles, most, partial(self._score, request, particles, scans, result))
         return result
 
     def _score(self, request: Request, particles: Piece, scans: ClassedScans, result: np.ndarray, piece: Piece) -> None:
@@ -66,13 +59,8 @@ class Gradients:
         scans, rows = scans.part(first - ahead, last - ahead), result[piece.begin : piece.end]
         if (value := self._pipeline.value(scans)) is not None:
             rows[:, 0] = value
-            return
-        part, readings = self._copied
-        if readings is None or part != piece.part:
-            self._copied = None, None
-            readings = self._pipeline.upload(self._split(scans), self._space)
-            self._copied = piece.part, readings
-        self._run(request.poses, piece, readings, rows)
+        else:
+            self._run(request.poses, piece, self._pipeline.upload(self._split(scans), self._space), rows)
 
     def _split(self, scans: ClassedScans) -> ClassedScans:
         """Return scans to copy."""

@@ -14,10 +14,9 @@ from gpusense.interface.lanes import with_lanes_flag, with_loops_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import FieldTerms, Score, packed
 from gpusense.models.poses import PlacedPoses
-from gpusense.models.scan.classed import ClassedScans
+from gpusense.models.scan.classed import ClassedScans, ModelContext
 from gpusense.models.scan.pipeline import ScanLaunch, ScanPipeline, Tiles
 from gpusense.models.scan.readings import ReadingLayout, Readings
-from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.tiles import ENOUGH_SHORT, spread_of, sum_launch
 from gpusense.tables.field import RING, FieldTable
 from gpusense.tables.reachable import ReachableMap

@@ -267,10 +267,7 @@ class BeamDensity:
 
     @property
     def possible(self) -> bool:
-        """Return whether ranges can be possible.
-
-        If ``max_depends``, the kernel detects impossible ranges.
-        """
+        """Return whether ranges can be possible. If ``max_depends``, the kernel detects impossible ranges."""
         return self.max_depends or any(p.z_hit or p.z_short or p.z_rand for p in self.mixtures)
 
 

@@ -21,9 +21,9 @@ from gpusense.interface.plan import Plan, SceneNotes
 from gpusense.models.arguments import Pickled, check_scene, map_words, real_dtype
 from gpusense.models.chunking import finish
 from gpusense.models.poses import Poses
+from gpusense.models.scan.classed import Beams, BeamSelection, ModelContext, check_beams
 from gpusense.models.scan.field_gradient import Differentiable, is_recorded, log_likelihood_of
 from gpusense.models.scan.pipeline import Request, ScanPipeline, make_request
-from gpusense.models.scan.rules import Beams, BeamSelection, ModelContext, check_beams
 from gpusense.models.scan.savings import plan_of_call
 from gpusense.models.scan.scoring import LastCall, ResidentPoses, run
 from gpusense.peers.weights import Peer, choose

@@ -22,9 +22,8 @@ from gpusense.interface.launches import Program
 from gpusense.interface.structs import ScanBatch, Score
 from gpusense.models.chunking import Piece, chunk_of
 from gpusense.models.poses import Part, PlacedPoses, Poses, place
-from gpusense.models.scan.classed import ClassedScans, check_ranges, class_scans
+from gpusense.models.scan.classed import ClassedScans, ModelContext, check_ranges, class_scans
 from gpusense.models.scan.readings import ReadingLayout, Readings, placing_launches
-from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.tiles import Order, Parts, order_of
 from gpusense.tables.reachable import MapState, ReachableMap
 from gpusense.tables.world_index import WorldIndex

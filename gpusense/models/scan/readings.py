@@ -16,7 +16,7 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Launch, Program, launch
 from gpusense.interface.structs import ReadingRules
 from gpusense.models.poses import PlacedPoses
-from gpusense.models.scan.rules import ModelContext
+from gpusense.models.scan.classed import ModelContext
 from gpusense.world.range_causes import NoReturn
 from gpusense.world.scanner import range_limits
 

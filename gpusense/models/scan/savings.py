@@ -12,9 +12,8 @@ from gpusense.backends.workspace import Workspace
 from gpusense.interface.plan import Omission, Plan, SceneNotes, share
 from gpusense.interface.signatures import KERNELS
 from gpusense.models.chunking import finish
-from gpusense.models.scan.classed import ClassedScans
+from gpusense.models.scan.classed import ClassedScans, ModelContext
 from gpusense.models.scan.pipeline import Request, ScanPipeline
-from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.scoring import LastCall, run
 from gpusense.world.grid import OccupancyGrid
 

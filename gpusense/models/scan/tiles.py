@@ -98,10 +98,7 @@ class Parts(NamedTuple):
 
 
 def sum_launch(flags: frozenset[str], particles: int, parts: Parts, **arguments: Any) -> Launch:
-    """Return the launch that sums the parts of each particle.
-
-    ``arguments``: the other arguments of ``sum_parts``.
-    """
+    """Return the launch that sums the parts of each particle (``arguments``: the other arguments of ``sum_parts``)."""
     return launch(
         "sum_parts", flags, (particles,), parts=parts.buffer, particles=particles, count=parts.count,
         block=parts.block, **arguments,

@@ -16,8 +16,7 @@ from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
 from gpusense.models import chunking
 from gpusense.models.scan import pipeline
-from gpusense.models.scan.classed import ClassedScans, OmittedReadings, _join, class_scans
-from gpusense.models.scan.rules import BeamSelection
+from gpusense.models.scan.classed import BeamSelection, ClassedScans, OmittedReadings, _join, class_scans
 
 BEAMS, RANGE = 37, 5.0
 RNG = np.random.default_rng(5)

@@ -202,6 +202,8 @@ def _device(info: BackendInfo, library: Library, verdict: DeviceCheck | None = N
 
 
 # ---- the devices among which ``"auto"`` chooses, the fastest first, and the devices that failed
+#
+# Each device is tried in turn: its library is loaded, its verdict is obtained, and it is opened. NumPy is the last.
 
 
 # Least speed ratio at which a device replaces an earlier device of its class.

@@ -1,4 +1,4 @@
-"""The host: its instruction sets, its memory, and a fingerprint for code that is compiled for it."""
+"""The host: its instruction sets, memory and fingerprint, and threads that share its part of large work."""
 
 from __future__ import annotations
 
@@ -96,6 +96,9 @@ def finish(helpers: Sequence[Future[Any]]) -> None:
 
 
 # ---- large copies between host arrays and a GPU: in pieces, through page-locked memory, by several threads
+#
+# A driver copies ordinary host memory with one thread, at a fraction of the speed at which the device reads and writes
+# page-locked memory. Threads also share the page faults of new results.
 
 
 # Size of a slot [bytes], number of slots, and number of slots that threads fill or empty while the device works on the

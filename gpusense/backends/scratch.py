@@ -174,6 +174,10 @@ def _remove_killed(folder: Path) -> None:
 
 
 # ---- folders for compiled kernels: a place that the user or the system chooses, and a folder of gpusense's in it
+#
+# The place is ``$GPUSENSE_CACHE_DIR``, else ``$XDG_CACHE_HOME/gpusense``, else the system's place for caches. It may
+# hold files of other programs: gpusense reads, writes and deletes only in its folder ``gpusense-kernels``, identified
+# by a marker file. Kernels are code: no other user may write in it or rename a folder above it.
 
 
 OWN = "gpusense-kernels"

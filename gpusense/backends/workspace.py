@@ -268,6 +268,11 @@ class Workspace:
 
 
 # ---- the programs of earlier calls, which repeated calls start again
+#
+# A cache belongs to one owner, holds strong references to its programs and their buffers, and is referenced only by its
+# owner. Nothing in it refers to the owner, so programs are freed with the owner at once. The oldest one goes earlier
+# where there are too many, and all of them when the owner replaces a buffer, or the table of the map. The owner's lock
+# also protects the cache. A forked child must not use the device (``Backend.check_process``).
 
 
 class ProgramCache(Generic[T]):

@@ -132,21 +132,11 @@ def launch_omissions(code: frozenset[str], least_ordered: tuple[int, int] | None
     elif code and "SHAPES" not in code:
         omissions.append(Omission("moving shapes", "no world has shapes", "an intersection of each ray and shape"))
     if "ROUNDED_CELLS" in code:
-        omissions.append(
-            Omission(
-                "guard of each end point",
-                "cells are found by rounding, and again where one of 16 end points is near an edge",
-                "a branch per particle-beam",
-            )
-        )
+        why = "cells are found by rounding, and again where one of 16 end points is near an edge"
+        omissions.append(Omission("guard of each end point", why, "a branch per particle-beam"))
     if "INSIDE" in code:
-        omissions.append(
-            Omission(
-                "clamps to the table",
-                "no end point of the cloud leaves the table",
-                "four comparisons per particle-beam",
-            )
-        )
+        why = "no end point of the cloud leaves the table"
+        omissions.append(Omission("clamps to the table", why, "four comparisons per particle-beam"))
     if code and least_ordered is not None and "ORDERED" not in code:
         rays, particles = least_ordered
         why = f"a launch has fewer than {rays} rays or {particles} particles"

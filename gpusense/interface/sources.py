@@ -207,6 +207,9 @@ def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
 
 
 # ---- the preprocessor of kernel sources: keep the branches that a set of flags selects
+#
+# ``#define`` and ``#pragma`` are left to the compiler. Other directives than conditions are refused: a compiler would
+# resolve them without knowing the flags.
 
 
 _DIRECTIVE = re.compile(r"\s*#\s*(\w*)\s*(.*?)\s*(//.*)?$")

@@ -168,7 +168,7 @@ def log_density(flags, z, expected, terms):
 
 
 def compat_density(flags, z, expected, terms):
-    """Return the density to be cubed, whose cubes nav2_amcl and Beluga sum over the beams of a scan.
+    """Return the density whose cube nav2_amcl and Beluga add for each beam of a scan.
 
     amcl's is without normalisers, Beluga's with both (book table 6.1). Terms are linear; hit_peak is z_hit alone for
     amcl, and z_max is no logarithm. A reading of range_max is a max reading; amcl's longer readings are neither

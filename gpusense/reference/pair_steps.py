@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.reference.reading_class import is_hit
+from gpusense.reference.sorting import sort_numbers
 
 # Median absolute value of a normal error [standard deviations].
 MEDIAN = 0.6745
@@ -17,11 +18,6 @@ LEAST_STEP, ODD = 1e-3, 0.02
 LEAST_BEAMS = 12
 # Points nearer than this have no bearing [m].
 NEAREST = 1e-6
-
-
-def sort_numbers(number: np.ndarray) -> None:
-    """Sort the rows of an array in ascending order, in place."""
-    number.sort(axis=1)
 
 
 def deviation_of(

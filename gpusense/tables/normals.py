@@ -1,7 +1,7 @@
 """Compute normals of a map's walls, for angles of incidence.
 
 The outline of a wall is followed from side to side of its cells. The normal of a straight outline is perpendicular to a
-line through the sides of the cell's piece of outline, which ends at corners (``outlines``).
+line through the sides of the cell's piece of outline, which ends at corners (``Outlines``).
 
 Elsewhere, on tight bends and in clutter, the occupied cells within RADIUS cells of a cell have a mean and a covariance.
 A wall is long and thin, so that its normal is the direction of least variance. A post varies equally in all directions:

@@ -218,7 +218,7 @@ real log_density(const real z, const real expected, global const MixtureTerms *t
 #endif
 
 #if CUBES
-// Return the density to be cubed, whose cubes nav2_amcl and Beluga sum over the beams of a scan: amcl's without
+// Return the density whose cube nav2_amcl and Beluga add for each beam of a scan: amcl's without
 // normalisers, Beluga's with both (book table 6.1). Terms are linear; hit_peak is z_hit alone for amcl, and z_max is no
 // logarithm. A reading of range_max is a max reading; amcl's longer readings are neither random nor max readings.
 real compat_density(const real z, const real expected, global const MixtureTerms *terms) {

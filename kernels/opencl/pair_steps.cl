@@ -1,4 +1,5 @@
-// Noise and points of scans, from their readings; see gpusense/matching/noise.py and points.py.
+// Noise and points of scans, from their readings; see gpusense/matching/noise.py and points.py. sort_numbers, scalar or in
+// lanes, stands before this file in a program.
 // requires: reading_class
 
 // Median absolute value of a normal error [standard deviations], and the deviation of rounding to steps of sqrt(12).
@@ -13,33 +14,6 @@
 #define LEAST_BEAMS 12
 // Points nearer than this have no bearing [m].
 #define NEAREST 1e-6
-
-// Write count numbers, a multiple of 8, in ascending order: each goes to the place that as many numbers precede.
-#if IN_LANES
-void sort_numbers(global const double *number, const int count, global double *sorted) {
-    for (int i = 0; i < count; ++i) {
-        const double mine = number[i];
-        const long8 own = (long8)(i) - (long8)(0, 1, 2, 3, 4, 5, 6, 7);
-        long8 before = 0;
-        for (int j = 0; j < count; j += 8) {
-            const double8 other = vload8(0, number + j);
-            before -= (other < mine) | ((other == mine) & ((long8)(j) < own));
-        }
-        const long4 four = before.lo + before.hi;
-        const long2 two = four.lo + four.hi;
-        sorted[two.x + two.y] = mine;
-    }
-}
-#else
-void sort_numbers(global const double *number, const int count, global double *sorted) {
-    for (int i = 0; i < count; ++i) {
-        const double mine = number[i];
-        int before = 0;
-        for (int j = 0; j < count; ++j) before += number[j] < mine || (number[j] == mine && j < i);
-        sorted[before] = mine;
-    }
-}
-#endif
 
 // Return the difference between a range and its prediction from neighbours on a straight wall, in standard deviations;
 // infinite where they are on different surfaces. weight has the neighbours' weights.

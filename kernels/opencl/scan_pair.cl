@@ -1,5 +1,5 @@
 // A pair of scans, from their readings: noise, points and lines, for match_scans of icp.cl.
-// requires: line_fit pair_steps
+// requires: line_fit sorting pair_steps
 
 // Place two scans of one scanner, a reference and a second one: points of their hits by bearing, with lines for the noise of
 // the pair; the pair itself, with the row of its rules, which depends on its level of noise and on the stride of its second

@@ -272,7 +272,7 @@ def functions(flags):
 
     @wp.func
     def compat_density(z: real, expected: real, terms: wp.array(dtype=types.MixtureTerms)):
-        """Return the density to be cubed, whose cubes nav2_amcl and Beluga sum over the beams of a scan. amcl's is
+        """Return the density whose cube nav2_amcl and Beluga add for each beam of a scan. amcl's is
         without normalisers, Beluga's with both (book table 6.1).
         """
         off = z - expected

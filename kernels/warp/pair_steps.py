@@ -8,6 +8,7 @@ import warp as wp
 
 from .prelude import precision
 from .reading_class import is_hit
+from .sorting import sort_numbers
 
 ZERO, ONE, MINUS_ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0)), wp.constant(wp.float64(-1.0))
 FOREVER = wp.constant(wp.float64(math.inf))
@@ -22,21 +23,6 @@ ODD = wp.constant(wp.float64(0.02))
 LEAST_BEAMS = wp.constant(12)
 # Points nearer than this have no bearing [m].
 NEAREST = wp.constant(wp.float64(1e-6))
-
-
-@wp.func
-def sort_numbers(number: wp.array(dtype=wp.float64), first: wp.int32, count: wp.int32, to: wp.int32):
-    """Write count numbers from first on in ascending order, from to on: each goes to the place that as many numbers
-    precede.
-    """
-    for i in range(count):
-        mine = number[first + i]
-        before = int(0)
-        for j in range(count):
-            other = number[first + j]
-            if other < mine or (other == mine and j < i):
-                before += 1
-        number[to + before] = mine
 
 
 @wp.func

@@ -260,6 +260,10 @@ def _environment(variables: dict[str, str]) -> Iterator[None]:
 
 
 # ---- the files of the OpenCL drivers of this machine
+#
+# The loader inside pyopencl's wheel reads the system's ``.icd`` files and those next to pyopencl. Intel's runtime is
+# also a wheel, but its file names a folder that exists on no user's machine: a new one, in a folder with the system's
+# files, replaces it. Writing next to pyopencl would change files that another package owns.
 
 
 _SYSTEM = "/etc/OpenCL/vendors"

@@ -1,4 +1,4 @@
-"""Launches of one OpenCL kernel: arguments are bound by the signature table."""
+"""Launches of OpenCL kernels, whose arguments are bound by the signature table, and recordings of launches."""
 
 from __future__ import annotations
 

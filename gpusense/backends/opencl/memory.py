@@ -1,4 +1,4 @@
-"""Memory of an OpenCL device, and the errors of its driver."""
+"""Memory of an OpenCL device, arrays of pyopencl in it, and the errors of its driver."""
 
 from __future__ import annotations
 

@@ -203,6 +203,13 @@ def _replace(place: int, name: str) -> None:
 
 
 # ---- kernels that PoCL has compiled: kept between processes, with checksums
+#
+# PoCL keeps a program's kernels in files below ``<folder>/XX/YYY...``, named by a hash of the source and the options,
+# and loads them without a check. Its folder belongs to this process; a program's folder is copied there from an entry
+# of the cache before the program is built, and back after its kernels have run. For that hash PoCL preprocesses its
+# headers and the source, 27 ms a program, so a program is made of its bitcode where the version of PoCL takes that, in
+# 1 ms. PoCL names kernels of bitcode by the kernel's name and the size of its groups alone: kernels get names that end
+# in a hash.
 
 
 # Files that PoCL reads again: programs, and kernels for a group size.

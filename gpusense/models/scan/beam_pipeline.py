@@ -1,4 +1,4 @@
-"""The beam model on a device: its mixture, rays and ranges of readings, flags and launches."""
+"""The beam model on a device: its mixture, rays and ranges of readings, flags and launches; and its report."""
 
 from __future__ import annotations
 

@@ -21,7 +21,6 @@ from gpusense.matching.field_search import (
 from gpusense.matching.location import NAMES, Location, PoseMode, Status, location_evidence, probabilities_right
 from gpusense.matching.pose_grid import PoseGrid, distinct_poses
 from gpusense.models.scan.caster import RayCaster
-from gpusense.models.scan.classed import BeamChoice
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.tables.world_map import check_one_map
 from gpusense.world.scanner import Reading, classify, float64_readings

@@ -25,7 +25,7 @@ import numpy as np
 import gpusense as gs
 from gpusense.evaluation.matching import WRONG, WRONG_TURN, differences, relative_poses
 from gpusense.evaluation.worlds import free_pose
-from gpusense.matching.noise import match_noise, scan_noise
+from gpusense.matching.points import match_noise, scan_noise
 from gpusense.matching.result import ScanMatch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))

@@ -16,9 +16,9 @@ from gpusense.backends import Selection, get_backend
 from gpusense.chaining.links import Links, chained, relative, scan_motions
 from gpusense.localization.motion import OdometryMotion
 from gpusense.localization.pose_algebra import compose_poses, invert_poses
-from gpusense.matching.basin import is_held
+from gpusense.matching.icp_with_search import is_held
 from gpusense.matching.match import WINDOW, match_log, match_scan
-from gpusense.matching.noise import scan_noise
+from gpusense.matching.points import scan_noise
 from gpusense.matching.result import ScanMatch
 from gpusense.world.scanner import Scanner
 

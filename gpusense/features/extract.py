@@ -19,8 +19,7 @@ from gpusense.features.objects import find_doors, find_poles
 from gpusense.features.result import KINDS, Features, Found, check_kinds, features_of, joined, nothing, turned_axes
 from gpusense.features.segments import NEIGHBOURS, ScanDevice, Segments, beams_of, by_bearing, find_segments
 from gpusense.matching.match import readings
-from gpusense.matching.noise import ASSUMED_NOISE, whole_noise
-from gpusense.matching.points import scan_points
+from gpusense.matching.points import ASSUMED_NOISE, scan_points, whole_noise
 from gpusense.world.scanner import Scanner, classify_ranges
 
 # Least and largest noise for splitting scans [m].

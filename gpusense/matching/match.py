@@ -15,9 +15,8 @@ from gpusense._util.typing import AnyArray, CasterName, Precision
 from gpusense.backends import Selection, arrays, get_backend
 from gpusense.backends.base import Backend
 from gpusense.matching.icp_with_search import match_pairs
-from gpusense.matching.noise import ASSUMED_NOISE, map_noise, match_noise, scan_noise
 from gpusense.matching.options import MatchOptions, check_guess, check_options
-from gpusense.matching.points import scan_points
+from gpusense.matching.points import ASSUMED_NOISE, map_noise, match_noise, scan_noise, scan_points
 from gpusense.matching.result import ScanMatch
 from gpusense.matching.scan_pair import match_pair, supports_single_pair
 from gpusense.matching.to_map import MapMatcher, match_to_map

@@ -18,11 +18,9 @@ from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.matching.icp import WIDTH, PlacedPairs, line_rules, slack_of, space_of
 from gpusense.matching.icp_with_search import POOR, POOR_TURN, finished, judged_pairs, to_sensor
-from gpusense.matching.noise import NoiseLevels, beams_in_order, neighbors, noise_levels
-from gpusense.matching.options import COARSE_POINTS, MatchOptions
-from gpusense.matching.points import beams_by_angle
+from gpusense.matching.options import COARSE_POINTS, Levels, MatchOptions
+from gpusense.matching.points import NoiseLevels, beams_by_angle, beams_in_order, neighbors, noise_levels
 from gpusense.matching.result import ScanMatch
-from gpusense.matching.start_search import Levels
 from gpusense.world.scanner import Scanner, range_limits
 
 _DOUBLE, _INT = np.dtype(np.float64), np.dtype(np.int32)

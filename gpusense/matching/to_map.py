@@ -15,17 +15,16 @@ import numpy as np
 from gpusense._util.angles import wrapped
 from gpusense._util.typing import CasterName
 from gpusense.backends import Backend
-from gpusense.matching.basin import is_held
-from gpusense.matching.columns import column_of, matrices_of, triangle_of
-from gpusense.matching.icp_with_search import DOUBTFUL, match_pairs
+from gpusense.matching.columns import column_of, columns_of, matrices_of, triangle_of
+from gpusense.matching.icp import LONG_WIDTH, WIDTH, IcpPairs, points_of_line, space_of
+from gpusense.matching.icp_with_search import DOUBTFUL, is_held, match_pairs
 from gpusense.matching.observability import axes_of, balance_of, observed_information, orthonormal
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints, dense_scanner, scan_points
 from gpusense.matching.result import ScanMatch
 from gpusense.matching.score_tables import ScoreTables, field_scores
 from gpusense.matching.search import PoseGrid, Search
-from gpusense.matching.uncertainty import observable_directions
-from gpusense.matching.verdicts import concluded, judged, pair_evidence, pair_sums
+from gpusense.matching.verdicts import concluded, judged, observed_pairs, pair_evidence, pair_sums
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.tables.distances import distance_transform
@@ -255,6 +254,42 @@ class MapMatcher:
             pose, triangle_of(joint), variance, score, iterations, status, lever, unknown, evidence, pairs, noise,
             self._options.window,
         )  # fmt: skip
+
+
+def observable_directions(
+    ranges: np.ndarray, pose: np.ndarray, variance: np.ndarray, scanner: Scanner, backend: Backend, real: np.dtype,
+    options: MatchOptions,
+) -> np.ndarray:  # fmt: skip
+    """Return the information (S, 3, 3) on poses by the scans' lines, 0 along directions that they do not observe.
+
+    Distances to a map ignore lines: the ends of a corridor's walls in the map, or gaps between cells, seem to constrain
+    the position along the corridor. A scan matched with itself has the information of its lines. ``ranges`` are (S, K)
+    readings [m], ``pose`` (S, 3) poses of the robot, ``variance`` (S,) variances of distances from the map [m^2].
+    """
+    points = scan_points(ranges, scanner, real)
+    everything = np.arange(len(pose))
+    lock, space = space_of(backend)
+    noise = np.full(len(pose), options.noise)
+    with lock, space:
+        device = IcpPairs(backend, real, points, np.stack([everything, everything], axis=1), noise, space)
+        device.fit_lines(lambda level: max(WIDTH, LONG_WIDTH * level))
+        rules = options.rules(int(points.counts.max(initial=0)), points.gap)
+        result = device.run(everything, np.zeros((len(pose), 1, 3)), [rules])[:, 0]
+    turned = _turned(pose[:, 2], scanner.mount[:2])
+    numbers, back = columns_of(result), turned.transpose(0, 2, 1)
+    information, doubt = (triangle_of(turned @ matrices_of(numbers[at : at + 6]) @ back) for at in (6, 12))
+    lever = points.rms_range(everything)
+    deviation, length = column_of(noise), column_of(lever)
+    lines = numbers[19] / points_of_line(points.gap, deviation, length)
+    found = observed_pairs(information, doubt, deviation**2, length, lines)
+    return matrices_of(found.information) / np.maximum(variance, 1e-12)[:, None, None]
+
+
+def _turned(heading: np.ndarray, mount: tuple[float, float]) -> np.ndarray:
+    """Return (S, 3, 3) derivatives that convert information on sensors' poses to that on robots' poses in the world."""
+    c, s, (x, y) = np.cos(heading), np.sin(heading), mount
+    zero, one = np.zeros(len(c)), np.ones(len(c))
+    return np.stack([c, -s, zero, s, c, zero, zero - y, zero + x, one], axis=1).reshape(-1, 3, 3)
 
 
 def _joint(field: np.ndarray, own: np.ndarray, bias: float, lever: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Noise and points of scans, from their readings; see ``gpusense.matching.noise`` and ``points``."""
+"""Noise and points of scans, from their readings; see ``gpusense.matching.points``."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-// Noise and points of scans, from their readings; see gpusense/matching/noise.py and points.py. sort_numbers, scalar or in
-// lanes, stands before this file in a program.
+// Noise and points of scans, from their readings; see gpusense/matching/points.py. sort_numbers, scalar or in lanes, stands
+// before this file in a program.
 // requires: reading_class
 
 // Median absolute value of a normal error [standard deviations], and the deviation of rounding to steps of sqrt(12).

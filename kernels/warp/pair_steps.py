@@ -1,4 +1,4 @@
-"""Noise and points of scans, from their readings; see gpusense/matching/noise.py and points.py."""
+"""Noise and points of scans, from their readings; see gpusense/matching/points.py."""
 
 import functools
 import math

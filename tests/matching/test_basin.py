@@ -9,7 +9,7 @@ from support.selection import present
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.matching import basin
+from gpusense.matching import icp_with_search
 
 FRONT = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / 180, count=181, range_max=12.0)
 MOUNTED = gs.Scanner(FRONT.bearings, FRONT.range_max, mount=(0.4, -0.2, 0.3))
@@ -46,7 +46,11 @@ def lost_and_held(
     )
     rows = np.flatnonzero(match.usable & (match.eigenvalues == 0).any(axis=1))
     some, motions = match.ordered(rows), (None, None) if moved is None else (moved[rows], moved[rows])
-    return rows, some, basin.is_held(one[rows], two[rows], scanner, some, get_backend(device), "float32", motions)
+    return (
+        rows,
+        some,
+        icp_with_search.is_held(one[rows], two[rows], scanner, some, get_backend(device), "float32", motions),
+    )
 
 
 @pytest.mark.parametrize("scanner", [FRONT, MOUNTED], ids=["at the robot", "mounted"])
@@ -99,7 +103,7 @@ def test_starts_have_the_noise_of_the_match(monkeypatch, noise):
     one, two = pairs([CORRIDOR, CORRIDOR], np.array([0.1, 0.0, 0.0]), FRONT)
     match = gs.match_scan(one, two, FRONT, backend="numpy", noise=noise)
     used: list[float] = []
-    made = basin.IcpPairs
-    monkeypatch.setattr(basin, "IcpPairs", lambda *given: (used.extend(given[4]), made(*given))[1])
-    basin.is_held(one, two, FRONT, match, get_backend("numpy"), "float32")
+    made = icp_with_search.IcpPairs
+    monkeypatch.setattr(icp_with_search, "IcpPairs", lambda *given: (used.extend(given[4]), made(*given))[1])
+    icp_with_search.is_held(one, two, FRONT, match, get_backend("numpy"), "float32")
     assert used == [noise] * 4

@@ -17,7 +17,7 @@ from gpusense.matching.columns import (
     squared_length,
     triangle_of,
 )
-from gpusense.matching.uncertainty import noise_of
+from gpusense.matching.verdicts import noise_of
 
 
 def drawn(count: int) -> np.ndarray:

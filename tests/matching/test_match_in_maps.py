@@ -13,8 +13,8 @@ from support.selection import present
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.matching.match import WINDOW, match_log
-from gpusense.matching.noise import match_noise, scan_noise
 from gpusense.matching.options import MatchOptions
+from gpusense.matching.points import match_noise, scan_noise
 from gpusense.matching.to_map import MapMatcher
 
 

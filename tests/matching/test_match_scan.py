@@ -9,7 +9,7 @@ import pytest
 from support.matching_scenes import CORRIDOR, FRONT, RING, ROOM, SQUARE, WALL, random_pairs, segments_scan
 
 import gpusense as gs
-from gpusense.matching.uncertainty import inflation_of
+from gpusense.matching.verdicts import inflation_of
 from gpusense.reference.icp_step import block_squares
 
 

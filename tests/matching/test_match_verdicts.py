@@ -11,8 +11,8 @@ from support.matching_scenes import FRONT, RING, WALL, box, random_pairs, relati
 
 import gpusense as gs
 from gpusense.matching.columns import matrices_of, triangle_of
-from gpusense.matching.noise import ROOT, scan_noise
 from gpusense.matching.observability import covariance_of, critical_ratio, observed_information
+from gpusense.matching.points import ROOT, scan_noise
 from gpusense.matching.result import STATUSES
 from gpusense.matching.verdicts import NAMES
 

@@ -14,9 +14,8 @@ from gpusense.backends import get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import MATCH_RESULT
 from gpusense.matching.icp import space_of
-from gpusense.matching.noise import match_noise, noise_levels, scan_noise
 from gpusense.matching.options import check_options
-from gpusense.matching.points import scan_points
+from gpusense.matching.points import match_noise, noise_levels, scan_noise, scan_points
 from gpusense.matching.scan_pair import _program, _Scene
 
 MOUNTED = gs.Scanner(FRONT.bearings, 30.0, 0.1, (0.2, 0.05, 0.3))

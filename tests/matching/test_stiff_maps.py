@@ -11,7 +11,7 @@ from support.matching_scenes import CORRIDOR, FRONT, RING, ROOM, WALL, segments_
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.matching.options import MatchOptions
-from gpusense.matching.uncertainty import observable_directions
+from gpusense.matching.to_map import observable_directions
 
 METHODS = ["auto", "gauss_newton", "correlative"]
 PLACES = {"near": (0.0, 0.0, 0.0), "far and yawed": (5e6, -4e6, 0.6)}

@@ -90,11 +90,14 @@ def scanned_files() -> list[Path]:
 
 
 def test_prose_has_no_banned_words():
+    # Tokens of Python take long: files without a banned word anywhere are not divided into passages.
     found = [
-        f"{file.relative_to(ROOT).as_posix()}:{line + passage.count(chr(10), 0, offset)}: {text}"
+        f"{file.relative_to(ROOT).as_posix()}:{line + passage.count(chr(10), 0, offset)}: {words}"
         for file in scanned_files()
-        for line, passage in PASSAGES[file.suffix](file.read_text(encoding="utf-8"))
-        for offset, text in findings(passage)
+        for text in [file.read_text(encoding="utf-8")]
+        if BANNED.search(re.sub("#|//", " ", text)) or CLAUSE.search(re.sub("#|//", " ", text))
+        for line, passage in PASSAGES[file.suffix](text)
+        for offset, words in findings(passage)
     ]
     assert not found, "\n".join(["banned words, see CONTRIBUTING.md:", *found])
 

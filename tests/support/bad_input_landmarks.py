@@ -1,4 +1,4 @@
-"""Bad input to the landmark map, its parameters and its model, with the exact messages, as in bad_input_models.py."""
+"""Bad input to the landmark map, its parameters and its model, with the exact messages."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.kernel_scenes import PRECISIONS, on_both, scene_flags
+from support.kernel_scenes import on_both, scene_flags
 
 import gpusense as gs
 from gpusense.backends import Backend
@@ -16,7 +16,7 @@ from gpusense.interface.constants import BLOCK_TERMS, MAX_FIXED, MAX_LEFT_OUT, M
 from gpusense.interface.structs import Frame, ReadingRules, Window
 from gpusense.models.scan.classed import BeamSelection, choose_beams, class_scans
 from gpusense.reference.scan import is_chosen
-from gpusense.world.frames import frame_of, ray_vectors, split
+from gpusense.world.frames import ray_vectors, split
 from gpusense.world.scanner import Reading
 
 RANGE, NEAREST, RESOLUTION, GUARD = 5.0, 0.2, 0.05, 3.25 * 2.0**-23
@@ -101,6 +101,7 @@ def test_readings_are_placed_as_the_host_prepares_them(
                 assert found["guard"][block] == real.type(GUARD * (longest + 2))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.long_on("warp")
 @pytest.mark.parametrize(("precision", "single"), [(np.float32, True), (np.float32, False), (np.float64, False)])
 @pytest.mark.parametrize(("end_points", "each"), [(True, 1), (False, 3)], ids=["end points", "rays"])
@@ -146,43 +147,8 @@ def test_readings_that_keep_their_places(device: Backend) -> None:
     assert differing(found["point"], vectors.astype(np.float32).ravel()) == 0
 
 
-@pytest.mark.long_on("warp")
-def test_a_range_where_none_is_possible_is_reported(device: Backend) -> None:
-    ranges = np.array([1.0, np.inf, np.nan, np.inf])
-    vectors = np.ones((4, 1, 2))
-    for flags in (frozenset({"END_POINTS"}), frozenset()):
-        for z, fixed in ((ranges, -np.inf), (ranges[[1, 1, 2, 3]], np.float32(3 * np.log(0.1)))):
-            found = placed(device, flags, z, vectors, 4, 4, MAX_FIXED, 0, NEAREST, np.log(0.1), np.inf)
-            assert found["constant_term"][0] == fixed
-            values = found["point" if flags else "reading"]
-            assert np.isnan(values).all()
-
-
 def test_an_even_choice_is_that_of_the_host() -> None:
     for informative, chosen in itertools.product(range(1, 40), range(42)):
         kinds = np.full(informative, Reading.HIT)
         expected = choose_beams(kinds, chosen, True)
         assert (is_chosen(np.arange(informative), informative, chosen) == expected).all()
-
-
-@pytest.mark.long_on("warp")
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_poses_are_placed_along_with_readings(precision: type, device: Backend) -> None:
-    """Poses equal those from place_poses for any number of preceding work-items for readings."""
-    rng, count, beams, grid = np.random.default_rng(5), 150, 53, gs.OccupancyGrid(np.zeros((9, 12), np.int8), 0.5)
-    poses = np.stack([rng.uniform(-1, 7, count), rng.uniform(-1, 5, count), rng.uniform(-4, 4, count)], axis=-1)
-    poses[7, 1] = np.nan
-    frame = frame_of(grid, (0.1, -0.2, 0.0)), Window(0, 0, *grid.shape), count
-    outputs = [np.full((count, 2), 77, np.int32), *np.full((2, count, 4), 77, precision), np.zeros(2, np.int32)]
-    flags = scene_flags(precision, "TWO_PART_POINTS")
-    alone, _ = on_both(device, "place_poses", flags, (count,), poses, *outputs, *frame)
-    room = [np.zeros(2 * beams, precision) for _ in range(5)]
-    readings = (rng.uniform(0, RANGE, beams), np.arange(beams, dtype=np.int32), np.ones((beams, 2)))
-    for head in (64, 128):
-        rules = ReadingRules(NEAREST, RANGE, -1.0, np.inf, GUARD, beams, 1, beams, beams, MAX_FIXED, 1)
-        call = (*outputs, *readings, *room, *frame, head, rules)
-        both = on_both(device, "place_inputs", flags, (head + count,), poses, *call)
-        for found in both:
-            for name in ("pose_cell", "pose", "pose_low", "pose_status"):
-                assert differing(found[name], alone[name]) == 0, name
-        assert both[1]["pose_status"].all() and differing(both[1]["reading"], both[0]["reading"]) == 0

@@ -1,10 +1,9 @@
-"""Tables of a map: distances, bits, empty rectangles and the field have the same numbers in every language."""
+"""Empty rectangles of a map are the best there are, and have the same numbers in every language."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 import zlib
 from collections.abc import Callable
 from typing import Any
@@ -14,67 +13,15 @@ import pytest
 from support.kernel_scenes import (
     GROUPED,
     PLANES,
-    UNREACHABLE,
     each_grid,
-    on_both,
     planes_of,
     row_after_row,
-    squared_distances,
 )
 
 from gpusense.backends import Backend, get_backend
 from gpusense.reference.rectangles import OCCUPIED, slope
-from gpusense.tables.distances import packed
 from gpusense.tables.rectangles import Planes, empty_rectangles
 from gpusense.world.windows import Window
-
-# ---- distances
-
-
-@pytest.mark.sampled(0.5)
-@each_grid
-@pytest.mark.parametrize("columns_first", [True, False])
-def test_distances_are_the_squares_of_the_exact_transform(
-    occupied: np.ndarray, columns_first: bool, device: Backend
-) -> None:
-    rows, cols = occupied.shape
-    by_column, by_row = (cols, rows, 1, cols), (rows, cols, cols, 1)
-    first, second = (by_column, by_row) if columns_first else (by_row, by_column)
-    cells, blank = occupied.astype(np.uint8), np.zeros(occupied.shape, np.int32)
-    reference, found = on_both(device, "distance_lines", frozenset(), (first[0],), cells, blank, *first)
-    np.testing.assert_array_equal(found["along"], reference["along"])
-    reference, found = on_both(
-        device, "distance_envelope", frozenset(), (second[0],), reference["along"], blank, blank, *second
-    )
-    np.testing.assert_array_equal(found["squared"], reference["squared"])
-    np.testing.assert_array_equal(found["squared"], squared_distances(occupied))
-
-
-@each_grid
-@pytest.mark.parametrize("most", [0, 29, 1601, UNREACHABLE])
-def test_distances_of_a_work_item_a_cell_are_exact_up_to_a_cap(
-    occupied: np.ndarray, most: int, device: Backend
-) -> None:
-    rows, cols = occupied.shape
-    bits, blocks = packed(occupied), -(-rows // 32)
-    blank, least = np.zeros(occupied.shape, np.uint16), np.zeros((blocks, cols), np.uint16)
-    reach = min(math.isqrt(most), 32767)
-    call = ("distance_bits", frozenset(), (cols, rows), bits, blank, rows, cols, bits.shape[1], reach)
-    reference, found = on_both(device, *call)
-    np.testing.assert_array_equal(found["nearest"], reference["nearest"])
-    nearest = found["nearest"]
-    call = ("distance_blocks", frozenset(), (cols, blocks), nearest, least, rows, cols, blocks)
-    reference, found = on_both(device, *call)
-    np.testing.assert_array_equal(found["blocks"], reference["blocks"])
-    squared = np.zeros(occupied.shape, np.int32)
-    call = ("distance_search", frozenset(), (cols, rows), nearest, found["blocks"], squared, rows, cols, blocks, most)
-    reference, found = on_both(device, *call)
-    np.testing.assert_array_equal(found["squared"], reference["squared"])
-    exact = squared_distances(occupied)
-    np.testing.assert_array_equal(found["squared"], np.where(exact <= most, exact, UNREACHABLE))
-
-
-# ---- empty rectangles
 
 
 def blocked_before(occupied: np.ndarray) -> np.ndarray:

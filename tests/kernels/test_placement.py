@@ -160,24 +160,6 @@ def assert_same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -
         assert found[name].tobytes() == expected[name].tobytes(), name
 
 
-@pytest.fixture(params=["opencl", "warp"])
-def device(request, needs) -> Backend:
-    return get_backend(needs(request.param))
-
-
-@pytest.mark.sampled(0.3)
-@pytest.mark.parametrize("given_as", PRECISIONS)
-@pytest.mark.parametrize("real", PRECISIONS)
-@pytest.mark.parametrize("name", FRAMES)
-def test_every_device_gives_the_bits_of_the_reference(name, real, given_as, device):
-    poses = rounded(poses_of(name), given_as)
-    scene = grid_of(name), FRAMES[name][2], real
-    for names in ((), ("TWO_PART_POINTS",)):
-        expected = launch(get_backend("numpy"), poses, *scene, names)
-        assert_same(launch(device, poses, *scene, names), expected)
-        assert (expected["pose_low"] == 77).all() == (not names)
-
-
 @pytest.mark.parametrize("real", PRECISIONS)
 @pytest.mark.parametrize("name", FRAMES)
 def test_the_kernel_does_what_the_host_does(name, real, backend):
@@ -247,23 +229,6 @@ def test_one_sensor_outside_the_window_is_reported(x, y, outside, backend):
     poses = np.repeat(INSIDE, 1000, axis=0)
     poses[617, :2] = x, y
     assert launch(get_backend(backend), poses, PLAIN, NO_MOUNT, "float32")["pose_status"].tolist() == [0, outside]
-
-
-def test_a_pose_status_is_kept_over_launches_until_it_is_cleared(backend):
-    device = get_backend(backend)
-    status = device.upload(np.zeros(2, np.int32))
-    kernel = device.compile("place_poses", frozenset())
-    buffers = (
-        device.empty(2, np.dtype(np.int32)),
-        device.empty(4, np.dtype(np.float32)),
-        device.empty(4, np.dtype(np.float32)),
-    )
-    told = []
-    for x in (INSIDE[0, 0], -5.0, INSIDE[0, 0]):
-        poses = device.upload(np.array([[x, INSIDE[0, 1], 0.0]]))
-        kernel((1,), poses, *buffers, status, frame_of(PLAIN, NO_MOUNT), Window(0, 0, ROWS, COLS), 1)
-        told.append(device.download(status, np.empty(2, np.int32)).tolist())
-    assert told == [[0, 0], [0, 1], [0, 1]]
 
 
 @pytest.mark.parametrize("yaw", [0.0, 3 * math.pi / 4])

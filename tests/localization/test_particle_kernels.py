@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -237,20 +235,6 @@ def test_other_draws_have_the_bits_of_the_reference(backend, draws, lanes):
         assert 0 < found["copies"][-1] <= 1500 and (np.diff(found["copies"]) >= 0).all()
 
 
-@pytest.mark.parametrize("count", [1, 37, 1500, 3000])
-def test_estimates_have_the_same_bits_where_work_items_take_single_lanes(backend, count, monkeypatch):
-    device, rng, found = get_backend(backend), np.random.default_rng(2), []
-    sums, poses, weights = Sums(device, count), rng.normal(size=3 * count), rng.exponential(size=count)
-    cloud = [device.upload(values) for values in (poses, weights)]
-    for kind, lanes in (("cpu", device.info.lanes), ("gpu", 1)):
-        monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind=kind, lanes=lanes))
-        estimate = device.upload(np.full(c.ESTIMATE, np.nan))
-        for second_pass in (0, 1):
-            device.run(sums.estimate(*cloud, estimate, count, estimate if second_pass else None))
-            found.append(device.download(estimate, np.empty(c.ESTIMATE)))
-    assert np.isfinite(found).all() and np.array_equal(found[:2], found[2:])
-
-
 CLOUDS = {
     "narrow": (1e-3, 1e-3, 0.0),
     "far from the first particle": (1e-3, 1e-3, 20.0),
@@ -286,35 +270,6 @@ def test_estimates_are_the_moments_of_the_cloud(backend, name):
     off = (rest[:, :2] ** 2).sum(axis=1) > c.FAR**2
     far_off = off | (np.abs(rest[:, 2]) > c.FAR_TURN)
     assert cloud.far_share(len(poses)) == pytest.approx(float(w[far_off].sum()), rel=1e-12)
-
-
-# Deviations of turns: none, for a jump of 100 m, and the largest of a filter.
-@pytest.mark.parametrize("deviation", [0.1, 14.2, 1e5])
-@pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
-@pytest.mark.parametrize("kind", [c.STRAIGHT, c.VELOCITY_MODEL])
-def test_headings_are_wrapped_after_any_move_with_the_same_bits(backend, deviation, lanes, kind):
-    count, rng = 1003, np.random.default_rng(3)
-    poses = rng.uniform(-np.pi, np.pi, 3 * count)
-    settings = settings_of_step(MEAN=[0.1, 1.0, 0.0, 0.2], DEVIATION=[deviation, 0.1, 0.05, deviation])
-    expected = np.zeros(3 * count)
-    move_particles(PLAIN, poses, settings, expected, count, kind)
-    # The same noise, in a plain sum of turns.
-    n, zero = np.arange(count), np.zeros(count)
-    words = random_words((n, zero + 3, zero, zero), 5, 0)
-    first = 0.1 + deviation * normal_pair(words[0], words[1])[0]
-    second = 0.2 + deviation * normal_pair(words[2], words[3])[1] + (first if kind == c.VELOCITY_MODEL else 0)
-    turned = poses[2::3] + first + second
-    assert (np.abs(expected[2::3]) <= np.pi).all() and (np.abs(turned).max() > 3 * np.pi) == (deviation > 1)
-    np.testing.assert_allclose(np.exp(1j * expected[2::3]), np.exp(1j * turned), atol=1e-15 * max(np.abs(turned)))
-    device = get_backend(backend)
-    on, step = device.upload(poses), device.upload(settings)
-    program = Sums(device, count).launch(
-        "move_particles", count, source=on, settings=step, target=on, particles=count, kind=kind
-    )
-    if not lanes:
-        program = tuple(one._replace(flags=one.flags - {"IN_LANES"}) for one in program)
-    device.run(program)
-    assert np.array_equal(device.download(on, np.empty(3 * count)), expected)
 
 
 def test_an_estimate_after_a_jump_has_the_moments_of_wrapped_headings(backend):

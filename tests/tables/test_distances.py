@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
+from support.kernel_scenes import each_grid, squared_distances
 
 import gpusense as gs
 
@@ -22,10 +23,14 @@ def test_distances_without_a_resolution_are_in_cells(backend):
     np.testing.assert_array_equal(gs.distance_transform(OBSTACLES, backend=backend), distance_transform_edt(~OBSTACLES))
 
 
-def test_squares_are_integers(backend):
-    found = gs.distance_transform(OBSTACLES, resolution=0.05, squared=True, backend=backend)
+@pytest.mark.sampled(1)
+@each_grid
+@pytest.mark.parametrize("gpu", [False, True])
+def test_squares_are_those_of_scipy(occupied, gpu, as_gpu, backend):
+    """Processors take a line a work-item, GPUs a cell."""
+    found = gs.distance_transform(occupied, resolution=0.05, squared=True, backend=as_gpu(gpu))
     assert found.dtype == np.int32
-    np.testing.assert_array_equal(found, np.rint(distance_transform_edt(~OBSTACLES) ** 2))
+    np.testing.assert_array_equal(found, squared_distances(occupied))
 
 
 def test_no_obstacle_is_infinitely_far(backend):

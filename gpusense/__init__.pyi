@@ -93,7 +93,7 @@ from gpusense.tables.worlds import Worlds as Worlds
 from gpusense.world.deskew import deskew_scan as deskew_scan
 from gpusense.world.grid import OccupancyGrid as OccupancyGrid
 from gpusense.world.landmarks import LandmarkMap as LandmarkMap
-from gpusense.world.line_map import LineMap as LineMap
+from gpusense.world.landmarks import LineMap as LineMap
 from gpusense.world.map_files import read_map as read_map
 from gpusense.world.map_files import write_map as write_map
 from gpusense.world.parameters import BeamParameters as BeamParameters

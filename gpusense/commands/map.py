@@ -17,7 +17,7 @@ from gpusense.commands.arguments import number, output_path, positive_number
 from gpusense.commands.output import counted, draw, grouped, write_table
 from gpusense.commands.scans import add_log, read_scans_of_lasers, scan_times, scanners_of
 from gpusense.commands.signals import held
-from gpusense.world.map_greys import MODES
+from gpusense.world.images import MODES
 
 if TYPE_CHECKING:
     from gpusense.chaining.result import ScanChain

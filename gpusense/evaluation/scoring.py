@@ -33,7 +33,7 @@ from gpusense.models.scan.classed import choose_beams
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, classify
-from gpusense.world.sensor_table import SensorTable
+from gpusense.world.sensor_parameters import SensorTable
 
 Array = NDArray[Any]
 Model = BeamModel | LikelihoodFieldModel

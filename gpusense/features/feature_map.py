@@ -16,8 +16,7 @@ from gpusense._util.files import write_whole
 from gpusense._util.lines import numbered_lines
 from gpusense._util.typing import Floats
 from gpusense.features.result import KIND_TYPE, check_kinds, signature_of
-from gpusense.world.landmarks import LandmarkMap
-from gpusense.world.line_map import LineMap
+from gpusense.world.landmarks import LandmarkMap, LineMap
 
 LANDMARK_KINDS = ("corner", "door", "pole", "reflector")
 """Kinds of features with positions independent of the robot's pose."""

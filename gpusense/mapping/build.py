@@ -13,8 +13,7 @@ from gpusense._util.memory import check_room
 from gpusense.backends import Selection, get_backend
 from gpusense.mapping.rays import SCANS, BandCounts, RayEnds, Survey, bands, batches, check_lengths, extent
 from gpusense.world.deskew import check_motion
-from gpusense.world.grid import OccupancyGrid, grid_of_checked
-from gpusense.world.grid_frame import GridFrame, check_origin, check_resolution
+from gpusense.world.grid import GridFrame, OccupancyGrid, check_origin, check_resolution, grid_of_checked
 from gpusense.world.scanner import Scanner, float64_readings
 from gpusense.world.sensor_scans import check_scans
 from gpusense.world.windows import LONGEST_SIDE, Window

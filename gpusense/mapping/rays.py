@@ -15,7 +15,7 @@ from gpusense.interface.constants import RAY_BITS
 from gpusense.interface.launches import launch
 from gpusense.world.deskew import beam_poses
 from gpusense.world.frames import ray_vectors
-from gpusense.world.grid_frame import FARTHEST_ORIGIN, GridFrame
+from gpusense.world.grid import FARTHEST_ORIGIN, GridFrame
 from gpusense.world.scanner import Reading, Scanner, classify
 from gpusense.world.sensor_scans import SensorScans
 from gpusense.world.windows import LONGEST_SIDE, Window

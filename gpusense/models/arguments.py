@@ -17,7 +17,7 @@ from gpusense.tables.worlds import Worlds
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.plausible import look_at_scene
 from gpusense.world.scanner import Scanner
-from gpusense.world.sensor_table import SensorTable
+from gpusense.world.sensor_parameters import SensorTable
 
 # Up to this number of cells float32 resolves the position of a crossing to 5/16 of a cell. From half a cell on,
 # neighbouring boundaries could be confused.

@@ -11,7 +11,7 @@ from gpusense.backends.base import Buffer
 from gpusense.interface.launches import launch
 from gpusense.peers.weights import OVERLAID, Beluga, Peer
 from gpusense.tables.distances import NO_OBSTACLE, check_size, squared_distances, squared_of_stack
-from gpusense.tables.world_stack import Stack, Table
+from gpusense.tables.world_cells import Stack, Table
 from gpusense.tables.worlds import Worlds
 from gpusense.world.field_density import FieldDensity
 from gpusense.world.likelihood import Likelihood

@@ -21,7 +21,7 @@ from gpusense._util import checks
 from gpusense._util.typing import Space
 from gpusense.backends.base import Buffer
 from gpusense.tables.reachable import obstacles_of
-from gpusense.tables.world_stack import Stack, Table
+from gpusense.tables.world_cells import Stack, Table
 from gpusense.tables.worlds import Worlds
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.windows import Window, whole

@@ -14,7 +14,7 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.tables.distances import as_bytes, check_size, packed
-from gpusense.tables.world_stack import Stack, Table
+from gpusense.tables.world_cells import Stack, Table
 from gpusense.tables.worlds import Worlds
 from gpusense.world.windows import Window
 

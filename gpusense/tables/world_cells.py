@@ -1,18 +1,19 @@
-"""Checks of the arguments of ``Worlds``: cells of any library, or grids; origins, resolution and threshold."""
+"""Checks of the arguments of ``Worlds``, and worlds of one size whose tables are made together."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gpusense._util import checks
 from gpusense.backends import Backend, arrays
-from gpusense.world.frames import frame_of
-from gpusense.world.grid import OccupancyGrid
-from gpusense.world.grid_frame import check_origin
+from gpusense.backends.base import Buffer
+from gpusense.backends.workspace import Workspace
+from gpusense.world.frames import PlainCells, frame_of
+from gpusense.world.grid import OccupancyGrid, check_origin
 from gpusense.world.windows import LONGEST_SIDE
 
 
@@ -92,16 +93,31 @@ def frames_of(
     known: dict[tuple[float, float, float], tuple[float, ...]] = {}
     for number, origin in enumerate(origins):
         if origin not in known:
-            frame = frame_of(_Corner(origin, resolution, (1, 1)), (0.0, 0.0, 0.0))
+            frame = frame_of(PlainCells(origin, resolution, (1, 1)), (0.0, 0.0, 0.0))
             known[origin] = (frame.origin_x, frame.origin_y, frame.yaw_cos, frame.yaw_sin)
         frames[number, :4] = known[origin]
     frames[:, 4:6], frames[:, 6] = sizes, place
     return frames
 
 
-class _Corner(NamedTuple):
-    """The corner of a world, as ``frame_of`` takes it."""
+class Stack(NamedTuple):
+    """Some worlds of one size whose tables are made together."""
 
-    origin: tuple[float, float, float]
-    resolution: float
-    shape: tuple[int, int]
+    indices: np.ndarray  # (W,) indices of the worlds
+    rows: int  # rows of each
+    cols: int  # columns of each
+    place: Buffer  # first cell of each in tables with a ring, on the device
+    space: Workspace  # memory besides the tables
+
+    @property
+    def worlds(self) -> int:
+        """W."""
+        return len(self.indices)
+
+
+class Table(NamedTuple):
+    """A table of all worlds."""
+
+    buffer: Buffer  # the table
+    size: int  # its size [bytes]
+    fill: Callable[[Stack, Buffer], None]  # function that fills the parts of a stack of worlds

@@ -16,14 +16,7 @@ from gpusense.world.windows import Frame, Window
 
 
 class WorldMap:
-    """The table of all worlds for a model, in place of a map's reachable window.
-
-    Attributes:
-        grid: The worlds.
-        window: A window of the size of the largest world.
-        frame: The frame of poses in it.
-        table: The table; None before it is made.
-    """
+    """The table of all worlds for a model, in place of a map's reachable window, here of the largest world's size."""
 
     def __init__(self, worlds: Worlds, mount: Mount, make: Callable[[], Buffer]) -> None:
         self.grid, self._make, self.version, self.preparations = worlds, make, 0, 0

@@ -16,12 +16,10 @@ from gpusense.backends import Backend, BackendInfo, Selection, arrays, get_backe
 from gpusense.backends.base import Adopted, Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.launches import launch
-from gpusense.tables.collisions import collisions
 from gpusense.tables.crowd import CrowdTable, Shapes
-from gpusense.tables.world_cells import are_grids, checked_cells, checked_origins, frames_of, of_grids
-from gpusense.tables.world_stack import Stack, Table
-from gpusense.world.grid import OccupancyGrid
-from gpusense.world.grid_frame import check_resolution
+from gpusense.tables.world_cells import Stack, Table, are_grids, checked_cells, checked_origins, frames_of, of_grids
+from gpusense.tables.world_index import collisions
+from gpusense.world.grid import OccupancyGrid, check_resolution
 
 _INT, _BYTE = np.dtype(np.int32), np.dtype(np.uint8)
 _NO_FLAGS: frozenset[str] = frozenset()
@@ -110,8 +108,6 @@ class Worlds:
         sizes = self._sizes
         self.uniform = bool((sizes == sizes[0]).all() and all(pose == self._origins[0] for pose in self._origins))
 
-    # ---- what worlds are
-
     def __len__(self) -> int:
         return len(self._sizes)
 
@@ -187,11 +183,7 @@ class Worlds:
         self.shapes = shapes
 
     def grid(self, index: int) -> OccupancyGrid:
-        """Return one world as a map in host memory.
-
-        Raises:
-            TypeError, ValueError: No index of a world.
-        """
+        """Return one world as a map in host memory."""
         number = checks.integer("index", index, low=0, high=len(self) - 1)
         (rows, cols), first = self._sizes[number].tolist(), int(self._place[number])
         cells = np.empty(rows * cols, np.int8)
@@ -199,8 +191,6 @@ class Worlds:
         return OccupancyGrid(
             cells.reshape(rows, cols), self._resolution, self._origins[number], occupied_threshold=self.threshold
         )
-
-    # ---- changes
 
     @property
     def shapes(self) -> Shapes:
@@ -283,17 +273,10 @@ class Worlds:
         """
         return collisions(self, poses, radius, world, ignore, unknown)
 
-    # ---- tables
-
     def table(self, key: Hashable, make: Callable[[], Table]) -> Table:
-        """Return a table of all worlds; models share it.
+        """Return a table of all worlds, which models share.
 
-        Args:
-            key: Everything on which the table depends, except the cells.
-            make: Function that returns the table before it is filled.
-
-        Raises:
-            MemoryError: The device does not hold it.
+        ``key``: all on which it depends, except the cells; ``make``: function that returns it before it is filled.
         """
         if key not in self._tables:
             table = make()
@@ -311,11 +294,7 @@ class Worlds:
         return min(self.device.max_buffer, numbers)
 
     def allocate(self, each: int, dtype: np.dtype) -> Buffer:
-        """Return a buffer for ``each`` numbers of each cell of all worlds.
-
-        Raises:
-            MemoryError: The device does not hold it; the message says how many worlds fit.
-        """
+        """Return a buffer for ``each`` numbers of each cell of all worlds, or say how many worlds fit."""
         info, size = self.backend.info, self._total * each * dtype.itemsize
         try:
             if size > self.largest_table:

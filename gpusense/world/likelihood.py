@@ -14,26 +14,13 @@ from gpusense.world.scanner import Scanner
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Rules of the book's likelihoods, for models without ``compat``.
-
-    Attributes:
-        name: None.
-        beam: Default parameters of the beam model.
-        field: Default parameters of the likelihood field.
-        constant_term: First term of the beam model's sum over readings.
-        field_constant: First term of the likelihood field's sum over readings.
-        outside: ``"free"`` or ``"occupied"``: state of space outside the grid for the beam model.
-        unknown: ``"free"`` or ``"occupied"``: state of unknown cells for the beam model.
-        caster: Default caster of the beam model.
-        is_peer: True if the model computes a peer's weights.
-        cubes: Whether the likelihood field sums cubes of densities instead of logarithms.
-        overlaid: True if some cells of the likelihood field have a fixed density.
-        neighbors: Radius of the neighbourhood that determines a cell's state in a mask [cells].
-    """
+    """Rules of the book's likelihoods, for models without ``compat``."""
 
     name: ClassVar[Any] = None
+    # Default parameters of both models.
     beam: ClassVar[BeamParameters] = BeamParameters()
     field: ClassVar[LikelihoodFieldParameters] = LikelihoodFieldParameters.tracking()
+    # Of the beam model: first term of the sum over readings, space outside the grid, unknown cells, default caster.
     constant_term: ClassVar[float] = 0.0
     outside: ClassVar[str] = "free"
     unknown: ClassVar[str] = "free"
@@ -42,22 +29,22 @@ class Likelihood:
 
     @property
     def cubes(self) -> bool:
-        """See the attributes of the class."""
+        """Whether the likelihood field sums cubes of densities instead of logarithms."""
         return False
 
     @property
     def field_constant(self) -> float:
-        """See the attributes of the class."""
+        """First term of the likelihood field's sum over readings."""
         return 1.0 if self.cubes else 0.0
 
     @property
     def overlaid(self) -> bool:
-        """See the attributes of the class."""
+        """True if some cells of the likelihood field have a fixed density."""
         return False
 
     @property
     def neighbors(self) -> int:
-        """See the attributes of the class."""
+        """Radius of the neighbourhood that determines a cell's state in a mask [cells]."""
         return 0
 
     def readings(self, ranges: np.ndarray, scanner: Scanner, field: bool) -> np.ndarray:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import DTypeLike, NDArray
 
 from gpusense._util import checks
 from gpusense.world.parameters import _Parameters
@@ -228,3 +230,23 @@ class LineParameters(_Parameters):
         self._check_weights("z_detect", "z_false")
         self._check("range_max", above=0)
         self._check("p_detect", low=0, high=1)
+
+
+class SensorTable(ABC):
+    """A table of a sensor for ``BeamModel``: one look-up per beam, max readings included."""
+
+    range_max: float
+    """Readings of at least ``range_max`` are "no return", > 0 [m]."""
+    bins: int
+    """Number of range bins; one more bin is for "no return"."""
+
+    @abstractmethod
+    def sensor_table(self, dtype: DTypeLike) -> NDArray[Any]:
+        """Return the (bins + 1, bins + 1) table of log densities by bin of the reading, then of the expected range.
+
+        The last row, "no return", holds log probabilities.
+        """
+
+    @abstractmethod
+    def to_dict(self) -> dict[str, Any]:
+        """Return the table's parameters as plain numbers and strings."""

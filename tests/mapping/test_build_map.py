@@ -16,7 +16,7 @@ from gpusense._util import memory
 from gpusense.backends import get_backend
 from gpusense.mapping.build import MapBuilder
 from gpusense.mapping.rays import BandCounts, RayEnds
-from gpusense.world.grid_frame import GridFrame
+from gpusense.world.grid import GridFrame
 from gpusense.world.windows import Window
 
 UNIT = 4096

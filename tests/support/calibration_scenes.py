@@ -22,8 +22,7 @@ from gpusense.models.point.beacons import BeaconModel
 from gpusense.models.point.bumper import BumperModel
 from gpusense.models.scan.beam import BeamModel
 from gpusense.tables.casters import Lookup
-from gpusense.world.landmarks import LandmarkMap
-from gpusense.world.line_map import LineMap
+from gpusense.world.landmarks import LandmarkMap, LineMap
 from gpusense.world.parameters import BeamParameters, IncidenceParameters, LandmarkParameters
 from gpusense.world.scanner import Scanner
 from gpusense.world.sensor_parameters import (

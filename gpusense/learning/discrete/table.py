@@ -15,7 +15,7 @@ from gpusense._util import checks
 from gpusense.learning.discrete.probabilities import MOST_BINS, DiscreteCauses, DiscreteFit, bins_of, check_pairs
 from gpusense.peers.weights import check_weights
 from gpusense.world.parameters import BeamParameters
-from gpusense.world.sensor_table import SensorTable
+from gpusense.world.sensor_parameters import SensorTable
 
 # Table entries per pass; each needs about twenty numbers.
 _BLOCK = 1 << 20

@@ -22,8 +22,7 @@ from gpusense.models.landmark.features import PreparedFeatures, in_two_parts, up
 from gpusense.models.landmark.sampling import draw_lines
 from gpusense.models.point.sampling import draws_at
 from gpusense.world.frames import Mount, split
-from gpusense.world.landmarks import LandmarkMap, make_buckets
-from gpusense.world.line_map import LineMap
+from gpusense.world.landmarks import LandmarkMap, LineMap, make_buckets
 from gpusense.world.sensor_parameters import LARGEST_ANGLE_DEVIATION, LineParameters
 
 

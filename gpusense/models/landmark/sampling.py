@@ -18,8 +18,7 @@ from gpusense.models.point.sampling import (
 )
 from gpusense.reference.landmarks import ZERO_RANGE
 from gpusense.reference.relative import wrapped_difference
-from gpusense.world.landmarks import LandmarkMap
-from gpusense.world.line_map import LineMap
+from gpusense.world.landmarks import LandmarkMap, LineMap
 from gpusense.world.parameters import LandmarkParameters
 from gpusense.world.sensor_parameters import LineParameters
 

@@ -29,7 +29,7 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.likelihood import Likelihood
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.scanner import Scanner
-from gpusense.world.sensor_table import SensorTable
+from gpusense.world.sensor_parameters import SensorTable
 
 
 class BeamModel(ScanModel):

@@ -183,16 +183,14 @@ class RayCaster(Pickled):
     def bind(
         self, poses: Any, bearings: AnyArray, *, world: Any = None, ignore: Any = None, out: Any = None
     ) -> BoundCall:
-        """Bind arrays that stay in place to a call of ``cast``, for simulators that repeat it.
+        """Bind arrays that stay in place to a call of ``cast``; see ``BeamModel.bind``.
 
-        Each call reads the present poses and indices, and writes ``out``. Where poses are on the caster's GPU, a call
-        starts a CUDA graph, or launches of OpenCL whose arguments stay set: it checks nothing, allocates nothing and
-        does not wait; ``check`` waits, and reports poses that were not finite. Elsewhere it is the ordinary call.
-        Ranges have the bits of ``cast``.
+        Each call casts the present poses to ``out``. On a GPU it is one CUDA graph, and does not wait. Ranges have the
+        bits of ``cast``.
 
         Args:
             poses: (N, 3) poses as for ``cast``, an array whose numbers every call reads anew.
-            bearings: (K,) directions relative to the heading [rad], which later calls repeat.
+            bearings: (K,) directions relative to the heading [rad].
             world: As for ``cast``; an array on the device is read anew by every call.
             ignore: The same.
             out: The array for the ranges, as for ``cast``.

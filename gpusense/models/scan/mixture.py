@@ -17,7 +17,7 @@ from gpusense.world.hit_shapes import shape_of
 from gpusense.world.hit_tables import mass_tables
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.range_causes import NoReturn, RandomDensity, ShortDensity
-from gpusense.world.sensor_table import SensorTable
+from gpusense.world.sensor_parameters import SensorTable
 
 # Largest number of bins of a sensor's table along each axis: 268 MB in float32.
 _MOST_BINS = 8192

@@ -21,7 +21,7 @@ from gpusense.world.hit_shapes import HitShape, shape_of
 from gpusense.world.hit_tables import mass_table, quantile_table
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.range_causes import ShortDensity
-from gpusense.world.sensor_table import SensorTable
+from gpusense.world.sensor_parameters import SensorTable
 
 # Seeds are keys of Philox: two words of 32 bits.
 MOST_SEED, MOST_STEP = (1 << 64) - 1, (1 << 31) - 1

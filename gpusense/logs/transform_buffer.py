@@ -100,7 +100,7 @@ class Link:
 
 
 class TransformBuffer:
-    """Transforms between frames over ``cache`` seconds. A slash before a frame's name is ignored.
+    """Transforms between frames over ``cache`` seconds. Slashes around a frame's name are ignored.
 
     In an infinite cache, as for a log, a single stamp that goes back drops nothing.
     """
@@ -112,7 +112,7 @@ class TransformBuffer:
     def add(self, message: object, static: bool = False) -> bool:
         """Add a ``geometry_msgs/TransformStamped``; return whether its stamp went back and dropped later transforms."""
         parent, child = (
-            str(field_of("message", message, name)).lstrip("/") for name in ("header.frame_id", "child_frame_id")
+            str(field_of("message", message, name)).strip("/") for name in ("header.frame_id", "child_frame_id")
         )
         if not parent or not child or parent == child:
             raise ValueError(f"message.child_frame_id: must differ from header.frame_id {parent!r}, got {child!r}")
@@ -150,7 +150,7 @@ class TransformBuffer:
 
     def look_up(self, target: str, source: str, time: float | None = None) -> NDArray[np.float64]:
         """Return the (4, 4) pose of ``source`` in ``target``; None as time [s] is the latest known to all links."""
-        target, source = target.lstrip("/"), source.lstrip("/")
+        target, source = target.strip("/"), source.lstrip("/")
         chain = self._chain(target, source, self._links.values())
         if time is None:
             time = min((link.times[-1] for link, _ in chain if not link.static and link.times), default=0.0)
@@ -166,7 +166,7 @@ class TransformBuffer:
 
     def fixed(self, target: str, source: str) -> NDArray[np.float64]:
         """Return the (4, 4) pose of ``source`` in ``target``, which must be constant."""
-        target, source = target.lstrip("/"), source.lstrip("/")
+        target, source = target.strip("/"), source.lstrip("/")
         still = [link for link in self._links.values() if not link.moved]
         try:
             return _product((link.at(link.times[-1]), ahead) for link, ahead in self._chain(target, source, still))
@@ -177,7 +177,7 @@ class TransformBuffer:
 
     def history(self, target: str, source: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the (N,) times [s] and (N, 4, 4) poses of the motion of ``source`` in ``target``."""
-        target, source = target.lstrip("/"), source.lstrip("/")
+        target, source = target.strip("/"), source.lstrip("/")
         chain = self._chain(target, source, self._links.values())
         moving = [link for link, _ in chain if not link.static]
         stamps = sorted({time for link in moving for time in link.times})

@@ -83,8 +83,8 @@ def covariance_of(numbers: Any) -> np.ndarray:
 
 def start_of(message: Any, frame: str) -> tuple[Pose, np.ndarray]:
     """Return the pose and the (3, 3) covariance of a PoseWithCovarianceStamped, which must be in ``frame``."""
-    named = str(field("message", message, "header.frame_id")).lstrip("/")
-    if named != frame.lstrip("/"):
+    named = str(field("message", message, "header.frame_id")).strip("/")
+    if named != frame.strip("/"):
         raise ValueError(f"message.header.frame_id: must be {frame!r}, got {named!r}")
     pose = planar_pose("message.pose", field("message", message, "pose.pose"))
     return pose, covariance_of(field("message", message, "pose.covariance"))

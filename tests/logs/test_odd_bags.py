@@ -299,3 +299,17 @@ def test_a_chain_that_is_absent_says_what_is_missing(tmp_path: Path) -> None:
         bag.scan(2.0, [2.0] * 5, -0.2, 0.1, frame="lidar", topic="/other")
     assert "to lidar: no transform names lidar; the laser is taken" in read(bag.path, topic="/other")[1][0]
     assert "to post: the frames are not connected; the laser is taken" in read(bag.path)[1][0]
+
+
+@pytest.mark.parametrize(
+    ("of_scan", "of_transform"), [("laser/", "laser/"), ("/laser", "laser/"), ("laser/", "/laser")]
+)
+def test_slashes_around_a_frame_do_not_matter(of_scan: str, of_transform: str, tmp_path: Path) -> None:
+    with Writer(tmp_path, "sqlite3") as bag:
+        bag.transform(1.0, f"{BASE}/", of_transform, (0.1, 0.2), 0.0)
+        for k in range(3):
+            bag.odometry(1.0 + k, 1.0 * k, 0.0, 0.0, base=f"{BASE}/")
+            bag.scan(1.0 + k, [2.0 + k] * 5, -0.2, 0.1, frame=of_scan)
+    for options in ({}, {"frame": "/laser/"}):
+        scans, told = read(bag.path, **options)
+        assert told == [] and [scan.scanner.mount for scan in scans] == [(0.1, 0.2, 0.0)] * 3

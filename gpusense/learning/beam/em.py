@@ -264,38 +264,12 @@ class _Search:
 
 def climb_gradient(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
     """Run L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995) with the analytic gradient, restarted as long as it gains."""
-    return _refine(_Search(problem, start, watch), max_iterations, tolerance)
+    return _by_gradient(_Search(problem, start, watch), max_iterations, tolerance)
 
 
-def _refine(search: _Search, max_iterations: int, tolerance: float) -> Climb:
-    from scipy.optimize import minimize
-
-    coordinates = search.coordinates
-    if not len(coordinates.places):
-        return Climb(search.best, search.trace, True)
-    while len(search.trace) <= max_iterations:
-        before = search.best.objective
-        result = minimize(
-            search.cost_and_gradient,
-            coordinates.vector(search.best.point),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=coordinates.limits,
-            callback=search.end_iteration,
-            options={
-                "maxiter": max_iterations + 1 - len(search.trace),
-                "maxfun": 20 * max_iterations,
-                "maxcor": 20,
-                "ftol": 1e-15,
-                "gtol": 1e-12,
-            },
-        )
-        gained = search.best.objective - before
-        if result.nit == 0:
-            search.end_iteration()
-        if gained <= max(tolerance, search.problem.noise(search.best)):
-            return search.stopped(tolerance)
-    return search.exhausted(max_iterations)
+def _by_gradient(search: _Search, max_iterations: int, tolerance: float) -> Climb:
+    options = {"maxfun": 20 * max_iterations, "maxcor": 20, "ftol": 1e-15, "gtol": 1e-12}
+    return _restarted(search, "L-BFGS-B", options, max_iterations, tolerance, tolerance)
 
 
 def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
@@ -305,35 +279,38 @@ def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance
     (Nelder and Mead) collapses. The first directions are the coordinates. If no direction gains although derivatives
     exclude an optimum, the search restarts along randomly rotated directions.
     """
+    options = {"xtol": 1e-4, "ftol": 1e-13}
+    search = _Search(problem, start, watch)
+    return _restarted(search, "Powell", options, max_iterations, tolerance, 10 * tolerance, _TURNS)
+
+
+def _restarted(
+    search: _Search, method: str, options: dict[str, Any], max_iterations: int, tolerance: float, least: float,
+    turns: int = 0,
+) -> Climb:  # fmt: skip
+    """Run a method of SciPy as long as it gains more than ``least``; Powell's turns its directions ``turns`` times."""
     from scipy.optimize import minimize
 
-    search = _Search(problem, start, watch)
-    coordinates = search.coordinates
+    coordinates, powell = search.coordinates, method == "Powell"
     if not len(coordinates.places):
         return Climb(search.best, search.trace, True)
-    rng = np.random.default_rng(0)
-    directions, turns = np.eye(len(coordinates.places)), 0
+    rng, directions = np.random.default_rng(0), np.eye(len(coordinates.places))
     while len(search.trace) <= max_iterations:
         before = search.best.objective
-        minimize(
-            search.cost,
-            coordinates.vector(search.best.point),
-            method="Powell",
-            bounds=coordinates.limits,
-            callback=search.end_iteration,
-            options={
-                "maxiter": max_iterations + 1 - len(search.trace),
-                "xtol": 1e-4,
-                "ftol": 1e-13,
-                # SciPy changes the directions in place.
-                "direc": directions.copy(),
-            },
-        )
-        if search.best.objective - before <= max(10 * tolerance, problem.noise(search.best)):
+        # SciPy changes the directions in place.
+        more = {"direc": directions.copy()} if powell else {}
+        result = minimize(
+            search.cost if powell else search.cost_and_gradient, coordinates.vector(search.best.point), method=method,
+            jac=not powell, bounds=coordinates.limits, callback=search.end_iteration,
+            options={**options, **more, "maxiter": max_iterations + 1 - len(search.trace)},
+        )  # fmt: skip
+        if result.nit == 0:
+            search.end_iteration()
+        if search.best.objective - before <= max(least, search.problem.noise(search.best)):
             end = search.stopped(tolerance)
-            if end.converged or turns == _TURNS:
+            if end.converged or not turns:
                 return end
-            turns += 1
+            turns -= 1
             directions = np.linalg.qr(rng.normal(size=directions.shape))[0]
     return search.exhausted(max_iterations)
 
@@ -366,6 +343,6 @@ def climb_genetic(
             polish=False,
             callback=search.end_iteration,
         )
-    climb = _refine(search, max_iterations + len(search.trace), tolerance)
+    climb = _by_gradient(search, max_iterations + len(search.trace), tolerance)
     climb.notes.append("the last steps are of method 'gradient'")
     return climb

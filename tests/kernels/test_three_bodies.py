@@ -57,6 +57,7 @@ ON_PURPOSE = [
     Purpose("beam", "strands_of", (WARP,), STAGES),
     Purpose("beam", "sum_terms", REFERENCE_ONLY, ARRAYS),
     Purpose("bits", "lowest_bit highest_bit", KERNELS_ONLY, "the reference unpacks words to bool"),
+    Purpose("bits", "occupied_at", (WARP,), "OpenCL counts the cells of four columns from words"),
     Purpose("bits", "unpacked", REFERENCE_ONLY, "the reference unpacks words to bool"),
     Purpose("circles", "point_of add_error", KERNELS_ONLY, "points come one after another"),
     Purpose("distance", "_lines _lowest", REFERENCE_ONLY, ARRAYS),

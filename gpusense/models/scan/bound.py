@@ -126,10 +126,14 @@ class ReplayedCall(BoundCall):
         program = self._programs.get(self._map.version)
         if program is None:
             # The map, or its table, has changed.
-            for _, last in self._programs.items():
-                last.recording.wait()
+            self._wait()
             program = self._recorded()
         return program
+
+    def _wait(self) -> None:
+        """Wait for the last program; no variable of the caller keeps its buffers."""
+        for _, program in self._programs.items():
+            program.recording.wait()
 
     def _recorded(self) -> RecordedProgram:
         """Make the table if it is missing, and record the program of a call; nothing is started."""

@@ -108,19 +108,6 @@ def test_copies_on_the_device(selection, needs):
     assert found.tolist() == [77, 2, 3, 4, 77, 77]
 
 
-@pytest.mark.parametrize("kind", [gs.BeamModel, gs.LikelihoodFieldModel])
-def test_batches_on_the_device(kind, warp_as_gpu):
-    model = kind(GRID, SCANNER, backend=warp_as_gpu)
-    several, scans = np.stack([POSES, POSES + 0.1]), np.stack([SCAN, np.full(BEAMS, np.nan)])
-    expected, expected_parts = model.log_likelihood(several, scans, per_beam=True)
-    given, out = to_device(several), to_device(np.zeros((2, COUNT), np.float32))
-    assert differing(model.log_likelihood(given, scans).numpy(), expected) == 0
-    assert model.log_likelihood(Array(given), scans, out=out) is out
-    assert differing(out.numpy(), expected) == 0
-    found, parts = model.log_likelihood(given, to_device(scans), per_beam=True)
-    assert differing(found.numpy(), expected) == 0 and differing(parts, expected_parts) == 0
-
-
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 @pytest.mark.parametrize("kind", [gs.BeamModel, gs.LikelihoodFieldModel])
 def test_scans_that_share_launches_on_the_device(kind, real, warp_as_gpu, warp_copies):
@@ -170,12 +157,6 @@ def test_no_array_of_a_call_is_kept(where, count, warp_as_gpu):
         model.log_likelihood(where(POSES[:count]), scan)
         caster.cast(where(POSES[:count]), SCANNER.bearings)
         assert model._workspace._busy == [] and caster._caster._workspace._busy == []
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_no_particles_on_the_device(method, warp_as_gpu):
-    call, shape = call_of(method, warp_as_gpu)
-    assert tuple(call(to_device(np.empty((0, 3)))).shape) == (0, *shape[1:])
 
 
 @pytest.mark.parametrize("scan", [SCAN, np.full(BEAMS, np.nan)], ids=["readings", "no reading"])

@@ -300,18 +300,6 @@ def test_joined_logs_of_two_buildings_are_not_closed(with_odometry: bool, lap: t
     assert (chain.motion is None) != with_odometry
 
 
-def test_two_lasers_of_a_robot_agree(needs) -> None:
-    rear = gs.Scanner(FRONT.bearings, FRONT.range_max, mount=(-0.3, 0.1, np.pi))
-    front = gs.Scanner(FRONT.bearings, FRONT.range_max, mount=(0.25, 0.0, 0.0))
-    poses = np.array([(0.15 * k, 0.03 * k, 0.06 * k) for k in range(12)])
-    chains = []
-    for seed, scanner in enumerate((front, rear)):
-        sensors = gs.compose_poses(poses, np.array(scanner.mount))
-        chains.append(gs.chain_scans(scans_of(ROOM, sensors, FRONT, seed=seed), scanner, backend=needs("opencl")))
-        assert errors(chains[-1], poses).max() < 0.03
-    assert np.abs(chains[0].poses - chains[1].poses).max() < 0.04
-
-
 def test_a_run_that_is_interrupted_keeps_what_it_has(lap: tuple[np.ndarray, ...], needs, monkeypatch) -> None:
     truth, scans, odometry = lap
     monkeypatch.setattr("gpusense.chaining.front.GUIDED_GROUP", 40)

@@ -290,21 +290,6 @@ def test_help_explains_itself(capsys):
     assert "examples:" in text and "gpusense fit --pairs readings.csv" in text and "z_hit" in text
 
 
-@pytest.mark.long
-def test_hits_of_a_student_are_fitted_written_and_read(capsys, recorded, tmp_path):
-    pairs = ["--pairs", recorded / "pairs.csv", "--range-max", RANGE]
-    code, out, _ = run(capsys, *pairs, "--hit", "student", "--holdout", "--out", tmp_path)
-    assert code == 0 and "hit_dof" in out and "nav2_amcl's defaults" in out
-    content = yaml.safe_load((tmp_path / "parameters.yaml").read_text())
-    p = gs.BeamParameters.from_dict(content["beam_model"])
-    assert p.hit == "student" and p.hit_dof > 1
-    assert not {"hit", "hit_dof"} & content["amcl"]["ros__parameters"].keys()
-    scored = ["--map", recorded / "map.yaml", "--log", recorded / "run.log", "--limit", 1, "--particles", 50]
-    options = ["--backend", "numpy", "--params", str(tmp_path / "parameters.yaml"), "--json"]
-    assert main(["score", *map(str, scored), *options]) in (0, 1)
-    capsys.readouterr()
-
-
 @pytest.mark.parametrize(
     "share, bias, verdict", [(0.02, 0.0, "FITTED"), (0.17, 0.05, "FITTED"), (0.6, 0.0, "DOUBTFUL")]
 )

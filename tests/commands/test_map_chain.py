@@ -113,17 +113,8 @@ def test_odometry_that_never_changes_is_none(log, tmp_path, capsys, needs):
         words[2 + FRONT.count : 8 + FRONT.count] = ["0.0"] * 6
         lines.append(" ".join(words))
     still.write_text("\n".join(lines) + "\n")
-    command = [
-        "map",
-        "--log",
-        str(still),
-        "--chain",
-        "--out",
-        str(tmp_path / "map.yaml"),
-        "--range-max",
-        "29",
-        "--json",
-    ]
+    command = ["map", "--log", str(still), "--chain"]
+    command += ["--out", str(tmp_path / "map.yaml"), "--range-max", "29", "--json"]
     assert main([*command, "--backend", needs("opencl")]) == 0
     found, said = capsys.readouterr()
     assert "never changes" in said
@@ -162,18 +153,8 @@ def test_a_log_of_hardly_anything(log, tmp_path, capsys, needs, kept):
     else:
         far = [" ".join([*row[:2], *["60.0"] * FRONT.count, *row[2 + FRONT.count :]]) for row in words]
         poor.write_text("\n".join(far) + "\n")
-    command = [
-        "map",
-        "--log",
-        str(poor),
-        "--chain",
-        "--out",
-        str(out),
-        "--range-max",
-        "29",
-        "--backend",
-        needs("opencl"),
-    ]
+    command = ["map", "--log", str(poor), "--chain"]
+    command += ["--out", str(out), "--range-max", "29", "--backend", needs("opencl")]
     if kept == "one scan":
         assert main(command) == 0
         assert "CONSISTENT: chained 1 scan over 0 m" in capsys.readouterr().out

@@ -53,14 +53,6 @@ def test_a_plan_is_run_resumed_and_drawn(place, capsys):
     assert out.startswith("4 FAILED: 0 of 8 jobs ran in ") and "4 were in the table before" in out
 
 
-@pytest.mark.long
-def test_a_job_beyond_a_limit_is_a_row(place, capsys):
-    assert cli.main(call(place, "--job-timeout", "1e-6", plan="good.yaml", table="limited.csv")) == 1
-    errors = gs.sweep.read_table(place / "limited.csv")["error"]
-    assert errors == ["JobTimeout: the worker was ended after the limit of 1e-06 s"] * 4
-    assert "4 FAILED: 0 of 4 jobs ran in " in capsys.readouterr().out
-
-
 def test_jobs_are_listed(place, capsys):
     assert cli.main(call(place, "--list", table="none.csv")) == 0
     out = capsys.readouterr().out

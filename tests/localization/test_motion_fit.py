@@ -80,19 +80,6 @@ def test_motion_noise_is_learned_from_references_at_some_steps():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("steps", "alpha"), [(59, (0.05, 0.01, 0.04, 0.01)), (150, (0.002, 0.002, 0.005, 0.001))])
-def test_independent_motion_noise_is_not_inflated(steps, alpha):
-    """The fitted variances of translations and turns are on average the true ones."""
-    motion, ratio = gs.OdometryMotion(alpha, reverse=0, least=(0.005, 0.003)), []
-    for seed in range(12):
-        fit = gs.fit_odometry_motion(*_drive(motion, steps, np.random.default_rng(seed))).motion
-        found, true = (np.square(one.sampled_turns(0.15, 0.3, 0.15).deviation)[[0, 1]] for one in (fit, motion))
-        ratio.append(found / true)
-    # Means of 12 fits have a deviation of 6 to 11 %.
-    np.testing.assert_allclose(np.mean(ratio, axis=0), 1.0, atol=0.25)
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("repeated", [0.0, 0.4, 0.7])
 def test_motion_noise_that_repeats_from_step_to_step_is_inflated(repeated):
     """Sums of errors with a correlation of rho^k over k steps have (1 + rho) / (1 - rho) times the variance."""

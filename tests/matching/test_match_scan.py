@@ -31,23 +31,6 @@ def test_exact_pairs_are_matched_from_poor_guesses(device, pairs):
     assert np.hypot(*error.T[:2]).max() < 0.05
 
 
-def test_one_call_is_many_calls(pairs):
-    first, second, truth = (values[:3] for values in pairs)
-    together = gs.match_scan(first, second, RING, truth, backend="numpy")
-    for i in range(3):
-        alone = gs.match_scan(first[i], second[i], RING, truth[i], backend="numpy")
-        assert alone.pose.tolist() == together.pose[i].tolist()
-        assert alone.status == together.status[i]
-        for name in ("covariance", "information", "p_right", "evidence", "score", "lever", "noise"):
-            np.testing.assert_array_equal(getattr(together[i], name), getattr(alone, name), err_msg=name)
-        # Axes of a single match come without LAPACK, with arbitrary signs.
-        np.testing.assert_allclose(together[i].eigenvalues, alone.eigenvalues, rtol=1e-12)
-        np.testing.assert_allclose(np.abs(together[i].directions @ alone.directions.T), np.eye(3), atol=1e-9)
-    shared = gs.match_scan(first[0], np.stack([first[0]] * 2), RING, backend="numpy")
-    assert len(shared) == 2
-    np.testing.assert_allclose(shared.pose, 0, atol=1e-3)
-
-
 def test_the_mount_moves_the_frame(pairs):
     """A scan from a sensor off the robot's centre gives the robot's pose, and its covariance."""
     mount = (0.3, -0.2, 0.7)

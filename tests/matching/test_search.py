@@ -12,7 +12,6 @@ from gpusense.matching.score_tables import ScoreTables, field_scores
 from gpusense.matching.search import PoseGrid, Search
 
 BACKENDS = ("numpy", "opencl", "warp")
-each_backend = pytest.mark.parametrize("name", BACKENDS)
 
 
 def scene(tables: int, *, beyond: int = 0):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 import re
 from types import SimpleNamespace
@@ -24,7 +23,6 @@ from gpusense.tables import casters
 from gpusense.tables.casters import Bresenham, Caster, CasterInput, Cddt, Dda, Exact, Lookup, March
 from gpusense.tables.directional import directional_table
 from gpusense.tables.rectangles import Planes, empty_rectangles, planes_of
-from gpusense.world import windows
 
 DOCS = ROOT / "docs" / "speed.md"
 KINDS = [
@@ -40,7 +38,6 @@ KINDS = [
         Lookup(5),
     ),
 ]
-CROPPED = [kind for kind in KINDS if not kind.whole]
 POLICIES = [("free", "free"), ("occupied", "free"), ("free", "occupied"), ("occupied", "occupied")]
 
 
@@ -51,25 +48,6 @@ def test_every_backend_has_the_bits_of_numpy(kind, backend):
         for unknown, outside in policies:
             case = dict(precision=precision, unknown=unknown, outside=outside)
             same_bits(cast(kind, backend, **case), numpy_cast(kind, **case))
-
-
-@pytest.mark.sampled(0.5)
-@pytest.mark.parametrize("kind", CROPPED, ids=by_name)
-@pytest.mark.parametrize("outside", ["free", "occupied"])
-def test_a_cropped_map_has_the_bits_of_the_whole_map(kind, outside, backend, monkeypatch):
-    """An earlier cloud chose the smallest window for these poses, and obstacles are near beyond it."""
-    rng = np.random.default_rng(1)
-    grid = gs.OccupancyGrid(rng.choice([0, 100], (300, 400), p=[0.998, 0.002]), 1.0)
-    poses = np.column_stack([rng.uniform(208, 209.5, 150), rng.uniform(158, 159.5, 150), rng.uniform(-3, 3, 150)])
-    bearings = np.linspace(-3, 3, 9)
-    caster = functools.partial(gs.RayCaster, grid, 20.0, method=kind, outside=outside)
-    whole = caster(backend="numpy").cast(poses, bearings)
-    monkeypatch.setattr(windows, "SMALLEST_CELLS", 100)
-    cropped = caster(backend=backend)
-    cropped.prepare([[200.5, 150.5, 0.0]])
-    before = cropped._caster.map.window
-    same_bits(cropped.cast(poses, bearings), whole)
-    assert cropped._caster.map.window == before and before.cells < grid.cells.size / 4
 
 
 @pytest.mark.long_on("warp")

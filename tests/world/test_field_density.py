@@ -66,20 +66,3 @@ def test_a_made_up_shape_is_followed_by_all_users(interpolation, precision, spec
         np.testing.assert_array_equal(made_up[name], values, err_msg=name)
         if name != "pose":
             assert not np.array_equal(plain[name], values), name
-
-
-@pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
-def test_another_function_of_distance_is_followed_on_the_host(interpolation, monkeypatch):
-    """Student's t with 3 degrees of freedom: tables of log densities, searches and pictures have it."""
-    truth = shown(0.1, interpolation, "float64", True)
-
-    def log(self, distance):
-        student = stats.t.logpdf(distance, 3, scale=self.sigma)
-        return np.logaddexp(math.log(0.8) + student, self.log_rand)
-
-    monkeypatch.setattr(FieldDensity, "log", log)
-    made_up = shown(0.1, interpolation, "float64", True)
-    assert made_up["picture"].shape == truth["picture"].shape and made_up["score"] != truth["score"]
-    assert not np.array_equal(made_up["picture"], truth["picture"])
-    if interpolation == "nearest":
-        assert not np.array_equal(made_up["log p"], truth["log p"])

@@ -110,16 +110,6 @@ def test_growth_offset_and_shape_are_fitted_together() -> None:
     assert fit.log_likelihood > gs.fit_beam_parameters(z, expected, RANGE, **options).log_likelihood
 
 
-@pytest.mark.long
-def test_a_fit_may_start_from_its_shape() -> None:
-    z, expected = (each[:1000] for each in drawn(STUDENT))
-    options: Any = dict(backend="numpy", hit="student")
-    free = gs.fit_beam_parameters(z, expected, RANGE, **options)
-    again = gs.fit_beam_parameters(z, expected, RANGE, initial=free.parameters, **options)
-    assert again.log_likelihood == pytest.approx(free.log_likelihood, abs=1e-6)
-    assert again.parameters.hit_dof == pytest.approx(free.parameters.hit_dof, rel=1e-3)
-
-
 def test_without_ranges_nothing_determines_the_shape() -> None:
     fit = gs.fit_beam_parameters([RANGE] * 5, [4.0] * 5, RANGE, backend="numpy", hit="student")
     assert fit.parameters.hit == "student" and fit.held["hit_dof"] == "no range determines it"

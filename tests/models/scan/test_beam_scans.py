@@ -132,21 +132,6 @@ def test_thinning_counts_informative_beams_only(backend):
     np.testing.assert_array_equal(log_p, model_of(backend).log_likelihood(poses, scan))
 
 
-@pytest.mark.long_on("warp")
-def test_several_scans_at_once(backend):
-    _, poses = room()
-    scans = np.array([SCANS["hits"], SCANS["mixed"], SCANS["all missing"]], float)
-    clouds = np.stack([poses, poses[::-1], poses + 0.1])
-    model = model_of(backend)
-    log_p, parts = model.log_likelihood(clouds, scans, per_beam=True)
-    assert log_p.shape == (3, 8) and parts.shape == (3, 8, 10)
-    for s in range(3):
-        one, each = model.log_likelihood(clouds[s], scans[s], per_beam=True)
-        np.testing.assert_array_equal(log_p[s], one)
-        np.testing.assert_array_equal(parts[s], each)
-    np.testing.assert_array_equal(model.log_likelihood(clouds, scans), log_p)
-
-
 @pytest.mark.parametrize("specialize", [True, False])
 def test_no_beams_and_no_particles(backend, specialize):
     grid, poses = room()

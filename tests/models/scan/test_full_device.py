@@ -125,20 +125,6 @@ def test_a_table_that_does_not_fit_is_reported_at_once(kind, backend, monkeypatc
     same_bits(call(), score(backend)[1]())
 
 
-def test_a_device_that_holds_nothing(backend):
-    """A model raises MemoryError, and works as soon as memory is free."""
-    grid, z = room(), scan()
-    poses = cloud(grid, 3000)
-    device = FullDevice(backend)
-    model = make("beam", grid, device)
-    model.log_likelihood(poses[:1], z)
-    device.largest = 10
-    with pytest.raises(MemoryError, match="no room"):
-        model.log_likelihood(poses, z)
-    device.largest = 1 << 60
-    same_bits(model.log_likelihood(poses, z), make("beam", grid, backend).log_likelihood(poses, z))
-
-
 def test_a_small_device_scores_in_pieces(backend):
     grid, z = room(), scan()
     poses = cloud(grid, 3000)

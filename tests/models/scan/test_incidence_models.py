@@ -85,25 +85,6 @@ def test_max_readings_where_their_probability_depends_on_the_pose(backend):
     assert np.isneginf(never.log_likelihood(poses, z)).all()
 
 
-@pytest.mark.long
-@pytest.mark.sampled(1, without="warp:cpu")
-def test_omissions_change_nothing(backend):
-    _, poses, _ = place()
-    z = a_scan()
-    lean, whole = model_of(backend), model_of(backend, specialize=False)
-    expected, parts = lean.log_likelihood(poses, z, per_beam=True)
-    found, each = whole.log_likelihood(poses, z, per_beam=True)
-    assert (np.abs(each - parts) <= 2 * per_beam(parts, "float32")).all()
-    assert (np.abs(found - expected) <= 2 * per_scan(parts, "float32")).all()
-    text = lean.explain()
-    assert "parameters for 3 ranges of the angle of incidence (max readings depend on it)" in text.splitlines()[0]
-    assert "INCIDENCE" in text and "probability z_max at every pose" not in text
-    same = gs.IncidenceParameters((0, 0.5, RIGHT), (P(sigma_hit=0.1), P(sigma_hit=0.3)))
-    equal = model_of(backend, incidence=same)
-    equal.log_likelihood(poses, z)
-    assert "depend on it" not in equal.explain() and "probability z_max at every pose" in equal.explain()
-
-
 def test_a_changed_map_changes_the_model():
     _, poses, _ = place()
     model, z = model_of("numpy"), a_scan()

@@ -1,7 +1,6 @@
-"""Densities of short, max and random readings have one home on the host, which all users of densities follow.
+"""Densities of short, max and random readings are those of SciPy, and have one home on the host.
 
-Each is replaced by a made-up one: lambda_short counts twice, random readings spread over 2 range_max, the probability
-of no return is halved. Every user must then give the results of other parameters without the change.
+Where lambda_short counts twice, every user must give the results of a doubled parameter without the change.
 """
 
 from __future__ import annotations
@@ -15,19 +14,12 @@ from support.learning_data import point
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.backends.workspace import Workspace
-from gpusense.evaluation.range_data import RangeData
-from gpusense.interface.structs import MixtureTerms
 from gpusense.learning.beam import growth, optimum, report
 from gpusense.learning.beam.device_sums import DeviceSums, make_bounds
 from gpusense.learning.beam.pairs import make_pairs
 from gpusense.learning.beam.problem import NO_PRIOR, Problem
-from gpusense.learning.point import beacons
 from gpusense.models.scan.densities import log_mixture
-from gpusense.models.scan.mixture import learning_terms, mixture_of, peer_mixture, tabulated
-from gpusense.models.scan.readings import device_readings
-from gpusense.plots import fits
-from gpusense.world.field_density import FieldDensity
+from gpusense.models.scan.mixture import learning_terms, mixture_of
 from gpusense.world.range_causes import NoReturn, RandomDensity, ShortDensity
 
 RANGE = 8.0
@@ -39,7 +31,6 @@ Z = RNG.uniform(0.2, 7.9, 20)
 WITH_MAX = np.where(np.arange(20) % 5 == 0, RANGE, Z)
 EXPECTED = np.maximum(Z * RNG.uniform(0.9, 1.6, 20), 0.3).clip(max=RANGE)
 BASE = gs.BeamParameters(0.6, 0.2, 0.1, 0.1, 0.3, 0.4)
-FIELD = gs.LikelihoodFieldParameters(z_hit=0.7, z_max=0.1, z_rand=0.2, sigma_hit=0.2)
 HOST = dict(backend="numpy", precision="float64")
 
 
@@ -156,128 +147,3 @@ def test_a_made_up_short_density_is_followed(monkeypatch):
     plain, wanted = users(1), users(2)
     monkeypatch.setattr(ShortDensity, "__init__", lambda self, rate: setattr(self, "rate", 2 * rate))
     compare(users(1), wanted, plain)
-
-
-def test_a_made_up_random_density_is_followed(monkeypatch):
-    weights = np.array([0.6, 0.2, 0.1, 0.1])
-    halved = weights * [1, 1, 1, 0.5]
-
-    def users(chosen):
-        total = chosen.sum()
-        p = gs.BeamParameters(*chosen / total, 0.3, 0.4)
-        found = {name: parts + math.log(total) for name, parts in models(p).items() if name not in skipped}
-        f = gs.LikelihoodFieldParameters(*chosen[[0, 2, 3]] / (total - 0.2), sigma_hit=0.2)
-        field = gs.LikelihoodFieldModel(ROOM, SCANNER, f, **HOST).log_likelihood(POSES, WITH_MAX, per_beam=True)[1]
-        density = FieldDensity(f, RANGE)
-        found |= {"field": field, "density of a field": density.log(Z / 8), "linear field": np.log(density.rand)}
-        found = {name: parts + (math.log(total - 0.2) if "field" in name else 0.0) for name, parts in found.items()}
-        return found | table(p) | mixture(chosen)
-
-    # A weight of 0 removes random readings from the sum of logarithms.
-    skipped = ("sum of logarithms",)
-    plain, wanted, ranges = users(weights), users(halved), far_ranges()
-    at = point(*weights, sigma=0.3, rate=0.4)
-    steep = BASE.replace(z_hit=0.7 - 1e-7, z_rand=1e-7, lambda_short=10.0)
-    log_term = numbers(steep)["terms of logarithms"][1]
-    before = learned(at), drawn(gs.BeamParameters(0.0, 0.0, 0.0, 1.0))["worlds"], peers(), radio(), log_floor()
-    monkeypatch.setattr(RandomDensity, "__init__", lambda self, longest: setattr(self, "range_max", 2 * longest))
-    compare(users(weights), wanted, plain)
-    after = learned(at), drawn(gs.BeamParameters(0.0, 0.0, 0.0, 1.0))["worlds"], peers(), radio(), log_floor()
-    dense, sparse = (MixtureTerms(*found[0]["terms"]).rand_density for found in (before, after))
-    assert sparse == pytest.approx(dense - math.log(2))
-    np.testing.assert_allclose(after[0]["components"][2], before[0]["components"][2] - math.log(2))
-    np.testing.assert_allclose(after[1], np.minimum(2 * before[1], RANGE))
-    np.testing.assert_allclose(after[2], 0.5 * before[2], rtol=1e-6)
-    np.testing.assert_allclose(after[3], before[3] - math.log(2))
-    assert after[4] == pytest.approx(before[4] - math.log(2))
-    assert numbers(steep)["terms of logarithms"][1] == pytest.approx(log_term - math.log(2))
-    np.testing.assert_allclose(far_ranges(), 2 * ranges)
-    # The joint fit's density equals the host's mixture.
-    growing = {**dict(zip(("z_hit", "z_short", "z_max", "z_rand"), weights, strict=True)), "sigma_growth": 0.01}
-    truth = log_mixture(WITH_MAX, EXPECTED, sigma_hit=0.3, lambda_short=0.4, range_max=RANGE, **growing)
-    np.testing.assert_allclose(after[0]["density"], truth, rtol=1e-9)
-
-
-def peers():
-    """Return densities of random readings among the numbers of peers' kernels and in their fields, far from walls."""
-    p = gs.LikelihoodFieldParameters(z_hit=0.5, z_rand=0.5, sigma_hit=0.1)
-    beluga, far = gs.compat.Beluga(model_unknown_space=True), np.array([1e4])
-    fields = [each.field_values(far, p, 0.1, RANGE)[0] for each in (beluga, gs.compat.Amcl())]
-    kernel = peer_mixture(BASE, RANGE, np.dtype(np.float64), amcl=False)[1].rand_density[0]
-    return np.array([kernel, *fields, beluga.beyond(p, RANGE), beluga.overlay(p, RANGE)])
-
-
-def radio():
-    """Return the log density of an impossible range to a beacon: of a model, and of a fit."""
-    p = gs.BeaconParameters(z_hit=0.8, z_rand=0.2, range_max=RANGE)
-    model = gs.BeaconModel([(0.0, 0.0)], p, **HOST).log_likelihood([(1.0, 0.0, 0.0)], [7.9])
-    one = np.ones(1)
-    fit = beacons._Beacons(7.9 * one, one, np.zeros(1, int), "normal", None, RANGE, 0, 1.0)
-    return np.append(model, fit.log_p(np.array([math.log(0.1), 0.2]))[0])
-
-
-def log_floor():
-    """Return the log of the lower end of the density's axis in the picture of a fit, half the random density."""
-    data = RangeData(np.full(20, 3.0), np.full(20, 3.0), None, np.zeros(20, int), RANGE)
-    rare = gs.BeamParameters(0.99, 0.0, 0.0, 0.01, 0.3)
-    return math.log(fits.density_figure(data, rare, [3.0]).axes[0].get_ylim()[0])
-
-
-def far_ranges():
-    """Return random readings to a beacon."""
-    p = gs.BeaconParameters(z_hit=0.0, z_rand=1.0, range_max=RANGE)
-    return gs.BeaconModel([(0.0, 0.0)], p, **HOST).sample(POSES, seed=4)
-
-
-def placed_and_drawn():
-    """Return log z_max for kernels that place readings, and in the picture of a fit."""
-    device, kind = get_backend("numpy"), np.dtype(np.float64)
-    sensing = gs.BeamModel(ROOM, SCANNER, BASE, **HOST)._pipeline.sensing()
-    placing, _ = device_readings(sensing, device.upload(WITH_MAX), kind, kind, Workspace(device))
-    data = RangeData(Z, EXPECTED, None, np.zeros(20, int), RANGE)
-    title = fits.surface_figure(data, BASE).axes[0].get_title()
-    return placing.arguments["rules"].log_max, float(title.rpartition("log z_max = ")[2])
-
-
-def test_a_made_up_probability_of_no_return_is_followed(monkeypatch):
-    far = WITH_MAX >= RANGE
-
-    def users():
-        found = models(BASE)
-        found["incidence"] = found["incidence"].min(axis=0)
-        field = gs.LikelihoodFieldModel(ROOM, SCANNER, FIELD, **HOST).log_likelihood(POSES, WITH_MAX, per_beam=True)
-        found |= {"field": field[1]} | mixture((0.6, 0.2, 0.1, 0.1)) | {"sum": field[0]}
-        at = learned(point(0.6, 0.2, 0.1, 0.1, sigma=0.3, rate=0.4))
-        found |= {
-            "joint fit": at["density"],
-            "objective": at["objective"],
-            "kernel's term": MixtureTerms(*at["terms"]).z_max,
-        }
-        found["peer"] = np.log(peer_mixture(BASE, RANGE, np.dtype(np.float64), amcl=False)[1].z_max[0])
-        nothing = gs.BeamModel(ROOM, SCANNER, BASE, **HOST).log_likelihood(POSES, np.full(20, RANGE), per_beam=True)
-        found["field's term"] = FieldDensity(FIELD, RANGE).terms(np.dtype(np.float64)).z_max
-        found["tabulated"] = tabulated(BASE, 0.5, RANGE, np.dtype(np.float64))[-1]
-        found |= {"only max readings": nothing[0], "each of them": nothing[1]}
-        impossible, every = gs.BeamParameters(0.0, 0.0, 1.0, 0.0), dict(specialize=False) | HOST
-        found["placed"] = gs.BeamModel(ROOM, SCANNER, impossible, **every).log_likelihood(
-            POSES, WITH_MAX, per_beam=True
-        )[1][:, ::5]
-        found["nothing but no return"] = gs.BeamModel(ROOM, SCANNER, impossible, **HOST).log_likelihood(
-            POSES, WITH_MAX, per_beam=True
-        )[1][:, ::5]
-        return found
-
-    plain, before = users(), placed_and_drawn()
-
-    def halve(self, weight):
-        self.weight = 0.5 * weight
-
-    monkeypatch.setattr(NoReturn, "__init__", halve)
-    assert placed_and_drawn() == pytest.approx([number - math.log(2) for number in before], abs=0.011)
-    once = dict.fromkeys(
-        ("field's term", "tabulated", "placed", "kernel's term", "peer", "each of them", "nothing but no return"), 1
-    )
-    counts = dict.fromkeys(("sum", "objective"), far.sum()) | once | {"only max readings": 20}
-    for name, values in users().items():
-        count = counts.get(name, far)
-        np.testing.assert_allclose(values, plain[name] - math.log(2) * count, rtol=1e-9, err_msg=name)

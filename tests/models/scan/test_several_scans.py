@@ -16,7 +16,6 @@ from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
 from gpusense.models import chunking
 from gpusense.models.scan import pipeline
-from gpusense.models.scan.classed import BeamSelection, ClassedScans, OmittedReadings, _join, class_scans
 
 BEAMS, RANGE = 37, 5.0
 RNG = np.random.default_rng(5)
@@ -224,41 +223,3 @@ def test_other_numbers_and_lists_as_poses():
     expected = model.log_likelihood(poses.astype(np.float64), scans_of()[:2])
     for given in (poses, poses.tolist(), poses.astype(np.float32), poses.astype(float)[:, ::-1][:, ::-1]):
         assert differing(model.log_likelihood(given, scans_of()[:2]), expected) == 0
-
-
-@pytest.mark.parametrize("options", [{}, {"beams": 9}, {"beams": np.array([3, 4, 30])}, {"z_max": 0.0}])
-@pytest.mark.parametrize("near", [0.0, 0.1])
-def test_a_batch_is_its_scans_one_after_the_other(options, near):
-    scanner = gs.Scanner(BEARINGS, RANGE, near)
-    vectors = np.stack([np.cos(BEARINGS), np.sin(BEARINGS)], axis=1)
-    rules = BeamSelection(scanner, vectors, options.get("z_max", 0.05), options.get("beams"), True)
-    for z in (scans_of(), scans_of().astype(np.float32), scans_of()[:1], scans_of()[3:5]):
-        alone = [class_scans(scan[None], rules) for scan in z]
-        for batch in (class_scans(z, rules), _join(alone)):
-            assert [batch.most_readings, batch.most_rays] == [max(len(scan.readings) for scan in alone)] * 2
-            for s, scan in enumerate(alone):
-                part = batch.part(s, s + 1)
-                for name in (
-                    "columns",
-                    "readings",
-                    "vectors",
-                    "rays",
-                    "ray_offsets",
-                    "counts",
-                    "ray_counts",
-                    "constants",
-                ):
-                    np.testing.assert_array_equal(getattr(part, name), getattr(scan, name))
-            for name in ("missing", "ignored_max", "thinned"):
-                assert getattr(batch.left_out, name) == getattr(alone[-1].left_out, name)
-            np.testing.assert_array_equal(batch.left_out.constant_max, alone[-1].left_out.constant_max)
-
-
-def test_groups_of_scans():
-    """Scans with no rays, as many rays as readings, or fewer."""
-    rays, counts = np.array([5, 4, 9, 0, 0, 3, 3, 3, 2, 2, 0]), np.array([5, 4, 9, 0, 0, 3, 3, 3, 7, 4, 0])
-    whole = np.zeros(counts.sum())
-    scans = ClassedScans(
-        whole, whole, whole, whole, whole, rays, counts, whole, OmittedReadings(*[whole > 0] * 5, False)
-    )
-    assert [*scans.groups()] == [(0, 3), (3, 4), (4, 5), (5, 8), (8, 10), (10, 11)]

@@ -6,9 +6,8 @@
 Every world is a room of 256 x 256 cells with boxes in it, each with 16 robots of 360 beams. A single map has as many
 robots as the largest number of worlds, and either the size of a room or as many cells as all rooms, up to 4096 x 4096.
 Rates time whole calls and, after a slash, bound calls. Poses, indices and ranges are in a GPU's memory, for processors
-in the host's. --kernels adds the time of each launch by the device's clock, and --tiles casts rays of worlds in tiles
-of poses and rays, as rays of one map. --peers casts lidars among discs in worlds without walls, and runs VMAS and
-ir-sim on the same scene where they are installed.
+in the host's. --kernels adds the time of each launch by the device's clock. --peers casts lidars among discs in worlds
+without walls, and runs VMAS and ir-sim on the same scene where they are installed.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.models.scan import tiles
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -297,11 +295,8 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--kernels", action="store_true", help="measure each launch by the device's clock")
     parser.add_argument("--shuffled", action="store_true", help="robots of a world do not follow each other")
     parser.add_argument("--peers", action="store_true", help="compare a lidar among discs with those of peers")
-    parser.add_argument("--tiles", action="store_true", help="cast rays of worlds in tiles of poses and rays")
     add_repeats(parser, 20, 5.0)
     arguments = parse(parser, argv)
-    if arguments.tiles:
-        tiles.LEAST_OF_ONE_POSE = len(BEARINGS) + 1
     if arguments.peers:
         lines = peers(arguments)
         columns = ("program", "lidars of 64 beams", "ms", "lidars/s", "differs from gpusense by at most")

@@ -30,6 +30,7 @@ _CALLS = 32
 _TIMES_RANGE, _TIMES_MAP, _VALUES = 10.0, 100.0, 3
 # Share of readings of exactly 0 beyond which 0 is probably a code.
 _ZEROS = 0.1
+_IN_DEGREES = "are they in degrees? Radians are meant (numpy.radians converts)"
 
 
 class PlausibilityWarning(UserWarning):
@@ -57,15 +58,9 @@ def look_at_bearings(name: str, bearings: NDArray[np.float64] | None) -> None:
         return
     low, high = float(bearings.min()), float(bearings.max())
     if high - low > _TURN * (1 + 1 / bearings.size):
-        _notice(
-            f"{name}: span {high - low:.4g} rad, more than a turn: are they in degrees? Radians are meant "
-            "(numpy.radians converts)"
-        )
+        _notice(f"{name}: span {high - low:.4g} rad, more than a turn: {_IN_DEGREES}")
     elif max(-low, high) > 2 * _TURN:
-        _notice(
-            f"{name}: reach {max(-low, high):.4g} rad, more than two turns from 0: are they in degrees? Radians are "
-            "meant (numpy.radians converts)"
-        )
+        _notice(f"{name}: reach {max(-low, high):.4g} rad, more than two turns from 0: {_IN_DEGREES}")
 
 
 def look_at_heading(name: str, heading: float) -> None:
@@ -87,10 +82,7 @@ def look_at_poses(name: str, poses: ArrayLike) -> None:
         return
     low, high = float(headings.min()), float(headings.max())
     if high - low > 4 * _TURN and max(-low, high) <= _DEGREES:
-        _notice(
-            f"{name}: have headings over more than four turns: are they in degrees? Radians are meant (numpy.radians "
-            "converts)"
-        )
+        _notice(f"{name}: have headings over more than four turns: {_IN_DEGREES}")
 
 
 def look_at_scanner(range_max: float, mount: tuple[float, float, float]) -> None:

@@ -16,10 +16,9 @@ from gpusense.evaluation.tracking import RISK, Track
 from gpusense.evaluation.trajectory_files import nearest_index, poses_at
 from gpusense.localization.diagnosis import Diagnosis
 from gpusense.localization.monitor import PoseMonitor
-from gpusense.localization.protection import check_risk
 from gpusense.localization.run_causes import diagnose_run
 from gpusense.localization.scan_motion import Moment
-from gpusense.localization.spread import FAR, WORDS, Word
+from gpusense.localization.spread import FAR, WORDS, Word, check_risk
 from gpusense.logs import Pose, Scan
 from gpusense.matching.locate import locate_scan
 from gpusense.matching.location import Location

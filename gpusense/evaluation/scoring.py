@@ -21,9 +21,8 @@ from gpusense._util.typing import Floats
 from gpusense.backends import BackendInfo
 from gpusense.evaluation.worlds import cloud_around, cloud_uniform
 from gpusense.localization.beam_consistency import BeamConsistency, MapJudge, beam_consistency
-from gpusense.localization.belief import Belief
+from gpusense.localization.belief import Belief, evidence_of_scan
 from gpusense.localization.diagnosis import Diagnosis, evidence_of
-from gpusense.localization.scan_evidence import evidence_of_scan
 from gpusense.localization.spread import LOST, TRACKING, Word
 from gpusense.localization.temperature import BeamCorrelation, learn_from_scan
 from gpusense.localization.weights import normalize_weights

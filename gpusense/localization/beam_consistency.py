@@ -175,23 +175,14 @@ def _judged_on_host(
 
 
 class _Setting(NamedTuple):
-    """A scanner in a map, or in a part of it.
-
-    Attributes:
-        scanner: The scanner.
-        turn: Direction of bearing 0 relative to the robot's heading [rad].
-        frame: The map's frame.
-        rules: The rules of the kernel.
-        rows: Least and largest row of a scanner whose beams stay within the part.
-        cols: Least and largest column.
-    """
+    """A scanner in a map, or in a part of it."""
 
     scanner: Scanner
-    turn: float
+    turn: float  # direction of bearing 0 relative to the robot's heading [rad]
     frame: Frame
     rules: BeamRules
-    rows: tuple[float, float]
-    cols: tuple[float, float]
+    rows: tuple[float, float]  # least and largest row of a scanner whose beams stay within the part
+    cols: tuple[float, float]  # least and largest column
 
 
 class _Expected(NamedTuple):

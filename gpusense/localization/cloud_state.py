@@ -23,46 +23,27 @@ _WIDE_JITTER = 0.7
 
 
 class Step(NamedTuple):
-    """Arguments of a correction.
+    """Arguments of a correction."""
 
-    Attributes:
-        settings: Settings, indexed by ``interface.constants``.
-        kind: Kind of the first motion.
-        stages: Most stages.
-        drawn: Particles of the next step.
-        readings: Indices of sensors with their readings.
-        judged: Scans to judge at the new pose, with the indices of their sensors; a cloud may leave this to the
-            verdict.
-        meanwhile: Called while the device works on the first stage.
-    """
-
-    settings: np.ndarray
-    kind: int
-    stages: int
-    drawn: int
-    readings: list[SensorReadings]
+    settings: np.ndarray  # settings, indexed by ``interface.constants``
+    kind: int  # kind of the first motion
+    stages: int  # most stages
+    drawn: int  # particles of the next step
+    readings: list[SensorReadings]  # indices of sensors with their readings
+    # Scans to judge at the new pose, with the indices of their sensors; a cloud may leave this to the verdict.
     judged: Sequence[SensorReadings] = ()
-    meanwhile: Callable[[], None] | None = None
+    meanwhile: Callable[[], None] | None = None  # called while the device works on the first stage
 
 
 class Contents(NamedTuple):
-    """Particles on the host.
+    """Particles on the host."""
 
-    Attributes:
-        poses: (N, 3) shown poses.
-        weights: (N,) their unnormalised weights.
-        next_poses: (M, 3) poses of the next step; None if the shown poses were not weighed.
-        next_weights: (M,) weights at the beginning of the next step; None if ``next_poses`` is None.
-        state: State of the last correction in the kernels' layout.
-        pool: Poses for recovery to inject, or None.
-    """
-
-    poses: np.ndarray
-    weights: np.ndarray
-    next_poses: np.ndarray | None
-    next_weights: np.ndarray | None
-    state: np.ndarray
-    pool: np.ndarray | None
+    poses: np.ndarray  # (N, 3) shown poses
+    weights: np.ndarray  # (N,) their unnormalised weights
+    next_poses: np.ndarray | None  # (M, 3) poses of the next step; None if the shown poses were not weighed
+    next_weights: np.ndarray | None  # (M,) weights at the beginning of the next step; None if ``next_poses`` is None
+    state: np.ndarray  # state of the last correction in the kernels' layout
+    pool: np.ndarray | None  # poses for recovery to inject, or None
 
     @property
     def next_count(self) -> int:
@@ -105,23 +86,14 @@ class Snapshot:
 
 
 class Summary(NamedTuple):
-    """The state of a filter after a correction.
+    """The state of a filter after a correction."""
 
-    Attributes:
-        effective_sample_size: Effective sample size of the last stage, at most the number of distinct particles.
-        temperature: Share of the temperature used by all stages.
-        degenerate: Whether no particle was possible.
-        stages: Number of stages that ran.
-        numbers: The state in the kernels' layout.
-        resampled: Whether particles were drawn at the end.
-    """
-
-    effective_sample_size: float
-    temperature: float
-    degenerate: bool
-    stages: int
-    numbers: np.ndarray
-    resampled: bool
+    effective_sample_size: float  # effective sample size of the last stage, at most the number of distinct particles
+    temperature: float  # share of the temperature used by all stages
+    degenerate: bool  # whether no particle was possible
+    stages: int  # number of stages that ran
+    numbers: np.ndarray  # the state in the kernels' layout
+    resampled: bool  # whether particles were drawn at the end
 
     @property
     def evidence(self) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from gpusense._util.typing import Floats
 from gpusense.interface.constants import THROUGH
 from gpusense.localization.beam_consistency import BeamConsistency, counts_of
-from gpusense.localization.scan_evidence import ratio_of_scan
+from gpusense.localization.belief import ratio_of_scan
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.verdict import sightings
 from gpusense.matching.field_search import searchable

@@ -9,8 +9,7 @@ import numpy as np
 
 from gpusense._util.html import card, pose_rows
 from gpusense.localization.pose_algebra import mean_pose, wrap_angle
-from gpusense.localization.protection import LEAST_SAMPLE, Distances, protection_level
-from gpusense.localization.spread import LOST, Word
+from gpusense.localization.spread import LEAST_SAMPLE, LOST, Distances, Word, protection_level
 
 # Bins of positions and headings [m, rad]; neighbouring bins belong to one cluster.
 _BIN, _BIN_TURN = 0.5, 0.35

@@ -9,7 +9,6 @@ import numpy as np
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 from gpusense.backends import BackendInfo
-from gpusense.localization import options
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.diagnosis import Diagnosis, diagnose
@@ -18,7 +17,7 @@ from gpusense.localization.filter_core import FilterCore
 from gpusense.localization.journal import Transactional, atomic, consistent
 from gpusense.localization.motion import MotionModel, OdometryMotion, SampledMotion
 from gpusense.localization.sensors import grid_of, sensors_of
-from gpusense.localization.state import FilterState, check_state, constructor_options, model_names
+from gpusense.localization.state import FilterState, check_state, checked_options, constructor_options, model_names
 from gpusense.localization.tracker import Tracker
 from gpusense.world.grid import OccupancyGrid
 
@@ -87,7 +86,7 @@ class ParticleFilter(Transactional):
         self.motion: MotionModel = OdometryMotion() if motion is None else motion
         if not hasattr(self.motion, "sampled"):
             raise TypeError(f"motion: must be a motion model, got {checks.show(motion)}")
-        self.options = options.checked(
+        self.options = checked_options(
             particles=particles, seed=seed, temperature=temperature, resampling=resampling, threshold=threshold,
             stages=stages, recovery=recovery, beam_skip=beam_skip,
         )  # fmt: skip

@@ -12,9 +12,18 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 from gpusense.localization import starts
 from gpusense.localization.diagnosis import Diagnosis, diagnose
-from gpusense.localization.protection import Distances, distances_by_scan, margins_of, protection_level
 from gpusense.localization.sensors import copied, readings_of, sensors_of
-from gpusense.localization.spread import LOST, Word, share_off, spread_of, verdict_label
+from gpusense.localization.spread import (
+    LOST,
+    Distances,
+    Word,
+    distances_by_scan,
+    margins_of,
+    protection_level,
+    share_off,
+    spread_of,
+    verdict_label,
+)
 from gpusense.localization.verdict import Verdict, VerdictState
 from gpusense.world.scanner import float64_readings
 

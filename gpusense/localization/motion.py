@@ -25,19 +25,13 @@ _MOST_TURNED = 1e5
 
 
 class SampledMotion(NamedTuple):
-    """Parameters of the kernel ``move_particles``.
+    """Parameters of the kernel ``move_particles``."""
 
-    Attributes:
-        mean: First turn, translation ahead and to the left, second turn [rad, m, m, rad].
-        deviation: Their standard deviations.
-        kind: Straight translation or arc.
-        reverse: Probability that the translation had the opposite direction.
-    """
-
+    # First turn, translation ahead and to the left, second turn [rad, m, m, rad].
     mean: tuple[float, float, float, float]
-    deviation: tuple[float, float, float, float]
-    kind: int = STRAIGHT
-    reverse: float = 0.0
+    deviation: tuple[float, float, float, float]  # their standard deviations
+    kind: int = STRAIGHT  # straight translation or arc
+    reverse: float = 0.0  # probability that the translation had the opposite direction
 
     def after(self, pose: Sequence[float]) -> tuple[float, float, float]:
         """Return a pose (x, y, theta) [m, m, rad] after the mean motion."""

@@ -300,17 +300,11 @@ def _cost(noise: np.ndarray, errors: Errors) -> float:
 
 
 class Errors(NamedTuple):
-    """Errors of G gaps along and across the motion [m], and of the heading [rad].
+    """Errors of G gaps along and across the motion [m], and of the heading [rad]."""
 
-    Attributes:
-        residual: (G, 3) errors.
-        basis: (7, G, 3, 3) covariances per unit of each variance of ``NOISES``.
-        design: (G, 3, 3) errors per unit of each part of the systematic error.
-    """
-
-    residual: np.ndarray
-    basis: np.ndarray
-    design: np.ndarray
+    residual: np.ndarray  # (G, 3) errors
+    basis: np.ndarray  # (7, G, 3, 3) covariances per unit of each variance of ``NOISES``
+    design: np.ndarray  # (G, 3, 3) errors per unit of each part of the systematic error
 
     def covariances(self, noise: np.ndarray) -> np.ndarray:
         """Return the (G, 3, 3) covariances for (7,) variances."""

@@ -28,21 +28,13 @@ _MOST_VIEWS = 32
 
 
 class BufferSlots(NamedTuple):
-    """Buffers of a filter's particles by index.
+    """Buffers of a filter's particles by index."""
 
-    Attributes:
-        shown: Weighted poses.
-        next: Poses of the next step; equal to ``shown`` if no step has weighed them.
-        weight: Weights of the shown poses.
-        before: Weights at the beginning of the next step.
-        state: State of the last correction.
-    """
-
-    shown: int = 0
-    next: int = 0
-    weight: int = 1
-    before: int = 1
-    state: int = 0
+    shown: int = 0  # weighted poses
+    next: int = 0  # poses of the next step; equal to ``shown`` if no step has weighed them
+    weight: int = 1  # weights of the shown poses
+    before: int = 1  # weights at the beginning of the next step
+    state: int = 0  # state of the last correction
 
     def placed(self, kept: BufferSlots) -> BufferSlots:
         """Return buffers for new particles outside ``kept``."""
@@ -70,29 +62,17 @@ class BufferSlots(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """A stage of a correction.
+    """A stage of a correction."""
 
-    Attributes:
-        source: Index of the buffer of poses; drawn particles go to the second buffer of the bank.
-        number: Number of the stage, from 0.
-        most: Most stages of the correction.
-        drawn: Number of particles to draw; 0 if the weights determine it.
-        before: Index of the weights before the stage.
-        weight: Index of the weights to set; weights of drawn particles are in the next buffer.
-        state: Index of the state to write.
-        origin: Index of the poses before the motion.
-        kind: Kind of the motion before the stage; None without motion.
-    """
-
-    source: int
-    number: int
-    most: int
-    drawn: int
-    before: int
-    weight: int
-    state: int
-    origin: int = 0
-    kind: int | None = None
+    source: int  # index of the buffer of poses; drawn particles go to the second buffer of the bank
+    number: int  # number of the stage, from 0
+    most: int  # most stages of the correction
+    drawn: int  # number of particles to draw; 0 if the weights determine it
+    before: int  # index of the weights before the stage
+    weight: int  # index of the weights to set; weights of drawn particles are in the next buffer
+    state: int  # index of the state to write
+    origin: int = 0  # index of the poses before the motion
+    kind: int | None = None  # kind of the motion before the stage; None without motion
 
     @property
     def key(self) -> tuple[int, ...]:

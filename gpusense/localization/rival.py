@@ -26,13 +26,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from gpusense.localization import starts
-from gpusense.localization.belief import correlation, motion_between, new_part
+from gpusense.localization.belief import correlation, motion_between, new_part, ratio_of_scan
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.cloud_state import Contents
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.rival_search import RivalSearch, are_apart, can_search, drawn
-from gpusense.localization.scan_evidence import ratio_of_scan
 from gpusense.localization.sensors import SensorReadings
 from gpusense.localization.spread import FAR, FAR_TURN, WIDE, deviations
 from gpusense.localization.tracker import Progress, Tracker

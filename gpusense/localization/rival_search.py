@@ -3,7 +3,7 @@
 Branch and bound searches the whole map for scans (:func:`gpusense.matching.locate.likely_poses`) without missing any
 place: once with all beams, and once with the longer half, since people shorten beams. People make the likelihood prefer
 places with many walls, so candidates are also weighed by the beams that meet walls
-(:mod:`gpusense.localization.scan_evidence`). A better fit of the scan at another place than at the estimate is evidence
+(:mod:`gpusense.localization.belief`). A better fit of the scan at another place than at the estimate is evidence
 for the verdict. For landmarks, and if the search finds nothing, poses are drawn at random.
 """
 
@@ -17,8 +17,8 @@ import numpy as np
 
 from gpusense.backends import arrays
 from gpusense.localization import starts
+from gpusense.localization.belief import ratio_of_places, ratio_of_scan
 from gpusense.localization.pose_algebra import wrap_angle
-from gpusense.localization.scan_evidence import ratio_of_places, ratio_of_scan
 from gpusense.localization.sensors import Sensor, SensorReadings
 from gpusense.localization.spread import FAR, FAR_TURN, deviations
 from gpusense.localization.verdict import sightings
@@ -41,26 +41,17 @@ _NEARBY, _MARGIN = 2.0, 1.0
 
 
 class Candidates(NamedTuple):
-    """Initial poses of a rival, and the comparison with the estimate.
+    """Initial poses of a rival, and the comparison with the estimate."""
 
-    Attributes:
-        poses: (M, 3) poses.
-        score: (M,) log-likelihood of each pose, less the ratio of its beams that meet walls.
-        effective: Effective number of initial poses.
-        lead: Tempered log-likelihood of the best candidate beyond 1 m or 0.5 rad of the estimate, less the estimate's
-            [nats]; NaN without a search of the whole map.
-        beams: Number of independent beams, the temperature times the number of beams.
-        walls: Ratio of the beams that meet walls at this candidate.
-        is_found: True if a candidate is at the estimate.
-    """
-
-    poses: np.ndarray
-    score: np.ndarray
-    effective: int
+    poses: np.ndarray  # (M, 3) poses
+    score: np.ndarray  # (M,) log-likelihood of each pose, less the ratio of its beams that meet walls
+    effective: int  # effective number of initial poses
+    # Tempered log-likelihood of the best candidate beyond 1 m or 0.5 rad of the estimate, less the estimate's
+    # [nats]; NaN without a search of the whole map.
     lead: float = math.nan
-    beams: float = 0.0
-    walls: float = 0.0
-    is_found: bool = False
+    beams: float = 0.0  # number of independent beams, the temperature times the number of beams
+    walls: float = 0.0  # ratio of the beams that meet walls at this candidate
+    is_found: bool = False  # true if a candidate is at the estimate
 
     @property
     def ratio(self) -> float:

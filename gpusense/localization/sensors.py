@@ -34,19 +34,12 @@ _MOST_SENSORS = DEPTH - TEMPERATURE
 
 
 class Lesson(NamedTuple):
-    """A scan that teaches the temperature.
+    """A scan that teaches the temperature."""
 
-    Attributes:
-        terms: (7, K) terms of its readings at :func:`poses_around` the estimate, or the function that waits for them.
-        axes: (3, 3) steps between these poses.
-        directions: (K,) directions of the beams in the world [rad].
-        follows: Whether the scan directly follows the previous lesson.
-    """
-
-    terms: Any
-    axes: np.ndarray
-    directions: np.ndarray
-    follows: bool
+    terms: Any  # (7, K) terms of its readings at :func:`poses_around` the estimate, or the function that waits for them
+    axes: np.ndarray  # (3, 3) steps between these poses
+    directions: np.ndarray  # (K,) directions of the beams in the world [rad]
+    follows: bool  # whether the scan directly follows the previous lesson
 
 
 class Sensor:

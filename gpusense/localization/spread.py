@@ -1,15 +1,33 @@
-"""Compute the probability that a pose is far off, from particles or from a covariance, and its word."""
+"""Compute the probability that a pose is far off, its word, and the protection level of a position.
+
+The protection level is a radius that the error exceeds with at most a stated probability, the risk. Let p_lost be the
+probability that the pose is lost. The protection level is the smallest r with
+
+    p_lost + (1 - p_lost) P(|error| > r | not lost) <= risk
+
+(Joerger and others, "Integrity monitoring of localization systems", *Sensors* 18(8), 2018, 2740, use the same terms).
+P comes from a normal density with the covariance of the position, and from the distances of spread-out particles. If
+the localiser states no covariance, it comes from the last scan: the likelihoods of poses around the pose, up to the
+errors of a lost one, with the temperature of ten independent beams.
+
+Errors of filters have longer tails than the particles, and the walls of a map are off by about a cell. So the radius is
+multiplied by a factor, and a margin is added; both were measured on logs.
+"""
 
 from __future__ import annotations
 
+import functools
 import math
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from gpusense._util import checks
 from gpusense._util.typing import Floats
 from gpusense.interface import constants
 from gpusense.localization.pose_algebra import wrap_angle
+from gpusense.localization.sensors import Sensor
 
 Word = Literal["tracking", "uncertain", "lost"]
 WORDS: tuple[Word, ...] = ("tracking", "uncertain", "lost")
@@ -36,18 +54,13 @@ def deviations(covariance: Floats) -> tuple[float, float]:
 
 
 class Spread(NamedTuple):
-    """Classes of a covariance, by the largest standard deviations of position and heading.
+    """Classes of a covariance, by the largest standard deviations of position and heading."""
 
-    Attributes:
-        wide: True if the position's exceeds 0.5 m, or the heading's 0.25 rad.
-        apart: True if the position's exceeds 1 m, or the heading's 0.5 rad: the distribution may cover several
-            places.
-        narrow: True if the position's is below 0.2 m and the heading's below 0.1 rad: a normal density then describes
-            the particles.
-    """
-
-    wide: bool
+    wide: bool  # true if the position's exceeds 0.5 m, or the heading's 0.25 rad
+    # True if the position's exceeds 1 m, or the heading's 0.5 rad: the distribution may cover several places.
     apart: bool
+    # True if the position's is below 0.2 m and the heading's below 0.1 rad: a normal density then describes the
+    # particles.
     narrow: bool
 
 
@@ -109,3 +122,160 @@ def _within_disc(large: float, small: float) -> float:
     across = np.array([_within(half, small) for half in chord.tolist()])
     density = np.exp(-0.5 * (along / large) ** 2) / (large * math.sqrt(2 * math.pi))
     return float(reach * (_WEIGHTS @ (density * across)))
+
+
+# Factor of the spread, least margin [m], and least risk that their calibration supports.
+WIDENING, MARGIN, LEAST_RISK = 1.25, 0.05, 0.01
+# Least effective sample size of a meaningful covariance.
+LEAST_SAMPLE = 10.0
+# Angles of the integral over a normal position: middles of parts of a quarter turn.
+_PARTS = 96
+_COSINES = np.cos((np.arange(_PARTS) + 0.5) * (math.pi / 2 / _PARTS)) ** 2
+# Steps of the bisection; each halves the interval.
+_STEPS = 60
+# Number of poses around a pose without a covariance, and of beams that weigh them. Steps of a low-discrepancy sequence:
+# the first powers of 1 / x for x^4 = x + 1 (Roberts, "The unreasonable effectiveness of quasirandom sequences" (2018)).
+_AROUND, _BEAMS, _SEQUENCE = 2048, 240, 1.2207440846057596 ** -np.arange(1.0, 4.0)
+
+
+class Distances:
+    """Distances of particles from a pose, sorted when a radius is first asked for: a filter's step has no use for them.
+
+    Args:
+        particles: Returns (N, 3) particles and (N,) weights >= 0, not necessarily normalised.
+        pose: (3,) pose.
+    """
+
+    def __init__(self, particles: Callable[[], tuple[Floats, Floats]], pose: Floats) -> None:
+        self._particles, self._pose = particles, pose
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_sorted": self._sorted}
+
+    @functools.cached_property
+    def _sorted(self) -> tuple[Floats, Floats]:
+        """Distances (N,) [m], increasing, and the share of the particles that is farther than each."""
+        (poses, weights), pose = self._particles(), self._pose
+        distance = np.hypot(poses[:, 0] - pose[0], poses[:, 1] - pose[1])
+        order = np.argsort(distance, kind="stable")
+        sums = np.cumsum(weights[order])
+        return distance[order], 1 - sums / sums[-1]
+
+    def radius(self, beyond: float) -> float:
+        """Return the least distance exceeded by at most a share of the particles."""
+        distance, farther = self._sorted
+        # Sums of many weights are 1 up to rounding.
+        k = int(np.searchsorted(-farther, -beyond - 1e-12))
+        return float(distance[min(k, len(distance) - 1)])
+
+
+def check_risk(risk: float) -> float:
+    """Return a risk that the calibration supports."""
+    risk = checks.real("risk", risk, high=1.0)
+    if risk < LEAST_RISK:
+        rule = f"must be at least {LEAST_RISK}, the least risk that the calibration on logs supports"
+        raise ValueError(f"risk: {rule}, got {checks.show(risk)}")
+    return risk
+
+
+def distances_by_scan(sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]], pose: Floats) -> Distances:
+    """Return distances of poses within 1 m and 0.5 rad of a pose, weighted by the likelihoods of readings there.
+
+    The poses are denser near the pose (3,); their weights make up for it. Keys of the readings are indices of sensors.
+    """
+    far, angle, turn = (np.arange(1, _AROUND + 1)[:, None] * _SEQUENCE % 1).T
+    far, angle, turn = far**2, math.tau * angle, 2 * turn - 1
+    offsets = np.column_stack([
+        FAR * far * np.cos(angle), FAR * far * np.sin(angle), FAR_TURN * turn * np.abs(turn),
+    ])  # fmt: skip
+    poses = pose + offsets
+
+    def particles() -> tuple[Floats, Floats]:
+        log_p = np.zeros(_AROUND)
+        for index, reading in readings.items():
+            sensor, every = sensors[index], 1
+            if sensor.calibrates and sensor.beams == len(reading[0]):
+                # Few beams have as much information at their temperature, in less time.
+                every = max(sensor.beams // _BEAMS, 1)
+                reading = (np.where(np.arange(sensor.beams) % every == 0, reading[0], np.nan), *reading[1:])
+            temperature = min(every * sensor.temperature("auto"), 1.0)
+            log_p += temperature * np.asarray(sensor.log_likelihood(poses, reading), np.float64)
+        best = log_p.max()
+        likelihood = np.exp(log_p - best) if math.isfinite(best) else np.ones(_AROUND)
+        return poses, np.asarray(likelihood * far**1.5 * np.abs(turn))
+
+    return Distances(particles, pose)
+
+
+def margins_of(sensors: Sequence[Sensor]) -> tuple[float, float]:
+    """Return the factor of the spread and the margin [m] of poses that sensors with a map judge."""
+    cells = [sensor.model.grid.resolution for sensor in sensors if sensor.calibrates]
+    return WIDENING, max([MARGIN, *cells])
+
+
+def protection_level(
+    risk: float,
+    p_lost: float,
+    covariance: Floats | None,
+    distances: Distances | None = None,
+    *,
+    widening: float = 1.0,
+    margin: float = 0.0,
+) -> float:
+    """Return the protection level of a pose [m].
+
+    Args:
+        risk: Largest probability that the position is farther off, from ``LEAST_RISK`` to 1.
+        p_lost: Probability that the pose is lost.
+        covariance: (3, 3) covariance of x, y [m] and heading; None if unknown: a pose that is not lost is off by at
+            most 1 m.
+        distances: Distances of the particles from the pose; None if the covariance describes them.
+        widening: Factor of the spread.
+        margin: Added to the radius [m].
+    """
+    risk = check_risk(risk)
+    if risk == 1:
+        return 0.0
+    if not p_lost <= risk:
+        return math.inf
+    beyond = (risk - p_lost) / (1 - p_lost)
+    if covariance is None:
+        return FAR if distances is None else min(widening * distances.radius(beyond) + margin, FAR)
+    radius = normal_radius(covariance, beyond)
+    if distances is not None:
+        radius = max(radius, distances.radius(beyond))
+    return widening * radius + margin
+
+
+def normal_radius(covariance: Floats, beyond: float) -> float:
+    """Return the distance that a normal position exceeds with a probability.
+
+    The position is (a u cos t, b u sin t) with the deviations a and b along its axes, u of a Rayleigh density and t
+    uniform. It is beyond r with probability exp(-r^2 / (2 (a^2 cos^2 t + b^2 sin^2 t))), averaged over t. The mean over
+    equal angles converges faster than any power of their number, even for b = 0.
+
+    Args:
+        covariance: (3, 3) covariance of x, y [m] and heading; entries may be infinite or NaN.
+        beyond: The probability, from 0 to 1.
+
+    Returns:
+        The distance [m]; infinite for an infinite covariance or a probability of 0.
+    """
+    large, _ = deviations(covariance)
+    if not math.isfinite(large):
+        return math.inf
+    if large == 0 or beyond >= 1:
+        return 0.0
+    if beyond <= 0:
+        return math.inf
+    (xx, _, _), (_, yy, _), _ = (covariance / large / large).tolist()
+    small = min(max(xx + yy - 1, 0.0), 1.0)
+    variances = small + (1 - small) * _COSINES
+    low, high = 0.0, math.sqrt(-2 * math.log(beyond))
+    for _ in range(_STEPS):
+        middle = (low + high) / 2
+        if np.exp(-0.5 * middle * middle / variances).mean() > beyond:
+            low = middle
+        else:
+            high = middle
+    return large * high

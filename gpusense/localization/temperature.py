@@ -81,23 +81,14 @@ def poses_around(pose: np.ndarray, axes: np.ndarray) -> np.ndarray:
 
 
 class _Scores(NamedTuple):
-    """Scores of beams along the axes, of a scan with K used beams.
+    """Scores of beams along the axes, of a scan with K used beams."""
 
-    Attributes:
-        numbers: (12 K,) scores of each beam, and their outer products.
-        curvature: Curvature.
-        blocks: (16, 12) sums of the numbers over short blocks of neighbours.
-        fit: (3,) change of the scores by a fit.
-        outer: (3, 3) sum of the outer products.
-        inverse: (3, 3) its inverse.
-    """
-
-    numbers: np.ndarray
-    curvature: float
-    blocks: np.ndarray
-    fit: np.ndarray
-    outer: np.ndarray
-    inverse: np.ndarray
+    numbers: np.ndarray  # (12 K,) scores of each beam, and their outer products
+    curvature: float  # curvature
+    blocks: np.ndarray  # (16, 12) sums of the numbers over short blocks of neighbours
+    fit: np.ndarray  # (3,) change of the scores by a fit
+    outer: np.ndarray  # (3, 3) sum of the outer products
+    inverse: np.ndarray  # (3, 3) its inverse
 
     def fitted(self, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (B, 3) scores of blocks after the fit, and (B, 3, 3) outer products, from their (B, 12) sums."""

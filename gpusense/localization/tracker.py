@@ -19,9 +19,9 @@ from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.estimates import covariance_of, sample_size_of
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import STILL, SampledMotion
-from gpusense.localization.options import Options, settings_of_step
 from gpusense.localization.sensors import Sensor, SensorReadings
 from gpusense.localization.spread import WIDE
+from gpusense.localization.state import Options, settings_of_step
 
 # Bins of the cloud [m, rad], error bound of its density, and normal quantile of the bound's probability.
 BIN, BIN_TURN = 0.5, math.radians(10)
@@ -31,19 +31,13 @@ _LOOK = 5
 
 
 class Progress(NamedTuple):
-    """Progress of the particles in time; immutable, replaced by one assignment.
+    """Progress of the particles in time; immutable, replaced by one assignment."""
 
-    Attributes:
-        step: Number of the last step; starts, motions, and corrections without a motion begin steps.
-        motion: The postponed motion, to share a program with the correction.
-        moved: Mean motion since the last correction, as a pose; None without a motion.
-        copies: Whether the last correction weighed particles drawn since the last motion.
-    """
-
-    step: int = 0
-    motion: SampledMotion | None = None
+    step: int = 0  # number of the last step; starts, motions, and corrections without a motion begin steps
+    motion: SampledMotion | None = None  # the postponed motion, to share a program with the correction
+    # Mean motion since the last correction, as a pose; None without a motion.
     moved: tuple[float, float, float] | None = None
-    copies: bool = False
+    copies: bool = False  # whether the last correction weighed particles drawn since the last motion
 
 
 class Tracker:

@@ -6,7 +6,7 @@ limits:
 
     p_lost = W + (1 - W) s.
 
-W comes from the scans (:mod:`gpusense.localization.scan_evidence`), s from the spread. Models of positions or headings
+W comes from the scans (:mod:`gpusense.localization.belief`), s from the spread. Models of positions or headings
 have no map and no evidence; W would only follow its prior and rates, and is omitted.
 """
 
@@ -20,9 +20,8 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.localization.beam_consistency import BeamConsistency, beam_consistency
-from gpusense.localization.belief import Belief, motion_between
+from gpusense.localization.belief import Belief, evidence_of_scan, motion_between, ratio_of_features
 from gpusense.localization.motion import STILL, SampledMotion
-from gpusense.localization.scan_evidence import evidence_of_scan, ratio_of_features
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.spread import TRACKING, spread_of
 from gpusense.models.landmark.base import FeatureModel

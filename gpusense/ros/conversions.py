@@ -17,7 +17,7 @@ from gpusense._util import checks
 from gpusense.evaluation.tracking import RISK
 from gpusense.localization.nav2 import DEFAULTS, Nav2Options, from_nav2
 from gpusense.localization.pose_algebra import compose_poses, invert_poses
-from gpusense.localization.protection import check_risk
+from gpusense.localization.spread import check_risk
 from gpusense.logs.records import Pose, planar_mount
 from gpusense.world.messages import field, planar_pose
 from gpusense.world.scanner import Scanner

@@ -12,8 +12,8 @@ from support import filter_scene as scene
 
 import gpusense as gs
 from gpusense.localization import rival
+from gpusense.localization.belief import IS_FOUND, ratio_of_places
 from gpusense.localization.rival_search import RivalSearch, are_apart, drawn
-from gpusense.localization.scan_evidence import IS_FOUND, ratio_of_places
 from gpusense.localization.sensors import Sensor
 from gpusense.matching.locate import likely_poses
 

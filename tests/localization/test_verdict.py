@@ -13,8 +13,19 @@ from gpusense.backends import get_backend
 from gpusense.interface.constants import AGREES, NOTHING, SHORT, THROUGH, VANISHED
 from gpusense.localization import belief as constants
 from gpusense.localization.beam_consistency import MapJudge, beam_consistency
-from gpusense.localization.belief import ALIKE, ALIKE_CHOSEN, FOUND, LENGTH, PER_METRE, PER_SCAN, STAYS, Belief
-from gpusense.localization.scan_evidence import LIMITS, evidence_of_scan, ratio_of_scan
+from gpusense.localization.belief import (
+    ALIKE,
+    ALIKE_CHOSEN,
+    FOUND,
+    LENGTH,
+    LIMITS,
+    PER_METRE,
+    PER_SCAN,
+    STAYS,
+    Belief,
+    evidence_of_scan,
+    ratio_of_scan,
+)
 from gpusense.localization.spread import share_off, share_off_of, verdict_label
 
 STILL = np.zeros((3, 3))

@@ -135,21 +135,17 @@ def beam_consistency(
 def _place_of(grid: OccupancyGrid, pose: Floats) -> tuple[bool, bool]:
     """Return whether all cells around a pose are solid, and whether all are unknown or off the map."""
     (x, y, _), (x0, y0, yaw) = pose.tolist(), grid.origin
-    c, s = math.cos(yaw), math.sin(yaw)
-    dx, dy = x - x0, y - y0
-    column = math.floor((c * dx + s * dy) / grid.resolution)
-    row = math.floor((-s * dx + c * dy) / grid.resolution)
-    reach = max(1, round(BESIDE / grid.resolution))
-    rows, columns = grid.shape
-    if not (-reach <= row < rows + reach and -reach <= column < columns + reach):
-        return False, True
-    if 0 <= row < rows and 0 <= column < columns and 0 <= grid.cells[row, column] < grid.occupied_threshold:
+    side, cells, occupied, (rows, columns) = grid.resolution, grid.cells, grid.occupied_threshold, grid.shape
+    c, s, dx, dy = math.cos(yaw), math.sin(yaw), x - x0, y - y0
+    column, row = math.floor((c * dx + s * dy) / side), math.floor((-s * dx + c * dy) / side)
+    if 0 <= row < rows and 0 <= column < columns and 0 <= cells[row, column] < occupied:
         return False, False
-    cells = grid.cells[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
-    if not cells.size:
+    reach = max(1, round(BESIDE / side))
+    around = cells[max(row - reach, 0) : max(row + reach + 1, 0), max(column - reach, 0) : max(column + reach + 1, 0)]
+    if not around.size:
         return False, True
-    solid = bool((cells >= grid.occupied_threshold).all())
-    return solid, not solid and bool((cells < 0).all())
+    solid = bool((around >= occupied).all())
+    return solid, not solid and bool((around < 0).all())
 
 
 def _chosen_beams(scanner: Scanner, ranges: Floats) -> Beams:

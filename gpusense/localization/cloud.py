@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import weakref
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import numpy as np
@@ -65,9 +65,10 @@ class Cloud(Particles):
         # present one compute the estimate; the same for the second pass, of one correction.
         self._asked, self._was_asked, self._estimates_too = 0, False, False
         self._was_refined, self._refines_too = False, False
-        # The present correction while it runs; scans to judge until judges expect them; judges until they receive the
-        # result.
-        self._step: Step | None = None
+        # Number of sensors of the present correction, and the host's work while the device runs its first stage; scans
+        # to judge until judges expect them; judges until they receive the result.
+        self._used = 0
+        self._meanwhile: Callable[[], None] | None = None
         self._expected: Sequence[SensorReadings] = ()
         self._judges: list[MapJudge] = []
         # Inputs of a recorded correction that are not yet on the device, and readings of other arrays of the device.
@@ -91,7 +92,7 @@ class Cloud(Particles):
     def _begin_change(self) -> None:
         """Invalidate the results on the host, and save the particles that the change may overwrite."""
         self._results = self._known = self._estimated_of = self._refined_of = None
-        self._step, self._expected, self._judges, self._given, self._adopted = None, (), [], None, ()
+        self._meanwhile, self._expected, self._judges, self._given, self._adopted = None, (), [], None, ()
         for one in self._snapshots:
             snapshot = one()
             if snapshot is not None and snapshot.places.free() != self.kept.free():
@@ -115,7 +116,7 @@ class Cloud(Particles):
         """Run a correction: stages until the temperature is used up."""
         settings, indices = step.settings, [index for index, _ in step.readings]
         self._begin_change()
-        self._step, self._expected = step, step.judged
+        self._used, self._meanwhile, self._expected = len(indices), step.meanwhile, step.judged
         self._asked, self._was_asked = self._asked + 1 if self._was_asked else 0, False
         self._estimates_too = self._asked >= _ASKED
         self._refines_too, self._was_refined = self._estimates_too and self._was_refined, False
@@ -217,8 +218,7 @@ class Cloud(Particles):
 
     def _weighing(self, stage: Stage) -> Program:
         """Return the launches of a stage after its scores, including the estimate if it is expected."""
-        assert self._step is not None
-        program = self.weighing(stage, len(self._step.readings))
+        program = self.weighing(stage, self._used)
         if self._estimates_too:
             program += self._estimating(stage.places, self.count)
         if self._refines_too:
@@ -249,9 +249,9 @@ class Cloud(Particles):
 
     def _use_wait(self) -> None:
         """Do the host's work of a correction while the device runs its first stage."""
-        if self._step is not None and self._step.meanwhile is not None:
-            self._step.meanwhile()
-            self._step = self._step._replace(meanwhile=None)
+        meanwhile, self._meanwhile = self._meanwhile, None
+        if meanwhile is not None:
+            meanwhile()
 
     def _estimating(self, places: BufferSlots, count: int, refined: Buffer | None = None) -> Program:
         """Return the launches of the estimate, or of its second pass."""

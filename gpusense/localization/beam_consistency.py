@@ -81,10 +81,6 @@ class BeamConsistency(NamedTuple):
         direction, origin = theta + turn + self.bearing, (x + c * mount_x - s * mount_y, y + s * mount_x + c * mount_y)
         return np.asarray(origin + distance * np.column_stack([np.cos(direction), np.sin(direction)]))
 
-    def count(self, kind: int) -> int:
-        """Return the number of beams of a class."""
-        return int(np.count_nonzero(self.kind == kind))
-
 
 class Counts(NamedTuple):
     """Counts of the beams of simultaneous scans, by their evidence."""
@@ -181,28 +177,11 @@ class _Setting(NamedTuple):
     cols: tuple[float, float]  # least and largest column
 
 
-class _Expected(NamedTuple):
-    """Scan to be judged by a correction, its judged beams, and the version of the part of the map."""
-
-    scanner: Scanner
-    ranges: Floats
-    beams: Beams
-    version: int
-
-
 class MapJudge:
-    """Cells of a map around the last pose on a device, for judging beams.
-
-    Args:
-        backend: The device.
-        grid: The map.
-
-    Attributes:
-        grid: The map.
-        version: Unique number of the part of the map on the device; 0 before.
-    """
+    """Cells of a map around the last pose on a device, for judging beams."""
 
     def __init__(self, backend: Backend, grid: OccupancyGrid) -> None:
+        # The map, and a unique number of its part on the device; 0 before.
         self.grid, self.version = grid, 0
         self._backend, self._space = backend, Workspace(backend)
         # First and last row and column of the cells on the device.
@@ -215,9 +194,10 @@ class MapJudge:
         self._given, self._begin = backend.upload(np.zeros(begin + JUDGED)), begin
         self._estimate = backend.part(self._given, 0, MOMENTS, _DOUBLE)
         self._scan = backend.part(self._given, begin, JUDGED, _DOUBLE)
-        # Scan to be judged by a correction; later with its pose and covariance, classes and distances.
-        self._expected: _Expected | None = None
-        self._known: tuple[_Expected, list[float], Floats, Floats] | None = None
+        # Scan to be judged by a correction, with its beams and the version of the part of the map; later with its pose
+        # and covariance, classes and distances.
+        self._expected: tuple[Scanner, Floats, Beams, int] | None = None
+        self._known: tuple[Floats, Beams, int, list[float], Floats, Floats] | None = None
         self._uploaded: Floats | None = None
 
     def __call__(
@@ -226,10 +206,10 @@ class MapJudge:
         """Return the judged beams of a scan (K,) on host or device, their classes, and distances of walls."""
         numbers, setting = _numbers_of(pose, covariance), self._covering(scanner, pose)
         if self._known is not None:
-            expected, at, kind, distance = self._known
+            expected, beams, version, at, kind, distance = self._known
             # Readings that a correction has judged are the same object.
-            if expected.ranges is ranges and expected.version == self.version and at == numbers:
-                return expected.beams, kind, distance
+            if expected is ranges and version == self.version and at == numbers:
+                return beams, kind, distance
         on_host = np.asarray(arrays.copied_to_host(ranges, self._backend, "ranges"))
         beams = _chosen_beams(scanner, float64_readings(on_host, scanner))
         count, space = len(beams.bearing), self._space
@@ -267,26 +247,21 @@ class MapJudge:
             scan[:] = np.nan
         np.add(beams.bearing, turn, out=scan[:count])
         scan[BEAMS : BEAMS + count] = beams.reading
-        self._expected = _Expected(scanner, ranges, beams, self.version)
+        self._expected = scanner, ranges, beams, self.version
         return count > 0
 
     def launches(self, estimate: Buffer, scan: Buffer, judged: Buffer) -> Program:
         """Return the launch that judges the expected scan at an estimate; ``version`` is its key."""
         if self._expected is None:
             raise RuntimeError("launches: needs a scan that is expected")
-        return self._launches(self._set(self._expected.scanner), estimate, scan, judged, BEAMS)
+        return self._launches(self._set(self._expected[0]), estimate, scan, judged, BEAMS)
 
     def receive(self, estimate: Floats, judged: Floats) -> None:
-        """Keep the judgement of the expected scan.
-
-        Args:
-            estimate: The results of ``finish_estimate``.
-            judged: The result of ``judge_beams``.
-        """
-        expected, self._expected = self._expected, None
-        if expected is not None:
-            count, numbers = len(expected.beams.bearing), _finished(estimate[:MOMENTS].tolist())
-            self._known = expected, numbers, judged[:count], judged[BEAMS : BEAMS + count]
+        """Keep the judgement of the expected scan: the results of ``finish_estimate`` and of ``judge_beams``."""
+        if self._expected is not None:
+            (_, ranges, beams, version), self._expected = self._expected, None
+            count, numbers = len(beams.bearing), _finished(estimate[:MOMENTS].tolist())
+            self._known = ranges, beams, version, numbers, judged[:count], judged[BEAMS : BEAMS + count]
 
     def _launches(self, setting: _Setting, estimate: Buffer, scan: Buffer, judged: Buffer, beams: int) -> Program:
         (top, bottom), (left, right) = self._part

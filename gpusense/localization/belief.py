@@ -129,17 +129,11 @@ def _odds(one: int, other: int) -> float:
 
 
 def ratio_of_places(lead: float, beams: float, walls: float, *, is_found: bool) -> float:
-    """Return the ratio from comparing a pose with other places of the map.
+    """Return the ratio from comparing a pose with other places; NaN if neither is possible, or without beams.
 
-    Args:
-        lead: Tempered log-likelihood of the best other place less the pose's [nats]; -inf if a search found none; NaN
-            if neither is possible.
-        beams: Number of independent beams, the temperature times the number of beams.
-        walls: Ratio of the scan at the other place, by the beams that meet walls.
-        is_found: Whether the search also found the pose.
-
-    Returns:
-        The ratio; NaN if neither place nor pose is possible, or without beams.
+    The lead is the tempered log-likelihood of the best other place less the pose's [nats], -inf if a search found none.
+    ``beams`` are independent, ``walls`` is the other place's ratio by the beams that meet walls, and ``is_found`` is
+    true if the search also found the pose.
     """
     if math.isnan(lead) or not beams > 0:
         return math.nan

@@ -19,16 +19,7 @@ from gpusense.backends.workspace import ProgramCache, RecordedProgram, RepeatedP
 from gpusense.interface.constants import ESTIMATE, FAR_SHARE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
 from gpusense.localization.beam_consistency import JUDGED, MapJudge
-from gpusense.localization.cloud_state import (
-    Contents,
-    Snapshot,
-    Step,
-    Summary,
-    deeper,
-    is_starved,
-    meaningful,
-    summary_of,
-)
+from gpusense.localization.cloud_state import Contents, Snapshot, Summary, deeper, is_starved, meaningful, summary_of
 from gpusense.localization.particles import BufferSlots, Particles, Stage
 from gpusense.localization.sensors import Sensor, SensorReadings
 
@@ -112,38 +103,45 @@ class Cloud(Particles):
     def _move(self, origin: int, target: int, kind: int) -> None:
         self._stages.run((origin, target, kind, self.count, "move"), lambda: self.motion(origin, target, kind))
 
-    def correct(self, step: Step) -> None:
-        """Run a correction: stages until the temperature is used up."""
-        settings, indices = step.settings, [index for index, _ in step.readings]
+    def correct(
+        self, settings: np.ndarray, kind: int, stages: int, drawn: int, readings: list[SensorReadings],
+        judged: Sequence[SensorReadings] = (), meanwhile: Callable[[], None] | None = None,
+    ) -> None:  # fmt: skip
+        """Run a correction by readings after a kind of motion: stages until the temperature is used up.
+
+        It draws a number of particles, judges scans at the new pose if it estimates that, and calls ``meanwhile`` while
+        the device works on the first stage.
+        """
+        indices = [index for index, _ in readings]
         self._begin_change()
-        self._used, self._meanwhile, self._expected = len(indices), step.meanwhile, step.judged
+        self._used, self._meanwhile, self._expected = len(indices), meanwhile, judged
         self._asked, self._was_asked = self._asked + 1 if self._was_asked else 0, False
         self._estimates_too = self._asked >= _ASKED
         self._refines_too, self._was_refined = self._estimates_too and self._was_refined, False
         recorded = self.backend.info.kind == "gpu"
-        for index, reading in step.readings:
+        for index, reading in readings:
             recorded = recorded and self._scored[index].records(reading)
         if recorded:
-            self._give(step)
+            self._give(settings, readings)
         else:
             self.upload_settings(settings)
-        stages = self.places.stages(self.kept, step.stages, step.drawn, step.kind, same=step.drawn == self.count)
+        planned = self.places.stages(self.kept, stages, drawn, kind, same=drawn == self.count)
         if settings[SLOW_RATE] > 0:
             # Keep the averages of the likelihood.
-            self.copy_state(self.places.state, stages[0].state)
-        for stage in stages:
+            self.copy_state(self.places.state, planned[0].state)
+        for stage in planned:
             last, deep = stage.most == 1, settings
             self._results = None
             if recorded:
                 self._replay(indices, stage)
             else:
-                self._call(step.readings, stage)
+                self._call(readings, stage)
             self._use_wait()
             if not last:
                 numbers, deep = self._deepen(stage, settings)
                 last = numbers[stage.number * STAGE + LEFT] == 0.0
                 if not stage.drawn:
-                    self._draw(stage, step.drawn if last else self.count)
+                    self._draw(stage, drawn if last else self.count)
             if deep is not settings:
                 self.upload_settings(settings)
             if last:
@@ -151,13 +149,13 @@ class Cloud(Particles):
         places = stage.places
         self._estimated_of = (places, self.count) if self._estimates_too else None
         self._refined_of = (places, self.count) if self._refines_too else None
-        self.set_particles(places, step.drawn)
+        self.set_particles(places, drawn)
 
-    def _give(self, step: Step) -> None:
+    def _give(self, settings: np.ndarray, readings: list[SensorReadings]) -> None:
         """Set the inputs of a recorded correction."""
         self._given, adopted = np.empty(self.inputs.size), []
-        self._given[self.inputs.spans[0]] = step.settings
-        for index, reading in step.readings:
+        self._given[self.inputs.spans[0]] = settings
+        for index, reading in readings:
             target = self.readings[index]
             source = self._scored[index].place(reading, self._given[self.inputs.spans[1 + index]], target)
             if source is not None:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gpusense.interface import constants as c
 from gpusense.localization.particles import BufferSlots
-from gpusense.localization.sensors import SensorReadings
 from gpusense.reference.tempering import left_of
 
 # Lowest depth of a ladder: distances of a million deviations differ by 2^-39 on its last rung.
@@ -20,19 +18,6 @@ _DEEPEST = c.LOWEST**5
 _FEWEST = 10.0
 # Jitter of a stage on a deeper ladder: the peak is beyond the particles, which must not contract before reaching it.
 _WIDE_JITTER = 0.7
-
-
-class Step(NamedTuple):
-    """Arguments of a correction."""
-
-    settings: np.ndarray  # settings, indexed by ``interface.constants``
-    kind: int  # kind of the first motion
-    stages: int  # most stages
-    drawn: int  # particles of the next step
-    readings: list[SensorReadings]  # indices of sensors with their readings
-    # Scans to judge at the new pose, with the indices of their sensors; a cloud may leave this to the verdict.
-    judged: Sequence[SensorReadings] = ()
-    meanwhile: Callable[[], None] | None = None  # called while the device works on the first stage
 
 
 class Contents(NamedTuple):

@@ -31,14 +31,7 @@ _ASKED, _MOST_SKIPPED = 100, 0.7
 
 
 class FilterCore:
-    """Particles, the verdict on their pose, and recovery from a wrong pose.
-
-    Attributes:
-        tracker: The particles, and the numbers of each step.
-        verdict: The verdict on their pose.
-        recovery: Recovery with the rivals of the particles.
-        last: Readings of the last correction by the index of their sensor.
-    """
+    """Particles, the verdict on their pose, and recovery from a wrong pose."""
 
     MEMORY: ClassVar[tuple[str, ...]] = ("last",)
 
@@ -47,6 +40,7 @@ class FilterCore:
         self.tracker = Tracker(sensors, options, cloud)
         self.verdict = Verdict(sensors, self.tracker.random_poses, seed=options.seed)
         self.recovery = Recovery(self.tracker, self.verdict)
+        # Readings of the last correction by the index of their sensor.
         self.last: dict[int, tuple[Any, ...]] = {}
         self._margins = margins_of(sensors)
 

@@ -31,18 +31,12 @@ ROS_1 = {
 
 
 def parameters_of(content: Mapping[str, Any], name: str, node: str | None, known: Collection[str]) -> dict[str, Any]:
-    """Return the parameters of a node by dotted names.
+    """Return the parameters of a node by dotted names, or of the only node named amcl for None.
 
     As in rclcpp, ``*`` in the name of a node matches one level, ``**`` any number of levels, and the last matching
     wildcard wins. The exact name wins over wildcards.
 
     A mapping within the parameters is equivalent to dotted names: ``initial_pose: {x: 1}`` is ``initial_pose.x: 1``.
-
-    Args:
-        content: The content of a file, or the mapping of the parameters themselves.
-        name: Name of the file.
-        node: Name of the node, with or without its namespaces; None for the only node named amcl.
-        known: Names of amcl's parameters.
     """
     if node is not None and not isinstance(node, str):
         raise TypeError(f"node: must be a string or None, got {checks.show(node)}")

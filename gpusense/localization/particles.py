@@ -96,14 +96,7 @@ class Stage(NamedTuple):
 
 
 class Packed:
-    """Arrays of float64 numbers in one buffer, which one copy reads or writes.
-
-    Attributes:
-        buffer: The buffer.
-        parts: The arrays on the device.
-        size: Numbers of the buffer.
-        spans: Places of the arrays among these numbers.
-    """
+    """Arrays of float64 numbers (``parts``) in one ``buffer``, at ``spans`` of its numbers, for single copies."""
 
     def __init__(self, backend: Backend, sizes: Sequence[int]) -> None:
         align = max(backend.alignment // _DOUBLE.itemsize, 1)
@@ -117,16 +110,7 @@ class Packed:
 
 
 class Particles:
-    """Particles and weights on a device, and their launches.
-
-    Attributes:
-        count: Particles of the next step.
-        places: Buffers of the particles.
-        kept: Buffers at the beginning of a call of the filter, which steps never overwrite.
-        pool_size: Number of poses for recovery to inject.
-        inputs: Settings of a step, and of each sensor the readings and the scan to judge.
-        results: Two states of corrections, the estimate and its second pass, and the judged beams of each sensor.
-    """
+    """Particles and weights on a device, and their launches."""
 
     MEMORY: ClassVar[tuple[str, ...]] = ("count", "block", "places", "pool", "pool_size")
 
@@ -134,6 +118,8 @@ class Particles:
         self, backend: Backend, capacity: int, readings: Sequence[int], precision: np.dtype, *, residual: bool = False
     ) -> None:
         self.backend, self.capacity, self.precision = backend, capacity, precision
+        # Particles of the next step; buffers of the particles; buffers at the beginning of a call of the filter, which
+        # steps never overwrite.
         self.count, self.places, self.kept = capacity, BufferSlots(), BufferSlots()
         self.block = weight_block(backend, capacity)
         # Other libraries get no memory that a processor shares with the host.
@@ -143,13 +129,15 @@ class Particles:
         self.log_p = [make(capacity, precision) for _ in readings]
         self.score, self.ends = backend.empty(capacity, _DOUBLE), backend.empty(capacity, _DOUBLE)
         self.sums, count = Sums(backend, capacity), len(readings)
-        # One copy writes all inputs of a step, and one reads all results.
+        # One copy writes all inputs of a step: settings, readings and scans to judge. Another reads all results: two
+        # states of corrections, the estimate and its second pass, and judged beams.
         self.inputs = Packed(backend, (SETTINGS, *readings, *[JUDGED] * count))
         self.settings, *more = self.inputs.parts
         self.readings, self.scans = more[:count], more[count:]
         self.results = Packed(backend, (STATE, STATE, ESTIMATE, ESTIMATE, *[JUDGED] * count))
         first, second, self.estimated, self.refined, *self.judged = self.results.parts
         self.states = [first, second]
+        # Poses for recovery to inject.
         self.pool, self.pool_size = backend.upload(np.zeros(3)), 0
         # Arrays that the device may still read; views of buffers for models, by the number of particles.
         self._uploads: list[np.ndarray] = []

@@ -59,12 +59,7 @@ _MOST = 50.0
 
 
 class Rival:
-    """Rival of a filter: a second set of particles with the filter's sensors.
-
-    Attributes:
-        active: True if a rival competes.
-        log_odds: Log odds of the rival against the particles.
-    """
+    """Rival of a filter: a second set of particles with the filter's sensors, and its log odds against the first."""
 
     def __init__(self, tracker: Tracker) -> None:
         self._tracker = tracker
@@ -103,12 +98,9 @@ class Rival:
         step: int,
         prior: float = PRIOR,
     ) -> float:
-        """Search for a rival by the last readings; equal steps give equal rivals.
+        """Search for a rival by the last readings; return the log-likelihood ratio of other places, NaN without a map.
 
-        Prior log odds of 0 exclude places near the estimate, a (3,) pose with a (3, 3) covariance.
-
-        Returns:
-            Log-likelihood ratio of other places against the estimate; NaN without a search of the whole map.
+        The ratio is against the estimate. Equal steps give equal rivals. Prior log odds of 0 exclude places near it.
         """
         self._tracker.progress = Progress(step)
         key, options = self._tracker.key(), self._tracker.options
@@ -212,12 +204,7 @@ class Rival:
 
 
 class Recovery:
-    """Rivals of a filter's particles, by the verdict on their pose.
-
-    Attributes:
-        rival: The rival of the particles, if there was one.
-        everywhere: Number of places still to be compared with the pose.
-    """
+    """Rivals of a filter's particles, by the verdict on their pose."""
 
     MEMORY: ClassVar[tuple[str, ...]] = ("rival", "everywhere")
 
@@ -225,6 +212,7 @@ class Recovery:
         self._tracker, self._verdict = tracker, verdict
         self._searches = tracker.options.recovery == "sensor" and can_search(tracker.sensors)
         self.rival: Rival | None = None
+        # Number of places still to be compared with the pose.
         self.everywhere = 0
 
     @property

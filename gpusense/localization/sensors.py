@@ -43,15 +43,7 @@ class Lesson(NamedTuple):
 
 
 class Sensor:
-    """Measurement model of a filter.
-
-    Attributes:
-        beams: Used beams of a scan; 0 for other models.
-        readings: All beams of a scan; 0 for other models.
-        calibrates: Whether temperature="auto" learns from this sensor.
-        ambiguous: True if its likelihood may have several peaks among concentrated particles, for example exchangeable
-            landmarks.
-    """
+    """Measurement model of a filter."""
 
     MEMORY = ("_correlation", "_seen", "_learned", "_lesson")
 
@@ -61,9 +53,12 @@ class Sensor:
         if isinstance(model, ScanModel) and model.temperature != 1:
             raise ValueError(f"models: must have temperature 1, the filter has its own, got {model.temperature}")
         self.model: Any = model
+        # Whether temperature="auto" learns from this sensor; whether its likelihood may have several peaks among
+        # concentrated particles, for example exchangeable landmarks.
         self.calibrates, self.ambiguous = isinstance(model, ScanModel), isinstance(model, FeatureModel)
         self.backend: Backend = model.backend
         self.precision = np.dtype(model.precision)
+        # Used beams and all beams of a scan; 0 for other models.
         self.beams = model.used_beams if isinstance(model, ScanModel) else 0
         self.readings = model.scanner.count if isinstance(model, ScanModel) else 0
         self._correlation = BeamCorrelation()

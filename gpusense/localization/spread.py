@@ -139,11 +139,9 @@ _AROUND, _BEAMS, _SEQUENCE = 2048, 240, 1.2207440846057596 ** -np.arange(1.0, 4.
 
 
 class Distances:
-    """Distances of particles from a pose, sorted when a radius is first asked for: a filter's step has no use for them.
+    """Distances of particles from a (3,) pose, sorted when a radius is first asked for, since steps need none.
 
-    Args:
-        particles: Returns (N, 3) particles and (N,) weights >= 0, not necessarily normalised.
-        pose: (3,) pose.
+    ``particles`` returns (N, 3) particles and (N,) weights >= 0, not necessarily normalised.
     """
 
     def __init__(self, particles: Callable[[], tuple[Floats, Floats]], pose: Floats) -> None:
@@ -222,16 +220,10 @@ def protection_level(
     widening: float = 1.0,
     margin: float = 0.0,
 ) -> float:
-    """Return the protection level of a pose [m].
+    """Return the protection level [m] at a risk, from ``LEAST_RISK`` to 1, of a pose that is lost with p_lost.
 
-    Args:
-        risk: Largest probability that the position is farther off, from ``LEAST_RISK`` to 1.
-        p_lost: Probability that the pose is lost.
-        covariance: (3, 3) covariance of x, y [m] and heading; None if unknown: a pose that is not lost is off by at
-            most 1 m.
-        distances: Distances of the particles from the pose; None if the covariance describes them.
-        widening: Factor of the spread.
-        margin: Added to the radius [m].
+    Without a covariance, a pose that is not lost is off by at most 1 m. Distances of the particles count unless the
+    covariance describes them; ``widening`` multiplies the spread, and ``margin`` [m] is added to the radius.
     """
     risk = check_risk(risk)
     if risk == 1:
@@ -253,13 +245,6 @@ def normal_radius(covariance: Floats, beyond: float) -> float:
     The position is (a u cos t, b u sin t) with the deviations a and b along its axes, u of a Rayleigh density and t
     uniform. It is beyond r with probability exp(-r^2 / (2 (a^2 cos^2 t + b^2 sin^2 t))), averaged over t. The mean over
     equal angles converges faster than any power of their number, even for b = 0.
-
-    Args:
-        covariance: (3, 3) covariance of x, y [m] and heading; entries may be infinite or NaN.
-        beyond: The probability, from 0 to 1.
-
-    Returns:
-        The distance [m]; infinite for an infinite covariance or a probability of 0.
     """
     large, _ = deviations(covariance)
     if not math.isfinite(large):

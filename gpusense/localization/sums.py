@@ -43,19 +43,14 @@ def reduction_fans(blocks: int) -> tuple[int, ...]:
 
 
 class Sums:
-    """Buffers of sums of at most ``capacity`` particles, and their launches.
-
-    Attributes:
-        largest: Largest score of each block.
-        rows: Sums of each block.
-        totals: Sums of the weights of all particles.
-    """
+    """Buffers of sums of at most ``capacity`` particles, and their launches."""
 
     def __init__(self, backend: Backend, capacity: int) -> None:
         self._backend, blocks = backend, -(-capacity // _LEAST)
         groups = math.isqrt(blocks) + 2
         # A block of poses has at least as many particles as the cube root of their number.
         moments = (math.ceil(capacity ** (2 / 3)) + 2) * ESTIMATE_SUMS
+        # Largest score, and sums, of each block; sums of the weights of all particles.
         self.largest = backend.empty(blocks, _DOUBLE)
         self.rows = backend.empty(max(WEIGHT_SUMS * blocks, ESTIMATE_LANES * moments), _DOUBLE)
         self._joined = backend.empty(max(WEIGHT_SUMS * groups, moments), _DOUBLE)

@@ -145,14 +145,10 @@ def _places_of_neighbors(beams: int) -> np.ndarray:
 
 
 class BeamCorrelation:
-    """Running variance of scans' scores, for the effective number of independent beams.
-
-    Attributes:
-        scans: Scans added.
-        beams: Mean number of beams of a scan.
-    """
+    """Running variance of scans' scores, for the effective number of independent beams."""
 
     def __init__(self) -> None:
+        # Number of scans, and their mean number of beams.
         self.scans, self.beams = 0, 0.0
         # Curvature; variance for independent beams; variances of long blocks, measured and for independent beams; the
         # same for short blocks.
@@ -164,14 +160,10 @@ class BeamCorrelation:
         self._around = 0
 
     def add(self, parts: AnyArray, axes: AnyArray, directions: AnyArray | None = None, *, follows: bool = True) -> None:
-        """Add a scan.
+        """Add a scan: (7, K) log-likelihoods of beams at :func:`poses_around` the pose, by bearing, with (3, 3) axes.
 
-        Args:
-            parts: (7, K) log-likelihoods of beams at :func:`poses_around` the estimated pose, in the order of their
-                bearings; beams with 0 or a non-finite value are ignored.
-            axes: (3, 3) steps between the poses; their products are the covariance of the pose.
-            directions: (K,) directions of beams in the world [rad], for comparing consecutive scans.
-            follows: Whether the scan directly follows the previous one.
+        Beams with 0 or a non-finite value are ignored. Directions (K,) in the world [rad] serve to compare a scan with
+        the previous one if it ``follows`` directly.
         """
         values = checks.array("parts", parts, (7, "K"), finite=False)
         steps = checks.array("axes", axes, (3, 3))

@@ -14,7 +14,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.localization import starts
 from gpusense.localization.cloud import Cloud
-from gpusense.localization.cloud_state import Contents, Step
+from gpusense.localization.cloud_state import Contents
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.estimates import covariance_of, sample_size_of
 from gpusense.localization.journal import plain_state, set_state
@@ -41,16 +41,7 @@ class Progress(NamedTuple):
 
 
 class Tracker:
-    """Particles with the sensors that weigh them.
-
-    Attributes:
-        started: True after a start.
-        progress: Steps so far, and the motion since the last correction.
-        shown: Number of shown particles, from the last step.
-        wide: Number of remaining corrections at a low temperature.
-        together: True if the particles are known to be concentrated.
-        pool: Number of poses for recovery to inject, and half widths of the box around each.
-    """
+    """Particles with the sensors that weigh them."""
 
     MEMORY: ClassVar[tuple[str, ...]] = (
         "started", "progress", "shown", "wide", "together", "pool", "corrections",
@@ -59,10 +50,13 @@ class Tracker:
     def __init__(self, sensors: Sequence[Sensor], options: Options, cloud: Cloud) -> None:
         self.sensors, self.options, self.cloud = sensors, options, cloud
         self._models = [sensor.model for sensor in sensors]
+        # Number of shown particles, from the last step; number of remaining corrections at a low temperature.
         self.started, self.progress, self.shown, self.wide = False, Progress(), options.most, 0
+        # Whether the particles are known to be concentrated.
         self.together, self.corrections = False, 0
         # An estimate from the kernels, with its mean and covariance.
         self._moments: tuple[np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
+        # Number of poses for recovery to inject, and half widths of the box around each.
         self.pool: tuple[int, starts.Spread] = 0, (0.0, 0.0, 0.0)
 
     def changing(self) -> tuple[Any, ...]:
@@ -160,7 +154,7 @@ class Tracker:
         self, readings: list[SensorReadings], *, judged: Sequence[SensorReadings] = (),
         meanwhile: Callable[[], None] | None = None,
     ) -> None:  # fmt: skip
-        """Run a postponed motion, correct the particles by readings, and judge scans at the new pose; see ``Step``."""
+        """Run a postponed motion, correct the particles by readings, and judge scans at the new pose."""
         chosen, drawn = self.options, self.cloud.count
         if chosen.least != chosen.most:
             self.move()
@@ -172,7 +166,7 @@ class Tracker:
         motion = self.progress.motion or STILL
         settings = self.settings(motion, [index for index, _ in readings])
         self.shown, self.progress = self.cloud.count, Progress(self.progress.step, copies=copies)
-        self.cloud.correct(Step(settings, motion.kind, chosen.stages, drawn, readings, judged, meanwhile))
+        self.cloud.correct(settings, motion.kind, chosen.stages, drawn, readings, judged, meanwhile)
         self.wide = max(self.wide - 1, 0)
 
     def sample_size(self) -> float:

@@ -72,12 +72,7 @@ class VerdictState(NamedTuple):
 
 
 class Verdict:
-    """Running verdict of a filter; ``random_poses`` returns poses anywhere in the free space.
-
-    Attributes:
-        state: Memory of the verdict.
-        informed: True if a sensor has a map that can contradict a pose.
-    """
+    """Running verdict of a filter; ``random_poses`` returns poses anywhere in the free space."""
 
     MEMORY: ClassVar[tuple[str, ...]] = ("state",)
 
@@ -91,6 +86,7 @@ class Verdict:
         }
         # Pose of the last call of ``judge``; no state, since it affects only the speed.
         self._pose: np.ndarray | None = None
+        # True if a sensor has a map that can contradict a pose.
         self.informed = bool(self._evidence) or any(sensor.calibrates for sensor in sensors)
         self.state = VerdictState()
 
@@ -173,8 +169,7 @@ class Verdict:
     ) -> float:
         """Judge a pose (3,) by the last readings, unless they add almost nothing to a sure pose.
 
-        The evidence is log p(last readings | earlier readings) of the particles. Return the share of explained beams,
-        NaN without beams.
+        Return the share of explained beams, or NaN. The evidence is log p(last | earlier readings) of the particles.
         """
         state, spread = self.state, spread_of(covariance)
         self._pose = pose

@@ -2,7 +2,9 @@
 
 A correction runs stages until the temperature is used up. On a GPU motion, scores, weights, the estimate and the beams
 to judge are one recorded program of a stage: one copy writes all of its inputs, and one reads all of its results. In
-CUDA the copies are part of its graph. Estimate and judgement are part of it where the last corrections' were read.
+CUDA the copies are part of its graph. The estimate is part of it if the estimates of the last corrections were read,
+its second pass if the last one needed that, and a judgement if the pose will probably be judged. While the device
+works, the host learns from the last lesson (:mod:`gpusense.localization.temperature`).
 """
 
 from __future__ import annotations

@@ -222,7 +222,7 @@ def protection_level(
 ) -> float:
     """Return the protection level [m] at a risk, from ``LEAST_RISK`` to 1, of a pose that is lost with p_lost.
 
-    Without a covariance, a pose that is not lost is off by at most 1 m. Distances of the particles count unless the
+    A pose without a covariance that is not lost is off by at most 1 m. Distances of the particles count unless the
     covariance describes them; ``widening`` multiplies the spread, and ``margin`` [m] is added to the radius.
     """
     risk = check_risk(risk)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import os
 import threading
 import weakref
 
@@ -167,35 +166,6 @@ def test_owners_of_memory_live_as_long_as_a_recording(backend):
     assert gone() is not None
     del recorded
     assert gone() is None
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
-def test_a_forked_child_starts_no_program(needs):
-    """The parent's device does not survive a fork: the child gets an error at once."""
-    needs("opencl")
-    device = get_backend("opencl")
-    buffers = device.upload(np.zeros(4)), device.empty(4, REAL)
-    launches = program(device, *buffers, 4)
-    recorded, repeated = RecordedProgram(device, launches), RepeatedPrograms(device, 2)
-    changing = ChangingProgram(device, launches, ["log_p"])
-    for _ in range(3):
-        repeated.run("key", lambda: launches)
-    read, write = os.pipe()
-    child = os.fork()
-    if child == 0:
-        refused = 0
-        for start in (
-            recorded.start, lambda: recorded({}), lambda: changing({"log_p": buffers[0]}),
-            lambda: repeated.run("key", lambda: launches),
-        ):  # fmt: skip
-            try:
-                start()
-            except RuntimeError as error:
-                refused += "does not survive a fork" in str(error)
-        os.write(write, bytes([refused]))
-        os._exit(0)
-    os.waitpid(child, 0)
-    assert os.read(read, 1) == bytes([4])
 
 
 def test_a_held_array_is_copied_once_for_each_key_and_again_after_an_error():

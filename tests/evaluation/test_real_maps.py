@@ -38,15 +38,6 @@ SMALL = [
     "wean_hall/wean_10cm.yaml",
 ]
 GIGANTIC = "ros_maps/gigantic_map.yaml"
-COMPARED = [
-    "carmen_logs/derived_maps/intel_even_05cm.yaml",
-    "ros_maps/Spielberg_map.yaml",
-    "ros_maps/basement_hallways_5cm.yaml",
-    "ros_maps/columbia.yaml",
-    "ros_maps/stata_basement.yaml",
-    "ros_maps/willow-full.yaml",
-    "wean_hall/wean_10cm.yaml",
-]
 
 
 @pytest.fixture(scope="module")
@@ -73,17 +64,6 @@ def test_distance_transform_is_scipys(data_dir, opencl, name):
     )
 
 
-def scene_of(data_dir, name):
-    """Return a scene in a map, and the present backends except NumPy (slow in open space)."""
-    scanner = gs.Scanner.uniform(
-        angle_min=-2.0, angle_increment=0.05, count=81, range_max=20.0, mount=(0.1, -0.05, 0.02)
-    )  # fmt: skip
-    backends = [backend for backend in selftest.chosen_backends() if backend.info.backend != "numpy"]
-    if not backends:
-        pytest.skip("only NumPy is here")
-    return selftest.scene_in(gs.read_map(data_dir / name), scanner, seed=5), backends
-
-
 @pytest.mark.long
 def test_end_points_on_edges_do_not_breach(data_dir):
     """Beams along the axes from poses on edges end on edges, for a mount of 0."""
@@ -91,14 +71,3 @@ def test_end_points_on_edges_do_not_breach(data_dir):
     scanner = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.025, count=161, range_max=20.0)
     checks = selftest.run([get_backend("numpy")], selftest.scene_in(grid, scanner), sonar=False)
     assert [check for check in checks if not check.passed] == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", COMPARED)
-def test_backends_agree(data_dir, name):
-    """Compare distances, squares, bits of ranges, and both models in both precisions, with the truth and pairwise."""
-    scene, backends = scene_of(data_dir, name)
-    # Two maps are enough for angles of incidence.
-    checks = selftest.run(backends, scene, sonar=name in (COMPARED[0], COMPARED[-1]))
-    assert [check for check in checks if not check.passed] == []
-    assert {"distance transform", "float32 beam model, beams"} <= {check.quantity for check in checks}

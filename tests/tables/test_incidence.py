@@ -100,19 +100,6 @@ def test_normals_turn_with_the_map_and_know_its_surroundings():
         gs.surface_normals(cells)
 
 
-def test_normals_do_not_depend_on_how_a_map_is_cut():
-    from gpusense.tables import normals
-
-    rng = np.random.default_rng(3)
-    obstacles = rng.random((70, 90)) < 0.2
-    for outside in ("free", "occupied"):
-        everything = normals.normal_table(obstacles, windows.Window(0, 0, 70, 90), outside, np.dtype(float))
-        for part in (windows.Window(0, 0, 20, 30), windows.Window(33, 41, 37, 49), windows.Window(10, 80, 5, 1)):
-            cut = normals.normal_table(obstacles, part, outside, np.dtype(float))
-            want = everything[part.row : part.row + part.rows + 2, part.col : part.col + part.cols + 2]
-            np.testing.assert_array_equal(cut, want)
-
-
 # ------------------------------------------------------------------------------------------- the cell that a ray hits
 
 

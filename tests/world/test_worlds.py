@@ -82,17 +82,6 @@ def test_worlds_of_one_size_have_one_frame_or_one_each(backend: str) -> None:
             same_bits(ranges[index == w], single)
 
 
-def test_gpus_make_and_read_the_same_tables(as_gpu: Any, grids: list[gs.OccupancyGrid]) -> None:
-    rng = np.random.default_rng(4)
-    index = np.arange(len(grids)).repeat(8)
-    poses = np.concatenate([poses_in(rng, grids[w], 1) for w in index])
-    device = as_gpu()
-    found = gs.RayCaster(gs.Worlds(grids, backend=device), RANGE, backend=device).cast(poses, BEARINGS, world=index)
-    device = as_gpu(False)
-    caster = gs.RayCaster(gs.Worlds(grids, backend=device), RANGE, backend=device)
-    same_bits(found, caster.cast(poses, BEARINGS, world=index))
-
-
 def test_replaced_worlds_have_the_bits_of_new_maps(grids: list[gs.OccupancyGrid], backend: str) -> None:
     rng = np.random.default_rng(5)
     worlds = gs.Worlds(grids, backend=backend)

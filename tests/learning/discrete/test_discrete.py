@@ -108,22 +108,13 @@ def assert_close(log_p: np.ndarray, truth: list[Fraction]) -> None:
 
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("bins", [1, 2, 7])
-@pytest.mark.parametrize("name", CAUSES)
-def test_separate_causes_are_those_of_exact_arithmetic(name, bins):
-    table = gs.DiscreteBeamModel(CAUSES[name], RANGE, bins)
+@pytest.mark.parametrize("name", [*CAUSES, *MIXTURES])
+def test_causes_are_those_of_exact_arithmetic(name, bins):
+    """A mixture's causes are shared, others act separately."""
+    causes, exactly = (CAUSES[name], separate_exactly) if name in CAUSES else (MIXTURES[name], shared_exactly)
+    table = gs.DiscreteBeamModel(causes, RANGE, bins)
     for j in range(bins + 1):
-        truth = separate_exactly(CAUSES[name], bins, j)
-        assert sum(truth) == 1
-        assert_close(table.log_probabilities[j], truth)
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("bins", [1, 2, 7])
-@pytest.mark.parametrize("name", MIXTURES)
-def test_shared_causes_are_those_of_exact_arithmetic(name, bins):
-    table = gs.DiscreteBeamModel(MIXTURES[name], RANGE, bins)
-    for j in range(bins + 1):
-        truth = shared_exactly(MIXTURES[name], bins, j)
+        truth = exactly(causes, bins, j)
         assert sum(truth) == 1
         assert_close(table.log_probabilities[j], truth)
 

@@ -174,20 +174,6 @@ def test_the_second_call(what, precision, path, as_gpu, monkeypatch):
 
 
 @pytest.mark.parametrize("gpu", [False, True])
-def test_out_spares_the_host_an_array_but_changes_no_copy(gpu, as_gpu, monkeypatch):
-    device = as_gpu(gpu)
-    watch = Watch(device, monkeypatch)
-    _, up, down = call_of("beam", device, "float32")
-    model = gs.BeamModel(GRID, SCANNER, backend=device)
-    out = np.empty(COUNT, np.float32)
-    model.log_likelihood(poses(COUNT, 2), scan(2), out=out)
-    watch.clear()
-    model.log_likelihood(poses(COUNT, 3), scan(3), out=out)
-    assert watch.allocated == [] and watch.compiled == []
-    assert sorted(watch.up) == sorted(up(COUNT)) and watch.down == down(COUNT)
-
-
-@pytest.mark.parametrize("gpu", [False, True])
 def test_calls_in_pieces_allocate_nothing_either(gpu, as_gpu, monkeypatch):
     device = as_gpu(gpu)
     monkeypatch.setattr(chunking, "CHUNK", 128)

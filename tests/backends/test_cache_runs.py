@@ -52,6 +52,7 @@ def entries(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_ino for path in (folder / scratch.OWN).glob("*.gpusense")}
 
 
+@pytest.mark.long
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("family", ["opencl", "warp:cpu"])
 def test_a_second_process_compiles_nothing(needs, tmp_path, expected, family):

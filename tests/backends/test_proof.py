@@ -414,6 +414,7 @@ def test_a_variable_that_names_nothing_is_an_error_that_names_it(monkeypatch):
     assert gs.backends.get_backend("numpy").info.backend == "numpy"
 
 
+@pytest.mark.long
 def test_devices_of_several_backends_are_proved_at_once(needs, monkeypatch):
     """Each thread waits in its first proof until the other one has begun."""
     needs("opencl")

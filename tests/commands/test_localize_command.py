@@ -95,6 +95,7 @@ def test_figures_come_as_json(place, capsys):
     assert 0 <= found["coverage_50"] <= found["coverage_95"] <= 1 and found["ms_correct"] > 0
 
 
+@pytest.mark.long
 def test_a_log_on_a_wrong_map_is_lost(place, capsys, needs):
     arguments = call(place, "--start", "3", "1.9", "0.2", "--backend", needs("opencl"), grid="other.yaml")
     assert cli.main(arguments) == 1

@@ -181,6 +181,7 @@ def test_a_model_that_fails_in_any_call_changes_nothing(name, backend, monkeypat
     fail_in_every_call(name, backend, monkeypatch)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", FILTERS)
 def test_a_recorded_step_that_fails_in_any_call_changes_nothing(name, device, monkeypatch):
     monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1, vector_loops=False))

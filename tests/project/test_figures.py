@@ -182,6 +182,7 @@ def scan_texts(figures: ModuleType) -> tuple[str, str]:
     )
 
 
+@pytest.mark.long
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 @pytest.mark.parametrize("name", NAMES)
 def test_pages_work_in_a_browser(figures: ModuleType, written: dict[str, str], name: str, tmp_path: Any) -> None:

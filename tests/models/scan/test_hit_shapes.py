@@ -329,7 +329,7 @@ BEAM = gs.BeamParameters(sigma_hit=0.3)
 FIELD = gs.LikelihoodFieldParameters(sigma_hit=0.2)
 
 
-@pytest.mark.long_on("warp")
+@pytest.mark.long
 def test_a_made_up_shape_is_followed_on_every_backend(backend, monkeypatch):
     monkeypatch.setitem(SHAPES, "made-up", MadeUpHit)
     for real in ("float32", "float64") if backend == "numpy" else ("float32",):

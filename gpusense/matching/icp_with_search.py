@@ -44,16 +44,9 @@ _NO_OTHER = np.full((1, 3), np.nan)
 
 
 def match_pairs(
-    backend: Backend,
-    real: np.dtype,
-    points: ScanPoints,
-    pairs: np.ndarray,
-    guess: np.ndarray,
-    method: str,
-    options: MatchOptions,
-    mount: tuple[float, float],
-    noise: np.ndarray | None = None,
-) -> ScanMatch:
+    backend: Backend, real: np.dtype, points: ScanPoints, pairs: np.ndarray, guess: np.ndarray, method: str,
+    options: MatchOptions, mount: tuple[float, float], noise: np.ndarray | None = None,
+) -> ScanMatch:  # fmt: skip
     """Match pairs (S, 2) of scans from guesses (S, 3) of the second robot frame in the first one.
 
     ``judged`` adds the probability that they are right. ``mount`` is the place of the scanner on the robot [m];
@@ -77,17 +70,9 @@ def match_pairs(
 
 
 def judged_pairs(
-    device: PlacedPairs,
-    guess: np.ndarray,
-    result: np.ndarray,
-    points: tuple[Column, Column],
-    lever: np.ndarray,
-    method: str,
-    options: MatchOptions,
-    noise: np.ndarray,
-    levels: Levels,
-    again: np.ndarray | None = None,
-) -> tuple[Best, PairSums]:
+    device: PlacedPairs, guess: np.ndarray, result: np.ndarray, points: tuple[Column, Column], lever: np.ndarray,
+    method: str, options: MatchOptions, noise: np.ndarray, levels: Levels, again: np.ndarray | None = None,
+) -> tuple[Best, PairSums]:  # fmt: skip
     """Return the best results of pairs, and the information of their pairs of points.
 
     ``guess`` (S, 3) is in the sensors' frames. ``result`` (S, 35) is overwritten. ``points`` are numbers of points of
@@ -141,7 +126,10 @@ def _straighten(device: PlacedPairs, result: np.ndarray, noise: np.ndarray, leve
     if any_of(straightened):
         rows = np.flatnonzero(straightened)
         device.fit_lines(lambda level: STRAIGHT_WIDTH * level, rows)
-        rules = [rule._replace(capture=rule.least_capture, scale=rule.least_scale) for rule in levels.final_rules()]
+        rules = [
+            rule._replace(capture=rule.least_capture, scale=rule.least_scale)
+            for rule in levels.rules(MatchOptions.final_rules)
+        ]
         result[rows] = device.run(rows, result[rows, None, :3], rules)[:, 0]
     return noisy
 

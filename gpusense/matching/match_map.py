@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 from dataclasses import dataclass, field
@@ -152,9 +153,6 @@ def match_map(
 
 
 _LOCK = threading.Lock()
-# Searches in the last global maps; each keeps its map alive, so that no later map has the same id.
-_KEPT: dict[tuple[int, int], tuple[OccupancyGrid, Search]] = {}
-_MOST_KEPT = 2
 
 
 def _levels_of(height: int, width: int) -> int:
@@ -162,16 +160,10 @@ def _levels_of(height: int, width: int) -> int:
     return min(_LEVELS, int(math.log2(max(min(height, width) / 4, 1))))
 
 
+@functools.lru_cache(maxsize=2)
 def _search_of(grid: OccupancyGrid, device: Backend) -> Search:
     """Return the search in a global map; tables of the last maps are kept."""
-    key = id(grid), id(device)
-    kept = _KEPT.pop(key, None)
-    if kept is None:
-        kept = grid, Search(ScoreTables(device, _scores(grid, backend=device), levels=_levels_of(*grid.shape)))
-    _KEPT[key] = kept
-    while len(_KEPT) > _MOST_KEPT:
-        del _KEPT[next(iter(_KEPT))]
-    return kept[1]
+    return Search(ScoreTables(device, _scores(grid, backend=device), levels=_levels_of(*grid.shape)))
 
 
 class _Local:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -61,7 +62,7 @@ class MatchOptions:
         """Scale of the last weights [m]."""
         return max(3 * self.noise, 0.03 * self.capture)
 
-    def rules(self, points: int, gap: float) -> MatchRules:
+    def rules(self, points: int, gap: float, reference: int = 0) -> MatchRules:
         """Return the rules of a match from a guess; ``points`` is the number of points of a scan."""
         stride = max(points // COARSE_POINTS, 1)
         scale, least = self.capture, self.least_scale
@@ -86,7 +87,7 @@ class MatchOptions:
             least_scale=least, shrink=0.55, tolerance=3e-3 * self.capture,
         )  # fmt: skip
 
-    def final_rules(self, points: int, gap: float) -> MatchRules:
+    def final_rules(self, points: int, gap: float, reference: int = 0) -> MatchRules:
         """Return the rules of the refinement of a search's best starts."""
         full = self.rules(points, gap)
         return full._replace(iterations=30, capture=max(0.4 * self.capture, full.near),
@@ -193,20 +194,12 @@ class Levels(NamedTuple):
     most: list[tuple[int, int]]
     gap: float
 
-    def rules(self) -> list[MatchRules]:
-        """Return the rules of matches from guesses."""
-        return [options.rules(most, self.gap) for options, (_, most) in zip(self.options, self.most, strict=True)]
-
-    def search_rules(self) -> list[MatchRules]:
-        """Return the rules of the starts of a search."""
-        return [
-            options.search_rules(most, self.gap, before)
-            for options, (before, most) in zip(self.options, self.most, strict=True)
-        ]
-
-    def final_rules(self) -> list[MatchRules]:
-        """Return the rules of the refinement of a search's best starts."""
-        return [options.final_rules(most, self.gap) for options, (_, most) in zip(self.options, self.most, strict=True)]
+    def rules(
+        self, rules: Callable[[MatchOptions, int, float, int], MatchRules] = MatchOptions.rules
+    ) -> list[MatchRules]:
+        """Return the rules of each level, by a method of its options."""
+        return [rules(options, most, self.gap, before)
+                for options, (before, most) in zip(self.options, self.most, strict=True)]  # fmt: skip
 
 
 class Best(NamedTuple):
@@ -217,16 +210,11 @@ class Best(NamedTuple):
 
 
 def search(
-    device: PlacedPairs,
-    poor: np.ndarray,
-    guess: np.ndarray,
-    offsets: np.ndarray,
-    best: Best,
-    options: MatchOptions,
+    device: PlacedPairs, poor: np.ndarray, guess: np.ndarray, offsets: np.ndarray, best: Best, options: MatchOptions,
     levels: Levels,
-) -> None:
+) -> None:  # fmt: skip
     """Search around the guesses of some pairs, and replace results by better ones."""
-    rules, parts = levels.search_rules(), []
+    rules, parts = levels.rules(MatchOptions.search_rules), []
     # The results of all starts of wide windows take much memory.
     step = max(device.pairs_of_launch(len(offsets)), _KEPT // len(offsets))
     for begin in range(0, len(poor), step):
@@ -237,7 +225,7 @@ def search(
     which, chosen = (np.concatenate(values) for values in zip(*parts, strict=True))
     if not len(which):
         return
-    fine = device.run(poor[which], chosen[:, None], levels.final_rules())[:, 0]
+    fine = device.run(poor[which], chosen[:, None], levels.rules(MatchOptions.final_rules))[:, 0]
     rows = poor[which]
     order = np.arange(len(rows)) - np.searchsorted(rows, rows)
     # The starts of all pairs in one launch, grouped by pair.

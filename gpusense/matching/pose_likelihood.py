@@ -192,12 +192,7 @@ def pose_likelihood(
 
 
 def prepare_tiles(
-    model: ScanModel,
-    ranges: ArrayLike,
-    *,
-    resolution: float,
-    headings: int,
-    positions: Literal["free", "all"],
+    model: ScanModel, ranges: ArrayLike, *, resolution: float, headings: int, positions: Literal["free", "all"]
 ) -> tuple[PoseLikelihood, Iterator[float]]:
     """Return the result, empty so far, and an iterator that fills it tile by tile and yields the share that is done."""
     if not isinstance(model, ScanModel):

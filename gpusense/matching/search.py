@@ -56,16 +56,9 @@ class Search:
         self._masks: tuple[np.ndarray | None, tuple[int, ...], list[Buffer]] = (None, (), [])
 
     def find(
-        self,
-        points: Sequence[np.ndarray],
-        grid: PoseGrid,
-        *,
-        slack: int | np.ndarray = 0,
-        level: int | None = None,
-        allowed: np.ndarray | None = None,
-        images: Sequence[np.ndarray] | None = None,
-        floor: int = -1,
-    ) -> Found:
+        self, points: Sequence[np.ndarray], grid: PoseGrid, *, slack: int | np.ndarray = 0, level: int | None = None,
+        allowed: np.ndarray | None = None, images: Sequence[np.ndarray] | None = None, floor: int = -1,
+    ) -> Found:  # fmt: skip
         """Return the best pose of each scan, and all poses whose scores are at most ``slack`` or (S,) lower.
 
         ``points`` (K_s, 2) are end points of each of S scans in the robot's frame [cells of the tables], ``images``

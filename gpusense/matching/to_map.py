@@ -6,6 +6,7 @@ sees. Expected scans follow the surfaces themselves, and show which space a scan
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 from dataclasses import replace
@@ -316,9 +317,8 @@ def _joint(field: np.ndarray, own: np.ndarray, bias: float, lever: np.ndarray) -
 
 
 _LOCK = threading.Lock()
-# The last matchers; each keeps its map alive, so that no later map has the same id.
-_KEPT: dict[tuple[object, ...], MapMatcher] = {}
-_MOST_KEPT = 4
+# The matchers of the last maps.
+_matcher = functools.lru_cache(maxsize=4)(MapMatcher)
 
 
 def match_to_map(
@@ -326,10 +326,5 @@ def match_to_map(
     precision: str, options: MatchOptions,
 ) -> ScanMatch:  # fmt: skip
     """Match (S, K) readings to a map from (S, 3) guesses; fields of the last maps are kept."""
-    key = (id(grid), scanner, id(backend), precision, options)
     with _LOCK:
-        matcher = _KEPT.pop(key, None) or MapMatcher(grid, scanner, backend, precision, options)
-        _KEPT[key] = matcher
-        while len(_KEPT) > _MOST_KEPT:
-            del _KEPT[next(iter(_KEPT))]
-        return matcher.match(ranges, guess, method)
+        return _matcher(grid, scanner, backend, precision, options).match(ranges, guess, method)

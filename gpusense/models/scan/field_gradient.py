@@ -13,7 +13,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import get_backend
 from gpusense.backends.base import Buffer
-from gpusense.backends.workspace import Workspace
+from gpusense.backends.workspace import ChangingProgram, Workspace
 from gpusense.interface.constants import CLIMB, GRADIENT_NUMBERS
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
@@ -141,8 +141,10 @@ class Climbs(Gradients):
         if backend.info.float64:
             there = space.upload("climb", end)
             step = launch("climb_step", flags, (count,), gradient=gradient, poses=placed.source, climb=there, **numbers)
+            climb = ChangingProgram(backend, (*program, step), ())
             while not end[:, ENDED].all():
-                backend.run((*program, step) * _STEPS_AT_ONCE[backend.info.kind])
+                for _ in range(_STEPS_AT_ONCE[backend.info.kind]):
+                    climb({})
                 space.read(there, end)
             return
         climb_step = get_backend("numpy").compile("climb_step", flags)

@@ -49,23 +49,14 @@ _FEW = 512
 
 
 class Candidates(NamedTuple):
-    """Poses that a search found for S scans, one scan after the other, in falling order of score.
+    """Poses that a search found for S scans, one scan after the other, in falling order of score."""
 
-    Attributes:
-        poses: (M, 3) in the world.
-        score: (M,) from 0 to 1, the mean of the end points.
-        log_p: (M,) log-likelihoods by the model, NaN where they were not computed.
-        scan: (M,) scan of each pose.
-        best: (S,) row of the likeliest pose of each scan.
-        evaluated: Poses and blocks of poses that were evaluated, on average over the scans of a search.
-    """
-
-    poses: np.ndarray
-    score: np.ndarray
-    log_p: np.ndarray
-    scan: np.ndarray
-    best: np.ndarray
-    evaluated: int
+    poses: np.ndarray  # (M, 3) in the world
+    score: np.ndarray  # (M,) from 0 to 1, the mean of the end points
+    log_p: np.ndarray  # (M,) log-likelihoods by the model, NaN where they were not computed
+    scan: np.ndarray  # (M,) scan of each pose
+    best: np.ndarray  # (S,) row of the likeliest pose of each scan
+    evaluated: int  # poses and blocks of poses that were evaluated, on average over the scans of a search
 
     @classmethod
     def joined(cls, parts: Sequence[Candidates]) -> Candidates:
@@ -185,7 +176,7 @@ class FieldSearch:
             grid = PoseGrid(searched.start.repeat(scans, axis=0), headings, searched.height, searched.width)
         found = self._search.find(cells, grid, slack=np.maximum(hits, most), allowed=allowed)
         poses, first = to_world(self.grid, grid.poses(found, self.stride)), found.best
-        # Rounding moves a score by half a step for each hit. Modes need the other poses, too, which are mostly few.
+        # Rounding moves a score by half a step for each hit. Modes need the other poses too, mostly few.
         near = found.score >= (found.score[first] - hits)[found.scan]
         every = np.bincount(found.scan)
         rows = padded_rows(first, every if every.max() <= _FEW else np.add.reduceat(near, first, dtype=np.intp))

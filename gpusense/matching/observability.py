@@ -50,15 +50,10 @@ _NOTHING = 1e-9
 
 
 class Observed(NamedTuple):
-    """Information of pairs.
+    """Information of pairs."""
 
-    Attributes:
-        information: Sums of w J J' without the part that noise makes up, 0 along lost directions up to rounding.
-        lost: Number of lost directions.
-    """
-
-    information: Triangle
-    lost: Column
+    information: Triangle  # sums of w J J' without the part that noise makes up, 0 along lost directions up to rounding
+    lost: Column  # number of lost directions
 
     def replaced(self, rows: np.ndarray, others: Observed) -> Observed:
         """Return the information with that of some rows replaced; a single match is replaced as a whole."""

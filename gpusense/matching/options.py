@@ -33,19 +33,13 @@ _FARTHEST = 1e6
 
 @dataclass(frozen=True)
 class MatchOptions:
-    """Options of a match.
+    """Options of a match."""
 
-    Attributes:
-        noise: Standard deviation of ranges [m].
-        capture: Farthest distance between paired points at the start [m].
-        window: Half widths of the search in x and y [m] and theta [rad] about a guess from which ICP fails.
-        one_way: Only the second scan counts for the agreement, because the reference has many more points.
-    """
-
-    noise: float
-    capture: float
+    noise: float  # standard deviation of ranges [m]
+    capture: float  # farthest distance between paired points at the start [m]
+    # Half widths of the search in x and y [m] and theta [rad] about a guess from which ICP fails.
     window: tuple[float, float]
-    one_way: bool = False
+    one_way: bool = False  # only the second scan counts for the agreement, because the reference has many more points
 
     def is_outside(self, offset: np.ndarray) -> Column:
         """Return whether (S, 3) offsets from guesses leave the window, enlarged by the move that a start may make."""
@@ -182,17 +176,12 @@ _OTHER, _OTHER_TURN, _CLOSE = 0.25, 0.1, 0.012
 
 
 class Levels(NamedTuple):
-    """Levels of noise of the pairs of a call.
+    """Levels of noise of the pairs of a call."""
 
-    Attributes:
-        options: The options of each level.
-        most: For each level the number of points of the largest reference and of the largest second scan.
-        gap: Largest step between the bearings of two neighbours that hides nothing [rad].
-    """
-
-    options: list[MatchOptions]
+    options: list[MatchOptions]  # the options of each level
+    # For each level the number of points of the largest reference and of the largest second scan.
     most: list[tuple[int, int]]
-    gap: float
+    gap: float  # largest step between the bearings of two neighbours that hides nothing [rad]
 
     def rules(
         self, rules: Callable[[MatchOptions, int, float, int], MatchRules] = MatchOptions.rules

@@ -35,19 +35,12 @@ GAP = 3.25
 
 @dataclass(frozen=True)
 class ScanPoints:
-    """End points of the hits of scans, in a frame at the sensor with axes parallel to the robot's.
+    """End points of the hits of scans, in a frame at the sensor with axes parallel to the robot's."""
 
-    Attributes:
-        point: (P, 4) x, y [m], bearing in [0, 2 pi) [rad] and range [m], sorted by bearing in each scan.
-        start: (S + 1,) first point of each scan.
-        gap: Largest step between the bearings of two neighbours that hides nothing [rad].
-        squares: (S,) sums of squared ranges [m^2].
-    """
-
-    point: np.ndarray
-    start: np.ndarray
-    gap: float
-    squares: np.ndarray
+    point: np.ndarray  # (P, 4) x, y [m], bearing in [0, 2 pi) [rad] and range [m], sorted by bearing in each scan
+    start: np.ndarray  # (S + 1,) first point of each scan
+    gap: float  # largest step between the bearings of two neighbours that hides nothing [rad]
+    squares: np.ndarray  # (S,) sums of squared ranges [m^2]
 
     @functools.cached_property
     def counts(self) -> np.ndarray:
@@ -229,17 +222,11 @@ def _step_of(noise: Column) -> Column:
 
 
 class NoiseLevels(NamedTuple):
-    """The values of the noise of a match.
+    """The values of the noise of a match."""
 
-    Attributes:
-        noise: The values, ascending [m].
-        largest: Largest noise of scans that is rounded to each of them; larger noise belongs to the last one.
-        assumed: Level of a match whose scans have too few beams for an estimate.
-    """
-
-    noise: list[float]
-    largest: list[float]
-    assumed: int
+    noise: list[float]  # the values, ascending [m]
+    largest: list[float]  # largest noise of scans that is rounded to each of them; larger noise belongs to the last one
+    assumed: int  # level of a match whose scans have too few beams for an estimate
 
 
 @functools.cache

@@ -11,19 +11,12 @@ from gpusense._util.angles import wrapped
 
 @dataclass(frozen=True, eq=False)
 class PoseGrid:
-    """Poses to search: for each of S scans A headings and H x W positions.
+    """Poses to search: for each of S scans A headings and H x W positions."""
 
-    Attributes:
-        start: (S, 2) x and y of the position with row and column 0 [cells of the table].
-        headings: (S, A) headings in the table's frame [rad].
-        height: Rows of positions.
-        width: Columns of positions; neighbours are ``stride`` cells of the tables apart.
-    """
-
-    start: np.ndarray
-    headings: np.ndarray
-    height: int
-    width: int
+    start: np.ndarray  # (S, 2) x and y of the position with row and column 0 [cells of the table]
+    headings: np.ndarray  # (S, A) headings in the table's frame [rad]
+    height: int  # rows of positions
+    width: int  # columns of positions; neighbours are ``stride`` cells of the tables apart
 
     @classmethod
     def around(cls, poses: np.ndarray, reach: tuple[int, int], turns: int, angle: float, stride: int = 1) -> PoseGrid:
@@ -53,25 +46,15 @@ class PoseGrid:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Poses of a search, in falling order of score for each scan; ties by row, then column, then heading.
+    """Poses of a search, in falling order of score for each scan; ties by row, then column, then heading."""
 
-    Attributes:
-        scan: (M,) scan of each pose.
-        row: (M,) its row.
-        col: (M,) its column.
-        heading: (M,) index of its heading.
-        score: (M,) its score, the sum of cells over the scan's points.
-        evaluated: Poses and blocks that were evaluated.
-        complete: (S,) whether all poses of a scan within ``slack`` of its best one are here.
-    """
-
-    scan: np.ndarray
-    row: np.ndarray
-    col: np.ndarray
-    heading: np.ndarray
-    score: np.ndarray
-    evaluated: int
-    complete: np.ndarray
+    scan: np.ndarray  # (M,) scan of each pose
+    row: np.ndarray  # (M,) its row
+    col: np.ndarray  # (M,) its column
+    heading: np.ndarray  # (M,) index of its heading
+    score: np.ndarray  # (M,) its score, the sum of cells over the scan's points
+    evaluated: int  # poses and blocks that were evaluated
+    complete: np.ndarray  # (S,) whether all poses of a scan within ``slack`` of its best one are here
 
     @property
     def best(self) -> np.ndarray:

@@ -30,23 +30,14 @@ _LEAST_BEAMS, _AT_ONCE = 3, 8
 
 
 class _Scene(NamedTuple):
-    """Everything on which the program of a match depends, but its readings and its guess.
+    """Everything on which the program of a match depends, but its readings and its guess."""
 
-    Attributes:
-        scanner: The scanner.
-        real: Precision.
-        kind: Type of the readings, to which the scanner's limits are rounded.
-        capture: Farthest distance between paired points at the start [m].
-        noise: Standard deviation of ranges [m]; None where the scans tell it.
-        turns: 2 where a match from a poor guess is repeated from its result, otherwise 1.
-    """
-
-    scanner: Scanner
-    real: np.dtype
-    kind: np.dtype
-    capture: float
-    noise: float | None
-    turns: int
+    scanner: Scanner  # the scanner
+    real: np.dtype  # precision
+    kind: np.dtype  # type of the readings, to which the scanner's limits are rounded
+    capture: float  # farthest distance between paired points at the start [m]
+    noise: float | None  # standard deviation of ranges [m]; None where the scans tell it
+    turns: int  # 2 where a match from a poor guess is repeated from its result, otherwise 1
 
     def levels(self) -> NoiseLevels:
         """Return the levels of noise."""

@@ -43,23 +43,14 @@ def field_scores(distances: np.ndarray, sigma: float, max_distance: float) -> np
 
 
 class Folded(NamedTuple):
-    """Tables of a level as images, one per first cell of blocks.
+    """Tables of a level as images, one per first cell of blocks."""
 
-    Attributes:
-        table: The images.
-        shape: Their sizes.
-        period: Cells of the tables between neighbouring cells of an image.
-        step: Cells between first cells of neighbouring images.
-        offset: Column and row of the tables' first cell in the images' source.
-        unit: Scores in a unit of a loss.
-    """
-
-    table: Buffer
-    shape: ScoreTable
-    period: int
-    step: int
-    offset: int
-    unit: int
+    table: Buffer  # the images
+    shape: ScoreTable  # their sizes
+    period: int  # cells of the tables between neighbouring cells of an image
+    step: int  # cells between first cells of neighbouring images
+    offset: int  # column and row of the tables' first cell in the images' source
+    unit: int  # scores in a unit of a loss
 
 
 class ScoreTables:

@@ -11,10 +11,8 @@ import numpy as np
 from gpusense._util.html import FIT_HEAD, card
 from gpusense._util.typing import Floats
 from gpusense.world.parameters import BeamParameters, LandmarkParameters
-from gpusense.world.sensor_parameters import BeaconParameters, BumperParameters, HeadingParameters, PositionParameters
 
 P = TypeVar("P")
-Q = TypeVar("Q", BeaconParameters, BeamParameters, BumperParameters, HeadingParameters, PositionParameters)
 
 
 class FitRow(NamedTuple):
@@ -223,7 +221,7 @@ class LandmarkFit(Fitted[LandmarkParameters]):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PointFit(Fitted[Q]):
+class PointFit(Fitted[P]):
     """Parameters of a position, heading, beacon or bumper model, fitted to readings at known poses.
 
     Attributes:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers
-from gpusense.learning.fitted import PointFit, Q
+from gpusense.learning.fitted import P, PointFit
 from gpusense.learning.information import FEW_BLOCKS, errors_of, notes_on_blocks, scatter_of
 
 
@@ -40,6 +40,9 @@ class Problem(ABC):
     """
 
     per_reading: ClassVar[tuple[str, ...]]
+    # Share of the largest scaled information, and information per squared step of a coordinate, that count as none.
+    flat: ClassVar[float] = 1e-7
+    least: ClassVar[float] = 0.0
 
     @property
     def readings(self) -> int:
@@ -136,6 +139,9 @@ _CLIMBED, _SAMPLE = 3, 20_000
 _ARMIJO, _HALVINGS = 1e-4, 50
 # Scaled curvature below the first share of the largest counts as none; errors of differences stay below the second.
 _FLAT, _NEGATIVE = 1e-10, 1e-7
+# Slope below which a direction without curvature is level [nats per deviation], and the share of the largest
+# information, per squared step of a coordinate, that differences cannot tell from none.
+_LEVEL, _ROUNDED = 1e-3, 1e-8
 
 
 @dataclass(frozen=True)
@@ -213,6 +219,8 @@ def _step(problem: Problem, theta: Floats, gradient: Floats, free: NDArray[np.bo
     flat = _FLAT * max(float(np.abs(size).max()), 1e-300)
     along: Floats = axes.T @ (scale * g)
     moves = along / np.maximum(np.abs(size), flat)
+    # Along a direction without curvature and slope, rounding alone would move a step.
+    moves[(np.abs(size) < problem.flat) & (np.abs(along) < _LEVEL)] = 0.0
     step[free] = scale * (axes @ moves)
     # Longer steps leave the region where the curvature is valid.
     limit = 4 * problem.scales(theta)
@@ -237,7 +245,7 @@ def _line_search(
     return None
 
 
-def report(problem: Problem, end: Climb, parameters: Q, blocks: Integers | None, missing: int) -> PointFit[Q]:
+def report(problem: Problem, end: Climb, parameters: P, blocks: Integers | None, missing: int) -> PointFit[P]:
     """Build the fit from the end of a search."""
     values = problem.values(end.theta)
     count = 0 if blocks is None else int(blocks.max()) + 1
@@ -279,7 +287,7 @@ def report(problem: Problem, end: Climb, parameters: Q, blocks: Integers | None,
 
 def _list(names: list[str]) -> str:
     """Return the first names, and the number of further ones."""
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 def standard_errors(
@@ -291,7 +299,11 @@ def standard_errors(
     if blocks is not None:
         size, gradients = int(blocks.max()) + 1, problem.log_p(theta)[1][:, free]
         scatter = scatter_of(np.stack([np.bincount(blocks, column, size) for column in gradients.T], axis=1))
-    errors = errors_of(-problem.hessian(theta, free), rows, scatter, _NEGATIVE)
+    curve = -problem.hessian(theta, free)
+    known = np.diag(curve) * problem.scales(theta)[free] ** 2
+    rounded = known <= max(_ROUNDED * float(known.max(initial=0.0)), problem.least)
+    curve[rounded], curve[:, rounded] = 0.0, 0.0
+    errors = errors_of(curve, rows, scatter, problem.flat)
     errors[~rows.any(axis=1)] = math.nan
     return dict(zip(problem.values(theta), errors.tolist(), strict=True))
 

@@ -56,7 +56,7 @@ def test_a_flat_direction_leaves_the_other_standard_errors() -> None:
     assert fit is not None and fit.converged
     errors = fit.standard_errors
     assert math.isnan(errors["lambda_short"]) and math.isnan(errors["lambda_rand"])
-    assert "the readings do not determine lambda_short, lambda_rand" in fit.status
+    assert "lambda_short, lambda_rand: the readings do not determine it" in fit.status
     # Fixing either rate removes the flat direction.
     counts = count_pairs(z, expected, 5.0, 50)
     causes = gs.DiscreteBeamModel.learn(z, expected, 5.0, 50).causes
@@ -101,7 +101,7 @@ def test_errors_over_blocks() -> None:
     assert (once.blocks, plain.blocks) == (2000, 0) and plain.standard_errors == plain.independent_errors
     for name, error in plain.standard_errors.items():
         # Independent readings: errors over 2000 blocks agree within their own error.
-        assert once.independent_errors[name] == error
+        assert once.independent_errors[name] == pytest.approx(error, rel=1e-5)
         assert once.standard_errors[name] == pytest.approx(error, rel=0.15), name
     nine = np.repeat(np.arange(4000), 9)
     repeated = learn(np.repeat(z, 9), np.repeat(expected, 9), nine)
@@ -285,7 +285,9 @@ def test_readings_are_counted_by_class_and_step(monkeypatch):
             cell = min(int(min(exp, 5.0) * 1.25), 5), min(int(min(own, 5.0) * 1.25), 5)
             wanted[cell] = wanted.get(cell, 0) + 1
     found = dict(zip(zip(whole.rows.tolist(), whole.steps.tolist(), strict=True), whole.counts.tolist(), strict=True))
-    assert found == wanted and whole.missing == np.count_nonzero(~(z >= 0)) and whole.total + whole.missing == 500
+    assert (
+        found == wanted and whole.missing == np.count_nonzero(~(z >= 0)) and whole.counts.sum() + whole.missing == 500
+    )
     monkeypatch.setattr("gpusense.learning.discrete.fit._BLOCK", 64)
     for one, two in zip(
         dataclasses.astuple(whole),

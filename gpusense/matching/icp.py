@@ -156,16 +156,10 @@ class PlacedPairs:
     def run(
         self, pairs: np.ndarray, guesses: np.ndarray, rules: Sequence[MatchRules], columns: int = MATCH_RESULT
     ) -> np.ndarray:
-        """Match some pairs from several guesses each.
+        """Match pairs (P,) from guesses (P, M, 3), poses of the second scans in the references' frames.
 
-        Args:
-            pairs: (P,) numbers of pairs.
-            guesses: (P, M, 3) poses of the second scan in the reference's frame.
-            rules: Those of each level; see the kernel file ``icp``.
-            columns: Numbers of each result that are returned.
-
-        Returns:
-            (P, M, columns) results in float64, as the kernel file describes them.
+        ``rules`` are the rules of each level. Return the first numbers (P, M, columns) of results, see the kernel file
+        ``icp``, in float64.
         """
         starts = guesses.shape[1]
         step = self.pairs_of_launch(starts)

@@ -169,12 +169,9 @@ def _search_of(grid: OccupancyGrid, device: Backend) -> Search:
 class _Local:
     """The known cells of a local map around their middle.
 
-    Attributes:
-        middle: (2,) centre of the known cell in their middle, in the local map's frame [m].
-        xy: (M, 2) centres of the known cells around the middle [cells of the global map].
-        occupied: (M,) whether they are occupied.
-        points: (K, 2) cells that the search sums.
-        images: (K,) table of each: 0 for occupied, 1 for free cells.
+    ``middle`` (2,) is the centre of the known cell in their middle, in the local map's frame [m]; ``xy`` (M, 2) are
+    their centres around it [cells of the global map]. The search sums the cells ``points`` (K, 2) in tables ``images``
+    (K,): 0 for occupied, 1 for free cells.
     """
 
     def __init__(self, grid: OccupancyGrid, cell: float) -> None:

@@ -136,9 +136,7 @@ class ScanMatch:
     def moved(self, frame: Floats, reach: tuple[float, float]) -> ScanMatch:
         """Return S matches in the frame in which the reference's robot frames are at (S, 3) poses.
 
-        Args:
-            frame: The poses.
-            reach: Farthest distance [m] and angle [rad] from a guess, see ``covariance_of``.
+        ``reach`` is the farthest distance [m] and angle [rad] from a guess, see ``covariance_of``.
         """
         c, s = np.cos(frame[:, 2]), np.sin(frame[:, 2])
         x, y, theta = self.pose.T

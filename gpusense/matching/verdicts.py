@@ -292,12 +292,10 @@ def _noise_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def inflation_of(squares: Sequence[Column]) -> Column:
     """Return the variances of sums of weighted errors, relative to independent errors; at least 1.
 
-    The ratio to single points rises with the size of blocks, and is less certain for large ones. So its steps are
-    summed until the first one that is not positive. The last of them counts twice: once blocks are longer than the
-    correlation, each step is half of the one before.
-
-    Args:
-        squares: 8 columns: sums of squares of the sums of blocks of 1, 2, 4 to 128 points.
+    ``squares`` are 8 columns: sums of squares of the sums of blocks of 1, 2, 4 to 128 points. The ratio to single
+    points rises with the size of blocks, and is less certain for large ones. So its steps are summed until the first
+    one that is not positive. The last of them counts twice: once blocks are longer than the correlation, each step is
+    half of the one before.
     """
     first = chosen(squares[0] > 0, squares[0], 1.0)
     rises, total, last = first > 0, 0.0, 0.0

@@ -260,7 +260,7 @@ class DiscreteFit:
     log_likelihood: float
     """Log-likelihood of all readings: probabilities of bins, not densities; natural logarithm."""
     converged: bool
-    """Whether the gradient vanishes at the result, within the bounds of the search."""
+    """Whether the search ended at a maximum, within its bounds."""
     standard_errors: Mapping[str, float]
     """Standard error of each parameter, in its unit, from the curvature of the likelihood; NaN if undetermined."""
     trace: tuple[float, ...]

@@ -1,7 +1,6 @@
 """Fit standard deviations and weights of the landmark model to features at known poses.
 
-``pairs`` computes the log-likelihood of features. The search is the one for sensors at known poses, see
-``gpusense.learning.point.problem``.
+``pairs`` computes the log-likelihood of features, and ``gpusense.learning.point.problem`` searches for its maximum.
 """
 
 from __future__ import annotations

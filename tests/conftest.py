@@ -41,7 +41,7 @@ QUICK = (
 
 GOLDEN = (5**0.5 - 1) / 2
 # Parts of a test's sample that run by default and in .ci/run.
-BRIEF, CHECKED = 0.1, 0.4
+BRIEF, CHECKED = 0.1, 0.3
 
 # Objects of collection live as long as the tests; searching them for garbage would take a quarter of its time.
 gc.disable()

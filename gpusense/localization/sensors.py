@@ -53,7 +53,7 @@ class Sensor:
         if isinstance(model, ScanModel) and model.temperature != 1:
             raise ValueError(f"models: must have temperature 1, the filter has its own, got {model.temperature}")
         self.model: Any = model
-        # Whether temperature="auto" learns from this sensor; whether its likelihood may have several peaks among
+        # True if temperature="auto" learns from this sensor; true if its likelihood may have several peaks among
         # concentrated particles, for example exchangeable landmarks.
         self.calibrates, self.ambiguous = isinstance(model, ScanModel), isinstance(model, FeatureModel)
         self.backend: Backend = model.backend

@@ -52,7 +52,7 @@ class Tracker:
         self._models = [sensor.model for sensor in sensors]
         # Number of shown particles, from the last step; number of remaining corrections at a low temperature.
         self.started, self.progress, self.shown, self.wide = False, Progress(), options.most, 0
-        # Whether the particles are known to be concentrated.
+        # True if the particles are known to be concentrated; number of corrections.
         self.together, self.corrections = False, 0
         # An estimate from the kernels, with its mean and covariance.
         self._moments: tuple[np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None

@@ -101,6 +101,26 @@ def test_scans_of_host_and_device_have_the_same_bits(warp_as_gpu, monkeypatch, g
     assert run(False, False) == run(True, False) == run(False, True) == run(True, True)
 
 
+def test_corrections_of_wide_clouds_refine_the_estimate_that_each_step_asks_for(backend, monkeypatch):
+    model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=backend)
+    ranges = np.full(60, np.nan)
+    ranges[0] = 1.0
+    pf, fresh = (gs.ParticleFilter(model, particles=300, seed=5, temperature=0.01, recovery=None) for _ in range(2))
+    pf.initialize(mean=(3.0, 2.5, 0.4), covariance=np.diag([0.2, 0.2, 4.0]))
+    launched, estimates = [], pf._cloud._estimates.run
+    monkeypatch.setattr(pf._cloud._estimates, "run", lambda *a: (launched.append(a), estimates(*a)))
+    for k in range(9):
+        if k == 6:
+            launched.clear()
+        pf.predict((0, 0, 0), (0.01, 0, 0))
+        pf.correct(ranges)
+        found = pf.estimate()
+        fresh.restore(pf.state())
+        again = fresh.estimate()
+        assert (found.p_lost, found.covariance.tobytes()) == (again.p_lost, again.covariance.tobytes())
+    assert not launched and not found.covariance[2, 2] < 0.25
+
+
 def test_corrections_compute_an_estimate_that_each_step_asks_for(backend, monkeypatch):
     ranges = gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast([[3.0, 2.5, 0.4]], SCANNER.bearings)[0]
 

@@ -225,7 +225,7 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     if kind == "png":
         # Twice as fast as the default level, for a file that is a sixth larger.
         options["pil_kwargs"] = dict(compress_level=3)
-        if engine is not None:
+        if engine is not None and figure.axes:
             # Matplotlib would draw the whole figure once more for its layout.
             engine.execute(figure)
             figure.set_layout_engine(None)

@@ -106,6 +106,7 @@ def programs_of(owner):
     return [weakref.ref(value) for cache in caches for _, value in cache.items() if not isinstance(value, tuple)]
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("kind", [gs.LikelihoodFieldModel, gs.BeamModel])
 def test_a_model_takes_its_programs_along(kind, backend, without_collector):
     model = kind(GRID, SCANNER, backend=backend)
@@ -124,6 +125,7 @@ def test_a_model_takes_its_programs_along(kind, backend, without_collector):
     assert all(one() is None for one in kept)
 
 
+@pytest.mark.long_on("warp")
 def test_a_filter_takes_its_programs_along(backend, without_collector):
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=backend)
     pf = gs.ParticleFilter(model, particles=64, seed=1)

@@ -274,6 +274,7 @@ def test_the_heaviest_cluster_is_found():
     np.testing.assert_allclose(np.diag(covariance), 0.01, rtol=0.3)
 
 
+@pytest.mark.long_on("warp")
 def test_readings_that_are_refused_cost_no_motion(backend):
     scanner = gs.Scanner.uniform(angle_min=-1, angle_increment=0.5, count=5, range_max=10.0)
     grid = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
@@ -324,6 +325,7 @@ def test_readings_may_be_overwritten_after_the_correction(backend):
     assert pf.estimate().explained > 0.9
 
 
+@pytest.mark.long_on("warp")
 def test_a_filter_that_never_draws_keeps_what_it_knows(backend):
     """At a threshold below 1 / N, no weight may round to the integer 0."""
     pf = gs.ParticleFilter(gps(backend), particles=1000, seed=2, threshold=1e-15, stages=1)

@@ -66,6 +66,7 @@ def test_a_correction_is_one_graph_with_a_copy_of_its_inputs_and_one_of_its_resu
             assert pf.explain().endswith("launches and 2 copies")
 
 
+@pytest.mark.long
 def test_steps_keep_the_inputs_of_few_steps_alive(warp_as_gpu, monkeypatch):
     made: list[weakref.ref[np.ndarray]] = []
     upload = type(warp_as_gpu).upload

@@ -322,6 +322,7 @@ def test_certificates_of_the_page_are_valid(tmp_path):
     security(*(str(tmp_path / name) for name in ("ca.pem", "cert.pem", "key.pem"))).get_connection_args("client")
 
 
+@pytest.mark.long
 def test_a_cluster_of_this_machine_may_use_tls(tmp_path):
     own = write_certificates(tmp_path)
     with gs.sweep.DaskExecutor(devices=["numpy"], security=security(*own)) as executor:

@@ -166,6 +166,7 @@ def crowd_of(rng: np.random.Generator) -> tuple[gs.Shapes, np.ndarray]:
     return gs.Shapes(discs=discs[None], boxes=boxes[None], segments=segments[None]), np.column_stack([places, headings])
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_rays_among_many_shapes_have_the_bits_of_the_reference(precision: Any, backend: str) -> None:
     """The reference tests every shape; devices test the shapes near a ray's direction."""

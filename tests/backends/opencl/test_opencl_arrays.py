@@ -78,6 +78,7 @@ def test_several_scans(kind, share, queue, there, monkeypatch):
         assert model.log_likelihood(among, scans, out=out) is out and differing(out.get(), expected) == 0
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", MODELS)
 def test_pieces_with_which_the_device_cannot_begin(kind, as_gpu, queue, there, monkeypatch):
     """Such pieces are written elsewhere and copied; bound calls copy nothing and use larger pieces."""

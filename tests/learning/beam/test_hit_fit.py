@@ -74,7 +74,7 @@ def fitted_by_scipy(count: int) -> tuple[float, np.ndarray]:
     return -best.fun, best.x
 
 
-@pytest.mark.long_on("warp")
+@pytest.mark.long
 def test_the_fit_is_that_of_scipy(backend: str) -> None:
     z, expected = (each[:1500] for each in drawn(STUDENT))
     blocks = np.arange(1500) // 5

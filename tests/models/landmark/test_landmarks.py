@@ -151,6 +151,7 @@ def test_negative_information_by_counting(association, precision, backend):
     np.testing.assert_allclose(model.log_likelihood(poses, features), expected, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.long_on("warp")
 def test_a_sensor_that_misses_nothing(backend):
     """With known landmarks, and without features."""
     p = gs.LandmarkParameters(field_of_view=2.5, range_max=9.0, p_detect=1.0, z_detect=0.9, z_false=0.1)

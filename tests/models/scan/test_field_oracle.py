@@ -121,6 +121,7 @@ def test_field_of_any_parameters(name, precision, interpolation, specialize, bac
     compare(field, model, poses, ranges, BEARINGS)
 
 
+@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (17, 23)])
 @pytest.mark.parametrize("filling", [0, 100, -1])

@@ -201,6 +201,29 @@ def test_every_option_has_a_body_in_lanes(kind, option, precision, bearings, in_
         assert allowed.difference(found[LANES, "parts"][possible], found[1, "parts"][possible]) <= allowed.value
 
 
+@pytest.mark.parametrize("outline", ["circle", "square"])
+@pytest.mark.parametrize("changes", [{}, {"sigma": 0.01, "p_contact": 1.0, "p_false": 0.0}])
+def test_bumpers(outline, changes, in_lanes, compiled_lanes):
+    """Poses are on edges of cells, off the map, and in walls; contact is certain in either state."""
+    rng = np.random.default_rng(5)
+    grid = gs.OccupancyGrid(rng.choice([0, 100], (37, 53), p=[0.97, 0.03]), 0.25, (3.0, -2.0, 0.3))
+    local = rng.uniform((-1, -1, -4), (14, 10, 4), (75, 3))
+    local[1::3] = np.round(local[1::3] * 4) / 4
+    poses = gs.compose_poses(np.array(grid.origin), local * (1.0, 1.0, math.pi / 4))
+    square = [(0.2, 0.25), (-0.2, 0.25), (-0.2, -0.25), (0.2, -0.25)]
+    shape, parts, pressed = (square, [0, 1, -1, 1], [True, False]) if outline == "square" else (0.3, None, True)
+    found = {}
+    for lanes in (1, LANES):
+        model = gs.BumperModel(grid, shape, gs.BumperParameters(**changes), segments=parts, backend=in_lanes(lanes))
+        compiled_lanes.clear()
+        found[lanes] = model.log_likelihood(poses, pressed)
+        assert compiled_lanes["score_contact"] == {lanes}
+    assert differing(model.log_likelihood(poses[::-1], pressed)[::-1], found[LANES]) == 0
+    allowed, finite = beam_tolerance(np.float32).twice(), np.isfinite(found[1])
+    assert np.array_equal(finite, np.isfinite(found[LANES])) and np.ptp(found[1][finite]) > 1
+    assert allowed.difference(found[LANES][finite], found[1][finite]) <= 2 * allowed.value
+
+
 def test_only_scenes_that_have_such_kernels_get_them():
     info = get_backend("numpy").info
     wide = dataclasses.replace(info, lanes=LANES)

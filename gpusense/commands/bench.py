@@ -22,7 +22,7 @@ from gpusense.commands.arguments import (
     whole_number,
 )
 from gpusense.commands.signals import held
-from gpusense.evaluation.benchmark.choice import Wish, choices, parse_error, parse_time
+from gpusense.evaluation.benchmark.choice import choices, parse_error, parse_time
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
@@ -131,7 +131,14 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         output.document(report)
     else:
-        _print(report, Wish(dict(args.max_error), args.max_time), args.output)
+        found = list(choices(report["points"], dict(args.max_error), args.max_time))
+        for _, answer, _ in found:
+            output.result(answer)
+        for backend in dict.fromkeys(backend for backend, _, _ in found):
+            print(f"\nbest methods on {backend}")
+            rows = [row for place, _, rows in found if place == backend for row in rows]
+            output.table(["problem", "method", "error", "time"], rows, right=["error", "time"])
+        _print_rest(report, args.output)
     if stops:
         raise stops[0]
     return 0
@@ -199,16 +206,9 @@ def write_page(file: Path, report: Mapping[str, Any]) -> None:
     write_whole(file, lambda stream: stream.write(page.encode()))
 
 
-def _print(report: Mapping[str, Any], wish: Wish, folder: Path | None) -> None:
-    """Print the answers, the Pareto front of each device, and the points without a result."""
+def _print_rest(report: Mapping[str, Any], folder: Path | None) -> None:
+    """Print the points without a result, their number, and the machine."""
     points = report["points"]
-    found = list(choices(points, wish))
-    for choice in found:
-        output.result(choice.answer)
-    for backend in dict.fromkeys(choice.backend for choice in found):
-        rows = [row for choice in found if choice.backend == backend for row in choice.rows]
-        print(f"\nbest methods on {backend}")
-        output.table(["problem", "method", "error", "time"], rows, right=["error", "time"])
     print()
     for point in points:
         if point["status"] in ("failed", "unstable"):

@@ -49,11 +49,10 @@ class PartialFit:
     """Results before an interrupt.
 
     Attributes:
-        iteration, log_likelihood, parameters: The likeliest parameters so far; None before the first iteration.
+        parameters: The likeliest parameters so far; None before the first iteration.
         fit: The fit, after its end.
     """
 
-    iteration: int = 0
     log_likelihood: float = -math.inf
     parameters: BeamParameters | None = None
     fit: BeamFit | None = None
@@ -61,7 +60,7 @@ class PartialFit:
     def see(self, iteration: int, log_likelihood: float, parameters: BeamParameters) -> None:
         """Record an iteration of the search."""
         if log_likelihood > self.log_likelihood:
-            self.iteration, self.log_likelihood, self.parameters = iteration, log_likelihood, parameters
+            self.log_likelihood, self.parameters = log_likelihood, parameters
 
     def print(self, *, json: bool) -> None:
         """Print the results, if any."""
@@ -71,12 +70,11 @@ class PartialFit:
         if json:
             fit = None if self.fit is None else self.fit.to_dict()
             output.document({"interrupted": True, "parameters": best.to_dict(), "fit": fit})
-        elif self.fit is not None:
-            print(f"{self.fit}\ninterrupted: this fit had ended, the rest had not")
-        else:
-            values = "\n".join(f"  {name:12} {value:.6g}" for name, value in best.to_dict().items())
-            print(f"interrupted: best parameters up to iteration {self.iteration}, before convergence\n{values}")
-            print(f"log-likelihood {self.log_likelihood:.3f}")
+            return
+        state = "before convergence" if self.fit is None else "this fit had ended, the rest had not"
+        output.result(f"INTERRUPTED, {state}: the likeliest parameters, log-likelihood {self.log_likelihood:.3f}")
+        for name, value in best.to_dict().items():
+            output.fact(name, f"{value:.6g}" if isinstance(value, float) else str(value))
 
 
 def print_fit(result: FitResult, files: list[Path], *, verbose: bool, paired: bool) -> None:

@@ -32,8 +32,6 @@ class Launch:
     """A recorded scoring launch: its arguments by name, results included.
 
     Attributes:
-        kernel: ``"score_beams"`` or ``"score_field"``.
-        flags: Flags of the compiled kernel.
         values: Arrays cut to their shapes, without the map's rectangles; scalars and structs in its precision.
         expected: (particles, rays) expected ranges of the same device for a beam launch, else None.
         incidence: (particles, rays) angles of incidence where the launch depends on them [rad], else None.

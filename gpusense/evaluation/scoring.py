@@ -44,7 +44,6 @@ class ParticleSampler:
 
     Attributes:
         sigma_position: Deviation of the particles around the logged pose, in x and in y, >= 0 [m].
-        sigma_heading: Deviation of their headings, >= 0 [rad].
         seed: Seed; each scan has a separate random stream, so its particles do not depend on the chosen scans.
     """
 
@@ -80,8 +79,6 @@ class ScanScore:
         mean: Weighted mean of the other particles, with the circular mean of headings; None if all weights are 0.
         error_position: Distance of the mean from the logged pose [m], or None.
         error_heading: Absolute difference of heading, 0 to pi [rad], or None.
-        effective: Effective sample size of the other particles, or None.
-        degenerate: Whether every other particle has probability 0.
         beams: Readings that are evaluated at every particle.
         better: Share of the particles anywhere in the free space at which the scan is less likely than at the logged
             pose; None if it is equally likely or impossible at all of them.

@@ -30,7 +30,6 @@ class Step:
     """A scan of a log with its odometry.
 
     Attributes:
-        index: Index of the scan in the log.
         odometry: Pose by raw odometry alone [m, m, rad].
         reference: Pose of the robot to judge or to compare with, by default the logged one; None if unknown.
         covariance: (3, 3) covariance of the reference; None if unknown.

@@ -158,8 +158,6 @@ class Case:
         beams: Beams of a scanner with a field of view of 360 degrees.
         readings: Readings that a scan repeats [cells]; None for the first pose's expected ranges, with missing and max
             readings.
-        options: Arguments of the models, such as ``outside``.
-        weights: Weights z_hit, z_short, z_max and z_rand.
         sigma: Standard deviation [cells].
         constant: log p if all particles have the same value; else None.
     """

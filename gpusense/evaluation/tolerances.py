@@ -27,7 +27,6 @@ class Tolerance:
     """Largest difference allowed for one quantity.
 
     Attributes:
-        value: Largest difference allowed, inclusive.
         unit: Unit of the difference; eps is float32's, 1.2e-7.
     """
 
@@ -148,7 +147,6 @@ class Check:
 
     Attributes:
         right: Selection string of another backend, or the name of the truth.
-        difference: The largest difference, in the tolerance's unit.
     """
 
     left: str

@@ -53,7 +53,6 @@ class FinePosterior:
 
     Attributes:
         poses: (M, 3) poses [m, m, rad].
-        log_p: (M,) log-likelihoods.
         deviation: (3,) standard deviations of the posterior [m, m, rad].
     """
 

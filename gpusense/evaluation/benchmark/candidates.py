@@ -39,7 +39,6 @@ class Candidate:
     Attributes:
         variant: Difference from the method's other curves.
         knob: Parameter that traces the curve; empty without one.
-        value: The knob's value; None without a knob.
         exact: Whether it computes the exact ranges or the model itself, up to rounding.
         precision: Precision of an outside candidate, for the report.
         outside: Version and threads of an outside candidate; empty for this package's candidates.

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 ALIKE = 1.25
@@ -45,10 +45,8 @@ class Entry:
     """A method with its setting on one device.
 
     Attributes:
-        method: Method and variant.
         error: Largest error over scenes and clouds, in the unit of its measure (shares as shares, lengths in metres).
         seconds: Geometric mean of the times of a call [s].
-        exact: Whether it computes the model itself.
         doubt: Factor of the error within which that of another run lies; 1 where all runs have the same errors.
     """
 
@@ -72,19 +70,6 @@ class Entry:
     def text(self) -> str:
         """Name the method with its setting and precision."""
         return ", ".join(word for word in (self.method, self.setting, self.precision) if word)
-
-
-@dataclass(frozen=True)
-class Wish:
-    """Limits of a choice.
-
-    Attributes:
-        errors: By unit the largest error: a share for ``"%"``, metres for ``"m"``.
-        seconds: Longest time of a call [s]; None without a limit.
-    """
-
-    errors: Mapping[str, float] = field(default_factory=dict)
-    seconds: float | None = None
 
 
 def parse_error(text: str) -> tuple[str, float]:
@@ -201,34 +186,25 @@ def time_text(seconds: float) -> str:
     return f"{seconds:.3g} s"
 
 
-@dataclass(frozen=True)
-class Choice:
-    """The choice for a problem on a device.
+def choices(
+    points: Sequence[Mapping[str, Any]], errors: Mapping[str, float], seconds: float | None = None
+) -> Iterator[tuple[str, str, list[tuple[str, str, str, str]]]]:
+    """Yield the choice for each problem and device of a report: device, answer, and rows of the Pareto front.
 
-    Attributes:
-        backend: Selection string of the device.
-        answer: The limits, and the method within them with its time and error.
-        rows: Problem, method, error and time of the methods on the Pareto front.
+    ``errors``: By unit the largest error: a share for ``"%"``, metres for ``"m"``. ``seconds``: Longest time of a call
+    [s]; None without a limit.
     """
-
-    backend: str
-    answer: str
-    rows: Sequence[tuple[str, str, str, str]]
-
-
-def choices(points: Sequence[Mapping[str, Any]], wish: Wish) -> Iterator[Choice]:
-    """Yield the choice for each problem and device of a report."""
     for problem, backend in dict.fromkeys((point["problem"], point["backend"]) for point in points):
         usual, most = DEFAULTS[problem]
-        unit = next((unit for unit in wish.errors if unit in MEASURES[problem]), usual)
-        limit = wish.errors.get(unit, most if wish.seconds is None else None)
+        unit = next((unit for unit in errors if unit in MEASURES[problem]), usual)
+        limit = errors.get(unit, most if seconds is None else None)
         listed = entries(points, problem, unit, backend)
         size = next(
             f"{p['particles']} x {p['beams']}" for p in points if (p["problem"], p["backend"]) == (problem, backend)
         )
         wanted = [f"error at most {error_text(limit, unit)}"] if limit is not None else []
-        wanted += [f"at most {time_text(wish.seconds)}"] if wish.seconds is not None else []
-        best, found = choose(listed, limit, wish.seconds), "no method"
+        wanted += [f"at most {time_text(seconds)}"] if seconds is not None else []
+        best, found = choose(listed, limit, seconds), "no method"
         if not listed:
             found = next((f"not measured: {p['reason']}" for p in points if _is_left_out(p, problem, backend)), found)
         if best is not None:
@@ -237,7 +213,7 @@ def choices(points: Sequence[Mapping[str, Any]], wish: Wish) -> Iterator[Choice]
             (problem, one.text.removesuffix(", float32"), error_text(one.error, unit), time_text(one.seconds))
             for one in front(listed)
         ]
-        yield Choice(backend, f"{problem} on {backend}, {size}, {', '.join(wanted)}: {found}", rows)
+        yield backend, f"{problem} on {backend}, {size}, {', '.join(wanted)}: {found}", rows
 
 
 def _is_left_out(point: Mapping[str, Any], problem: str, backend: str) -> bool:

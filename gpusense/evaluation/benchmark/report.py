@@ -132,13 +132,11 @@ class Row:
 
     Attributes:
         need: Need that it serves, a value of ``NEEDS``.
-        device: Title of the device.
         scene: Name of the map; ``ALL`` for the worst error and the mean time over all maps.
         seconds: Time of a call, a step or a match: on a processor its CPU time over all cores, on a GPU the least
             elapsed time.
         quartiles: Quartiles of the elapsed times [s]; geometric means over the maps.
         errors: By the text of the measure.
-        exact: Whether it computes the model itself.
         outside: Version and threads of another implementation; empty for gpusense.
         work: Rays or readings of a call; 1 for tasks.
         maps: "8 of 10 clouds" if some were left out because of the time that a table takes; such a row is never chosen.

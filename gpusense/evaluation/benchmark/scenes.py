@@ -52,7 +52,6 @@ class MapSource:
 
     Attributes:
         origin: Description of a generated map, or the name of the map's file.
-        path: The map_server YAML; None for a generated map.
         size: Width and height of a generated map [m].
     """
 

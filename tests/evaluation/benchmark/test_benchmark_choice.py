@@ -127,16 +127,16 @@ def test_a_method_is_judged_by_its_worst_scene_and_must_work_in_all():
     ]
     (only,) = choice.entries(points, "beam", "nats", "numpy")
     assert (only.method, only.error, only.seconds) == ("exact", 0.3, pytest.approx(2.0))
-    (found,) = choice.choices(points, choice.Wish({"nats": 0.1}))
-    assert found.answer == "beam on numpy, 10 x 10, error at most 0.1 nats: no method"
+    ((_, answer, _),) = choice.choices(points, {"nats": 0.1})
+    assert answer == "beam on numpy, 10 x 10, error at most 0.1 nats: no method"
     late = made_point(
         problem="beam", status="left out", reason="the 40 s of this run were over", errors=None, time=None
     )
-    (found,) = choice.choices([late], choice.Wish({"nats": 0.1}))
-    assert found.answer.endswith("error at most 0.1 nats: not measured: the 40 s of this run were over")
-    (found,) = choice.choices(points, choice.Wish({"nats": 0.4}, 3.0))
-    assert found.answer == "beam on numpy, 10 x 10, error at most 0.4 nats, at most 3 s: exact, float32: 2 s, 0.3 nats"
-    assert found.rows == [("beam", "exact", "0.3 nats", "2 s")]
+    ((_, answer, _),) = choice.choices([late], {"nats": 0.1})
+    assert answer.endswith("error at most 0.1 nats: not measured: the 40 s of this run were over")
+    ((_, answer, rows),) = choice.choices(points, {"nats": 0.4}, 3.0)
+    assert answer == "beam on numpy, 10 x 10, error at most 0.4 nats, at most 3 s: exact, float32: 2 s, 0.3 nats"
+    assert rows == [("beam", "exact", "0.3 nats", "2 s")]
 
 
 def test_limits_have_units():

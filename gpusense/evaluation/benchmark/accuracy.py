@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util.typing import Floats
-from gpusense.backends import SPEED_CLASSES, Backend, devices, get_backend
+from gpusense.backends import Backend, get_backend
 from gpusense.evaluation.benchmark.scenes import Scene
 from gpusense.localization.weights import normalize_weights
 from gpusense.models.scan.beam import BeamModel
@@ -38,13 +38,9 @@ class UnstableError(ValueError):
 
 
 def truth_device() -> Backend:
-    """Open the fastest device with float64, or else NumPy; simulators are excluded."""
-    best, rank = get_backend("numpy"), len(SPEED_CLASSES)
-    for device in devices():
-        place = SPEED_CLASSES.index((device.backend, device.kind)) if device.kind != "simulator" else rank
-        if device.available and place < rank and (backend := get_backend(device.selection)).info.float64:
-            best, rank = backend, place
-    return best
+    """Open the fastest device, or NumPy if that lacks float64."""
+    device = get_backend("auto")
+    return device if device.info.float64 else get_backend("numpy")
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,6 @@ class Tolerance:
 _ALL = (
     Tolerance("distance transform", 0, "cells that differ", "squared distances are integers, found exactly"),
     Tolerance("empty squares", 0, "cells that differ", "shorter sides of empty rectangles are integers, found exactly"),
-    Tolerance("placed poses", 0, "values with other bits", "float64 sums, products and quotients, each rounded"),
     Tolerance(
         "cosines and sines of headings", 0.9, "ulps of float64",
         "half an ulp of the last sum, and up to 0.4 from the rounding of its terms and the polynomials",
@@ -88,8 +87,6 @@ _ALL = (
         "a crossing distance is (k + a) / |d|: four roundings of 1.1e-16 and the conditioning of the direction",
     ),
     Tolerance("float32 ranges to float64", 1e-3, "cells", "rounded inputs, for a ray that grazes nothing"),
-    Tolerance("moved origin of a grazing ray", 1e-4, "cells", "a range jumps at a corner: move the ray instead"),
-    Tolerance("moved bearing of a grazing ray", 1e-6, "rad", "float32 directions are rounded to some 1e-7"),
     Tolerance(
         "float32 beam", 16, "eps (1 + |log p_k|)",
         "exp, log, tanh and division within a few eps, erf within 16 eps (OpenCL), u^2 / 2 within 3 eps of itself",

@@ -78,17 +78,18 @@ def distinct_poses(
     Poses (M, 3) of S scans, (M,) ascending in ``scan``, come by falling score; the best ones are in the rows ``best``
     (S,), None for the first row alone. Poses within ``radius`` [m] and ``angle`` [rad] of a better one are left out.
     """
-    chosen = [np.arange(len(poses))[:1] if best is None else best]
-    left, of, columns = np.arange(len(poses)), scan, poses.T
+    left, columns = np.arange(len(poses)), np.ascontiguousarray(poses.T)
+    of = np.zeros(len(poses), np.intp) if scan is None else scan
+    chosen = [left[:1] if best is None else best]
+    firsts = np.append(True, of[1:] != of[:-1])[: len(of)].nonzero()[0]
     while len(left) and len(chosen) < count:
-        # The last choice of each scan; scans without one have no poses left.
-        at = poses[chosen[-1]].T
-        if of is not None:
-            at = at[:, np.searchsorted(scan[chosen[-1]], of)]  # type: ignore[index]
-        x, y, heading = columns - at
-        far = ((x * x + y * y > radius * radius) | (np.abs(wrapped(heading)) > angle)).nonzero()[0]
-        left, columns = left[far], columns[:, far]
-        of = None if of is None else of[far]
-        chosen.append(left[:1] if of is None else left[np.append(True, of[1:] != of[:-1])[: len(of)]])
+        # The last choice of each scan that has poses left.
+        x, y, heading = columns - np.repeat(poses[chosen[-1]].T, np.diff(np.append(firsts, len(of))), axis=1)
+        far = x * x + y * y > radius * radius
+        near = (~far).nonzero()[0]
+        far[near] = np.abs(wrapped(heading[near])) > angle
+        left, columns, of = left[far], columns[:, far], of[far]
+        firsts = np.append(True, of[1:] != of[:-1])[: len(of)].nonzero()[0]
+        chosen.append(left[firsts])
     rows = np.concatenate(chosen)
     return rows if scan is None else rows[np.argsort(scan[rows], kind="stable")]

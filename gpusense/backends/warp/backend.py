@@ -30,8 +30,6 @@ from gpusense.interface.signatures import KERNELS, Kernel, team_of
 from gpusense.interface.sources import relevant
 
 _MOST_NUMBERS = (1 << 31) - 1
-# Most freed memory of a GPU that the driver keeps for later results [bytes], and share of the GPU's memory.
-_KEPT_BYTES, _KEPT_SHARE = 1 << 30, 64
 # Largest copy that a thread reads through its cached memory of each type [bytes].
 _FEW_BYTES = 1 << 10
 
@@ -46,10 +44,6 @@ class WarpBackend(ProcessBound, Backend):
         initialize()
         self.info = info
         self._device = wp.get_device(device)
-        if self._device.is_cuda and self._device.is_mempool_enabled:
-            # By default each wait returns freed results to the system, and the next call's result is mapped anew.
-            kept = min(_KEPT_BYTES, self._device.total_memory // _KEPT_SHARE)
-            wp.set_mempool_release_threshold(self._device, max(kept, wp.get_mempool_release_threshold(self._device)))
         self._graphs = GraphCache(self._device)
         self.results = ResultMemory() if info.kind == "gpu" else None
         # Large copies; None on the processor, which uses the host's memory.

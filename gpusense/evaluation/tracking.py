@@ -57,7 +57,7 @@ class Track:
     seconds: list[tuple[float, float, float]] = field(default_factory=list)
 
     def add(self, pf: ParticleFilter, step: Step, clock: list[float]) -> None:
-        """Add the estimate of a filter after a step; ``clock`` has the times before predict, correct and estimate."""
+        """Add the estimate after a step; ``clock`` contains the times before predict, correct and estimate."""
         found = pf.estimate()
         predict, correct, estimate = np.diff([*clock, time.perf_counter()]).tolist()
         self.seconds.append((predict, correct, estimate))

@@ -1,8 +1,8 @@
 """Match pairs of scans: ICP from the guess, then a search around the guess where the scans do not agree.
 
 Where few pairs constrain a direction, noise explains them, and it counts as not observed, among furniture as in a
-corridor. Starts on both sides tell these apart. Among furniture they end at one pose, and the scans exchanged have the
-inverse pose. Along a corridor they stay apart. Where doors that look alike hold them at a wrong pose, the exchanged
+corridor. Starts on both sides tell these apart. They end at one pose among furniture, and exchanging the scans inverts
+the pose. Along a corridor they stay apart. Where doors that look alike hold them at a wrong pose, the exchanged
 scans, which see others at their edges, mostly do not.
 """
 

@@ -1,4 +1,4 @@
-"""Launches of OpenCL kernels, whose arguments are bound by the signature table, and recordings of launches."""
+"""Launch OpenCL kernels, bind their arguments by the signature table, and record launches."""
 
 from __future__ import annotations
 

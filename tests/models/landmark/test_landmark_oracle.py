@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import itertools
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import mpmath as mp
@@ -231,7 +230,6 @@ def joint(model: gs.LandmarkModel, tabled: Table) -> np.ndarray:
 
 
 PRECISIONS = ("float32", "float64")
-NAN = scenes.NAN
 KNOWN = (0, 2, -1, 5, 6)
 
 
@@ -323,47 +321,3 @@ def test_features_as_the_caller_gave_them(backend, precision):
     # float64 positions of up to 300 m, rounded by up to 16 eps; deviations are 0.2.
     allowed = (TOLERANCES["landmark"].value + (3e4 if precision == "float64" else 0)) * np.finfo(precision).eps
     assert (np.abs(found.astype(np.float64) - expected) <= allowed * (1 + np.abs(expected))).all()
-
-
-@pytest.mark.parametrize("name", ["ordinary", "everything", "wide field", "narrow field", "flat", "ranges", "bearings"])
-@pytest.mark.parametrize("place", [(0.0, 0.0), (2.9, 0.9), (3.0, 1.0)])
-def test_the_mixture_integrates_to_1(name, place):
-    """The integral is over all features of a known landmark, also at zero range and near the sensor's limits."""
-    landmarks, p, _, _, options = scenes.make(name)
-    model = gs.LandmarkModel(landmarks, p, backend="numpy", precision="float64", **{**options, "mount": (0, 0, 0)})
-    half, (low, high), j = p.field_of_view / 2, model._sensor.span, 0 if place == (3.0, 1.0) else 2
-    # Put the landmark a little to the left, since zero range has no direction.
-    away = scenes.XY[j] - place
-    d, b = np.hypot(*away), 0.1
-    pose = [[*place, np.arctan2(away[1], away[0]) - b]]
-
-    def pieces(start, end, middle, sigma):
-        cuts = [
-            start,
-            *(middle + sigma * s for s in (-30, -8, -3, 0, 3, 8, 30) if start < middle + sigma * s < end),
-            end,
-        ]
-        nodes, weights = np.polynomial.legendre.leggauss(24)
-        x = np.concatenate([(e - s) / 2 * nodes + (e + s) / 2 for s, e in pairwise(cuts)])
-        w = np.concatenate([(e - s) / 2 * weights for s, e in pairwise(cuts)])
-        return x, w
-
-    axes = [([NAN], [1.0])] * 3
-    if p.sigma_range is not None:
-        axes[0] = pieces(0.0, p.range_max, d, p.sigma_range)
-    if p.sigma_bearing is not None:
-        # The wrapped difference jumps half a turn away from the landmark.
-        back = (b + 2 * np.pi) % (2 * np.pi) - np.pi
-        cut = min(max(back, -half), half)
-        first, second = (pieces(*ends, b, p.sigma_bearing) for ends in ((-half, cut), (cut, half)))
-        axes[1] = np.append(first[0], second[0]), np.append(first[1], second[1])
-    if p.sigma_signature is not None:
-        axes[2] = pieces(low, high, scenes.SIGNATURES[j], p.sigma_signature)
-    # The components are independent, so one axis is integrated at a time, with the others fixed.
-    for axis in range(3):
-        if len(axes[axis][0]) > 1:
-            grid = np.full((len(axes[axis][0]), 3), NAN)
-            grid[:, axis] = axes[axis][0]
-            grid[:, 1] = np.where(np.isnan(grid[:, 1]), NAN, np.clip(grid[:, 1], -half, half))
-            _, _, parts = model._evaluate(pose, grid, np.full(len(grid), j), each=True)
-            assert abs(np.exp(parts[0]) @ axes[axis][1] - 1) < 1e-11

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.special import ndtr
 from support import landmark_scenes as scenes
 from support.selection import on_every_backend
 
@@ -97,26 +96,6 @@ def test_known_landmarks_without_features_and_without_landmarks(backend):
     assert model.associate(np.zeros((0, 3)), features)[0].shape == (0, len(features))
 
 
-@pytest.mark.long
-def test_false_positives_and_impossible_features(backend):
-    landmarks, _, poses, features, _ = scenes.make("ordinary")
-    only = gs.LandmarkModel(landmarks, gs.LandmarkParameters(z_detect=0, z_false=1), backend=backend)
-    expected = -len(features) * np.log(20 * 2 * np.pi)
-    np.testing.assert_allclose(only.log_likelihood(poses, features), expected, rtol=1e-6)
-    never = gs.LandmarkModel(landmarks, gs.LandmarkParameters(z_detect=1, z_false=0), backend=backend)
-    assert np.isneginf(never.log_likelihood(poses, features, [-1] * len(features))).all()
-    empty = gs.LandmarkModel(gs.LandmarkMap([]), gs.LandmarkParameters(z_detect=1, z_false=0), backend=backend)
-    assert np.isneginf(empty.log_likelihood(poses, features)).all()
-    # More features than landmarks, none of them false.
-    few = gs.LandmarkModel(
-        gs.LandmarkMap(scenes.XY[:2]),
-        gs.LandmarkParameters(z_detect=1, z_false=0),
-        backend=backend,
-        association="joint",
-    )
-    assert np.isneginf(few.log_likelihood(poses, features)).all()
-
-
 @pytest.mark.long_on("warp")
 def test_joint_association_is_exclusive_where_the_nearest_is_not(backend):
     # Two features, both nearest to landmark 0; landmark 1 is a little farther from the second.
@@ -188,25 +167,6 @@ def test_buckets_hold_every_landmark_once(xy):
     np.testing.assert_array_equal(cell[:, 1] * cols + cell[:, 0], own)
 
 
-def test_the_plan_names_what_is_left_out():
-    model, poses, features = scenes.model("ordinary", "numpy")
-    model.log_likelihood(poses, [*features, [NAN, NAN]], [0, 2, -1, 5, 6, -1])
-    text = model.explain()
-    assert "2 of 6 features do not depend on the pose" in text and "correspondences are known" in text
-    assert "sigma_signature = None" in text and "it is a full circle" in text
-
-
-@pytest.mark.long_on("warp")
-def test_wrong_signatures_are_other_landmarks(backend):
-    landmarks = gs.LandmarkMap([[5.0, 0.0], [5.0, 0.1]], [10.0, 20.0])
-    model = gs.LandmarkModel(landmarks, gs.LandmarkParameters(sigma_signature=0.5), backend=backend)
-    which, _ = model.associate([[0, 0, 0]], [[5.0, 0.0, 20.0], [5.0, 0.02, 10.0], [5.0, 0.0, NAN], [5.0, 0.0, 15.0]])
-    assert which.tolist() == [[1, 0, 0, -1]]
-    # By default signatures have no deviation and are ignored.
-    which, _ = gs.LandmarkModel(landmarks, backend=backend).associate([[0, 0, 0]], [[5.0, 0.0, 20.0]])
-    assert which.tolist() == [[0]]
-
-
 @on_every_backend(on_warp=lambda false: False, false=(0.05, 0.0))
 def test_a_particle_has_the_same_bits_among_any_others(backend, false):
     """Only nearby particles of a group visit the same landmarks."""
@@ -223,31 +183,3 @@ def test_a_particle_has_the_same_bits_among_any_others(backend, false):
     exact = gs.LandmarkModel(landmarks, model.parameters, backend="numpy", **FLOAT64)
     truth, parts = exact.log_likelihood(mixed, features[:, :2]), exact.associate(mixed, features[:, :2])[1]
     assert (np.abs(found - truth) <= 17 * np.finfo(np.float32).eps * (1 + np.abs(parts)).sum(axis=1)).all()
-
-
-@pytest.mark.parametrize("association", ["nearest", "sum"])
-def test_100_000_landmarks_by_brute_force(needs, association):
-    """Omitted landmarks of a large map affect no feature: compare with the definition over all landmarks in NumPy."""
-    landmarks, poses, features = forest(100_000, 1265.0)
-    poses, features = poses[::4], features[:, :2]
-    p = gs.LandmarkParameters()
-    model = gs.LandmarkModel(landmarks, p, backend=needs("opencl"), association=association, **FLOAT64)
-    found = model.log_likelihood(poses, features)
-    assert float(model.explain().split("saves about ")[1].split(" %")[0]) >= 99
-    expected = []
-    for x, y, theta in poses:
-        dx, dy = landmarks.xy[:, 0] - x, landmarks.xy[:, 1] - y
-        d, b = np.hypot(dx, dy), np.arctan2(dy, dx) - theta
-        total = 0.0
-        for z, bearing in features:
-            turn = (bearing - b + np.pi) % (2 * np.pi) - np.pi
-            density = np.exp(-0.5 * ((z - d) / p.sigma_range) ** 2 - 0.5 * (turn / p.sigma_bearing) ** 2)
-            # Mass of a range on [0, range_max], clamped for farther landmarks; a bearing's mass is nearly 1.
-            near = np.minimum(d, p.range_max) / p.sigma_range
-            mass = ndtr(near) - ndtr(near - p.range_max / p.sigma_range)
-            density /= 2 * np.pi * p.sigma_range * p.sigma_bearing * mass
-            of_landmarks = density.max() if association == "nearest" else density.mean()
-            total += np.log(p.z_detect * of_landmarks + p.z_false / (p.range_max * 2 * np.pi))
-        expected.append(total)
-    # float64 at 600 m: exponents of 0.2 m and 0.05 rad to some 1e-11.
-    np.testing.assert_allclose(found, expected, rtol=1e-10)

@@ -335,28 +335,6 @@ def test_angles_wrap_and_sides_count():
     assert log_p[0] == pytest.approx(log_p[1], abs=1e-5)
 
 
-def test_a_line_through_the_sensor_has_two_forms():
-    """(angle, distance) and (angle + pi, -distance) are one line: its density is continuous across it."""
-    model = gs.LineModel(gs.LineMap([(-5, 0, 5, 0)]), backend="numpy", precision="float64")
-    poses = [(0, y, 0.0) for y in (-0.02, -1e-9, 0, 1e-9, 0.02)]
-    up, down = ((a, 0.005, -1, 1) for a in (np.pi / 2, -np.pi / 2))
-    first, second = (model.log_likelihood(poses, [line]) for line in (up, down))
-    np.testing.assert_allclose(first, second[::-1], atol=1e-12)
-    np.testing.assert_allclose(first[1:4], first[2], atol=1e-6)
-    assert first[0] > first[4]
-
-
-def test_parallel_walls_10_cm_apart_are_distinguished_where_both_are_seen():
-    """The nearer of two faces is in front only for x > 0; past its end the farther one is visible."""
-    model = gs.LineModel(gs.LineMap([(-5, 2.1, 5, 2.1), (0, 2, 5, 2)]), gs.LineParameters(sigma_distance=0.015),
-                         backend="numpy")  # fmt: skip
-    lines = [(np.pi / 2, 2.1, 0.3, 3.0), (np.pi / 2, 2.0, -3.0, -0.3)]
-    assert model.associate([(0, 0, 0)], lines)[0].tolist() == [[0, 1]]
-    # Places along a line are positive to the left of its normal: mirrored, the nearer face cannot be that wall.
-    mirrored = [(np.pi / 2, 2.1, -3.0, -0.3), (np.pi / 2, 2.0, 0.3, 3.0)]
-    assert model.associate([(0, 0, 0)], mirrored)[0].tolist() == [[0, -1]]
-
-
 def test_lines_that_say_nothing_are_left_out():
     model, poses, features = make("ordinary", "numpy")
     expected = model.log_likelihood(poses, features)
@@ -368,17 +346,6 @@ def test_lines_that_say_nothing_are_left_out():
     which, parts = model.associate(poses, with_them)
     assert (which[:, 2:7] == -1).all() and (parts[:, 2:7] == 0).all()
     assert (model.log_likelihood(poses, []) == 0).all()
-
-
-def test_explain_names_what_is_left_out():
-    rng = np.random.default_rng(0)
-    ends = rng.uniform(0, 400, (500, 2))
-    model = gs.LineModel(gs.LineMap(np.hstack([ends, ends + rng.uniform(0.5, 2, (500, 2))])), backend="numpy")
-    model.log_likelihood([(200, 200, 0)], [(0.3, 2.0, -1, 1)])
-    text = model.explain()
-    assert text.startswith("line model, nearest") and "of 500 lines" in text and "far lines" in text
-    model.log_likelihood([(200, 200, 0)], [(0.3, 2.0, -1, 1)], [3])
-    assert "499 of 500 lines" in model.explain()
 
 
 def test_an_empty_map_has_false_positives_only():

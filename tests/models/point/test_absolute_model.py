@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support import absolute_oracle as oracle
 from support.absolute_scenes import GRID, NAN, models, poses_around
 
 import gpusense as gs
@@ -130,15 +129,3 @@ def test_explain_names_what_is_left_out():
     square.log_likelihood(POSES, [True, None])
     assert "1 of 2 are nan or None" in left_out(square)["missing readings"]
     assert "points of the outline" not in left_out(square) and "TWO_PART_POINTS" in square.explain()
-
-
-def test_the_heading_that_explain_names_is_where_other_turns_begin_to_count():
-    """By mpmath, omitted turns up to this heading add less than eps; it is 2.3 rad from half a turn at sigma =
-    0.6."""
-    p = gs.HeadingParameters(sigma=0.6)
-    model = gs.HeadingModel(p, backend="numpy", precision="float64")
-    edge = np.pi - float(left_out(model)["other turns"].split("pi - ")[1].split(" ")[0])
-    for r in (edge - 0.01, 0.5, -edge + 0.01):
-        normal = -0.5 * (r / 0.6) ** 2 - np.log(0.6 * np.sqrt(2 * np.pi))
-        truth = oracle.heading(r, 0.0, p)
-        assert abs(normal - truth) < 4e-16 * (1 + abs(truth))

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
-from scipy import stats
 from support import absolute_oracle as oracle
 from support.absolute_scenes import assert_close, each_precision
 
 import gpusense as gs
-from gpusense.models.point.beacons import t_series
 
 STEPS = np.array([0.0, 0.3, -1.0, 2.5, -6.0, 12.0, 37.0])
 
@@ -136,32 +132,3 @@ def test_beacons_of_ten_nanometres(backend: str, precision: str, kind: str, nu: 
     xy = [[3.0, 4.0]]
     found = gs.BeaconModel(xy, p, backend=backend, precision=precision).log_likelihood(poses, [5.0])
     assert_close(found, [oracle.beacon(pose, xy[0], 5.0, p) for pose in poses], precision)
-
-
-@pytest.mark.sampled(0.5)
-@pytest.mark.parametrize("name", BEACONS)
-@pytest.mark.parametrize("distance", [0.0, 2.0, 30.0])
-def test_a_range_integrates_to_1(name: str, distance: float) -> None:
-    p = own_bias(BEACONS[name], 0).replace(mount=(0.0, 0.0))
-    mean = distance + p.bias
-    if not 0 <= mean <= p.range_max:
-        assert name == "shrunk"
-        return
-    model = gs.BeaconModel([[0.0, 0.0]], p, backend="numpy", precision="float64")
-    wide = p.sigma_range * np.array([0, 1, 3, 8, 20, 60, 200, 1000])
-    cuts = np.unique(np.clip(np.concatenate([[0, p.range_max], mean + wide, mean - wide]), 0, p.range_max))
-    node, weight = np.polynomial.legendre.leggauss(24)
-    total = 0.0
-    for a, b in itertools.pairwise(cuts):
-        density = [model.log_likelihood([[distance, 0, 0]], [a + (b - a) * (x + 1) / 2])[0] for x in node]
-        total += (b - a) / 2 * (weight @ np.exp(density))
-    assert abs(total - 1) < 1e-7
-
-
-@pytest.mark.parametrize("nu", [1, 2, 3, 4, 9, 10, 100])
-def test_series_of_a_t(nu: int) -> None:
-    arc, series = t_series(nu)
-    t = np.array([0.01, 0.5, 2.0, 30.0])
-    angle = np.arctan(t / np.sqrt(nu))
-    inner = np.sin(angle) * (np.cos(angle) if nu % 2 else 1) * np.polyval(series[::-1], np.cos(angle) ** 2)
-    np.testing.assert_allclose(arc * angle + inner, 2 * stats.t.cdf(t, nu) - 1, rtol=1e-12)

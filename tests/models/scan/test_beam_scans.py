@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 from support.beam_world import PRECISIONS, exact_log_reading, parameters
-from support.oracles import Mixture, classify, informative
+from support.oracles import Mixture, informative
 from support.ray_oracles import walk, world_ray
 from support.selection import on_every_backend
 
@@ -178,13 +178,3 @@ def test_sums_of_many_beams(count, nats, shared, precision, backend):
         assert truth[k] == pytest.approx(float(mixture.log_density(scan[k], expected[k])), rel=1e-12)
     error = abs(float(model.log_likelihood(poses[1:2], scan)[0]) - math.fsum(truth))
     assert error <= (nats if precision == "float32" else 1e-11 * (1 + np.abs(truth).sum()))
-
-
-def test_classes_of_readings():
-    """Readings have the classes of the table above."""
-    last = np.nextafter(RANGE, 0)
-    for range_min in (0.0, 0.5):
-        scan = [NAN, -INF, INF, -1.0, -0.0, 0.0, 0.2, np.nextafter(0.5, 0), 0.5, 3.0, last, RANGE, 7.0]
-        names = {gs.Reading.MISSING: "missing", gs.Reading.MAX: "max", gs.Reading.HIT: "hit"}
-        found = gs.classify(scan, gs.Scanner(np.zeros(len(scan)), RANGE, range_min))
-        assert [names[gs.Reading(kind)] for kind in found] == [classify(z, RANGE, range_min) for z in scan]

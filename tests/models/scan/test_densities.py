@@ -8,14 +8,12 @@ import math
 import mpmath as mp
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gpusense as gs
 from gpusense.models.scan.densities import log_hit, log_mixture, log_rand, log_short, naive_log_hit, naive_log_short
 
 PRECISIONS = ("float64", "float32")
-BOUND = 16  # eps (1 + |log p|)
 
 
 def exact_hit(z: float, expected: float, sigma: float, range_max: float) -> mp.mpf:
@@ -93,24 +91,6 @@ def test_short_for_any_rate(precision):
 finite = st.floats(-3, 3)
 
 
-@given(st.floats(0, 1), st.floats(-8, 6), finite, st.booleans(), st.floats(-2, 4), st.sampled_from(PRECISIONS))
-@settings(max_examples=300, deadline=None, derandomize=True)
-def test_hit_anywhere(share, sigma, expected, far, scale, precision):
-    real = np.dtype(precision).type
-    top = real(10**scale)
-    case = real(share) * top, real(expected * 30 if far else expected) * top, real(10**sigma) * top, top
-    assert eps_off(log_hit(*case), exact_hit(*case), precision) <= BOUND
-
-
-@given(st.floats(0, 1), st.floats(-9, 4), st.floats(-12, 6), st.sampled_from(PRECISIONS))
-@settings(max_examples=300, deadline=None, derandomize=True)
-def test_short_anywhere(share, expected, rate, precision):
-    real = np.dtype(precision).type
-    expected = real(10**expected)
-    case = real(share) * expected, expected, real(10**rate) / expected
-    assert eps_off(log_short(*case), exact_short(*case), precision) <= BOUND
-
-
 @pytest.mark.parametrize("expected", [-20.0, -1.0, 0.0, 1e-6, 2.4, 7.992, 8.0, 9.0, 30.0])
 @pytest.mark.parametrize("sigma", [1e-3, 0.1, 5.0, 1e5])
 @pytest.mark.parametrize("rate", [0.0, 1e-9, 0.5, 200.0])
@@ -159,16 +139,3 @@ def test_mixture_of_one_component_is_that_component_and_nothing_is_nan():
     np.testing.assert_array_equal(log_mixture(z, expected, **alone[3]), log_rand(z, 8.0))
     assert log_mixture(np.inf, 3.0, **alone[2]) == 0.0
     assert log_mixture([8.0, np.inf], 3.0, **alone[0]).tolist() == [-np.inf, -np.inf]
-
-
-def test_mixture_is_the_mixture_of_the_kernels():
-    """The numbers equal the reference kernel's on its domain, z* in [0, range_max]."""
-    from gpusense.reference.mixture import log_density
-
-    p = gs.BeamParameters()
-    model = gs.BeamModel(gs.OccupancyGrid([[0]], 1.0), gs.Scanner([0.0], 8.0), p, backend="numpy", precision="float64")
-    z, expected = (a.ravel() for a in np.meshgrid(np.linspace(0, 7.99, 50), np.linspace(0, 8, 41)))
-    ours = log_mixture(z, expected, range_max=8.0, **p.to_dict())
-    np.testing.assert_allclose(
-        ours, log_density(model._pipeline.mixture.flags, z, expected, model._pipeline.mixture.terms), rtol=0, atol=1e-12
-    )

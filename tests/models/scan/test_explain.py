@@ -55,16 +55,6 @@ def test_explain_of_a_model_that_leaves_nothing_out(kind):
     assert "nothing is left out" in model.explain() and "specialize=False" in model.explain()
 
 
-def test_explain_of_a_full_beam_model(backend):
-    """Needed parts are not listed; the other tests check host code shared by all backends."""
-    grid = room()
-    model = make("beam", grid, backend, precision="float64")
-    model.log_likelihood(cloud(grid, 100), scan())
-    needless = {"log-domain sum", "exponents in two parts", "range_bias", "sigma_growth"}
-    needless |= {"order of particles"} if model.device.kind == "gpu" else set()
-    assert set(left_out(model)) == needless | {"reduction of huge headings", "other worlds", "kernel arguments"}
-
-
 @pytest.mark.parametrize("kind", ["field", "bilinear"])
 def test_explain_of_a_field(kind):
     grid = room()
@@ -100,12 +90,6 @@ def test_what_is_kept_and_what_could_go():
     assert "interpolation" in marked(smooth, "+") and "nearest" in marked(smooth, "?")["interpolation"]
     plain = make("field", grid, "numpy")
     assert not marked(plain, "?")
-
-
-def test_parts_of_a_component_that_is_left_out_go_with_it():
-    model = make("beam", room(), "numpy", weights=(0.0, 0.5, 0.1, 0.4))
-    assert "hit component" in left_out(model)
-    assert not {"range_bias", "sigma_growth", "exponents in two parts"} & set(left_out(model))
 
 
 # Words of the kernel's text for a part of the density; parameters of a scene without and with the part.
@@ -164,16 +148,6 @@ def test_measured_savings(backend):
     # The model is unchanged.
     assert "EXACT_EXPONENT" not in model.explain().splitlines()[1]
     np.testing.assert_array_equal(model.log_likelihood(poses, z), before)
-
-
-def test_sources_are_those_of_every_backend(backend):
-    grid = room()
-    for kind, kernels in (("beam", ("score_beams", "beam_tiles")), ("field", ("score_field", "field_blocks"))):
-        model = make(kind, grid, backend)
-        model.log_likelihood(cloud(grid, 20), scan())
-        found = model.sources()
-        assert any(name in kernels for name in found)
-        assert all(name in text for name, text in found.items())
 
 
 # ------------------------------------------------------------------------------------- what the last cloud left out

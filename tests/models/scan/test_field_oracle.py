@@ -139,20 +139,6 @@ def test_empty_full_and_unknown_maps(shape, filling, interpolation, backend):
         compare(field, model, poses, rng.uniform(0, 5, len(BEARINGS)), BEARINGS)
 
 
-@pytest.mark.long_on("warp")
-def test_all_max_and_all_missing(backend):
-    grid, poses, _ = scene(0.25, (0.0, 0.0, 0.0))
-    for z_max in (0.0, 0.2, 1.0):
-        p = gs.LikelihoodFieldParameters(z_hit=0.9 * (1 - z_max), z_max=z_max, z_rand=0.1 * (1 - z_max))
-        for specialize in (True, False):
-            model = gs.LikelihoodFieldModel(
-                grid, gs.Scanner(BEARINGS, RANGE), p, backend=backend, precision="float64", specialize=specialize
-            )
-            assert (model.log_likelihood(poses, np.full(40, NAN)) == 0).all()
-            expected = 40 * math.log(z_max) if z_max else 0.0
-            np.testing.assert_allclose(model.log_likelihood(poses, np.full(40, INF)), expected, rtol=1e-12)
-
-
 # ------------------------------------------------------------------------------------ the same cells in float32
 
 

@@ -7,13 +7,10 @@ import itertools
 import numpy as np
 import pytest
 from mpmath import mp
-from scipy.special import roots_legendre
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import per_beam
 from gpusense.models.scan.densities import log_mixture
-from gpusense.models.scan.mixture import mixture_of
-from gpusense.reference.mixture import log_density
 
 RANGE = 8.0
 SHAPES = {
@@ -58,16 +55,6 @@ def test_densities_are_those_of_60_digits(name, shape):
             # The mean is a float64.
             rounding = abs(z - mean) / sigma**2 * np.spacing(max(mean, expected))
             assert abs(found - truth) <= 1e-11 * (1 + abs(truth)) + rounding
-
-
-def test_a_density_with_offset_and_growth_has_mass_1():
-    p = gs.BeamParameters(range_bias=0.4, sigma_growth=0.05)
-    nodes, weights = roots_legendre(2000)
-    z = RANGE / 2 * (nodes + 1)
-    for expected in (0.3, 2.0, 7.7):
-        # The kink of p_short at z* limits the quadrature.
-        continuous = (np.exp(log_mixture(z, expected, range_max=RANGE, **p.to_dict())) * RANGE / 2 * weights).sum()
-        assert continuous + p.z_max == pytest.approx(1, abs=2e-4)
 
 
 def scene(real):
@@ -147,61 +134,6 @@ def test_a_mean_that_rounds_to_the_longest_range_has_half_of_its_mass(shape, bac
             for by in (offset, moved)
         )
         assert far - 1e-3 <= log_p[0] <= near + 1e-3, (sigma, far, near)
-
-
-@pytest.mark.long_on("warp")
-def test_parameters_of_0_change_no_bit_and_are_left_out(backend):
-    grid, scanner, poses, expected = scene("float32")
-    plain = gs.BeamModel(grid, scanner, gs.BeamParameters(), backend=backend)
-    moved = gs.BeamModel(grid, scanner, gs.BeamParameters(range_bias=0.1), backend=backend)
-    assert "range_bias = 0;" in plain.explain() and "sigma_growth = 0;" in plain.explain()
-    assert "range_bias = 0;" not in moved.explain() and "range_bias = 0.1" in moved.explain()
-    plain.log_likelihood(poses, expected[3])
-    moved.log_likelihood(poses, expected[3])
-    assert not {"BIAS", "GROWTH"} & plain._last.flags and {"BIAS"} == {"BIAS", "GROWTH"} & moved._last.flags
-
-
-@pytest.mark.parametrize("real", ["float32", "float64"])
-@pytest.mark.parametrize("name", MIXTURES)
-def test_the_code_for_them_changes_nothing_where_they_are_0(name, real):
-    flags, terms, _ = mixture_of([MIXTURES[name]], RANGE, np.dtype(real), specialize=True, max_depends=False)
-    *_, expected = scene(real)
-    z = np.roll(expected, 1, axis=1)
-    plain = log_density(flags, z, expected, terms)
-    found = log_density(flags | {"BIAS", "GROWTH"}, z, expected, terms)
-    # Exponents in two parts are normalised again.
-    eps = np.finfo(real).eps if "EXACT_EXPONENT" in flags else 0
-    same = plain == found
-    assert (same | (np.abs(np.where(same, 0, plain) - np.where(same, 0, found)) <= 2 * eps * np.abs(plain))).all()
-
-
-@pytest.mark.long
-@pytest.mark.sampled(1, without="warp:cpu")
-def test_tables_and_angles_of_incidence_have_them(backend):
-    grid, scanner, poses, expected = scene("float32")
-    p = gs.BeamParameters(range_bias=0.3, sigma_growth=0.02)
-    z = np.minimum(expected[5] + np.float32(0.3), np.float32(7.9))
-    tabulated = gs.BeamModel(grid, scanner, p, backend=backend, sensor_table=0.02)
-    assert tabulated.log_likelihood(poses, z).argmax() == 5
-    bins = gs.IncidenceParameters((0, 0.8, np.pi / 2), (p, p))
-    both = [
-        gs.BeamModel(grid, scanner, incidence=bins, backend=backend).log_likelihood(poses, z),
-        gs.BeamModel(grid, scanner, p, backend=backend).log_likelihood(poses, z),
-    ]
-    np.testing.assert_allclose(both[0], both[1], rtol=2e-5, atol=2e-3)
-
-
-def test_a_fit_hands_its_offset_to_the_model():
-    rng = np.random.default_rng(8)
-    expected = rng.uniform(1, 7, 4000)
-    z = np.where(rng.random(4000) < 0.9, expected + 0.12 + rng.normal(0, 0.03, 4000), rng.uniform(0, RANGE, 4000))
-    fit = gs.fit_beam_parameters(np.clip(z, 0, 7.99), expected, RANGE, backend="numpy", range_bias=True)
-    assert fit.parameters.range_bias == fit.range_bias and abs(fit.range_bias - 0.12) < 5 * fit.range_bias_error
-    log_p = log_mixture(np.clip(z, 0, 7.99), expected, range_max=RANGE, **fit.parameters.to_dict()).sum()
-    assert log_p == pytest.approx(fit.log_likelihood, rel=1e-6)
-    assert (
-        gs.fit_beam_parameters(z[:500].clip(0, 7.9), expected[:500], RANGE, backend="numpy").parameters.range_bias == 0
-    )
 
 
 @pytest.mark.parametrize("peer", ["amcl", "beluga"])

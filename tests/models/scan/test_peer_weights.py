@@ -30,19 +30,6 @@ TOP = 12.0
 SCANNER = gs.Scanner(BEARINGS, TOP, 0.5)
 
 
-def test_a_literal_of_each_peer():
-    # amcl: 0.5 exp(-0.5^2 / (2 * 0.04)) + 0.05 * 0.1 exp(-0.55) + 0.5 / 12 at z = 5.5, z* = 6.
-    amcl = gs.BeamModel(GRID, gs.Scanner([0.0], TOP), compat="amcl", backend="numpy", precision="float64")
-    assert amcl.log_likelihood(POSE, [5.5])[0] == pytest.approx(math.log1p(0.06651988253**3), rel=1e-6)
-    # Beluga: 0.5 * 1.994711402 * 0.0439369336 + 0.05 * 0.1 exp(-0.55) / (1 - exp(-0.6)) + 0.5 / 12.
-    beluga = gs.BeamModel(GRID, gs.Scanner([0.0], TOP), compat="beluga", backend="numpy", precision="float64")
-    assert beluga.log_likelihood(POSE, [5.5])[0] == pytest.approx(3 * math.log(0.0918810869), rel=1e-6)
-    # amcl's field: 2 cells short of the wall, d = 2 = max_distance; beluga's: 0.5 N(2; 0, 0.2) + 0.5 / 12.
-    for peer, density in (("amcl", 0.5 * math.exp(-50) + 0.5 / 12), ("beluga", float(np.float32(0.5 / 12)))):
-        field = gs.LikelihoodFieldModel(GRID, gs.Scanner([0.0], TOP), compat=peer, backend="numpy", precision="float64")
-        assert field.log_likelihood(POSE, [4.0])[0] == pytest.approx(math.log1p(density**3), rel=1e-9)
-
-
 def test_a_scan_without_a_reading():
     for peer, lead in (("amcl", 0.0), ("beluga", -INF)):
         model = gs.BeamModel(GRID, SCANNER, compat=peer, backend="numpy")
@@ -126,11 +113,6 @@ def test_ranges_are_those_of_the_compiled_peers(scene, peer, backend):
     np.testing.assert_allclose(model.expected_ranges(poses), scene["ranges"][peer], rtol=0, atol=1e-12)
 
 
-def test_ranges_of_amcl_exceed_range_max_in_these_scenes():
-    beyond = [int((np.array(scene["ranges"]["amcl"]) > scene["range_max"]).sum()) for scene in SCENES]
-    assert all(count > 0 for count in beyond)
-
-
 def line_to(cell: tuple[int, int], peer: str, backend: str) -> float:
     """Return the range from cell (0, 0) of cells of 1 m to (2, 1), with an obstacle at a column and row."""
     cells = np.zeros((6, 6), int)
@@ -150,14 +132,6 @@ def test_lines_midway_between_cells(backend):
     # One cell beyond the end of the line is (3, 2) for nav2_amcl: a range of 3.606 with a range_max of 2.236.
     assert line_to((3, 2), "amcl", backend) == pytest.approx(math.sqrt(13), rel=1e-6)
     assert line_to((3, 2), "beluga", backend) == root
-
-
-def test_a_particle_off_the_map(backend):
-    cells = np.zeros((4, 8), int)
-    cells[:, 5] = 100
-    for peer, expected in (("amcl", 0.0), ("beluga", 9.0)):
-        model = gs.BeamModel(gs.OccupancyGrid(cells, 1.0), gs.Scanner([0.0], 9.0), compat=peer, backend=backend)
-        assert model.expected_ranges([(-1.5, 1.5, 0.0), (1.5, 1.5, 0.0)])[:, 0].tolist() == [expected, 4.0]
 
 
 def test_readings_beyond_range_max():

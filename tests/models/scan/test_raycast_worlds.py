@@ -108,26 +108,3 @@ def test_range_max_is_returned_as_it_is(backend):
             caster = gs.RayCaster(grid, range_max, backend=backend, precision=precision)
             found = caster.cast([[0.5, 0.5, 0.3], [-50.0, 3.0, 0.0]], np.linspace(-3, 3, 9))
             assert (found == np.dtype(precision).type(range_max)).all()
-
-
-def test_all_unknown_map(backend):
-    grid = gs.OccupancyGrid(np.full((5, 5), -1), 1.0)
-    poses = [[2.5, 2.5, 0.0], [-1.5, 2.5, 0.0]]
-    assert gs.RayCaster(grid, 9.0, backend=backend).cast(poses, [0.0]).tolist() == [[9.0], [9.0]]
-    caster = gs.RayCaster(grid, 9.0, backend=backend, unknown="occupied")
-    assert caster.cast(poses, [0.0, math.pi]).tolist() == [[0.0, 0.0], [1.5, 9.0]]
-
-
-@pytest.mark.parametrize("heading", [0.0, math.pi / 2, -math.pi / 2, math.pi, 2 * math.pi])
-def test_a_ray_along_an_edge_stays_in_its_row(backend, heading):
-    """A ray along the lower edge of a cell distinguishes the walls of the rows above and below."""
-    cells = np.zeros((9, 9), int)
-    cells[4, 7] = cells[7, 4] = cells[4, 1] = cells[1, 4] = 100
-    grid = gs.OccupancyGrid(cells, 1.0)
-    for precision in PRECISIONS:
-        found = gs.RayCaster(grid, 20.0, backend=backend, precision=precision).cast([[4.5, 4.5, heading]], [0.0])
-        assert found[0, 0] == pytest.approx(2.5, abs=1e-6)
-        edge = {0.0: (4.5, 4.0), math.pi / 2: (4.0, 4.5), 2 * math.pi: None}.get(heading)
-        if edge is not None:
-            found = gs.RayCaster(grid, 20.0, backend=backend, precision=precision).cast([[*edge, heading]], [0.0])
-            assert found[0, 0] == 2.5

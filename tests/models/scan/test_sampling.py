@@ -6,14 +6,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy import integrate, stats
+from scipy import stats
 from scipy.special import ndtri
 from support.array_libraries import to_device
 from support.kernel_scenes import PRECISIONS
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.reference.sampling import half_mass, half_quantile, normal_within, short_of
+from gpusense.reference.sampling import half_mass, half_quantile, normal_within
 
 # Every statistical test may fail by chance with this probability; seeds are fixed.
 FALSE_ALARM = 1e-5
@@ -270,14 +270,3 @@ def test_deviates_within_an_interval_keep_their_digits():
     np.testing.assert_allclose(wide, -3e-7 + u * 8e-7, rtol=1e-12, atol=1e-19)
     edge = normal_within(u, np.zeros(2001), np.full(2001, 1e9))
     np.testing.assert_allclose(edge, stats.halfnorm.ppf(u), rtol=1e-12)
-
-
-def test_short_readings_agree_where_the_series_begins():
-    u, expected = np.linspace(0.001, 0.999, 999), np.full(999, 2.0)
-    for x in (0.0, 1e-9, 9.99e-5, 1.001e-4, 1e-2, 5.0, 1e5):
-        found = short_of(u, expected, np.full(999, x / 2.0))
-        exact = 2.0 * u if x == 0 else -np.log1p(u * np.expm1(-x)) / x * 2.0
-        np.testing.assert_allclose(found, exact, rtol=1e-12, atol=4e-12)
-    assert integrate.quad(lambda t: float(short_of(np.array([t]), np.array([2.0]), np.array([1.0]))[0]), 0, 1)[0] == (
-        pytest.approx(stats.truncexpon(2.0).mean(), rel=1e-6)
-    )

@@ -42,17 +42,6 @@ def bits(array: np.ndarray) -> np.ndarray:
     return array.view(array.dtype.str.replace("f", "u"))
 
 
-@pytest.mark.sampled(1, without="warp:cpu")
-def test_one_reading_by_hand(backend):
-    """A reading of 1.3 m for 2 m has, in bins of 0.5 m, the mixture at 1.25 m and 2.25 m; range_max stays range_max."""
-    _, scanner, _ = scene()
-    for precision in PRECISIONS:
-        tabulated = model(0.5, backend=backend, precision=precision)
-        _, parts = tabulated.log_likelihood([[1.99, 0.005, 0.0]], [1.3] * scanner.count, per_beam=True)
-        exact = [-1.9408022282454782] * 4 + [-2.9320850272796114] * 4
-        np.testing.assert_allclose(parts[0], exact, rtol=4 * np.finfo(precision).eps)
-
-
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("width", [1.0, 0.3, 0.01])
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -74,26 +63,6 @@ def test_a_table_holds_the_mixture_at_the_centres_of_bins(width, precision):
         sure = (np.abs(place - np.round(place)) > 1e-4) | (expected >= RANGE)
         eps = np.finfo(precision).eps
         assert (np.abs(parts - wanted) <= 8 * eps * (1 + np.abs(wanted)))[sure].all() and sure.mean() > 0.9
-
-
-@pytest.mark.parametrize("weights", WEIGHTS)
-def test_narrower_bins_are_more_exact(weights):
-    """The mean error is at least of first order; so is the largest error, where the mixture is continuous."""
-    (grid, _, poses), p = scene(), model(None, weights).parameters
-    z, parts = readings(count=200), []
-    for width in (None, 0.4, 0.2, 0.1, 0.05):
-        options = dict(backend="numpy", precision="float64", sensor_table=width)
-        tabulated = gs.BeamModel(grid, gs.Scanner([0.0] * 200, RANGE), p, **options)
-        parts.append(tabulated.log_likelihood(poses, z, per_beam=True)[1])
-    mean, largest = [], []
-    for approximate in parts[1:]:
-        error = np.abs(approximate - parts[0])
-        mean.append(error.mean())
-        largest.append(error.max())
-    # A halved width halves the error; 1.6 leaves room for chance.
-    assert (np.array(mean[:-1]) / mean[1:] > 1.6).all() and mean[0] / mean[-1] > 6
-    if weights == "no short":
-        assert (np.array(largest[:-1]) / largest[1:] > 1.6).all() and largest[0] / largest[-1] > 6
 
 
 @pytest.mark.sampled(1, without="warp:cpu")
@@ -147,26 +116,3 @@ def test_every_backend_has_the_bits_of_numpy_with_and_without_specialisation(wei
             tabulated = model(0.05, weights, precision=precision, backend=backend, specialize=specialize, **options)
             for found, wanted in zip(tabulated.log_likelihood(poses, z, per_beam=True), reference, strict=True):
                 np.testing.assert_array_equal(bits(found), bits(wanted))
-
-
-@pytest.mark.sampled(1, without="warp:cpu")
-def test_any_caster_may_feed_the_table(backend):
-    _, _, poses = scene()
-    lines, alone = model(0.01, backend=backend, caster="bresenham"), model(0.01, backend=backend)
-    _, parts = lines.log_likelihood(poses, readings(), per_beam=True)
-    _, exact = alone.log_likelihood(poses, readings(), per_beam=True)
-    # Densities are equal if the line's range and the exact range share a bin.
-    bins = [(one.expected_ranges(poses) * np.float32(100)).astype(int) for one in (lines, alone)]
-    same = bins[0] == bins[1]
-    assert 0.5 < same.mean() < 1
-    assert (parts == exact)[same].all() and (parts != exact)[~same].any()
-
-
-def test_the_plan_says_that_the_mixture_is_tabulated():
-    _, _, poses = scene()
-    tabulated, formula = model(0.05), model(None)
-    for one in (tabulated, formula):
-        one.log_likelihood(poses[:3], readings())
-    assert "log p is tabulated over 80 x 81 bins of readings and expected ranges" in tabulated.explain()
-    assert "tabulated" not in formula.explain()
-    assert tabulated.sensor_table == 0.05 and formula.sensor_table is None

@@ -9,7 +9,6 @@ import pickle
 
 import numpy as np
 import pytest
-from scipy.ndimage import distance_transform_edt
 from support.incidence_world import EDGES, INCIDENCE, KINDS, P, place
 from support.selection import on_every_backend
 
@@ -131,49 +130,6 @@ def test_a_cone_of_one_ray_is_a_laser(backend):
         assert differing(one.expected_ranges(poses), laser.expected_ranges(poses)) == 0
         assert differing(one.log_likelihood(poses, a_scan()), laser.log_likelihood(poses, a_scan())) == 0
         assert "CONES" not in one._last.flags
-
-
-def test_nothing_is_nearer_than_the_nearest_obstacle():
-    """Each end of a distance is at most half a diagonal from its cell's centre."""
-    grid, _, _ = place()
-    rng = np.random.default_rng(2)
-    row, col = rng.integers(0, 90, 400), rng.integers(0, 120, 400)
-    xy = grid.cell_centers(row, col) + rng.uniform(-0.049, 0.049, (400, 2)) / math.sqrt(2)
-    poses = np.column_stack([xy, rng.uniform(-4, 4, 400)])
-    scanner = gs.Scanner(RING, 30.0, cone=2 * math.pi, cone_rays=90)
-    found = gs.BeamModel(grid, scanner, backend="numpy").expected_ranges(poses)
-    distance = distance_transform_edt(~grid.obstacles("free"))[row, col] * grid.resolution
-    diagonal = grid.resolution * math.sqrt(2)
-    assert (found >= distance[:, None] - diagonal).all()
-    # Rays in all directions find it unless it fits between two rays.
-    assert np.median(found[:, 0] - distance) < diagonal
-
-
-def test_sensors_may_come_in_any_order():
-    grid, poses, _ = place()
-    order = np.array([5, 2, 7, 0, 1, 6, 3, 4])
-    turned = gs.Scanner(RING[order], RANGE, mount=MOUNT, **SONAR)
-    found = gs.BeamModel(grid, turned, backend="numpy").expected_ranges(poses)
-    assert differing(found, gs.BeamModel(grid, ring(**SONAR), backend="numpy").expected_ranges(poses)[:, order]) == 0
-
-
-def test_a_mirror_in_a_corner_and_a_wall_aslant():
-    """A sonar hears nothing from a wall beyond the critical angle."""
-    cells = np.zeros((200, 200), int)
-    cells[150:153] = 100
-    grid = gs.OccupancyGrid(cells, 0.05)
-    turns = np.radians([0, 10, 20, 30, 40, 50])
-    poses = np.column_stack([np.full(6, 5.0), np.full(6, 5.5), math.pi / 2 - turns])
-    model = gs.BeamModel(grid, gs.Scanner([0.0], 5.0, critical_incidence=math.radians(25)), backend="numpy")
-    found = model.expected_ranges(poses)[:, 0]
-    np.testing.assert_allclose(found[:3], 2.0 / np.cos(turns[:3]), rtol=1e-6)
-    assert (found[3:] == 5.0).all() and np.isnan(model.incidence(poses)[3:]).all()
-    # A cone of 30 degrees still holds a ray that meets the wall at 15 degrees less.
-    wide = gs.Scanner([0.0], 5.0, cone=math.radians(30), cone_rays=31, critical_incidence=math.radians(25))
-    found = gs.BeamModel(grid, wide, backend="numpy").expected_ranges(poses)[:, 0]
-    nearest = np.maximum(np.degrees(turns) - 15, 0)
-    np.testing.assert_allclose(found[:4], 2.0 / np.cos(np.radians(nearest[:4])), rtol=1e-3)
-    assert found[5] == 5.0
 
 
 # ------------------------------------------------------------------------------------------------- the scanner

@@ -197,23 +197,6 @@ def test_each_cast_orders_its_own_cloud(as_gpu, monkeypatch):
 
 
 @pytest.mark.long_on("warp")
-@pytest.mark.sampled(0.3)
-@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 257])
-def test_any_number_of_particles(count, ordered, as_gpu):
-    grid, scanner, z = world()
-    caster = gs.RayCaster(grid, RANGE, backend=as_gpu())
-    models = gs.BeamModel(grid, scanner, backend=as_gpu()), gs.LikelihoodFieldModel(grid, scanner, backend=as_gpu())
-    poses = poses_of("all over", count)
-    found = [model.log_likelihood(poses, z) for model in models] + [caster.cast(poses, scanner.bearings)]
-    as_gpu(False)
-    right = [model.log_likelihood(poses, z) for model in models] + [caster.cast(poses, scanner.bearings)]
-    for one, other in zip(found, right, strict=True):
-        assert one.shape == other.shape
-        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4)
-    assert differing(found[2], right[2]) == 0 or count == 0
-
-
-@pytest.mark.long_on("warp")
 @pytest.mark.parametrize("chunk", ["CHUNK", "CHUNK_BYTES"])
 def test_in_pieces(chunk, ordered, as_gpu, monkeypatch):
     """Each piece has its own window, place in the result and order."""
@@ -342,19 +325,3 @@ def test_origins_at_the_border(as_gpu):
         )  # fmt: skip
         for poses in border_poses(grid, 0.0):
             assert differing(caster.cast(poses, bearings), right.cast(poses, bearings)) == 0
-
-
-@pytest.mark.long_on("warp")
-def test_a_window_that_grows(as_gpu):
-    """Clouds are far from each other, and each sees a part of the map."""
-    cells = np.where(np.random.default_rng(6).random((400, 400)) < 0.01, 100, 0).astype(np.int8)
-    grid, scanner = gs.OccupancyGrid(cells, 0.1), gs.Scanner(np.linspace(-3, 3, 21), 2.0)
-    z = np.random.default_rng(9).uniform(0, 2, 21)
-    rng = np.random.default_rng(10)
-    clouds = [np.column_stack([rng.uniform(-0.5, 0.5, (30, 2)) + at, rng.uniform(-4, 4, 30)]) for at in (5, 35, 20, 5)]
-    for kind in (gs.BeamModel, gs.LikelihoodFieldModel):
-        model, whole = (kind(grid, scanner, backend=as_gpu(), specialize=one) for one in (True, False))
-        for poses in clouds:
-            found, right = (one.log_likelihood(poses, z, per_beam=True)[1] for one in (model, whole))
-            np.testing.assert_allclose(found, right, rtol=1e-5, atol=1e-5)
-            assert differing(model.log_likelihood(poses, z), model.log_likelihood(poses, z, per_beam=True)[0]) == 0

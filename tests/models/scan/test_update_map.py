@@ -233,16 +233,6 @@ def test_before_the_first_call_only_the_map_changes(make):
     np.testing.assert_array_equal(says(poses), tables(make(other), RANGES)[1](poses))
 
 
-def test_a_grid_that_models_share_stays_as_it_is(make):
-    grid = gs.OccupancyGrid(cells_of(np.random.default_rng(10), (50, 50)), RESOLUTION)
-    before, poses = grid.cells.copy(), poses_in(np.random.default_rng(10), (50, 50))
-    model, other = make(grid), make(grid)
-    expected = tables(other, RANGES)[1](poses)
-    model.update_map(np.full((50, 50), 100), (0, 0))
-    np.testing.assert_array_equal(grid.cells, before)
-    np.testing.assert_array_equal(tables(other, RANGES)[1](poses), expected)
-
-
 def test_a_device_without_room_for_an_update_makes_the_table_anew(make, monkeypatch):
     grid = gs.OccupancyGrid(np.zeros((50, 50), int), RESOLUTION)
     model, poses = make(grid), poses_in(np.random.default_rng(11), (50, 50))
@@ -325,14 +315,3 @@ def test_a_grid_with_other_cells_is_read_only_and_keeps_the_rest():
     assert np.argwhere(other.occupied).tolist() == [[2, 2]]
     with pytest.raises(ValueError, match="read-only"):
         other.cells[0, 0] = 1
-
-
-def test_windows_and_boxes():
-    window = windows.Window(2, 3, 4, 5)
-    assert window.grown(3, (10, 9)) == windows.Window(0, 0, 9, 9)
-    assert window.shared(windows.Window(5, 0, 9, 4)) == windows.Window(5, 3, 1, 1)
-    assert window.shared(windows.Window(6, 3, 1, 1)) is None
-    cells = np.zeros((6, 7), bool)
-    assert windows.box(cells) is None
-    cells[2, 5] = cells[4, 1] = True
-    assert windows.box(cells) == windows.Window(2, 1, 3, 5)

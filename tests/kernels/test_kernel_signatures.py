@@ -16,7 +16,7 @@ from support.kernel_scenes import PRECISIONS
 from gpusense.interface import sources
 from gpusense.interface.kernel_files import kernel_root, opencl_names, opencl_source, warp_module
 from gpusense.interface.signatures import KERNELS
-from gpusense.interface.sources import assemble, parameters, relevant, source_text
+from gpusense.interface.sources import parameters, source_text
 
 each_kernel = pytest.mark.parametrize("kernel", list(KERNELS))
 
@@ -66,37 +66,6 @@ def test_a_kernel_without_a_row_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(sources, "opencl_source", lambda file: "kernel void fourth(ARGUMENTS) {\n}\n")
     with pytest.raises(ValueError, match=r"^ranges.cl: a kernel must have a row in the signature table, got 'fourth'"):
         source_text("ranges", frozenset())
-
-
-def test_twenty_one_kernels_have_a_second_body_in_lanes() -> None:
-    lanes = frozenset({"IN_LANES"})
-    programs = {
-        row.file: assemble(row.file, lanes) for row in KERNELS.values() if "IN_LANES" in relevant(row.file, lanes)
-    }
-    twice = {name for name, row in KERNELS.items() if f"kernel void {name}(" in programs.get(row.file, "")}
-    assert twice == {
-        "cast_ranges",
-        "count_unseen",
-        "draw_particles",
-        "e_step",
-        "field_gradient",
-        "fit_lines",
-        "match_scans",
-        "move_particles",
-        "place_pair",
-        "place_poses",
-        "score_beacons",
-        "score_beams",
-        "score_contact",
-        "score_features",
-        "score_field",
-        "score_heading",
-        "score_position",
-        "set_weights",
-        "shift_scores",
-        "sum_poses",
-        "weigh_particles",
-    }
 
 
 @each_kernel

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-import zlib
 from collections.abc import Callable
 from typing import Any
 
@@ -21,7 +19,6 @@ from support.kernel_scenes import (
 from gpusense.backends import Backend, get_backend
 from gpusense.reference.rectangles import OCCUPIED, slope
 from gpusense.tables.rectangles import Planes, empty_rectangles
-from gpusense.world.windows import Window
 
 
 def blocked_before(occupied: np.ndarray) -> np.ndarray:
@@ -164,55 +161,3 @@ def test_rectangles_have_the_bits_of_the_reference(
         np.testing.assert_array_equal(groups, planes_of(occupied, GROUPED, kind))
         in_rows = planes_of(occupied, Planes(GROUPED.sectors), kind)
         np.testing.assert_array_equal(row_after_row(groups, GROUPED, len(occupied)), in_rows)
-
-
-def edits(rng: np.random.Generator, shape: tuple[int, int]) -> list[Window]:
-    """Return edits of single cells, including the four corners, and of windows, including windows at borders."""
-    rows, cols = shape
-    places = [(0, 0), (0, cols - 1), (rows - 1, 0), (rows - 1, cols - 1), (rows // 2, cols // 2)]
-    windows = [Window(row, col, 1, 1) for row, col in places]
-    for number in range(6):
-        high, wide = min(int(rng.integers(1, 40)), rows), min(int(rng.integers(1, 40)), cols)
-        row, col = int(rng.integers(0, rows - high + 1)), int(rng.integers(0, cols - wide + 1))
-        row = [0, rows - high, row][number % 3]
-        col = [0, col, cols - wide][number // 2]
-        windows.append(Window(row, col, high, wide))
-    return windows
-
-
-@functools.cache
-def made_anew(
-    shape: tuple[int, int], share: float, form: Planes, kind: str
-) -> list[tuple[np.ndarray, Window | None, bytes]]:
-    """Yield a map after each edit: the map, the changed window, and the compressed rectangles made anew."""
-    rng = np.random.default_rng(5)
-    occupied = rng.random(shape) < share
-    found: list[tuple[np.ndarray, Window | None, bytes]] = []
-    for number, changed in enumerate([None, *edits(rng, shape)], -1):
-        if changed is not None:
-            part = changed.cut(occupied)
-            part[...] = ~part if changed.cells == 1 else rng.random(part.shape) < [0, 0.02, 1][number % 3]
-        found.append((occupied.copy(), changed, zlib.compress(planes_of(occupied, form, kind).tobytes(), 1)))
-    return found
-
-
-@pytest.mark.long
-@pytest.mark.sampled(0.12)
-@pytest.mark.parametrize("kind", ["cpu", "gpu"])
-@pytest.mark.parametrize(
-    ("shape", "share"), [((540, 530), 0.0), ((540, 530), 1e-4), ((40, 700), 3e-3), ((700, 3), 0.01), ((9, 9), 0.1)]
-)
-def test_updated_rectangles_are_those_made_anew(
-    shape: tuple[int, int], share: float, kind: str, as_kind: Callable[[str], Backend]
-) -> None:
-    device, form = as_kind(kind), GROUPED if kind == "gpu" else PLANES[1]
-    rectangles, planes = None, np.empty((4, form.sectors, form.lines(shape[0]), shape[1] + 2), np.uint16)
-    for occupied, changed, anew in made_anew(shape, share, form, kind):
-        mended = empty_rectangles(device, occupied, form, *(() if changed is None else (rectangles, changed)))
-        assert changed is None or mended is rectangles
-        rectangles = mended
-        device.download(rectangles, planes)
-        np.testing.assert_array_equal(planes, np.frombuffer(zlib.decompress(anew), np.uint16).reshape(planes.shape))
-
-
-# ---- the likelihood field

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import re
-
 import mpmath as mp
 import numpy as np
 import pytest
 from scipy import special
-from support.bench_scripts import derived
 
 from gpusense.evaluation.tolerances import TOLERANCES
 from gpusense.interface.kernel_files import opencl_source, warp_module
@@ -160,29 +157,3 @@ def test_ends(in_either):
     assert at("one_minus_exp_lanes", 0.0, -20.0, -1e9, -np.inf) == [0, 1, 1, 1]
     assert at("log_lanes", 1.0) == [0]
     assert at("erf_lanes", 0.0, 4.0, 1e9, np.inf) == [0, 1, 1, 1]
-
-
-@pytest.mark.long
-def test_constants_are_those_that_were_derived():
-    made, expected = derived("lane_constants"), {}
-    with mp.workdps(50):
-        polynomials = (made.exponential(), made.logarithm(), made.error_function(), made.arc(), made.log_complement())
-        for name, (powers, error) in zip("ELWAV", polynomials, strict=True):
-            assert error < -24
-            expected |= {f"{name}{i}": powers[i] for i in range(len(powers))}
-        expected |= dict(zip(("LOG2_HIGH", "LOG2_LOW", "ONE_OVER_LOG2"), made.log_parts(), strict=True))
-    text = opencl_source("lanes/math")
-    defined = re.findall(r"^#define (\w+) (\S+)f$", text, re.MULTILINE)
-    found = {name: float(np.float32(value)) for name, value in defined}
-    assert {name: found[name] for name in expected} == expected
-
-
-def test_constants_of_warp_are_those_of_opencl(needs):
-    needs("warp")
-    defined = re.findall(r"^#define (\w+) (\S+?)f?$", opencl_source("lanes/math"), re.MULTILINE)
-    lanes = vars(warp_module("lanes.math"))
-    both = {name: value for name, value in defined if name in lanes}
-    assert {f"{letter}{i}" for letter, last in (("E", 4), ("L", 7), ("W", 8)) for i in range(last + 1)} < both.keys()
-    for name, value in both.items():
-        number = int(value, 16) if value.startswith("0x") else np.float32(value)
-        assert type(number)(lanes[name].value) == number, name

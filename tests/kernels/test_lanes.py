@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-import re
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import beam_tolerance, differing
 from gpusense.interface.kernel_files import opencl_names, opencl_source
-from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.signatures import KERNELS, LANES
 from gpusense.interface.sources import assemble, relevant, required_files
 
@@ -34,36 +30,6 @@ def test_fields_of_view_end_at_their_edges(way, field, needs, request):
     model = gs.LandmarkModel(gs.LandmarkMap(xy), p, negative=True, backend=backend)
     found = model.log_likelihood(np.zeros((3, 3)), [])
     np.testing.assert_allclose(found, inside.sum() * math.log(0.3), rtol=1e-6)
-
-
-@pytest.mark.parametrize("field", [2.0, 5.5])
-@pytest.mark.parametrize("way", [1, LANES, "warp", "numpy"])
-def test_bearings_have_their_mass_in_the_field_of_view(way, field, needs, request):
-    """The field divides a density by the normal's mass in it, which is integrated here."""
-    backend, sigma = request.getfixturevalue("in_lanes")(way) if isinstance(way, int) else needs(way), 0.3
-    bearing = np.linspace(-field / 2, field / 2, 31)
-    poses = np.stack([0 * bearing, 0 * bearing, -bearing], axis=1)
-    found = []
-    for view in (None, field):
-        p = gs.LandmarkParameters(
-            sigma_bearing=sigma, range_max=10.0, z_detect=1.0, z_false=0.0, **({"field_of_view": view} if view else {})
-        )
-        model = gs.LandmarkModel(gs.LandmarkMap([[5.0, 0.0]]), p, backend=backend)
-        found.append(model.log_likelihood(poses, [(5.0, 0.2)], [0]))
-    steps = (np.arange(20_000) + 0.5) * (field / 20_000) - field / 2
-    error = (steps - bearing[:, None] + math.pi) % (2 * math.pi) - math.pi
-    mass = np.exp(-0.5 * (error / sigma) ** 2).sum(axis=1) * (field / 20_000) / (sigma * math.sqrt(2 * math.pi))
-    np.testing.assert_allclose(found[1] - found[0], -np.log(mass), atol=1e-4)
-
-
-def test_float64_and_lines_have_no_vectors():
-    points = ("score_beacons", "score_contact", "score_heading", "score_position")
-    for kernel in ("score_features", "count_unseen", *points):
-        assert with_lanes_flag(LANES, kernel, {"RANGE", "BEARING"}) == {"RANGE", "BEARING", "IN_LANES"}
-        assert with_lanes_flag(LANES, kernel, {"RANGE", "FLOAT64"}) == {"RANGE", "FLOAT64"}
-    assert with_lanes_flag(LANES, "score_features", {"RANGE", "LINE"}) == {"RANGE", "LINE"}
-    for flag in ("SIGNATURE", "FIELD", "MARGINAL", "PER_BEAM"):
-        assert "IN_LANES" in with_lanes_flag(LANES, "score_features", {"BEARING", flag})
 
 
 RANGE = 9.0
@@ -224,36 +190,6 @@ def test_bumpers(outline, changes, in_lanes, compiled_lanes):
     assert allowed.difference(found[LANES][finite], found[1][finite]) <= 2 * allowed.value
 
 
-def test_only_scenes_that_have_such_kernels_get_them():
-    info = get_backend("numpy").info
-    wide = dataclasses.replace(info, lanes=LANES)
-    assert with_lanes_flag(info.lanes, "cast_ranges", set()) == frozenset()
-    assert with_lanes_flag(wide.lanes, "cast_ranges", set()) == {"IN_LANES"}
-    for flags in ({"FLOAT64"}, {"LOOKUP"}, {"MARCH", "ORIGINS_OUTSIDE"}):
-        assert with_lanes_flag(wide.lanes, "cast_ranges", flags) == {*flags, "IN_LANES"}
-    for flags in (
-        set(),
-        {"HIT"},
-        {"HIT", "LINEAR"},
-        {"HIT", "EXACT_EXPONENT", "CONES", "INCIDENCE"},
-        {"CUBES", "ALL_READINGS"},
-    ):
-        assert with_lanes_flag(wide.lanes, "score_beams", flags) == {*flags, "IN_LANES"}
-    for flags in (
-        {"BILINEAR"},
-        {"BILINEAR", "LINEAR", "EXACT_EXPONENT"},
-        {"LOG_TABLE", "TWO_PART_POINTS"},
-        {"LOG_TABLE", "FLOAT64"},
-    ):
-        assert with_lanes_flag(wide.lanes, "score_field", flags) == {*flags, "IN_LANES"}
-    assert with_lanes_flag(wide.lanes, "score_field", {"ALL_READINGS"}) == {"ALL_READINGS"}
-    for flag in ("FLOAT64", "EXACT_EXPONENT"):
-        assert with_lanes_flag(wide.lanes, "field_gradient", {"LINEAR", flag}) == {"LINEAR", flag}
-    assert with_lanes_flag(wide.lanes, "beam_tiles", {"LINEAR"}) == {"LINEAR"}
-    assert with_lanes_flag(wide.lanes, "score_field", {"BILINEAR"}, float64=False) == {"BILINEAR"}
-    assert with_lanes_flag(wide.lanes, "score_field", {"LOG_TABLE"}, float64=False) == {"LOG_TABLE", "IN_LANES"}
-
-
 def test_programs_in_lanes_begin_in_their_folder():
     for file in {row.file for row in KERNELS.values()}:
         scalar, wide = required_files(file), required_files(file, frozenset({"IN_LANES"}))
@@ -268,14 +204,6 @@ def test_programs_in_lanes_begin_in_their_folder():
         else:
             assert wide == scalar
             assert "IN_LANES" not in relevant(file, frozenset({"IN_LANES"}))
-
-
-def test_scalar_files_hold_nothing_of_vectors():
-    for name in opencl_names():
-        text = opencl_source(name)
-        assert "IN_LANES" not in text.replace("WIDE_HEADINGS", "")
-        if not name.startswith("lanes/"):
-            assert "lanes" not in "".join(re.findall("^// requires:.*", text, re.MULTILINE))
 
 
 @pytest.mark.parametrize(

@@ -6,20 +6,14 @@ import copy
 import dataclasses
 import itertools
 import math
-import re
 
 import mpmath as mp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from support.bench_scripts import derived
-from support.oracles import placed
 
 import gpusense as gs
 from gpusense.backends import Backend, get_backend
 from gpusense.evaluation.tolerances import TOLERANCES
-from gpusense.interface.kernel_files import opencl_source, warp_module
 from gpusense.interface.sources import assemble, relevant, uses_double
 from gpusense.reference import heading
 from gpusense.reference.placement import FARTHEST
@@ -63,34 +57,6 @@ ANGLES = {
 @pytest.mark.parametrize("name", ANGLES)
 def test_cosines_and_sines_are_within_an_ulp(name):
     assert errors(ANGLES[name]).max() <= WORST
-
-
-@settings(max_examples=300, deadline=None)
-@given(st.one_of(st.floats(-7, 7), st.floats(-1e6, 1e6), st.floats(allow_nan=False, allow_infinity=False)))
-def test_any_heading(theta):
-    assert errors(np.array([theta])).max() <= WORST
-
-
-def test_constants_are_those_that_were_derived_in_all_three_languages(needs):
-    needs("warp")
-    made = derived("heading_constants")
-    with mp.workdps(400):
-        quarters, pair, words = made.quarter_parts(), made.quarter_pair(), made.words()
-    with mp.workdps(50):
-        sine, cosine = made.polynomials()
-        sine_error, cosine_error = made.errors(sine, cosine)
-    assert sine_error < -56 and cosine_error < -59
-    expected = {f"S{i}": value for i, value in enumerate(sine)} | {f"C{i}": value for i, value in enumerate(cosine)}
-    expected |= {f"QUARTER_{i}": value for i, value in enumerate(quarters, 1)}
-    expected |= {"QUARTER": pair[0], "QUARTER_LOW": pair[1], "TWO_OVER_PI": 2 / math.pi, "LARGEST_HEADING": 2.0**20}
-    expected |= {"ROUNDER": 1.5 * 2.0**52}
-    text, warp = opencl_source("heading"), warp_module("heading")
-    defined = {name: float(value) for name, value in re.findall(r"^#define (\w+) (\S+)$", text, re.MULTILINE)}
-    assert defined == expected
-    assert {name: getattr(heading, name) for name in expected} == expected
-    assert {name: float(getattr(warp, name)) for name in expected} == expected
-    assert [int(word, 16) for word in re.findall(r"\b0x[0-9A-F]{8}\b(?=,)", text)] == words
-    assert heading.WORDS.tolist() == [int(word) for word in warp.WORDS] == words
 
 
 # ---- the kernel
@@ -179,31 +145,6 @@ def test_float32_poses_are_placed_as_the_numbers_they_are(name, backend):
     grid, mount = grid_of(name), FRAMES[name][2]
     narrow = launch(get_backend(backend), poses, grid, mount, "float32")
     assert_same(launch(get_backend(backend), poses.astype(np.float64), grid, mount, "float32"), narrow)
-
-
-@pytest.mark.parametrize("name", FRAMES)
-def test_positions_and_headings_against_60_digits(name):
-    resolution, origin, mount = FRAMES[name]
-    poses = poses_of(name)[500:800]
-    found = place_poses(poses, grid_of(name), mount, np.dtype(np.float64))
-    # A sum of world coordinates in cells is rounded to an ulp of the coordinates.
-    slack = 1e-12 + 8 * np.finfo(float).eps * (2000 + math.hypot(*origin[:2]) / resolution)
-    for pose, cell, high, low in zip(poses, found.cell, found.pose, found.low, strict=True):
-        x, y, cos, sin = placed(pose, origin, resolution, mount)
-        for k, exact in enumerate((x, y)):
-            assert abs(int(cell[k]) + mp.mpf(float(high[k])) + mp.mpf(float(low[k])) - exact) <= slack
-        assert max(abs(high[2] - cos), abs(high[3] - sin)) <= 5e-16
-
-
-def test_frames_without_yaw_and_mount_change_no_bit(backend):
-    """Zero yaw and mount add no term: a heading keeps its cosine and sine, and a whole cell has no fraction."""
-    poses = np.array([[3.0, 4.0, 0.1], [0.5, 0.25, -2.0], [600.0, 300.0, 1e5], [-0.0, -0.0, -0.0]])
-    grid = gs.OccupancyGrid(np.zeros((ROWS, COLS), np.int8), 1.0)
-    found = launch(get_backend(backend), poses, grid, (0.0, 0.0, 2.0), "float64")
-    np.testing.assert_array_equal(found["pose"][:, :2], [[0, 0], [0.5, 0.25], [0, 0], [0, 0]])
-    assert not np.signbit(found["pose"][:, :2]).any()
-    np.testing.assert_array_equal(found["pose"][:, 2:], np.transpose(heading.cos_sin(poses[:, 2])))
-    np.testing.assert_array_equal(found["pose_low"], 0)
 
 
 # ---- the pose status

@@ -113,22 +113,6 @@ def unexplained(
     ]  # fmt: skip
 
 
-def test_a_diagonal_pair_of_walls_never_leaks(backend):
-    """Neither pair of diagonal neighbours lets a ray pass through their common corner, from any side."""
-    for pair in (((5, 5), (6, 6)), ((5, 6), (6, 5))):
-        occupied = np.zeros((12, 12), bool)
-        for row, col in pair:
-            occupied[row, col] = True
-        for sign_x, sign_y in ((1, 1), (-1, 1), (1, -1), (-1, -1)):
-            starts = np.arange(1, 5)
-            cell = np.stack([6 - sign_x * starts, 6 - sign_y * starts], axis=1)
-            scene = Scene(occupied, cell, np.zeros((4, 2)), np.tile([0.5 * sign_x, 0.5 * sign_y], (4, 1)), 30.0)
-            for precision in PRECISIONS:
-                along_the_pair = (pair[0] == (5, 5)) == (sign_x == sign_y)
-                expected = 2.0 * (starts - 1 if along_the_pair else starts)
-                np.testing.assert_array_equal(cast(scene, backend, precision), expected)
-
-
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_no_pair_of_walls_leaks_at_any_slope(precision, backend):
     """Rays aim at the common corner of two walls as exactly as floats allow; a wall stops them for any rounding."""

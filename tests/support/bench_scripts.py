@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import io
 import json
 import runpy
@@ -11,10 +10,8 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
-from types import ModuleType
 from unittest import mock
 
-import mpmath as mp
 from support.paths import ROOT
 
 BENCH = ROOT / "bench"
@@ -56,15 +53,3 @@ def report_of(name: str, output: Path, printed: str) -> dict:
     assert report["command"].startswith(f"python bench/{name} ")
     assert str(output.parent) not in json.dumps(report)
     return report
-
-
-def derived(name: str) -> ModuleType:
-    """Import a script of bench/derive, and restore mpmath's precision."""
-    spec = importlib.util.spec_from_file_location(name, BENCH / "derive" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    digits = mp.mp.dps
-    try:
-        spec.loader.exec_module(module)
-    finally:
-        mp.mp.dps = digits
-    return module

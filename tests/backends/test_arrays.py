@@ -72,11 +72,6 @@ def test_float32_poses_are_the_numbers_they_are(method, backend):
     assert differing(call(Array(single)).held, call(single.astype(np.float64))) == 0
 
 
-def test_readings_of_another_library(backend):
-    call, _ = call_of("log_likelihood", backend, Array(SCAN))
-    assert differing(call(POSES), call_of("log_likelihood", backend)[0](POSES)) == 0
-
-
 def test_arrays_whose_gradients_are_recorded_are_refused_with_the_remedy():
     model = gs.BeamModel(GRID, SCANNER, backend="numpy")
     poses, scan, out = Recorded(POSES), Recorded(SCAN), Recorded(np.empty(COUNT, np.float32))
@@ -124,13 +119,6 @@ def test_arrays_that_can_be_used_as_they_are_are_not_copied(method, wrap, backen
         assert seen["poses"] != other.ctypes.data
 
 
-def test_read_only_poses(backend):
-    fixed = POSES.copy()
-    fixed.flags.writeable = False
-    call, _ = call_of("log_likelihood", backend)
-    assert differing(call(fixed), call(POSES)) == 0
-
-
 # ---- out
 
 
@@ -146,16 +134,6 @@ def test_out_is_filled_and_returned(method, backend):
         room[...] = 7
         assert call(Array(POSES), out=out) is out
         assert differing(room, expected) == 0
-
-
-def test_out_of_a_batch_and_with_parts(backend):
-    model = gs.BeamModel(GRID, SCANNER, backend=backend)
-    several, scans = np.stack([POSES, POSES + 0.1]), np.stack([SCAN, SCAN[::-1]])
-    expected, expected_parts = model.log_likelihood(several, scans, per_beam=True)
-    out = np.empty((2, COUNT), np.float32)
-    found, parts = model.log_likelihood(several, scans, per_beam=True, out=out)
-    assert found is out
-    assert differing(out, expected) == 0 and differing(parts, expected_parts) == 0
 
 
 def test_out_of_scans_without_a_reading_and_without_particles(backend):
@@ -217,14 +195,6 @@ def test_poses_on_a_device_that_the_backend_cannot_read(method, backend):
     )
     with pytest.raises(TypeError, match="^" + re.escape(message) + "$"):
         call(Array(POSES, CUDA))
-
-
-def test_readings_on_a_device_that_the_backend_cannot_read(backend):
-    if backend.startswith("warp:cuda"):
-        backend = "numpy"
-    call, _ = call_of("log_likelihood", backend, Array(SCAN, CUDA))
-    with pytest.raises(TypeError, match=r"^ranges: must be in host memory for .*, got a fakelib\.Array on a device$"):
-        call(POSES)
 
 
 @pytest.mark.parametrize("kind", [1, 3, 11])

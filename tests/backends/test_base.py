@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gpusense.backends import Backend, get_backend
-from gpusense.backends.base import Recording, pluralize
+from gpusense.backends.base import Recording
 from gpusense.backends.proxy import Proxy
 from gpusense.interface.launches import Launch
 
@@ -167,14 +167,6 @@ def test_a_proxy_sees_each_launch_of_programs_and_recordings(backend):
     found = device.download(table, np.empty((7, 6), REAL))[2:-2, 2:-2]
     np.testing.assert_array_equal(found, np.arange(6).reshape(3, 2))
     assert get_backend(device) is device
-
-
-@pytest.mark.parametrize(
-    ("number", "noun", "text"),
-    [(0, "launch", "0 launches"), (1, "launch", "1 launch"), (3, "launch", "3 launches"), (2, "copy", "2 copies")],
-)
-def test_numbers_in_words(number, noun, text):
-    assert pluralize(number, noun) == text
 
 
 @pytest.mark.skipif(not Path("/sys/kernel/mm/transparent_hugepage").exists(), reason="the system has no large pages")

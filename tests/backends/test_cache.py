@@ -4,39 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import importlib
 import os
 import signal
 import stat
 import time
 from pathlib import Path
 
-import platformdirs
 import pytest
 from support.cache_folders import BLOCKED, blocked, contents, entries_in
 
 from gpusense.backends import BackendInfo, cache, scratch
 from gpusense.backends.cache import discard_entry, load_entry, pack, program_key, store_entry, unpack, write_files
-
-
-@pytest.mark.parametrize(
-    "module, name, place",
-    [
-        ("unix", "Unix", "home/.cache/gpusense"),
-        ("macos", "MacOS", "home/Library/Caches/gpusense"),
-        ("windows", "Windows", "local/gpusense/Cache"),
-    ],
-)
-def test_the_cache_is_where_the_system_has_caches(tmp_path, monkeypatch, module, name, place):
-    for variable in ("GPUSENSE_CACHE_DIR", "GPUSENSE_CACHE", "XDG_CACHE_HOME"):
-        monkeypatch.delenv(variable, raising=False)
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    system = importlib.import_module(f"platformdirs.{module}")
-    if module == "windows":
-        monkeypatch.setattr(system, "get_win_folder", lambda _: str(tmp_path / "local"))
-    monkeypatch.setattr(platformdirs, "PlatformDirs", getattr(system, name))
-    assert scratch.chosen_place().folder == tmp_path / place
-
 
 INFO = BackendInfo("opencl:0:0", "opencl", "Some device", "gpu", "Driver 1", 1 << 30, 1 << 28, True)
 needs_fifo = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no FIFOs")

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import pytest
 from support import fake_driver
-from support.cache_folders import BLOCKED, blocked
 
 from gpusense.backends import scratch
 
@@ -91,24 +90,6 @@ def test_with_the_cache_off_nothing_is_kept(needs, tmp_path, expected, family):
     assert outcome(start(family, environment)) == (0, expected, "")
     # The database is pyopencl's own, and is empty.
     assert [path for path in tmp_path.rglob("*") if path.is_file() and path.suffix != ".sqlite"] == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("family", "how"), [("opencl", BLOCKED[0]), ("opencl", BLOCKED[2]), ("warp:cpu", BLOCKED[1])])
-def test_a_cache_that_cannot_be_written_is_named_and_stops_nothing(needs, tmp_path, expected, family, how):
-    """The folder of gpusense, and the default folders of PoCL and Warp."""
-    needs(family.split(":")[0])
-    place = str(blocked(tmp_path, how))
-    (tmp_path / "tmp").mkdir()
-    places = dict.fromkeys(("GPUSENSE_CACHE_DIR", "XDG_CACHE_HOME", "POCL_CACHE_DIR", "WARP_CACHE_PATH"), place)
-    environment = fake_driver.environment(tmp_path, **places, TMPDIR=str(tmp_path / "tmp"))
-    for turn in range(2):
-        code, out, errors = outcome(start(family, environment))
-        assert (code, out) == (0, expected), errors
-        lines = [line for line in errors.splitlines() if line.startswith("gpusense: ")]
-        assert len(lines) == len(errors.splitlines()) and all(place in line for line in lines)
-        assert turn or lines
-    assert len(list((tmp_path / "tmp").rglob("*.gpusense"))) > 5
 
 
 @pytest.mark.slow

@@ -210,15 +210,6 @@ def test_a_marker_that_was_begun_is_completed(place, begun):
     assert (own / scratch.MARKER).read_bytes() == scratch._MARKER_TEXT
 
 
-def test_a_marker_that_is_another_programs_stays(place):
-    own = place / scratch.OWN
-    own.mkdir(parents=True, mode=0o700)
-    (own / scratch.MARKER).write_bytes(b"Signature: mine\n")
-    with pytest.raises(UnsafeFolderError, match=r"one without its CACHEDIR\.TAG"):
-        scratch.own_folder(place)
-    assert (own / scratch.MARKER).read_bytes() == b"Signature: mine\n"
-
-
 _COLD = """
 import sys
 from gpusense.backends import cache

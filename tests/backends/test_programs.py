@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import threading
 import weakref
 
 import numpy as np
@@ -69,26 +68,6 @@ def test_arguments_change_from_call_to_call(backend):
     for source, value in zip(sources, (1.0, 2.0), strict=True):
         changing({"log_p": source})
         np.testing.assert_array_equal(device.download(target, np.empty(4)), value)
-
-
-def test_programs_of_threads_are_their_owners():
-    """Models of two threads on one device have separate caches; a shared model locks each call."""
-    model = gs.LikelihoodFieldModel(GRID, SCANNER, backend="numpy")
-    expected = [model.log_likelihood(POSES[:count], RANGES) for count in (1, 2)]
-    wrong = []
-
-    def work(count):
-        for _ in range(50):
-            if not np.array_equal(model.log_likelihood(POSES[:count], RANGES), expected[count - 1]):
-                wrong.append(count)
-
-    threads = [threading.Thread(target=work, args=(1 + i % 2,)) for i in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not wrong
-    assert len(model._workspace._programs) <= 2
 
 
 @pytest.fixture

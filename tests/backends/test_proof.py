@@ -7,14 +7,13 @@ import json
 import os
 import subprocess
 import sys
-import threading
 
 import pytest
 from support import fake_driver
 
 import gpusense as gs
 from gpusense._util import files
-from gpusense.backends import BackendInfo, get_backend, probe_process, processor, proof, selection
+from gpusense.backends import BackendInfo, get_backend, probe_process, proof, selection
 from gpusense.backends.probe_process import Outcome
 from gpusense.backends.proof import FLOAT64, SCALAR, VECTORS, DeviceCheck, verdict_on
 
@@ -381,55 +380,8 @@ def test_without_a_linker_pocl_says_what_to_install(needs, tmp_path):
     assert "install the linker ld (on Debian: apt-get install binutils), then run 'gpusense devices --prove'" in errors
 
 
-_MISFIT = """
-import sys
-from gpusense.backends.opencl import pocl
-fit = pocl.fit_target
-def misfit(device):
-    fit(device)
-    place, name = pocl._find_name(device)
-    pocl._replace(place, "znver3")
-pocl.fit_target = misfit
-"""
-
-
-@pytest.mark.slow
-def test_a_target_that_does_not_fit_the_library_ends_in_narrower_kernels(needs, tmp_path):
-    """The fault of a Zen 4: PoCL gets a processor without the AVX-512 of its library."""
-    needs("opencl")
-    info = gs.backends.get_backend("opencl").info
-    if "Portable" not in info.driver or info.target != "skylake-avx512":
-        pytest.skip(f"{info.name} has no AVX-512, or the driver is not PoCL")
-    (tmp_path / "sitecustomize.py").write_text(_MISFIT)
-    found, errors = default_of(tmp_path, PYTHONPATH=str(tmp_path), GPUSENSE_PROOF_SECONDS="12")
-    # The machine's load decides between them.
-    assert found["lanes"] < 16
-    assert "kernels in vectors of 16 " in errors
-
-
 def test_a_variable_that_names_nothing_is_an_error_that_names_it(monkeypatch):
     monkeypatch.setenv("GPUSENSE_BACKEND", "vulkan")
     with pytest.raises(ValueError, match=r"GPUSENSE_BACKEND: backend: must be 'auto'.* got 'vulkan'"):
         gs.backends.get_backend("auto")
     assert gs.backends.get_backend("numpy").info.backend == "numpy"
-
-
-@pytest.mark.long
-def test_devices_of_several_backends_are_proved_at_once(needs, monkeypatch):
-    """Each thread waits in its first proof until the other one has begun."""
-    needs("opencl")
-    needs("warp")
-    monkeypatch.setattr(proof, "awaits_child", lambda info: True)
-    monkeypatch.setattr(processor, "threads", lambda: 2)
-    both, met = threading.Barrier(2, timeout=60), set()
-
-    def verdict(info, *, setup=None, anew=False):
-        thread = threading.current_thread()
-        if thread is not threading.main_thread() and thread not in met:
-            met.add(thread)
-            both.wait()
-        return proof.trust(info)
-
-    monkeypatch.setattr(proof, "verdict_on", verdict)
-    found = gs.devices()
-    assert len(met) == 2 and {"opencl", "warp"} <= {one.backend for one in found if one.available}

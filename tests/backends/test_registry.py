@@ -142,28 +142,6 @@ def test_arrays_of_a_new_backend(metal):
         model.log_likelihood(array, [1.0])
 
 
-def test_defaults_of_a_library():
-    class Least(Library):
-        def list_devices(self):
-            return []
-
-        def open(self, info, handle):
-            raise AssertionError
-
-    library = Least()
-    assert (library.absent(), library.trouble(None), library.child_setup(), library.queue_key(3)) == (
-        [],
-        "",
-        None,
-        None,
-    )
-    assert library.no_device("pip install it") == "no driver offers a device: pip install it"
-    assert library.no_device("") == "no driver offers a device: install or update the driver of its vendor"
-    assert not library.is_simulator(INFO)
-    library.renew()
-    library.set_up_child(None)
-
-
 def test_a_child_is_set_up_by_its_library(metal, monkeypatch):
     seen = []
     monkeypatch.setattr(metal, "set_up_child", seen.append, raising=False)

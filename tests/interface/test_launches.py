@@ -37,11 +37,6 @@ def test_arguments_are_in_the_order_of_the_row_whatever_their_order():
     assert (bound.kernel, bound.flags, bound.size) == (KERNEL, frozenset({"FLOAT64"}), (2, 3))
 
 
-def test_named_is_the_inverse():
-    assert bind().named() == VALUES
-    assert launch(KERNEL, (), (2, 3), **bind(cap=4).named()).named() == {**VALUES, "cap": 4}
-
-
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_every_kernel_takes_the_names_of_its_row(kernel):
     row = KERNELS[kernel]
@@ -99,11 +94,6 @@ def test_a_mistyped_argument_is_named(name, value, rule):
 @pytest.mark.parametrize(("name", "value"), [("cap", np.int64(3)), ("beyond", 3), ("beyond", np.float32(3))])
 def test_numbers_of_numpy_and_integers_for_real_numbers_are_taken(name, value):
     assert bind(**{name: value}).named()[name] is value
-
-
-def test_an_unknown_kernel():
-    with pytest.raises(KeyError, match="no_kernel"):
-        launch("no_kernel", (), (1,))
 
 
 def test_flags_of_a_program_are_those_of_all_launches():

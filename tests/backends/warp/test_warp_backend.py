@@ -124,13 +124,6 @@ def test_warp_starts_without_a_word_and_keeps_its_settings(needs: Callable[[str]
     assert list(tmp_path.rglob("*.gpusense")) and not list(tmp_path.rglob("*.o"))
 
 
-@pytest.mark.slow
-def test_the_cache_can_be_switched_off(needs: Callable[[str], str], tmp_path: Path) -> None:
-    needs("warp")
-    run_quietly(tmp_path, GPUSENSE_CACHE="off", GPUSENSE_PROOF="off")
-    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
-
-
 @pytest.fixture
 def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
     """Return a launcher of the field's scores for three threads, and a function that runs a launcher on particles."""

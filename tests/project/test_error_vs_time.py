@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import importlib
 import json
 import math
@@ -13,7 +12,6 @@ from typing import Any
 
 import pytest
 from support.bench_world import made_point
-from support.browser import CHROMIUM, in_browser
 from support.paths import ROOT
 
 DEVICE, WISH = "2 cores of an X, PoCL", "localisation to 2 cm"
@@ -135,35 +133,6 @@ def test_the_answers_by_hand(page: ModuleType, tmp_path: Path) -> None:
     assert "beam model, at most 1 ms" not in text
 
 
-def test_the_first_answer_names_fewer_particles_that_leave_time_for_more_beams(
-    page: ModuleType, tmp_path: Path
-) -> None:
-    hint = "; fewer particles with more beams: **beam, 1000 x 60**: 9 ms (18 ms elapsed), 6 mm"
-    for setting, error, hinted in (
-        ("10000 x 8", 0.018, True),
-        ("10000 x 60", 0.018, False),
-        ("10000 x 8", 5e-3, False),
-    ):
-        write_tasks(tmp_path, [task("field", setting, 0.008, error), *ROWS[1:]])
-        text = page.files(tmp_path)[page.PAGE]
-        line = next(line for line in text.splitlines() if line.startswith(f"- {DEVICE}: "))
-        assert (hint in line) == hinted and line.startswith(f"- {DEVICE}: **field, {setting}**: 8 ms (16 ms elapsed), ")
-
-
-def test_answers_of_the_last_page_stand(page: ModuleType, tmp_path: Path) -> None:
-    """The beam model is slower than the field by less than the noise of two days, then by more."""
-    found = []
-    for seconds in (0.0029, 0.0033):
-        write_tasks(tmp_path, [*ROWS, task("beam", "500 x 60", seconds, 0.006)])
-        files = page.files(tmp_path, {(DEVICE, WISH): "beam, 500 x 60", ("gone", "x"): "y"})
-        (answer,) = (row for row in csv.DictReader(files[page.STANDING].splitlines()) if row["to do"] == WISH)
-        assert answer["device"] == DEVICE and "gone" not in files[page.STANDING]
-        assert f"| {WISH} | **{answer['answer']}**: " in files[page.PAGE]
-        assert files == page.files(tmp_path, {(DEVICE, WISH): answer["answer"]})
-        found.append(answer["answer"])
-    assert found == ["beam, 500 x 60", "field, 1000 x 60"]
-
-
 def test_reports_of_uncommitted_changes_are_refused(page: ModuleType, tmp_path: Path) -> None:
     write_tasks(tmp_path, ROWS, commit="abc+")
     with pytest.raises(ValueError, match="uncommitted changes: abc\\+"):
@@ -172,59 +141,9 @@ def test_reports_of_uncommitted_changes_are_refused(page: ModuleType, tmp_path: 
         page.files(tmp_path / "none")
 
 
-def test_devices_and_other_matchers_have_their_places(page: ModuleType, tmp_path: Path) -> None:
-    """The devices are a GPU by OpenCL, Warp's processor, and one core for another program."""
-    outside = {"backend": "outside", "device": "csm 1, 1 thread", "outside": "csm 1, 1 thread"}
-    rows = [
-        task("icp", "180 beams", 0.0003, 0.005, need="matching", backend="warp:cpu", device="CPU"),
-        task("icp", "180 beams", 0.00002, 0.005, need="matching", device="NVIDIA H200", kind="gpu"),
-        task("csm", "180 beams", 0.001, 0.004, need="matching", precision="float64") | outside,
-    ]  # fmt: skip
-    write_tasks(tmp_path, rows)
-    text = page.files(tmp_path)[page.PAGE]
-    assert "| to do | 1 core of an X, Warp | NVIDIA H200, OpenCL |" in text
-    assert (
-        "| match of two scans, at most 1 cm | **icp, 180 beams**: 300 us, 5 mm | **icp, 180 beams**: 40 us, 5 mm |"
-        in text
-    )
-    assert re.findall(r"^\| (\w+) \| 180 beams \| (.*?) \| (.*?) \| (.*?) \|", text, re.MULTILINE) == [
-        ("icp", "gpusense", "300 us", "600 us"), ("csm", "csm 1, 1 thread", "1 ms", "2 ms"),
-    ]  # fmt: skip
-
-
 # ---- the interactive page
 
 
 def test_the_interactive_page_fetches_nothing(page: ModuleType) -> None:
     text = page.interactive().replace("http://www.w3.org/2000/svg", "").replace('href="../docs/error-vs-time.html"', "")
     assert not re.search(r"https?:|\bsrc=|\bhref=|\bimport\b|\bfetch\(|XMLHttp|@import|url\(|\{(script|data)\}", text)
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
-def test_the_interactive_page_works_in_a_browser(page: ModuleType, tmp_path: Path) -> None:
-    """Answer, marked point, front and tooltip follow a chosen need, a moved budget and the pointer."""
-    write_tasks(tmp_path, ROWS)
-    script = """
-    const slide = value => { $("budget").value = value; $("budget").dispatchEvent(new Event("input")); };
-    document.body.dataset.opening = $("answer").textContent; slide(1000);
-    document.body.dataset.most = $("answer").textContent; slide(0);
-    document.body.dataset.least = $("answer").textContent;
-    document.body.dataset.circles = document.querySelectorAll(".mark").length;
-    document.querySelector(".mark").dispatchEvent(new MouseEvent("mousemove"));
-    document.body.dataset.tip = $("tip").textContent;
-    document.body.dataset.front = [...$("front").rows].map(row => row.cells[0].textContent).join("; ");
-    $("particles").value = "1000"; $("particles").dispatchEvent(new Event("change"));
-    document.body.dataset.fewer = document.querySelectorAll(".mark").length;
-    document.body.dataset.legend = [...$("legend").children].map(item => item.textContent).join("; ");
-    $("view").value = "profile"; $("view").dispatchEvent(new Event("change"));
-    document.body.dataset.profile = $("answer").textContent;
-    """
-    body = in_browser(page.interactive(tmp_path), script, tmp_path)
-    assert re.match(r"Within (9\.\d+|10|10\.\d+) ms: ", body["opening"])
-    assert body["fewer"] == "3" and body["legend"] == "field; beam"
-    assert body["most"].startswith("Within 50.5 ms: beam, 1000 x 60, temperature 1, 1 ms, 1 mm. make(beam)")
-    assert body["least"] == "Nothing within 990 us." and body["circles"] == "6"
-    for part in ("field, 10000 x 60", "make(field)", "python x (2026-01-01, commit abc)"):
-        assert part in body["tip"]
-    assert body["front"] == "method; beam, 1000 x 60, temperature 1"
-    assert body["profile"] == "One scene only: a profile is about several."

@@ -121,14 +121,6 @@ def test_few_blocks_are_skipped():
     assert 0 < skips <= blocks / SKIPPED
 
 
-SHELL = 'gpusense fit --map map.yaml \\\n    --out "a b"  # a comment\n\ngpusense devices\n'
-
-
-def test_commands_of_a_shell_block():
-    assert commands(SHELL) == [["gpusense", "fit", "--map", "map.yaml", "--out", "a b"], ["gpusense", "devices"]]
-    assert is_ours(SHELL) and not is_ours("pip install gpusense\n")
-
-
 FAULTS = {
     "a name that no block defines": ("```python\nx = y\n```\n", "name 'y' is not defined"),
     "a bad command": ("```sh\ngpusense map --log none.log --out m.yaml\n```\n", "exit code 2: gpusense map"),
@@ -145,15 +137,3 @@ def test_a_block_that_fails_is_found(name, tmp_path):
     page.write_text(text)
     with pytest.raises(Exception, match=message):
         run_page(page, tmp_path)
-
-
-def test_blocks_share_names_and_files(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text(
-        "```yaml\n# a.yaml\nb: 1\n```\n<!-- invisible-code-block: python\ntext = open('a.yaml').read()\n-->\n"
-        "```python\nassert __name__ == '__main__'\n```\n"
-        "```python\nassert text == '# a.yaml\\nb: 1\\n'\n```\n```sh\nls none\n```\n"
-        '<!-- skip: next "why" -->\n\n```python\n1 / 0\n```\n'
-    )
-    run = run_page(page, tmp_path)
-    assert (run.ran, run.skipped) == (2, 1)

@@ -11,7 +11,6 @@ import tokenize
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-import pytest
 from support.paths import ROOT
 
 import gpusense as gs
@@ -168,37 +167,6 @@ def test_paths_in_comments_docstrings_and_pages_exist():
 def test_links_and_anchors_of_pages_resolve():
     assert len(PAGES) > 20
     assert [link for name in PAGES for link in broken_links(name, FILES[name].read_text(encoding="utf-8"))] == []
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "gone"),
-    [
-        ("gpusense/x.py", "# see tests/test_lanes.py\n", ["gpusense/x.py:1: tests/test_lanes.py"]),
-        ("gpusense/x.py", '"""Run.\n\nSee bench/limits.py, or bench/speed/limits.py.\n"""\n',
-         ["gpusense/x.py:3: bench/limits.py"]),
-        ("gpusense/x.py", "x = 'bench/limits.py'  # a string is no prose\n", []),
-        ("kernels/opencl/x.cl", "int x; // as in raycasting.cl and raycast.cl\n",
-         ["kernels/opencl/x.cl:1: raycasting.cl"]),
-        ("docs/x.md", "`models/scan/modell.py`, `models/scan/`, `world/gone/`, your/own.py, map.yaml, <x>.py, a/*.md",
-         ["docs/x.md:1: models/scan/modell.py", "docs/x.md:1: world/gone"]),
-        ("docs/x.md", "https://example.org/bench/limits.py and /usr/lib/bench/limits.py and ~/docs/none.md", []),
-        (".ci/run", "cd bench/none.py # see docs/none.md\n", [".ci/run:1: docs/none.md"]),
-    ],
-)  # fmt: skip
-def test_the_check_finds_paths_that_are_gone(name, text, gone):
-    assert missing_paths(name, text) == gone
-
-
-def test_the_check_finds_links_that_lead_nowhere():
-    text = (
-        "[a](models.md) [b](none.md) [c](../README.md#nowhere) [d](#here) ![e](img/none.png) [f](https://a.org/x.md)\n"
-        "[g](#code-and-more) `[h](none.md)` [i]: gone.md\n## Here\n## `Code` and more\n[j]: away.md\n"
-        "```\n[k](none.md)\n```\n"
-    )
-    assert anchors(text) == {"here", "code-and-more"} and anchors("# A\n# A\n") == {"a", "a-1"}
-    assert broken_links("docs/models.md", text.replace("(#here)", "()").replace("(#code-and-more)", "()")) == [
-        f"docs/models.md: {target}" for target in ("none.md", "../README.md#nowhere", "img/none.png", "away.md")
-    ]
 
 
 def imported_names(path: Path) -> Iterator[tuple[str, str]]:

@@ -8,8 +8,6 @@ import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 ROOT = next(folder for folder in Path(__file__).resolve().parents if (folder / "pyproject.toml").is_file())
 
 SCANNED = ("gpusense", "kernels", "docs", "README.md", "CHANGELOG.md", "CONTRIBUTING.md")
@@ -112,23 +110,3 @@ def test_no_sentence_of_a_page_ends_with_too():
         for match in TOO.finditer(text)
     ]
     assert found == [] and TOO.search("as on one device, too.") and not TOO.search("also, too many. Too")
-
-
-@pytest.mark.parametrize(
-    ("suffix", "text", "expected"),
-    [
-        (".py", '"""Return.\n\n    What is told."""\n', [(3, "What is told"), (3, "told")]),
-        (".py", 'x = f"{a} of so\\\n many"\n# Of which\n# some.\n', [(3, "Of which some")]),
-        (".py", '"""What is it? Mended."""\n', [(1, "Mended")]),
-        (".cl", "int a; // One.\n// That of b.\nfloat told;\n", [(2, "That of b")]),
-        (".md", "# What is here\n\n```\nnobody\n```\n- So many.\n- What now?\n", [(1, "What is here"), (6, "So many")]),
-        (".md", "A mendable amendment; what is here is what one sees. untold\n", []),
-    ],
-)
-def test_scan(suffix, text, expected):
-    found = [
-        (line + passage.count("\n", 0, offset), word)
-        for line, passage in PASSAGES[suffix](text)
-        for offset, word in findings(passage)
-    ]
-    assert sorted(found) == sorted(expected)

@@ -12,7 +12,7 @@ from support.caster_world import lists_of
 
 import gpusense as gs
 from gpusense.evaluation.worlds import building, cloud_uniform
-from gpusense.tables.casters import Cddt, Exact, Lookup
+from gpusense.tables.casters import Cddt, Exact
 from gpusense.tables.directional import directional_table
 
 
@@ -124,22 +124,3 @@ def test_pruned_ranges_differ_beside_an_obstacle_only(backend):
         assert (longer >= 0).all() and np.count_nonzero(longer) <= 0.01 * longer.size
         assert (longer[clearance > 1.86] == 0).all()
         assert pruned.table_bytes < every.table_bytes
-
-
-@pytest.mark.parametrize("make", [Cddt, Lookup])
-def test_more_bins_are_more_exact(make):
-    """Compare medians and shares of rays off by more than two cells, as averages over three buildings."""
-    median, wrong = [], []
-    for bins in (16, 64, 256):
-        off = []
-        for seed in range(3):
-            grid = building(seed, (10.0, 10.0), 0.2)
-            poses = cloud_uniform(grid, 1000, np.random.default_rng(seed))
-            exact, found = (
-                gs.RayCaster(grid, 6.0, method=kind, backend="auto").cast(poses, [0.0, 2.0])
-                for kind in (Exact(), make(bins))
-            )
-            off.append(np.abs(found - exact) / grid.resolution)
-        median.append(np.mean([np.median(some) for some in off]))
-        wrong.append(np.mean([(some > 2).mean() for some in off]))
-    assert median[0] > median[1] > median[2] and wrong[0] > wrong[1] > wrong[2]

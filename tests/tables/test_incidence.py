@@ -48,22 +48,6 @@ def test_normals_of_straight_walls(thick, record_property):
     assert each.max() <= TOLERANCES["normals of straight walls, largest"].value
 
 
-@pytest.mark.parametrize("radius", [5, 12, 40])
-@pytest.mark.parametrize("filled", [True, False])
-def test_normals_of_circles(radius, filled):
-    """Normals of a disc point outwards; normals of a thin ring are radial, in either direction."""
-    side = 2 * radius + 11
-    x, y = np.meshgrid(*2 * [np.arange(side) + 0.5 - side / 2])
-    far = np.hypot(x, y)
-    normals = gs.surface_normals(gs.OccupancyGrid(100 * (far <= radius if filled else abs(far - radius) <= 0.6), 1.0))
-    known = ~np.isnan(normals[..., 0])
-    outwards = (normals * np.stack([x, y], axis=-1)).sum(axis=-1)[known] / far[known]
-    error = np.degrees(np.arccos(np.minimum(outwards if filled else abs(outwards), 1)))
-    assert known.sum() >= 5 * radius
-    # A window of 9 cells sees a bend of 4.5 / radius.
-    assert error.mean() <= 2.5 and error.max() <= 9
-
-
 def test_cells_without_a_surface_have_no_normal():
     cells = np.zeros((60, 60), int)
     cells[5, 5] = cells[5, 40] = cells[5, 41] = 100

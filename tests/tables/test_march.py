@@ -59,14 +59,6 @@ def test_marching_is_too_long_by_the_tolerance_or_clips_less_of_a_corner(toleran
     assert clipped <= 0.3 * tolerance * 2 * len(rays) + 2
 
 
-def room(seed: int) -> tuple[gs.OccupancyGrid, np.ndarray]:
-    """Return four walls and nothing else: no corner that a ray could clip."""
-    cells = np.full((30, 40), 100)
-    cells[2:-2, 2:-2] = 0
-    rng = np.random.default_rng(seed)
-    return gs.OccupancyGrid(cells, 1.0), rng.uniform((2, 2, -4), (38, 28, 4), (200, 3))
-
-
 class Counting:
     """A table that counts its look-ups."""
 
@@ -86,28 +78,6 @@ def steps(grid: gs.OccupancyGrid, poses: np.ndarray, kind: March, limit: float) 
     ahead, window = np.tile([1.0, 0.0], (len(pose), 1)), Window(0, 0, *grid.shape)
     march_reference.cast_ray(frozenset({"FLOAT64"}), table, window, cell.astype(int), pose, ahead, limit, kind.struct())
     return table.count
-
-
-def test_a_smaller_tolerance_is_more_exact_and_takes_more_steps():
-    tolerances, limit = (2.0, 0.5, 0.1, 0.02, 0.004), 40.0
-    for seed in range(4):
-        for make in (room, scattered):
-            grid, poses = make(seed)
-            exact = gs.RayCaster(grid, limit, backend="numpy", precision="float64").cast(poses, [0.0])
-            medians, worst, counts = [], [], []
-            for tolerance in tolerances:
-                kind = March(tolerance)
-                found = gs.RayCaster(grid, limit, method=kind, backend="numpy", precision="float64").cast(poses, [0.0])
-                error = (found - exact)[exact < limit]
-                assert error.min() >= -1e-12
-                medians.append(np.median(error))
-                worst.append(error.max())
-                counts.append(steps(grid, poses, kind, limit))
-            assert sorted(medians, reverse=True) == medians and medians[-1] < 0.02 * medians[0]
-            assert sorted(counts) == counts and counts[-1] > 3 * counts[0]
-            if make is room:
-                assert sorted(worst, reverse=True) == worst
-                assert all(w <= t + LEAST_PART * limit for w, t in zip(worst, tolerances, strict=True))
 
 
 def test_the_rule_centre_takes_fewer_steps_and_errs_more():

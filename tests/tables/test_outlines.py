@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense.tables.normals import REACH, Outlines
 
 TURNS = (0.0, 0.05, 0.2, 0.4, 0.55, math.pi / 4, 1.1, 1.4)
 
@@ -95,21 +94,6 @@ def test_the_end_of_a_wall_has_the_direction_of_the_wall(thick):
     assert np.abs(sides[..., 0]).max() <= math.sin(math.radians(1.5))
     if thick > 1:
         np.testing.assert_allclose(sides[..., 1], [[-1] * 24, [1] * 24], atol=1e-3)
-
-
-def test_an_outline_surrounds_each_obstacle_once():
-    """The sides of random obstacles form closed loops with neighbours at most a cell apart."""
-    obstacles = np.zeros((60, 70), bool)
-    obstacles[2:-2, 2:-2] = np.random.default_rng(1).random((56, 66)) < 0.4
-    outlines = Outlines(obstacles)
-    free = [~obstacles[1:-1, 1:-1] & obstacles[1 + dy : 59 + dy, 1 + dx : 69 + dx]
-            for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1))]  # fmt: skip
-    assert len(outlines.cell) == sum(side.sum() for side in free)
-    np.testing.assert_array_equal(np.sort(outlines.following), np.arange(len(outlines.cell)))
-    np.testing.assert_array_equal(outlines.preceding[outlines.following], np.arange(len(outlines.cell)))
-    middle = np.stack([outlines.cell % 70, outlines.cell // 70], axis=1) + outlines.outward / 2
-    assert (np.hypot(*(middle[outlines.following] - middle).T) <= 1).all()
-    assert REACH >= 16
 
 
 # ------------------------------------------------------------------------------------------------------------- sonars

@@ -29,16 +29,6 @@ def test_raw_ignores_alpha(place):
     assert read_map(place(image, "map.png", mode="raw")).cells.tolist() == [[7, 9]]
 
 
-def test_colours_count_by_their_luma(place):
-    rgb = np.array([[[255, 255, 255], [0, 0, 255], [0, 255, 0], [255, 0, 0], [0, 0, 0]]], np.uint8)
-    grid = read_map(place(Image.fromarray(rgb), "map.png"))
-    assert grid.cells.tolist() == [[0, 100, -1, 100, 100]]  # Greys 255, 29, 149, 76 and 0.
-    grid = read_map(place(Image.fromarray(rgb), "map.png", mode="scale", free_thresh=0, occupied_thresh=1))
-    assert grid.cells.tolist() == [[0, 89, 42, 70, 100]]
-    ppm = b"P6 5 1 255\n" + rgb.tobytes()
-    assert read_map(place(ppm)).cells.tolist() == [[0, 100, -1, 100, 100]]
-
-
 @pytest.mark.parametrize(
     ("name", "image"),
     [

@@ -66,14 +66,6 @@ def test_thresholds_of_every_grey(place, mode, negate):
         assert [found[g] for g in near] == [cell(g, k / 255, (k + 1) / 255, mode, negate) for g in near]
 
 
-def test_scale_of_any_thresholds(place):
-    rng = np.random.default_rng(0)
-    for free, occupied in np.sort(rng.uniform(0, 1, (15, 2)), axis=1).tolist():
-        for negate in (False, True):
-            found = cells_of(place, free, occupied, "scale", negate)
-            np.testing.assert_array_equal(found, [cell(g, free, occupied, "scale", negate) for g in LEVELS])
-
-
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("steps", "apart", "digest"),

@@ -91,14 +91,6 @@ def test_geometry_in_other_units(make, text) -> None:
         make()
 
 
-def test_a_map_file_of_large_cells(tmp_path) -> None:
-    gs.write_map(GRID, tmp_path / "map.yaml")
-    text = (tmp_path / "map.yaml").read_text().replace("resolution: 0.05", "resolution: 5")
-    (tmp_path / "map.yaml").write_text(text)
-    with warns_once("resolution: is 5 m"):
-        assert gs.read_map(tmp_path / "map.yaml").resolution == 5.0
-
-
 # ------------------------------------------------------------------------------------------------- readings
 
 
@@ -110,13 +102,6 @@ def test_negative_readings_are_missing_with_one_warning() -> None:
         for _ in range(3):
             one.log_likelihood(POSES, some)
     np.testing.assert_array_equal(first, one.log_likelihood(POSES, np.where(some < 0, np.nan, some)))
-
-
-def test_readings_that_become_negative_later() -> None:
-    one = model()
-    one.log_likelihood(POSES, RANGES)
-    with warns_once("negative readings"):
-        one.log_likelihood(POSES, -RANGES)
 
 
 @pytest.mark.parametrize("zeros", [3, 8, 19])

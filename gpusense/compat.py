@@ -4,7 +4,6 @@
 """
 
 from gpusense.localization.nav2 import Nav2Options, from_nav2
-from gpusense.peers.parameters import BeamWeights, FieldWeights
-from gpusense.peers.weights import PEERS, Amcl, Beluga, Peer
+from gpusense.peers.weights import PEERS, Amcl, BeamWeights, Beluga, FieldWeights, Peer
 
 __all__ = ["PEERS", "Amcl", "Beluga", "BeamWeights", "FieldWeights", "Nav2Options", "Peer", "from_nav2"]

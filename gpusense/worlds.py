@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gpusense.evaluation.buildings import named_world
     from gpusense.evaluation.simulation.changes import change_world
-    from gpusense.evaluation.simulation.files import write_run
-    from gpusense.evaluation.simulation.run import SimulatedRun, simulate_run
+    from gpusense.evaluation.simulation.run import SimulatedRun, simulate_run, write_run
     from gpusense.evaluation.worlds import (
         building,
         cloud_around,
@@ -25,7 +24,7 @@ __all__ = [
 # Modules of the package ``evaluation``.
 _HOME = dict.fromkeys(__all__, "worlds") | {
     "SimulatedRun": "simulation.run", "building": "buildings", "change_world": "simulation.changes",
-    "named_world": "buildings", "simulate_run": "simulation.run", "write_run": "simulation.files",
+    "named_world": "buildings", "simulate_run": "simulation.run", "write_run": "simulation.run",
 }  # fmt: skip
 
 

@@ -73,7 +73,7 @@ WISHES = (
 def value(number: float, unit: str) -> str:
     """Format an error; shares and relative errors in percent, lengths in millimetres or centimetres."""
     if unit in ("share", "relative"):
-        return "0" if number == 0 else error_text(number, "%")
+        return "0" if number == 0 else error_text(number, "share")
     if unit == "nats":
         return "0" if number < 1e-6 else f"{number:.2g}"
     return f"{number:.3g}" if unit == "cells" else error_text(number, unit)
@@ -89,14 +89,12 @@ def chosen(rows: Sequence[Row], wish: Wish, device: str, standing: str = "") -> 
     able = [row for row in own(rows, wish.need, device) if wish.only(row) and not row.maps]
     if not able:
         return None, False
-    entries = [row.entry(SHOWN[wish.need][0]) for row in able]
-    earlier = next((entry for row, entry in zip(able, entries, strict=True) if row.text == standing), None)
-    best = choose(entries, wish.error, wish.seconds, earlier)
+    measure, earlier = SHOWN[wish.need][0], next((row for row in able if row.text == standing), None)
+    best = choose(able, measure, wish.error, wish.seconds, earlier)
     if best is not None:
-        return able[entries.index(best)], True
+        return best, True
     # If none keeps the limit, choose the fastest or the most exact one, among equal ones by the same rule.
-    nearest = choose(entries, None if wish.error else math.inf, None, earlier)
-    return (able[entries.index(nearest)] if nearest else None), False
+    return choose(able, measure, None if wish.error else math.inf, None, earlier), False
 
 
 Standing = Mapping[tuple[str, str], str]

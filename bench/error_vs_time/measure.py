@@ -30,6 +30,7 @@ from speed.baselines import candidates as outside
 
 from gpusense.backends import get_backend
 from gpusense.commands import bench
+from gpusense.commands.arguments import Options
 from gpusense.evaluation.benchmark.report import document, plain
 from gpusense.evaluation.benchmark.runner import Outcome, Plan, run
 from gpusense.evaluation.machine import machine
@@ -44,8 +45,8 @@ FIRST = ("building", "basement", "intel", "clutter", "willow", "spielberg")
 
 def plans_of(arguments: argparse.Namespace) -> tuple[list[Plan], dict[str, Any], list[str]]:
     """Return a plan for each scene, exact methods in float64 included, the arguments, and notes on absent programs."""
-    parser = argparse.ArgumentParser()
-    bench.add_arguments(parser)
+    parser = argparse.ArgumentParser(add_help=False)
+    bench.add_options(Options(parser))
     words = [
         *(QUICK if arguments.quick else SIZE),
         "--build-limit",

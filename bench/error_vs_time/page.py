@@ -49,9 +49,7 @@ TABLES = ("cddt", "lookup", "march, centre")
 
 def best(rows: Sequence[Row], measure: str) -> list[Row]:
     """Return the Pareto front of the rows of all maps."""
-    rows = [row for row in rows if not row.maps]
-    entries = [row.entry(measure) for row in rows]
-    return [rows[entries.index(entry)] for entry in front(entries)]
+    return front([row for row in rows if not row.maps], measure)
 
 
 def chart(rows: Sequence[Row], need: str, devices: Sequence[str]) -> str:

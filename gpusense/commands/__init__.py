@@ -2,10 +2,10 @@
 
 A command module has
 
-- ``NAME: str``, the name on the command line;
-- ``HELP: str``, the line that ``gpusense --help`` shows;
-- ``EPILOG: str``, shown verbatim at the end of its help;
-- ``add_arguments(parser) -> None``, which may also set ``parser.description``;
+- ``HELP: str``, the line that ``gpusense --help`` shows, and optionally ``DESCRIPTION``, which its help shows instead;
+- ``FIRST``, the options that lead its help, and ``SHARED``, its options of :data:`gpusense.commands.arguments.SHARED`;
+- ``EPILOG: str``, the end of its help, with examples, and optionally ``CODES``, meanings of exit codes;
+- ``add_options(add) -> None``, which adds further options by :class:`gpusense.commands.arguments.Options`;
 - ``run(args) -> int``, which returns the exit code.
 
 Importing a command module is cheap: backends, drawing and rich are imported on use. A ValueError, TypeError, OSError or

@@ -1,18 +1,18 @@
-"""Define options and value types for several commands, and open the backends of ``--backend``."""
+"""Define the options of commands and their types, and open what the options choose."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gpusense._util.extras import check_library
 from gpusense._util.files import check_writable
 from gpusense._util.typing import PRECISIONS
-from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
     from gpusense.backends import Backend
@@ -31,53 +31,112 @@ _LONGEST_RANGE = 10_000.0
 # Library that writes files of a suffix, and the subject of the message if it is missing.
 _PICTURE = ("matplotlib", "a picture")
 _WRITERS = {".png": _PICTURE, ".pdf": _PICTURE, ".svg": _PICTURE, ".rrd": ("rerun", "a recording for Rerun")}
-_SHARED = ("z_hit", "z_max", "z_rand", "sigma_hit", "hit", "hit_dof")
-_SPECIFIC = {"beam": ("z_short", "lambda_short"), "field": ("max_distance", "interpolation")}
-_MEANING = {
-    "z_hit": "weight of a correct range with noise",
-    "z_max": "weight of 'no return'",
-    "z_rand": "weight of a random reading; the weights must sum to 1",
-    "sigma_hit": "deviation of a correct range, or of an end point from a wall [m]",
-    "hit_dof": "degrees of freedom of --hit student, 1 to 1e6",
-    "z_short": "weight of an unexpected obstacle; beam model only",
-    "lambda_short": "rate of unexpected obstacles along a beam [1/m]; beam model only",
-    "max_distance": "largest distance to an obstacle that counts [m]; field only",
-}
 
 
-def add_backend(parser: argparse.ArgumentParser, *, default: str = "auto") -> None:
+class Options:
+    """Options of a command; those named in ``first`` lead the help.
+
+    ``add("--step M", "distance between scans [m]", positive_number, 0.2)`` adds an option with one value, and states
+    its default. "--start X Y THETA" has three values, "--topic NAME..." one or more, "--scene NAME*" may be repeated,
+    "--quick" is a switch, and "PLAN" an argument without a name. A type may be a tuple of choices.
+    """
+
+    def __init__(self, parser: argparse.ArgumentParser, first: Sequence[str] = ()) -> None:
+        self.usage = "%(prog)s"
+        self._first = first
+        titles = ("most used", "further options") if first else ("most used", "options")
+        self._groups: list[Any] = [parser.add_argument_group(title) for title in titles]
+        self._groups[1].add_argument("-h", "--help", action="help", help="show this help and exit")
+
+    @contextlib.contextmanager
+    def exclusive(self, *, first: bool = True, required: bool = False) -> Iterator[None]:
+        """Make the options that are added meanwhile exclude each other."""
+        before = self._groups
+        self._groups = [before[not first].add_mutually_exclusive_group(required=required)] * 2
+        yield
+        self._groups = before
+
+    def __call__(self, names: str, text: str, kind: Any = None, default: Any = None, **more: Any) -> None:
+        """Add an option with its help, type and default; ``more`` are arguments of ``add_argument``."""
+        flags = [word for word in names.split() if word.startswith("-")]
+        values = [word.rstrip("*") for word in names.split() if not word.startswith("-") and word != "*"]
+        if isinstance(kind, tuple):
+            more["choices"] = kind
+        elif not values and "action" not in more:
+            more["action"] = "store_true"
+        elif kind is not None:
+            more["type"] = kind
+        if names.endswith("..."):
+            more["nargs"], values = "+", [values[0].removesuffix("...")]
+        if names.endswith("*"):
+            more["action"] = "append"
+        if values:
+            more.setdefault("metavar", values[0] if len(values) == 1 else tuple(values))
+        if len(values) > 1:
+            more.setdefault("nargs", len(values))
+        if default is not None:
+            more["default"] = default
+            if "(default: " not in text and default not in ([], ()):
+                shown = " ".join(f"{one:g}" for one in default) if isinstance(default, tuple) else default
+                text += f" (default: {shown})"
+        dest = more.pop("dest", (flags or values)[0].strip("-").replace("-", "_").lower())
+        where = self._groups[dest not in self._first and bool(flags)]
+        where.add_argument(*(flags or [dest]), help=text, **more, **({"dest": dest} if flags else {}))
+        if not flags:
+            self.usage += f" [{values[0]}]" if more.get("nargs") == "?" else f" {values[0]}"
+        elif more.get("required"):
+            self.usage += f" {flags[0]} {values[0]}"
+
+
+def _json(add: Options, *, verbose: bool = False) -> None:
+    with add.exclusive(first=False):
+        add("--json", "print one JSON document, and nothing else, on standard output")
+        if verbose:
+            add("-v --verbose", "also print all details", dest="verbose")
+
+
+def _model(add: Options, default: str = "beam") -> None:
+    add("--model", "measurement model", ("beam", "field"), default)
+    _beams(add)
+    add("--precision", "precision", PRECISIONS, "float32")
+    add("--parameters YAML", "a file with beam_model or likelihood_field, such as 'gpusense fit --out' writes", Path)
+    add("--set NAME=VALUE...", "values of the model's parameters, such as sigma_hit=0.1 hit=student", default=[])
+
+
+def _beams(add: Options) -> None:
+    add("--beams B", "thin each scan evenly to B beams (default: all)", whole_number(low=1))
+
+
+def add_backend(add: Options, default: str = "auto") -> None:
     """Add ``--backend``, one selection string; the library checks it on use."""
-    parser.add_argument("--backend", default=default, metavar="DEVICE", help=f"{BACKEND_HELP} (default: %(default)s)")
+    add("--backend DEVICE", BACKEND_HELP, default=default)
 
 
-def add_temperature(parser: argparse.ArgumentParser, automatic: str) -> None:
-    """Add ``--temperature``: a number, or ``DEFAULTS.temperature``, explained by ``automatic``."""
-    parser.add_argument(
-        "--temperature", type=_temperature, default=DEFAULTS.temperature, metavar="T",
-        help=f"factor of log-likelihoods in (0, 1], or {automatic} (default: %(default)s)",
-    )  # fmt: skip
+def _range(add: Options) -> None:
+    add("--range-max M", "readings of at least this are 'no return' [m] (default: the log's reading for 'no return')",
+        range_number)  # fmt: skip
+    add("--range-min M", "readings of a bag below this are missing [m] (default: the bag's value)", not_negative_number)
 
 
-def _temperature(text: str) -> float | str:
-    return text if text == "auto" else positive_number(text)
+def _choice(add: Options, what: str = "scan") -> None:
+    add("--every E", f"every E-th {what}, from --offset on; '--every 2 --offset 1' are the odd ones",
+        whole_number(low=1), 1)  # fmt: skip
+    add("--offset O", f"index of the first {what}", whole_number(low=0), 0)
+    add("--limit S", "read at most S (default: all)", whole_number(low=1))
+    _range(add)
 
 
-def add_json(parser: argparse.ArgumentParser, *, verbose: bool = False) -> None:
-    """Add ``--json``, and as its alternative ``--verbose`` where the command has more to print."""
-    group = parser.add_mutually_exclusive_group()
-    group.add_argument(
-        "--json", action="store_true", help="print one JSON document, and nothing else, on standard output"
-    )
-    if verbose:
-        group.add_argument("-v", "--verbose", action="store_true", help="also print all details")
-
-
-def add_seed(parser: argparse.ArgumentParser) -> None:
-    """Add ``--seed``, an integer >= 0 for ``numpy.random.default_rng``."""
-    parser.add_argument(
-        "--seed", type=whole_number(low=0), default=0, metavar="N",
-        help="seed of the random numbers: the same seed gives the same run (default: %(default)s)",
-    )  # fmt: skip
+# Options of many commands, by their names in the attribute ``SHARED`` of a command.
+SHARED: dict[str, Callable[[Options], None]] = {
+    "reference": lambda add: add(
+        "--reference FILE", "a TUM trajectory with the poses of the robot at the times of the scans; scans without a "
+        "pose are skipped (default: the logged poses)", Path,
+    ),
+    "choice": _choice, "pairs": lambda add: _choice(add, "scan or pair"), "range": _range, "beams": _beams,
+    "model": _model, "field": lambda add: _model(add, "field"), "backend": add_backend,
+    "seed": lambda add: add("--seed N", "seed; the same seed gives the same run", whole_number(low=0), 0),
+    "json": _json, "verbose": lambda add: _json(add, verbose=True),
+}  # fmt: skip
 
 
 def open_backends(selections: Sequence[str] | None) -> tuple[list[Backend], list[str]]:
@@ -137,106 +196,75 @@ range_number = real_number(
 
 
 class Output:
-    """A type for ``add_argument``: a file to write, different from the command's other files."""
+    """A type of option: an output of the command; a file of one of some suffixes is checked before any work."""
 
-    def __init__(self, convert: Callable[[str], Path] = Path) -> None:
-        self._convert = convert
+    def __init__(self, *suffixes: str) -> None:
+        self._suffixes = suffixes
 
     def __call__(self, text: str) -> Path:
         """Convert an argument to a path."""
-        return self._convert(text)
-
-
-def output_path(*suffixes: str) -> Output:
-    """Make a type for ``add_argument``: a file of one of some suffixes that can be written, checked before any work."""
-
-    def convert(text: str) -> Path:
         path = Path(text)
-        if suffixes and path.suffix.lower() not in suffixes:
-            raise argparse.ArgumentTypeError(f"must end in {' or '.join(suffixes)}, got {text!r}")
-        check_writer(path.suffix.lower())
-        try:
-            check_writable(path)
-        except (OSError, ValueError) as error:
-            reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-            raise argparse.ArgumentTypeError(f"must be a file that can be written, got {text!r}: {reason}") from None
+        if self._suffixes and path.suffix.lower() not in self._suffixes:
+            raise argparse.ArgumentTypeError(f"must end in {' or '.join(self._suffixes)}, got {text!r}")
+        if self._suffixes:
+            _check_target(text, path, path.suffix.lower(), "must be a file that can be written")
         return path
 
-    return Output(convert)
+
+picture, table, trajectory = Output(".png", ".pdf", ".svg"), Output(".csv"), Output(".tum", ".txt")
 
 
 def output_folder(*suffixes: str) -> Callable[[str], Path]:
-    """Make a type for ``add_argument``: a folder that can be written to, or created, for files of some suffixes."""
+    """Make a type of option: a folder that can be written to, or created after the work, for files of some suffixes."""
 
     def convert(text: str) -> Path:
-        folder = Path(text)
-        for suffix in suffixes:
-            check_writer(suffix)
-        try:
-            # The folder is created after the work.
-            there = next(each for each in (folder, *folder.absolute().parents) if os.path.lexists(each))
-            if not there.is_dir():
-                raise ValueError("not a folder")
-            check_writable(there / "new")
-        except (OSError, ValueError) as error:
-            reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-            rule = "must be a folder that can be written to"
-            raise argparse.ArgumentTypeError(f"{rule}, got {text!r}: {reason}") from None
+        folder, rule = Path(text), "must be a folder that can be written to"
+        there = next(each for each in (folder, *folder.absolute().parents) if os.path.lexists(each))
+        if not there.is_dir():
+            raise argparse.ArgumentTypeError(f"{rule}, got {text!r}: not a folder")
+        for suffix in suffixes or ("",):
+            _check_target(text, there / "new", suffix, rule)
         return folder
 
     return convert
 
 
-def check_writer(suffix: str) -> None:
-    """Check that the library for writing files of a suffix is installed."""
-    if suffix not in _WRITERS:
-        return
+def _check_target(text: str, path: Path, suffix: str, rule: str) -> None:
+    """Check that a file can be written, and that the library for its suffix is installed."""
     try:
-        check_library(*_WRITERS[suffix])
+        if suffix in _WRITERS:
+            check_library(*_WRITERS[suffix])
+        check_writable(path)
     except ImportError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise argparse.ArgumentTypeError(f"{rule}, got {text!r}: {reason}") from None
 
 
-def add_model(parser: argparse.ArgumentParser, default: str = "beam") -> None:
-    """Add ``--model``, ``--precision`` and ``--beams``."""
-    add = parser.add_argument
-    add("--model", choices=("beam", "field"), default=default, help="measurement model (default: %(default)s)")
-    add("--beams", type=whole_number(low=1), metavar="B", help="thin each scan evenly to B beams (default: all)")
-    add("--precision", choices=PRECISIONS, default="float32", help="precision (default: %(default)s)")
-
-
-def add_parameters(parser: argparse.ArgumentParser) -> None:
-    """Add the group of the model's parameters."""
-    from gpusense.world.hit_shapes import SHAPES
-
-    group = parser.add_argument_group("parameters of the model")
-    group.add_argument("--parameters", "--params", type=Path, metavar="YAML",
-        help="a file with beam_model, such as 'gpusense fit --out' writes; beam model only")  # fmt: skip
-    for name, meaning in _MEANING.items():
-        group.add_argument(_option(name), type=number, metavar="X", help=meaning)
-    group.add_argument("--hit", choices=tuple(SHAPES), help="shape of a correct range")
-    group.add_argument("--interpolation", choices=("nearest", "bilinear"), help="look-up of the field; field only")
+def temperature(text: str) -> float | str:
+    """Convert an argument to a positive number or "auto"."""
+    return text if text == "auto" else positive_number(text)
 
 
 def parameters_of(args: argparse.Namespace) -> BeamParameters | LikelihoodFieldParameters:
     """Return the parameters of the model that the options choose."""
+    from gpusense.commands.parameter_files import read_parameters
     from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 
-    options = {name: getattr(args, name) for name in (*_SHARED, *_SPECIFIC["beam"], *_SPECIFIC["field"])}
-    changes = {name: value for name, value in options.items() if value is not None}
-    for name in changes:
-        if name not in (*_SHARED, *_SPECIFIC[args.model]):
-            raise ValueError(f"{_option(name)}: must be a parameter of the {args.model} model, got another model's")
-    if args.model == "field":
-        if args.parameters is not None:
-            raise ValueError(f"--parameters: must be left out with the field, got {args.parameters}")
-        return LikelihoodFieldParameters.tracking().replace(**changes)
-    beam = BeamParameters()
+    values: BeamParameters | LikelihoodFieldParameters
+    values = BeamParameters() if args.model == "beam" else LikelihoodFieldParameters.tracking()
     if args.parameters is not None:
-        from gpusense.commands.parameter_files import read_beam_parameters
-
-        beam = read_beam_parameters(args.parameters)
-    return beam.replace(**changes)
+        values = read_parameters(args.parameters, "beam_model" if args.model == "beam" else "likelihood_field")
+    changes: dict[str, float | str] = {}
+    for name, equals, text in (word.partition("=") for word in args.set):
+        if not equals:
+            raise ValueError(f"--set: must be NAME=VALUE, got {name}")
+        try:
+            changes[name] = float(text)
+        except ValueError:
+            changes[name] = text
+    return values.replace(**changes)
 
 
 def scan_model(
@@ -252,7 +280,3 @@ def scan_model(
     if isinstance(parameters, BeamParameters):
         return BeamModel(grid, scanner, parameters, **options)
     return LikelihoodFieldModel(grid, scanner, parameters, **options)
-
-
-def _option(name: str) -> str:
-    return f"--{name.replace('_', '-')}"

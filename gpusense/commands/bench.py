@@ -10,18 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gpusense._util.files import write_whole
-from gpusense._util.progress import progress
 from gpusense._util.typing import PRECISIONS
 from gpusense.commands import output
 from gpusense.commands.arguments import (
     BACKEND_HELP,
+    Options,
+    Output,
     open_backends,
     output_folder,
-    output_path,
     positive_number,
     whole_number,
 )
-from gpusense.commands.signals import held
+from gpusense.commands.signals import working
 from gpusense.evaluation.benchmark.choice import choices, parse_error, parse_time
 from gpusense.evaluation.machine import machine, machine_line
 
@@ -46,9 +46,9 @@ whole map ('global') and around the true pose ('tracking'). Errors are against t
 
 The answer comes first: for each problem and device the fastest method with an error of at most --max-error, or the most
 exact one whose call takes at most --max-time. The table below it lists the methods that no other method beats in both
-error and time. Nats are the KL divergence of the posterior, lengths the shift of its mean, both at a comparable
-temperature; per cent are rays wrong by more than a cell, cells the range error that 95 % of the rays keep. Times are
-calls of --particles times --beams.
+error and time. Nats are the KL divergence of the posterior around the true pose, lengths the shift of its mean, both at
+a comparable temperature; per cent are rays wrong by more than a cell, cells the range error that 95 % of the rays keep.
+Times are calls of --particles times --beams.
 
 Scenes: 'building' and 'clutter' are generated. If GPUSENSE_DATA names the folder of recorded data, 'basement',
 'spielberg', 'willow' and 'intel' are added; --map adds others.
@@ -66,39 +66,31 @@ examples:
       --max-error "0.01 nats" --max-time "1 ms\""""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_options(add: Options) -> None:
     """Add the command's options."""
-    add = parser.add_argument
-    add("--output", type=output_folder(), metavar="DIR", help="folder for the report, created if absent")
-    add("--html", type=output_path(".html"), metavar="FILE",
-        help="interactive page of the measurement, one file that works offline")  # fmt: skip
-    add("--quick", action="store_true",
-        help="small maps, few values of the knobs, float32: half a minute plus compiling")  # fmt: skip
-    add("--scene", action="append", metavar="NAME", help="a scene; may be repeated (default: all)")
-    add("--map", action="append", default=[], type=Path, metavar="YAML",
-        help="a map_server map as a further scene; may be repeated")  # fmt: skip
-    add("--backend", action="append", metavar="DEVICE",
-        help=f"{BACKEND_HELP}; may be repeated (default: all present except simulators)")  # fmt: skip
-    add("--problem", action="append", choices=PROBLEMS, help="a problem; may be repeated (default: all)")
-    add("--method", action="append", metavar="NAME",
-        help="a method, such as exact, march or field; may be repeated (default: all)")  # fmt: skip
-    add("--precision", action="append", choices=PRECISIONS,
-        help="a precision; may be repeated (default: both; with --quick float32)")  # fmt: skip
-    add("--particles", type=whole_number(low=1), metavar="N",
-        help="particles of a timed call; NumPy gets an eighth (default: GPU 4096, processor 1024)")  # fmt: skip
-    add("--checked", type=whole_number(low=2), metavar="M", help="particles whose errors are computed (default: 512)")
-    add("--beams", type=whole_number(low=1, high=100_000), metavar="K", help="beams of the scanner (default: 360)")
-    add("--repeats", type=whole_number(low=1), metavar="R", help="timed calls per point (default: 20; with --quick 10)")
-    add("--seconds", type=positive_number, metavar="S",
-        help="longest time of a point's timed calls, at least three [s] (default: 5; with --quick 0.02)")  # fmt: skip
-    add("--build-limit", type=positive_number, metavar="S",
-        help="leave out tables that take longer to build [s] (default: 60)")  # fmt: skip
-    add("--max-error", action="append", default=[], type=_limit(parse_error), metavar="E",
-        help="recommend the fastest method with at most this error, such as '0.01 nats', '2 cm', '1 %%' or '0.5 cells' "
-        "(default: 0.01 nats, 1 %%); may be repeated with other units")  # fmt: skip
-    add("--max-time", type=_limit(parse_time), metavar="T",
-        help="recommend the most exact method whose call takes at most this time, such as '1 ms'")  # fmt: skip
-    add("--seed", type=whole_number(low=0), metavar="N", help="seed of maps, scans and particles (default: 0)")
+    add("--output DIR", "folder for the report, created if absent", output_folder())
+    add("--html FILE", "interactive page of the measurement, one file that works offline", Output(".html"))
+    add("--quick", "small maps, few values of the knobs, float32: half a minute plus compiling")
+    add("--scene NAME*", "a scene; may be repeated (default: all)")
+    add("--map YAML*", "a map_server map as a further scene; may be repeated", Path, [])
+    add("--backend DEVICE*", f"{BACKEND_HELP}; may be repeated (default: all present except simulators)")
+    add("--problem *", "a problem; may be repeated (default: all)", PROBLEMS)
+    add("--method NAME*", "a method, such as exact, march or field; may be repeated (default: all)")
+    add("--precision *", "a precision; may be repeated (default: both; with --quick float32)", PRECISIONS)
+    add("--particles N", "particles of a timed call; NumPy gets an eighth (default: GPU 4096, processor 1024)",
+        whole_number(low=1))  # fmt: skip
+    add("--checked M", "particles whose errors are computed (default: 512)", whole_number(low=2))
+    add("--beams K", "beams of the scanner (default: 360)", whole_number(low=1, high=100_000))
+    add("--repeats R", "timed calls per point (default: 20; with --quick 10)", whole_number(low=1))
+    add("--seconds S", "longest time of a point's timed calls, at least three [s] (default: 5; with --quick 0.02)",
+        positive_number)  # fmt: skip
+    add("--build-limit S", "leave out tables that take longer to build [s] (default: 60)", positive_number)
+    add("--max-error E*", "choose the fastest method with at most this error, such as '0.01 nats', '2 cm', '1 %%' "
+        "or '0.5 cells' (default: 0.01 nats, 1 %%); may be repeated with other units",
+        _limit(parse_error), [])  # fmt: skip
+    add("--max-time T", "recommend the most exact method whose call takes at most this time, such as '1 ms'",
+        _limit(parse_time))  # fmt: skip
+    add("--seed N", "seed of maps, scans and particles (default: 0)", whole_number(low=0))
 
 
 def _limit(parse: Callable[[str], Any]) -> Callable[[str], Any]:
@@ -121,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
 
     plan, absent = make_plan(args)
     outcome = Outcome([], [])
-    with held(outcome.points) as stops, progress(steps(plan)) as step:
+    with working(outcome.points, steps(plan)) as step:
         run_plan(plan, step, outcome)
     report = document(plan, outcome, arguments_of(args, plan), machine(), absent, command_of(sys.argv[1:]))
     if args.output is not None:
@@ -131,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         output.document(report)
     else:
-        found = list(choices(report["points"], dict(args.max_error), args.max_time))
+        found = list(choices(report, dict(args.max_error), args.max_time))
         for _, answer, _ in found:
             output.result(answer)
         for backend in dict.fromkeys(backend for backend, _, _ in found):
@@ -139,8 +131,6 @@ def run(args: argparse.Namespace) -> int:
             rows = [row for place, _, rows in found if place == backend for row in rows]
             output.table(["problem", "method", "error", "time"], rows, right=["error", "time"])
         _print_rest(report, args.output)
-    if stops:
-        raise stops[0]
     return 0
 
 

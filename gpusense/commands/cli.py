@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import difflib
-import functools
 import importlib
 import io
 import itertools
@@ -14,13 +13,13 @@ import re
 import sys
 import textwrap
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from types import ModuleType
 from typing import Any, NoReturn
 
 from gpusense._util.extras import explained
 from gpusense._version import __version__
-from gpusense.commands import arguments, scans, signals
+from gpusense.commands import arguments, signals
 
 # Modules of gpusense.commands, in the order of the help.
 COMMANDS = (
@@ -29,13 +28,6 @@ COMMANDS = (
 )  # fmt: skip
 ALIASES = {"localise": "localize"}
 
-# Options of many commands; the attribute ``SHARED`` of a command names them.
-_SHARED: dict[str, Callable[[argparse.ArgumentParser], None]] = {
-    "reference": scans.add_reference, "choice": scans.add_choice, "range": scans.add_range_max,
-    "model": arguments.add_model, "parameters": arguments.add_parameters, "backend": arguments.add_backend,
-    "seed": arguments.add_seed, "json": arguments.add_json,
-    "verbose": functools.partial(arguments.add_json, verbose=True),
-}  # fmt: skip
 # Meanings of the exit codes where a command states none.
 _CODES = {0: "success", 2: "bad input", 130: "interrupted", 143: "terminated"}
 BAD_INPUT = 2
@@ -64,78 +56,31 @@ keeps and prints the results so far."""
 class Parser(argparse.ArgumentParser):
     """Parser that reports an error in one line."""
 
-    _command: str | None = None
-
     def error(self, message: str) -> NoReturn:
         """Print the message with a likely correction instead of the usage, and exit."""
-        self.exit(BAD_INPUT, _error_line(message + self._correction(message)))
-
-    def _correction(self, message: str) -> str:
-        """Return the name that an unknown command, choice or option resembles, or ""."""
-        wrong = re.match(r"argument (\S+): invalid choice: '([^']*)'|unrecognized arguments: (-\S+)", message)
-        if wrong is None:
-            return ""
-        name, choice, option = wrong.groups()
-        parser = self
-        if option:
-            # The top-level parser reports the unknown options of commands.
-            parser = self._commands().get(self._command or "", self)
-            known: list[str] = [text for action in parser._actions for text in action.option_strings]
-        elif name == "COMMAND":
-            known = list(COMMANDS)
-        else:
-            actions = [
-                action for action in self._actions if name.split("/")[0] in (*action.option_strings, action.dest)
-            ]
-            known = [str(choice) for action in actions for choice in action.choices or ()]
-        close = difflib.get_close_matches(option or choice, known, n=1)
-        return f"; did you mean {close[0]!r}?" if close else ""
-
-    def _commands(self) -> dict[str, Parser]:
-        """Return the parsers of commands by name."""
-        actions = [action for action in self._actions if isinstance(action, argparse._SubParsersAction)]
-        return actions[0].choices if actions else {}
+        choice = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message)
+        option = re.match(r"unrecognized arguments: (-\S+)", message)
+        wrong = choice or option
+        known = re.findall(r"[\w-]+", choice[2]) if choice else [one for action in self._actions
+                                                                 for one in action.option_strings]  # fmt: skip
+        close = difflib.get_close_matches(wrong[1], known, n=1) if wrong else []
+        self.exit(BAD_INPUT, _error_line(message + (f"; did you mean {close[0]!r}?" if close else "")))
 
     def parse_known_args(  # type: ignore[override]
         self, args: Any = None, namespace: Any = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse arguments like the base class, and check that no output is another file of the command."""
+        """Parse arguments like the base class; refuse unknown ones, and an output that is another of its files."""
         found, rest = super().parse_known_args(args, namespace)
-        self._command = getattr(found, "command", None)
-        self._check_outputs(found)
-        return found, rest
-
-    def _check_outputs(self, found: argparse.Namespace) -> None:
-        """Report an output that would replace another output or an input."""
+        if rest:
+            self.error(f"unrecognized arguments: {' '.join(rest)}")
         values = [(action, getattr(found, action.dest, None)) for action in self._actions]
         files = [(action, os.path.realpath(value)) for action, value in values if isinstance(value, os.PathLike)]
-        if not files:
-            return
         for action, file in files:
             for other, same in files if isinstance(action.type, arguments.Output) else ():
                 if other is not action and same == file:
-                    name = other.option_strings[0]
-                    self.error(
-                        f"argument {action.option_strings[0]}: must be another file than that of {name}, got both"
-                    )
-
-    def group_options(self, first: Sequence[str]) -> None:
-        """Put the options that one needs first into a group of the help, and shorten the usage to required ones."""
-        options, group = self._optionals, self.add_argument_group("most used")
-        actions = {action.dest: action for action in self._actions}
-        for action in [actions[name] for name in first if actions[name] in options._group_actions]:
-            options._group_actions.remove(action)
-            group._group_actions.append(action)
-        options.title = "further options" if first else "options"
-        self._action_groups.remove(group)
-        self._action_groups.insert(1, group)
-        required = [action for action in self._actions if action.required or not action.option_strings]
-        words = [
-            f"{action.option_strings[0]} {action.metavar}" if action.option_strings
-            else f"[{action.metavar}]" if action.nargs == "?" else str(action.metavar)
-            for action in required
-        ]  # fmt: skip
-        self.usage = " ".join(["%(prog)s", *words, "[options]"])
+                    rule = f"must be another file than that of {other.option_strings[0]}, got both"
+                    self.error(f"argument {action.option_strings[0]}: {rule}")
+        return found, rest
 
 
 class Layout(argparse.RawDescriptionHelpFormatter):
@@ -259,27 +204,28 @@ def _dispatch(argv: list[str]) -> int:
         parser.print_help()
         return 0
     code: int = args.run(args)
+    signals.raise_held()
     return code
 
 
 def _build(names: Sequence[str]) -> Parser:
     """Build the parser of these commands."""
-    layout = Layout
     parser = Parser(
-        prog="gpusense", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=layout, allow_abbrev=False
+        prog="gpusense", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=Layout, allow_abbrev=False
     )
     parser.add_argument("--version", action="version", version=f"gpusense {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
     for name in names:
         module = importlib.import_module(f"gpusense.commands.{name.replace('-', '_')}")
         command = commands.add_parser(
-            name, help=module.HELP, description=module.HELP, epilog=_epilog(module), formatter_class=layout,
-            allow_abbrev=False,
+            name, help=module.HELP, description=getattr(module, "DESCRIPTION", module.HELP), epilog=_epilog(module),
+            formatter_class=Layout, allow_abbrev=False, add_help=False,
         )  # fmt: skip
-        module.add_arguments(command)
-        for option in getattr(module, "SHARED", ()):
-            _SHARED[option](command)
-        command.group_options(module.FIRST)
+        add = arguments.Options(command, module.FIRST)
+        module.add_options(add)
+        for option in module.SHARED:
+            arguments.SHARED[option](add)
+        command.usage = f"{add.usage} [options]"
         command.set_defaults(run=module.run)
     return parser
 

@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 from gpusense.commands import output
+from gpusense.commands.arguments import Options
 from gpusense.commands.output import driver_text
 from gpusense.evaluation.machine import machine_line
 
@@ -33,11 +34,9 @@ examples:
   gpusense devices --json"""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_options(add: Options) -> None:
     """Add the command's options."""
-    parser.add_argument(
-        "--prove", action="store_true", help="prove all devices anew, as after a change to the machine or its drivers"
-    )
+    add("--prove", "prove all devices anew, as after a change to the machine or its drivers")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from gpusense._util.typing import CasterName
 from gpusense.commands import output
-from gpusense.commands.arguments import scan_model, whole_number
+from gpusense.commands.arguments import Options, scan_model, whole_number
 from gpusense.commands.output import counted
 from gpusense.commands.scans import OPTIONS, add_log, read_scan
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 HELP = "Report the parts that the kernels omit, keep or could omit for a scene, with reasons."
 FIRST = ("map", "log", "model", "parameters", "measure")
-SHARED = ("range", "model", "parameters", "backend", "seed", "verbose")
+SHARED = ("range", "model", "backend", "seed", "verbose")
 
 EPILOG = """\
 The scene is a map, a scan of a log, the model's parameters, and 2000 particles in the free cells of the map. The
@@ -35,18 +35,17 @@ examples:
   gpusense explain
   gpusense explain --map map.yaml --log run.log.gz \\
       --parameters fitted/parameters.yaml --measure
-  gpusense explain --model field --z-rand 0 --z-hit 1 --sources"""
+  gpusense explain --model field --set z_rand=0 z_hit=1 --sources"""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_options(add: Options) -> None:
     """Add the command's options."""
-    add = parser.add_argument
-    add("--map", type=Path, metavar="YAML", help="a map_server map (default: the building of 'gpusense demo')")
-    add_log(parser, "a log with scans, of the robot in the map", required=False)
-    add("--scan", type=whole_number(low=0), metavar="I", help="index of the log's scan (default: 0)")
-    add("--caster", choices=get_args(CasterName), help="method of the expected ranges; beam model only")
-    add("--measure", action="store_true", help="time the scene with and without each part")
-    add("--sources", action="store_true", help="also print the text of the kernels as compiled for the scene")
+    add("--map YAML", "a map_server map (default: the building of 'gpusense demo')", Path)
+    add_log(add, "a log with scans, of the robot in the map", required=False)
+    add("--scan I", "index of the log's scan (default: 0)", whole_number(low=0))
+    add("--caster", "method of the expected ranges; beam model only", get_args(CasterName))
+    add("--measure", "time the scene with and without each part")
+    add("--sources", "also print the text of the kernels as compiled for the scene")
 
 
 def run(args: argparse.Namespace) -> int:

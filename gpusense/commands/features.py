@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gpusense._util.progress import progress
 from gpusense.commands import output
-from gpusense.commands.arguments import output_path, positive_number, whole_number
+from gpusense.commands.arguments import Options, picture, positive_number, table, whole_number
 from gpusense.commands.output import counted, draw, write_table
 from gpusense.commands.scans import add_log, read_scans
-from gpusense.commands.signals import held
+from gpusense.commands.signals import working
 
 if TYPE_CHECKING:
     from gpusense.features.feature_map import FeatureMap
@@ -28,6 +27,7 @@ SHARED = ("reference", "choice", "backend", "verbose")
 _COLUMNS = (
     "scan", "kind", "x", "y", "theta", "deviation_x", "deviation_y", "deviation_theta", "size", "score",
 )  # fmt: skip
+_KINDS = ("line", "corner", "door", "hallway", "pole", "reflector")
 # Scans per call and step of the progress bar.
 _CALL = 256
 
@@ -43,22 +43,17 @@ examples:
   gpusense features --map-in map.yaml --map-out landmarks.csv"""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_options(add: Options) -> None:
     """Add the command's options."""
-    add = parser.add_argument
-    add_log(parser, "a log with scans", required=False)
-    add("--map-in", type=Path, metavar="YAML", help="a map_server map from which landmarks are made, instead of a log")
-    add("--kinds", nargs="+", choices=("line", "corner", "door", "hallway", "pole", "reflector"),
-        metavar="KIND", help="line, corner, door, hallway, pole, reflector (default: all)")  # fmt: skip
-    add("--noise", type=positive_number, metavar="M",
-        help="standard deviation of ranges [m] (default: that of each scan)")  # fmt: skip
-    add("--least", type=whole_number(low=1), default=2, metavar="N",
-        help="smallest number of scans that must show a landmark (default: %(default)s)")  # fmt: skip
-    add("--out", type=output_path(".csv"), metavar="CSV", help="write all features")
-    add("--map-out", type=output_path(".csv"), metavar="CSV", help="write landmarks")
-    picture = output_path(".png", ".pdf", ".svg")
-    add("--plot", type=picture, metavar="FILE", help="draw the scan with the most features")
-    add("--map-plot", type=picture, metavar="FILE", help="draw the landmarks")
+    add_log(add, "a log with scans", required=False)
+    add("--map-in YAML", "a map_server map from which landmarks are made, instead of a log", Path)
+    add("--kinds KIND...", f"{', '.join(_KINDS)} (default: all)", _KINDS)
+    add("--noise M", "standard deviation of ranges [m] (default: by each scan)", positive_number)
+    add("--least N", "smallest number of scans that must show a landmark", whole_number(low=1), 2)
+    add("--out CSV", "write all features", table)
+    add("--map-out CSV", "write landmarks", table)
+    add("--plot FILE", "draw the scan with the most features", picture)
+    add("--map-plot FILE", "draw the landmarks", picture)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -71,14 +66,12 @@ def run(args: argparse.Namespace) -> int:
     scans = read_scans(args, posed=posed)
     parts: list[Features] = []
     begun = time.perf_counter()
-    with held(parts) as stops, progress(len(scans)) as step:
+    with working(parts, len(scans)) as step:
         for first in range(0, len(scans), _CALL):
             parts.append(_extract(args, scans[first : first + _CALL]))
             for index, _ in scans[first : first + _CALL]:
                 step(f"scan {index}")
     _report(args, scans, parts, posed, time.perf_counter() - begun)
-    if stops:
-        raise stops[0]
     return 0
 
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from gpusense._util.files import write_whole
 from gpusense._util.progress import progress
 from gpusense.commands import output
-from gpusense.commands.arguments import output_folder, whole_number
+from gpusense.commands.arguments import Options, output_folder, whole_number
 from gpusense.commands.fit_results import DOUBT, FitResult, PartialFit, is_doubtful, print_fit
-from gpusense.commands.scans import OPTIONS, add_choice, add_log, read_chosen_steps, read_scans
+from gpusense.commands.scans import OPTIONS, add_log, read_chosen_steps, read_scans
 
 if TYPE_CHECKING:
     from gpusense.evaluation.range_data import RangeData
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 HELP = "Fit the beam model's parameters to a recorded log in a map, or to pairs of readings and expected ranges."
 FIRST = ("map", "log", "reference", "holdout", "out")
-SHARED = ("reference", "backend", "seed", "verbose")
+SHARED = ("reference", "pairs", "backend", "seed", "verbose")
 CODES = {1: "the fit did not converge"}
 
-_DESCRIPTION = """\
+DESCRIPTION = """\
 How good is a range finder? gpusense fit estimates the six parameters of the beam model from your sensor's data: weight
 and deviation of correct ranges (z_hit, sigma_hit), weight and rate of unexpected obstacles (z_short, lambda_short),
 weight of 'no return' (z_max) and of random readings (z_rand). It needs readings with expected ranges: either a map and
@@ -57,38 +57,26 @@ _PICTURES = ("readings.png", "density.png", "trace.png", "surface.png")
 _PAIRS_BLOCK = 100
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_options(add: Options) -> None:
     """Add the command's options."""
     from gpusense.world.hit_shapes import SHAPES
 
-    parser.description = _DESCRIPTION
-    add = parser.add_argument
-    add("--map", type=Path, metavar="YAML", help="a map_server map; needs --log")
-    add_log(parser, "a log with corrected poses, or any with --reference; needs --map", required=False)
-    add("--pairs", type=Path, metavar="CSV",
-        help="a file of columns separated by commas instead: reading [m], expected range [m] and, optionally, angle of "
-        "incidence [rad]; needs --range-max")  # fmt: skip
-    add_choice(parser, "scan or pair", "scans or pairs")
-    add("--method", choices=("em", "em-book", "gradient", "hill_climb", "genetic"), default="em",
-        help="optimiser; em-book is table 6.2 as printed (default: %(default)s)")  # fmt: skip
-    add("--range-bias", action="store_true", help="also fit an offset of all correct ranges")
-    add("--sigma-growth", action="store_true", help="also fit a deviation of correct ranges that grows with range")
-    add("--hit", choices=tuple(SHAPES), default="normal",
-        help="shape of correct ranges; student fits a Student t (default: %(default)s)")  # fmt: skip
-    add("--fit-motion", action="store_true", help="also learn the noise of the log's odometry from its poses")
-    add("--incidence", type=whole_number(low=1, high=90), metavar="BINS",
-        help="also fit parameters for BINS bins of the angle of incidence")  # fmt: skip
-    add("--restarts", type=whole_number(low=0, high=10_000), default=0, metavar="N",
-        help="further random starts (default: 0)")  # fmt: skip
-    add("--holdout", action="store_true", help="hold out every other block, and score it with other programs' defaults")
-    add("--block", type=whole_number(low=1), metavar="B",
-        help=f"neighbouring scans or pairs per block (default: 1 scan, {_PAIRS_BLOCK} pairs)")  # fmt: skip
-    add(
-        "--out",
-        type=output_folder(".png"),
-        metavar="DIR",
-        help="folder for parameters.yaml and pictures, created if absent",
-    )
+    add("--map YAML", "a map_server map; needs --log", Path)
+    add_log(add, "a log with corrected poses, or any with --reference; needs --map", required=False)
+    add("--pairs CSV", "a file of columns separated by commas instead: reading [m], expected range [m] and, if known, "
+        "angle of incidence [rad]; needs --range-max", Path)  # fmt: skip
+    add("--method", "optimiser; em-book is table 6.2 as printed",
+        ("em", "em-book", "gradient", "hill_climb", "genetic"), "em")  # fmt: skip
+    add("--range-bias", "also fit an offset of all correct ranges")
+    add("--sigma-growth", "also fit a deviation of correct ranges that grows with range")
+    add("--hit", "shape of correct ranges; student fits a Student t", tuple(SHAPES), "normal")
+    add("--fit-motion", "also learn the noise of the log's odometry from its poses")
+    add("--incidence BINS", "also fit parameters for BINS bins of the angle of incidence", whole_number(low=1, high=90))
+    add("--restarts N", "further random starts", whole_number(low=0, high=10_000), 0)
+    add("--holdout", "hold out every other block, and score it with other programs' defaults")
+    add("--block B", f"neighbouring scans or pairs per block (default: 1 scan, {_PAIRS_BLOCK} pairs)",
+        whole_number(low=1))  # fmt: skip
+    add("--out DIR", "folder for parameters.yaml and pictures, created if absent", output_folder(".png"))
 
 
 def run(args: argparse.Namespace) -> int:

@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gpusense._util.progress import progress
 from gpusense.commands import output
-from gpusense.commands.arguments import output_path, positive_number
+from gpusense.commands.arguments import Options, Output, picture, positive_number, table
 from gpusense.commands.output import counted, draw, length, write_table
 from gpusense.commands.scans import add_log, options_named, read_chosen_steps
-from gpusense.commands.signals import held
+from gpusense.commands.signals import working
 
 if TYPE_CHECKING:
     from gpusense.evaluation.integrity import Integrity
@@ -58,25 +57,23 @@ examples:
       --alert-limit 0.5"""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_options(add: Options) -> None:
     """Add the command's options."""
-    add = parser.add_argument
-    add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
-    add_log(parser, "a log with laser scans", several="lasers that judge the poses")
-    add("--poses", type=_source, metavar="SOURCE",
-        help="topic of a bag with the poses, such as /amcl_pose, or /tf; or a TUM trajectory, such as run.tum "
-        "(default: /tf, the only topic of poses, or the poses of a CARMEN log)")  # fmt: skip
-    add("--map-frame", default="map", metavar="NAME", help="frame of the map among transforms (default: %(default)s)")
-    add("--risk", type=positive_number, default=0.05, metavar="P",
-        help="probability that the error exceeds the radius, at least 0.01 (default: %(default)s)")  # fmt: skip
-    add("--truth", type=Path, metavar="FILE",
-        help="a TUM trajectory of true poses on the map, for errors, integrity and the Stanford diagram")  # fmt: skip
-    add("--alert-limit", type=positive_number, default=0.5, metavar="M",
-        help="with --truth: largest error that is safe [m] (default: %(default)s)")  # fmt: skip
-    add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
-        help="draw the track on the map coloured by p_lost, p_lost and radius over time, and errors")  # fmt: skip
-    add("--csv", type=output_path(".csv"), metavar="FILE", help="write a row for each pose")
-    add("--record", type=output_path(".rrd"), metavar="FILE", help="record the run for the viewer Rerun")
+    add("--map YAML", "a map_server map", Path, required=True)
+    add_log(add, "a log with laser scans", several="lasers that judge the poses")
+    add("--poses SOURCE", "topic of a bag with the poses, such as /amcl_pose, or /tf; or a TUM trajectory, such as "
+        "run.tum (default: /tf, the only topic of poses, or the poses of a CARMEN log)", _source)  # fmt: skip
+    add("--map-frame NAME", "frame of the map among transforms", default="map")
+    add("--risk P", "probability that the error exceeds the radius, at least 0.01", positive_number, 0.05)
+    add(
+        "--truth FILE",
+        "a TUM trajectory of true poses on the map, for errors, integrity and the Stanford diagram",
+        Path,
+    )
+    add("--alert-limit M", "with --truth: largest error that is safe [m]", positive_number, 0.5)
+    add("--plot FILE", "draw the track on the map coloured by p_lost, p_lost and radius over time, and errors", picture)
+    add("--csv FILE", "write a row for each pose", table)
+    add("--record FILE", "record the run for the viewer Rerun", Output(".rrd"))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -92,14 +89,12 @@ def run(args: argparse.Namespace) -> int:
     with options_named():
         source, posed = posed_scans(args.log, steps, args.poses, map_frame=args.map_frame)
         judge = TrajectoryJudge(_models(args, grid, steps), risk=args.risk)
-    with held(judge) as stops, progress(len(posed)) as step:
+    with working(judge, len(posed)) as step:
         for one in posed:
             step(f"scan {one.index}")
             judge.add(one.index, one.scan, np.array(one.reference), one.covariance, one.odometry)
     found = judge.result(len(steps))
     _report(args, grid, found, source, [one.scan for one in posed[: len(judge)]], truth)
-    if stops:
-        raise stops[0]
     return int(found.lost or not found.informed)
 
 

@@ -8,11 +8,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpusense._util.progress import progress
 from gpusense.commands import output
-from gpusense.commands.arguments import not_negative_number, positive_number, range_number, whole_number
+from gpusense.commands.arguments import Options, not_negative_number, positive_number, range_number, whole_number
 from gpusense.commands.output import counted, degrees, length
-from gpusense.commands.signals import held
+from gpusense.commands.signals import working
 from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
@@ -51,26 +50,23 @@ examples:
       --particles 5000"""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_options(add: Options) -> None:
     """Add the command's options."""
-    add = parser.add_argument
-    add("--folder", required=True, type=Path, metavar="DIR", help="the recorded run, in the format below")
-    add("--robot", required=True, type=whole_number(low=1), metavar="N", help="number in its files' names")
-    kind = parser.add_mutually_exclusive_group()
-    kind.add_argument("--known", dest="known", action="store_true", default=True,
-        help="the landmark of each reading is known by its barcode (default)")  # fmt: skip
-    kind.add_argument("--unknown", dest="known", action="store_false", help="the landmark of each reading is unknown")
-    add("--particles", type=whole_number(low=2), default=DEFAULTS.particles, metavar="N",
-        help="number of the filter's particles (default: %(default)s)")  # fmt: skip
-    add("--drift", type=not_negative_number, nargs=2, metavar=("M", "RAD"),
-        help="random walks of the translation [m/sqrt(s)] and of the heading [rad/sqrt(s)] "
-        "(default: 0.01 and the measured error of the odometer's heading)")  # fmt: skip
-    add("--fit-motion", action="store_true", help="learn the motion noise from the logged poses of this run first")
-    add("--scans", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
-    add("--range-max", type=range_number, metavar="M",
-        help="the sensor's largest range [m] (default: the next metre above the largest reading)")  # fmt: skip
-    add("--field-of-view", type=positive_number, metavar="RAD",
-        help="the sensor's field of view [rad] (default: 5 %% more than the readings' span)")  # fmt: skip
+    add("--folder DIR", "the recorded run, in the format below", Path, required=True)
+    add("--robot N", "number in its files' names", whole_number(low=1), required=True)
+    with add.exclusive():
+        add("--known", "the landmark of each reading is known by its barcode (default)", dest="known",
+            action="store_true", default=True)  # fmt: skip
+        add("--unknown", "the landmark of each reading is unknown", dest="known", action="store_false")
+    add("--particles N", "number of the filter's particles", whole_number(low=2), DEFAULTS.particles)
+    add("--drift M RAD", "random walks of the translation [m/sqrt(s)] and of the heading [rad/sqrt(s)] "
+        "(default: 0.01 and the measured error of the odometer's heading)", not_negative_number)  # fmt: skip
+    add("--fit-motion", "learn the motion noise from the logged poses of this run first")
+    add("--scans S", "largest number of scans (default: all)", whole_number(low=1))
+    add("--range-max M", "the sensor's largest range [m] (default: the next metre above the largest reading)",
+        range_number)  # fmt: skip
+    add("--field-of-view RAD", "the sensor's field of view [rad] (default: 5 %% more than the readings' span)",
+        positive_number)  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -94,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     drift = None if args.drift is None else tuple(args.drift)
     motion = landmark_runs.run_motion(recorded, drift=drift, fit=args.fit_motion)
     pf, track = landmark_runs.make_filter(recorded, model, motion, particles=args.particles, seed=args.seed), Track()
-    with held(track.steps) as stops, progress(len(recorded.time)) as step:
+    with working(track.steps, len(recorded.time)) as step:
         for one in landmark_runs.follow(pf, recorded, track, known=args.known):
             step(f"scan {one.index}" + (", lost" if track.verdicts[-1] == "lost" else ""))
     figures = summary(track) | {"gain": pf.gain}
@@ -110,8 +106,6 @@ def run(args: argparse.Namespace) -> int:
             f"{fit}\n\nleft out of the recording: {_left_out(recorded)}\nmotion noise {alpha}, reverse "
             f"{motion.reverse:.2g}, random walk {motion.drift:.2g} m and {motion.drift_heading:.2g} rad per sqrt(s)",
         )
-    if stops:
-        raise stops[0]
     return int(track.verdict == "lost")
 
 

@@ -7,19 +7,18 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gpusense._util.progress import progress
 from gpusense.commands import output
-from gpusense.commands.arguments import add_model, output_path, positive_number, scan_model, whole_number
+from gpusense.commands.arguments import Options, picture, positive_number, scan_model, whole_number
 from gpusense.commands.output import grouped
 from gpusense.commands.scans import add_log, read_scan
-from gpusense.commands.signals import held
+from gpusense.commands.signals import working
 
 if TYPE_CHECKING:
     import numpy as np
 
 HELP = "Draw the likelihood of a scan over all positions and headings of a map."
 FIRST = ("map", "log", "scan", "out", "model")
-SHARED = ("range", "parameters", "backend", "verbose")
+SHARED = ("range", "field", "backend", "verbose")
 
 # Number of printed modes.
 _MODES = 5
@@ -40,20 +39,16 @@ examples:
       --temperature 0.1 --out beam.pdf"""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_options(add: Options) -> None:
     """Add the command's options."""
-    add = parser.add_argument
-    add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
-    add_log(parser, "a log with scans")
-    add("--scan", type=whole_number(low=0), default=0, metavar="I", help="index of the scan (default: 0)")
-    add("--out", required=True, type=output_path(".png", ".pdf", ".svg"), metavar="FILE", help="the picture")
-    add_model(parser, "field")
-    add("--resolution", type=positive_number, default=0.1, metavar="M",
-        help="distance between neighbouring positions, at least a cell [m] (default: %(default)s)")  # fmt: skip
-    add("--headings", type=whole_number(low=1), default=72, metavar="A", help="headings (default: %(default)s)")
-    add("--positions", choices=("free", "all"), default="free", help="cells that are evaluated (default: %(default)s)")
-    add("--temperature", type=positive_number, default=1.0, metavar="T",
-        help="factor of log-likelihoods in (0, 1] (default: %(default)s, the plain product over beams)")  # fmt: skip
+    add("--map YAML", "a map_server map", Path, required=True)
+    add_log(add, "a log with scans")
+    add("--scan I", "index of the scan", whole_number(low=0), 0)
+    add("--out FILE", "the picture", picture, required=True)
+    add("--resolution M", "distance between neighbouring positions, at least a cell [m]", positive_number, 0.1)
+    add("--headings A", "headings", whole_number(low=1), 72)
+    add("--temperature T", "factor of log-likelihoods in (0, 1]; 1 is the plain product over beams",
+        positive_number, 1.0)  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -65,10 +60,10 @@ def run(args: argparse.Namespace) -> int:
     scan = read_scan(args)
     model = scan_model(args, grid, scan.scanner, temperature=args.temperature)
     result, tiles = prepare_tiles(
-        model, scan.ranges, resolution=args.resolution, headings=args.headings, positions=args.positions
+        model, scan.ranges, resolution=args.resolution, headings=args.headings, positions="free"
     )
     done = 0.0
-    with held((result,)) as stops, progress(100) as step:
+    with working((result,), 100) as step:
         for done in tiles:
             step(f"{100 * done:.0f}%")
     result.plot(args.out)
@@ -86,8 +81,6 @@ def run(args: argparse.Namespace) -> int:
         output.interrupted(round(100 * done), 100, "per cent of the positions")
         output.details(args, f"{grouped(result.log_p.size)} poses, entropy {result.entropy:.2f} nats; refinement gains "
                        f"{gain:.2g} nats")  # fmt: skip
-    if stops:
-        raise stops[0]
     return 0
 
 

@@ -11,18 +11,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gpusense._util.progress import progress
 from gpusense.commands.arguments import (
-    add_temperature,
+    Options,
+    Output,
     finite_number,
     not_negative_number,
-    output_path,
+    picture,
     positive_number,
+    temperature,
+    trajectory,
     whole_number,
 )
 from gpusense.commands.parameter_files import Localization, read_localization
 from gpusense.commands.scans import add_log, options_named, read_chosen_steps
-from gpusense.commands.signals import held
+from gpusense.commands.signals import working
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.world.scanner import Scanner
 
@@ -37,7 +39,7 @@ if TYPE_CHECKING:
 
 HELP = "Localise a robot along a recorded log with a particle filter."
 FIRST = ("map", "log", "everywhere", "start", "plot")
-SHARED = ("choice", "backend", "seed", "verbose")
+SHARED = ("beams", "choice", "backend", "seed", "verbose")
 CODES = {0: "the verdict is 'tracking'", 1: "uncertain or lost at the end, or no reading there to judge by"}
 
 
@@ -71,55 +73,46 @@ examples:
       --parameters fitted/parameters.yaml"""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_options(add: Options) -> None:
     """Add the command's options."""
-    add = parser.add_argument
-    add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
-    add_log(parser, "a log with laser scans and odometry", several="lasers that correct the filter")
-    add("--particles", type=whole_number(low=1), metavar="N",
-        help=f"particles (default: {DEFAULTS.particles}, with --global {DEFAULTS.particles_everywhere})")  # fmt: skip
-    begin = parser.add_mutually_exclusive_group()
-    begin.add_argument("--global", dest="everywhere", action="store_true",
-        help="begin anywhere in the free space of the map")  # fmt: skip
-    begin.add_argument("--start", type=finite_number, nargs=3, metavar=("X", "Y", "THETA"),
-        help="begin around a pose on the map [m, m, rad] (default: the first reference pose, at its scan)")  # fmt: skip
-    add("--reference", type=Path, metavar="FILE",
-        help="a TUM trajectory of true poses on the map to compare with, by the times of the scans (default: the "
-        "logged poses)")  # fmt: skip
-    add("--parameters", "--params", type=Path, metavar="YAML",
-        help="a file with beam_model or odometry_motion, such as 'gpusense fit --out' writes, or nav2's parameters of "
-        "amcl (default: a likelihood field, and the noise below)")  # fmt: skip
-    add("--node", metavar="NAME", help="amcl's node in a file of nav2 with several, such as /robot1/amcl")
-    add("--beams", type=whole_number(low=1), metavar="B", help="thin each scan evenly to B beams (default: all)")
-    add_temperature(parser, "auto: learned from the scans")
-    add("--motion-noise", type=not_negative_number, nargs=4, metavar=("A1", "A2", "A3", "A4"),
-        help="variances of the odometry per squared motion, Probabilistic Robotics table 5.6: of turns by turns "
-        "[rad^2/rad^2] and by translation [rad^2/m^2], of translations by translation and by turns "
-        f"(default: {' '.join(map(str, DEFAULTS.alpha))})")  # fmt: skip
-    add("--sideways", type=not_negative_number, metavar="S",
-        help="variance of sideways slips per squared turn [m^2/rad^2] "
-        f"(default: {DEFAULTS.sideways})")  # fmt: skip
-    add("--reverse", type=not_negative_number, metavar="P",
-        help=f"probability that a translation was reversed (default: {DEFAULTS.reverse})")  # fmt: skip
-    add("--fit-motion", action="store_true", help="learn the motion noise from the reference poses of this log first")
-    add("--recovery", choices=("sensor", "augmented", "none"),
-        help="if scans contradict the pose: search for a rival that later scans must confirm, or inject particles "
-        f"anywhere, or neither (default: {DEFAULTS.recovery})")  # fmt: skip
-    add("--beam-skip", type=positive_number, metavar="P",
-        help="skip beams, such as on people, that less than this share of the particles explains")  # fmt: skip
-    add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the trajectory for evo")
-    add("--tum-from", choices=("tracking", "start"), default="tracking",
-        help="where the trajectory begins: at the first scan whose verdict is 'tracking', or at the first one "
-        "(default: %(default)s)")  # fmt: skip
-    add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
-        help="draw map, particles, estimated and reference poses")  # fmt: skip
-    add("--animate", type=output_path(".gif"), metavar="FILE", help="animate the run: particles, scan, verdict")
-    add("--record", type=output_path(".rrd"), metavar="FILE", help="record the run for the viewer Rerun")
+    add("--map YAML", "a map_server map", Path, required=True)
+    add_log(add, "a log with laser scans and odometry", several="lasers that correct the filter")
+    add("--particles N", f"particles (default: {DEFAULTS.particles}, with --global {DEFAULTS.particles_everywhere})",
+        whole_number(low=1))  # fmt: skip
+    with add.exclusive():
+        add("--global", "begin anywhere in the free space of the map", dest="everywhere")
+        add("--start X Y THETA", "begin around a pose on the map [m, m, rad] (default: the first reference pose)",
+            finite_number)  # fmt: skip
+    add("--reference FILE", "a TUM trajectory of true poses on the map to compare with, by the times of the scans "
+        "(default: the logged poses)", Path)  # fmt: skip
+    add("--parameters YAML", "a file of 'gpusense fit --out' (beam_model, odometry_motion), or nav2's parameters "
+        "(default: a likelihood field, and the noise below)", Path)  # fmt: skip
+    add("--node NAME", "amcl's node in a file of nav2 with several, such as /robot1/amcl")
+    add("--temperature T", "factor of log-likelihoods in (0, 1], or auto: learned from the scans",
+        temperature, DEFAULTS.temperature)  # fmt: skip
+    add("--motion-noise A1 A2 A3 A4", "variances of the odometry per squared motion, Probabilistic Robotics table 5.6: "
+        "of turns by turns [rad^2/rad^2] and by translation [rad^2/m^2], of translations by translation and by turns "
+        f"(default: {' '.join(map(str, DEFAULTS.alpha))})", not_negative_number)  # fmt: skip
+    add("--sideways S", f"variance of sideways slips per squared turn [m^2/rad^2] (default: {DEFAULTS.sideways})",
+        not_negative_number)  # fmt: skip
+    add(
+        "--reverse P", f"probability that a translation was reversed (default: {DEFAULTS.reverse})", not_negative_number
+    )
+    add("--fit-motion", "learn the motion noise from the reference poses of this log first")
+    add("--recovery", "if scans contradict the pose: search for a rival that later scans must confirm, or inject "
+        f"particles anywhere, or neither (default: {DEFAULTS.recovery})", ("sensor", "augmented", "none"))  # fmt: skip
+    add("--beam-skip P", "skip beams, such as on people, that less than this share of the particles explains",
+        positive_number)  # fmt: skip
+    add("--tum FILE", "write the trajectory for evo", trajectory)
+    add("--tum-from", "where the trajectory begins: at the first scan whose verdict is 'tracking', or at the first one",
+        ("tracking", "start"), "tracking")  # fmt: skip
+    add("--plot FILE", "draw map, particles, estimated and reference poses", picture)
+    add("--animate FILE", "animate the run: particles, scan, verdict", Output(".gif"))
+    add("--record FILE", "record the run for the viewer Rerun", Output(".rrd"))
 
 
 def run(args: argparse.Namespace) -> int:
     """Localise, and print the results; after Ctrl-C, the results so far."""
-    from gpusense.commands.localize import make_filter, read_chosen, read_parameters, start_of
     from gpusense.commands.localize_report import report
     from gpusense.evaluation.tracking import Track, follow, start
     from gpusense.world.map_files import read_map
@@ -131,15 +124,13 @@ def run(args: argparse.Namespace) -> int:
     pose, covariance = start_of(args, read.nav2) or (None, None)
     start(pf, steps, everywhere=args.everywhere, pose=pose, covariance=covariance)
     track, recorders = Track(), _recorders(args, pf, len(steps))
-    with held(track.steps) as stops, progress(len(steps)) as step:
+    with working(track.steps, len(steps)) as step:
         step("starting")
         for one in follow(pf, steps, track):
             step(_text(track, one))
             for recorder in recorders.values():
                 recorder.add(pf, track, one)
     found = report(args, pf, track, len(steps), recorders)
-    if stops:
-        raise stops[0]
     return int(found["verdict"] != "tracking" or found["explained_at_end"] is None)
 
 

@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from gpusense._util.progress import progress
 from gpusense.commands import output
-from gpusense.commands.arguments import number, output_path, positive_number
+from gpusense.commands.arguments import Options, Output, number, picture, positive_number, table, trajectory
 from gpusense.commands.output import counted, draw, grouped, write_table
 from gpusense.commands.scans import add_log, read_scans_of_lasers, scan_times, scanners_of
-from gpusense.commands.signals import held
+from gpusense.commands.signals import working
 from gpusense.world.images import MODES
 
 if TYPE_CHECKING:
@@ -59,21 +58,25 @@ examples:
   gpusense map --log run.bag --reference run.tum --out map.yaml"""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_options(add: Options) -> None:
     """Add the command's options."""
-    add = parser.add_argument
-    add_log(parser, "a log with scans", several="lasers of the map")
-    _add_chain(parser)
-    add("--out", required=True, type=output_path(".yaml"), metavar="YAML", help="the map, next to its image")
-    add("--mode", choices=MODES, default="trinary",
-        help="trinary: white, black and grey; scale: shades, a PNG; raw: per cent as greys, almost black "
-        "(default: %(default)s)")  # fmt: skip
-    add("--resolution", type=positive_number, default=0.05, metavar="M", help="side of a cell [m] (default: 0.05)")
-    add("--range-limit", type=positive_number, metavar="M",
-        help="longer ranges clear cells up to it and mark no obstacle [m] (default: none)")  # fmt: skip
-    add("--clear-max", action="store_true", help="clear cells along 'no return' readings, up to --range-limit")
-    add("--p-hit", type=number, default=0.85, metavar="P", help="occupancy after one hit (default: %(default)s)")
-    add("--p-miss", type=number, default=0.45, metavar="P", help="occupancy after one miss (default: %(default)s)")
+    add_log(add, "a log with scans", several="lasers of the map")
+    add("--chain", "find the poses by matching the scans and closing loops, even if the log has poses (default: if it "
+        "has none)")  # fmt: skip
+    add("--no-odometry", "chain the scans without the log's odometry")
+    add("--no-loops", "do not search for revisited places")
+    add("--tum FILE", "write the poses of a chain for evo", trajectory)
+    add("--poses CSV", "write the poses of a chain with covariances and doubts", table)
+    add("--plot FILE", "draw the map with trajectory, closures and doubtful stretches of a chain", picture)
+    add("--out YAML", "the map, next to its image", Output(".yaml"), required=True)
+    add("--mode", "trinary: white, black and grey; scale: shades, a PNG; raw: per cent as greys, almost black",
+        MODES, "trinary")  # fmt: skip
+    add("--resolution M", "side of a cell [m]", positive_number, 0.05)
+    add("--range-limit M", "longer ranges clear cells up to it and mark no obstacle [m] (default: none)",
+        positive_number)  # fmt: skip
+    add("--clear-max", "clear cells along 'no return' readings, up to --range-limit")
+    add("--p-hit P", "occupancy after one hit", number, 0.85)
+    add("--p-miss P", "occupancy after one miss", number, 0.45)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -96,17 +99,14 @@ def run(args: argparse.Namespace) -> int:
         motion=None if chained is None else chained.chain.motions, **scanners_of(scans, sensor),
     )  # fmt: skip
     done = 0.0
-    with held((builder,)) as stops, progress(max(builder.parts, 1)) as step:
+    with working((builder,), max(builder.parts, 1)) as step:
         for done in builder.steps():
             step(f"{100 * done:.0f}%")
     grid = builder.grid()
     image = _write(args, grid)
     if chained is not None:
         _write_chain(args, chained, grid)
-        stops = chained.stops + stops
     _report(args, builder, grid, image, (round(done * len(scans)), chosen), chained)
-    if stops:
-        raise stops[0]
     return 0
 
 
@@ -161,31 +161,11 @@ _COLUMNS = (
 
 @dataclass
 class ChainedScans:
-    """Scans with poses from a chain.
-
-    Attributes:
-        stops: The signal that interrupted the chain, if any.
-    """
+    """Scans with poses from a chain."""
 
     scans: Scans
     chain: ScanChain
     seconds: float
-    stops: list[KeyboardInterrupt]
-
-
-def _add_chain(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a chain."""
-    add = parser.add_argument
-    add("--chain", action="store_true",
-        help="find the poses by matching the scans and closing loops, even if the log has "
-        "poses (default: if it has none)")  # fmt: skip
-    add("--no-odometry", action="store_true", help="chain the scans without the log's odometry")
-    add("--no-loops", action="store_true", help="do not search for revisited places")
-    add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the poses of a chain for evo")
-    add("--poses", type=output_path(".csv"), metavar="CSV",
-        help="write the poses of a chain with covariances and doubts")  # fmt: skip
-    add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
-        help="draw the map with trajectory, closures and doubtful stretches of a chain")  # fmt: skip
 
 
 def _is_chained(args: argparse.Namespace, scans: Scans) -> bool:
@@ -215,7 +195,7 @@ def _chain_log(args: argparse.Namespace, scans: Scans, sensor: list[int]) -> Cha
         duration=durations if len(durations) > 1 else durations[0], backend=args.backend, **scanners_of(scans, sensor),
     )  # fmt: skip
     begun, done = time.perf_counter(), 0
-    with held((chainer,)) as stops, progress(len(scans) + _ROUNDS) as step:
+    with working((chainer,), len(scans) + _ROUNDS) as step:
         for word in chainer.steps():
             for _ in range(max(chainer.scans - done, 1)):
                 step(word)
@@ -225,7 +205,7 @@ def _chain_log(args: argparse.Namespace, scans: Scans, sensor: list[int]) -> Cha
         (index, replace(scan, pose=tuple(pose)))
         for (index, scan), pose in zip(scans, chain.poses.tolist(), strict=False)
     ]
-    return ChainedScans(placed, chain, time.perf_counter() - begun, stops)
+    return ChainedScans(placed, chain, time.perf_counter() - begun)
 
 
 def _odometry(scans: Scans) -> np.ndarray | None:

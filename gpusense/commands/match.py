@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gpusense._util.progress import progress
 from gpusense.commands import output
-from gpusense.commands.arguments import not_negative_number, output_path, positive_number
+from gpusense.commands.arguments import Options, not_negative_number, picture, positive_number, table, trajectory
 from gpusense.commands.output import counted, degrees, draw, length, write_table
 from gpusense.commands.scans import add_log, read_scans, scan_times
-from gpusense.commands.signals import held
+from gpusense.commands.signals import working
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,27 +42,19 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_options(add: Options) -> None:
     """Add the command's options."""
-    add = parser.add_argument
-    add_log(parser, "a log with scans")
-    add("--map", type=Path, metavar="YAML", help="a map_server map to which all scans are matched")
-    add("--guess", choices=("odometry", "logged", "identity"),
-        help="the guess of each match (default: odometry, with --map logged)")  # fmt: skip
-    add("--shift", type=not_negative_number, default=0.0, metavar="M",
-        help="change guesses by up to this in x and in y, uniformly at random [m] (default: 0)")  # fmt: skip
-    add("--turn", type=not_negative_number, default=0.0, metavar="DEG",
-        help="change headings of guesses by up to this [degrees] (default: 0)")  # fmt: skip
-    add("--method", choices=("auto", "icp", "gauss_newton", "correlative"), default="auto",
-        help="method of match_scan (default: %(default)s)")  # fmt: skip
-    add("--noise", type=positive_number, metavar="M",
-        help="standard deviation of ranges [m] (default: that of match_scan)")  # fmt: skip
-    add("--out", type=output_path(".csv"), metavar="CSV", help="write poses, deviations and statuses")
-    add("--tum", type=output_path(".tum", ".txt"), metavar="FILE",
-        help="write the trajectory: matches chained from the first scan on, or poses in the map; a match that failed "
-        "is replaced by its guess")  # fmt: skip
-    add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
-        help="draw the match with the largest correction, before and after")  # fmt: skip
+    add_log(add, "a log with scans")
+    add("--map YAML", "a map_server map to which all scans are matched", Path)
+    add("--guess", "the guess of each match (default: odometry, with --map logged)", ("odometry", "logged", "identity"))
+    add("--shift M", "change guesses by up to this in x and in y, uniformly at random [m]", not_negative_number, 0.0)
+    add("--turn DEG", "change headings of guesses by up to this [degrees]", not_negative_number, 0.0)
+    add("--method", "method of match_scan", ("auto", "icp", "gauss_newton", "correlative"), "auto")
+    add("--noise M", "standard deviation of ranges [m] (default: by match_scan, from the scans)", positive_number)
+    add("--out CSV", "write poses, deviations and statuses", table)
+    add("--tum FILE", "write the trajectory: matches chained from the first scan on, or poses in the map; a failed "
+        "match is replaced by its guess", trajectory)  # fmt: skip
+    add("--plot FILE", "draw the match with the largest correction, before and after", picture)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -79,14 +70,12 @@ def run(args: argparse.Namespace) -> int:
         scans, grid, guess=args.guess or ("odometry" if grid is None else "logged"), method=args.method,
         backend=args.backend, spread=(args.shift, math.radians(args.turn)), seed=args.seed, noise=args.noise,
     )  # fmt: skip
-    with held(parts) as stops, progress(len(scans)) as step:
+    with working(parts, len(scans)) as step:
         for part in calls:
             parts.append(part)
             for _ in part.indices:
                 step(f"scan {part.indices[-1, 1]}")
     _report(args, grid, scans, parts, time.perf_counter() - begun)
-    if stops:
-        raise stops[0]
     return 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import os
@@ -45,7 +46,9 @@ def report(facts: dict[str, Any], args: argparse.Namespace | None = None) -> Non
 
 
 def _plain(value: Any) -> Any:
-    """Convert a value to JSON's types; NumPy's scalars and arrays become numbers and lists."""
+    """Convert a value to JSON's types: dataclasses to mappings, NumPy's scalars and arrays to numbers and lists."""
+    if dataclasses.is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     if hasattr(value, "tolist"):
@@ -60,7 +63,7 @@ def _plain(value: Any) -> Any:
 def result(text: str) -> None:
     """Print the result of a command: in one line, on a terminal wrapped and in bold."""
     if is_terminal(sys.stdout):
-        text = _wrapped(text, min(terminal_width(), _WIDTH))
+        text = _wrapped(text, min(shutil.get_terminal_size().columns, _WIDTH))
         text = text if "NO_COLOR" in os.environ else f"\033[1m{text}\033[0m"
     print(text, flush=True)
 
@@ -117,38 +120,17 @@ def _wrapped(text: str, width: int, indent: str = "") -> str:
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[str] = ()) -> None:
     """Print a table; on a terminal that is too narrow, each row becomes a paragraph with one value per line."""
-    lines = table_lines(columns, rows, right=right)
-    if is_terminal(sys.stdout) and max(map(len, lines)) > terminal_width():
-        lines = paragraph_lines(columns, rows)
-    print(*lines, sep="\n")
-
-
-def terminal_width() -> int:
-    """Return the columns of the terminal."""
-    return shutil.get_terminal_size().columns
-
-
-def paragraph_lines(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Format rows as paragraphs with one value per line, without empty values."""
-    widest = max(map(len, columns))
-    lines = []
-    for row in rows:
-        lines += [f"{name.ljust(widest)}  {text}".strip() for name, text in zip(columns, row, strict=True) if text]
-        lines.append("")
-    return lines
-
-
-def table_lines(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[str] = ()) -> list[str]:
-    """Format the lines of a plain table, with two spaces between columns."""
-    widths = [max(len(text) for text in texts) for texts in zip(columns, *rows, strict=True)]
+    widths = [max(map(len, texts)) for texts in zip(columns, *rows, strict=True)]
     lines = []
     for row in (columns, ["-" * width for width in widths], *rows):
-        cells = [
-            text.rjust(width) if column in right else text.ljust(width)
-            for text, width, column in zip(row, widths, columns, strict=True)
-        ]
-        lines.append("  ".join(cells).rstrip())
-    return lines
+        cells = zip(row, widths, [">" if name in right else "<" for name in columns], strict=True)
+        lines.append("  ".join(f"{text:{side}{width}}" for text, width, side in cells).rstrip())
+    if is_terminal(sys.stdout) and max(map(len, lines)) > shutil.get_terminal_size().columns:
+        widest, lines = max(map(len, columns)), []
+        for row in rows:
+            lines += [f"{name:<{widest}}  {text}" for name, text in zip(columns, row, strict=True) if text]
+            lines.append("")
+    print(*lines, sep="\n")
 
 
 def counted(number: int, noun: str, plural: str | None = None) -> str:

@@ -6,18 +6,23 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gpusense._util import checks
+from gpusense._util.documents import read_mapping
+
 if TYPE_CHECKING:
     from gpusense.commands.fit_results import FitResult
     from gpusense.localization.nav2 import Nav2Options
     from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 
 
-def read_beam_parameters(path: Path) -> BeamParameters:
-    """Read the mapping ``beam_model`` of a YAML file."""
-    from gpusense.world.parameters import BeamParameters
+def read_parameters(path: Path, name: str) -> BeamParameters | LikelihoodFieldParameters:
+    """Read the mapping ``beam_model`` or ``likelihood_field`` of a YAML file."""
+    from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 
-    values = _content(path).get("beam_model")
-    return _made(path, "beam_model", values, BeamParameters.from_dict)
+    make = BeamParameters.from_dict if name == "beam_model" else LikelihoodFieldParameters.from_dict
+    values = read_mapping(checks.existing_file(path)).get(name)
+    made: BeamParameters | LikelihoodFieldParameters = _made(path, name, values, make)
+    return made
 
 
 @dataclass(frozen=True)
@@ -36,13 +41,12 @@ class Localization:
 
 def read_localization(path: Path, node: str | None = None) -> Localization:
     """Read ``beam_model`` and ``odometry_motion`` of a YAML file, or the parameters of nav2_amcl's ``node``."""
-    from gpusense._util import checks
     from gpusense.localization.motion import OdometryMotion
     from gpusense.localization.nav2 import from_nav2, has_parameters
 
-    content = _content(path)
-    own = content.keys() & {"beam_model", "odometry_motion"}
-    if has_parameters(content) and not own:
+    content = read_mapping(checks.existing_file(path))
+    models = [name for name in ("beam_model", "likelihood_field") if name in content]
+    if has_parameters(content) and not models and "odometry_motion" not in content:
         try:
             options = from_nav2(path, node=node)
         except (TypeError, ValueError) as error:
@@ -51,28 +55,19 @@ def read_localization(path: Path, node: str | None = None) -> Localization:
         return Localization(options.parameters, {}, options)
     if node is not None:
         raise ValueError(f"--node: must come with a file of nav2's parameters, got {path}")
-    if not own:
-        rule = "must hold a mapping beam_model or odometry_motion, or amcl's ros__parameters"
+    if len(models) > 1:
+        raise ValueError(f"{path}: must hold one of beam_model and likelihood_field, got both")
+    if not models and "odometry_motion" not in content:
+        rule = "must hold a mapping beam_model, likelihood_field or odometry_motion, or amcl's ros__parameters"
         raise ValueError(f"{path}: {rule}, got {checks.show(list(content))}")
-    beam = read_beam_parameters(path) if "beam_model" in content else None
-    if "odometry_motion" not in content:
-        return Localization(beam, {})
-    values = content["odometry_motion"]
+    sensor = read_parameters(path, models[0]) if models else None
+    values = content.get("odometry_motion", {})
     _made(path, "odometry_motion", values, OdometryMotion.from_dict)
-    return Localization(beam, values)
-
-
-def _content(path: Path) -> dict[Any, Any]:
-    from gpusense._util import checks
-    from gpusense._util.documents import read_mapping
-
-    return read_mapping(checks.existing_file(path))
+    return Localization(sensor, values)
 
 
 def _made(path: Path, name: str, values: Any, make: Any) -> Any:
     """Build an object from a mapping of a file."""
-    from gpusense._util import checks
-
     if not isinstance(values, dict):
         raise ValueError(f"{path}: must hold a mapping {name}, got {checks.show(values)}")
     try:

@@ -9,7 +9,7 @@ from typing import Any
 
 from gpusense._util import checks
 from gpusense._util.documents import read_mapping
-from gpusense.commands.arguments import finite_number
+from gpusense.commands.arguments import Options, finite_number
 from gpusense.localization.nav2_file import FITTED
 
 HELP = "Localise inside ROS 2, in the place of nav2_amcl, or watch another localiser."
@@ -37,25 +37,21 @@ examples:
   gpusense ros watch --base-frame base_link"""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_options(add: Options) -> None:
     """Add the command's options."""
-    add = parser.add_argument
-    add("what", nargs="?", choices=("localize", "watch"), default="localize", metavar="watch",
-        help="judge the poses of another localiser (default: localise)")  # fmt: skip
-    add("--map", type=Path, metavar="YAML", help="a map_server map (default: the topic map)")
-    add("--params-file", type=Path, metavar="YAML",
-        help="parameters of nav2_amcl, as nav2_params.yaml has them, or parameters.yaml of 'gpusense fit'")  # fmt: skip
-    start = parser.add_mutually_exclusive_group()
-    start.add_argument(
-        "--start", type=finite_number, nargs=3, metavar=("X", "Y", "THETA"), help="first pose [m, m, rad]"
-    )
-    start.add_argument("--global", dest="anywhere", action="store_true", help="start all over the map")
-    add("--mount", type=finite_number, nargs=3, metavar=("X", "Y", "THETA"),
-        help="pose of the laser on the robot [m, m, rad] (default: by /tf)")  # fmt: skip
-    add("--odom-topic", metavar="TOPIC", help="read odometry from nav_msgs/Odometry (default: by /tf)")
-    add("--base-frame", metavar="FRAME", help="frame of the robot's base (default: base_footprint)")
-    add("--no-autostart", action="store_true", help="leave it to a lifecycle manager to configure and activate")
-    add(_ROS, nargs=argparse.REMAINDER, default=[], metavar="ARGUMENT", help="arguments of ROS 2")
+    add("watch", "judge the poses of another localiser (default: localise)", ("localize", "watch"), "localize",
+        nargs="?", dest="what")  # fmt: skip
+    add("--map YAML", "a map_server map (default: the topic map)", Path)
+    add("--params-file YAML", "parameters of nav2_amcl, as nav2_params.yaml has them, or parameters.yaml of "
+        "'gpusense fit'", Path)  # fmt: skip
+    with add.exclusive():
+        add("--start X Y THETA", "first pose [m, m, rad]", finite_number)
+        add("--global", "start all over the map", dest="anywhere")
+    add("--mount X Y THETA", "pose of the laser on the robot [m, m, rad] (default: by /tf)", finite_number)
+    add("--odom-topic TOPIC", "read odometry from nav_msgs/Odometry (default: by /tf)")
+    add("--base-frame FRAME", "frame of the robot's base (default: base_footprint)")
+    add("--no-autostart", "leave it to a lifecycle manager to configure and activate")
+    add(f"{_ROS} ARGUMENT", "arguments of ROS 2", default=[], nargs=argparse.REMAINDER)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpusense.commands.arguments import finite_number, not_negative_number, range_number, whole_number
+from gpusense.commands.arguments import Options, finite_number
 
 if TYPE_CHECKING:
     from gpusense.evaluation.steps import Step
@@ -28,44 +28,19 @@ OPTIONS = {
 """Command line options by the library's arguments."""
 
 
-def add_log(parser: argparse.ArgumentParser, what: str, *, required: bool = True, several: str | None = None) -> None:
+def add_log(add: Options, what: str, *, required: bool = True, several: str | None = None) -> None:
     """Add ``--log``, and its laser or ``several`` lasers, described by their use: ``--topic`` and ``--mount``."""
-    add = parser.add_argument
-    add("--log", required=required, type=Path, metavar="FILE", help=f"{what}: {FORMATS}")
+    add("--log FILE", f"{what}: {FORMATS}", Path, required=required)
     names = "topic of a bag (default: /scan, or the only one); front or rear of a CARMEN log (default: front)"
     if several:
-        add("--topic", "--sensors", dest="topic", nargs="+", default=[], metavar="NAME",
-            help=f"{several}, one or more: {names}")  # fmt: skip
+        add("--topic NAME...", f"{several}, one or more: {names}", default=[])
     else:
-        add("--topic", metavar="NAME", help=f"laser: {names}")
-    add("--mount", type=finite_number, nargs=3, metavar=("X", "Y", "THETA"),
-        help="pose of a bag's laser on the robot [m, m, rad] (default: by the bag's transforms)")  # fmt: skip
-    add("--frame", metavar="NAME", help="frame of the laser, if several share a bag's topic")
-    add("--odometry", dest="odometry_from", metavar="NAME",
-        help="topic of a bag's odometry, or frame of the transforms that move the robot (default: near the scans, "
-        "/odom, or the first one)")  # fmt: skip
-
-
-def add_choice(parser: argparse.ArgumentParser, what: str = "scan", several: str = "scans") -> None:
-    """Add the options that choose among the scans of a log, ``--range-max`` and ``--range-min``."""
-    add = parser.add_argument
-    add("--every", type=whole_number(low=1), default=1, metavar="E",
-        help=f"every E-th {what}, from --offset on; '--every 2 --offset 1' are the odd ones (default: 1)")  # fmt: skip
-    add("--offset", type=whole_number(low=0), default=0, metavar="O", help=f"index of the first {what} (default: 0)")
-    add("--limit", type=whole_number(low=1), metavar="S", help=f"largest number of {several} (default: all)")
-    add_range_max(parser)
-
-
-def add_range_max(parser: argparse.ArgumentParser) -> None:
-    """Add ``--range-max`` and ``--range-min``, the limits of readings."""
-    parser.add_argument(
-        "--range-max", type=range_number, metavar="M",
-        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')",
-    )  # fmt: skip
-    parser.add_argument(
-        "--range-min", type=not_negative_number, metavar="M",
-        help="readings of a bag below this are missing [m] (default: the bag's value)",
-    )  # fmt: skip
+        add("--topic NAME", f"laser: {names}")
+    add("--mount X Y THETA", "pose of a bag's laser on the robot [m, m, rad] (default: by the bag's transforms)",
+        finite_number)  # fmt: skip
+    add("--frame NAME", "frame of the laser, if several share a bag's topic")
+    add("--odometry NAME", "topic of a bag's odometry, or frame of the transforms that move the robot (default: near "
+        "the scans, /odom, or the first one)", dest="odometry_from")  # fmt: skip
 
 
 def log_options(args: argparse.Namespace) -> LogOptions:
@@ -74,15 +49,6 @@ def log_options(args: argparse.Namespace) -> LogOptions:
         "range_max": args.range_max, "range_min": args.range_min, "frame": args.frame, "mount": args.mount,
         "odometry_from": args.odometry_from,
     }  # fmt: skip
-
-
-def add_reference(parser: argparse.ArgumentParser) -> None:
-    """Add ``--reference``, the poses of the scans."""
-    parser.add_argument(
-        "--reference", type=Path, metavar="FILE",
-        help="a TUM trajectory with the poses of the robot at the times of the scans; scans without a pose are skipped "
-        "(default: the logged poses)",
-    )  # fmt: skip
 
 
 @contextlib.contextmanager

@@ -7,24 +7,25 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gpusense._util.progress import progress
 from gpusense.commands import output
-from gpusense.commands.arguments import add_temperature, not_negative_number, output_path, scan_model, whole_number
+from gpusense.commands.arguments import Options, picture, scan_model, temperature, whole_number
 from gpusense.commands.output import counted, degrees, draw, grouped, length
 from gpusense.commands.scans import add_log, read_scans
-from gpusense.commands.signals import held
+from gpusense.commands.signals import working
+from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
     from gpusense.evaluation.scoring import Fitness, LogScore, Model
 
 HELP = "Score particles with the scans of a recorded log, and rank the logged poses among them."
 FIRST = ("map", "log", "reference", "parameters", "plot")
-SHARED = ("reference", "choice", "model", "parameters", "backend", "seed", "verbose")
+SHARED = ("reference", "choice", "model", "backend", "seed", "verbose")
 CODES = {0: "the log fits the map", 1: "it does not or the verdict is uncertain"}
 
 
 EPILOG = """\
-Each scan is scored for N particles: the logged pose, half of the others around it, half uniform over the free cells.
+Each scan is scored for N particles: the logged pose, half of the others around it (0.5 m and 0.25 rad), half
+uniform over the free cells.
 The percentile is the share of the other particles that score worse than the logged pose, ties counting half. The
 weighted mean excludes the logged pose. BeamParameters and LikelihoodFieldParameters define the default parameters.
 Beams of a scan are not independent, so the temperature multiplies their sum. By default it is calibrated: from the
@@ -39,19 +40,14 @@ message states their share and the place of most of them. Cases in between are u
       --parameters fitted/parameters.yaml"""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_options(add: Options) -> None:
     """Add the command's options."""
-    add = parser.add_argument
-    add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
-    add_log(parser, "a log with corrected poses, or any with --reference")
-    add("--particles", type=whole_number(low=2), default=20_000, metavar="N", help="per scan (default: %(default)s)")
-    add("--sigma-position", type=not_negative_number, default=0.5, metavar="M",
-        help="deviation of the particles around the logged pose, in x and in y [m] (default: %(default)s)")  # fmt: skip
-    add("--sigma-heading", type=not_negative_number, default=0.25, metavar="RAD",
-        help="deviation of their heading [rad] (default: %(default)s)")  # fmt: skip
-    add_temperature(parser, "auto: calibrated from the chosen scans")
-    add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
-        help="draw map, logged and estimated poses, and errors")  # fmt: skip
+    add("--map YAML", "a map_server map", Path, required=True)
+    add_log(add, "a log with corrected poses, or any with --reference")
+    add("--particles N", "per scan", whole_number(low=2), 20_000)
+    add("--temperature T", "factor of log-likelihoods in (0, 1], or auto: calibrated from the chosen scans",
+        temperature, DEFAULTS.temperature)  # fmt: skip
+    add("--plot FILE", "draw map, logged and estimated poses, and errors", picture)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -60,22 +56,20 @@ def run(args: argparse.Namespace) -> int:
     from gpusense.plots.runs import scores_figure
     from gpusense.world.map_files import read_map
 
-    sampler = ParticleSampler(args.particles, args.sigma_position, args.sigma_heading, args.seed)
+    sampler = ParticleSampler(args.particles, seed=args.seed)
     grid = read_map(args.map)
     scans = read_scans(args)
-    scanner, temperature = scans[0][1].scanner, args.temperature
-    if temperature == "auto":
-        temperature = temperature_of_log(scan_model(args, grid, scanner), scans)
-    model = scan_model(args, grid, scanner, temperature=temperature)
+    scanner, factor = scans[0][1].scanner, args.temperature
+    if factor == "auto":
+        factor = temperature_of_log(scan_model(args, grid, scanner), scans)
+    model = scan_model(args, grid, scanner, temperature=factor)
     scoring, fitness = LogScoring(model, sampler), FitnessOfLog(model)
-    with held(scoring) as stops, progress(len(scans)) as step:
+    with working(scoring, len(scans)) as step:
         for index, scan in scans:
             step(f"scan {index}")
             fitness.add(scan, scoring.add(index, scan).better)
     score, fit = scoring.result(), fitness.result()
     _report(args, model, score, fit, len(scans))
-    if stops:
-        raise stops[0]
     draw(args.plot, lambda: scores_figure(grid, score, pose_name(args)))
     if not args.json:
         output.files(args.plot)

@@ -11,12 +11,15 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sized
+from collections.abc import Callable, Iterator, Sized
 from types import FrameType
 from typing import Any
 
 from gpusense._util import interrupts
+from gpusense._util.progress import progress
 
+# Signals that ended the work of this command.
+HELD: list[KeyboardInterrupt] = []
 # Signals that end a command, and words for the end. Signals ignored by the caller, as by nohup, stay ignored.
 _WORDS = {name: word for name, word in (("SIGINT", "interrupted"), ("SIGTERM", "terminated"), ("SIGHUP", "hung up"))
           if hasattr(signal, name)}  # fmt: skip
@@ -46,6 +49,7 @@ def stopping() -> Iterator[None]:
 
     Python ignores exceptions in destructors and callbacks; a signal that arrives there is delivered again.
     """
+    HELD.clear()
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -82,15 +86,24 @@ def stopping() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def held(results: Sized) -> Iterator[list[KeyboardInterrupt]]:
-    """Hold back a signal that ends the work, and yield the list that receives it; without results, raise it at once."""
-    stops: list[KeyboardInterrupt] = []
-    try:
-        yield stops
-    except KeyboardInterrupt as stop:
-        if not len(results):
-            raise
-        stops.append(stop)
+def working(results: Sized, total: int) -> Iterator[Callable[[str], None]]:
+    """Show the progress of ``total`` steps; hold back a signal that ends them, but not without results.
+
+    Yields the function that begins a step. :func:`raise_held` raises the signal after the report of the results.
+    """
+    with progress(total) as step:
+        try:
+            yield step
+        except KeyboardInterrupt as stop:
+            if not len(results):
+                raise
+            HELD.append(stop)
+
+
+def raise_held() -> None:
+    """Raise the signal that was held back, if any."""
+    if HELD:
+        raise HELD[0]
 
 
 @contextlib.contextmanager

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from gpusense.commands import output
 from gpusense.commands.arguments import (
+    Options,
     Output,
     add_backend,
     finite_number,
     not_negative_number,
-    output_path,
     positive_number,
     range_number,
+    trajectory,
     whole_number,
 )
 from gpusense.commands.output import counted
@@ -48,76 +49,59 @@ examples:
       --tum truth.tum"""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_options(add: Options) -> None:
     """Add the command's options."""
-    add = parser.add_argument
-    source = parser.add_mutually_exclusive_group(required=True)
-    source.add_argument("--map", type=Path, metavar="YAML", help="the robot's map, a map_server map")
-    source.add_argument("--world", metavar="NAME", help="a generated map instead: office, corridor, hall or twins, "
-                        "or one of these with a separate seed, as in office:3")  # fmt: skip
-    add("--log-out", required=True, type=Output(), metavar="FILE", help="the log to write")
-    add("--format", choices=("carmen", "ros1", "ros2"),
-        help="a CARMEN log, gzipped if the name ends in .gz; a bag of ROS 1 (.bag); a new folder with a bag of "
-        "ROS 2 (default: by the name, ros1 for .bag and carmen for others)")  # fmt: skip
-    add("--map-out", type=output_path(".yaml"), metavar="YAML", help="write the robot's map")
-    add("--world-out", type=output_path(".yaml"), metavar="YAML", help="write the true world, without people")
-    add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the true poses of the robot")
-    _add_run(parser)
-    _add_world(parser)
-    _add_sensors(parser)
-    add_backend(parser, default="numpy")
+    with add.exclusive(required=True):
+        add("--map YAML", "the robot's map, a map_server map", Path)
+        add("--world NAME", "a generated map instead: office, corridor, hall or twins, or one of these with a separate "
+            "seed, as in office:3")  # fmt: skip
+    add("--log-out FILE", "the log to write", Output(), required=True)
+    add("--format", "a CARMEN log, gzipped if the name ends in .gz; a bag of ROS 1 (.bag); a new folder with a bag of "
+        "ROS 2 (default: by the name, ros1 for .bag and carmen for others)", ("carmen", "ros1", "ros2"))  # fmt: skip
+    add("--map-out YAML", "write the robot's map", Output(".yaml"))
+    add("--world-out YAML", "write the true world, without people", Output(".yaml"))
+    add("--tum FILE", "write the true poses of the robot", trajectory)
+    _add_run(add)
+    _add_world(add)
+    _add_sensors(add)
+    add_backend(add, "numpy")
 
 
-def _add_run(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--scans", type=whole_number(low=1, high=1_000_000), metavar="T",
-        help="number of scans (default: 200, or the poses of --path)")  # fmt: skip
-    add("--path", type=Path, metavar="FILE", help="a TUM trajectory of true poses of the robot to follow")
-    add("--step", type=positive_number, default=0.2, metavar="M", help="distance between scans [m] (default: 0.2)")
-    add("--turn", type=positive_number, default=0.35, metavar="RAD",
-        help="largest turn between scans [rad] (default: 0.35)")  # fmt: skip
-    add("--period", type=positive_number, default=0.25, metavar="S", help="time between scans [s] (default: 0.25)")
-    add("--clearance", type=not_negative_number, default=0.35, metavar="M",
-        help="least distance from walls [m] (default: 0.35)")  # fmt: skip
-    add("--kidnaps", type=whole_number(low=0), default=0, metavar="N",
-        help="number of times that the robot is carried elsewhere without odometry (default: 0)")  # fmt: skip
+def _add_run(add: Options) -> None:
+    add("--scans T", "number of scans (default: 200, or the poses of --path)", whole_number(low=1, high=1_000_000))
+    add("--path FILE", "a TUM trajectory of true poses of the robot to follow", Path)
+    add("--step M", "distance between scans [m]", positive_number, 0.2)
+    add("--turn RAD", "largest turn between scans [rad]", positive_number, 0.35)
+    add("--period S", "time between scans [s]", positive_number, 0.25)
+    add("--clearance M", "least distance from walls [m]", not_negative_number, 0.35)
+    add("--kidnaps N", "number of times that the robot is carried elsewhere without odometry", whole_number(low=0), 0)
 
 
-def _add_world(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--true-map", type=Path, metavar="YAML", help="the true world, instead of the robot's map with changes")
-    add("--people", type=whole_number(low=0, high=1000), default=0, metavar="N",
-        help="people who walk near the robot (default: 0)")  # fmt: skip
-    share: dict[str, Any] = dict(type=not_negative_number, default=0.0, metavar="SHARE")
-    add("--hidden", **share, help="share of the beams that additional people hide, up to 0.9 (default: 0)")
-    add("--moved", **share, help="share of the walls that are moved by 0.5 to 2 m (default: 0)")
-    add("--removed", **share, help="share of the walls that are removed (default: 0)")
-    add("--added", **share, help="new furniture, as a share of the walls (default: 0)")
-    add("--glass", **share, help="share of the walls that beams pass through (default: 0)")
+def _add_world(add: Options) -> None:
+    add("--true-map YAML", "the true world, instead of the robot's map with changes", Path)
+    add("--people N", "people who walk near the robot", whole_number(low=0, high=1000), 0)
+    add("--hidden SHARE", "share of the beams that additional people hide, up to 0.9", not_negative_number, 0.0)
+    add("--moved SHARE", "share of the walls that are moved by 0.5 to 2 m", not_negative_number, 0.0)
+    add("--removed SHARE", "share of the walls that are removed", not_negative_number, 0.0)
+    add("--added SHARE", "new furniture, as a share of the walls", not_negative_number, 0.0)
+    add("--glass SHARE", "share of the walls that beams pass through", not_negative_number, 0.0)
 
 
-def _add_sensors(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--beams", type=whole_number(low=1, high=100_000), default=181, metavar="K",
-        help="beams of the laser (default: %(default)s)")  # fmt: skip
-    add("--view", type=positive_number, default=180.0, metavar="DEG",
-        help="angle between the first and the last beam [deg], below 360 (default: 180)")  # fmt: skip
-    add("--range-max", type=range_number, default=20.0, metavar="M", help="largest range [m] (default: 20)")
-    add("--mount", type=finite_number, nargs=3, default=(0.0, 0.0, 0.0), metavar=("X", "Y", "THETA"),
-        help="pose of the laser on the robot [m, m, rad] (default: 0 0 0)")  # fmt: skip
-    add("--noise", type=positive_number, metavar="M", help="standard deviation of ranges [m] (default: 0.02)")
-    add("--motion-noise", type=not_negative_number, nargs=4, metavar=("A1", "A2", "A3", "A4"),
-        help="variances of the odometry per squared motion, as in 'gpusense localize' (default: a fair "
-        "odometer's, 5 %% of turns and distances)")  # fmt: skip
-    add("--parameters", "--params", type=Path, metavar="YAML",
-        help="a file with beam_model or odometry_motion, such as 'gpusense fit --out' writes, for readings and "
-        "odometry")  # fmt: skip
+def _add_sensors(add: Options) -> None:
+    add("--beams K", "beams of the laser", whole_number(low=1, high=100_000), 181)
+    add("--view DEG", "angle between the first and the last beam [deg], below 360", positive_number, 180.0)
+    add("--range-max M", "largest range [m]", range_number, 20.0)
+    add("--mount X Y THETA", "pose of the laser on the robot [m, m, rad]", finite_number, (0.0, 0.0, 0.0))
+    add("--noise M", "standard deviation of ranges [m] (default: 0.02)", positive_number)
+    add("--motion-noise A1 A2 A3 A4", "variances of the odometry per squared motion, as in 'gpusense localize' "
+        "(default: a fair odometer's, 5 %% of turns and distances)", not_negative_number)  # fmt: skip
+    add("--parameters YAML", "a file with beam_model or odometry_motion, such as 'gpusense fit --out' writes, for "
+        "readings and odometry", Path)  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
     """Simulate, and write the files."""
-    from gpusense.evaluation.simulation.files import write_run
-    from gpusense.evaluation.simulation.run import simulate_run
+    from gpusense.evaluation.simulation.run import simulate_run, write_run
     from gpusense.evaluation.trajectory_files import read_tum, write_tum
     from gpusense.world.map_files import read_map, write_map
 
@@ -145,7 +129,7 @@ def run(args: argparse.Namespace) -> int:
 def _check_output(args: argparse.Namespace) -> str:
     """Return the format of the log, after checking that it can be written."""
     from gpusense._util.files import check_writable
-    from gpusense.evaluation.simulation.files import kind_of
+    from gpusense.evaluation.simulation.run import kind_of
     from gpusense.logs.bag_writer import check_bag
 
     kind = kind_of(args.log_out) if args.format is None else str(args.format)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from gpusense._util import checks
 from gpusense._util.progress import progress
 from gpusense.commands import output
-from gpusense.commands.arguments import BACKEND_HELP, output_path, positive_number, whole_number
+from gpusense.commands.arguments import BACKEND_HELP, Options, picture, positive_number, whole_number
 from gpusense.commands.output import counted
 from gpusense.evaluation.machine import machine_line
 
@@ -55,29 +55,25 @@ examples:
       --tls-cert cert.pem --tls-key key.pem"""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_options(add: Options) -> None:
     """Add the command's options."""
-    add = parser.add_argument
-    add("plan", type=Path, metavar="PLAN", help="the plan, a YAML file")
-    add("--table", type=Path, metavar="FILE",
-        help="the table, .csv or .parquet (default: the plan's name with .csv, in this folder)")  # fmt: skip
-    add("--resume", action="store_true", help="keep the rows of an existing table, and run the remaining jobs")
-    add("--retry-failed", action="store_true", help="with --resume: run failed jobs again")
-    add("--root", type=Path, metavar="FOLDER", help="folder of maps and logs (default: the plan's)")
-    add("--dask", metavar="ADDRESS", help="a Dask scheduler, such as tcp://10.0.0.1:8786, or 'local' for a new cluster")
-    add("--processes", type=whole_number(low=1), metavar="N",
-        help="processes, or workers of the local cluster (default: one for each --device)")  # fmt: skip
-    add("--device", action="append", metavar="DEVICE", help=f"{BACKEND_HELP}; repeatable: one worker each")
+    add("PLAN", "the plan, a YAML file", Path)
+    add("--table FILE", "the table, .csv or .parquet (default: the plan's name with .csv, in this folder)", Path)
+    add("--resume", "keep the rows of an existing table, and run the remaining jobs")
+    add("--retry-failed", "with --resume: run failed jobs again")
+    add("--root FOLDER", "folder of maps and logs (default: the plan's)", Path)
+    add("--dask ADDRESS", "a Dask scheduler, such as tcp://10.0.0.1:8786, or 'local' for a new cluster")
+    add("--processes N", "processes, or workers of the local cluster (default: one for each --device)",
+        whole_number(low=1))  # fmt: skip
+    add("--device DEVICE*", f"{BACKEND_HELP}; repeatable: one worker each")
     for name, what in _TLS.items():
-        add(f"--tls-{name}", type=Path, metavar="FILE", help=f"with --dask: {what}, PEM")
-    add("--no-send", action="store_true", help="with --dask: workers read maps and logs from --root themselves")
-    add("--attempts", type=whole_number(low=1), default=3, metavar="A",
-        help="largest number of starts of a job whose worker ends (default: %(default)s)")  # fmt: skip
-    add("--job-timeout", type=positive_number, metavar="SECONDS",
-        help="longest time of a job, which then fails, and its worker is replaced (default: none)")  # fmt: skip
-    add("--list", action="store_true", help="print the jobs with their keys, and run none")
-    add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
-        help="draw error against run time, with a point for each job")  # fmt: skip
+        add(f"--tls-{name} FILE", f"with --dask: {what}, PEM", Path)
+    add("--no-send", "with --dask: workers read maps and logs from --root themselves")
+    add("--attempts A", "largest number of starts of a job whose worker ends", whole_number(low=1), 3)
+    add("--job-timeout SECONDS", "longest time of a job, which then fails, and its worker is replaced (default: none)",
+        positive_number)  # fmt: skip
+    add("--list", "print the jobs with their keys, and run none")
+    add("--plot FILE", "draw error against run time, with a point for each job", picture)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -21,8 +21,7 @@ from gpusense.localization.nav2_file import (
 )
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.peers.parameters import BeamWeights, FieldWeights
-from gpusense.peers.weights import Amcl
+from gpusense.peers.weights import Amcl, BeamWeights, FieldWeights
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 from gpusense.world.scanner import Scanner

@@ -24,8 +24,8 @@ def error_page(
     ``shown``: Texts of the measures on the page, by need; None for all.
     """
     origins = list(dict.fromkeys(row.origin for row in rows))
-    order = sorted({_preference(row) for row in rows})
-    lines = ",\n".join(_json(_plain(row, origins, shown) | {"place": order.index(_preference(row))}) for row in rows)
+    order = sorted({row.preference for row in rows})
+    lines = ",\n".join(_json(_plain(row, origins, shown) | {"place": order.index(row.preference)}) for row in rows)
     data = f'{{"origins":{_json(origins)},"text":{_json(text)},"rows":[\n{lines}]}}'
     page = (_PAGES / "error.html").read_text(encoding="utf-8")
     script = (_PAGES / "error.js").read_text(encoding="utf-8")
@@ -49,11 +49,6 @@ def _plain(row: Row, origins: Sequence[str], shown: Mapping[str, Sequence[str]] 
         ],
         "origin": origins.index(row.origin),
     }  # fmt: skip
-
-
-def _preference(row: Row) -> tuple[Any, ...]:
-    """Return the sort key of a row among equal rows."""
-    return row.entry(next(iter(row.errors))).preference
 
 
 def _json(value: Any) -> str:

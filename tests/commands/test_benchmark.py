@@ -70,10 +70,10 @@ def test_the_answer_comes_first_on_the_terminal(tmp_path, capsys):
     folder = tmp_path / "results"
     assert cli.main([*FIELD, *SMALL, "--backend", "numpy", "--output", str(folder)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("field on numpy, 1 x 7, error at most 0.01 nats: field, float32: ")
+    assert lines[0].startswith("likelihood field on numpy, 1 x 7, error at most 0.01 nats: field: ")
     assert lines[1:3] == ["", "best methods on numpy"] and lines[3].split() == ["problem", "method", "error", "time"]
     table = lines[3 : lines.index("", 3)]
-    assert max(map(len, table)) <= 80 and 3 <= len(table) <= 4 and table[2].startswith("field    field  ")
+    assert max(map(len, table)) <= 80 and 3 <= len(table) <= 4 and table[2].startswith("likelihood field  field  ")
     assert lines[-3].startswith("4 points, 0 left out; truth: ") and lines[-1] == f"written: {folder}"
     written = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     assert ("fewer beams", "every", 4) in {(p["variant"], p["knob"], p["value"]) for p in written["points"]}
@@ -83,9 +83,9 @@ def test_the_recommendation_follows_the_request(capsys):
     """Limits are a time below every method's, a time above all, and an error that only the model keeps."""
     own = [*FIELD, *SMALL, "--backend", "numpy"]
     for wish, answer in (
-        (["--max-time", "1 us"], "field on numpy, 1 x 7, at most 1 us: no method"),
-        (["--max-time", "99 s"], "field on numpy, 1 x 7, at most 99 s: field, float32: "),
-        (["--max-error", "0.1 mm"], "field on numpy, 1 x 7, error at most 0.1 mm: field, float32: "),
+        (["--max-time", "1 us"], "likelihood field on numpy, 1 x 7, at most 1 us: no method"),
+        (["--max-time", "99 s"], "likelihood field on numpy, 1 x 7, at most 99 s: field: "),
+        (["--max-error", "0.1 mm"], "likelihood field on numpy, 1 x 7, error at most 0.1 mm: field: "),
     ):
         assert cli.main([*own, *wish]) == 0
         assert answer in capsys.readouterr().out

@@ -52,7 +52,8 @@ def test_command_help_has_an_example(name, capsys):
 
 
 def test_options_of_a_page_belong_to_a_command_that_it_names():
-    commands = cli._build(cli.COMMANDS)._commands()
+    (group,) = cli._build(cli.COMMANDS)._subparsers._group_actions
+    commands = group.choices
     options = {
         name: {text for one in parser._actions for text in one.option_strings} for name, parser in commands.items()
     }

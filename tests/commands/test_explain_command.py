@@ -39,7 +39,7 @@ def test_the_built_in_scene_is_explained(capsys):
 
 def test_a_scan_of_a_log_is_explained_as_by_the_library(recorded, capsys):
     command = ["explain", "--map", recorded["map"], "--log", recorded["log"], "--scan", "1", "--range-max", "50",
-               "--parameters", recorded["parameters"], "--sigma-hit", "0.04", "--backend", "opencl"]  # fmt: skip
+               "--parameters", recorded["parameters"], "--set", "sigma_hit=0.04", "--backend", "opencl"]  # fmt: skip
     assert main([*command, "-v"]) == 0
     scan = list(gs.read_log(recorded["log"], range_max=50.0))[1]
     grid = gs.read_map(recorded["map"])
@@ -58,8 +58,8 @@ def test_a_scan_of_a_log_is_explained_as_by_the_library(recorded, capsys):
 
 
 def test_parts_are_measured_and_texts_printed(capsys):
-    command = ["explain", "--model", "field", "--z-hit", "1", "--z-rand", "0", "--backend", "opencl"]
-    assert main([*command, "--interpolation", "bilinear", "--measure", "--json"]) == 0
+    command = ["explain", "--model", "field", "--backend", "opencl"]
+    assert main([*command, "--set", "z_hit=1", "z_rand=0", "interpolation=bilinear", "--measure", "--json"]) == 0
     rows = {row["part"]: row["measured_s"] for row in json.loads(capsys.readouterr().out)["left_out"]}
     assert isinstance(rows["rand component"], float) and rows["reduction of huge headings"] is None
     assert main([*command, "--sources"]) == 0
@@ -74,8 +74,8 @@ def test_parts_are_measured_and_texts_printed(capsys):
         (["--scan", "1"], "--scan: must come with --log, got it alone"),
         (["--map", "{map}", "--log", "{log}", "--scan", "2"], "--scan: must be below the log's number of scans, 2,"),
         (["--model", "field", "--caster", "dda"], "--caster: must be left out with the field, got dda"),
-        (["--model", "field", "--z-short", "0.1"], "--z-short: must be a parameter of the field model, got"),
-        (["--z-hit", "0.9"], "z_hit + z_short + z_max + z_rand: must be 1 within 1e-06, got 1.2"),
+        (["--model", "field", "--set", "z_short=0.1"], "LikelihoodFieldParameters: every field must be one of"),
+        (["--set", "z_hit=0.9"], "z_hit + z_short + z_max + z_rand: must be 1 within 1e-06, got 1.2"),
         (["--map", "{map}x"], "{map}x: must exist, got no such file"),
     ],
 )  # fmt: skip

@@ -176,7 +176,7 @@ def test_two_lasers_of_a_bag_track_together(place, capsys, tmp_path):
     neither = call(place, "--global")
     neither[neither.index("--log") + 1] = str(bag.path)
     assert "--topic: must be given, one of /front, /rear" in error_of(neither, capsys)
-    one = call(place, "--sensors", "rear")
+    one = call(place, "--topic", "rear")
     assert "log" in error_of(one, capsys)
 
 
@@ -184,11 +184,11 @@ def test_two_lasers_of_a_bag_track_together(place, capsys, tmp_path):
     ("more", "message"),
     [
         (
-            ["--sensors", "front", "rear"],
+            ["--topic", "front", "rear"],
             "which states no mounts, got front, rear",
         ),
         (
-            ["--sensors", "/scan"],
+            ["--topic", "/scan"],
             "must be only one of 'front' and 'rear' for a CARMEN log, which states no mounts, got /scan",
         ),
         (["--temperature", "2"], "temperature: must be"),

@@ -132,7 +132,7 @@ def test_an_interrupt_keeps_the_chain_so_far(log, truth, tmp_path, capsys, monke
 
         yield show
 
-    monkeypatch.setattr("gpusense.commands.map.progress", interrupting)
+    monkeypatch.setattr("gpusense.commands.signals.progress", interrupting)
     out, tum = tmp_path / "map.yaml", tmp_path / "run.tum"
     command = ["map", "--log", str(log), "--chain", "--out", str(out), "--tum", str(tum), "--range-max", "29"]
     assert main([*command, "--backend", needs("opencl")]) == 130

@@ -82,11 +82,10 @@ def test_an_interrupt_keeps_the_results_so_far(log, tmp_path, capsys, monkeypatc
     def interrupting(total):
         yield stop_after("5")
 
-    monkeypatch.setattr("gpusense.commands.map.progress", interrupting)
+    monkeypatch.setattr("gpusense.commands.signals.progress", interrupting)
     assert main(["map", "--log", str(log), "--out", str(out), "--backend", "numpy", "--range-max", "50"]) == 130
     assert "results of 2 of 4 scans" in capsys.readouterr().out
     assert gs.read_map(out).occupied.any()
-    monkeypatch.setattr("gpusense.commands.likelihood_map.progress", interrupting)
     monkeypatch.setattr("gpusense.matching.pose_likelihood._TILE", 6000)
     code = main(["likelihood-map", "--map", str(out), "--log", str(log), "--out", str(picture), "--headings", "4",
                  "--backend", "numpy", "--range-max", "50", "--resolution", "0.05"])  # fmt: skip

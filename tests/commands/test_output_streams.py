@@ -65,9 +65,9 @@ def test_json_has_no_numbers_that_json_does_not_know(capsys):
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, 1], "c": [1.5, None], "d": "x", "e": None}
 
 
-def test_plain_table_is_aligned():
-    lines = output.table_lines(["name", "s"], [["numpy", "1.25"], ["a", "10.50"]], right=["s"])
-    assert lines == ["name       s", "-----  -----", "numpy   1.25", "a      10.50"]
+def test_plain_table_is_aligned(capsys):
+    output.table(["name", "s"], [["numpy", "1.25"], ["a", "10.50"]], right=["s"])
+    assert capsys.readouterr().out.splitlines() == ["name       s", "-----  -----", "numpy   1.25", "a      10.50"]
 
 
 def test_terminal_gets_a_table_and_a_progress_bar(monkeypatch, capsys):

@@ -86,7 +86,8 @@ def stop_at(monkeypatch: pytest.MonkeyPatch, command: str, number: int, step: in
 
         yield show
 
-    monkeypatch.setattr(f"gpusense.commands.{command}.progress", stopping)
+    for module in ("signals", *(("sweep",) if command == "sweep" else ())):
+        monkeypatch.setattr(f"gpusense.commands.{module}.progress", stopping)
 
 
 @pytest.mark.sampled(0.35)

@@ -140,7 +140,7 @@ def test_parameters_come_from_a_file(capsys, recorded, tmp_path):
     options = ["--particles", "50", "--backend", "numpy", "--limit", "1", "--json", "--parameters", str(file)]
     code, out, _ = run(capsys, recorded, *options)
     assert (code, json.loads(out)["parameters"]) == (0, gs.BeamParameters(sigma_hit=0.07).to_dict())
-    code, out, _ = run(capsys, recorded, *options, "--sigma-hit", "0.2")
+    code, out, _ = run(capsys, recorded, *options, "--set", "sigma_hit=0.2")
     assert json.loads(out)["parameters"]["sigma_hit"] == 0.2
 
 
@@ -151,7 +151,7 @@ def test_parameters_come_from_a_file(capsys, recorded, tmp_path):
         ("beam_model: 3", "beam", "parameters.yaml: must hold a mapping beam_model, got 3"),
         ("{}", "beam", "parameters.yaml: must hold a mapping beam_model, got None"),
         ("[", "beam", "parameters.yaml: must be plain YAML, got an error"),
-        ("beam_model: {}", "field", "--parameters: must be left out with the field"),
+        ("beam_model: {}", "field", "parameters.yaml: must hold a mapping likelihood_field, got None"),
     ],
 )
 def test_bad_files_of_parameters(capsys, recorded, tmp_path, text, model, message):
@@ -172,14 +172,14 @@ def test_plot_is_drawn_and_text_names_device(capsys, recorded, tmp_path):
 
 def test_impossible_particles_are_reported_and_json_has_no_nan(capsys, recorded):
     code, out, _ = run(capsys, recorded, "--model", "beam", "--particles", "20", "--backend", "numpy", "--limit", "1",
-                       "--z-hit", "0", "--z-short", "0", "--z-rand", "0", "--z-max", "1", "--json")  # fmt: skip
+                       "--set", "z_hit=0", "z_short=0", "z_rand=0", "z_max=1", "--json")  # fmt: skip
     assert code == 0
     assert "NaN" not in out
     document = json.loads(out)
     assert document["summary"]["degenerate"] == 1
     assert document["scans"][0]["mean"] is None
     code, out, _ = run(capsys, recorded, "--model", "beam", "--particles", "20", "--backend", "numpy", "--limit", "1",
-                       "--z-hit", "0", "--z-short", "0", "--z-rand", "0", "--z-max", "1")  # fmt: skip
+                       "--set", "z_hit=0", "z_short=0", "z_rand=0", "z_max=1")  # fmt: skip
     assert "every particle is impossible in every scan" in out
 
 
@@ -187,13 +187,13 @@ def test_impossible_particles_are_reported_and_json_has_no_nan(capsys, recorded)
     "arguments, complaint",
     [
         (["--offset", "99"], "scan of index 99"),
-        (["--z-hit", "0.9"], "must be 1"),
-        (["--model", "field", "--lambda-short", "1"], "--lambda-short"),
-        (["--interpolation", "bilinear"], "--interpolation"),
+        (["--set", "z_hit=0.9"], "must be 1"),
+        (["--set", "z_hit"], "--set: must be NAME=VALUE, got z_hit"),
+        (["--model", "field", "--set", "lambda_short=1"], "must be one of z_hit, z_max"),
+        (["--set", "interpolation=bilinear"], "got 'interpolation'"),
         (["--backend", "opencl:no such device"], "no such device"),
         (["--temperature", "2"], "temperature"),
         (["--particles", "1"], "particles"),
-        (["--sigma-heading", "-1"], "sigma-heading"),
         (["--plot", "picture.txt"], "picture.txt"),
     ],
 )

@@ -42,9 +42,8 @@ def test_class_commands_sweeps_and_bench_have_one_field(monkeypatch):
     assert model.parameters == copy.copy(model).parameters == tracking != gs.LikelihoodFieldParameters()
     monkeypatch.syspath_prepend(BENCH)
     assert importlib.import_module("recordings").field("numpy")(grid, scanner).parameters == tracking
-    parser = argparse.ArgumentParser()
-    arguments.add_model(parser)
-    arguments.add_parameters(parser)
+    parser = argparse.ArgumentParser(add_help=False)
+    arguments.SHARED["model"](arguments.Options(parser))
     assert arguments.parameters_of(parser.parse_args(["--model", "field"])) == tracking
 
 
@@ -58,8 +57,8 @@ def test_library_and_commands_have_its_values():
     assert gs.OmniMotion().least == gs.VelocityMotion().least == DEFAULTS.least
     parsers = []
     for command in (localize, landmarks):
-        parsers.append(argparse.ArgumentParser())
-        command.add_arguments(parsers[-1])
+        parsers.append(argparse.ArgumentParser(add_help=False))
+        command.add_options(arguments.Options(parsers[-1]))
     assert parsers[0].get_default("temperature") == DEFAULTS.temperature
     assert parsers[1].get_default("particles") == DEFAULTS.particles
     # Options that override a file of parameters have no default; their help states the table's value.

@@ -46,9 +46,11 @@ def test_the_script_chooses_as_python_does() -> None:
         f"(list => [paretoFront(list).map(row => row.name), {budgets}.map(s => (recommended(list, s) ?? {{}}).name "
         f"?? null)])({rows})"
     )
-    entries = [choice.Entry(name, "", "", error, time) for name, error, time in listed]
-    assert front == [entry.method for entry in choice.front(entries)]
-    found = [choice.choose(entries, None, seconds) for seconds in budgets]
+    entries = [
+        Row("rays", "d", ALL, name, "", "", "", time, (time,) * 3, {"e": error}, {}) for name, error, time in listed
+    ]
+    assert front == [entry.method for entry in choice.front(entries, "e")]
+    found = [choice.choose(entries, "e", None, seconds) for seconds in budgets]
     assert chosen == [None if entry is None else entry.method for entry in found]
     assert chosen == [None, "f", "c", "e", "e", "b", "a"]
 
@@ -144,8 +146,8 @@ def test_a_scene_without_any_method_does_not_count() -> None:
     for extra, maps in (([], {""}), (late, {""}), ([half, *late], {"", "4 of 5 clouds"})):
         rows = model_rows(report | {"points": [*report["points"], *extra]})
         assert {row.maps for row in rows if row.scene == ALL} == maps
-    chosen = choice.entries([*report["points"], *late], "ranges", "%", "numpy")
-    assert {entry.method for entry in chosen} == {"exact", "march"}
+    ((_, _, front),) = choice.choices(report | {"points": [*report["points"], *late]}, {"%": 1.0})
+    assert {method for _, method, *_ in front} == {"exact"}
 
 
 def test_devices_with_equal_titles_are_distinguished() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import re
 import subprocess
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,7 +13,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gpusense.evaluation.benchmark.choice import Entry, error_of, label, setting
 from gpusense.evaluation.benchmark.runner import Outcome, Plan
 
 SCHEMA = 2
@@ -93,13 +93,18 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: int) -
 
 
 ALL = "all maps"
+_NUMBER = re.compile(r"[0-9.]+")
+# Methods that gpusense takes where none is named.
+_DEFAULT = ("exact", "field", "beam", "auto", "em", "nearest")
+# Knobs whose smaller values are finer; of the others larger ones are.
+_SMALLER = ("tolerance", "every", "bin width")
 NEEDS = {"ranges": "rays", "beam": "beam model", "field": "likelihood field"}
 # Measures of each need as (place in a point, cloud or "" for all, text, unit); the limit applies to the first.
 MODEL_MEASURES = {
     "rays": (
         (("ranges", "wrong_1"), "", "rays wrong by more than a cell", "share"),
-        (("ranges", "median"), "", "median error of a ray", "cells"),
         (("ranges", "p95"), "", "95 % error of a ray", "cells"),
+        (("ranges", "median"), "", "median error of a ray", "cells"),
         (("ranges", "max"), "", "largest error of a ray", "cells"),
     ),
     "beam model": (
@@ -142,7 +147,7 @@ class Row:
         maps: "8 of 10 clouds" if some were left out because of the time that a table takes; such a row is never chosen.
         cases: For a row of all maps, each scene by itself.
         origin: Command that measured it, with date and commit.
-        doubt: See :class:`~gpusense.evaluation.benchmark.choice.Entry`.
+        doubt: Factor of the error within which the error of another run lies; 1 if all runs have the same errors.
     """
 
     need: str
@@ -171,11 +176,13 @@ class Row:
         text = ", ".join(word for word in (self.method, self.setting, precision) if word)
         return f"{text} ({self.maps})" if self.maps else text
 
-    def entry(self, measure: str) -> Entry:
-        """Return the row as an entry to choose from, by a measure."""
-        return Entry(
-            self.method, self.setting, self.precision, self.errors[measure], self.seconds, self.exact, self.doubt,
-        )  # fmt: skip
+    @property
+    def preference(self) -> tuple[bool, bool, int, bool, str, float]:
+        """Place among equal methods: exact, float32, few assumptions, a default, name, and the coarsest setting."""
+        numbers = math.prod(float(number) for number in _NUMBER.findall(self.setting))
+        coarse = -numbers if self.setting.startswith(_SMALLER) else numbers
+        other = self.method not in _DEFAULT
+        return not self.exact, self.precision != "float32", self.method.count(","), other, self.method, coarse
 
 
 def title_of(point: Mapping[str, Any], machine: Mapping[str, Any], driver: str = "", target: str = "") -> str:
@@ -224,20 +231,41 @@ def mean(numbers: Iterable[float]) -> float:
     return math.exp(sum(logs) / len(logs))
 
 
-def seconds_of(point: Mapping[str, Any]) -> float | None:
-    """Return the time of a point: CPU time on a processor, least elapsed time on a GPU."""
-    name = "call_min_s" if point["kind"] == "gpu" else "processor_s"
+def label(point: Mapping[str, Any]) -> str:
+    """Name a point's method with its variant."""
+    return f"{point['method']}, {point['variant']}" if point["variant"] else str(point["method"])
+
+
+def setting(point: Mapping[str, Any]) -> str:
+    """Format a point's knob with its value; empty without a knob."""
+    return f"{point['knob']} = {point['value']:g}" if point["knob"] else ""
+
+
+def error_of(point: Mapping[str, Any], kind: str, name: str) -> float | None:
+    """Return an error of a point; None where the point failed or lacks that kind."""
+    value = ((point.get("errors") or {}).get(kind) or {}).get(name)
+    return None if value is None or point["status"] != "ok" else float(value)
+
+
+def seconds_of(point: Mapping[str, Any], *, elapsed: bool = False) -> float | None:
+    """Return the time of a point: CPU time on a processor, least elapsed time on a GPU or if ``elapsed``."""
+    name = "call_min_s" if elapsed or point["kind"] == "gpu" else "processor_s"
     value = (point["time"] or {}).get(name)
     return float(value) if value else None
 
 
-def model_rows(report: Mapping[str, Any]) -> list[Row]:
+def model_rows(report: Mapping[str, Any], *, elapsed: bool = False) -> list[Row]:
     """Return the rows of a report of ``gpusense bench``, for each map and for all together.
+
+    ``elapsed``: Whether to take elapsed times on processors too, and to name devices by their selection strings.
 
     A method that failed in a scene has no row for the scene and none for all maps. A scene where every method was left
     out, such as one after the deadline of a quick run, does not count.
     """
-    titles, origin = titles_of(report["points"], report["machine"], report.get("devices", ())), origin_of(report)
+    titles: Mapping[str, str] = {point["backend"]: point["backend"] for point in report["points"]}
+    if not elapsed:
+        titles = titles_of(report["points"], report["machine"], report.get("devices", ()))
+    origin = origin_of(report)
     groups: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
     everywhere: dict[tuple[str, ...], set[tuple[str, str]]] = {}
     for point in report["points"]:
@@ -251,7 +279,7 @@ def model_rows(report: Mapping[str, Any]) -> list[Row]:
         whole = len(everywhere.get((need, backend, precision), ()))
         for scene in [*dict.fromkeys(point["scene"] for point in kept), ALL]:
             part = kept if scene == ALL else [point for point in kept if point["scene"] == scene]
-            made = _model_row(need, titles[backend], scene, part) if part else None
+            made = _model_row(need, titles[backend], scene, part, elapsed) if part else None
             if made is not None:
                 some = scene == ALL and len(part) < whole
                 maps = f"{len(part)} of {whole} clouds" if some else ""
@@ -271,8 +299,8 @@ def _case(need: str, point: Mapping[str, Any]) -> Case:
     return Case(f"{point['scene']}, {point['cloud']}", seconds_of(point) or 0.0, _measured(need, point))
 
 
-def _model_row(need: str, title: str, scene: str, group: Sequence[Mapping[str, Any]]) -> Row | None:
-    times = [seconds_of(point) for point in group]
+def _model_row(need: str, title: str, scene: str, group: Sequence[Mapping[str, Any]], elapsed: bool) -> Row | None:
+    times = [seconds_of(point, elapsed=elapsed) for point in group]
     if any(time is None or point["status"] != "ok" for time, point in zip(times, group, strict=True)):
         return None
     found = [_measured(need, point) for point in group]

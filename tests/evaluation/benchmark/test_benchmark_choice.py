@@ -9,7 +9,7 @@ import random
 
 import numpy as np
 import pytest
-from support.bench_world import made_point
+from support.bench_world import made_point, made_report
 
 from gpusense.evaluation.benchmark import choice, report
 
@@ -31,8 +31,16 @@ def test_numbers_of_a_report_are_json():
     }
 
 
-def entry(method: str, error: float, seconds: float, **changes: object) -> choice.Entry:
-    return choice.Entry(method, "", "float32", error, seconds, **changes)
+def entry(method, error, seconds, setting="", precision="float32", **changes):
+    errors, units = {"e": error}, {"e": "m"}
+    quartiles = (seconds,) * 3
+    return report.Row(
+        "rays", "d", report.ALL, method, setting, precision, "", seconds, quartiles, errors, units, **changes
+    )
+
+
+def choose(rows, *limits):
+    return choice.choose(rows, "e", *limits)
 
 
 LISTED = [
@@ -57,13 +65,13 @@ LISTED = [
     ],
 )
 def test_choice_by_hand(error, seconds, chosen):
-    found = choice.choose(LISTED, error, seconds)
+    found = choose(LISTED, error, seconds)
     assert (found and found.method) == chosen
 
 
 def test_front_by_hand():
     """Rounding errors do not count: the slower of two exact methods is beaten."""
-    names = [one.method for one in choice.front(LISTED)]
+    names = [one.method for one in choice.front(LISTED, "e")]
     assert names == ["model itself", "little off, varied", "little off, twice varied, once", "rough"]
 
 
@@ -73,7 +81,7 @@ def test_noise_of_other_days_changes_no_choice(seed):
     draw = random.Random(seed)
     noisy = [dataclasses.replace(each, seconds=each.seconds * draw.uniform(0.9, 1.1)) for each in LISTED]
     for error, seconds in ((1e-5, None), (0.01, None), (1.0, None), (None, 10.0), (None, 2.0), (None, 0.5)):
-        assert choice.choose(noisy, error, seconds).method == choice.choose(LISTED, error, seconds).method
+        assert choose(noisy, error, seconds).method == choose(LISTED, error, seconds).method
 
 
 def test_of_equal_methods_nothing_measured_decides():
@@ -86,12 +94,12 @@ def test_of_equal_methods_nothing_measured_decides():
     ]  # fmt: skip
     draw = random.Random(0)
     listed = [
-        choice.Entry(*one, draw.uniform(0.1, 0.12), draw.uniform(1, 1.2), exact=one[0] == "exact") for one in order
+        entry(one[0], draw.uniform(0.1, 0.12), draw.uniform(1, 1.2), *one[1:], exact=one[0] == "exact") for one in order
     ]
     for first in range(len(listed)):
         rest = draw.sample(listed[first:], len(listed) - first)
         for limits in ((1.0, None), (None, 9.0)):
-            assert choice.choose(rest, *limits) == listed[first]
+            assert choose(rest, *limits) == listed[first]
 
 
 @pytest.mark.parametrize(
@@ -106,37 +114,34 @@ def test_of_equal_methods_nothing_measured_decides():
 )  # fmt: skip
 def test_an_earlier_choice_stands_until_another_method_is_clearly_better(error, seconds, changes, stands):
     best, earlier = entry("a", 0.1, 1.0), entry("z", **({"error": 0.1, "seconds": 1.0} | changes))
-    assert choice.choose([best, earlier], error, seconds) == best
-    assert choice.choose([best, earlier], error, seconds, earlier) == (earlier if stands else best)
-    assert choice.choose([best], error, seconds, earlier) == best
+    assert choose([best, earlier], error, seconds) == best
+    assert choose([best, earlier], error, seconds, earlier) == (earlier if stands else best)
+    assert choose([best], error, seconds, earlier) == best
 
 
 def test_an_error_keeps_its_limit_for_other_seeds():
     sure, doubtful = entry("b", 0.019, 2.0), entry("a", 0.017, 1.0, doubt=1.2)
-    assert choice.choose([sure, doubtful], 0.02, None) == sure and choice.choose([doubtful], 0.021, None) == doubtful
-    assert choice.choose([doubtful], 0.02, None) is None
+    assert choose([sure, doubtful], 0.02, None) == sure and choose([doubtful], 0.021, None) == doubtful
+    assert choose([doubtful], 0.02, None) is None
 
 
 def test_a_method_is_judged_by_its_worst_scene_and_must_work_in_all():
-    kl = {"kl": 0.0}
+    kl, known = {"kl": 0.0}, {"problem": "beam", "cloud": "tracking"}
     points = [
-        made_point(problem="beam", comparable=kl, call_min_s=1.0),
-        made_point(problem="beam", scene="t", comparable={"kl": 0.3}, call_min_s=4.0),
-        made_point(problem="beam", method="dda", comparable=kl),
-        made_point(problem="beam", method="dda", scene="t", status="failed", errors=None, time=None),
+        made_point(**known, comparable=kl, call_min_s=1.0),
+        made_point(**known, scene="t", comparable={"kl": 0.3}, call_min_s=4.0),
+        made_point(**known, method="dda", comparable=kl),
+        made_point(**known, method="dda", scene="t", status="failed", errors=None, time=None),
     ]
-    (only,) = choice.entries(points, "beam", "nats", "numpy")
-    assert (only.method, only.error, only.seconds) == ("exact", 0.3, pytest.approx(2.0))
-    ((_, answer, _),) = choice.choices(points, {"nats": 0.1})
-    assert answer == "beam on numpy, 10 x 10, error at most 0.1 nats: no method"
-    late = made_point(
-        problem="beam", status="left out", reason="the 40 s of this run were over", errors=None, time=None
-    )
-    ((_, answer, _),) = choice.choices([late], {"nats": 0.1})
+    made = made_report() | {"points": points, "command": "", "date": "", "commit": ""}
+    ((_, answer, _),) = choice.choices(made, {"nats": 0.1})
+    assert answer == "beam model on numpy, 10 x 10, error at most 0.1 nats: no method"
+    late = made_point(**known, status="left out", reason="the 40 s of this run were over", errors=None, time=None)
+    ((_, answer, _),) = choice.choices(made | {"points": [late]}, {"nats": 0.1})
     assert answer.endswith("error at most 0.1 nats: not measured: the 40 s of this run were over")
-    ((_, answer, rows),) = choice.choices(points, {"nats": 0.4}, 3.0)
-    assert answer == "beam on numpy, 10 x 10, error at most 0.4 nats, at most 3 s: exact, float32: 2 s, 0.3 nats"
-    assert rows == [("beam", "exact", "0.3 nats", "2 s")]
+    ((_, answer, rows),) = choice.choices(made, {"nats": 0.4}, 3.0)
+    assert answer == "beam model on numpy, 10 x 10, error at most 0.4 nats, at most 3 s: exact: 2 s, 0.3 nats"
+    assert rows == [("beam model", "exact", "0.3 nats", "2 s")]
 
 
 def test_limits_have_units():
@@ -150,6 +155,6 @@ def test_limits_have_units():
 
 
 def test_values_are_read_with_units():
-    values = ((0.0123, "%"), (0.0123, "m"), (0.0042, "m"), (3e-9, "nats"), (0.5, "cells"))
+    values = ((0.0123, "share"), (0.0123, "m"), (0.0042, "m"), (3e-9, "nats"), (0.5, "cells"))
     assert [choice.error_text(*one) for one in values] == ["1.2 %", "1.23 cm", "4.2 mm", "0 nats", "0.5 cells"]
     assert [choice.time_text(s) for s in (1.5e-5, 0.0042, 2.0)] == ["15 us", "4.2 ms", "2 s"]

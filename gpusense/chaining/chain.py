@@ -143,9 +143,9 @@ class Chainer:
             check_step(step), 0.0, motion, close_loops, backend, precision,
         )  # fmt: skip
         self._fronts = [self._new_front(one) for one in range(len(data.scanners))]
-        self._loops: tuple[Joint, Loops] | None = None
-        self._links_of: tuple[Joint, Links] | None = None
-        self._motion, self._fitted_to = motion, 0
+        # The trajectory with its links, and the search for loops in it, once it has begun.
+        self._loops: tuple[Joint, Links, Loops] | None = None
+        self._motion = motion
 
     @property
     def scans(self) -> int:
@@ -165,7 +165,7 @@ class Chainer:
     @property
     def loops(self) -> Loops | None:
         """The search for revisited places; None before it begins."""
-        return None if self._loops is None else self._loops[1]
+        return None if self._loops is None else self._loops[2]
 
     def steps(self) -> Iterator[str]:
         """Match, search and close loops step by step, and yield a message on each step."""
@@ -182,8 +182,9 @@ class Chainer:
             yield f"scan {self.scans} of {len(self._data)}"
         if self._options.close_loops and any(len(front.keys) > LOCAL + 1 for front in self._fronts):
             joint = self._joint()
-            self._loops = joint, self._make_loops(joint)
-            yield from self._loops[1].steps()
+            links = self._links(joint)
+            self._loops = joint, links, self._make_loops(joint, links)
+            yield from self._loops[2].steps()
 
     def _find_order(self, one: int) -> Iterator[str]:
         """Determine the order of a scanner's beams in time, and restart its front end with this order."""
@@ -213,13 +214,13 @@ class Chainer:
 
     def chain(self) -> ScanChain:
         """Return the trajectory of the scans so far."""
-        joint = self._joint() if self._loops is None else self._loops[0]
-        links, poses = self._all_links(joint), joint.poses
-        closures = Links.joined([])
-        if self._loops is not None:
-            loops = self._loops[1]
+        if self._loops is None:
+            joint = self._joint()
+            links, poses, closures = self._links(joint), joint.poses, Links.joined([])
+        else:
+            joint, links, loops = self._loops
             closures = loops.closures.renumbered(joint.keys)
-            poses = _carried(poses, joint.keys, loops.solution.poses)
+            poses = _carried(joint.poses, joint.keys, loops.solution.poses)
         # The curvature of a long chain is barely observable without closures, and the chain of matches bends least.
         solution = solve(poses, Links.joined([links, closures]), settle=len(closures) > 0)
         spread = pose_covariances(solution)
@@ -228,14 +229,12 @@ class Chainer:
         corrections = np.hypot(*(solution.links.pose[found] - moved)[:, :2].T)
         return self._placed(joint, solution, spread, corrections)
 
-    def _make_loops(self, joint: Joint) -> Loops:
+    def _make_loops(self, joint: Joint, links: Links) -> Loops:
         """Return the search for loops in the graph of the key scans."""
         keys, data = joint.keys, self._data
         number = np.full(len(joint.nodes), -1)
         number[keys] = np.arange(len(keys))
-        links, poses = self._all_links(joint), joint.poses
-        if len(joint.fronts) > 1:
-            poses = solve(poses, links).poses
+        poses = joint.poses if len(joint.fronts) == 1 else solve(joint.poses, links).poses
         links = links[(number[links.first] >= 0) & (number[links.second] >= 0)].renumbered(number)
         links = Links.joined([links, joint.couplings_of_keys(poses)])
         places = data.places()
@@ -246,14 +245,8 @@ class Chainer:
             weak[keys], links, solve(poses[keys], links), TEMPERATURE, (LOCAL + 1) * len(joint.fronts),
         )  # fmt: skip
 
-    def _all_links(self, joint: Joint) -> Links:
-        """Return the links of matches and of odometry or constant motion; keep the last trajectory's links."""
-        if self._links_of is None or self._links_of[0] is not joint:
-            self._links_of = joint, self._made_links(joint)
-        return self._links_of[1]
-
-    def _made_links(self, joint: Joint) -> Links:
-        """Make the links of matches and of odometry or constant motion; fit the odometry's noise once."""
+    def _links(self, joint: Joint) -> Links:
+        """Return the links of matches and of odometry or constant motion; fit the odometry's noise."""
         parts = [joint.renumbered(weighed(front), one) for one, front in enumerate(joint.fronts)]
         if self._odometry is None:
             links = Links.joined([*parts, joint.couplings(None, None)])
@@ -263,8 +256,8 @@ class Chainer:
             links, wheels = weighed(front), self._odometry[self._data.rows[one][front.nodes[: front.done]]]
             if front.done < 2:
                 continue
-            if self._options.motion is None and self._fitted_to != front.done and one == 0:
-                self._motion, self._fitted_to = fitted_odometry(front, links, wheels), front.done
+            if self._options.motion is None and one == 0:
+                self._motion = fitted_odometry(front, links, wheels)
             others = links_of_odometry(front, links, wheels, self._motion or OdometryMotion())
             # All scanners share one odometer.
             others = replace(others, information=others.information / len(joint.fronts))
@@ -288,7 +281,7 @@ class Chainer:
             compose_poses(start, poses), turn @ covariance @ turn.T, solution.links.renumbered(nodes),
             nodes[joint.keys], None if self._odometry is None else self._motion, self._motions(count),
             durations[0] if len(durations) == 1 else durations, self._data.sensor[:count], corrections,
-            doubts_of(joint, self._odometry is None), len(nodes), 0 if self._loops is None else self._loops[1].searched,
+            doubts_of(joint, self._odometry is None), len(nodes), 0 if self.loops is None else self.loops.searched,
         )  # fmt: skip
 
     def _motions(self, count: int) -> Floats | None:

@@ -187,7 +187,7 @@ class Loops:
         for _ in range(3):
             taken = left[agree]
             links, poses = Links.joined([self.links, taken]), self.solution.poses
-            equations = Equations(len(poses), links.first, links.second, 0, ordered=True)
+            equations = Equations(len(poses), links.first, links.second, ordered=True)
             if (taken.squared(taken.residuals(poses)) > KERNEL**2 / _WEIGHT).any():
                 poses = solve(poses, links, kernel=_WIDE * KERNEL, least=_GAIN, equations=equations).poses
             self.solution = solve(poses, links, least=_GAIN, equations=equations)

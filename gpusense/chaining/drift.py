@@ -51,7 +51,7 @@ class Drift:
             return
         moved = (links.kind == CLOSURE) & (len(anchors) < count)
         local = links[~moved]
-        matrix, _ = normal_equations(poses, local, local.weight, 0)
+        matrix = normal_equations(poses, local)
         # The first pose is known, so its rows and columns are 0.
         rows = (3 * (anchors[1:, None] - 1) + np.arange(3)).ravel()
         whole, size = np.zeros_like(self._joint), 3 * len(anchors) - 3
@@ -224,8 +224,7 @@ def pose_covariances(solution: Solution) -> Floats:
     count = len(solution.poses)
     result = np.zeros((count, 3, 3))
     if count > 1:
-        matrix, _ = normal_equations(solution.poses, solution.links, solution.links.weight, 0)
-        result[1:] = inverse_blocks(matrix, DAMPING)
+        result[1:] = inverse_blocks(normal_equations(solution.poses, solution.links), DAMPING)
     return result
 
 

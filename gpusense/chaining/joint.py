@@ -7,8 +7,9 @@ this interpolation.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,16 +140,30 @@ class Joint:
         self.nodes, self.owner = whole[order], owner[order]
         self.of = [np.searchsorted(self.nodes, nodes) for nodes in own]  # each front end's nodes among all
         self.keys = np.sort(np.concatenate([of[_below(front.keys, len(of))] for front, of in self._each()]))
-        self._trust = np.stack([self._trust_of(front, of) for front, of in self._each()])
+        # (L, M - 1) knowledge of each motion: -1 no scans, 0 no match, 1 with open directions, 2 full.
+        self._trust = self._of_motions(
+            lambda front: np.where(front.p_right < SURE, 0, np.where(front.lost > 0, 1, 2)), -1
+        )
         # (M - 1,) whether no scanner determines the motion from a node to the next, whether scanners that do leave a
         # direction open, and whether a second motion fits the scans equally.
         self.failed: Flags = self._trust.max(axis=0) <= 0
         self.open = ~self.failed & self._open()
-        self.contested = ~self.failed & self._contested()
+        self.contested = ~self.failed & (self._of_motions(lambda front: front.rivalled, True) | (self._trust <= 0)).all(
+            axis=0
+        )
         self.poses = fronts[0].poses if len(fronts) == 1 else self._chained(times)
 
     def _each(self) -> list[tuple[Front, Integers]]:
         return list(zip(self.fronts, self.of, strict=True))
+
+    def _of_motions(self, values: Callable[[Front], NDArray[Any]], absent: object) -> NDArray[Any]:
+        """Return (L, M - 1) values of the front ends' steps at the motions between all nodes."""
+        rows = []
+        for front, of in self._each():
+            step, inside = _steps_of(of, len(self.nodes))
+            rows.append(np.full(len(step), absent))
+            rows[-1][inside] = values(front)[step[inside]]
+        return np.stack(rows)
 
     def renumbered(self, links: Links, index: int) -> Links:
         """Renumber links of a front end to the nodes of all front ends, without links beyond the last node."""
@@ -158,28 +173,20 @@ class Joint:
     @property
     def broken(self) -> Integers:
         """(M,) number of motions before each node that no scanner determines and no match spans."""
-        spanned = np.zeros(len(self.failed), bool)
-        for front, of in self._each():
-            step, inside = _steps_of(of, len(self.nodes))
-            spanned[inside] |= front.spanned[step[inside]]
+        spanned = self._of_motions(lambda front: front.spanned, False).any(axis=0)
         result: Integers = np.append(0, np.cumsum(self.failed & ~spanned))
         return result
 
     @property
     def weak(self) -> Flags:
         """Mask (M - 1,) of motions between nodes that may be breaks of the chain by every scanner."""
-        weak = np.ones(len(self.failed), bool)
-        for front, of in self._each():
-            step, inside = _steps_of(of, len(self.nodes))
-            weak[inside] &= front.weak[step[inside]]
+        weak: Flags = np.logical_and.reduce(self._of_motions(lambda front: front.weak, True))
         return weak
 
     def jumped(self) -> Flags:
         """Return whether the time jumps from a node to the next for all scanners with scans there."""
-        jumped = np.ones(len(self.nodes) - 1, bool)
-        for front, of in self._each():
-            step, inside = _steps_of(of, len(self.nodes))
-            jumped[inside] &= front.jumps[front.nodes[step[inside] + 1]]
+        jumps = self._of_motions(lambda front: front.jumps[front.nodes[1 : front.done]], True)
+        jumped: Flags = np.logical_and.reduce(jumps)
         return jumped
 
     def ranks(self) -> Integers:
@@ -192,22 +199,9 @@ class Joint:
 
     def confirmations(self) -> Integers:
         """Count the additional matches (M - 1,) that determine the motion from a node to the next."""
-        total = np.count_nonzero(self._trust > 0, axis=0) - 1
-        for front, of in self._each():
-            step, inside = _steps_of(of, len(self.nodes))
-            if inside.any():
-                total = total + np.where(inside, front.confirmations()[np.where(inside, step, 0)], 0)
-        result: Integers = np.maximum(total, 0)
+        spanning = self._of_motions(lambda front: front.confirmations(), 0).sum(axis=0)
+        result: Integers = np.maximum(np.count_nonzero(self._trust > 0, axis=0) - 1 + spanning, 0)
         return result
-
-    def _trust_of(self, front: Front, of: Integers) -> Integers:
-        """Rate a front end's knowledge of each motion: -1 no scans, 0 no match, 1 with open directions, 2 full."""
-        step, inside = _steps_of(of, len(self.nodes))
-        trust = np.full(len(step), -1)
-        if inside.any():
-            step = step[inside]
-            trust[inside] = np.where(front.p_right[step] < SURE, 0, np.where(front.lost[step] > 0, 1, 2))
-        return trust
 
     def _open(self) -> Flags:
         """Return whether matches leave a direction of the motion from each node to the next open."""
@@ -224,15 +218,6 @@ class Joint:
         values = np.linalg.eigvalsh(total)
         found: Flags = values[:, 0] <= _OPEN * np.maximum(values[:, -1], 1e-300)
         return found & (self._trust.max(axis=0) < 2)
-
-    def _contested(self) -> Flags:
-        """Return whether a second motion explains the scans of every front end that determines each motion."""
-        contested = np.ones(len(self.nodes) - 1, bool)
-        for index, (front, of) in enumerate(self._each()):
-            told = self._trust[index] > 0
-            step, _ = _steps_of(of, len(self.nodes))
-            contested[told] &= front.rivalled[step[told]]
-        return contested
 
     def _chained(self, times: Floats | None) -> Floats:
         """Return poses by the motions of the front ends that determine them best."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,15 +94,6 @@ _LITTLE = 1e-6
 NEAR = (0.5, 0.3)
 
 
-class Found(NamedTuple):
-    """Matches of L pairs: see :class:`gpusense.matching.result.ScanMatch` for the fields."""
-
-    pose: Floats
-    information: Floats
-    p_right: Floats
-    status: NDArray[np.str_]
-
-
 class Matcher:
     """Matcher of a scanner's (S, K) readings [m].
 
@@ -145,8 +136,8 @@ class Matcher:
         return replace(found, information=information, eigenvalues=values)
 
     def across(
-        self, first: Integers, other: Matcher, second: Integers, guess: Floats, window: tuple[float, float] | None
-    ) -> Found:
+        self, first: Integers, other: Matcher, second: Integers, guess: Floats, window: tuple[float, float]
+    ) -> ScanMatch:
         """Return the robot's poses at scans of a second scanner with equal bearings, relative to this scanner's.
 
         Both are matched as scans of a scanner in the middle of a robot, so that matched poses are scanner poses.
@@ -156,11 +147,14 @@ class Matcher:
             self.scanner.bearings, min(self.scanner.range_max, other.scanner.range_max),
             max(self.scanner.range_min, other.scanner.range_min),
         )  # fmt: skip
-        moved: tuple[Floats | None, Floats | None] = (None, None)
+        moved: dict[str, Any] = {}
         if self.motion is not None or other.motion is not None:
-            moved = _motion_at(self, first, one), _motion_at(other, second, two)
-        seen = compose_poses(invert_poses(one), compose_poses(guess, two))
-        match = self._matched(plain, self.readings[first], other.readings[second], seen, window, moved)
+            moved = dict(motion=_motion_at(other, second, two), reference_motion=_motion_at(self, first, one))
+        match = match_scan(
+            self.readings[first], other.readings[second], plain,
+            compose_poses(invert_poses(one), compose_poses(guess, two)), window=window,
+            backend=self._options.backend, precision=self._options.precision, **moved,
+        )  # fmt: skip
         back = invert_poses(two)
         pose = compose_poses(one, compose_poses(match.pose, back))
         # Derivative of the robot's pose by the scanner's.
@@ -170,18 +164,7 @@ class Matcher:
         c, s = np.cos(one[2]), np.sin(one[2])
         inverse = np.linalg.inv(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ inner)
         information = inverse.transpose(0, 2, 1) @ match.information @ inverse
-        return Found(pose, information, match.p_right, np.asarray(match.status))
-
-    def _matched(
-        self, scanner: Scanner, one: Floats, two: Floats, guess: Floats, window: tuple[float, float] | None,
-        moved: tuple[Floats | None, Floats | None],
-    ) -> ScanMatch:  # fmt: skip
-        options: dict[str, Any] = {} if window is None else {"window": window}
-        if moved[0] is not None:
-            options |= {"motion": moved[1], "reference_motion": moved[0]}
-        return match_scan(
-            one, two, scanner, guess, backend=self._options.backend, precision=self._options.precision, **options
-        )
+        return match.changed(pose=pose, information=information)
 
     def links(self, kind: str, first: Integers, second: Integers, guess: Floats) -> Links:
         """Return links of the usable matches near their guesses."""
@@ -211,7 +194,7 @@ class TeamMatcher:
         result: NDArray[np.bool] = self._alike[self._sensor[first], self._sensor[second]]
         return result
 
-    def match(self, first: Integers, second: Integers, guess: Floats, window: tuple[float, float]) -> Found:
+    def match(self, first: Integers, second: Integers, guess: Floats, window: tuple[float, float]) -> ScanMatch:
         """Return the poses at second scans relative to first scans, for pairs that can be matched."""
         pairs = self._sensor[first] * len(self._matchers) + self._sensor[second]
         parts, order = [], []
@@ -219,14 +202,10 @@ class TeamMatcher:
             some = np.flatnonzero(pairs == pair)
             one, two = (self._matchers[k] for k in divmod(int(pair), len(self._matchers)))
             a, b = self._place[first[some]], self._place[second[some]]
-            if one is two:
-                match = one.match(a, b, guess[some], window)
-                parts.append(Found(match.pose, match.information, match.p_right, np.asarray(match.status)))
-            else:
-                parts.append(one.across(a, two, b, guess[some], window))
+            same = one is two
+            parts.append(one.match(a, b, guess[some], window) if same else one.across(a, two, b, guess[some], window))
             order.append(some)
-        back = np.argsort(np.concatenate(order))
-        return Found(*(np.concatenate(values)[back] for values in zip(*parts, strict=True)))
+        return ScanMatch.joined(parts).ordered(np.argsort(np.concatenate(order)))
 
 
 def _motion_at(matcher: Matcher, scans: Integers, mount: Floats) -> Floats:

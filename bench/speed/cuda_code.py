@@ -20,7 +20,7 @@ from pathlib import Path
 import warp as wp
 
 from gpusense.interface.flags import FLAGS
-from gpusense.interface.kernel_files import warp_module
+from gpusense.interface.kernel_files import warp_files
 from gpusense.interface.signatures import KERNELS
 
 _INSTRUCTION = re.compile(r"/\*[0-9a-f]{4,}\*/\s+(?:@!?U?P\w+\s+)?([A-Z]\w*)")
@@ -29,7 +29,7 @@ _ENDS = {"BRA", "CALL", "EXIT", "RET", "BSYNC", "WARPSYNC"}
 
 def disassembled(kernel: str, flags: frozenset[str], arch: int, nvdisasm: str) -> str:
     """Return the machine code of a kernel as text."""
-    made = warp_module(KERNELS[kernel].file).make(kernel, flags)
+    made = warp_files().kernel_of(kernel, flags)
     with tempfile.TemporaryDirectory() as folder:
         wp.compile_aot_module(made.module, arch=arch, module_dir=folder, use_ptx=False)
         (code,) = Path(folder).glob("*.cubin")

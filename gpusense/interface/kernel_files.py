@@ -56,10 +56,15 @@ def has_opencl_source(name: str) -> bool:
     return (kernel_root() / "opencl" / f"{name}.cl").is_file()
 
 
-def warp_module(name: str) -> ModuleType:
-    """Import ``warp/<name>.py`` as ``gpusense.kernels.warp.<name>``."""
+def warp_source(name: str) -> str:
+    """Return the text of ``warp/<name>.py``."""
+    return (kernel_root() / "warp" / f"{name}.py").read_text(encoding="utf-8")
+
+
+def warp_files() -> ModuleType:
+    """Import ``warp/prelude.py``, which loads the other files for sets of flags."""
     _register_package()
-    return importlib.import_module(f"{_PACKAGE}.warp.{name}")
+    return importlib.import_module(f"{_PACKAGE}.warp.prelude")
 
 
 def _register_package() -> None:

@@ -7,12 +7,13 @@ sin^2(r / 2). Mardia and Jupp, *Directional Statistics* (2000), section 3.5. z_r
 (RAND).
 """
 
-import functools
-
 import warp as wp
 
-from . import error_free, log_terms
-from .prelude import kernel, precision
+from .error_free import pair_product, pair_sum, two_sum
+from .flags import FLOAT64, RAND
+from .log_terms import bounded_square, either, log_one_plus
+from .prelude import kernel
+from .types import real, vec2
 
 # Distributions of a heading: sum of normals, its Fourier series, von Mises.
 NEARBY, SERIES, VON_MISES = wp.constant(0), wp.constant(1), wp.constant(2)
@@ -23,108 +24,100 @@ SINE = (
     -2.505210838544172e-08, 1.6059043836821613e-10, -7.647163731819816e-13, 2.8114572543455206e-15,
     -8.22063524662433e-18, 1.9572941063391263e-20,
 )  # fmt: skip
+ZERO, HALF, ONE, TWO = real(0.0), real(0.5), real(1.0), real(2.0)
+HALF_TURN = real(3.141592653589793)
+HALF_TURN_LOW = real(0.0 if FLOAT64 else -8.742277657347586e-08)
+# exp(-NEGLIGIBLE) is below half an eps.
+NEGLIGIBLE = real(40.0)
+S0, S1, S2, S3, S4, S5, S6, S7, S8, S9 = (real(term) for term in SINE)
 
 
-@functools.cache
-def make(name, flags):
-    types = precision(flags)
-    real, vec2 = types.real, types.vec2
-    base = flags & {"FLOAT64"}
-    exact, logs = error_free.functions(base), log_terms.functions(base)
-    two_sum, pair_sum, pair_product = exact.two_sum, exact.pair_sum, exact.pair_product
-    bounded_square, log_one_plus, either = logs.bounded_square, logs.log_one_plus, logs.either
-    ZERO, HALF, ONE, TWO = real(0.0), real(0.5), real(1.0), real(2.0)
-    HALF_TURN = real(3.141592653589793)
-    HALF_TURN_LOW = real(0.0 if "FLOAT64" in flags else -8.742277657347586e-08)
-    # exp(-NEGLIGIBLE) is below half an eps.
-    NEGLIGIBLE = real(40.0)
-    RAND = "RAND" in flags
-    S0, S1, S2, S3, S4, S5, S6, S7, S8, S9 = (real(term) for term in SINE)
+@wp.func
+def half_sine(residual: vec2):
+    """Return sin(r / 2) of an angle in [-pi, pi]."""
+    x = HALF * residual.x
+    z = x * x
+    higher = S5 + z * (S6 + z * (S7 + z * (S8 + z * S9)))
+    series = S0 + z * (S1 + z * (S2 + z * (S3 + z * (S4 + z * higher))))
+    return two_sum(x, HALF * residual.y + x * (z * series))
 
-    @wp.func
-    def half_sine(residual: vec2):
-        """Return sin(r / 2) of an angle in [-pi, pi]."""
-        x = HALF * residual.x
-        z = x * x
-        higher = S5 + z * (S6 + z * (S7 + z * (S8 + z * S9)))
-        series = S0 + z * (S1 + z * (S2 + z * (S3 + z * (S4 + z * higher))))
-        return two_sum(x, HALF * residual.y + x * (z * series))
 
-    @wp.func
-    def log_other_turns(residual: vec2, decay: real):
-        """Return the log of the ratio of the sum over all turns to the normal of the nearest turn."""
-        size = wp.abs(residual.x)
-        low = residual.y
-        if residual.x < ZERO:
-            low = -low
-        rest = wp.max((HALF_TURN - size) + (HALF_TURN_LOW - low), ZERO)
-        others = real(0.0)
-        k = int(1)
-        # For most headings the other turns add nothing.
-        if decay * rest > NEGLIGIBLE:
-            k = WRAPS + 1
-        while k <= WRAPS:
-            turns = real(k)
-            others += wp.exp(-decay * turns * ((turns - ONE) * HALF_TURN + rest))
-            others += wp.exp(-decay * turns * (turns * HALF_TURN + size))
-            k += 1
-        return log_one_plus(others)
+@wp.func
+def log_other_turns(residual: vec2, decay: real):
+    """Return the log of the ratio of the sum over all turns to the normal of the nearest turn."""
+    size = wp.abs(residual.x)
+    low = residual.y
+    if residual.x < ZERO:
+        low = -low
+    rest = wp.max((HALF_TURN - size) + (HALF_TURN_LOW - low), ZERO)
+    others = real(0.0)
+    k = int(1)
+    # For most headings the other turns add nothing.
+    if decay * rest > NEGLIGIBLE:
+        k = WRAPS + 1
+    while k <= WRAPS:
+        turns = real(k)
+        others += wp.exp(-decay * turns * ((turns - ONE) * HALF_TURN + rest))
+        others += wp.exp(-decay * turns * (turns * HALF_TURN + size))
+        k += 1
+    return log_one_plus(others)
 
-    @wp.func
-    def log_waves(residual: vec2, waves: wp.array(dtype=real)):
-        """Return the log of the ratio of the Fourier series to its first term, by Clenshaw's recurrence. waves are 2
-        q^(n n).
-        """
-        sine = half_sine(residual)
-        cosine = ONE - TWO * sine.x * sine.x
-        newer = real(0.0)
-        older = real(0.0)
-        n = WAVES
-        while n > 0:
-            following = waves[n - 1] + TWO * cosine * newer - older
-            older = newer
-            newer = following
-            n -= 1
-        return log_one_plus(cosine * newer - older)
 
-    @kernel(flags)
-    def score_position(place, terms, log_p, particles, temperature):
-        """Score positions: one work-item takes a particle."""
-        n = wp.tid()
-        if n >= particles:
-            return
-        sensor = place[n]
-        x = vec2(sensor.x, sensor.y)
-        y = vec2(sensor.z, sensor.w)
-        first = bounded_square(pair_product(x, vec2(terms[0].x_scale, terms[0].x_scale_low)))
-        y_scaled = pair_product(y, vec2(terms[0].y_scale, terms[0].y_scale_low))
-        mixed = pair_sum(pair_product(x, vec2(terms[0].shear, terms[0].shear_low)), y_scaled)
-        exponent = pair_sum(first, bounded_square(mixed))
+@wp.func
+def log_waves(residual: vec2, waves: wp.array(dtype=real)):
+    """Return the log of the ratio of the Fourier series to its first term, by Clenshaw's recurrence. waves are 2 q^(n
+    n).
+    """
+    sine = half_sine(residual)
+    cosine = ONE - TWO * sine.x * sine.x
+    newer = real(0.0)
+    older = real(0.0)
+    n = WAVES
+    while n > 0:
+        following = waves[n - 1] + TWO * cosine * newer - older
+        older = newer
+        newer = following
+        n -= 1
+    return log_one_plus(cosine * newer - older)
+
+
+@kernel
+def score_position(place, terms, log_p, particles, temperature):
+    """Score positions: one work-item takes a particle."""
+    n = wp.tid()
+    if n >= particles:
+        return
+    sensor = place[n]
+    x = vec2(sensor.x, sensor.y)
+    y = vec2(sensor.z, sensor.w)
+    first = bounded_square(pair_product(x, vec2(terms[0].x_scale, terms[0].x_scale_low)))
+    y_scaled = pair_product(y, vec2(terms[0].y_scale, terms[0].y_scale_low))
+    mixed = pair_sum(pair_product(x, vec2(terms[0].shear, terms[0].shear_low)), y_scaled)
+    exponent = pair_sum(first, bounded_square(mixed))
+    log_density = (terms[0].peak - exponent.x) + (terms[0].peak_low - exponent.y)
+    if RAND:
+        log_density = either(log_density, terms[0].random)
+    log_p[n] = temperature * log_density
+
+
+@kernel
+def score_heading(residual, terms, waves, log_p, particles, kind, temperature):
+    """Score headings: one work-item takes a particle. Residuals are headings minus the reading, in [-pi, pi]."""
+    n = wp.tid()
+    if n >= particles:
+        return
+    r = residual[n]
+    log_density = real(0.0)
+    if kind == SERIES:
+        log_density = terms[0].peak + (terms[0].peak_low + log_waves(r, waves))
+    else:
+        root = r
+        if kind == VON_MISES:
+            root = half_sine(r)
+        exponent = bounded_square(pair_product(root, vec2(terms[0].scale, terms[0].scale_low)))
         log_density = (terms[0].peak - exponent.x) + (terms[0].peak_low - exponent.y)
-        if RAND:
-            log_density = either(log_density, terms[0].random)
-        log_p[n] = temperature * log_density
-
-    @kernel(flags)
-    def score_heading(residual, terms, waves, log_p, particles, kind, temperature):
-        """Score headings: one work-item takes a particle. Residuals are headings minus the reading, in [-pi, pi]."""
-        n = wp.tid()
-        if n >= particles:
-            return
-        r = residual[n]
-        log_density = real(0.0)
-        if kind == SERIES:
-            log_density = terms[0].peak + (terms[0].peak_low + log_waves(r, waves))
-        else:
-            root = r
-            if kind == VON_MISES:
-                root = half_sine(r)
-            exponent = bounded_square(pair_product(root, vec2(terms[0].scale, terms[0].scale_low)))
-            log_density = (terms[0].peak - exponent.x) + (terms[0].peak_low - exponent.y)
-            if kind == NEARBY:
-                log_density += log_other_turns(r, terms[0].decay)
-        if RAND:
-            log_density = either(log_density, terms[0].random)
-        log_p[n] = temperature * log_density
-
-    return locals()[name]
+        if kind == NEARBY:
+            log_density += log_other_turns(r, terms[0].decay)
+    if RAND:
+        log_density = either(log_density, terms[0].random)
+    log_p[n] = temperature * log_density

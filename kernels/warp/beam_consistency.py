@@ -4,15 +4,16 @@ These start next to it and diverge. gpusense.localization.beam_consistency descr
 With IN_TEAMS the work-items of a group share the steps of a walk, of which each takes some neighbours.
 """
 
-import functools
 import math
 
 import warp as wp
 
 from gpusense.interface import constants
 
-from . import heading
-from .prelude import kernel, precision, work_item
+from .flags import IN_TEAMS, SMALL_TEAMS
+from .heading import cos_sin
+from .prelude import kernel, work_item
+from .types import Frame
 
 # Values of unknown cells, and of places off the map, also unknown.
 UNKNOWN, OFF = wp.constant(255), wp.constant(256)
@@ -81,9 +82,7 @@ def walk_ray(
     start: wp.vec2d, slope: wp.vec2d, begin: wp.int32, end: wp.int32, cells: wp.array(dtype=wp.uint8), part: wp.vec2i,
     rows: wp.int32, cols: wp.int32, occupied: wp.int32,
 ):  # fmt: skip
-    """Return the distances along a ray to the first wall, and to the first unknown cell before it [cells]; infinite for
-    none.
-    """
+    """Return the distances along a ray to the first wall, and to the first unknown cell before it [cells]."""
     wall = wp.float64(FOREVER)
     unknown = wp.float64(FOREVER)
     col_before = int(0)
@@ -117,122 +116,116 @@ def walk_ray(
     return wp.vec2d(wall, unknown)
 
 
-@functools.cache
-def make(name, flags):
-    structs = precision(flags)
-    Frame = structs.Frame
-    cos_sin = heading.functions(flags & {"HUGE_HEADINGS"}).cos_sin
-    IN_TEAMS = "IN_TEAMS" in flags
-    TEAM = 1
-    if IN_TEAMS:
-        TEAM = FEWER_WALKERS if "SMALL_TEAMS" in flags else MOST_WALKERS
+TEAM = 1
 
-    @wp.func
-    def walk_beside(
-        side: wp.float64, direction: wp.float64, origin: wp.vec2d, companion: wp.vec2d, steps: wp.int32,
-        cells: wp.array(dtype=wp.uint8), part: wp.vec2i, rows: wp.int32, cols: wp.int32, cell: wp.float64,
-        occupied: wp.int32, member: wp.int32,
-    ):  # fmt: skip
-        """Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1), which starts next to
-        it and diverges.
-        """
-        along = cos_sin(direction)
-        slope = cos_sin(direction + side * companion.y)
-        shift = side * companion.x
-        x = (origin.x - shift * along.y) / cell
-        y = (origin.y + shift * along.x) / cell
-        start = wp.vec2d(wp.min(wp.max(x, MINUS_AFAR), AFAR), wp.min(wp.max(y, MINUS_AFAR), AFAR))
-        if not IN_TEAMS:
-            return walk_ray(start, slope, 0, steps, cells, part, rows, cols, occupied) * cell
-        share = (steps + walkers() - 1) / walkers()
-        begin = member * share
-        own = walk_ray(start, slope, begin, wp.min(begin + share, steps), cells, part, rows, cols, occupied)
-        first = least_of_team(own)
-        if first.y > first.x:
-            first = wp.vec2d(first.x, FOREVER)
-        return first * cell
 
-    @wp.func
-    def origin_of(estimate: wp.array(dtype=wp.float64), frame: Frame):
-        """Return where the beams of an estimated pose begin, along the map's axes [m]."""
-        x = estimate[0] - frame.origin_x
-        y = estimate[1] - frame.origin_y
-        if frame.mount_x != ZERO or frame.mount_y != ZERO:
-            heading = cos_sin(estimate[2])
-            x += heading.x * frame.mount_x - heading.y * frame.mount_y
-            y += heading.y * frame.mount_x + heading.x * frame.mount_y
-        return wp.vec2d(frame.yaw_cos * x + frame.yaw_sin * y, frame.yaw_cos * y - frame.yaw_sin * x)
+if IN_TEAMS:
+    TEAM = FEWER_WALKERS if SMALL_TEAMS else MOST_WALKERS
 
-    @wp.func
-    def deviations_of(estimate: wp.array(dtype=wp.float64)):
-        """Return the largest deviation of a position over directions [m], and the deviation of the heading [rad]."""
-        xx = wp.max(estimate[3], ZERO)
-        xy = estimate[4]
-        yy = wp.max(estimate[6], ZERO)
-        tt = wp.max(estimate[8], ZERO)
-        all = estimate[3] + estimate[4] + estimate[5] + estimate[6] + estimate[7] + estimate[8]
-        if not (all - all == ZERO):
-            return wp.vec2d(FOREVER, FOREVER)
-        half_apart = (xx - yy) / TWO
-        return wp.vec2d(wp.sqrt((xx + yy) / TWO + wp.sqrt(half_apart * half_apart + xy * xy)), wp.sqrt(tt))
 
-    @kernel(flags)
-    def judge_beams(cells, estimate, scan, judged, frame, rules, rows, cols, beams):
-        """Judge the beams of an estimated pose: a work-item, or with IN_TEAMS a team of them, takes a beam."""
-        item = work_item(wp.tid())
-        b = item // TEAM
-        member = item - b * TEAM
-        if b >= beams or (IN_TEAMS and member >= walkers()):
-            return
-        reading = scan[beams + b]
-        if wp.isnan(reading):
-            # NOTHING, as Warp would take a converted constant for the variable below.
-            judged[b] = ZERO
-            judged[beams + b] = FOREVER
-            return
-        origin = origin_of(estimate, frame)
-        deviation = deviations_of(estimate)
-        near = wp.min(deviation.x, rules.most_beside)
-        companion = wp.vec2d(
-            wp.min(wp.max(rules.beside, deviation.x), rules.most_beside),
-            wp.min(wp.max(rules.apart, deviation.y), rules.most_apart) + rules.cone,
-        )
-        direction = scan[b] + estimate[2]
-        cell = frame.resolution
-        wall = rules.occupied
-        part = wp.vec2i(rules.left, rules.top)
-        returned = reading < rules.range_max
-        if not returned:
-            reading = rules.range_max
-        tolerance = wp.max(wp.max(rules.least, near), rules.part * reading)
-        before = reading - tolerance
-        after = reading + tolerance
-        within = returned and reading <= rules.limit
-        steps = wp.int32(wp.min(after, rules.limit) / (cell * STEP)) + 1
-        # A ray gives no evidence beyond the first unknown cell.
-        end = wp.where(returned, before, reading)
-        own = walk_beside(ZERO, direction, origin, companion, steps, cells, part, rows, cols, cell, wall, member)
-        seen = own.y >= wp.min(own.x, end)
-        kind = NOTHING
-        if within and own.x >= before and own.x <= after and seen:
+@wp.func
+def walk_beside(
+    side: wp.float64, direction: wp.float64, origin: wp.vec2d, companion: wp.vec2d, steps: wp.int32,
+    cells: wp.array(dtype=wp.uint8), part: wp.vec2i, rows: wp.int32, cols: wp.int32, cell: wp.float64,
+    occupied: wp.int32, member: wp.int32,
+):  # fmt: skip
+    """Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1)."""
+    along = cos_sin(direction)
+    slope = cos_sin(direction + side * companion.y)
+    shift = side * companion.x
+    x = (origin.x - shift * along.y) / cell
+    y = (origin.y + shift * along.x) / cell
+    start = wp.vec2d(wp.min(wp.max(x, MINUS_AFAR), AFAR), wp.min(wp.max(y, MINUS_AFAR), AFAR))
+    if not IN_TEAMS:
+        return walk_ray(start, slope, 0, steps, cells, part, rows, cols, occupied) * cell
+    share = (steps + walkers() - 1) / walkers()
+    begin = member * share
+    own = walk_ray(start, slope, begin, wp.min(begin + share, steps), cells, part, rows, cols, occupied)
+    first = least_of_team(own)
+    if first.y > first.x:
+        first = wp.vec2d(first.x, FOREVER)
+    return first * cell
+
+
+@wp.func
+def origin_of(estimate: wp.array(dtype=wp.float64), frame: Frame):
+    """Return where the beams of an estimated pose begin, along the map's axes [m]."""
+    x = estimate[0] - frame.origin_x
+    y = estimate[1] - frame.origin_y
+    if frame.mount_x != ZERO or frame.mount_y != ZERO:
+        heading = cos_sin(estimate[2])
+        x += heading.x * frame.mount_x - heading.y * frame.mount_y
+        y += heading.y * frame.mount_x + heading.x * frame.mount_y
+    return wp.vec2d(frame.yaw_cos * x + frame.yaw_sin * y, frame.yaw_cos * y - frame.yaw_sin * x)
+
+
+@wp.func
+def deviations_of(estimate: wp.array(dtype=wp.float64)):
+    """Return the largest deviation of a position over directions [m], and the deviation of the heading [rad]."""
+    xx = wp.max(estimate[3], ZERO)
+    xy = estimate[4]
+    yy = wp.max(estimate[6], ZERO)
+    tt = wp.max(estimate[8], ZERO)
+    all = estimate[3] + estimate[4] + estimate[5] + estimate[6] + estimate[7] + estimate[8]
+    if not (all - all == ZERO):
+        return wp.vec2d(FOREVER, FOREVER)
+    half_apart = (xx - yy) / TWO
+    return wp.vec2d(wp.sqrt((xx + yy) / TWO + wp.sqrt(half_apart * half_apart + xy * xy)), wp.sqrt(tt))
+
+
+@kernel
+def judge_beams(cells, estimate, scan, judged, frame, rules, rows, cols, beams):
+    """Judge the beams of an estimated pose: a work-item, or with IN_TEAMS a team of them, takes a beam."""
+    item = work_item(wp.tid())
+    b = item // TEAM
+    member = item - b * TEAM
+    if b >= beams or (IN_TEAMS and member >= walkers()):
+        return
+    reading = scan[beams + b]
+    if wp.isnan(reading):
+        # NOTHING, as Warp would take a converted constant for the variable below.
+        judged[b] = ZERO
+        judged[beams + b] = FOREVER
+        return
+    origin = origin_of(estimate, frame)
+    deviation = deviations_of(estimate)
+    near = wp.min(deviation.x, rules.most_beside)
+    companion = wp.vec2d(
+        wp.min(wp.max(rules.beside, deviation.x), rules.most_beside),
+        wp.min(wp.max(rules.apart, deviation.y), rules.most_apart) + rules.cone,
+    )
+    direction = scan[b] + estimate[2]
+    cell = frame.resolution
+    wall = rules.occupied
+    part = wp.vec2i(rules.left, rules.top)
+    returned = reading < rules.range_max
+    if not returned:
+        reading = rules.range_max
+    tolerance = wp.max(wp.max(rules.least, near), rules.part * reading)
+    before = reading - tolerance
+    after = reading + tolerance
+    within = returned and reading <= rules.limit
+    steps = wp.int32(wp.min(after, rules.limit) / (cell * STEP)) + 1
+    # A ray gives no evidence beyond the first unknown cell.
+    end = wp.where(returned, before, reading)
+    own = walk_beside(ZERO, direction, origin, companion, steps, cells, part, rows, cols, cell, wall, member)
+    seen = own.y >= wp.min(own.x, end)
+    kind = NOTHING
+    if within and own.x >= before and own.x <= after and seen:
+        kind = AGREES
+    else:
+        left = walk_beside(ONE, direction, origin, companion, steps, cells, part, rows, cols, cell, wall, member)
+        right = walk_beside(MINUS_ONE, direction, origin, companion, steps, cells, part, rows, cols, cell, wall, member)
+        nearest = wp.min(own.x, wp.min(left.x, right.x))
+        farthest = wp.max(own.x, wp.max(left.x, right.x))
+        seen = seen and left.y >= wp.min(left.x, end) and right.y >= wp.min(right.x, end)
+        if seen and within and wp.isinf(nearest):
+            kind = SHORT
+        if seen and not returned and not wp.isinf(farthest):
+            kind = VANISHED
+        if seen and returned and farthest < before:
+            kind = THROUGH
+        if seen and within and nearest <= after and farthest >= before and not wp.isinf(farthest):
             kind = AGREES
-        else:
-            left = walk_beside(ONE, direction, origin, companion, steps, cells, part, rows, cols, cell, wall, member)
-            right = walk_beside(
-                MINUS_ONE, direction, origin, companion, steps, cells, part, rows, cols, cell, wall, member
-            )
-            nearest = wp.min(own.x, wp.min(left.x, right.x))
-            farthest = wp.max(own.x, wp.max(left.x, right.x))
-            seen = seen and left.y >= wp.min(left.x, end) and right.y >= wp.min(right.x, end)
-            if seen and within and wp.isinf(nearest):
-                kind = SHORT
-            if seen and not returned and not wp.isinf(farthest):
-                kind = VANISHED
-            if seen and returned and farthest < before:
-                kind = THROUGH
-            if seen and within and nearest <= after and farthest >= before and not wp.isinf(farthest):
-                kind = AGREES
-        judged[b] = wp.float64(kind)
-        judged[beams + b] = own.x
-
-    return locals()[name]
+    judged[b] = wp.float64(kind)
+    judged[beams + b] = own.x

@@ -41,9 +41,7 @@ def occupied_at(bits: wp.array(dtype=wp.int32), begin: wp.int32, col: wp.int32):
 
 @wp.func
 def cells_right(bits: wp.array(dtype=wp.int32), begin: wp.int32, words: wp.int32, col: wp.int32, most: wp.int32):
-    """Count the cells from a cell to the first occupied one to its right, itself included; NONE if none is within most
-    cells. An occupied cell beyond most cells may also be returned. The row begins at index begin.
-    """
+    """Count the cells from a cell to the first occupied one to its right, itself included."""
     last = wp.min((col + most) >> 5, words - 1)
     i = col >> 5
     word = wp.uint32(word_at(bits, begin + i)) & (ALL_BITS << wp.uint32(col & 31))

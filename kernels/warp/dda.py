@@ -2,60 +2,46 @@
 exact caster. The table holds 1 for occupied cells in a ring of twos.
 """
 
-import functools
-from types import SimpleNamespace
-
 import warp as wp
 
-from . import ray as ray_file
-from .prelude import precision
-from .ray import off_grid
+from .flags import ORIGINS_OUTSIDE, OUTSIDE_OCCUPIED
+from .ray import make_ray, off_grid, start_walk
 from .rectangles import padded
+from .types import Caster, Window, real, vec2, vec4
 
 ENTRY = wp.uint8
+ZERO = real(0.0)
 
 
-@functools.cache
-def functions(flags):
-    types = precision(flags)
-    real, vec2, vec4 = types.real, types.vec2, types.vec4
-    geometry = ray_file.functions(flags)
-    make_ray, start_walk = geometry.make_ray, geometry.start_walk
-    ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags
-    OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
-    ZERO = real(0.0)
-
-    @wp.func
-    def cast_ray(
-        map_table: wp.array(dtype=ENTRY), window: types.Window, cell: wp.vec2i, pose: vec4, ray: vec2, limit: real,
-        caster: types.Caster,
-    ):  # fmt: skip
-        """Return the distance in cells to the first occupied cell, limit where none is nearer."""
-        r = make_ray(pose, ray)
-        if ORIGINS_OUTSIDE and OUTSIDE_OCCUPIED:
-            if off_grid(cell.x, cell.y, window.rows, window.cols):
-                return ZERO
-        start = start_walk(r, cell, window, limit)
-        k_x = int(start.k_x)
-        k_y = int(start.k_y)
-        t = real(start.t)
+@wp.func
+def cast_ray(
+    map_table: wp.array(dtype=ENTRY), window: Window, cell: wp.vec2i, pose: vec4, ray: vec2, limit: real,
+    caster: Caster,
+):  # fmt: skip
+    """Return the distance in cells to the first occupied cell, limit where none is nearer."""
+    r = make_ray(pose, ray)
+    if ORIGINS_OUTSIDE and OUTSIDE_OCCUPIED:
+        if off_grid(cell.x, cell.y, window.rows, window.cols):
+            return ZERO
+    start = start_walk(r, cell, window, limit)
+    k_x = int(start.k_x)
+    k_y = int(start.k_y)
+    t = real(start.t)
+    if t >= limit:
+        return limit
+    while True:
+        state = int(map_table[padded(cell.y + r.step_y * k_y, cell.x + r.step_x * k_x, window.cols)])
+        if state != 0:
+            if OUTSIDE_OCCUPIED:
+                return t
+            else:
+                return wp.where(state == 1, t, limit)
+        t_x = (real(k_x) + r.a_x) * r.inv_x
+        t_y = (real(k_y) + r.a_y) * r.inv_y
+        t = wp.min(t_x, t_y)
         if t >= limit:
             return limit
-        while True:
-            state = int(map_table[padded(cell.y + r.step_y * k_y, cell.x + r.step_x * k_x, window.cols)])
-            if state != 0:
-                if OUTSIDE_OCCUPIED:
-                    return t
-                else:
-                    return wp.where(state == 1, t, limit)
-            t_x = (real(k_x) + r.a_x) * r.inv_x
-            t_y = (real(k_y) + r.a_y) * r.inv_y
-            t = wp.min(t_x, t_y)
-            if t >= limit:
-                return limit
-            if t_x <= t_y:
-                k_x += 1
-            else:
-                k_y += 1
-
-    return SimpleNamespace(**locals())
+        if t_x <= t_y:
+            k_x += 1
+        else:
+            k_y += 1

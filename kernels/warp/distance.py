@@ -6,8 +6,6 @@ cell, and stops its search around the cell once no nearer obstacle is possible. 
 indices fit int32.
 """
 
-import functools
-
 import warp as wp
 
 from .bits import cells_left, cells_right
@@ -17,7 +15,7 @@ NO_OBSTACLE = wp.constant(-1)
 UNREACHABLE = wp.constant(0x7FFFFFFF)
 
 
-@kernel()
+@kernel
 def distance_lines(occupied, along, lines, length, line_stride, step):
     """First pass: count the cells to the nearest occupied cell of the same line, NO_OBSTACLE without one."""
     line = wp.tid()
@@ -49,7 +47,7 @@ def parabola(i: wp.int32, j: wp.int32, across: wp.int32):
     return (i - j) * (i - j) + across * across
 
 
-@kernel()
+@kernel
 def distance_envelope(along, starts, squared, lines, length, line_stride, step):
     """Second pass: evaluate the lower envelope of the parabolas of the first pass."""
     line = wp.tid()
@@ -85,8 +83,6 @@ def distance_envelope(along, starts, squared, lines, length, line_stride, step):
                 top -= 1
 
 
-# ---- kernels with a work-item per cell
-
 # Larger than all distances. Its square plus the square of a distance fits into 32 unsigned bits.
 FAR = wp.constant(46341)
 BLOCK_BITS = wp.constant(5)
@@ -95,7 +91,7 @@ BLOCK_ROWS = wp.constant(32)
 STEP_ROWS = wp.constant(4)
 
 
-@kernel()
+@kernel
 def distance_bits(bits, nearest, rows, cols, words, reach):
     """First pass: count the cells to the nearest occupied cell of the same row, FAR where it is over reach."""
     row, col = wp.tid()
@@ -108,7 +104,7 @@ def distance_bits(bits, nearest, rows, cols, words, reach):
     nearest[row * cols + col] = wp.uint16(cells)
 
 
-@kernel()
+@kernel
 def distance_blocks(nearest, blocks, rows, cols, count):
     """Find the minimum of each column of a block of rows. One work-item takes a column of a block."""
     block, col = wp.tid()
@@ -126,7 +122,7 @@ def squares_sum(a: wp.uint32, b: wp.uint32):
     return a * a + b * b
 
 
-@kernel()
+@kernel
 def distance_search(nearest, blocks, squared, rows, cols, count, most):
     """Second pass: find the least sum of squares along the column of a cell, UNREACHABLE where it is over most."""
     row, col = wp.tid()
@@ -174,28 +170,15 @@ def distance_search(nearest, blocks, squared, rows, cols, count, most):
     squared[row * cols + col] = result
 
 
-# ---- table of a likelihood field
-
-
-@functools.cache
-def make(name, flags):
-    """Return a kernel of the file; only the table of a likelihood field has the precision of the flags."""
-    if name != "fill_field":
-        return globals()[name]
-
-    @kernel(flags)
-    def fill_field(squared, density, table, rows, cols, cap, beyond, from_col, from_row, width, height, begin, stride):
-        """Fill width x height cells of a field's table from squared distances: density has a value for each squared
-        distance up to the cap.
-        """
-        j, i = wp.tid()
-        if i >= width or j >= height:
-            return
-        col = from_col + i
-        row = from_row + j
-        value = beyond
-        if col >= 0 and col < cols and row >= 0 and row < rows:
-            value = density[wp.min(squared[row * cols + col], cap)]
-        table[begin + j * stride + i] = value
-
-    return fill_field
+@kernel
+def fill_field(squared, density, table, rows, cols, cap, beyond, from_col, from_row, width, height, begin, stride):
+    """Fill width x height cells of a field's table from squared distances."""
+    j, i = wp.tid()
+    if i >= width or j >= height:
+        return
+    col = from_col + i
+    row = from_row + j
+    value = beyond
+    if col >= 0 and col < cols and row >= 0 and row < rows:
+        value = density[wp.min(squared[row * cols + col], cap)]
+    table[begin + j * stride + i] = value

@@ -1,7 +1,5 @@
 """Steps of damped Gauss-Newton (Levenberg) from poses to maxima of an interpolated likelihood field."""
 
-import functools
-
 import warp as wp
 
 from .prelude import kernel
@@ -49,65 +47,59 @@ def damped_step(climb: wp.array(dtype=wp.float64), at: wp.int32):
     return wp.vec3d(step_x / over, step_y / over, turn / over)
 
 
-@functools.cache
-def make(name, flags):
-    """Make the kernel for a set of flags."""
-
-    @kernel(flags)
-    def climb_step(gradient, poses, climb, scans, parts, most, small, yaw_cos, yaw_sin):
-        """Judge the poses that were evaluated, and take the next step of each climb."""
-        n = wp.tid()
-        if n >= scans:
-            return
-        at = CLIMB * n
-        if climb[at + ENDED] != ZERO:
-            return
-        numbers = Numbers()
-        for part in range(parts):
-            for k in range(13):
-                numbers[k] = numbers[k] + wp.float64(gradient[GRADIENT_NUMBERS * (parts * n + part) + k])
-        pose = 3 * parts * n
-        off_x = poses[pose] - climb[at]
-        off_y = poses[pose + 1] - climb[at + 1]
-        turn = wp.abs(poses[pose + 2] - climb[at + 2])
-        far_x = poses[pose] - climb[at + START]
-        far_y = poses[pose + 1] - climb[at + START + 1]
-        first = climb[at + STEPS] < ZERO
-        within = far_x * far_x + far_y * far_y <= FARTHEST_CLIMB * FARTHEST_CLIMB
-        better = first or (numbers[0] >= climb[at + VALUE] and within)
+@kernel
+def climb_step(gradient, poses, climb, scans, parts, most, small, yaw_cos, yaw_sin):
+    """Judge the poses that were evaluated, and take the next step of each climb."""
+    n = wp.tid()
+    if n >= scans:
+        return
+    at = CLIMB * n
+    if climb[at + ENDED] != ZERO:
+        return
+    numbers = Numbers()
+    for part in range(parts):
+        for k in range(13):
+            numbers[k] = numbers[k] + wp.float64(gradient[GRADIENT_NUMBERS * (parts * n + part) + k])
+    pose = 3 * parts * n
+    off_x = poses[pose] - climb[at]
+    off_y = poses[pose + 1] - climb[at + 1]
+    turn = wp.abs(poses[pose + 2] - climb[at + 2])
+    far_x = poses[pose] - climb[at + START]
+    far_y = poses[pose + 1] - climb[at + START + 1]
+    first = climb[at + STEPS] < ZERO
+    within = far_x * far_x + far_y * far_y <= FARTHEST_CLIMB * FARTHEST_CLIMB
+    better = first or (numbers[0] >= climb[at + VALUE] and within)
+    if better:
+        c = yaw_cos
+        s = yaw_sin
+        x, y = numbers[1], numbers[2]
+        xx, xy, xt = numbers[4], numbers[5], numbers[6]
+        yy, yt = numbers[8], numbers[9]
+        for k in range(3):
+            climb[at + k] = poses[pose + k]
+        climb[at + VALUE] = numbers[0]
+        climb[at + SLOPE] = c * x - s * y
+        climb[at + SLOPE + 1] = s * x + c * y
+        climb[at + SLOPE + 2] = numbers[3]
+        climb[at + MATRIX] = c * c * xx - TWO * c * s * xy + s * s * yy
+        climb[at + MATRIX + 1] = c * s * (xx - yy) + (c * c - s * s) * xy
+        climb[at + MATRIX + 2] = c * xt - s * yt
+        climb[at + MATRIX + 3] = s * s * xx + TWO * c * s * xy + c * c * yy
+        climb[at + MATRIX + 4] = s * xt + c * yt
+        climb[at + MATRIX + 5] = numbers[12]
+    if not first:
+        damping = climb[at + DAMPING] * EIGHT
         if better:
-            c = yaw_cos
-            s = yaw_sin
-            x, y = numbers[1], numbers[2]
-            xx, xy, xt = numbers[4], numbers[5], numbers[6]
-            yy, yt = numbers[8], numbers[9]
-            for k in range(3):
-                climb[at + k] = poses[pose + k]
-            climb[at + VALUE] = numbers[0]
-            climb[at + SLOPE] = c * x - s * y
-            climb[at + SLOPE + 1] = s * x + c * y
-            climb[at + SLOPE + 2] = numbers[3]
-            climb[at + MATRIX] = c * c * xx - TWO * c * s * xy + s * s * yy
-            climb[at + MATRIX + 1] = c * s * (xx - yy) + (c * c - s * s) * xy
-            climb[at + MATRIX + 2] = c * xt - s * yt
-            climb[at + MATRIX + 3] = s * s * xx + TWO * c * s * xy + c * c * yy
-            climb[at + MATRIX + 4] = s * xt + c * yt
-            climb[at + MATRIX + 5] = numbers[12]
-        if not first:
-            damping = climb[at + DAMPING] * EIGHT
-            if better:
-                damping = climb[at + DAMPING] / FIVE
-            climb[at + DAMPING] = wp.min(wp.max(damping, LEAST), MOST)
-            if off_x * off_x + off_y * off_y < small * small and turn < small:
-                climb[at + CALM] = ONE
-        climb[at + STEPS] = climb[at + STEPS] + ONE
-        step = wp.vec3d()
-        if climb[at + CALM] != ZERO or climb[at + STEPS] >= wp.float64(most):
-            climb[at + ENDED] = ONE
-        else:
-            step = damped_step(climb, at)
-        for part in range(parts):
-            for k in range(3):
-                poses[pose + 3 * part + k] = climb[at + k] + step[k]
-
-    return locals()[name]
+            damping = climb[at + DAMPING] / FIVE
+        climb[at + DAMPING] = wp.min(wp.max(damping, LEAST), MOST)
+        if off_x * off_x + off_y * off_y < small * small and turn < small:
+            climb[at + CALM] = ONE
+    climb[at + STEPS] = climb[at + STEPS] + ONE
+    step = wp.vec3d()
+    if climb[at + CALM] != ZERO or climb[at + STEPS] >= wp.float64(most):
+        climb[at + ENDED] = ONE
+    else:
+        step = damped_step(climb, at)
+    for part in range(parts):
+        for k in range(3):
+            poses[pose + 3 * part + k] = climb[at + k] + step[k]

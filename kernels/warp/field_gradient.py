@@ -1,160 +1,132 @@
 """Gradient and Gauss-Newton information of the interpolated likelihood field with respect to the pose."""
 
-import functools
-from types import SimpleNamespace
-
 import warp as wp
 
-from . import end_point as end_points
-from . import error_free, field_term, hit_shape
-from .end_point import field_cell
-from .prelude import kernel, precision, reader, work_item
+from .end_point import EndPoint, end_point, field_cell
+from .error_free import add_term
+from .field_term import bilinear, field_exponent, field_square, log_field
+from .flags import ALL_READINGS, HIT, LINEAR, SCANS, TWO_PART_POINTS
+from .hit_shape import shape_weight
+from .prelude import kernel, reader, work_item
+from .types import FieldTerms, Window, real, vec2, vec4
 
 GRADIENT_NUMBERS = wp.constant(13)
+number_at = reader(real)
+ZERO, ONE = real(0.0), real(1.0)
 
 
-@functools.cache
-def functions(flags):
-    types = precision(flags)
-    real, vec2, vec4 = types.real, types.vec2, types.vec4
-    made = field_term.functions(flags)
-    bilinear, field_exponent = made.bilinear, made.field_exponent
-    EndPoint = end_points.functions(flags).EndPoint
-    number_at = reader(real)
-    HIT = "HIT" in flags
-    ZERO, ONE = real(0.0), real(1.0)
+# Return the share of the hit density in the density at a distance.
+if LINEAR:
 
-    # Return the share of the hit density in the density at a distance.
-    if "LINEAR" in flags:
-
-        @wp.func
-        def hit_share(distance: vec2, terms: wp.array(dtype=types.FieldTerms)):
-            hit = ZERO
-            if HIT:
-                exponent = field_exponent(distance, terms)
-                hit = terms[0].hit_peak * wp.exp(-exponent.x) * (ONE - exponent.y)
-            return hit / (hit + terms[0].rand_density)
-
-    else:
-
-        @wp.func
-        def hit_share(distance: vec2, terms: wp.array(dtype=types.FieldTerms)):
+    @wp.func
+    def hit_share(distance: vec2, terms: wp.array(dtype=FieldTerms)):
+        hit = ZERO
+        if HIT:
             exponent = field_exponent(distance, terms)
-            hit = (terms[0].hit_peak - exponent.x) + (terms[0].hit_peak_low - exponent.y)
-            return ONE / (ONE + wp.exp(terms[0].rand_density - hit))
+            hit = terms[0].hit_peak * wp.exp(-exponent.x) * (ONE - exponent.y)
+        return hit / (hit + terms[0].rand_density)
+
+else:
 
     @wp.func
-    def distance_slope(table: wp.array(dtype=real), cell: wp.vec2i, end: EndPoint, window: types.Window):
-        """Return the distance at an end point, and its derivatives in x and y, in metres per cell."""
-        a = number_at(table, field_cell(cell.x, cell.y, window))
-        b = number_at(table, field_cell(cell.x + 1, cell.y, window))
-        c = number_at(table, field_cell(cell.x, cell.y + 1, window))
-        d = number_at(table, field_cell(cell.x + 1, cell.y + 1, window))
-        distance = bilinear(table, cell, end, window)
-        x = end.to_next_y.x * (b - a) + end.rest_y.x * (d - c)
-        y = end.to_next_x.x * (c - a) + end.rest_x.x * (d - b)
-        return vec4(distance.x, distance.y, x, y)
-
-    return SimpleNamespace(**locals())
+    def hit_share(distance: vec2, terms: wp.array(dtype=FieldTerms)):
+        exponent = field_exponent(distance, terms)
+        hit = (terms[0].hit_peak - exponent.x) + (terms[0].hit_peak_low - exponent.y)
+        return ONE / (ONE + wp.exp(terms[0].rand_density - hit))
 
 
-@functools.cache
-def make(name, flags):
-    types = precision(flags)
-    real, vec2, vec4 = types.real, types.vec2, types.vec4
-    of_field = field_term.functions(flags)
-    log_field, field_square = of_field.log_field, of_field.field_square
-    shape_weight = hit_shape.functions(flags).shape_weight
-    made = functions(flags)
-    hit_share, distance_slope = made.hit_share, made.distance_slope
-    end_point = end_points.functions(flags).end_point
-    add_term = error_free.functions(flags).add_term
-    Sums = wp.types.vector(length=9, dtype=real)
-    TWO_PART_POINTS = "TWO_PART_POINTS" in flags
-    ALL_READINGS = "ALL_READINGS" in flags
-    SCANS = "SCANS" in flags
-    ZERO, HALF, TWO = real(0.0), real(0.5), real(2.0)
+@wp.func
+def distance_slope(table: wp.array(dtype=real), cell: wp.vec2i, end: EndPoint, window: Window):
+    """Return the distance at an end point, and its derivatives in x and y, in metres per cell."""
+    a = number_at(table, field_cell(cell.x, cell.y, window))
+    b = number_at(table, field_cell(cell.x + 1, cell.y, window))
+    c = number_at(table, field_cell(cell.x, cell.y + 1, window))
+    d = number_at(table, field_cell(cell.x + 1, cell.y + 1, window))
+    distance = bilinear(table, cell, end, window)
+    x = end.to_next_y.x * (b - a) + end.rest_y.x * (d - c)
+    y = end.to_next_x.x * (c - a) + end.rest_x.x * (d - b)
+    return vec4(distance.x, distance.y, x, y)
 
-    @wp.func
-    def add_slope(before: Sums, slope: vec4, weight: real, at: vec4, arm: vec2, resolution: real):
-        """Return the sums with the gradient and information of a reading: slope is the distance, its low part and its
-        derivatives in x and y, and arm the end point relative to the robot in the sensor's frame.
-        """
-        sums = before
-        x = slope.z / resolution
-        y = slope.w / resolution
-        turn = slope.w * (at.z * arm.x - at.w * arm.y) - slope.z * (at.w * arm.x + at.z * arm.y)
-        pull = -weight * slope.x
-        sums[0] += pull * x
-        sums[1] += pull * y
-        sums[2] += pull * turn
-        sums[3] += weight * x * x
-        sums[4] += weight * x * y
-        sums[5] += weight * x * turn
-        sums[6] += weight * y * y
-        sums[7] += weight * y * turn
-        sums[8] += weight * turn * turn
-        return sums
 
-    @kernel(flags)
-    def field_gradient(
-        table, pose_cell, pose, pose_low, point, point_low, terms, start, constant_terms, gradient, window, particles,
-        readings, guard, mount_x, mount_y, resolution, score, batch,
-    ):  # fmt: skip
-        """Write log p, its gradient (3) and the information (9) of poses in the grid's frame, each times the
-        temperature. One work-item takes a particle. mount is the sensor's place on the robot in cells.
-        """
-        n = work_item(wp.tid())
-        if n >= particles:
-            return
-        begin = int(0)
-        size = readings
-        constant_term = score.constant_term
-        if SCANS:
-            scan = (n + batch.ahead) // batch.per_scan
-            begin = start[scan]
-            size = start[scan + 1] - begin
-            constant_term = constant_terms[scan]
-        origin = pose_cell[n]
-        at = pose[n]
-        low = vec4()
-        if TWO_PART_POINTS:
-            low = pose_low[n]
-        total = vec2(constant_term, ZERO)
-        sums = Sums()
-        k = int(0)
-        while k < size:
-            to = point[begin + k]
-            used = bool(True)
-            if ALL_READINGS:
-                used = wp.isfinite(to.x)
-                if wp.isinf(to.x):
-                    total = add_term(total, terms[0].z_max)
-            if used:
-                to_low = vec2()
-                if TWO_PART_POINTS:
-                    to_low = point_low[begin + k]
-                end = end_point(at, low, to, to_low, HALF, guard)
-                slope = distance_slope(table, origin + end.cell, end, window)
-                distance = vec2(slope.x, slope.y)
-                total = add_term(total, log_field(distance, terms))
-                bend = shape_weight(field_square(distance, terms).x, terms[0].shape_power, terms[0].shape_rate)
-                weight = TWO * terms[0].square_scale * hit_share(distance, terms) * bend
-                sums = add_slope(sums, slope, weight, at, vec2(to.x + mount_x, to.y + mount_y), resolution)
-            k += 1
-        out = n * GRADIENT_NUMBERS
-        if wp.isinf(total.x):
-            gradient[out] = total.x
-        else:
-            gradient[out] = score.temperature * (total.x + total.y)
-        for i in range(6):
-            gradient[out + 1 + i] = score.temperature * sums[i]
-        # The other rows of the symmetric information matrix.
-        gradient[out + 7] = score.temperature * sums[4]
-        gradient[out + 8] = score.temperature * sums[6]
-        gradient[out + 9] = score.temperature * sums[7]
-        gradient[out + 10] = score.temperature * sums[5]
-        gradient[out + 11] = score.temperature * sums[7]
-        gradient[out + 12] = score.temperature * sums[8]
+Sums = wp.types.vector(length=9, dtype=real)
+ZERO, HALF, TWO = real(0.0), real(0.5), real(2.0)
 
-    return locals()[name]
+
+@wp.func
+def add_slope(before: Sums, slope: vec4, weight: real, at: vec4, arm: vec2, resolution: real):
+    """Return the sums with the gradient and information of a reading."""
+    sums = before
+    x = slope.z / resolution
+    y = slope.w / resolution
+    turn = slope.w * (at.z * arm.x - at.w * arm.y) - slope.z * (at.w * arm.x + at.z * arm.y)
+    pull = -weight * slope.x
+    sums[0] += pull * x
+    sums[1] += pull * y
+    sums[2] += pull * turn
+    sums[3] += weight * x * x
+    sums[4] += weight * x * y
+    sums[5] += weight * x * turn
+    sums[6] += weight * y * y
+    sums[7] += weight * y * turn
+    sums[8] += weight * turn * turn
+    return sums
+
+
+@kernel
+def field_gradient(
+    table, pose_cell, pose, pose_low, point, point_low, terms, start, constant_terms, gradient, window, particles,
+    readings, guard, mount_x, mount_y, resolution, score, batch,
+):  # fmt: skip
+    """Write log p, gradient (3) and information (9) of poses in the grid's frame, each times the temperature."""
+    n = work_item(wp.tid())
+    if n >= particles:
+        return
+    begin = int(0)
+    size = readings
+    constant_term = score.constant_term
+    if SCANS:
+        scan = (n + batch.ahead) // batch.per_scan
+        begin = start[scan]
+        size = start[scan + 1] - begin
+        constant_term = constant_terms[scan]
+    origin = pose_cell[n]
+    at = pose[n]
+    low = vec4()
+    if TWO_PART_POINTS:
+        low = pose_low[n]
+    total = vec2(constant_term, ZERO)
+    sums = Sums()
+    k = int(0)
+    while k < size:
+        to = point[begin + k]
+        used = bool(True)
+        if ALL_READINGS:
+            used = wp.isfinite(to.x)
+            if wp.isinf(to.x):
+                total = add_term(total, terms[0].z_max)
+        if used:
+            to_low = vec2()
+            if TWO_PART_POINTS:
+                to_low = point_low[begin + k]
+            end = end_point(at, low, to, to_low, HALF, guard)
+            slope = distance_slope(table, origin + end.cell, end, window)
+            distance = vec2(slope.x, slope.y)
+            total = add_term(total, log_field(distance, terms))
+            bend = shape_weight(field_square(distance, terms).x, terms[0].shape_power, terms[0].shape_rate)
+            weight = TWO * terms[0].square_scale * hit_share(distance, terms) * bend
+            sums = add_slope(sums, slope, weight, at, vec2(to.x + mount_x, to.y + mount_y), resolution)
+        k += 1
+    out = n * GRADIENT_NUMBERS
+    if wp.isinf(total.x):
+        gradient[out] = total.x
+    else:
+        gradient[out] = score.temperature * (total.x + total.y)
+    for i in range(6):
+        gradient[out + 1 + i] = score.temperature * sums[i]
+    # The other rows of the symmetric information matrix.
+    gradient[out + 7] = score.temperature * sums[4]
+    gradient[out + 8] = score.temperature * sums[6]
+    gradient[out + 9] = score.temperature * sums[7]
+    gradient[out + 10] = score.temperature * sums[5]
+    gradient[out + 11] = score.temperature * sums[7]
+    gradient[out + 12] = score.temperature * sums[8]

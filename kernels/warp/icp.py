@@ -1,33 +1,24 @@
 """Scan matching by point-to-line ICP with exact nearest points; see icp_pairs.py and icp_match.py."""
 
-import functools
-
 import warp as wp
 
-from . import icp_match, icp_step
-from .icp_match import MATCH_RESULT
+from .icp_match import MATCH_RESULT, match_in_turns
+from .icp_step import TEAM
 from .prelude import kernel, work_item
 
 
-@functools.cache
-def make(name, flags):
-    match_in_turns = icp_match.functions(flags).match_in_turns
-    TEAM = icp_step.functions(flags).TEAM
-
-    @kernel(flags)
-    def match_scans(
-        point, start, line, pair, guess, rules, result, scans, points, pairs, starts, levels, turns, far, far_turn
-    ):  # fmt: skip
-        """Match scans: a work-item, or with IN_TEAMS a team of them, takes a pair (reference, second scan, level of its
-        rules) and a guess (x, y, theta), the pose of the second scan in the reference's frame. one_way excludes the
-        reference's points from the score.
-        """
-        item = work_item(wp.tid())
-        n = item // TEAM
-        if n < pairs * starts:
-            match_in_turns(
-                point, start, line, pair, 3 * (n // starts), guess[n], rules, result, n * MATCH_RESULT * turns, turns,
-                far, far_turn, item - n * TEAM,
-            )  # fmt: skip
-
-    return locals()[name]
+@kernel
+def match_scans(
+    point, start, line, pair, guess, rules, result, scans, points, pairs, starts, levels, turns, far, far_turn
+):  # fmt: skip
+    """Match scans: a work-item, or with IN_TEAMS a team of them, takes a pair (reference, second scan, level of its
+    rules) and a guess (x, y, theta), the pose of the second scan in the reference's frame. one_way excludes the
+    reference's points from the score.
+    """
+    item = work_item(wp.tid())
+    n = item // TEAM
+    if n < pairs * starts:
+        match_in_turns(
+            point, start, line, pair, 3 * (n // starts), guess[n], rules, result, n * MATCH_RESULT * turns, turns,
+            far, far_turn, item - n * TEAM,
+        )  # fmt: skip

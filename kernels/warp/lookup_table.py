@@ -1,33 +1,24 @@
 """The look-up table of expected ranges, filled by the exact caster from the centres of cells, some rows at a time."""
 
-import functools
-
 import warp as wp
 
-from . import raycast
-from .prelude import kernel, precision
+from .prelude import kernel
+from .raycast import cast_ray
+from .types import Caster, real, vec2, vec4
+
+ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
+PARTS = real(65535.0)
 
 
-@functools.cache
-def make(name, flags):
-    types = precision(flags)
-    real, vec2, vec4 = types.real, types.vec2, types.vec4
-    cast_ray = raycast.functions(flags).cast_ray
-    ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
-    PARTS = real(65535.0)
-    Caster = types.Caster
-
-    @kernel(flags)
-    def fill_lookup(rectangles, ray, lookup, window, bins, first_row, count, limit):
-        """Fill rows of the table: one work-item takes a bin and cell. The table has fewer than 2^31 entries."""
-        index, bin = wp.tid()
-        if bin >= bins or index >= count * window.cols:
-            return
-        row = first_row + index / window.cols
-        col = index % window.cols
-        pose = vec4(HALF, HALF, ray[bin].x, ray[bin].y)
-        t = cast_ray(rectangles, window, wp.vec2i(col, row), pose, vec2(ONE, ZERO), limit, Caster())
-        part = int(t * (PARTS / limit) + HALF)
-        lookup[(row * window.cols + col) * bins + bin] = wp.uint16(wp.where(t >= limit, 65535, wp.min(part, 65534)))
-
-    return locals()[name]
+@kernel
+def fill_lookup(rectangles, ray, lookup, window, bins, first_row, count, limit):
+    """Fill rows of the table: one work-item takes a bin and cell. The table has fewer than 2^31 entries."""
+    index, bin = wp.tid()
+    if bin >= bins or index >= count * window.cols:
+        return
+    row = first_row + index / window.cols
+    col = index % window.cols
+    pose = vec4(HALF, HALF, ray[bin].x, ray[bin].y)
+    t = cast_ray(rectangles, window, wp.vec2i(col, row), pose, vec2(ONE, ZERO), limit, Caster())
+    part = int(t * (PARTS / limit) + HALF)
+    lookup[(row * window.cols + col) * bins + bin] = wp.uint16(wp.where(t >= limit, 65535, wp.min(part, 65534)))

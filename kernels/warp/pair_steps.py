@@ -1,14 +1,12 @@
 """Noise and points of scans, from their readings; see gpusense/matching/points.py."""
 
-import functools
 import math
-from types import SimpleNamespace
 
 import warp as wp
 
-from .prelude import precision
 from .reading_class import is_hit
 from .sorting import sort_numbers
+from .types import real, vec4
 
 ZERO, ONE, MINUS_ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0)), wp.constant(wp.float64(-1.0))
 FOREVER = wp.constant(wp.float64(math.inf))
@@ -96,9 +94,7 @@ def noise_of(
 
 @wp.func
 def level_of(noise: wp.float64, level: wp.array(dtype=wp.float64), levels: wp.int32, assumed: wp.int32):
-    """Return the level of noise of a pair: the first one whose largest noise is not exceeded, the last one beyond all
-    of them, or the assumed one where neither scan measures its noise.
-    """
+    """Return the level of noise of a pair."""
     number = int(0)
     while number < levels - 1 and noise > level[2 * number]:
         number += 1
@@ -107,27 +103,18 @@ def level_of(noise: wp.float64, level: wp.array(dtype=wp.float64), levels: wp.in
     return number
 
 
-@functools.cache
-def functions(flags):
-    types = precision(flags)
-    real, vec4 = types.real, types.vec4
-
-    @wp.func
-    def place_points(
-        reading: wp.array(dtype=wp.float64), first: wp.int32, beam: wp.array(dtype=wp.float64), beams: wp.int32,
-        nearest: wp.float64, farthest: wp.float64, point: wp.array(dtype=vec4), to: wp.int32,
-    ):  # fmt: skip
-        """Write the points of a scan's hits from to on, and return their number and the sum of squared ranges."""
-        count = int(0)
-        squares = wp.float64(0.0)
-        for i in range(beams):
-            z = reading[first + wp.int32(beam[4 * i + 3])]
-            if is_hit(z, nearest, farthest) and z > NEAREST:
-                point[to + count] = vec4(
-                    real(z * beam[4 * i]), real(z * beam[4 * i + 1]), real(beam[4 * i + 2]), real(z)
-                )
-                squares += z * z
-                count += 1
-        return count, squares
-
-    return SimpleNamespace(place_points=place_points)
+@wp.func
+def place_points(
+    reading: wp.array(dtype=wp.float64), first: wp.int32, beam: wp.array(dtype=wp.float64), beams: wp.int32,
+    nearest: wp.float64, farthest: wp.float64, point: wp.array(dtype=vec4), to: wp.int32,
+):  # fmt: skip
+    """Write the points of a scan's hits from to on, and return their number and the sum of squared ranges."""
+    count = int(0)
+    squares = wp.float64(0.0)
+    for i in range(beams):
+        z = reading[first + wp.int32(beam[4 * i + 3])]
+        if is_hit(z, nearest, farthest) and z > NEAREST:
+            point[to + count] = vec4(real(z * beam[4 * i]), real(z * beam[4 * i + 1]), real(beam[4 * i + 2]), real(z))
+            squares += z * z
+            count += 1
+    return count, squares

@@ -4,13 +4,10 @@ Philox 4x32-10: Salmon, Moraes, Dror and Shaw, *Parallel random numbers: as easy
 those of Box and Muller: sqrt(-2 log u) (cos 2 pi v, sin 2 pi v). The counter is (particle, step, stream, 0).
 """
 
-import functools
-from types import SimpleNamespace
-
 import warp as wp
 
-from . import heading
 from .elementary import log_of
+from .heading import cos_sin
 
 MULTIPLIER_0, MULTIPLIER_1 = wp.constant(wp.uint64(0xD2511F53)), wp.constant(wp.uint64(0xCD9E8D57))
 WEYL_0, WEYL_1 = wp.constant(wp.uint32(0x9E3779B9)), wp.constant(wp.uint32(0xBB67AE85))
@@ -44,16 +41,9 @@ def uniform_of(word: wp.uint32):
     return (wp.float64(word) + HALF) * WORD
 
 
-@functools.cache
-def functions(flags):
-    """Return the functions of the file; no flag changes them."""
-    cos_sin = heading.functions(frozenset()).cos_sin
-
-    @wp.func
-    def normal_pair(word_0: wp.uint32, word_1: wp.uint32):
-        """Return two independent standard normal deviates."""
-        radius = wp.sqrt(MINUS_TWO * log_of(uniform_of(word_0)))
-        turn = cos_sin(wp.float64(word_1) * WORD_TURN)
-        return wp.vec2d(radius * turn.x, radius * turn.y)
-
-    return SimpleNamespace(**locals())
+@wp.func
+def normal_pair(word_0: wp.uint32, word_1: wp.uint32):
+    """Return two independent standard normal deviates."""
+    radius = wp.sqrt(MINUS_TWO * log_of(uniform_of(word_0)))
+    turn = cos_sin(wp.float64(word_1) * WORD_TURN)
+    return wp.vec2d(radius * turn.x, radius * turn.y)

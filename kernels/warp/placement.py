@@ -1,12 +1,11 @@
 """Placement of poses in a window of the grid, in float64: an integer cell, the fraction of it, and the heading."""
 
-import functools
-from types import SimpleNamespace
-
 import warp as wp
 
-from . import heading
-from .prelude import kernel, precision, work_item
+from .flags import FLOAT64, TWO_PART_POINTS
+from .heading import cos_sin
+from .prelude import kernel, work_item
+from .types import Frame, Window, coordinate, real, vec4
 
 # Coordinates are clamped to this many cells: no range reaches so far, and the sum of two fits int32.
 FARTHEST, MINUS_FARTHEST = wp.constant(wp.float64(1073741824.0)), wp.constant(wp.float64(-1073741824.0))
@@ -21,101 +20,84 @@ def within_reach(position: wp.float64):
     return wp.where(above < FARTHEST, above, FARTHEST)
 
 
-@functools.cache
-def functions(flags):
-    types = precision(flags)
-    real, vec4 = types.real, types.vec4
-    cos_sin = heading.functions(flags & {"HUGE_HEADINGS"}).cos_sin
-    coordinate = wp.float32 if "POSES_FLOAT32" in flags else wp.float64
-    TWO_PART_POINTS = "TWO_PART_POINTS" in flags
-    BELOW_ONE = real(1.0 - (2.0**-53 if "FLOAT64" in flags else 2.0**-24))
-
-    @wp.func
-    def place_pose(
-        particle: wp.int32, poses: wp.array(dtype=coordinate), pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4), pose_low: wp.array(dtype=vec4), pose_status: wp.array(dtype=wp.int32),
-        frame: types.Frame, window: types.Window,
-    ):  # fmt: skip
-        """Place a sensor: a pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low
-        gets the rounding errors (low parts) of pose. pose_status, which the caller clears, becomes 1 at index 0 if a
-        pose is not finite, and at index 1 if a sensor is outside the window.
-        """
-        x = wp.float64(poses[3 * particle])
-        y = wp.float64(poses[3 * particle + 1])
-        theta = wp.float64(poses[3 * particle + 2])
-        finite = (x - x) + (y - y) + (theta - theta) == ZERO
-        turned = cos_sin(theta)
-        cosine = turned.x
-        sine = turned.y
-        x = x - frame.origin_x
-        y = y - frame.origin_y
-        if frame.mount_x != ZERO or frame.mount_y != ZERO:
-            x = x + (cosine * frame.mount_x - sine * frame.mount_y)
-            y = y + (sine * frame.mount_x + cosine * frame.mount_y)
-        if frame.yaw_sin != ZERO:
-            x_before = x
-            cosine_before = cosine
-            x = frame.yaw_cos * x + frame.yaw_sin * y
-            y = frame.yaw_cos * y - frame.yaw_sin * x_before
-            cosine = cosine * frame.yaw_cos + sine * frame.yaw_sin
-            sine = sine * frame.yaw_cos - cosine_before * frame.yaw_sin
-        x = within_reach(x / frame.resolution)
-        y = within_reach(y / frame.resolution)
-        if not finite:
-            wp.atomic_max(pose_status, 0, 1)
-            x = MINUS_FARTHEST
-            y = MINUS_FARTHEST
-            cosine = ONE
-            sine = ZERO
-        whole_x = wp.floor(x)
-        whole_y = wp.floor(y)
-        cell = wp.vec2i(int(whole_x) - window.col, int(whole_y) - window.row)
-        if cell.x < 0 or cell.y < 0 or cell.x >= window.cols or cell.y >= window.rows:
-            wp.atomic_max(pose_status, 1, 1)
-        pose_cell[particle] = cell
-        x = x - whole_x
-        y = y - whole_y
-        # A fraction just below 1 may round to 1, which would be the next cell.
-        rounded = vec4(wp.min(real(x), BELOW_ONE), wp.min(real(y), BELOW_ONE), real(cosine), real(sine))
-        pose[particle] = rounded
-        if TWO_PART_POINTS:
-            pose_low[particle] = vec4(
-                real(x - wp.float64(rounded.x)),
-                real(y - wp.float64(rounded.y)),
-                real(cosine - wp.float64(rounded.z)),
-                real(sine - wp.float64(rounded.w)),
-            )
-
-    return SimpleNamespace(**locals())
+BELOW_ONE = real(1.0 - (2.0**-53 if FLOAT64 else 2.0**-24))
 
 
-@functools.cache
-def make(name, flags):
-    placing = functions(flags)
-    place_pose = placing.place_pose
+@wp.func
+def place_pose(
+    particle: wp.int32, poses: wp.array(dtype=coordinate), pose_cell: wp.array(dtype=wp.vec2i),
+    pose: wp.array(dtype=vec4), pose_low: wp.array(dtype=vec4), pose_status: wp.array(dtype=wp.int32),
+    frame: Frame, window: Window,
+):  # fmt: skip
+    """Place a sensor: a pose times the scanner's mount, without its yaw."""
+    x = wp.float64(poses[3 * particle])
+    y = wp.float64(poses[3 * particle + 1])
+    theta = wp.float64(poses[3 * particle + 2])
+    finite = (x - x) + (y - y) + (theta - theta) == ZERO
+    turned = cos_sin(theta)
+    cosine = turned.x
+    sine = turned.y
+    x = x - frame.origin_x
+    y = y - frame.origin_y
+    if frame.mount_x != ZERO or frame.mount_y != ZERO:
+        x = x + (cosine * frame.mount_x - sine * frame.mount_y)
+        y = y + (sine * frame.mount_x + cosine * frame.mount_y)
+    if frame.yaw_sin != ZERO:
+        x_before = x
+        cosine_before = cosine
+        x = frame.yaw_cos * x + frame.yaw_sin * y
+        y = frame.yaw_cos * y - frame.yaw_sin * x_before
+        cosine = cosine * frame.yaw_cos + sine * frame.yaw_sin
+        sine = sine * frame.yaw_cos - cosine_before * frame.yaw_sin
+    x = within_reach(x / frame.resolution)
+    y = within_reach(y / frame.resolution)
+    if not finite:
+        wp.atomic_max(pose_status, 0, 1)
+        x = MINUS_FARTHEST
+        y = MINUS_FARTHEST
+        cosine = ONE
+        sine = ZERO
+    whole_x = wp.floor(x)
+    whole_y = wp.floor(y)
+    cell = wp.vec2i(int(whole_x) - window.col, int(whole_y) - window.row)
+    if cell.x < 0 or cell.y < 0 or cell.x >= window.cols or cell.y >= window.rows:
+        wp.atomic_max(pose_status, 1, 1)
+    pose_cell[particle] = cell
+    x = x - whole_x
+    y = y - whole_y
+    # A fraction just below 1 may round to 1, which would be the next cell.
+    rounded = vec4(wp.min(real(x), BELOW_ONE), wp.min(real(y), BELOW_ONE), real(cosine), real(sine))
+    pose[particle] = rounded
+    if TWO_PART_POINTS:
+        pose_low[particle] = vec4(
+            real(x - wp.float64(rounded.x)),
+            real(y - wp.float64(rounded.y)),
+            real(cosine - wp.float64(rounded.z)),
+            real(sine - wp.float64(rounded.w)),
+        )
 
-    @kernel(flags)
-    def place_poses(poses, pose_cell, pose, pose_low, pose_status, frame, window, particles):
-        """Place poses: one work-item takes a particle."""
-        particle = work_item(wp.tid())
-        if particle >= particles:
-            return
-        place_pose(particle, poses, pose_cell, pose, pose_low, pose_status, frame, window)  # fmt: skip
 
-    @kernel(flags)
-    def bound_numbers(number, bounds, count, apart, items):
-        """Write the least of some numbers, and the largest of the numbers that lie apart from them; NaN remains."""
-        i = wp.tid()
-        if i >= items:
-            return
-        low = INFINITE
-        high = MINUS_INFINITE
-        for n in range(i, count, items):
-            a = wp.float64(number[n])
-            b = wp.float64(number[apart + n])
-            low = wp.where(a < low or a != a, a, low)
-            high = wp.where(b > high or b != b, b, high)
-        bounds[i] = low
-        bounds[items + i] = high
+@kernel
+def place_poses(poses, pose_cell, pose, pose_low, pose_status, frame, window, particles):
+    """Place poses: one work-item takes a particle."""
+    particle = work_item(wp.tid())
+    if particle >= particles:
+        return
+    place_pose(particle, poses, pose_cell, pose, pose_low, pose_status, frame, window)  # fmt: skip
 
-    return locals()[name]
+
+@kernel
+def bound_numbers(number, bounds, count, apart, items):
+    """Write the least of some numbers, and the largest of the numbers that lie apart from them; NaN remains."""
+    i = wp.tid()
+    if i >= items:
+        return
+    low = INFINITE
+    high = MINUS_INFINITE
+    for n in range(i, count, items):
+        a = wp.float64(number[n])
+        b = wp.float64(number[apart + n])
+        low = wp.where(a < low or a != a, a, low)
+        high = wp.where(b > high or b != b, b, high)
+    bounds[i] = low
+    bounds[items + i] = high

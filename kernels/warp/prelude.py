@@ -1,19 +1,26 @@
-"""Types of a precision, the decorator of kernels, and readers and writers of arrays, for all kernel files.
+"""The loader of kernel files, and functions that all of them use.
 
-In each kernel file ``functions(flags)`` makes the file's functions for a set of flags, and ``make(name, flags)`` a
-kernel. Flags are those of ``gpusense.interface``. A factory turns them into closure constants. Warp drops the branches
-of ``if FLAG:`` whose condition is such a constant, so code that a set of flags does not need is never generated.
-Numbers are such constants too. A negative number has a separate constant: some versions of Warp lose the sign of
-``-ONE`` in float64.
+A kernel file is executed once for each set of flags. ``from .flags import HIT`` gives it the truth of a flag of
+``gpusense.interface``, ``from .types import real`` a type of the flags' precision, and ``from .caster import cast_ray``
+a function of the flags' caster. An import from another kernel file gives that file's names for the same flags, from
+``.float64`` for the same flags in float64. Warp drops the branches of ``if FLAG:`` whose condition is such a constant,
+so code that a set of flags does not need is never generated. Numbers are such constants too. A negative number has a
+separate constant: some versions of Warp lose the sign of ``-ONE`` in float64.
 """
 
+import builtins
 import functools
 import inspect
-from types import SimpleNamespace
+import re
+import sys
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import warp as wp
 
-from gpusense.interface import structs
+from gpusense.interface import casters, structs
+from gpusense.interface.flags import FLAGS
 from gpusense.interface.signatures import KERNELS
 
 # Ranges have the same bits on every device only if each product and sum is rounded by itself and division is correctly
@@ -29,34 +36,96 @@ _ONE_EACH = {"grid_stride": False} if "grid_stride" in inspect.signature(wp.kern
 apart = functools.partial(wp.func, inline=False) if "inline" in inspect.signature(wp.func).parameters else wp.func
 
 _module = wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS, **_ONE_EACH)
+_FOLDER = Path(__file__).parent
+_IMPORTED = re.compile(r"^ *from (\.+)([\w.]*) import", re.MULTILINE)
+# Flags that choose types.
+_PRECISION = frozenset({"FLOAT64", "POSES_FLOAT32", "RANGES_FLOAT32"})
 
 
-def kernel(flags=frozenset(), entry=None):
-    """Return the decorator that types a kernel's parameters by its row of the signature table.
+def kernel(body):
+    """Mark a kernel; ``kernel_of`` types its parameters."""
+    return body
+
+
+@functools.cache
+def kernel_of(name, flags):
+    """Return a kernel by its row of the signature table, which names and types its parameters.
 
     The kernel and the functions that it calls become a separate module, named by their contents.
 
-    Args:
-        flags: Flags of the kernel's code; they choose real, coordinate and measured.
-        entry: The type of an entry of the map's table, where the kernel casts rays.
-
     Raises:
-        TypeError: the parameters' names differ from the row.
+        TypeError: The parameters' names differ from the row.
     """
+    return typed(getattr(file_of(KERNELS[name].file, flags), name), flags)
 
-    def decorate(body):
-        row = KERNELS[body.__name__].arguments
-        names = tuple(inspect.signature(body).parameters)
-        if names != tuple(argument.name for argument in row):
-            raise TypeError(f"{body.__name__}: parameters must be those of its row, got {', '.join(names)}")
-        types = _argument_types(flags) | {"entry": entry}
-        body.__annotations__ = {
-            argument.name: types[argument.type] if argument.shape is None else wp.array(dtype=types[argument.type])
-            for argument in row
-        }
-        return _module(body)
 
-    return decorate
+def typed(body, flags):
+    """Return the kernel of a marked function."""
+    row = KERNELS[body.__name__].arguments
+    names = tuple(inspect.signature(body).parameters)
+    if names != tuple(argument.name for argument in row):
+        raise TypeError(f"{body.__name__}: parameters must be those of its row, got {', '.join(names)}")
+    types = _argument_types(flags) | {"entry": body.__globals__.get("ENTRY")}
+    body.__annotations__ = {
+        argument.name: types[argument.type] if argument.shape is None else wp.array(dtype=types[argument.type])
+        for argument in row
+    }
+    return _module(body)
+
+
+def file_of(name, flags=frozenset()):
+    """Return the module of a kernel file (``"beam"``, ``"lanes.math"``) for a set of flags."""
+    return _executed(name, flags & _relevant(name))
+
+
+@functools.cache
+def _executed(name, flags):
+    """Execute a kernel file."""
+    here = name.split(".")
+
+    def imported(target, scope=None, local=None, names=(), level=0):
+        if level == 0:
+            return __import__(target, scope, local, names, level)
+        first, *rest = [*here[: len(here) - level], *target.split(".")]
+        if first == "prelude":
+            return sys.modules[__name__]
+        if first in ("flags", "types"):
+            return precision(flags) if first == "types" else _switches(flags)
+        if first == "float64":
+            return file_of(".".join(rest), flags | {"FLOAT64"})
+        return file_of(casters.caster_file(flags) if first == "caster" else ".".join([first, *rest]), flags)
+
+    loader, module = _loader(name), ModuleType(f"{__package__}.{name}")
+    module.__file__, module.__builtins__ = loader.path, vars(builtins) | {"__import__": imported}
+    exec(loader.get_code(module.__name__), vars(module))
+    return module
+
+
+def _loader(name):
+    """Return the loader of a kernel file, which keeps its bytecode."""
+    return SourceFileLoader(f"{__package__}.{name}", str(_FOLDER.joinpath(*name.split(".")).with_suffix(".py")))
+
+
+@functools.cache
+def _relevant(name):
+    """Return the flags that may change a kernel file: flags that it or a file that it imports names, and of types."""
+    if name == "caster":
+        files = [entry.file for entry in casters.ENTRIES.values()]
+        return frozenset(casters.FLAGS).union(*map(_relevant, files))
+    if name in ("flags", "prelude"):
+        return frozenset()
+    if name == "types":
+        return _PRECISION
+    text, here = _loader(name).get_data(_loader(name).path).decode(), name.split(".")
+    files = {".".join([*here[: len(here) - len(dots)], target]) for dots, target in _IMPORTED.findall(text)}
+    named = FLAGS.keys() & set(re.findall(r"\w+", text))
+    return frozenset(named).union(*(_relevant(file.removeprefix("float64.")) for file in files))
+
+
+@functools.cache
+def _switches(flags):
+    """Return the truth of each flag by name."""
+    return SimpleNamespace(**{flag: flag in flags for flag in FLAGS})
 
 
 @functools.cache
@@ -71,22 +140,17 @@ def _argument_types(flags):
         "uchar": wp.uint8,
         "ushort": wp.uint16,
         "double": wp.float64,
-        "coordinate": wp.float32 if "POSES_FLOAT32" in flags else wp.float64,
-        "measured": wp.float32 if "RANGES_FLOAT32" in flags else wp.float64,
     }
 
 
 @functools.cache
 def precision(flags):
-    """Return the types of a set of flags: real, vec2, vec4, and the structs by name."""
-    if "FLOAT64" in flags:
-        return SimpleNamespace(real=wp.float64, vec2=wp.vec2d, vec4=wp.vec4d, **_structs(wp.float64))
-    return SimpleNamespace(real=wp.float32, vec2=wp.vec2f, vec4=wp.vec4f, **_structs(wp.float32))
-
-
-def _structs(real):
-    """Return the structs of the signature table in a precision, by name."""
-    return {name: _struct(name, real if "real" in structs.fields(name).values() else None) for name in structs.STRUCTS}
+    """Return the types of a set of flags: real, vec2, vec4, of poses and readings, and the structs by name."""
+    real, vec2, vec4 = (wp.float64, wp.vec2d, wp.vec4d) if "FLOAT64" in flags else (wp.float32, wp.vec2f, wp.vec4f)
+    made = {name: _struct(name, real if "real" in structs.fields(name).values() else None) for name in structs.STRUCTS}
+    coordinate = wp.float32 if "POSES_FLOAT32" in flags else wp.float64
+    measured = wp.float32 if "RANGES_FLOAT32" in flags else wp.float64
+    return SimpleNamespace(real=real, vec2=vec2, vec4=vec4, coordinate=coordinate, measured=measured, **made)
 
 
 @functools.cache
@@ -95,9 +159,6 @@ def _struct(name, real):
     kinds = {"int": wp.int32, "real": real, "double": wp.float64}
     fields = {field: kinds[kind] for field, kind in structs.fields(name).items()}
     return wp.struct(type(name, (), {"__annotations__": fields, "__module__": __name__}))
-
-
-Window = _struct("Window", None)
 
 
 # Return the work-item of a launch of one dimension, given wp.tid(), which divides a number of 64 bits by 1.

@@ -1,85 +1,66 @@
 """Expected ranges of poses and bearings by any caster. A walk ends at the nearest moving shape."""
 
-import functools
-import importlib
-
 import warp as wp
 
-from gpusense.interface.casters import caster_file
+from .caster import ENTRY, cast_ray
+from .flags import ORDERED, SHAPES, WORLDS
+from .prelude import behind, kernel, reader, work_item, writer
+from .ray import expected_range, tile_place, tile_ray, tile_step
+from .shapes import nearest_shape, world_begin, world_window
+from .types import real, vec2, vec4
 
-from . import ray as ray_file
-from . import shapes as shapes_file
-from .prelude import behind, kernel, precision, reader, work_item, writer
-from .ray import tile_place, tile_ray, tile_step
-from .shapes import world_begin, world_window
+if WORLDS:
+    from .raycast import PLANES
+rest_of = behind(ENTRY)
+cell_at, pose_at, ray_at, put = reader(wp.vec2i), reader(vec4), reader(vec2), writer(real)
 
 
-def caster_of(flags):
-    """Return the kernel file of the caster of a set of flags."""
-    return importlib.import_module(f".{caster_file(flags)}", __package__)
+@kernel
+def cast_ranges(
+    map_table, world, shapes, pose_cell, pose, ray, ranges, window, particles, rays, caster, scale, crowd
+):  # fmt: skip
+    """Cast rays: one work-item takes a particle and ray. A launch has fewer than 2^31."""
+    n, k = wp.tid()
+    if k >= rays or n >= particles:
+        return
+    table = map_table
+    seen = window
+    if WORLDS:
+        table = rest_of(map_table, world_begin(world, n, PLANES))
+        seen = world_window(world, n)
+    cell = cell_at(pose_cell, n)
+    limit = scale.limit
+    if SHAPES:
+        limit = nearest_shape(shapes, world, crowd, n, cell, pose_at(pose, n), ray_at(ray, k), limit).x
+    t = cast_ray(table, seen, cell, pose_at(pose, n), ray_at(ray, k), limit, caster)
+    put(ranges, n * rays + k, expected_range(t, scale))
 
 
-@functools.cache
-def make(name, flags):
-    types = precision(flags)
-    real, vec2, vec4 = types.real, types.vec2, types.vec4
-    casting = caster_of(flags)
-    ENTRY = casting.ENTRY
-    cast_ray = casting.functions(flags).cast_ray
-    expected_range = ray_file.functions(flags).expected_range
-    nearest_shape = shapes_file.functions(flags).nearest_shape
-    rest_of, PLANES = behind(ENTRY), getattr(casting.functions(flags), "PLANES", 0)
-    WORLDS, SHAPES = "WORLDS" in flags, "SHAPES" in flags
-    ORDERED = "ORDERED" in flags
-    cell_at, pose_at, ray_at, put = reader(wp.vec2i), reader(vec4), reader(vec2), writer(real)
-
-    @kernel(flags, entry=ENTRY)
-    def cast_ranges(
-        map_table, world, shapes, pose_cell, pose, ray, ranges, window, particles, rays, caster, scale, crowd
-    ):  # fmt: skip
-        """Cast rays: one work-item takes a particle and ray. A launch has fewer than 2^31."""
-        n, k = wp.tid()
-        if k >= rays or n >= particles:
-            return
-        table = map_table
-        seen = window
-        if WORLDS:
-            table = rest_of(map_table, world_begin(world, n, PLANES))
-            seen = world_window(world, n)
-        cell = cell_at(pose_cell, n)
+@kernel
+def cast_tiles(
+    map_table, world, shapes, pose_cell, pose, order, ray, ranges, window, particles, rays, caster, scale, crowd,
+    spread,
+):  # fmt: skip
+    """Cast rays in tiles of particles and rays, for GPUs."""
+    item = work_item(wp.tid())
+    place = tile_place(item, spread)
+    if place >= particles:
+        return
+    n = place
+    if ORDERED:
+        n = order[place]
+    cell = cell_at(pose_cell, n)
+    sensor_pose = pose_at(pose, n)
+    table = map_table
+    seen = window
+    if WORLDS:
+        table = rest_of(map_table, world_begin(world, n, PLANES))
+        seen = world_window(world, n)
+    k = tile_ray(item, spread)
+    while k < rays:
         limit = scale.limit
         if SHAPES:
-            limit = nearest_shape(shapes, world, crowd, n, cell, pose_at(pose, n), ray_at(ray, k), limit).x
-        t = cast_ray(table, seen, cell, pose_at(pose, n), ray_at(ray, k), limit, caster)
+            limit = nearest_shape(shapes, world, crowd, n, cell, sensor_pose, ray_at(ray, k), limit).x
+        t = cast_ray(table, seen, cell, sensor_pose, ray_at(ray, k), limit, caster)
         put(ranges, n * rays + k, expected_range(t, scale))
-
-    @kernel(flags, entry=ENTRY)
-    def cast_tiles(
-        map_table, world, shapes, pose_cell, pose, order, ray, ranges, window, particles, rays, caster, scale, crowd,
-        spread,
-    ):  # fmt: skip
-        """Cast rays in tiles of particles and rays, for GPUs."""
-        item = work_item(wp.tid())
-        place = tile_place(item, spread)
-        if place >= particles:
-            return
-        n = place
-        if ORDERED:
-            n = order[place]
-        cell = cell_at(pose_cell, n)
-        sensor_pose = pose_at(pose, n)
-        table = map_table
-        seen = window
-        if WORLDS:
-            table = rest_of(map_table, world_begin(world, n, PLANES))
-            seen = world_window(world, n)
-        k = tile_ray(item, spread)
-        while k < rays:
-            limit = scale.limit
-            if SHAPES:
-                limit = nearest_shape(shapes, world, crowd, n, cell, sensor_pose, ray_at(ray, k), limit).x
-            t = cast_ray(table, seen, cell, sensor_pose, ray_at(ray, k), limit, caster)
-            put(ranges, n * rays + k, expected_range(t, scale))
-            k += tile_step(spread)
-
-    return locals()[name]
+        k += tile_step(spread)

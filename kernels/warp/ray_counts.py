@@ -31,7 +31,7 @@ def crossed_before(first: wp.int32, size: wp.int64, reached: wp.int64, other: wp
     return crossed
 
 
-@kernel()
+@kernel
 def count_rays(start_cell, start_inside, end_cell, end_inside, hit, hits, misses, rows, cols, rays):
     """Add the cells of rays to the counts; cells outside the grid are left out. One work-item takes a ray."""
     n = wp.tid()
@@ -89,8 +89,3 @@ def count_rays(start_cell, start_inside, end_cell, end_inside, hit, hits, misses
             wp.atomic_add(hits, row * cols + col, 1)
         else:
             wp.atomic_add(misses, row * cols + col, 1)
-
-
-def make(name, flags):
-    """Return the kernel of the file; no flag changes it."""
-    return globals()[name]

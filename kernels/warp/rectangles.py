@@ -90,10 +90,10 @@ def slope(sectors: wp.int32, sector: wp.int32):
     return wp.vec2i(5, 1)
 
 
-@kernel()
+@kernel
 def free_columns(occupied, runs, band, cols, begin, end):
     """Count the free cells along columns of the band, to larger rows (direction 0) or smaller rows (direction 1), for
-    columns in [begin, end). For processors: one work-item takes 64 columns and a direction.
+    columns in [begin, end).
     """
     direction, strip = wp.tid()
     first = begin + 64 * strip
@@ -110,7 +110,7 @@ def free_columns(occupied, runs, band, cols, begin, end):
             runs[out + row * cols + col] = wp.uint8(free)
 
 
-@kernel()
+@kernel
 def rectangles_rows(
     runs, place, stack, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds
 ):  # fmt: skip
@@ -165,10 +165,10 @@ def rectangles_rows(
                 planes[out + padded(row, col, cols)] = wp.uint16(sides)
 
 
-@kernel()
+@kernel
 def free_rows(bits, runs, band, cols, words, begin, end):
-    """Count the free cells along rows, to the right (direction 0) and to the left (direction 1), for columns in [begin,
-    end). For GPUs: one work-item takes four cells, whose counts differ by one until an occupied cell.
+    """Count the free cells along rows, to the right (direction 0) and to the left (direction 1), for columns in
+    [begin, end).
     """
     row, item = wp.tid()
     start = begin + 4 * item
@@ -188,7 +188,7 @@ def free_rows(bits, runs, band, cols, words, begin, end):
         put_run(runs, (band + row) * cols + forward, wp.uint8(wp.min(left, LONGEST)))
 
 
-@kernel()
+@kernel
 def rectangles_scan(
     runs, place, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds, lines, group
 ):  # fmt: skip
@@ -287,8 +287,3 @@ def rectangles_scan(
                         put(planes, at - part + place_in_four, wp.uint16(one))
                 four = wp.uint64(0)
                 filled = int(0)
-
-
-def make(name, flags):
-    """Return a kernel of the file; no flag changes it."""
-    return globals()[name]

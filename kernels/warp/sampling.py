@@ -16,16 +16,16 @@ each bin of angles of incidence, and then the tables. ``chances`` = for each bin
 probabilities of the bins of readings.
 """
 
-import functools
 import math
-from types import SimpleNamespace
 
 import warp as wp
 
-from . import sensor_table as sensor_table_file
 from .elementary import exp_of, log_of
+from .flags import INCIDENCE, MASS_TABLE, SENSOR_TABLE
 from .philox import random_words
-from .prelude import kernel, precision
+from .prelude import kernel
+from .sensor_table import range_bin
+from .types import real
 
 READING_STREAM = wp.constant(wp.uint32(1 << 30))
 DRAW_TERMS = wp.constant(9)
@@ -98,191 +98,180 @@ def fine_uniform(high: wp.uint32, low: wp.uint32):
     return ((wp.float64(high) * HALF_WORD + wp.float64(low >> WORD_SHIFT)) + HALF) * FINE
 
 
-@functools.cache
-def functions(flags):
-    MASS_TABLE = "MASS_TABLE" in flags
-
-    @wp.func
-    def half_mass(x: wp.float64):
-        """Return the mass of the standard normal between 0 and x >= 0."""
-        if x >= HALF_FROM:
-            return HALF
-        if x >= SERIES_END:
-            fraction = wp.float64(x)
-            for i in range(FRACTION_TERMS):
-                fraction = x + wp.float64(FRACTION_TERMS - i) / fraction
-            return HALF - NORMAL_PEAK * exp_of(MINUS_HALF * x * x) / fraction
-        square = x * x
-        term = wp.float64(1.0)
-        total = wp.float64(1.0)
-        for n in range(1, SERIES_TERMS):
-            term = term * (square / (TWO * wp.float64(n) + ONE))
-            total = total + term
-        return x * (NORMAL_PEAK * exp_of(MINUS_HALF * square)) * total
-
-    @wp.func
-    def polynomial(factor: factors_8, x: wp.float64):
-        """Return a polynomial by Horner's rule, the highest power first."""
-        value = factor[0]
-        for i in range(1, 8):
-            value = value * x + factor[i]
-        return value
-
-    @wp.func
-    def half_quantile(mass: wp.float64):
-        """Return the x >= 0 with a mass of the standard normal between 0 and x, from 0 to MOST_HALF."""
-        if mass <= CENTRAL:
-            r = CENTRAL_OFFSET - mass * mass
-            return mass * (polynomial(CENTRAL_OVER, r) / polynomial(CENTRAL_UNDER, r))
-        root = wp.sqrt(-log_of(HALF - mass))
-        if root <= CENTRAL_END:
-            outer = root - OUTER_OFFSET
-            return polynomial(OUTER_OVER, outer) / polynomial(OUTER_UNDER, outer)
-        outermost = root - OUTERMOST_OFFSET
-        return polynomial(OUTERMOST_OVER, outermost) / polynomial(OUTERMOST_UNDER, outermost)
-
-    @wp.func
-    def normal_within(u: wp.float64, low: wp.float64, high: wp.float64):
-        """Return a standard normal deviate between -low <= 0 and high >= 0."""
-        below = half_mass(low)
-        above = half_mass(high)
-        mark = u * (below + above) - below
-        size = half_quantile(wp.min(wp.abs(mark), MOST_HALF))
-        return wp.min(wp.max(wp.where(mark < ZERO, -size, size), -low), high)
-
-    @wp.func
-    def tabulated(at: wp.float64, tables: wp.array(dtype=wp.float64), place: wp.int32):
-        """Return the number of a table that begins at a place, at a logarithmic coordinate."""
-        steps = at * DRAW_PER_LOG
-        cell = wp.int32(wp.min(steps, DRAW_LAST))
-        share = steps - wp.float64(cell)
-        first = place + cell * DRAW_POWERS
-        value = tables[first + DRAW_POWERS - 1]
-        for i in range(DRAW_POWERS - 1):
-            value = value * share + tables[first + DRAW_POWERS - 2 - i]
-        return value
-
-    @wp.func
-    def table_mass(u: wp.float64, tables: wp.array(dtype=wp.float64), place: wp.int32):
-        """Return the mass of a hit between its mean and a distance of u scales, from its table."""
-        return wp.min(tabulated(log_of(ONE + wp.min(u, FARTHEST_HIT) * SQRT_HALF), tables, place), HALF)
-
-    @wp.func
-    def table_within(
-        u: wp.float64, low: wp.float64, high: wp.float64, tables: wp.array(dtype=wp.float64), place: wp.int32
-    ):
-        """Return a deviate of a hit between -low <= 0 and high >= 0, from its tables."""
-        below = table_mass(low, tables, place)
-        above = table_mass(high, tables, place)
-        mark = u * (below + above) - below
-        level = -log_of(ONE - TWO * wp.min(wp.abs(mark), MOST_HALF))
-        size = (exp_of(tabulated(level, tables, place + DRAW_CELLS * DRAW_POWERS)) - ONE) / SQRT_HALF
-        return wp.min(wp.max(wp.where(mark < ZERO, -size, size), -low), high)
-
-    @wp.func
-    def short_of(u: wp.float64, expected: wp.float64, decay: wp.float64):
-        """Return a range drawn from p_short, up to the expected range (> 0)."""
-        x = decay * expected
-        if x < SHORT_SERIES:
-            square = u * u
-            bend = (u / SIX - square / TWO) + square * u / THREE
-            return wp.min(expected * (u + x * ((square - u) / TWO + x * bend)), expected)
-        return wp.min(-log_of((ONE - u) + u * exp_of(-x)) / decay, expected)
-
-    @wp.func
-    def reading_of(
-        u: wp.float64, v: wp.float64, expected: wp.float64, mixture: wp.array(dtype=wp.float64), bins: wp.int32,
-        range_max: wp.float64,
-    ):  # fmt: skip
-        """Return a reading drawn from the mixture; infinity without return, NaN where no reading is possible."""
-        p = DRAW_TERMS * bins
-        first = mixture[p]
-        second = first + wp.where(expected > ZERO, mixture[p + 1], ZERO)
-        third = second + mixture[p + 2]
-        total = third + mixture[p + 3]
-        mark = u * total
-        if not total > ZERO:
-            return NOWHERE
-        if mark < first:
-            mean = wp.min(wp.max(expected + mixture[p + 6], ZERO), range_max)
-            spread = mixture[p + 4] + mixture[p + 5] * expected
-            low = mean / spread
-            high = (range_max - mean) / spread
-            if MASS_TABLE:
-                return wp.max(mean + spread * table_within(v, low, high, mixture, wp.int32(mixture[p + 8])), ZERO)
-            else:
-                return wp.max(mean + spread * normal_within(v, low, high), ZERO)
-        if mark < second:
-            return short_of(v, expected, mixture[p + 7])
-        return wp.where(mark < third, INFINITE, v * range_max)
-
-    @wp.func
-    def cell_reading_of(
-        u: wp.float64, v: wp.float64, column: wp.int32, chances: wp.array(dtype=wp.float64), cells: wp.int32,
-        range_max: wp.float64, margin: wp.float64,
-    ):  # fmt: skip
-        """Return a reading drawn from a table: uniform in a drawn bin, at a margin from the bin's ends."""
-        row = column * (cells + 1)
-        mark = u * chances[row + cells]
-        low = int(0)
-        high = wp.int32(cells)
-        while low < high:
-            middle = (low + high) // 2
-            if chances[row + middle] > mark:
-                high = middle
-            else:
-                low = middle + 1
-        if low == cells:
-            return INFINITE
-        return (wp.float64(low) + (margin + v * (ONE - TWO * margin))) * (range_max / wp.float64(cells))
-
-    return SimpleNamespace(**locals())
+@wp.func
+def half_mass(x: wp.float64):
+    """Return the mass of the standard normal between 0 and x >= 0."""
+    if x >= HALF_FROM:
+        return HALF
+    if x >= SERIES_END:
+        fraction = wp.float64(x)
+        for i in range(FRACTION_TERMS):
+            fraction = x + wp.float64(FRACTION_TERMS - i) / fraction
+        return HALF - NORMAL_PEAK * exp_of(MINUS_HALF * x * x) / fraction
+    square = x * x
+    term = wp.float64(1.0)
+    total = wp.float64(1.0)
+    for n in range(1, SERIES_TERMS):
+        term = term * (square / (TWO * wp.float64(n) + ONE))
+        total = total + term
+    return x * (NORMAL_PEAK * exp_of(MINUS_HALF * square)) * total
 
 
-@functools.cache
-def make(name, flags):
-    types = precision(flags)
-    real = types.real
-    made = functions(flags & {"MASS_TABLE"})
-    reading_of, cell_reading_of = made.reading_of, made.cell_reading_of
-    range_bin = sensor_table_file.functions(flags).range_bin
-    SENSOR_TABLE = "SENSOR_TABLE" in flags
-    INCIDENCE = "INCIDENCE" in flags
+@wp.func
+def polynomial(factor: factors_8, x: wp.float64):
+    """Return a polynomial by Horner's rule, the highest power first."""
+    value = factor[0]
+    for i in range(1, 8):
+        value = value * x + factor[i]
+    return value
 
-    @kernel(flags)
-    def draw_readings(incidence, mixture, edges, chances, settings, ranges, particles, rays, tables, scale):
-        """Replace expected ranges by readings; incidence holds cosines, and edges the cosines between bins. One
-        work-item takes a particle and ray; a launch has fewer than 2^31.
-        """
-        i, k = wp.tid()
-        if k >= rays or i >= particles:
-            return
-        place = i * rays + k
-        n = wp.int64(settings[DRAW_FIRST]) + wp.int64(i)
-        each = wp.int64(settings[DRAW_PER_SCAN])
-        step = wp.uint32(n / each) + wp.uint32(settings[DRAW_STEP])
-        words = random_words(
-            wp.uint32(n % each), step, READING_STREAM + wp.uint32(k), wp.uint32(settings[DRAW_SEED]),
-            wp.uint32(settings[DRAW_SEED + 1]),
-        )  # fmt: skip
-        u = fine_uniform(words[0], words[1])
-        v = fine_uniform(words[2], words[3])
-        limit = settings[DRAW_RANGE_MAX]
-        drawn = wp.float64(0.0)
-        if SENSOR_TABLE:
-            column = range_bin(ranges[place], tables.per_metre, tables.cells, scale.range_max)
-            drawn = cell_reading_of(u, v, column, chances, tables.cells, limit, settings[DRAW_MARGIN])
+
+@wp.func
+def half_quantile(mass: wp.float64):
+    """Return the x >= 0 with a mass of the standard normal between 0 and x, from 0 to MOST_HALF."""
+    if mass <= CENTRAL:
+        r = CENTRAL_OFFSET - mass * mass
+        return mass * (polynomial(CENTRAL_OVER, r) / polynomial(CENTRAL_UNDER, r))
+    root = wp.sqrt(-log_of(HALF - mass))
+    if root <= CENTRAL_END:
+        outer = root - OUTER_OFFSET
+        return polynomial(OUTER_OVER, outer) / polynomial(OUTER_UNDER, outer)
+    outermost = root - OUTERMOST_OFFSET
+    return polynomial(OUTERMOST_OVER, outermost) / polynomial(OUTERMOST_UNDER, outermost)
+
+
+@wp.func
+def normal_within(u: wp.float64, low: wp.float64, high: wp.float64):
+    """Return a standard normal deviate between -low <= 0 and high >= 0."""
+    below = half_mass(low)
+    above = half_mass(high)
+    mark = u * (below + above) - below
+    size = half_quantile(wp.min(wp.abs(mark), MOST_HALF))
+    return wp.min(wp.max(wp.where(mark < ZERO, -size, size), -low), high)
+
+
+@wp.func
+def tabulated(at: wp.float64, tables: wp.array(dtype=wp.float64), place: wp.int32):
+    """Return the number of a table that begins at a place, at a logarithmic coordinate."""
+    steps = at * DRAW_PER_LOG
+    cell = wp.int32(wp.min(steps, DRAW_LAST))
+    share = steps - wp.float64(cell)
+    first = place + cell * DRAW_POWERS
+    value = tables[first + DRAW_POWERS - 1]
+    for i in range(DRAW_POWERS - 1):
+        value = value * share + tables[first + DRAW_POWERS - 2 - i]
+    return value
+
+
+@wp.func
+def table_mass(u: wp.float64, tables: wp.array(dtype=wp.float64), place: wp.int32):
+    """Return the mass of a hit between its mean and a distance of u scales, from its table."""
+    return wp.min(tabulated(log_of(ONE + wp.min(u, FARTHEST_HIT) * SQRT_HALF), tables, place), HALF)
+
+
+@wp.func
+def table_within(u: wp.float64, low: wp.float64, high: wp.float64, tables: wp.array(dtype=wp.float64), place: wp.int32):
+    """Return a deviate of a hit between -low <= 0 and high >= 0, from its tables."""
+    below = table_mass(low, tables, place)
+    above = table_mass(high, tables, place)
+    mark = u * (below + above) - below
+    level = -log_of(ONE - TWO * wp.min(wp.abs(mark), MOST_HALF))
+    size = (exp_of(tabulated(level, tables, place + DRAW_CELLS * DRAW_POWERS)) - ONE) / SQRT_HALF
+    return wp.min(wp.max(wp.where(mark < ZERO, -size, size), -low), high)
+
+
+@wp.func
+def short_of(u: wp.float64, expected: wp.float64, decay: wp.float64):
+    """Return a range drawn from p_short, up to the expected range (> 0)."""
+    x = decay * expected
+    if x < SHORT_SERIES:
+        square = u * u
+        bend = (u / SIX - square / TWO) + square * u / THREE
+        return wp.min(expected * (u + x * ((square - u) / TWO + x * bend)), expected)
+    return wp.min(-log_of((ONE - u) + u * exp_of(-x)) / decay, expected)
+
+
+@wp.func
+def reading_of(
+    u: wp.float64, v: wp.float64, expected: wp.float64, mixture: wp.array(dtype=wp.float64), bins: wp.int32,
+    range_max: wp.float64,
+):  # fmt: skip
+    """Return a reading drawn from the mixture; infinity without return, NaN where no reading is possible."""
+    p = DRAW_TERMS * bins
+    first = mixture[p]
+    second = first + wp.where(expected > ZERO, mixture[p + 1], ZERO)
+    third = second + mixture[p + 2]
+    total = third + mixture[p + 3]
+    mark = u * total
+    if not total > ZERO:
+        return NOWHERE
+    if mark < first:
+        mean = wp.min(wp.max(expected + mixture[p + 6], ZERO), range_max)
+        spread = mixture[p + 4] + mixture[p + 5] * expected
+        low = mean / spread
+        high = (range_max - mean) / spread
+        if MASS_TABLE:
+            return wp.max(mean + spread * table_within(v, low, high, mixture, wp.int32(mixture[p + 8])), ZERO)
         else:
-            bins = int(0)
-            if INCIDENCE:
-                while bins + 1 < tables.incidence_bins and incidence[place] <= edges[bins]:
-                    bins += 1
-            drawn = reading_of(u, v, wp.min(wp.float64(ranges[place]), limit), mixture, bins, limit)
-        if wp.isinf(drawn):
-            ranges[place] = scale.range_max
-        elif wp.isnan(drawn):
-            ranges[place] = real(drawn)
-        else:
-            ranges[place] = real(wp.min(drawn, settings[DRAW_TOP]))
+            return wp.max(mean + spread * normal_within(v, low, high), ZERO)
+    if mark < second:
+        return short_of(v, expected, mixture[p + 7])
+    return wp.where(mark < third, INFINITE, v * range_max)
 
-    return locals()[name]
+
+@wp.func
+def cell_reading_of(
+    u: wp.float64, v: wp.float64, column: wp.int32, chances: wp.array(dtype=wp.float64), cells: wp.int32,
+    range_max: wp.float64, margin: wp.float64,
+):  # fmt: skip
+    """Return a reading drawn from a table: uniform in a drawn bin, at a margin from the bin's ends."""
+    row = column * (cells + 1)
+    mark = u * chances[row + cells]
+    low = int(0)
+    high = wp.int32(cells)
+    while low < high:
+        middle = (low + high) // 2
+        if chances[row + middle] > mark:
+            high = middle
+        else:
+            low = middle + 1
+    if low == cells:
+        return INFINITE
+    return (wp.float64(low) + (margin + v * (ONE - TWO * margin))) * (range_max / wp.float64(cells))
+
+
+@kernel
+def draw_readings(incidence, mixture, edges, chances, settings, ranges, particles, rays, tables, scale):
+    """Replace expected ranges by readings; incidence holds cosines, and edges the cosines between bins. One work-item
+    takes a particle and ray; a launch has fewer than 2^31.
+    """
+    i, k = wp.tid()
+    if k >= rays or i >= particles:
+        return
+    place = i * rays + k
+    n = wp.int64(settings[DRAW_FIRST]) + wp.int64(i)
+    each = wp.int64(settings[DRAW_PER_SCAN])
+    step = wp.uint32(n / each) + wp.uint32(settings[DRAW_STEP])
+    words = random_words(
+        wp.uint32(n % each), step, READING_STREAM + wp.uint32(k), wp.uint32(settings[DRAW_SEED]),
+        wp.uint32(settings[DRAW_SEED + 1]),
+    )  # fmt: skip
+    u = fine_uniform(words[0], words[1])
+    v = fine_uniform(words[2], words[3])
+    limit = settings[DRAW_RANGE_MAX]
+    drawn = wp.float64(0.0)
+    if SENSOR_TABLE:
+        column = range_bin(ranges[place], tables.per_metre, tables.cells, scale.range_max)
+        drawn = cell_reading_of(u, v, column, chances, tables.cells, limit, settings[DRAW_MARGIN])
+    else:
+        bins = int(0)
+        if INCIDENCE:
+            while bins + 1 < tables.incidence_bins and incidence[place] <= edges[bins]:
+                bins += 1
+        drawn = reading_of(u, v, wp.min(wp.float64(ranges[place]), limit), mixture, bins, limit)
+    if wp.isinf(drawn):
+        ranges[place] = scale.range_max
+    elif wp.isnan(drawn):
+        ranges[place] = real(drawn)
+    else:
+        ranges[place] = real(wp.min(drawn, settings[DRAW_TOP]))

@@ -2,14 +2,12 @@
 
 import warp as wp
 
-from .prelude import precision
+from .types import ScoreTable
 
 # Neighbouring rows of shifts that a work-item sums; the margin holds as many.
 SHIFT_ROWS = 8
 # Largest score of a cell.
 TOP = 255
-# The struct has integers only, and so is the same in both precisions.
-ScoreTable = precision(frozenset()).ScoreTable
 
 
 @wp.func
@@ -26,9 +24,7 @@ def padded_stride(scores: ScoreTable):
 
 @wp.func
 def block_index(scores: ScoreTable, row: wp.int32, col: wp.int32, rows: wp.int32, cols: wp.int32):
-    """Return the index of a cell in its table, from which cells up to rows lines and cols columns further are read;
-    cells beyond the margin have the value of the margin's outer cells.
-    """
+    """Return the index of a cell in its table, from which cells up to rows lines and cols columns further are read."""
     line = wp.min(wp.max(row, -scores.margin), scores.rows + scores.margin - 1 - rows) + scores.margin
     begin = wp.min(wp.max(col, -scores.margin), scores.cols + scores.margin - 1 - cols) + scores.margin
     return line * padded_stride(scores) + begin

@@ -27,7 +27,7 @@ AT_ONCE = 8
 BINS = 512
 
 
-@kernel()
+@kernel
 def pool_scores(table, pooled, scores, reach):
     """Write the maximum of each cell and the cells up to reach rows and columns further. One work-item takes a cell."""
     image, line, col = wp.tid()
@@ -43,10 +43,10 @@ def pool_scores(table, pooled, scores, reach):
     pooled[begin + line * stride + col] = wp.max(upper, lower)
 
 
-@kernel()
+@kernel
 def fold_scores(table, out, scores, folded, period, step, beyond, unit):
-    """Write the losses of every period-th row and column of each padded table as an image, for each of
-    (period / step)^2 first cells, step apart. One work-item takes a cell of an image.
+    """Write the losses of every period-th row and column of each padded table as an image, for each of (period /
+    step)^2 first cells, step apart.
     """
     image, line, col = wp.tid()
     lines = padded_lines(folded)
@@ -66,12 +66,9 @@ def fold_scores(table, out, scores, folded, period, step, beyond, unit):
     out[(image * lines + line) * stride + col] = wp.uint8((TOP - value) // unit)
 
 
-@kernel()
+@kernel
 def pack_quarters(table, quarters, scores, reach, top):
-    """Write the losses of the quarters of the block that begins at each cell, as bytes of a number: upper left, upper
-    right, lower left, lower right. They are relative to the largest of the four scores or, with top, to the largest
-    possible score. A quarter has reach rows and columns. One work-item takes a cell.
-    """
+    """Write the losses of the quarters of the block that begins at each cell, as bytes of a number."""
     image, line, col = wp.tid()
     lines = padded_lines(scores)
     stride = padded_stride(scores)
@@ -96,9 +93,7 @@ def divided(
     quarters: wp.array(dtype=wp.int32), point: wp.array(dtype=wp.vec2i), image: wp.array(dtype=wp.int32),
     scores: ScoreTable, begin: wp.int32, end: wp.int32, row: wp.int32, col: wp.int32, score: wp.int32, least: wp.int32,
 ):  # fmt: skip
-    """Return the scores of a block's quarters: score less the losses of points begin to end - 1. Once all are below
-    least, the other points are left out.
-    """
+    """Return the scores of a block's quarters: score less the losses of points begin to end - 1."""
     size = padded_lines(scores) * padded_stride(scores)
     total = wp.vec4i(score, score, score, score)
     k = int(begin)
@@ -124,10 +119,10 @@ def divided(
     return total
 
 
-@kernel()
+@kernel
 def shift_scores(table, point, image, first, allowed, score, scores, begin, items, height, width, unit):
     """Sum the losses of each item's points at all shifts by less than height rows and width columns, and write the
-    scores; a shift that is not allowed has -1. One work-item takes SHIFT_ROWS rows of a column of an item.
+    scores; a shift that is not allowed has -1.
     """
     part, block, col = wp.tid()
     item = begin + part
@@ -157,10 +152,10 @@ def shift_scores(table, point, image, first, allowed, score, scores, begin, item
             score[item * height * width + n] = value
 
 
-@kernel()
+@kernel
 def row_maxima(score, best, histogram, rows, width, height, turns, shift):
     """Find the largest score of each row of shifts and its first column, and count the rows of each scan by their
-    scores, divided by 2^shift. The caller clears the counts. One work-item takes a row of an item.
+    scores, divided by 2^shift.
     """
     n = wp.tid()
     if n >= rows:
@@ -179,8 +174,8 @@ def row_maxima(score, best, histogram, rows, width, height, turns, shift):
 
 @wp.func
 def promising(histogram: wp.array(dtype=wp.int32), scan: wp.int32, most: wp.int32):
-    """Return the least score, divided by 2^shift, of a scan's most rows with the largest scores, and of others as
-    good.
+    """Return the least score, divided by 2^shift, of a scan's most rows with the largest scores, and of
+    others as good.
     """
     bin = int(BINS - 1)
     rows = histogram[scan * BINS + bin]
@@ -190,7 +185,7 @@ def promising(histogram: wp.array(dtype=wp.int32), scan: wp.int32, most: wp.int3
     return bin
 
 
-@kernel()
+@kernel
 def count_promising(best, histogram, number, items, height, turns, shift, most):
     """Count the promising rows of each item. One work-item takes an item."""
     item = wp.tid()
@@ -204,12 +199,9 @@ def count_promising(best, histogram, number, items, height, turns, shift, most):
     number[item] = rows
 
 
-@kernel()
+@kernel
 def pick_blocks(best, histogram, number, block, items, height, turns, level, shift, most):
-    """Take most of the promising rows of each scan, evenly spaced: many bounds are equal, most of all the largest.
-    Their best blocks follow each other as item, first row and column, and score; blocks that are missing have the
-    score -1. One work-item takes an item.
-    """
+    """Take most of the promising rows of each scan, evenly spaced: many bounds are equal, most of all the largest."""
     item = wp.tid()
     if item >= items:
         return
@@ -238,7 +230,7 @@ def pick_blocks(best, histogram, number, block, items, height, turns, level, shi
             before = before + 1
 
 
-@kernel()
+@kernel
 def raise_low(block, slack, low, blocks, most):
     """Raise the least scores of scans to the scores of poses less their slack. One work-item takes a pose."""
     n = wp.tid()
@@ -248,12 +240,9 @@ def raise_low(block, slack, low, blocks, most):
         wp.atomic_max(low, n // most, block[4 * n + 3] - slack[n // most])
 
 
-@kernel()
+@kernel
 def choose_blocks(score, best, low, block, count, rows, height, width, turns, level, room):
-    """Collect the shifts whose scores are at least low of their scan, in no certain order: item, first row and column
-    of each block, and score. count[level], which the caller clears, may exceed room: then some are left out. best is
-    the result of row_maxima. One work-item takes a row of an item.
-    """
+    """Collect the shifts whose scores are at least low of their scan, in no certain order."""
     k = wp.tid()
     if k >= rows:
         return
@@ -272,13 +261,11 @@ def choose_blocks(score, best, low, block, count, rows, height, width, turns, le
                 block[4 * n + 3] = value
 
 
-@kernel()
+@kernel
 def follow_blocks(
     quarters, point, image, first, allowed, block, scores, blocks, height, width, columns, level, spacing, top
 ):  # fmt: skip
-    """Replace blocks of positions by their best allowed quarters of 2^level x 2^level, the first of equal ones; a block
-    without an allowed quarter has the score -1. One work-item takes a block.
-    """
+    """Replace blocks of positions by their best allowed quarters of 2^level x 2^level, the first of equal ones."""
     n = wp.tid()
     if n >= blocks:
         return
@@ -305,15 +292,14 @@ def follow_blocks(
     block[4 * n + 3] = most
 
 
-@kernel()
+@kernel
 def divide_blocks(
     quarters, point, image, first, allowed, block, low, part, count, scores, begin, some, room, workers, run, height,
     width, columns, turns, level, spacing, top,
 ):  # fmt: skip
     """Divide count[level + 1] blocks of positions, but at most some from begin on, into quarters of 2^level x 2^level,
     and collect the allowed ones whose scores are at least low of their scan, in no certain order. count[level], which
-    the caller clears, may exceed room: then some are left out. Of workers work-items each takes run neighbouring
-    blocks at a time.
+    the caller clears, may exceed room: then some are left out.
     """
     worker = wp.tid()
     blocks = wp.min(count[level + 1] - begin, some)
@@ -344,8 +330,3 @@ def divide_blocks(
         if n % run == run - 1:
             n = n + run * (workers - 1)
         n = n + 1
-
-
-def make(name, flags):
-    """Return a kernel of the file; no flag changes one."""
-    return globals()[name]

@@ -15,14 +15,12 @@ def periods(cell: wp.int32, stride: wp.int32, level: wp.int32):
     return quotient
 
 
-@kernel()
+@kernel
 def place_ends(
     end, heading, start, first, image, point, folded, folded_image, begin, items, turns, stride, level, step_level,
     offset,
 ):  # fmt: skip
-    """Place the end points of a scan at a heading in cells of the tables, and in cells and images of a folded table.
-    One work-item takes a point of an item.
-    """
+    """Place the end points of a scan at a heading in cells of the tables, and in cells and images of a folded table."""
     part, n = wp.tid()
     item = begin + part
     if item >= items:
@@ -47,8 +45,3 @@ def place_ends(
     point[k] = cell
     folded[k] = whole
     folded_image[k] = (image[k] * side + row) * side + col
-
-
-def make(name, flags):
-    """Return a kernel of the file; no flag changes one."""
-    return globals()[name]

@@ -4,32 +4,21 @@ Row i is a bin of readings; the last row is for max readings (log probabilities)
 the last column is for rays without an obstacle. The table has fewer than 2^31 entries.
 """
 
-import functools
-from types import SimpleNamespace
-
 import warp as wp
 
-from .prelude import precision
+from .types import MixtureTables, real
 
 
-@functools.cache
-def functions(flags):
-    types = precision(flags)
-    real = types.real
+@wp.func
+def range_bin(distance: real, per_metre: real, cells: wp.int32, range_max: real):
+    """Return the bin of a range; the last one, after the cells, is for range_max and more."""
+    if distance >= range_max:
+        return cells
+    return wp.min(int(distance * per_metre), cells - 1)
 
-    @wp.func
-    def range_bin(distance: real, per_metre: real, cells: wp.int32, range_max: real):
-        """Return the bin of a range; the last one, after the cells, is for range_max and more."""
-        if distance >= range_max:
-            return cells
-        return wp.min(int(distance * per_metre), cells - 1)
 
-    @wp.func
-    def tabulated_density(
-        z: real, expected: real, sensor: wp.array(dtype=real), tables: types.MixtureTables, range_max: real
-    ):
-        """Return log p of a reading for an expected range."""
-        column = range_bin(expected, tables.per_metre, tables.cells, range_max)
-        return sensor[range_bin(z, tables.per_metre, tables.cells, range_max) * (tables.cells + 1) + column]
-
-    return SimpleNamespace(**locals())
+@wp.func
+def tabulated_density(z: real, expected: real, sensor: wp.array(dtype=real), tables: MixtureTables, range_max: real):
+    """Return log p of a reading for an expected range."""
+    column = range_bin(expected, tables.per_metre, tables.cells, range_max)
+    return sensor[range_bin(z, tables.per_metre, tables.cells, range_max) * (tables.cells + 1) + column]

@@ -9,15 +9,14 @@ ranges of directions a bit for each shape that a ray in this range may meet, 64 
 shapes.
 """
 
-import functools
 import math
-from types import SimpleNamespace
 
 import warp as wp
 
-from . import ray as ray_file
 from .bits import ALL_BITS, lowest_bit
-from .prelude import Window, precision, reader
+from .prelude import reader
+from .ray import ray_direction
+from .types import Crowd, Window, real, vec2, vec4
 
 DISC, BOX, SEGMENT = wp.constant(4), wp.constant(8), wp.constant(4)
 # Ranges of directions of a particle's sights.
@@ -41,268 +40,266 @@ def world_begin(world: wp.array(dtype=wp.vec2i), n: wp.int32, each: wp.int32):
     return wp.int64(cell_at(world, 2 * n).x) * wp.int64(each)
 
 
-@functools.cache
-def functions(flags):
-    types = precision(flags)
-    real, vec2, vec4 = types.real, types.vec2, types.vec4
-    ray_direction = ray_file.functions(flags).ray_direction
-    number_at, four_at = reader(real), reader(real, 4)
-    ZERO, ONE, TWO, MINUS_ONE = real(0.0), real(1.0), real(2.0), real(-1.0)
-    TINY, NEVER, ALWAYS, UNKNOWN = real(1e-30), real(math.inf), real(-math.inf), real(math.nan)
-    # Widening of a shape's range of directions, which covers rounding, as a sine and in ranges.
-    WIDER, APART = real(1e-5), real(2e-3)
-    # Factor that covers rounding where a shape is behind what is nearest so far.
-    FARTHER = real(1.00001)
-    THREE, QUARTER, NEAR, OPPOSITE = real(3.0), real(SIGHTS / 4), real(0.99), real(-1e-3)
+number_at, four_at = reader(real), reader(real, 4)
+ZERO, ONE, TWO, MINUS_ONE = real(0.0), real(1.0), real(2.0), real(-1.0)
+TINY, NEVER, ALWAYS, UNKNOWN = real(1e-30), real(math.inf), real(-math.inf), real(math.nan)
+# Widening of a shape's range of directions, which covers rounding, as a sine and in ranges.
+WIDER, APART = real(1e-5), real(2e-3)
+# Factor that covers rounding where a shape is behind what is nearest so far.
+FARTHER = real(1.00001)
+THREE, QUARTER, NEAR, OPPOSITE = real(3.0), real(SIGHTS / 4), real(0.99), real(-1e-3)
 
-    @wp.func
-    def sight_of(x: real, y: real):
-        """Return the place of a direction among the ranges of sights, from 0 to SIGHTS. It grows with the angle, at a
-        rate that varies.
-        """
-        part = y / (wp.abs(x) + wp.abs(y))
-        return wp.where(x >= ZERO, ONE + part, THREE - part) * QUARTER
 
-    @wp.func
-    def sights_between(low: vec2, high: vec2, around: wp.bool):
-        """Return the first range of directions in which a shape is seen and the one after the last. From the origin,
-        low and high are the directions of its ends against the clock; a shape all around is seen in all.
-        """
-        if around:
-            return wp.vec2i(0, SIGHTS)
-        begin = int(wp.floor(sight_of(low.x, low.y) - APART))
-        last = int(wp.floor(sight_of(high.x, high.y) + APART))
-        return wp.vec2i(begin, wp.where(last < begin, last + SIGHTS, last) + 1)
+@wp.func
+def sight_of(x: real, y: real):
+    """Return the place of a direction among the ranges of sights, from 0 to SIGHTS."""
+    part = y / (wp.abs(x) + wp.abs(y))
+    return wp.where(x >= ZERO, ONE + part, THREE - part) * QUARTER
 
-    @wp.func
-    def sights_of_disc(x: real, y: real, radius: real):
-        """Return the ranges of directions in which a disc, or a circle around a shape, is seen."""
-        sine = radius / wp.sqrt(x * x + y * y) + WIDER
-        cosine = wp.sqrt((ONE - sine) * (ONE + sine))
-        low = vec2(x * cosine + y * sine, y * cosine - x * sine)
-        high = vec2(x * cosine - y * sine, y * cosine + x * sine)
-        return sights_between(low, high, not (sine < NEAR))
 
-    @wp.func
-    def sights_of_segment(x: real, y: real, end_x: real, end_y: real):
-        """Return the ranges of directions in which a segment is seen."""
-        turn = x * end_y - y * end_x
-        along = x * end_x + y * end_y
-        at_end = (x == ZERO and y == ZERO) or (end_x == ZERO and end_y == ZERO)
-        between = wp.abs(turn) <= OPPOSITE * along or at_end
-        one = vec2(x, y)
-        other = vec2(end_x, end_y)
-        if turn >= ZERO:
-            return sights_between(one, other, between)
-        return sights_between(other, one, between)
+@wp.func
+def sights_between(low: vec2, high: vec2, around: wp.bool):
+    """Return the first range of directions in which a shape is seen and the one after the last."""
+    if around:
+        return wp.vec2i(0, SIGHTS)
+    begin = int(wp.floor(sight_of(low.x, low.y) - APART))
+    last = int(wp.floor(sight_of(high.x, high.y) + APART))
+    return wp.vec2i(begin, wp.where(last < begin, last + SIGHTS, last) + 1)
 
-    @wp.func
-    def shape_at(crowd: types.Crowd, i: wp.int32):
-        """Return the index of a shape's first number."""
-        boxes = wp.max(i - crowd.discs, 0)
-        segments = wp.max(boxes - crowd.boxes, 0)
-        return DISC * (i - boxes) + BOX * (boxes - segments) + SEGMENT * segments
 
-    @wp.func
-    def sights_of(
-        shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32, i: wp.int32,
-        cell: wp.vec2i, pose: vec4,
-    ):  # fmt: skip
-        """Return the first range of directions in which a particle sees a shape and the one after the last."""
-        seen = world[2 * n + 1]
-        one = seen.x * crowd.stride + shape_at(crowd, i)
-        x = (number_at(shapes, one) - real(cell.x)) - pose.x
-        y = (number_at(shapes, one + 1) - real(cell.y)) - pose.y
-        if i == seen.y or not (x - x == ZERO):
-            return wp.vec2i(0, 0)
-        if i < crowd.discs + crowd.boxes:
-            return sights_of_disc(x, y, number_at(shapes, one + wp.where(i < crowd.discs, 2, 6)))
-        end_x = (number_at(shapes, one + 2) - real(cell.x)) - pose.x
-        end_y = (number_at(shapes, one + 3) - real(cell.y)) - pose.y
-        return sights_of_segment(x, y, end_x, end_y)
+@wp.func
+def sights_of_disc(x: real, y: real, radius: real):
+    """Return the ranges of directions in which a disc, or a circle around a shape, is seen."""
+    sine = radius / wp.sqrt(x * x + y * y) + WIDER
+    cosine = wp.sqrt((ONE - sine) * (ONE + sine))
+    low = vec2(x * cosine + y * sine, y * cosine - x * sine)
+    high = vec2(x * cosine - y * sine, y * cosine + x * sine)
+    return sights_between(low, high, not (sine < NEAR))
 
-    @wp.func
-    def sight_at(crowd: types.Crowd, n: wp.int32, sight: wp.int32):
-        """Return the index of the first pair of numbers that hold the shapes which a particle may see in a range of
-        directions.
-        """
-        return crowd.begin + (n * SIGHTS + (sight & (SIGHTS - 1))) * crowd.pairs
 
-    @wp.func
-    def meet_disc(dx: real, dy: real, x: real, y: real, radius: real):
-        """Return the distance along a ray to a disc, infinite where it is not met, and the cosine of the angle of
-        incidence; inside the disc 0 and 1. Places are relative to the ray's origin.
-        """
-        along = dx * x + dy * y
-        aside = dx * y - dy * x
-        square = (radius - aside) * (radius + aside)
-        half_chord = wp.sqrt(wp.where(square > ZERO, square, ZERO))
-        near = along - half_chord
-        far = along + half_chord
-        t = wp.where(near > ZERO, near, ZERO)
-        cosine = wp.where(radius > ZERO, half_chord / wp.where(radius > ZERO, radius, ONE), ONE)
-        return vec2(wp.where(square >= ZERO and far >= ZERO, t, NEVER), wp.where(near > ZERO, cosine, ONE))
+@wp.func
+def sights_of_segment(x: real, y: real, end_x: real, end_y: real):
+    """Return the ranges of directions in which a segment is seen."""
+    turn = x * end_y - y * end_x
+    along = x * end_x + y * end_y
+    at_end = (x == ZERO and y == ZERO) or (end_x == ZERO and end_y == ZERO)
+    between = wp.abs(turn) <= OPPOSITE * along or at_end
+    one = vec2(x, y)
+    other = vec2(end_x, end_y)
+    if turn >= ZERO:
+        return sights_between(one, other, between)
+    return sights_between(other, one, between)
 
-    @wp.func
-    def meet_box(
-        dx: real, dy: real, x: real, y: real, cosine: real, sine: real, half_length: real, half_width: real
-    ):  # fmt: skip
-        """Return the same for a box with this cosine and sine of its yaw."""
-        u = cosine * dx + sine * dy
-        v = cosine * dy - sine * dx
-        p = -(cosine * x + sine * y)
-        q = -(cosine * y - sine * x)
-        fast_u = wp.abs(u)
-        fast_v = wp.abs(v)
-        inv_u = ONE / wp.where(fast_u < TINY, TINY, fast_u)
-        inv_v = ONE / wp.where(fast_v < TINY, TINY, fast_v)
-        from_u = wp.where(u < ZERO, -p, p)
-        from_v = wp.where(v < ZERO, -q, q)
-        flat_u = wp.where(wp.abs(p) <= half_length, ALWAYS, NEVER)
-        flat_v = wp.where(wp.abs(q) <= half_width, ALWAYS, NEVER)
-        in_u = wp.where(fast_u < TINY, flat_u, (-half_length - from_u) * inv_u)
-        in_v = wp.where(fast_v < TINY, flat_v, (-half_width - from_v) * inv_v)
-        out_u = wp.where(fast_u < TINY, NEVER, (half_length - from_u) * inv_u)
-        out_v = wp.where(fast_v < TINY, NEVER, (half_width - from_v) * inv_v)
-        into = wp.where(in_u > in_v, in_u, in_v)
-        out = wp.where(out_u < out_v, out_u, out_v)
-        t = wp.where(into > ZERO, into, ZERO)
-        straight = wp.where(in_u > in_v, fast_u, fast_v)
-        return vec2(wp.where(into <= out and out >= ZERO, t, NEVER), wp.where(into > ZERO, straight, ONE))
 
-    @wp.func
-    def meet_segment(dx: real, dy: real, x: real, y: real, end_x: real, end_y: real):
-        """Return the same of a segment; a ray along it meets its nearer end."""
-        along = dx * x + dy * y
-        end_along = dx * end_x + dy * end_y
-        aside = dx * y - dy * x
-        end_aside = dx * end_y - dy * end_x
-        width = end_aside - aside
-        length = end_along - along
-        nearer = wp.where(along < end_along, along, end_along)
-        farther = wp.where(along < end_along, end_along, along)
-        across = along - aside / wp.where(width == ZERO, ONE, width) * length
-        clipped = wp.where(across < nearer, nearer, wp.where(across > farther, farther, across))
-        on_line = wp.where(nearer > ZERO, nearer, wp.where(farther < ZERO, MINUS_ONE, ZERO))
-        t = wp.where(width == ZERO, wp.where(aside == ZERO, on_line, MINUS_ONE), clipped)
-        straight = wp.abs(width) / wp.sqrt(wp.where(width == ZERO, ONE, width * width + length * length))
-        meets = (aside <= ZERO and end_aside >= ZERO) or (aside >= ZERO and end_aside <= ZERO)
-        return vec2(wp.where(meets and t >= ZERO, t, NEVER), straight)
+@wp.func
+def shape_at(crowd: Crowd, i: wp.int32):
+    """Return the index of a shape's first number."""
+    boxes = wp.max(i - crowd.discs, 0)
+    segments = wp.max(boxes - crowd.boxes, 0)
+    return DISC * (i - boxes) + BOX * (boxes - segments) + SEGMENT * segments
 
-    @wp.func
-    def lowest_bits(n: wp.int32):
-        """Return a word whose lowest n bits are 1."""
-        bits = ALL_BITS
-        if n < 32:
-            bits = (wp.uint32(1) << wp.uint32(wp.max(n, 0))) - wp.uint32(1)
-        return bits
 
-    @wp.func
-    def nearest_shape(
-        shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32, cell: wp.vec2i,
-        pose: vec4, ray: vec2, t: real,
-    ):  # fmt: skip
-        """Return the nearest of the shapes that a particle sees along a ray and of an obstacle at a distance t: the
-        distance in cells, and the cosine of the angle of incidence, 2 where no shape is nearer than t. A kind follows
-        the other, so that work-items of a GPU run the same code. Most shapes are beside the ray, or behind what is
-        nearest so far.
-        """
-        direction = ray_direction(pose, ray)
-        dx = direction.x
-        dy = direction.y
-        # Shape i of a kind begins i times its numbers behind these places.
-        disc = cell_at(world, 2 * n + 1).x * crowd.stride
-        box = disc + (DISC - BOX) * crowd.discs
-        segment = box + (BOX - SEGMENT) * (crowd.discs + crowd.boxes)
-        sights = sight_at(crowd, n, int(sight_of(dx, dy)))
-        nearest = vec2(t, TWO)
-        for k in range(2 * crowd.pairs):
-            both = cell_at(world, sights + (k >> 1))
-            seen = wp.uint32(wp.where((k & 1) == 0, both.x, both.y))
-            discs = lowest_bits(crowd.discs - 32 * k)
-            boxes = lowest_bits(crowd.discs + crowd.boxes - 32 * k)
-            left = seen & discs
-            while left != wp.uint32(0):
-                four = four_at(shapes, disc + DISC * (32 * k + lowest_bit(left)))
-                left = left & (left - wp.uint32(1))
-                x = (four[0] - real(cell.x)) - pose.x
-                y = (four[1] - real(cell.y)) - pose.y
-                if wp.abs(dx * y - dy * x) <= four[2] and dx * x + dy * y - FARTHER * four[2] < nearest.x:
-                    met = meet_disc(dx, dy, x, y, four[2])
-                    if met.x < nearest.x:
-                        nearest = met
-            left = seen & boxes & (discs ^ ALL_BITS)
-            while left != wp.uint32(0):
-                one = box + BOX * (32 * k + lowest_bit(left))
-                left = left & (left - wp.uint32(1))
-                four = four_at(shapes, one)
-                rest = four_at(shapes, one + 4)
-                x = (four[0] - real(cell.x)) - pose.x
-                y = (four[1] - real(cell.y)) - pose.y
-                along = dx * x + dy * y
-                if wp.abs(dx * y - dy * x) <= rest[2] and along - (FARTHER - ONE) * along - rest[2] < nearest.x:
-                    met = meet_box(dx, dy, x, y, four[2], four[3], rest[0], rest[1])
-                    if met.x < nearest.x:
-                        nearest = met
-            left = seen & (boxes ^ ALL_BITS)
-            while left != wp.uint32(0):
-                four = four_at(shapes, segment + SEGMENT * (32 * k + lowest_bit(left)))
-                left = left & (left - wp.uint32(1))
-                x = (four[0] - real(cell.x)) - pose.x
-                y = (four[1] - real(cell.y)) - pose.y
-                end_x = (four[2] - real(cell.x)) - pose.x
-                end_y = (four[3] - real(cell.y)) - pose.y
-                aside = dx * y - dy * x
-                end_aside = dx * end_y - dy * end_x
-                beside = (aside > ZERO and end_aside > ZERO) or (aside < ZERO and end_aside < ZERO)
-                behind = dx * x + dy * y >= nearest.x and dx * end_x + dy * end_y >= nearest.x
-                if not beside and not behind:
-                    met = meet_segment(dx, dy, x, y, end_x, end_y)
-                    if met.x < nearest.x:
-                        nearest = met
-        return nearest
+@wp.func
+def sights_of(
+    shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: Crowd, n: wp.int32, i: wp.int32,
+    cell: wp.vec2i, pose: vec4,
+):  # fmt: skip
+    """Return the first range of directions in which a particle sees a shape and the one after the last."""
+    seen = world[2 * n + 1]
+    one = seen.x * crowd.stride + shape_at(crowd, i)
+    x = (number_at(shapes, one) - real(cell.x)) - pose.x
+    y = (number_at(shapes, one + 1) - real(cell.y)) - pose.y
+    if i == seen.y or not (x - x == ZERO):
+        return wp.vec2i(0, 0)
+    if i < crowd.discs + crowd.boxes:
+        return sights_of_disc(x, y, number_at(shapes, one + wp.where(i < crowd.discs, 2, 6)))
+    end_x = (number_at(shapes, one + 2) - real(cell.x)) - pose.x
+    end_y = (number_at(shapes, one + 3) - real(cell.y)) - pose.y
+    return sights_of_segment(x, y, end_x, end_y)
 
-    @wp.func
-    def shape_distance(
-        shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: types.Crowd, n: wp.int32, cell: wp.vec2i,
-        point: vec2,
-    ):  # fmt: skip
-        """Return the distance from a point to the nearest shape that a particle sees, infinite without one, 0 inside a
-        shape. The point is relative to the cell.
-        """
-        nearest = real(NEVER)
-        seen = cell_at(world, 2 * n + 1)
-        one = seen.x * crowd.stride
-        i = int(0)
-        while i < crowd.discs + crowd.boxes + crowd.segments:
-            x = (number_at(shapes, one) - real(cell.x)) - point.x
-            y = (number_at(shapes, one + 1) - real(cell.y)) - point.y
-            away = real(NEVER)
-            if i < crowd.discs:
-                away = wp.sqrt(x * x + y * y) - number_at(shapes, one + 2)
-                one += DISC
-            elif i < crowd.discs + crowd.boxes:
-                u = wp.abs(number_at(shapes, one + 2) * x + number_at(shapes, one + 3) * y) - number_at(shapes, one + 4)
-                v = wp.abs(number_at(shapes, one + 2) * y - number_at(shapes, one + 3) * x) - number_at(shapes, one + 5)
-                out_u = wp.where(u > ZERO, u, ZERO)
-                out_v = wp.where(v > ZERO, v, ZERO)
-                # The comparisons turn NaN into 0.
-                away = wp.where(x == x, wp.sqrt(out_u * out_u + out_v * out_v), UNKNOWN)
-                one += BOX
-            else:
-                to_x = ((number_at(shapes, one + 2) - real(cell.x)) - point.x) - x
-                to_y = ((number_at(shapes, one + 3) - real(cell.y)) - point.y) - y
-                square = to_x * to_x + to_y * to_y
-                part = -(x * to_x + y * to_y) / wp.where(square > ZERO, square, ONE)
-                on = wp.where(part > ZERO, wp.where(part < ONE, part, ONE), ZERO)
-                off_x = x + on * to_x
-                off_y = y + on * to_y
-                away = wp.sqrt(off_x * off_x + off_y * off_y)
-                one += SEGMENT
-            if i != seen.y and away < nearest:
-                nearest = away
-            i += 1
-        nearest = wp.where(nearest > ZERO, nearest, ZERO)
-        return nearest
 
-    return SimpleNamespace(**locals())
+@wp.func
+def sight_at(crowd: Crowd, n: wp.int32, sight: wp.int32):
+    """Return the index of the first pair of numbers that hold the shapes which a particle may see in a range of
+    directions.
+    """
+    return crowd.begin + (n * SIGHTS + (sight & (SIGHTS - 1))) * crowd.pairs
+
+
+@wp.func
+def meet_disc(dx: real, dy: real, x: real, y: real, radius: real):
+    """Return the distance along a ray to a disc, infinite where it is not met, and the cosine of the angle of
+    incidence; inside the disc 0 and 1.
+    """
+    along = dx * x + dy * y
+    aside = dx * y - dy * x
+    square = (radius - aside) * (radius + aside)
+    half_chord = wp.sqrt(wp.where(square > ZERO, square, ZERO))
+    near = along - half_chord
+    far = along + half_chord
+    t = wp.where(near > ZERO, near, ZERO)
+    cosine = wp.where(radius > ZERO, half_chord / wp.where(radius > ZERO, radius, ONE), ONE)
+    return vec2(wp.where(square >= ZERO and far >= ZERO, t, NEVER), wp.where(near > ZERO, cosine, ONE))
+
+
+@wp.func
+def meet_box(
+    dx: real, dy: real, x: real, y: real, cosine: real, sine: real, half_length: real, half_width: real
+):  # fmt: skip
+    """Return the same for a box with this cosine and sine of its yaw."""
+    u = cosine * dx + sine * dy
+    v = cosine * dy - sine * dx
+    p = -(cosine * x + sine * y)
+    q = -(cosine * y - sine * x)
+    fast_u = wp.abs(u)
+    fast_v = wp.abs(v)
+    inv_u = ONE / wp.where(fast_u < TINY, TINY, fast_u)
+    inv_v = ONE / wp.where(fast_v < TINY, TINY, fast_v)
+    from_u = wp.where(u < ZERO, -p, p)
+    from_v = wp.where(v < ZERO, -q, q)
+    flat_u = wp.where(wp.abs(p) <= half_length, ALWAYS, NEVER)
+    flat_v = wp.where(wp.abs(q) <= half_width, ALWAYS, NEVER)
+    in_u = wp.where(fast_u < TINY, flat_u, (-half_length - from_u) * inv_u)
+    in_v = wp.where(fast_v < TINY, flat_v, (-half_width - from_v) * inv_v)
+    out_u = wp.where(fast_u < TINY, NEVER, (half_length - from_u) * inv_u)
+    out_v = wp.where(fast_v < TINY, NEVER, (half_width - from_v) * inv_v)
+    into = wp.where(in_u > in_v, in_u, in_v)
+    out = wp.where(out_u < out_v, out_u, out_v)
+    t = wp.where(into > ZERO, into, ZERO)
+    straight = wp.where(in_u > in_v, fast_u, fast_v)
+    return vec2(wp.where(into <= out and out >= ZERO, t, NEVER), wp.where(into > ZERO, straight, ONE))
+
+
+@wp.func
+def meet_segment(dx: real, dy: real, x: real, y: real, end_x: real, end_y: real):
+    """Return the same of a segment; a ray along it meets its nearer end."""
+    along = dx * x + dy * y
+    end_along = dx * end_x + dy * end_y
+    aside = dx * y - dy * x
+    end_aside = dx * end_y - dy * end_x
+    width = end_aside - aside
+    length = end_along - along
+    nearer = wp.where(along < end_along, along, end_along)
+    farther = wp.where(along < end_along, end_along, along)
+    across = along - aside / wp.where(width == ZERO, ONE, width) * length
+    clipped = wp.where(across < nearer, nearer, wp.where(across > farther, farther, across))
+    on_line = wp.where(nearer > ZERO, nearer, wp.where(farther < ZERO, MINUS_ONE, ZERO))
+    t = wp.where(width == ZERO, wp.where(aside == ZERO, on_line, MINUS_ONE), clipped)
+    straight = wp.abs(width) / wp.sqrt(wp.where(width == ZERO, ONE, width * width + length * length))
+    meets = (aside <= ZERO and end_aside >= ZERO) or (aside >= ZERO and end_aside <= ZERO)
+    return vec2(wp.where(meets and t >= ZERO, t, NEVER), straight)
+
+
+@wp.func
+def lowest_bits(n: wp.int32):
+    """Return a word whose lowest n bits are 1."""
+    bits = ALL_BITS
+    if n < 32:
+        bits = (wp.uint32(1) << wp.uint32(wp.max(n, 0))) - wp.uint32(1)
+    return bits
+
+
+@wp.func
+def nearest_shape(
+    shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: Crowd, n: wp.int32, cell: wp.vec2i,
+    pose: vec4, ray: vec2, t: real,
+):  # fmt: skip
+    """Return the nearest of the shapes that a particle sees along a ray and of an obstacle at a distance t."""
+    direction = ray_direction(pose, ray)
+    dx = direction.x
+    dy = direction.y
+    # Shape i of a kind begins i times its numbers behind these places.
+    disc = cell_at(world, 2 * n + 1).x * crowd.stride
+    box = disc + (DISC - BOX) * crowd.discs
+    segment = box + (BOX - SEGMENT) * (crowd.discs + crowd.boxes)
+    sights = sight_at(crowd, n, int(sight_of(dx, dy)))
+    nearest = vec2(t, TWO)
+    for k in range(2 * crowd.pairs):
+        both = cell_at(world, sights + (k >> 1))
+        seen = wp.uint32(wp.where((k & 1) == 0, both.x, both.y))
+        discs = lowest_bits(crowd.discs - 32 * k)
+        boxes = lowest_bits(crowd.discs + crowd.boxes - 32 * k)
+        left = seen & discs
+        while left != wp.uint32(0):
+            four = four_at(shapes, disc + DISC * (32 * k + lowest_bit(left)))
+            left = left & (left - wp.uint32(1))
+            x = (four[0] - real(cell.x)) - pose.x
+            y = (four[1] - real(cell.y)) - pose.y
+            if wp.abs(dx * y - dy * x) <= four[2] and dx * x + dy * y - FARTHER * four[2] < nearest.x:
+                met = meet_disc(dx, dy, x, y, four[2])
+                if met.x < nearest.x:
+                    nearest = met
+        left = seen & boxes & (discs ^ ALL_BITS)
+        while left != wp.uint32(0):
+            one = box + BOX * (32 * k + lowest_bit(left))
+            left = left & (left - wp.uint32(1))
+            four = four_at(shapes, one)
+            rest = four_at(shapes, one + 4)
+            x = (four[0] - real(cell.x)) - pose.x
+            y = (four[1] - real(cell.y)) - pose.y
+            along = dx * x + dy * y
+            if wp.abs(dx * y - dy * x) <= rest[2] and along - (FARTHER - ONE) * along - rest[2] < nearest.x:
+                met = meet_box(dx, dy, x, y, four[2], four[3], rest[0], rest[1])
+                if met.x < nearest.x:
+                    nearest = met
+        left = seen & (boxes ^ ALL_BITS)
+        while left != wp.uint32(0):
+            four = four_at(shapes, segment + SEGMENT * (32 * k + lowest_bit(left)))
+            left = left & (left - wp.uint32(1))
+            x = (four[0] - real(cell.x)) - pose.x
+            y = (four[1] - real(cell.y)) - pose.y
+            end_x = (four[2] - real(cell.x)) - pose.x
+            end_y = (four[3] - real(cell.y)) - pose.y
+            aside = dx * y - dy * x
+            end_aside = dx * end_y - dy * end_x
+            beside = (aside > ZERO and end_aside > ZERO) or (aside < ZERO and end_aside < ZERO)
+            behind = dx * x + dy * y >= nearest.x and dx * end_x + dy * end_y >= nearest.x
+            if not beside and not behind:
+                met = meet_segment(dx, dy, x, y, end_x, end_y)
+                if met.x < nearest.x:
+                    nearest = met
+    return nearest
+
+
+@wp.func
+def shape_distance(
+    shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: Crowd, n: wp.int32, cell: wp.vec2i,
+    point: vec2,
+):  # fmt: skip
+    """Return the distance from a point to the nearest shape that a particle sees, infinite without one, 0 inside a
+    shape.
+    """
+    nearest = real(NEVER)
+    seen = cell_at(world, 2 * n + 1)
+    one = seen.x * crowd.stride
+    i = int(0)
+    while i < crowd.discs + crowd.boxes + crowd.segments:
+        x = (number_at(shapes, one) - real(cell.x)) - point.x
+        y = (number_at(shapes, one + 1) - real(cell.y)) - point.y
+        away = real(NEVER)
+        if i < crowd.discs:
+            away = wp.sqrt(x * x + y * y) - number_at(shapes, one + 2)
+            one += DISC
+        elif i < crowd.discs + crowd.boxes:
+            u = wp.abs(number_at(shapes, one + 2) * x + number_at(shapes, one + 3) * y) - number_at(shapes, one + 4)
+            v = wp.abs(number_at(shapes, one + 2) * y - number_at(shapes, one + 3) * x) - number_at(shapes, one + 5)
+            out_u = wp.where(u > ZERO, u, ZERO)
+            out_v = wp.where(v > ZERO, v, ZERO)
+            # The comparisons turn NaN into 0.
+            away = wp.where(x == x, wp.sqrt(out_u * out_u + out_v * out_v), UNKNOWN)
+            one += BOX
+        else:
+            to_x = ((number_at(shapes, one + 2) - real(cell.x)) - point.x) - x
+            to_y = ((number_at(shapes, one + 3) - real(cell.y)) - point.y) - y
+            square = to_x * to_x + to_y * to_y
+            part = -(x * to_x + y * to_y) / wp.where(square > ZERO, square, ONE)
+            on = wp.where(part > ZERO, wp.where(part < ONE, part, ONE), ZERO)
+            off_x = x + on * to_x
+            off_y = y + on * to_y
+            away = wp.sqrt(off_x * off_x + off_y * off_y)
+            one += SEGMENT
+        if i != seen.y and away < nearest:
+            nearest = away
+        i += 1
+    nearest = wp.where(nearest > ZERO, nearest, ZERO)
+    return nearest

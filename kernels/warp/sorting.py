@@ -5,9 +5,7 @@ import warp as wp
 
 @wp.func
 def sort_numbers(number: wp.array(dtype=wp.float64), first: wp.int32, count: wp.int32, to: wp.int32):
-    """Write count numbers from first on in ascending order, from to on: each goes to the place that as many numbers
-    precede.
-    """
+    """Write count numbers from first on in ascending order, from to on."""
     for i in range(count):
         mine = number[first + i]
         before = int(0)

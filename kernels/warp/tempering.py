@@ -28,17 +28,13 @@ EVIDENCE, SLOW, FAST, INJECTED = (wp.constant(place) for place in (48, 49, 50, 5
 LARGEST_EXPONENT = wp.constant(wp.float64(700.0))
 NEVER = wp.constant(wp.float64(-math.inf))
 ZERO, HALF, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1.0))
-
-
 eight = wp.types.vector(length=8, dtype=wp.float64)
 number_at = reader(wp.float64)
 
 
 @wp.func
 def eight_at(values: wp.array(dtype=wp.float64), first: wp.int32, end: wp.int32, missing: wp.float64):
-    """Return 8 numbers from first on, and missing in place of those from end on: a work-item waits once for all of
-    them.
-    """
+    """Return 8 numbers from first on, and missing in place of those from end on."""
     found = eight(missing)
     for i in range(8):
         if first + i < end:
@@ -90,9 +86,7 @@ def column_of(high: wp.float64, rung: wp.int32):
 def sum_before(
     sums: wp.array(dtype=wp.float64), joined: wp.array(dtype=wp.float64), b: wp.int32, fan: wp.int32, column: wp.int32
 ):
-    """Return the sum of a column over all blocks before one: over the blocks before it in its group, and over the
-    groups before it.
-    """
+    """Return the sum of a column over all blocks before one."""
     total = number_at(sums, b * WEIGHT_SUMS + column)
     if b >= fan:
         total += number_at(joined, b / fan * WEIGHT_SUMS + column)
@@ -101,9 +95,7 @@ def sum_before(
 
 @wp.func
 def tempered(scores: eight, largest: wp.float64, left: wp.float64):
-    """Return the likelihoods of 8 scores relative to the largest, on the last rung; 1 where none is possible or nothing
-    is left. Their squares belong to the rung before: an error of 2^-53 grows to 2^-46 on the first rung.
-    """
+    """Return the likelihoods of 8 scores relative to the largest, on the last rung."""
     found = eight(ONE)
     if not wp.isinf(largest) and left > ZERO:
         for i in range(8):

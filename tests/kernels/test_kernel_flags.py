@@ -14,7 +14,7 @@ from support.kernel_scenes import PRECISIONS, scene_flags
 
 from gpusense.backends import get_backend
 from gpusense.interface.flags import FLAGS
-from gpusense.interface.kernel_files import warp_module
+from gpusense.interface.kernel_files import warp_files
 from gpusense.interface.signatures import KERNELS
 from gpusense.interface.sources import assemble, relevant
 
@@ -111,7 +111,7 @@ def warp_code(kernel: str, flags: frozenset[str]) -> str:
     """Return the C++ that Warp generates for a kernel, without comments, which quote the Python source."""
     import warp as wp
 
-    made = warp_module(KERNELS[kernel].file).make(kernel, flags)
+    made = warp_files().kernel_of(kernel, flags)
     with tempfile.TemporaryDirectory() as folder:
         wp.compile_aot_module(made.module, device="cpu", module_dir=folder)
         (source,) = Path(folder).glob("*.cpp")
@@ -125,7 +125,7 @@ def cuda_code(kernel: str, flags: frozenset[str], folder: Path) -> str:
     architectures = wp.get_cuda_supported_archs()
     if not architectures:
         pytest.skip("this build of Warp has no CUDA compiler")
-    made = warp_module(KERNELS[kernel].file).make(kernel, flags)
+    made = warp_files().kernel_of(kernel, flags)
     arch = min(architectures, key=lambda number: abs(number - 90))
     wp.compile_aot_module(made.module, arch=arch, module_dir=folder, use_ptx=True)
     (code,) = folder.glob("*.ptx")

@@ -14,7 +14,7 @@ import pytest
 from support.kernel_scenes import PRECISIONS
 
 from gpusense.interface import sources
-from gpusense.interface.kernel_files import kernel_root, opencl_names, opencl_source, warp_module
+from gpusense.interface.kernel_files import kernel_root, opencl_names, opencl_source, warp_files
 from gpusense.interface.signatures import KERNELS
 from gpusense.interface.sources import parameters, source_text
 
@@ -77,9 +77,7 @@ def test_reference_kernels_have_the_arguments_of_their_row(kernel: str) -> None:
 
 def warp_types(precision: type) -> Any:
     """Return the types of Warp's kernels in a precision."""
-    return importlib.import_module(f"{warp_module('ray').__package__}.prelude").precision(
-        frozenset({"FLOAT64"} if precision is np.float64 else ())
-    )
+    return warp_files().precision(frozenset({"FLOAT64"} if precision is np.float64 else ()))
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -96,7 +94,7 @@ def test_warp_kernels_have_the_arguments_of_their_row(
     types |= {"double": wp.float64, "coordinate": wp.float64, "measured": wp.float64}
     types |= vars(warp_types(precision))
     row = KERNELS[kernel]
-    made = warp_module(row.file).make(kernel, frozenset({"FLOAT64"} if precision is np.float64 else ()))
+    made = warp_files().kernel_of(kernel, frozenset({"FLOAT64"} if precision is np.float64 else ()))
     expected = {a.name: (types[a.type], a.shape is not None) for a in row.arguments}
     found = {
         name: (getattr(annotation, "dtype", annotation), isinstance(annotation, wp.array))
@@ -110,13 +108,12 @@ def test_warp_kernels_have_the_arguments_of_their_row(
 
 def test_a_warp_kernel_has_the_names_of_its_row(needs: Callable[[str], str]) -> None:
     needs("warp")
-    prelude = warp_module("prelude")
 
     def wrap_headings(poses, count):
         pass
 
     with pytest.raises(TypeError, match=r"^wrap_headings: parameters must be those of its row, got poses, count$"):
-        prelude.kernel()(wrap_headings)
+        warp_files().typed(wrap_headings, frozenset())
 
 
 def test_both_languages_have_the_same_files() -> None:

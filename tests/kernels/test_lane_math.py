@@ -8,7 +8,7 @@ import pytest
 from scipy import special
 
 from gpusense.evaluation.tolerances import TOLERANCES
-from gpusense.interface.kernel_files import opencl_source, warp_module
+from gpusense.interface.kernel_files import opencl_source, warp_files
 from gpusense.interface.signatures import LANES
 from gpusense.interface.sources import prelude, resolve
 
@@ -71,7 +71,7 @@ def evaluate_warp(needs):
     needs("warp")
     import warp as wp
 
-    lanes = warp_module("lanes.math")
+    lanes = warp_files().file_of("lanes.math")
     exp, one_minus_exp, log, erf = (getattr(lanes, name) for name in FUNCTIONS)
 
     def each(given, found):

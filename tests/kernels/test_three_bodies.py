@@ -17,11 +17,9 @@ from gpusense.interface.signatures import KERNELS
 
 OPENCL, WARP, NUMPY = LANGUAGES = "OpenCL", "Warp", "NumPy"
 FOLDERS = {WARP: kernel_root() / "warp", NUMPY: Path(gpusense.reference.__file__).parent}
-# Factories of a file's Warp functions and kernels for a set of flags, not part of the concept.
-FACTORIES = {"functions", "make"}
 # Files of a single language that are not concepts.
 OTHER_FILES = {
-    WARP: {"__init__": "makes the folder a package", "prelude": "types and decorators of all Warp kernels"},
+    WARP: {"__init__": "makes the folder a package", "prelude": "loads all Warp kernels"},
     NUMPY: {
         "__init__": "makes the folder a package",
     },
@@ -108,7 +106,7 @@ ON_PURPOSE = [
     Purpose("philox", "number_of", (OPENCL,), LANES),
     Purpose("placement", "move_to_sensor", (OPENCL,), LANES),
     Purpose("placement", "floor_cells", (OPENCL,), FLOOR),
-    Purpose("ranges", "caster_of", (WARP, NUMPY), "OpenCL requires the file caster, which sources.py resolves"),
+    Purpose("ranges", "caster_of", REFERENCE_ONLY, "kernels import the file caster, which their loaders resolve"),
     Purpose("raycast", "track_of rectangle_at", KERNELS_ONLY, COUNTS),
     Purpose("ray", "as_bits farther", (WARP,), "OpenCL has casts of bits, as_bits and as_real; NumPy needs none"),
     Purpose("ray", "whole", KERNELS_ONLY, COUNTS),
@@ -141,10 +139,10 @@ def opencl_functions(text: str) -> list[str]:
 
 
 def python_functions(text: str) -> list[str]:
-    """Return the names of a Python file's functions in order, including nested ones and without factories."""
+    """Return the names of a Python file's functions in order, including nested ones."""
     found = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)]
     found.sort(key=lambda node: node.lineno)
-    return list(dict.fromkeys(node.name for node in found if node.name not in FACTORIES))
+    return list(dict.fromkeys(node.name for node in found))
 
 
 @functools.cache

@@ -42,10 +42,10 @@ print(json.dumps({"package": gpusense.__file__, "root": str(root), "path": sys.p
 IMPORT = """
 import json
 import warp
-from gpusense.interface.kernel_files import kernel_root, warp_module
+from gpusense.interface.kernel_files import kernel_root, warp_files
 
-names = [path.stem for path in kernel_root().glob("warp/*.py") if path.stem != "__init__"]
-modules = {name: warp_module(name) for name in names}
+names = [path.stem for path in kernel_root().glob("warp/*.py") if path.stem not in ("__init__", "prelude")]
+modules = {name: warp_files().file_of(name) for name in names}
 report = {name: [module.__name__, module.__file__] for name, module in modules.items()}
 print(json.dumps({"modules": report, "library": warp.__file__}))
 """
@@ -197,7 +197,9 @@ def test_kernels_are_found(layout: Layout, checkout: Path, tmp_path: Path) -> No
 @needs_warp
 def test_warp_kernels_are_imported_under_one_name(layout: Layout, checkout: Path, tmp_path: Path) -> None:
     report = json.loads(layout.run(IMPORT, cwd=tmp_path))
-    names = [path.stem for path in (checkout / "kernels" / "warp").glob("*.py") if path.stem != "__init__"]
+    names = [
+        path.stem for path in (checkout / "kernels" / "warp").glob("*.py") if path.stem not in ("__init__", "prelude")
+    ]
     folder = layout.kernels / "warp"
     assert report["modules"] == {name: [f"gpusense.kernels.warp.{name}", str(folder / f"{name}.py")] for name in names}
     assert Path(report["library"]).parent != folder

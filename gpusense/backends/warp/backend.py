@@ -7,7 +7,6 @@ kernels unpack ``wp.tid()`` in that order.
 from __future__ import annotations
 
 import functools
-import inspect
 import threading
 from typing import Any
 
@@ -24,7 +23,7 @@ from gpusense.backends.warp.launch import SCALARS, Launch, host_view
 from gpusense.backends.warp.pieces import SharedLaunch, shared
 from gpusense.backends.warp.queue import CallQueue
 from gpusense.backends.warp.settings import LOCK, initialize, load, settings
-from gpusense.interface.kernel_files import warp_module
+from gpusense.interface.kernel_files import warp_files, warp_source
 from gpusense.interface.launches import Program
 from gpusense.interface.signatures import KERNELS, Kernel, team_of
 from gpusense.interface.sources import relevant
@@ -183,8 +182,8 @@ class WarpBackend(ProcessBound, Backend):
         return 256
 
     def source(self, kernel: str, flags: frozenset[str]) -> str:
-        """See Backend.source; flags are constants of the file's factory, which Warp resolves."""
-        return inspect.getsource(warp_module(KERNELS[kernel].file))
+        """See Backend.source; flags are constants of the file, which Warp resolves."""
+        return warp_source(KERNELS[kernel].file)
 
     def synchronize(self) -> None:
         queue = self.batch()
@@ -259,7 +258,7 @@ class WarpBackend(ProcessBound, Backend):
         """Compile a kernel."""
         group = (team_of(row, flags) if "IN_TEAMS" in flags else row.group) if self._device.is_cuda else 1
         with settings():
-            compiled = warp_module(row.file).make(kernel, flags)
+            compiled = warp_files().kernel_of(kernel, flags)
             try:
                 load(compiled.module, self._device, group)
             except Exception as error:

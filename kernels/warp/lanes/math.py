@@ -6,12 +6,10 @@ erf(x) = 1 - exp(-x W(x)). bench/derive/lane_constants.py derives the constants.
 elementary.py.
 """
 
-import functools
-from types import SimpleNamespace
-
 import warp as wp
 
-from .. import elementary
+from ..elementary import exp_of, log_of
+from ..flags import FLOAT64
 
 _number = wp.float32
 
@@ -94,11 +92,5 @@ def erf_lanes(x: wp.float32):
     return one_minus_exp_lanes(-b * (low + (square * square) * high))
 
 
-@functools.cache
-def functions(flags):
-    """Return the functions of the file for a set of flags."""
-    if "FLOAT64" in flags:
-        return SimpleNamespace(exp_lanes=elementary.exp_of, log_lanes=elementary.log_of)
-    return SimpleNamespace(
-        exp_lanes=exp_lanes, one_minus_exp_lanes=one_minus_exp_lanes, log_lanes=log_lanes, erf_lanes=erf_lanes
-    )
+if FLOAT64:
+    exp_lanes, log_lanes = exp_of, log_of

@@ -159,7 +159,7 @@ class Cloud(Particles):
         self._given[self.inputs.spans[0]] = settings
         for index, reading in readings:
             target = self.readings[index]
-            source = self._scored[index].place(reading, self._given[self.inputs.spans[1 + index]], target)
+            source = self._scored[index].place(reading, self._given[self.inputs.spans[1 + index]])
             if source is not None:
                 adopted.append((source, target, self._scored[index].readings * _DOUBLE.itemsize))
         self._adopted = adopted

@@ -42,11 +42,12 @@ class FilterCore:
         self.recovery = Recovery(self.tracker, self.verdict)
         # Readings of the last correction by the index of their sensor.
         self.last: dict[int, tuple[Any, ...]] = {}
+        self._learners = [sensor.learner for sensor in sensors if sensor.learner is not None]
         self._margins = margins_of(sensors)
 
     def changing(self) -> tuple[Any, ...]:
         """Return the objects whose state a call may change, and keep their present buffers."""
-        return self, self.verdict, *self.sensors, *self.tracker.changing(), *self.recovery.changing()
+        return self, self.verdict, *self._learners, *self.tracker.changing(), *self.recovery.changing()
 
     def check_started(self) -> None:
         """Refuse to continue without particles."""
@@ -88,8 +89,8 @@ class FilterCore:
         self.last = {}
         self.recovery.restart()
         self.verdict.reset()
-        for sensor in self.sensors:
-            sensor.restart()
+        for learner in self._learners:
+            learner.restart()
 
     # ---- steps
 
@@ -112,20 +113,20 @@ class FilterCore:
             particles = tracker.moved_particles()
             if is_together(tracker.mean_and_covariance()[1]):
                 used = skipped(self.sensors, used, particles, verdict.anywhere(), share)
-        for sensor in self.sensors:
-            sensor.receive()
+        for learner in self._learners:
+            learner.receive()
         judged = verdict.expected(everything, tracker.progress.motion)
         tracker.weigh(used, judged=judged, meanwhile=functools.partial(self._use_wait, everything))
         tracker.learn(used, self.recovery.is_doubted)
         self.recovery.corrected(used, self.last)
 
     def _use_wait(self, readings: dict[int, tuple[Any, ...]]) -> None:
-        """Learn from the scans of the last correction, unless they contradict the pose, and count this one."""
-        doubted = self.recovery.is_doubted()
-        for sensor in self.sensors:
-            sensor.learn(doubted=doubted)
+        """Count a correction, and advance the lessons of earlier ones unless scans contradict the pose."""
         self.last = readings
+        doubted = self.recovery.is_doubted()
         self.verdict.corrected()
+        for learner in self._learners:
+            learner.work(doubted=doubted)
 
     def reset(self) -> None:
         """Replace half of the particles by poses that make the last readings likely, moved by all later motion."""
@@ -179,11 +180,11 @@ class FilterCore:
     def state(self) -> tuple[Contents, dict[str, Any]]:
         """Return particles and memory as plain data."""
         tracker = self.tracker
-        for sensor in self.sensors:
-            sensor.receive()
+        for learner in self._learners:
+            learner.receive()
         memory = {
             "tracker": plain_state(tracker), "verdict": plain_state(self.verdict), "recovery": self.recovery.state(),
-            "sensors": [plain_state(sensor) for sensor in self.sensors],
+            "learners": [plain_state(learner) for learner in self._learners],
             "readings": {index: tuple(map(self._on_host, reading)) for index, reading in self.last.items()},
         }  # fmt: skip
         return tracker.cloud.contents(tracker.shown), memory
@@ -198,8 +199,8 @@ class FilterCore:
         self.tracker.cloud.restore(contents)
         set_state(self.tracker, memory["tracker"])
         set_state(self.verdict, memory["verdict"])
-        for sensor, values in zip(self.sensors, memory["sensors"], strict=True):
-            set_state(sensor, values)
+        for learner, values in zip(self._learners, memory["learners"], strict=True):
+            set_state(learner, values)
         self.recovery.restore(memory["recovery"])
         self.last = {index: tuple(map(copy.copy, reading)) for index, reading in memory["readings"].items()}
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import copy
-import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -15,8 +13,7 @@ from gpusense.backends.base import Backend, Buffer
 from gpusense.interface.constants import DEPTH, TEMPERATURE
 from gpusense.interface.launches import Program
 from gpusense.localization.beam_consistency import MapJudge
-from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around
+from gpusense.localization.lessons import Learner
 from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.point.base import PointModel
 from gpusense.models.scan.bound import RecordedCall
@@ -33,19 +30,8 @@ _MOST_STARTED = 64
 _MOST_SENSORS = DEPTH - TEMPERATURE
 
 
-class Lesson(NamedTuple):
-    """A scan that teaches the temperature."""
-
-    terms: Any  # (7, K) terms of its readings at :func:`poses_around` the estimate, or the function that waits for them
-    axes: np.ndarray  # (3, 3) steps between these poses
-    directions: np.ndarray  # (K,) directions of the beams in the world [rad]
-    follows: bool  # whether the scan directly follows the previous lesson
-
-
 class Sensor:
     """Measurement model of a filter."""
-
-    MEMORY = ("_correlation", "_seen", "_learned", "_lesson")
 
     def __init__(self, model: Any) -> None:
         if not isinstance(model, (ScanModel, PointModel)):
@@ -61,102 +47,30 @@ class Sensor:
         # Used beams and all beams of a scan; 0 for other models.
         self.beams = model.used_beams if isinstance(model, ScanModel) else 0
         self.readings = model.scanner.count if isinstance(model, ScanModel) else 0
-        self._correlation = BeamCorrelation()
-        # A temperature and its correlation; learning replaces the correlation.
-        self._known: tuple[BeamCorrelation, float] | None = None
-        self._seen, self._learned = 0, -1
-        self._lesson: Lesson | None = None
-        # The readings, the poses and the call that scores the readings around an estimate, or no call; the reading
-        # on the device, its buffer, and its values if they came from the host.
-        self._terms: tuple[Buffer, Buffer, RecordedCall | None] | None = None
-        self._uploaded: object = None
-        self._ranges: Buffer = None
-        self._values: np.ndarray | None = None
-        self._sent: list[np.ndarray] = []
+        # The temperature of scans; None for other models.
+        self.learner = Learner(model) if isinstance(model, ScanModel) else None
+        # The last reading placed for a recorded step, and its values if they came from the host.
+        self._placed: tuple[object, np.ndarray | None] = None, None
         self._judge: MapJudge | None = None
         self._started = 0
 
     def temperature(self, chosen: float | str) -> float:
         """Return the present temperature of the log-likelihood, for the option ``chosen``."""
-        if not self.calibrates:
+        if self.learner is None:
             return 1.0
-        if not isinstance(chosen, str):
-            return chosen
-        if self._known is None or self._known[0] is not self._correlation:
-            self._known = self._correlation, self._correlation.temperature(self.beams)
-        return self._known[1]
-
-    def restart(self) -> None:
-        """Reset the count of scans, and drop the lesson."""
-        self._seen, self._learned, self._lesson = 0, -1, None
-
-    @property
-    def due(self) -> bool:
-        """Return whether to learn the correlation of beams from the last scan: each of the first, then two in 25.
-
-        A lesson takes as long as a step on a GPU, so fewer than a tenth of the steps have one.
-        """
-        return self._seen <= DEFAULTS.calibrations or self._seen % 25 <= 1
-
-    def count(self) -> None:
-        """Count a scan."""
-        self._seen += 1
+        return self.learner.temperature if isinstance(chosen, str) else chosen
 
     def begin_lesson(self, pose: np.ndarray, covariance: np.ndarray, reading: tuple[Any, ...]) -> None:
-        """Start scoring the last counted scan around the estimated pose, for ``learn`` in the next correction."""
-        axes = axes_of(covariance)
-        terms = self._start_terms(poses_around(pose, axes), reading)
-        follows = self._learned == self._seen - 1
-        self._lesson = Lesson(terms, axes, self.model.scanner.bearings + pose[2], follows)
-        self._learned = self._seen
+        """Begin to learn from the last scan at the estimated pose."""
+        if self.learner is not None:
+            self.learner.begin(pose, covariance, reading, self._values_of(reading) if self.records(reading) else None)
 
-    def _start_terms(self, poses: np.ndarray, reading: tuple[Any, ...]) -> np.ndarray | Callable[[], np.ndarray]:
-        """Return (7, K) terms of a scan's readings, or the function that waits for terms that the device computes."""
-        if not self.records(reading):
-            return self.parts(poses, reading)
-        backend = self.backend
-        if self._uploaded is not reading:
-            self._upload(reading)
-        if self._terms is None or self._terms[0] is not self._ranges:
-            around, count = backend.empty_external(poses.size, _DOUBLE), len(poses)
-            ranges = backend.view(self._ranges, (self.readings,), _DOUBLE)
-            out = backend.view(backend.empty_external(count, self.precision), (count,), self.precision)
-            call = self.model.bind_terms(backend.view(around, poses.shape, _DOUBLE), ranges, out)
-            self._terms = self._ranges, around, call
-        _, around, call = self._terms
-        if call is None:
-            return self.parts(poses, reading)
-        backend.begin_batch()
-        try:
-            self._send(poses, around)
-            call.begin()
-        finally:
-            backend.end_batch()
-        # The terms that were read stay: a repeated correction reads them again, after the buffers have changed.
-        return functools.cache(functools.partial(self._read_terms, call, self._values))
-
-    def _read_terms(self, call: RecordedCall, ranges: np.ndarray | None) -> np.ndarray:
-        """Wait for the terms of a scan's readings, and return them."""
-        if ranges is None:
-            ranges = self.backend.download(self._ranges, np.empty(self.readings))
-        return call.terms(ranges)
-
-    def receive(self) -> None:
-        """Copy the terms of a started lesson to the host, before the buffers are used again."""
-        self._uploaded, lesson = None, self._lesson
-        if lesson is not None and callable(lesson.terms):
-            self._lesson = lesson._replace(terms=np.asarray(lesson.terms(), np.float64))
-
-    def learn(self, *, doubted: bool) -> None:
-        """Learn the correlation of beams from the received lesson, or drop it if its pose is doubted by now."""
-        if doubted:
-            self._lesson, self._learned = None, -1
-        elif self._lesson is not None:
-            # A new object, since the correlation is part of the state.
-            correlation = copy.copy(self._correlation)
-            terms, axes, directions, follows = self._lesson
-            correlation.add(terms, axes, directions, follows=follows)
-            self._correlation, self._lesson = correlation, None
+    def _values_of(self, reading: tuple[Any, ...]) -> np.ndarray:
+        """Return the ranges of a scan on the host, in float64."""
+        placed, values = self._placed
+        if placed is reading and values is not None:
+            return values
+        return float64_readings(np.asarray(arrays.copied_to_host(reading[0], self.backend, "ranges")), self.model.scanner)
 
     def judge(self) -> MapJudge:
         """Return the present map on the device for judging beams, copied on first use."""
@@ -210,12 +124,12 @@ class Sensor:
         """Version of the map's table, a key of recorded programs."""
         return self.model.table_version if self.calibrates else 0
 
-    def place(self, reading: tuple[Any, ...], values: np.ndarray, buffer: Buffer) -> Buffer | None:
-        """Write the ranges of a scan to ``values``, which the caller copies to ``buffer``.
+    def place(self, reading: tuple[Any, ...], values: np.ndarray) -> Buffer | None:
+        """Write the ranges of a scan to ``values``, which the caller copies to the device.
 
-        Float64 ranges on the device are returned instead, and the caller copies them to ``buffer``.
+        Float64 ranges on the device are returned instead, for a copy there.
         """
-        ranges, self._uploaded, self._ranges, self._values = reading[0], reading, buffer, None
+        ranges, self._placed = reading[0], (reading, None)
         if type(ranges) is not np.ndarray:
             if arrays.on_device(ranges) and self.backend.reads(ranges):
                 adopted = self.backend.adopt(ranges, "ranges")
@@ -224,26 +138,8 @@ class Sensor:
             ranges = arrays.copied_to_host(ranges, self.backend, "ranges")
         checked = checks.array("ranges", ranges, (self.readings,), finite=False, dtype=None)
         values[...] = float64_readings(checked, self.model.scanner)
-        self._values = values
+        self._placed = reading, values
         return None
-
-    def _upload(self, reading: tuple[Any, ...]) -> None:
-        """Copy the ranges of a scan to the device outside of a recorded correction."""
-        buffer = self.backend.empty_external(self.readings, _DOUBLE) if self._ranges is None else self._ranges
-        values = np.empty(self.readings)
-        source = self.place(reading, values, buffer)
-        if source is None:
-            self._send(values, buffer)
-        else:
-            self.backend.copy(source, buffer, values.nbytes)
-
-    def _send(self, array: np.ndarray, buffer: Buffer) -> None:
-        """Start copying an array that does not change, and keep it alive until the device has read it."""
-        if len(self._sent) >= _MOST_STARTED:
-            self.backend.synchronize()
-            self._sent.clear()
-        self._sent.append(array)
-        self.backend.upload(array, buffer, wait=False)
 
     def program(self, poses: Any, buffer: Buffer, out: Any) -> tuple[Program, object]:
         """Return the launches for scoring poses by readings on the device, and the owner of their memory."""

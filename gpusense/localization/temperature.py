@@ -31,6 +31,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -55,7 +56,10 @@ _STEPS, _TURN = (1e-4, 0.1), 0.25
 # Deviations from the pose to the points of a cubature of degree 3 in 3 dimensions (Arasaratnam and Haykin, "Cubature
 # Kalman filters" (2009)): differences are means of derivatives over the normal density of the pose.
 _FAR = 3**0.5
-_IDENTITY, _TWELVE = np.eye(3), np.arange(12)
+# Rows of a beam's numbers: three scores, their six products (by both factors), and 1; rows of the matrix of products.
+_ROWS = 10
+_FIRST, _SECOND = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
+_OUTER, _BEGINS = np.array([[3, 4, 5], [4, 6, 7], [5, 7, 8]]), np.arange(_ROWS)[:, None]
 # Initial steps without a known covariance: ahead, to the side [m] and in heading [rad].
 _FIRST_STEPS = (0.05, 0.05, 0.0125)
 
@@ -80,52 +84,62 @@ def poses_around(pose: np.ndarray, axes: np.ndarray) -> np.ndarray:
     return poses
 
 
-class _Scores(NamedTuple):
-    """Scores of beams along the axes, of a scan with K used beams."""
+class Scores(NamedTuple):
+    """Scores of the used beams of a scan along the axes of :func:`poses_around`."""
 
-    numbers: np.ndarray  # (12 K,) scores of each beam, and their outer products
-    curvature: float  # curvature
-    blocks: np.ndarray  # (16, 12) sums of the numbers over short blocks of neighbours
-    fit: np.ndarray  # (3,) change of the scores by a fit
-    outer: np.ndarray  # (3, 3) sum of the outer products
-    inverse: np.ndarray  # (3, 3) its inverse
-
-    def fitted(self, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (B, 3) scores of blocks after the fit, and (B, 3, 3) outer products, from their (B, 12) sums."""
-        outer = sums[:, 3:].reshape(-1, 3, 3)
-        return sums[:, :3] - outer @ self.fit, outer
-
-    def variances(self) -> tuple[float, float, float, float]:
-        """Return the variances of scores after a fit, of long and of short blocks, measured and if independent."""
-        short, outer = self.fitted(self.blocks)
-        long, outer_of_long = short.reshape(_LONG, -1, 3).sum(axis=1), outer.reshape(_LONG, -1, 3, 3).sum(axis=1)
-        trace = float(self.outer.trace())
-        return (
-            float((long * long).sum()), trace - float((outer_of_long @ self.inverse * outer_of_long).sum()),
-            float((short * short).sum()), trace - float((outer @ self.inverse * outer).sum()),
-        )  # fmt: skip
+    beams: int  # number of used beams
+    curvature: float  # negative second derivatives of the log-likelihood, summed over the axes
+    trace: float  # sum of the squared scores
+    # Variances of the scores after a fit: of long blocks, measured and if independent, and the same of short blocks.
+    variances: tuple[float, float, float, float]
+    sectors: np.ndarray  # (3, A) sums of the scores after the fit over sectors of the world; A is 0 without directions
+    seen: np.ndarray  # (A,) whether a sector has beams
 
 
-def _scores_of(parts: np.ndarray) -> _Scores:
-    """Return the scores of (7, K) log-likelihoods at the poses of ``poses_around``."""
+def _scores_of(parts: np.ndarray, sector: np.ndarray, sectors: int) -> Scores:
+    """Return the scores of (7, K) log-likelihoods of used beams, by the sector (K,) of each beam."""
     beams = parts.shape[1]
-    each = (parts[1:4] - parts[4:7]).T / (2 * _FAR)
     at, *around = parts.sum(axis=1).tolist()
-    rows = np.empty((beams, 12))
-    rows[:, :3] = each
-    np.multiply(each[:, :, None], each[:, None, :], out=rows[:, 3:].reshape(-1, 3, 3))
-    numbers = rows.reshape(-1)
-    blocks = np.bincount(_places_of_neighbors(beams), numbers, 12 * _SHORT).reshape(_SHORT, 12)
-    total = blocks.sum(axis=0)
-    outer = total[3:].reshape(3, 3)
-    outer = outer + 1e-9 * max(float(outer.trace()), 1e-30) * _IDENTITY
-    inverse = _inverse_of(outer)
-    return _Scores(numbers, (6 * at - sum(around)) / _FAR**2, blocks, inverse @ total[:3], outer, inverse)
+    # The scores of each beam, their products, and its number, 1.
+    rows = np.ones((_ROWS, beams))
+    np.subtract(parts[1:4], parts[4:], out=rows[:3])
+    rows[:3] /= 2 * _FAR
+    np.multiply(rows[_FIRST], rows[_SECOND], out=rows[3:9])
+    short = _sums_of(rows, _neighbors(beams), _SHORT)
+    blocks = [short, short.reshape(_ROWS, _LONG, -1).sum(axis=2)]
+    sums = np.concatenate([*blocks, _sums_of(rows, sector, sectors)] if sectors else blocks, axis=1)
+    *scores, xx, xy, xt, yy, yt, tt, _ = short.sum(axis=1).tolist()
+    least = 1e-9 * max(xx + yy + tt, 1e-30)
+    trace = xx + yy + tt + 3 * least
+    inverse = _inverse_of(((xx + least, xy, xt), (xy, yy + least, yt), (xt, yt, tt + least)))
+    fit = (inverse * scores).sum(axis=1)
+    outer = sums[_OUTER]
+    fitted = sums[:3] - np.einsum("ijt,j->it", outer, fit)
+    measured = (fitted * fitted).sum(axis=0).tolist()
+    removed = np.einsum("ijt,jk,kit->t", outer, inverse, outer).tolist()
+    end = _SHORT + _LONG
+    variances = (
+        sum(measured[_SHORT:end]), trace - sum(removed[_SHORT:end]),
+        sum(measured[:_SHORT]), trace - sum(removed[:_SHORT]),
+    )  # fmt: skip
+    return Scores(beams, (6 * at - sum(around)) / _FAR**2, trace, variances, fitted[:, end:], sums[9, end:] > 0)
 
 
-def _inverse_of(matrix: np.ndarray) -> np.ndarray:
+def _sums_of(rows: np.ndarray, block: np.ndarray, blocks: int) -> np.ndarray:
+    """Return (R, B) sums of rows (R, K) over blocks (K,)."""
+    places = _BEGINS * blocks + block
+    return np.bincount(places.reshape(-1), rows.reshape(-1), _ROWS * blocks).reshape(_ROWS, blocks)
+
+
+@functools.lru_cache(maxsize=64)
+def _neighbors(beams: int) -> np.ndarray:
+    """Return the short block of each beam; four of them are a long block."""
+    return np.arange(beams) * _SHORT // beams
+
+
+def _inverse_of(matrix: Sequence[Sequence[float]]) -> np.ndarray:
     """Return the inverse of a (3, 3) matrix by its cofactors."""
-    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
+    (a, b, c), (d, e, f), (g, h, i) = matrix
     one, two, three = e * i - f * h, f * g - d * i, d * h - e * g
     cofactors = [
         (one, c * h - b * i, b * f - c * e), (two, a * i - c * g, c * d - a * f), (three, b * g - a * h, a * e - b * d),
@@ -133,28 +147,22 @@ def _inverse_of(matrix: np.ndarray) -> np.ndarray:
     return np.array(cofactors) / (a * one + b * two + c * three)
 
 
-def _places_of(block: np.ndarray) -> np.ndarray:
-    """Return the indices (12 K,) of beams' numbers in the sums of their blocks (K,)."""
-    return (block[:, None] * 12 + _TWELVE).reshape(-1)
-
-
-@functools.lru_cache(maxsize=64)
-def _places_of_neighbors(beams: int) -> np.ndarray:
-    """Return the indices of beams' numbers in the sums of short blocks of neighbours; four of them are a long block."""
-    return _places_of(np.arange(beams) * _SHORT // beams)
+def _mixed(one: np.ndarray, other: np.ndarray, keep: float) -> np.ndarray:
+    """Return a running mean ``one`` after adding ``other``."""
+    return keep * one + (1 - keep) * other
 
 
 class BeamCorrelation:
     """Running variance of scans' scores, for the effective number of independent beams."""
 
     def __init__(self) -> None:
-        # Number of scans, and their mean number of beams.
-        self.scans, self.beams = 0, 0.0
-        # Curvature; variance for independent beams; variances of long blocks, measured and for independent beams; the
-        # same for short blocks.
-        self._sums = np.zeros(6)
-        # Products and squares of consecutive scans; share of a pose's information that a scan contributes.
-        self._products, self._pairs, self._gain = np.zeros(2), 0, 0.0
+        self.scans = 0
+        # Running means of scans: curvature; variance for independent beams; variances of long blocks, measured and for
+        # independent beams; the same for short blocks; share of a pose's information that a scan contributes; beams.
+        self._means = np.zeros(8)
+        # Products and squares of consecutive scans, and their number.
+        self._products, self._pairs = np.zeros(2), 0
+        # Gradients in sectors of the world of the last scan, and the sectors with beams.
         self._previous: tuple[np.ndarray, np.ndarray] | None = None
         # Number of sectors of the world for comparing scans; 0 before the first scan.
         self._around = 0
@@ -165,51 +173,60 @@ class BeamCorrelation:
         Beams with 0 or a non-finite value are ignored. Directions (K,) in the world [rad] serve to compare a scan with
         the previous one if it ``follows`` directly.
         """
+        self.learn(self.scored(parts, directions), checks.array("axes", axes, (3, 3)), follows=follows)
+
+    def scored(self, parts: AnyArray, directions: AnyArray | None = None) -> Scores | None:
+        """Return the scores of a scan, the first half of :meth:`add`; None of too few beams."""
         values = checks.array("parts", parts, (7, "K"), finite=False)
-        steps = checks.array("axes", axes, (3, 3))
         used = np.isfinite(values).all(axis=0) & values.any(axis=0)
-        count = int(np.count_nonzero(used))
+        count, around, sector = int(np.count_nonzero(used)), 0, used
         if count < _FEWEST:
+            return None
+        if directions is not None:
+            sector = self._sectors_of(checks.array("directions", directions, (len(used),)))
+            around = self._around
+        if count < len(used):
+            values, sector = values[:, used], sector[used]
+        return _scores_of(values, sector, around)
+
+    def learn(self, scores: Scores | None, axes: np.ndarray, *, follows: bool = True) -> None:
+        """Add the scores of a scan with (3, 3) axes."""
+        if scores is None:
             self._previous = None
             return
-        scores = _scores_of(values[:, used])
+        count = scores.beams
         gain = min(max(self.temperature(count) * scores.curvature / 3, 0.0), 1.0)
-        independent = float(scores.outer.trace()) * count / (count - 3)
-        found = np.array([scores.curvature, independent, *scores.variances()])
-        keep = 1 - 1 / min(self.scans + 1, _MEMORY)
-        self._sums = keep * self._sums + (1 - keep) * found
-        self._gain = keep * self._gain + (1 - keep) * gain
-        self.beams = keep * self.beams + (1 - keep) * count
+        found = (scores.curvature, scores.trace * count / (count - 3), *scores.variances, gain, count)
+        self._means = _mixed(self._means, np.array(found), 1 - 1 / min(self.scans + 1, _MEMORY))
         self.scans += 1
-        if directions is not None:
-            ways = checks.array("directions", directions, (values.shape[1],))
-            self._follow(scores, steps, ways, used, follows)
+        if len(scores.seen):
+            self._compare(scores, axes, follows)
 
-    def _follow(
-        self, scores: _Scores, axes: np.ndarray, directions: np.ndarray, used: np.ndarray, follows: bool
-    ) -> None:
-        """Correlate a scan's blocks with the last scan's blocks in the same directions."""
+    def _sectors_of(self, directions: np.ndarray) -> np.ndarray:
+        """Return the sector of the world of each direction (K,): an eighth of a scan, a whole number per turn."""
         ahead = np.mod(directions, math.tau)
         if not self._around:
-            # Sectors of the world, an eighth of a scan wide, a whole number per turn; the same for all scans.
             ordered = np.sort(ahead)
             gap = max(float(np.max(ordered[1:] - ordered[:-1])), float(ordered[0] + math.tau - ordered[-1]))
             self._around = max(round(_SECTORS * math.tau / max(math.tau - gap, 0.1)), 1)
-        around = self._around
-        block = (ahead[used] * (around / math.tau)).astype(np.int64) % around
-        sums = np.bincount(_places_of(block), scores.numbers, 12 * around).reshape(around, 12)
-        blocks, _ = scores.fitted(sums)
-        # Gradients in the world, times this scan's root of the covariance.
-        world = blocks @ _inverse_of(axes)
-        seen = np.bincount(block, minlength=around) > 0
+        return (ahead * (self._around / math.tau)).astype(np.int64) % self._around
+
+    def _compare(self, scores: Scores, axes: np.ndarray, follows: bool) -> None:
+        """Correlate a scan's sectors with those of the last scan."""
         if follows and self._previous is not None:
-            both = seen & self._previous[1]
-            now, then = blocks[both], self._previous[0][both] @ axes
-            keep = 1 - 1 / min(self._pairs + 1, _MEMORY)
-            found = np.array([(now * then).sum(), ((now * now).sum() + (then * then).sum()) / 2])
-            self._products = keep * self._products + (1 - keep) * found
+            now, then = scores.sectors, np.einsum("ji,jt->it", axes, self._previous[0])
+            squares = ((now * now + then * then) * (scores.seen & self._previous[1])).sum() / 2
+            found = np.array([(now * then).sum(), squares])
+            self._products = _mixed(self._products, found, 1 - 1 / min(self._pairs + 1, _MEMORY))
             self._pairs += 1
-        self._previous = world, seen
+        # Gradients in the world, times this scan's root of the covariance.
+        world = np.einsum("ji,jt->it", _inverse_of(axes.tolist()), scores.sectors)
+        self._previous = world, scores.seen
+
+    @property
+    def beams(self) -> float:
+        """Mean number of used beams of a scan."""
+        return float(self._means[7])
 
     @property
     def repeat(self) -> float:
@@ -221,15 +238,15 @@ class BeamCorrelation:
     @property
     def kept(self) -> float:
         """Share f of a pose's information that precedes the scan, 0 to 1."""
-        return 1 - self._gain if self.scans else 0.0
+        return 1 - float(self._means[6]) if self.scans else 0.0
 
     @property
     def inflation(self) -> float:
         """Variance of the sum over a scan, relative to independent beams; at least 1."""
-        _, _, long, long_wanted, short, short_wanted = self._sums
+        long, long_wanted, short, short_wanted = self._means[2:6].tolist()
         if not (long_wanted > 0 and short_wanted > 0 and short > 0):
             return 1.0
-        quarters, sixteenths = float(long / long_wanted), float(short / short_wanted)
+        quarters, sixteenths = long / long_wanted, short / short_wanted
         # Deviations of the ratios for independent beams, with at least one degree of freedom per block.
         scans = min(self.scans, 2 * _MEMORY - 1)
         unsure, less = (_SIGNIFICANT * math.sqrt(2 / ((blocks - 1) * scans)) for blocks in (_LONG, _SHORT))
@@ -242,10 +259,11 @@ class BeamCorrelation:
     def temperature(self, beams: int) -> float:
         """Return the temperature of a sensor with ``beams`` used beams from its scans, or an initial one."""
         count = checks.integer("beams", beams, low=0)
-        if self.scans < _LEAST_SCANS or not self._sums[1] > 0:
+        curvature, independent = self._means[:2].tolist()
+        if self.scans < _LEAST_SCANS or not independent > 0:
             return min(1.0, INDEPENDENT_AT_FIRST / max(count, 1))
         repeated = self.repeat * self.kept
-        found = (1 - repeated) / (1 + repeated) * self._sums[0] / (self._sums[1] * self.inflation)
+        found = (1 - repeated) / (1 + repeated) * curvature / (independent * self.inflation)
         return min(1.0, max(found, INDEPENDENT_AT_LEAST / max(count, 1)))
 
 

@@ -209,9 +209,8 @@ def _due_of(sensors: Sequence[Sensor], readings: Sequence[SensorReadings]) -> li
     due = []
     for index, reading in readings:
         sensor = sensors[index]
-        if sensor.calibrates:
-            sensor.count()
-            due += [(sensor, reading)] if sensor.due else []
+        if sensor.learner is not None and sensor.learner.count():
+            due.append((sensor, reading))
     return due
 
 

@@ -18,7 +18,7 @@ from support.tracking_scene import field
 
 import gpusense as gs
 from gpusense.backends.workspace import RecordedProgram
-from gpusense.localization import journal, sensors, starts
+from gpusense.localization import journal, lessons, rival, sensors, starts
 
 # Rooms with lines to interrupt: lower rooms do not use filters.
 ROOMS = ("localization", "sweeps")
@@ -188,15 +188,16 @@ def test_a_recorded_step_that_fails_in_any_call_changes_nothing(name, device, mo
     fail_in_every_call(name, device.info.selection, monkeypatch)
 
 
-@pytest.mark.parametrize("late", ["corrected", "begin_lesson"])
+@pytest.mark.parametrize("late", ["corrected", "begin_lesson", "work"])
 def test_a_repeated_correction_learns_from_the_same_lesson(backend, monkeypatch, late):
-    """The interrupted correction has begun its lesson, or an upload for it, in the buffers of the last one."""
-    owner = type(begun(FILTERS["field"](backend), 0)._parts.recovery) if late == "corrected" else sensors.Sensor
+    """The interrupted correction has begun its lesson, or has started the last one in the buffers of an earlier one."""
+    owners = {"corrected": rival.Recovery, "begin_lesson": sensors.Sensor, "work": lessons.Learner}
+    owner = owners[late]
     inner, fails = getattr(owner, late), [False]
 
-    def failing(*arguments):
-        if late == "begin_lesson":
-            inner(*arguments)
+    def failing(*arguments, **options):
+        if late != "corrected":
+            inner(*arguments, **options)
         if fails[0]:
             raise KeyboardInterrupt
         if late == "corrected":

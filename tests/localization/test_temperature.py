@@ -149,19 +149,19 @@ def test_a_filter_learns_from_each_scanner_while_its_particles_lie_together():
         pf.correct({models[step % 2]: ranges})
         pf.predict((0, 0, 0), (0, 0, 0))
     assert first == (10 / 60, 10 / 60) and all(0 < value != 10 / 60 for value in pf.temperatures)
-    # A scan is learned from during the next correction.
+    # The next correction starts the lesson of a scan, and the one after it ends the lesson.
     known = pf.temperatures
-    assert [sensor._correlation.scans for sensor in pf._sensors] == [8, 7]
+    assert [sensor.learner.correlation.scans for sensor in pf._sensors] == [7, 7]
     copied = pickle.loads(pickle.dumps(pf))
     for one in (pf, copied):
         assert one.temperatures == known
         one.correct({one.models[0]: ranges})
         one.initialize_uniform()
         one.correct({one.models[0]: np.full(60, 20.0)})
-        assert [sensor._correlation.scans for sensor in one._sensors] == [8, 8]
-        assert all(sensor._correlation.repeat > 0.5 for sensor in one._sensors)
+        assert [sensor.learner.correlation.scans for sensor in one._sensors] == [8, 7]
+        assert all(sensor.learner.correlation.repeat > 0.5 for sensor in one._sensors)
     assert pf.temperatures == copied.temperatures
-    assert np.array_equal(*(one._sensors[1]._correlation._sums for one in (pf, copied)))
+    assert np.array_equal(*(one._sensors[1].learner.correlation._means for one in (pf, copied)))
 
 
 @pytest.mark.parametrize("scans", [5, 20])

@@ -246,12 +246,22 @@ class RecordedCall(ReplayedCall):
         self._current()
         return self._program()
 
-    def terms(self, ranges: np.ndarray) -> np.ndarray:
-        """Wait for the last call, and return the (N, K) terms of its readings, which are ``ranges``."""
-        pipeline = self._pipeline
-        each = np.empty((self._poses.count, self._readings.readings), pipeline.real)
-        each = pipeline.backend.download(self._parts, each)
-        return terms_of(pipeline, each, pipeline.classed(ranges[None]))
+    def refresh(self) -> None:
+        """Record the program anew if the map has changed; not within a batch."""
+        self._current()
+
+    def start_terms(self) -> np.ndarray:
+        """Start a call as part of this thread's batch; the device fills the result, for ``terms``, before it is idle.
+
+        The call must be recorded for the present map.
+        """
+        self.begin()
+        each = np.empty((self._poses.count, self._readings.readings), self._pipeline.real)
+        return self._pipeline.backend.download(self._parts, each, wait=False)
+
+    def terms(self, each: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+        """Return the (N, K) terms of readings ``ranges`` from the result of ``start_terms``."""
+        return terms_of(self._pipeline, each, self._pipeline.classed(ranges[None]))
 
     def _placed_readings(self, adopted: Adopted, limits: np.dtype) -> Readings:
         """Return the readings as the kernel ``place_inputs`` places them."""

@@ -1,0 +1,142 @@
+"""Learn the temperature of a scan sensor from lessons: scans at the estimated pose, spread over several corrections.
+
+A correction that begins a lesson only keeps its scan and estimate. In later corrections, while the device works on the
+step, the host first starts the terms of the readings at poses around the estimate, behind the launches of the step,
+then computes the scores, and then adds them to the correlation. A correction continues only the oldest lesson; among
+the first scans, which are all lessons, it computes scores and adds them at once. A lesson therefore ends a fixed number
+of corrections later on every device.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from gpusense.localization.defaults import DEFAULTS
+from gpusense.localization.particles import Packed
+from gpusense.localization.temperature import BeamCorrelation, Scores, axes_of, poses_around
+from gpusense.models.scan.model import ScanModel
+
+_DOUBLE = np.dtype(np.float64)
+# Number of poses of a lesson; its stages.
+_POSES = 7
+_KEPT, _STARTED, _SCORED, _LEARNED = range(4)
+
+
+class Lesson(NamedTuple):
+    """A scan that teaches the temperature, and its results so far."""
+
+    pose: np.ndarray  # (3,) estimate
+    axes: np.ndarray  # (3, 3) steps to the poses around it
+    ranges: np.ndarray | None  # (K,) readings; None if the host has computed the terms
+    follows: bool  # whether the scan directly follows the previous lesson
+    stage: int = _KEPT
+    terms: Any = None  # (7, K) terms of the readings; as the device writes them, with ``ranges``
+    scores: Scores | None = None
+
+
+class Learner:
+    """Temperature of a scan sensor, a number or learned from its scans."""
+
+    MEMORY: ClassVar[tuple[str, ...]] = ("correlation", "seen", "learned", "lessons")
+
+    def __init__(self, model: ScanModel) -> None:
+        self._model, self._backend = model, model.backend
+        self.correlation = BeamCorrelation()
+        # A temperature and its correlation; learning replaces the correlation.
+        self._known: tuple[BeamCorrelation, float] | None = None
+        # Number of scans, and the number of the last lesson's scan.
+        self.seen, self.learned = 0, -1
+        self.lessons: tuple[Lesson, ...] = ()
+        # Poses and readings of a started lesson, which the device may still read.
+        self._given: np.ndarray | None = None
+
+    @property
+    def temperature(self) -> float:
+        """The present temperature of the log-likelihood."""
+        if self._known is None or self._known[0] is not self.correlation:
+            self._known = self.correlation, self.correlation.temperature(self._model.used_beams)
+        return self._known[1]
+
+    def restart(self) -> None:
+        """Reset the count of scans, and drop all lessons."""
+        self.seen, self.learned, self.lessons = 0, -1, ()
+
+    def count(self) -> bool:
+        """Count a scan; return whether it is due as a lesson: each of the first, then two in 25."""
+        self.seen += 1
+        return self.seen <= DEFAULTS.calibrations or self.seen % 25 <= 1
+
+    def begin(
+        self, pose: np.ndarray, covariance: np.ndarray, reading: tuple[Any, ...], ranges: np.ndarray | None
+    ) -> None:
+        """Begin the lesson of the last counted scan at the estimated pose.
+
+        ``ranges``: its readings on the host, for a recorded program; None where the model must prepare them.
+        """
+        axes, stage, terms = axes_of(covariance), _KEPT, None
+        if ranges is None or self._bound[1] is None:
+            around = poses_around(pose, axes)
+            terms = np.asarray(self._model.log_likelihood(around, *reading, per_beam=True)[1], np.float64)
+            ranges, stage = None, _STARTED
+        self.lessons = *self.lessons, Lesson(pose, axes, ranges, self.learned == self.seen - 1, stage, terms)
+        self.learned = self.seen
+
+    def receive(self) -> None:
+        """Complete the terms of a started lesson, or let the call of the next one follow changes of the map."""
+        if self.lessons and self.lessons[0].ranges is not None:
+            if self.lessons[0].stage == _STARTED:
+                self._backend.synchronize()
+            else:
+                self._bound[1].refresh()
+
+    def work(self, *, doubted: bool) -> None:
+        """Continue the oldest lesson, or end and start lessons of the first scans; drop all if scans are doubted."""
+        if doubted:
+            self.lessons, self.learned = (), -1
+        if not self.lessons:
+            return
+        first, *rest = self.lessons
+        if first.stage == _KEPT:
+            first = self._started(first)
+        elif self.seen > DEFAULTS.calibrations:
+            first = self._advanced(first)
+        else:
+            while first.stage < _LEARNED:
+                first = self._advanced(first)
+            rest[:1] = [self._started(one) for one in rest[:1]]
+        self.lessons = tuple(rest if first.stage == _LEARNED else [first, *rest])
+
+    def _advanced(self, lesson: Lesson) -> Lesson:
+        """Score a received lesson, or learn from a scored one."""
+        # A new object, since the correlation is part of the state.
+        self.correlation = copy.copy(self.correlation)
+        if lesson.stage == _SCORED:
+            self.correlation.learn(lesson.scores, lesson.axes, follows=lesson.follows)
+            return lesson._replace(stage=_LEARNED)
+        terms = lesson.terms
+        if lesson.ranges is not None:
+            terms = self._bound[1].terms(terms, lesson.ranges)
+        scores = self.correlation.scored(terms, self._model.scanner.bearings + lesson.pose[2])
+        return lesson._replace(stage=_SCORED, terms=None, scores=scores)
+
+    def _started(self, lesson: Lesson) -> Lesson:
+        """Start the terms of a lesson, which the device completes before it is idle."""
+        inputs, call = self._bound
+        given = self._given = np.empty(inputs.size)
+        given[inputs.spans[0]] = poses_around(lesson.pose, lesson.axes).reshape(-1)
+        given[inputs.spans[1]] = lesson.ranges
+        self._backend.refill(given, inputs.buffer)
+        return lesson._replace(stage=_STARTED, terms=call.start_terms())
+
+    @functools.cached_property
+    def _bound(self) -> tuple[Packed, Any]:
+        """Poses and readings of a lesson on the device, and the call that scores them; None if the host must score."""
+        backend, count, precision = self._backend, self._model.scanner.count, np.dtype(self._model.precision)
+        inputs = Packed(backend, (3 * _POSES, count))
+        poses = backend.view(inputs.parts[0], (_POSES, 3), _DOUBLE)
+        out = backend.view(backend.empty_external(_POSES, precision), (_POSES,), precision)
+        return inputs, self._model.bind_terms(poses, backend.view(inputs.parts[1], (count,), _DOUBLE), out)

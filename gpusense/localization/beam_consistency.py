@@ -17,6 +17,7 @@ and one copy reads both.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -27,7 +28,7 @@ import numpy as np
 from gpusense._util.typing import Floats
 from gpusense.backends import arrays
 from gpusense.backends.base import Backend, Buffer
-from gpusense.backends.workspace import Workspace
+from gpusense.backends.workspace import Packed, Workspace
 from gpusense.interface.constants import AGREES, MOMENTS, NOTHING, SHORT, THROUGH
 from gpusense.interface.lanes import with_teams_flags
 from gpusense.interface.launches import Program, launch
@@ -37,9 +38,8 @@ from gpusense.world.frames import frame_of
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner, float64_readings, range_limits
 
-# Most judged beams of a scan; longest walk [m]. Twice the middles of as many parts of a scan.
+# Most judged beams of a scan; longest walk [m].
 BEAMS, _FARTHEST = 32, 20.0
-_MIDDLES = np.arange(BEAMS) * 2 + 1
 # Offset [m] and divergence [rad] of companion rays; both grow with the deviations of the pose, up to these limits.
 BESIDE, _APART, _MOST_BESIDE, _MOST_APART = 0.08, 0.025, 0.3, 0.1
 # Tolerance of a range: relative, and least values [m] and [cells]; largest distance of close agreement [m].
@@ -48,7 +48,7 @@ _PART, _LEAST, _LEAST_CELLS, _CLOSE = 0.02, 0.2, 2.0, 0.1
 JUDGED = 2 * BEAMS
 _AGREES, *_OTHERS = map(float, (AGREES, THROUGH, SHORT, NOTHING))
 _DOUBLE, _PLAIN, _STILL = np.dtype(np.float64), frozenset[str](), np.zeros((3, 3))
-# Version numbers of map parts on devices, keys of recorded launches.
+# Numbers of maps on devices, keys of recorded launches.
 _VERSIONS = itertools.count(1)
 
 
@@ -120,7 +120,7 @@ def beam_consistency(
 ) -> BeamConsistency:
     """Judge the beams of a scan (K,) at a (3,) pose with a (3, 3) covariance, by the map on a device or on the host."""
     if judge is None:
-        beams = _chosen_beams(scanner, ranges)
+        beams, _ = _chosen_beams(scanner, ranges)
         kind, distance = _judged_on_host(grid, scanner, pose, covariance, beams)
     else:
         beams, kind, distance = judge(scanner, pose, covariance, ranges)
@@ -144,13 +144,19 @@ def _place_of(grid: OccupancyGrid, pose: Floats) -> tuple[bool, bool]:
     return solid, not solid and bool((around < 0).all())
 
 
-def _chosen_beams(scanner: Scanner, ranges: Floats) -> Beams:
-    """Return the judged beams of a scan (K,): hits and max readings, evenly."""
+def _chosen_beams(scanner: Scanner, ranges: Floats) -> tuple[Beams, np.ndarray]:
+    """Return the judged beams of a scan (K,), hits and max readings, evenly; and their indices."""
     nearest, _ = range_limits(ranges.dtype, scanner.range_min, scanner.range_max)
     chosen = (ranges >= nearest).nonzero()[0]
     if len(chosen) > BEAMS:
-        chosen = chosen[_MIDDLES * len(chosen) // JUDGED]
-    return Beams(scanner.bearings[chosen], ranges[chosen])
+        chosen = chosen[_evenly(len(chosen))]
+    return Beams(scanner.bearings[chosen], ranges[chosen]), chosen
+
+
+@functools.lru_cache(maxsize=256)
+def _evenly(count: int) -> np.ndarray:
+    """Return the middles of as many equal parts of ``count`` beams as are judged."""
+    return (np.arange(BEAMS) * 2 + 1) * count // JUDGED
 
 
 def _judged_on_host(
@@ -167,149 +173,104 @@ def _judged_on_host(
 
 
 class _Setting(NamedTuple):
-    """A scanner in a map, or in a part of it."""
+    """A scanner in a map."""
 
     scanner: Scanner
     turn: float  # direction of bearing 0 relative to the robot's heading [rad]
+    directions: Floats  # (K,) directions of the beams relative to the robot's heading [rad]
     frame: Frame
     rules: BeamRules
-    rows: tuple[float, float]  # least and largest row of a scanner whose beams stay within the part
-    cols: tuple[float, float]  # least and largest column
 
 
 class MapJudge:
-    """Cells of a map around the last pose on a device, for judging beams."""
+    """Cells of a map on a device, for judging beams."""
 
     def __init__(self, backend: Backend, grid: OccupancyGrid) -> None:
-        # The map, and a unique number of its part on the device; 0 before.
-        self.grid, self.version = grid, 0
+        # The map, and its unique number.
+        self.grid, self.version = grid, next(_VERSIONS)
         self._backend, self._space = backend, Workspace(backend)
-        # First and last row and column of the cells on the device.
-        self._part = (0, 0), (0, 0)
-        self._cells: Buffer = None
-        self._context: _Setting | None = None
+        self._cells = backend.upload(grid.cells.reshape(-1).view(np.uint8))
+        self._setting: _Setting | None = None
         # The estimate, then the scan.
-        align = max(backend.alignment // _DOUBLE.itemsize, 1)
-        begin = -(-MOMENTS // align) * align
-        self._given, self._begin = backend.upload(np.zeros(begin + JUDGED)), begin
-        self._estimate = backend.part(self._given, 0, MOMENTS, _DOUBLE)
-        self._scan = backend.part(self._given, begin, JUDGED, _DOUBLE)
-        # Scan to be judged by a correction, with its beams and the version of the part of the map; later with its pose
-        # and covariance, classes and distances.
-        self._expected: tuple[Scanner, Floats, Beams, int] | None = None
-        self._known: tuple[Floats, Beams, int, list[float], Floats, Floats] | None = None
+        self._given = Packed(backend, (MOMENTS, JUDGED))
+        # Scan to be judged by a correction, with its beams; later with its pose and covariance, classes and distances.
+        self._expected: tuple[Floats, Beams] | None = None
+        self._known: tuple[Floats, Beams, list[float], Floats, Floats] | None = None
         self._uploaded: Floats | None = None
 
     def __call__(
         self, scanner: Scanner, pose: Floats, covariance: Floats, ranges: Floats
     ) -> tuple[Beams, Floats, Floats]:
         """Return the judged beams of a scan (K,) on host or device, their classes, and distances of walls."""
-        numbers, setting = _numbers_of(pose, covariance), self._covering(scanner, pose)
-        if self._known is not None:
-            expected, beams, version, at, kind, distance = self._known
-            # Readings that a correction has judged are the same object.
-            if expected is ranges and version == self.version and at == numbers:
-                return beams, kind, distance
+        numbers, setting = _numbers_of(pose, covariance), self._set(scanner)
+        # Readings that a correction has judged are the same object.
+        if self._known is not None and self._known[0] is ranges and self._known[2] == numbers:
+            return self._known[1], *self._known[3:]
         on_host = np.asarray(arrays.copied_to_host(ranges, self._backend, "ranges"))
-        beams = _chosen_beams(scanner, float64_readings(on_host, scanner))
-        count, space = len(beams.bearing), self._space
+        beams, space = _chosen_beams(scanner, float64_readings(on_host, scanner))[0], self._space
+        count = len(beams.bearing)
         result = np.empty(2 * count)
         if count:
-            given = np.empty(self._begin + 2 * count)
-            given[:MOMENTS] = numbers
-            np.add(beams.bearing, setting.turn, out=given[self._begin : self._begin + count])
-            given[self._begin + count :] = beams.reading
+            given, (estimate, scan) = np.empty(self._given.size), self._given.spans
+            given[estimate] = numbers
+            given[scan.start : scan.start + count] = beams.bearing + setting.turn
+            given[scan.start + count : scan.start + 2 * count] = beams.reading
             self._expected, self._uploaded = None, given
-            self._backend.upload(given, self._given, wait=False)
+            self._backend.upload(given, self._given.buffer, wait=False)
             judged = space.empty("judged", 2 * count, _DOUBLE)
-            (top, bottom), (left, right) = self._part
-            changing = dict(
-                cells=self._cells, frame=setting.frame, rules=setting.rules, rows=bottom - top, cols=right - left
-            )
-            space.run(
-                count, changing, lambda: self._launches(setting, self._estimate, self._scan, judged, count), version=0
-            )
+            changing = dict(cells=self._cells, frame=setting.frame, rules=setting.rules)
+            at, beams_at = self._given.parts
+            space.run(count, changing, lambda: self._launches(setting, at, beams_at, judged, count), version=0)
             space.read(judged, result)
         return beams, result[:count], result[count:]
 
-    def expects(self, scanner: Scanner, ranges: Floats, scan: Floats) -> bool:
-        """Prepare for judging a scan (K,) in a correction at its estimated pose, and write it to ``scan`` (JUDGED,).
+    def expects(self, scanner: Scanner, ranges: Floats, values: Floats, scan: Floats) -> bool:
+        """Prepare for judging a scan in a correction at its estimated pose; return False without beams.
 
-        Return False without beams, or without cells of the map on the device.
+        ``ranges``: the scan (K,) as it is judged later; ``values``: its float64 readings; ``scan``: (JUDGED,) array to
+        be filled with its beams.
         """
-        self._expected = self._known = None
-        if self._cells is None:
-            return False
-        beams, turn = _chosen_beams(scanner, float64_readings(ranges, scanner)), self._set(scanner).turn
-        count = len(beams.bearing)
+        setting, self._known = self._set(scanner), None
+        beams, chosen = _chosen_beams(scanner, values)
+        count = len(chosen)
+        self._expected = (ranges, beams) if count else None
         if count < BEAMS:
             # NaN marks unused beams.
             scan[:] = np.nan
-        np.add(beams.bearing, turn, out=scan[:count])
+        scan[:count] = setting.directions[chosen]
         scan[BEAMS : BEAMS + count] = beams.reading
-        self._expected = scanner, ranges, beams, self.version
         return count > 0
 
     def launches(self, estimate: Buffer, scan: Buffer, judged: Buffer) -> Program:
         """Return the launch that judges the expected scan at an estimate; ``version`` is its key."""
-        if self._expected is None:
+        if self._setting is None:
             raise RuntimeError("launches: needs a scan that is expected")
-        return self._launches(self._set(self._expected[0]), estimate, scan, judged, BEAMS)
+        return self._launches(self._setting, estimate, scan, judged, BEAMS)
 
     def receive(self, estimate: Floats, judged: Floats) -> None:
         """Keep the judgement of the expected scan: the results of ``finish_estimate`` and of ``judge_beams``."""
         if self._expected is not None:
-            (_, ranges, beams, version), self._expected = self._expected, None
+            (ranges, beams), self._expected = self._expected, None
             count, numbers = len(beams.bearing), _finished(estimate[:MOMENTS].tolist())
-            self._known = ranges, beams, version, numbers, judged[:count], judged[BEAMS : BEAMS + count]
+            self._known = ranges, beams, numbers, judged[:count], judged[BEAMS : BEAMS + count]
 
     def _launches(self, setting: _Setting, estimate: Buffer, scan: Buffer, judged: Buffer, beams: int) -> Program:
-        (top, bottom), (left, right) = self._part
-        info, steps = self._backend.info, int(setting.rules.limit / setting.frame.resolution / STEP)
+        (rows, cols), info = self.grid.shape, self._backend.info
+        steps = int(setting.rules.limit / setting.frame.resolution / STEP)
         flags, team = with_teams_flags(info.kind, "judge_beams", _PLAIN, steps, self._backend.largest_group)
         return (
             launch(
                 "judge_beams", flags, (team * beams,), cells=self._cells, estimate=estimate, scan=scan,
-                judged=judged, frame=setting.frame, rules=setting.rules, rows=bottom - top, cols=right - left,
+                judged=judged, frame=setting.frame, rules=setting.rules, rows=rows, cols=cols,
                 beams=beams,
             ),
         )  # fmt: skip
 
     def _set(self, scanner: Scanner) -> _Setting:
-        """Return the setting of a scanner in the present part of the map."""
-        if self._context is None or self._context.scanner is not scanner:
-            self._context = _setting_of(self.grid, scanner, *self._part)
-        return self._context
-
-    def _covering(self, scanner: Scanner, pose: Floats) -> _Setting:
-        """Return the setting of a scanner; copy another part of the map if it lacks cells within reach of a pose."""
-        setting, (x, y, theta) = self._set(scanner), pose.tolist()
-        frame, (top, bottom), (left, right) = setting.frame, setting.rows, setting.cols
-        c, s = math.cos(theta), math.sin(theta)
-        x += c * frame.mount_x - s * frame.mount_y - frame.origin_x
-        y += s * frame.mount_x + c * frame.mount_y - frame.origin_y
-        row = (frame.yaw_cos * y - frame.yaw_sin * x) / frame.resolution
-        col = (frame.yaw_cos * x + frame.yaw_sin * y) / frame.resolution
-        if self._cells is not None and top <= row < bottom and left <= col < right:
-            return setting
-        # Add a margin, so that a moving robot seldom needs another part.
-        reach, (rows, cols) = 1.5 * _reach_of(setting.rules, frame), self.grid.shape
-        self._part = (top, bottom), (left, right) = _span_of(row, reach, rows), _span_of(col, reach, cols)
-        part = np.ascontiguousarray(self.grid.cells[top:bottom, left:right])
-        self._cells = self._space.upload("cells", part.reshape(-1).view(np.uint8))
-        self.version, self._context = next(_VERSIONS), None
-        return self._set(scanner)
-
-
-def _span_of(place: float, reach: float, size: int) -> tuple[int, int]:
-    """Return the rows or columns within a distance of a position [cells], at least one, of a map of a size."""
-    low = int(min(max(place - reach, 0.0), size - 1.0))
-    return low, int(min(max(place + reach, low), size - 1.0)) + 1
-
-
-def _reach_of(rules: BeamRules, frame: Frame) -> float:
-    """Return the farthest distance of a walk [cells]."""
-    return (rules.limit + rules.most_beside) / frame.resolution + 2
+        """Return the setting of a scanner in the map."""
+        if self._setting is None or self._setting.scanner is not scanner:
+            self._setting = _setting_of(self.grid, scanner)
+        return self._setting
 
 
 def _numbers_of(pose: Floats, covariance: Floats) -> list[float]:
@@ -327,19 +288,12 @@ def _finished(numbers: list[float]) -> list[float]:
     return numbers
 
 
-def _setting_of(
-    grid: OccupancyGrid, scanner: Scanner, rows: tuple[int, int] = (0, 0), cols: tuple[int, int] = (0, 0)
-) -> _Setting:
-    """Return the setting of a scanner in a map, or in a part between first and last rows and columns."""
-    side, frame = grid.resolution, frame_of(grid, scanner.mount)
+def _setting_of(grid: OccupancyGrid, scanner: Scanner) -> _Setting:
+    """Return the setting of a scanner in a map."""
+    side, turn = grid.resolution, math.remainder(scanner.mount[2] - grid.origin[2], math.tau)
     rules = BeamRules(
         max(BESIDE, side), max(_MOST_BESIDE, side), _APART, _MOST_APART, scanner.cone / 2,
         max(_LEAST, _LEAST_CELLS * side), _PART, min(_FARTHEST, scanner.range_max), scanner.range_max,
-        grid.occupied_threshold, cols[0], rows[0],
+        grid.occupied_threshold, 0, 0,
     )  # fmt: skip
-    turn, reach = math.remainder(scanner.mount[2] - grid.origin[2], math.tau), _reach_of(rules, frame)
-    covered = [
-        (-math.inf if begin == 0 else begin + reach, math.inf if end >= size else end - reach)
-        for (begin, end), size in zip((rows, cols), grid.shape, strict=True)
-    ]
-    return _Setting(scanner, turn, frame, rules, *covered)
+    return _Setting(scanner, turn, scanner.bearings + turn, frame_of(grid, scanner.mount), rules)

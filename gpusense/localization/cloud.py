@@ -238,10 +238,11 @@ class Cloud(Particles):
         if not self._estimates_too:
             return ()
         expected, self._expected, given = self._expected, (), self._given
-        for index, (ranges, *_) in expected:
-            judge, place = self._scored[index].judge(), len(self._judges)
+        for index, reading in expected:
+            sensor, place = self._scored[index], len(self._judges)
+            judge = sensor.judge()
             scan = np.empty(JUDGED) if given is None else given[self.inputs.spans[1 + len(self.readings) + place]]
-            if judge.expects(self._scored[index].model.scanner, ranges, scan):
+            if judge.expects(sensor.model.scanner, reading[0], sensor.values_of(reading), scan):
                 self._judges.append(judge)
                 if given is None:
                     self.backend.refill(self.held(scan), self.scans[place])

@@ -101,12 +101,11 @@ class FilterCore:
 
     def correct(self, readings: Any) -> None:
         """Weigh the particles by readings; see ``ParticleFilter.correct``."""
-        used = readings_of(readings, self.sensors)
+        # Copies, since the caller may reuse the arrays for the next readings; the verdict compares their identity.
+        used = [(index, tuple(map(copied, reading))) for index, reading in readings_of(readings, self.sensors)]
         if not used:
             return
-        tracker, verdict, share = self.tracker, self.verdict, self.options.beam_skip
-        # Copies, since the caller may reuse the arrays for the next readings; the verdict compares their identity.
-        everything = {index: tuple(map(copied, reading)) for index, reading in used}
+        tracker, verdict, share, everything = self.tracker, self.verdict, self.options.beam_skip, dict(used)
         if verdict.watches(everything):
             verdict.predicted(*tracker.moved_particles(), everything)
         if share is not None:

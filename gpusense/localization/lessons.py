@@ -15,8 +15,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from gpusense.backends.workspace import Packed
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.particles import Packed
 from gpusense.localization.temperature import BeamCorrelation, Scores, axes_of, poses_around
 from gpusense.models.scan.model import ScanModel
 

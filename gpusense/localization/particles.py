@@ -8,7 +8,6 @@ the second buffer of its bank.
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -16,6 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
+from gpusense.backends.workspace import Packed
 from gpusense.interface.constants import ESTIMATE, SETTINGS, STATE
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
@@ -93,20 +93,6 @@ class Stage(NamedTuple):
     def places(self) -> BufferSlots:
         """The buffers after the stage."""
         return BufferSlots(self.source, self.source ^ 1, self.weight, self.weight + 1, self.state)
-
-
-class Packed:
-    """Arrays of float64 numbers (``parts``) in one ``buffer``, at ``spans`` of its numbers, for single copies."""
-
-    def __init__(self, backend: Backend, sizes: Sequence[int]) -> None:
-        align = max(backend.alignment // _DOUBLE.itemsize, 1)
-        begins = (0, *itertools.accumulate(-(-max(size, 1) // align) * align for size in sizes))
-        self.spans = [slice(begin, begin + size) for begin, size in zip(begins, sizes, strict=False)]
-        self.size = begins[-1]
-        # Other libraries get no memory that a processor shares with the host.
-        make = backend.empty_external if backend.info.kind == "gpu" else backend.empty
-        self.buffer = backend.upload(np.zeros(self.size), make(self.size, _DOUBLE))
-        self.parts = [backend.part(self.buffer, one.start, max(one.stop - one.start, 1), _DOUBLE) for one in self.spans]
 
 
 class Particles:

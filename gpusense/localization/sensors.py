@@ -63,14 +63,15 @@ class Sensor:
     def begin_lesson(self, pose: np.ndarray, covariance: np.ndarray, reading: tuple[Any, ...]) -> None:
         """Begin to learn from the last scan at the estimated pose."""
         if self.learner is not None:
-            self.learner.begin(pose, covariance, reading, self._values_of(reading) if self.records(reading) else None)
+            self.learner.begin(pose, covariance, reading, self.values_of(reading) if self.records(reading) else None)
 
-    def _values_of(self, reading: tuple[Any, ...]) -> np.ndarray:
+    def values_of(self, reading: tuple[Any, ...]) -> np.ndarray:
         """Return the ranges of a scan on the host, in float64."""
         placed, values = self._placed
         if placed is reading and values is not None:
             return values
-        return float64_readings(np.asarray(arrays.copied_to_host(reading[0], self.backend, "ranges")), self.model.scanner)
+        ranges = np.asarray(arrays.copied_to_host(reading[0], self.backend, "ranges"))
+        return float64_readings(ranges, self.model.scanner)
 
     def judge(self) -> MapJudge:
         """Return the present map on the device for judging beams, copied on first use."""

@@ -113,9 +113,7 @@ QUANTILES = (0.1, 0.5, 0.9, 0.99, 1.0)
 # Methods with extra work, by a word for it; a commit has the methods of its time.
 WORK = {
     "begin": ("sensors.Sensor", ("begin_lesson",)),
-    "start": ("lessons.Learner", ("_started",)),
-    "score": ("temperature.BeamCorrelation", ("scored",)),
-    "learn": ("temperature.BeamCorrelation", ("learn",)),
+    "learn": ("lessons.Learner", ("_advanced",)),
     "search": ("rival.Rival", ("start",)),
     "rival": ("rival.Rival", ("correct",)),
     "stage": ("cloud.Cloud", ("_draw",)),

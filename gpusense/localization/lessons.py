@@ -2,9 +2,9 @@
 
 A correction that begins a lesson only keeps its scan and estimate. In later corrections, while the device works on the
 step, the host first starts the terms of the readings at poses around the estimate, behind the launches of the step,
-then computes the scores, and then adds them to the correlation. A correction continues only the oldest lesson; among
-the first scans, which are all lessons, it computes scores and adds them at once. A lesson therefore ends a fixed number
-of corrections later on every device.
+then computes their scores in three parts, and then adds them to the correlation. A correction does one part of the
+oldest lesson; among the first scans, which are all lessons, it ends one and starts the next. A lesson therefore ends a
+fixed number of corrections later on every device.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import numpy as np
 
 from gpusense.backends.workspace import Packed
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.temperature import BeamCorrelation, Scores, axes_of, poses_around
+from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around, scores_of
 from gpusense.models.scan.model import ScanModel
 
 _DOUBLE = np.dtype(np.float64)
 # Number of poses of a lesson; its stages.
 _POSES = 7
-_KEPT, _STARTED, _SCORED, _LEARNED = range(4)
+_KEPT, _STARTED, _PLACED, _SUMMED, _SCORED, _LEARNED = range(6)
 
 
 class Lesson(NamedTuple):
@@ -34,8 +34,8 @@ class Lesson(NamedTuple):
     ranges: np.ndarray | None  # (K,) readings; None if the host has computed the terms
     follows: bool  # whether the scan directly follows the previous lesson
     stage: int = _KEPT
-    terms: Any = None  # (7, K) terms of the readings; as the device writes them, with ``ranges``
-    scores: Scores | None = None
+    # Terms of the readings as the device writes them, then (7, K) terms, then their sums and scores.
+    result: Any = None
 
 
 class Learner:
@@ -77,21 +77,22 @@ class Learner:
 
         ``ranges``: its readings on the host, for a recorded program; None where the model must prepare them.
         """
-        axes, stage, terms = axes_of(covariance), _KEPT, None
+        axes, terms = axes_of(covariance), None
         if ranges is None or self._bound[1] is None:
             around = poses_around(pose, axes)
             terms = np.asarray(self._model.log_likelihood(around, *reading, per_beam=True)[1], np.float64)
-            ranges, stage = None, _STARTED
-        self.lessons = *self.lessons, Lesson(pose, axes, ranges, self.learned == self.seen - 1, stage, terms)
+        stage = _KEPT if terms is None else _PLACED
+        lesson = Lesson(pose, axes, ranges, self.learned == self.seen - 1, stage, terms)
+        self.lessons = *self.lessons, lesson
         self.learned = self.seen
 
     def receive(self) -> None:
         """Complete the terms of a started lesson, or let the call of the next one follow changes of the map."""
-        if self.lessons and self.lessons[0].ranges is not None:
-            if self.lessons[0].stage == _STARTED:
-                self._backend.synchronize()
-            else:
-                self._bound[1].refresh()
+        stage = self.lessons[0].stage if self.lessons else _LEARNED
+        if stage == _STARTED:
+            self._backend.synchronize()
+        elif stage == _KEPT:
+            self._bound[1].refresh()
 
     def work(self, *, doubted: bool) -> None:
         """Continue the oldest lesson, or end and start lessons of the first scans; drop all if scans are doubted."""
@@ -100,37 +101,36 @@ class Learner:
         if not self.lessons:
             return
         first, *rest = self.lessons
-        if first.stage == _KEPT:
-            first = self._started(first)
-        elif self.seen > DEFAULTS.calibrations:
+        if first.stage == _KEPT or self.seen > DEFAULTS.calibrations:
             first = self._advanced(first)
         else:
             while first.stage < _LEARNED:
                 first = self._advanced(first)
-            rest[:1] = [self._started(one) for one in rest[:1]]
+            rest[:1] = [self._advanced(one) for one in rest[:1] if one.stage == _KEPT] or rest[:1]
         self.lessons = tuple(rest if first.stage == _LEARNED else [first, *rest])
 
     def _advanced(self, lesson: Lesson) -> Lesson:
-        """Score a received lesson, or learn from a scored one."""
-        # A new object, since the correlation is part of the state.
-        self.correlation = copy.copy(self.correlation)
-        if lesson.stage == _SCORED:
-            self.correlation.learn(lesson.scores, lesson.axes, follows=lesson.follows)
-            return lesson._replace(stage=_LEARNED)
-        terms = lesson.terms
-        if lesson.ranges is not None:
-            terms = self._bound[1].terms(terms, lesson.ranges)
-        scores = self.correlation.scored(terms, self._model.scanner.bearings + lesson.pose[2])
-        return lesson._replace(stage=_SCORED, terms=None, scores=scores)
-
-    def _started(self, lesson: Lesson) -> Lesson:
-        """Start the terms of a lesson, which the device completes before it is idle."""
-        inputs, call = self._bound
-        given = self._given = np.empty(inputs.size)
-        given[inputs.spans[0]] = poses_around(lesson.pose, lesson.axes).reshape(-1)
-        given[inputs.spans[1]] = lesson.ranges
-        self._backend.refill(given, inputs.buffer)
-        return lesson._replace(stage=_STARTED, terms=call.start_terms())
+        """Return a lesson after its next stage; the device completes started terms before it is idle."""
+        result, stage = lesson.result, lesson.stage
+        if stage == _KEPT:
+            inputs, call = self._bound
+            given = self._given = np.empty(inputs.size)
+            given[inputs.spans[0]] = poses_around(lesson.pose, lesson.axes).reshape(-1)
+            given[inputs.spans[1]] = lesson.ranges
+            self._backend.refill(given, inputs.buffer)
+            result = call.start_terms()
+        elif stage == _STARTED:
+            result = self._bound[1].terms(result, lesson.ranges)
+        elif stage == _SUMMED:
+            result = None if result is None else scores_of(result)
+        else:
+            # A new object, since the correlation is part of the state.
+            self.correlation = copy.copy(self.correlation)
+            if stage == _PLACED:
+                result = self.correlation.summed(result, self._model.scanner.bearings + lesson.pose[2])
+            else:
+                self.correlation.learn(result, lesson.axes, follows=lesson.follows)
+        return lesson._replace(stage=stage + 1, result=result)
 
     @functools.cached_property
     def _bound(self) -> tuple[Packed, Any]:

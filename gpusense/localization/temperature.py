@@ -84,45 +84,58 @@ def poses_around(pose: np.ndarray, axes: np.ndarray) -> np.ndarray:
     return poses
 
 
+class ScoreSums(NamedTuple):
+    """Scores of the used beams of a scan along the axes of :func:`poses_around`, summed over groups of beams."""
+
+    beams: int  # number of used beams
+    curvature: float  # negative second derivatives of the log-likelihood, summed over the axes
+    # (10, B) sums of three scores, their six products, and 1, over short blocks, long blocks, and sectors of the world.
+    groups: np.ndarray
+
+
 class Scores(NamedTuple):
-    """Scores of the used beams of a scan along the axes of :func:`poses_around`."""
+    """Scores of a scan after a fit of the pose."""
 
     beams: int  # number of used beams
     curvature: float  # negative second derivatives of the log-likelihood, summed over the axes
     trace: float  # sum of the squared scores
-    # Variances of the scores after a fit: of long blocks, measured and if independent, and the same of short blocks.
+    # Variances of long blocks, measured and if independent, and the same of short blocks.
     variances: tuple[float, float, float, float]
-    sectors: np.ndarray  # (3, A) sums of the scores after the fit over sectors of the world; A is 0 without directions
+    sectors: np.ndarray  # (3, A) sums over sectors of the world; A is 0 without directions
     seen: np.ndarray  # (A,) whether a sector has beams
 
 
-def _scores_of(parts: np.ndarray, sector: np.ndarray, sectors: int) -> Scores:
-    """Return the scores of (7, K) log-likelihoods of used beams, by the sector (K,) of each beam."""
+def _summed(parts: np.ndarray, sector: np.ndarray, sectors: int) -> ScoreSums:
+    """Return the sums of scores of (7, K) log-likelihoods of used beams, by the sector (K,) of each beam."""
     beams = parts.shape[1]
     at, *around = parts.sum(axis=1).tolist()
-    # The scores of each beam, their products, and its number, 1.
     rows = np.ones((_ROWS, beams))
     np.subtract(parts[1:4], parts[4:], out=rows[:3])
     rows[:3] /= 2 * _FAR
     np.multiply(rows[_FIRST], rows[_SECOND], out=rows[3:9])
     short = _sums_of(rows, _neighbors(beams), _SHORT)
-    blocks = [short, short.reshape(_ROWS, _LONG, -1).sum(axis=2)]
-    sums = np.concatenate([*blocks, _sums_of(rows, sector, sectors)] if sectors else blocks, axis=1)
-    *scores, xx, xy, xt, yy, yt, tt, _ = short.sum(axis=1).tolist()
+    groups = [short, short.reshape(_ROWS, _LONG, -1).sum(axis=2)]
+    if sectors:
+        groups.append(_sums_of(rows, sector, sectors))
+    return ScoreSums(beams, (6 * at - sum(around)) / _FAR**2, np.concatenate(groups, axis=1))
+
+
+def scores_of(sums: ScoreSums) -> Scores:
+    """Return the scores of a scan after a fit of the pose."""
+    groups, end = sums.groups, _SHORT + _LONG
+    *scores, xx, xy, xt, yy, yt, tt, _ = groups[:, :_SHORT].sum(axis=1).tolist()
     least = 1e-9 * max(xx + yy + tt, 1e-30)
     trace = xx + yy + tt + 3 * least
     inverse = _inverse_of(((xx + least, xy, xt), (xy, yy + least, yt), (xt, yt, tt + least)))
-    fit = (inverse * scores).sum(axis=1)
-    outer = sums[_OUTER]
-    fitted = sums[:3] - np.einsum("ijt,j->it", outer, fit)
+    outer = groups[_OUTER]
+    fitted = groups[:3] - np.einsum("ijb,j->ib", outer, (inverse * scores).sum(axis=1))
     measured = (fitted * fitted).sum(axis=0).tolist()
-    removed = np.einsum("ijt,jk,kit->t", outer, inverse, outer).tolist()
-    end = _SHORT + _LONG
+    removed = np.einsum("ijb,jk,kib->b", outer, inverse, outer).tolist()
     variances = (
         sum(measured[_SHORT:end]), trace - sum(removed[_SHORT:end]),
         sum(measured[:_SHORT]), trace - sum(removed[:_SHORT]),
     )  # fmt: skip
-    return Scores(beams, (6 * at - sum(around)) / _FAR**2, trace, variances, fitted[:, end:], sums[9, end:] > 0)
+    return Scores(sums.beams, sums.curvature, trace, variances, fitted[:, end:], groups[9, end:] > 0)
 
 
 def _sums_of(rows: np.ndarray, block: np.ndarray, blocks: int) -> np.ndarray:
@@ -173,10 +186,12 @@ class BeamCorrelation:
         Beams with 0 or a non-finite value are ignored. Directions (K,) in the world [rad] serve to compare a scan with
         the previous one if it ``follows`` directly.
         """
-        self.learn(self.scored(parts, directions), checks.array("axes", axes, (3, 3)), follows=follows)
+        sums = self.summed(parts, directions)
+        steps = checks.array("axes", axes, (3, 3))
+        self.learn(None if sums is None else scores_of(sums), steps, follows=follows)
 
-    def scored(self, parts: AnyArray, directions: AnyArray | None = None) -> Scores | None:
-        """Return the scores of a scan, the first half of :meth:`add`; None of too few beams."""
+    def summed(self, parts: AnyArray, directions: AnyArray | None = None) -> ScoreSums | None:
+        """Return the sums of a scan's scores, as for :meth:`add`; None of too few beams."""
         values = checks.array("parts", parts, (7, "K"), finite=False)
         used = np.isfinite(values).all(axis=0) & values.any(axis=0)
         count, around, sector = int(np.count_nonzero(used)), 0, used
@@ -187,7 +202,7 @@ class BeamCorrelation:
             around = self._around
         if count < len(used):
             values, sector = values[:, used], sector[used]
-        return _scores_of(values, sector, around)
+        return _summed(values, sector, around)
 
     def learn(self, scores: Scores | None, axes: np.ndarray, *, follows: bool = True) -> None:
         """Add the scores of a scan with (3, 3) axes."""

@@ -24,9 +24,9 @@ from gpusense.learning.beam.fit import fit_beam_parameters as fit_beam_parameter
 from gpusense.learning.beam.incidence import IncidenceFit as IncidenceFit
 from gpusense.learning.beam.incidence import fit_incidence_parameters as fit_incidence_parameters
 from gpusense.learning.discrete.probabilities import DiscreteCauses as DiscreteCauses
-from gpusense.learning.discrete.probabilities import DiscreteFit as DiscreteFit
 from gpusense.learning.discrete.table import DiscreteBeamModel as DiscreteBeamModel
 from gpusense.learning.fitted import BeamFit as BeamFit
+from gpusense.learning.fitted import DiscreteFit as DiscreteFit
 from gpusense.learning.fitted import LandmarkFit as LandmarkFit
 from gpusense.learning.fitted import PointFit as PointFit
 from gpusense.learning.landmark.fit import fit_landmark_parameters as fit_landmark_parameters

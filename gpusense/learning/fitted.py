@@ -256,6 +256,27 @@ class PointFit(Fitted[P]):
         return "\n".join(lines)
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class DiscreteFit(PointFit[Any]):
+    """Causes of a :class:`DiscreteBeamModel`, learned from readings.
+
+    Log-likelihoods are of probabilities of bins, not of densities. An undetermined parameter has the standard error NaN.
+
+    Attributes:
+        hits: Number of readings with a range.
+        max: Number of readings without a return.
+
+    Example:
+        >>> import gpusense as gs
+        >>> table = gs.DiscreteBeamModel.learn([1.9, 2.0, 2.1, 5.0], [2.0, 2.0, 2.0, 2.0], range_max=5.0, bins=10)
+        >>> table.fit.hits, table.fit.max, table.fit.missing
+        (3, 1, 0)
+    """
+
+    hits: int
+    max: int
+
+
 def _offset(name: str, value: float, error: float, is_fitted: bool) -> FitRow:
     """Return the row of an offset; the parameters may exclude it."""
     return FitRow(name, value, error, "fitted" if is_fitted else "estimated, not in the parameters")

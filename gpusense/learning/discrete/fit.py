@@ -14,11 +14,11 @@ from gpusense._util.typing import Floats, Integers
 from gpusense.learning.discrete.probabilities import (
     MOST_BINS,
     DiscreteCauses,
-    DiscreteFit,
     bins_of,
     check_pairs,
     separate_causes,
 )
+from gpusense.learning.fitted import DiscreteFit
 from gpusense.learning.information import number_blocks
 from gpusense.learning.point.problem import Problem, maximize, report
 
@@ -49,16 +49,12 @@ def learn_causes(
         labels, data_of_blocks = _counts_of_blocks(data, ranges, expected, float(range_max), blocks)
         problem = _Causes(data_of_blocks)
     fit = report(problem, end, causes, labels, data.missing)
-    errors, independent = (
-        {name: error if math.isfinite(error) else math.nan for name, error in each.items()}
-        for each in (fit.standard_errors, fit.independent_errors)
-    )
-    none = data.steps == data.bins
-    return causes, DiscreteFit(
-        fit.log_likelihood, fit.converged, errors, tuple(fit.trace.tolist()), hits=int(data.counts[~none].sum()),
-        max=int(data.counts[none].sum()), missing=data.missing, status=fit.status, independent_errors=independent,
-        blocks=fit.blocks,
-    )  # fmt: skip
+    errors = {
+        each: {name: error if math.isfinite(error) else math.nan for name, error in getattr(fit, each).items()}
+        for each in ("standard_errors", "independent_errors")
+    }
+    hits, none = (int(data.counts[some].sum()) for some in (data.steps < data.bins, data.steps == data.bins))
+    return causes, DiscreteFit(**vars(fit) | errors | {"readings": hits + none, "hits": hits, "max": none})
 
 
 @dataclass(frozen=True, eq=False)

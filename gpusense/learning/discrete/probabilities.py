@@ -18,15 +18,13 @@ within range.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfcx, logsumexp
 
 from gpusense._util import checks
-from gpusense._util.html import card
 from gpusense._util.typing import Floats, Integers
 from gpusense.world.parameters import _Parameters
 from gpusense.world.range_causes import RandomDensity, ShortDensity
@@ -244,46 +242,3 @@ class DiscreteCauses(_Parameters):
         self._check("lambda_rand", low=0)
         self._check("p_detect", low=0, high=1)
         self._check("sigma_hit", low=0)
-
-
-@dataclass(frozen=True)
-class DiscreteFit:
-    """Result of learning a :class:`DiscreteBeamModel`.
-
-    Example:
-        >>> import gpusense as gs
-        >>> table = gs.DiscreteBeamModel.learn([1.9, 2.0, 2.1, 5.0], [2.0, 2.0, 2.0, 2.0], range_max=5.0, bins=10)
-        >>> table.fit.hits, table.fit.max, table.fit.missing
-        (3, 1, 0)
-    """
-
-    log_likelihood: float
-    """Log-likelihood of all readings: probabilities of bins, not densities; natural logarithm."""
-    converged: bool
-    """Whether the search ended at a maximum, within its bounds."""
-    standard_errors: Mapping[str, float]
-    """Standard error of each parameter, in its unit, from the curvature of the likelihood; NaN if undetermined."""
-    trace: tuple[float, ...]
-    """Log-likelihood after each iteration of the best search."""
-    hits: int
-    """Number of readings with a range."""
-    max: int
-    """Number of readings without a return."""
-    missing: int
-    """Number of missing readings."""
-    status: str
-    """Reason for the end of the search, and undetermined parameters, in words."""
-    independent_errors: Mapping[str, float] = field(default_factory=dict)
-    """Standard errors for independent readings; equal to ``standard_errors`` without blocks."""
-    blocks: int = 0
-    """Number of blocks behind ``standard_errors``; 0 without blocks."""
-
-    def __repr__(self) -> str:
-        return (
-            f"DiscreteFit(log_likelihood={self.log_likelihood:.6g}, hits={self.hits}, max={self.max}, "
-            f"missing={self.missing}, converged={self.converged})"
-        )
-
-    def _repr_html_(self) -> str:
-        rows = list(self.standard_errors.items())
-        return card(f"DiscreteFit: {self.status}", rows, head=("parameter", "standard error"), detail=repr(self))

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from gpusense._util import checks
-from gpusense.learning.discrete.probabilities import MOST_BINS, DiscreteCauses, DiscreteFit, bins_of, check_pairs
+from gpusense.learning.discrete.probabilities import MOST_BINS, DiscreteCauses, bins_of, check_pairs
+from gpusense.learning.fitted import DiscreteFit
 from gpusense.peers.weights import check_weights
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.sensor_parameters import SensorTable

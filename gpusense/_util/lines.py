@@ -6,9 +6,13 @@ import gzip
 import math
 import warnings
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
+
+import numpy as np
+
+from gpusense._util.typing import Floats
 
 FLOOR, RATIO = 1 << 28, 100
 """Limit of a stream: ``FLOOR`` bytes, plus ``RATIO`` per compressed byte."""
@@ -52,6 +56,23 @@ def number_in(field: bytes) -> float:
         return math.nan if b"_" in field else float(field)
     except ValueError:
         return math.nan
+
+
+def numbers_in(where: str, fields: Sequence[bytes], name: Callable[[int], str], *, finite: bool = True) -> Floats:
+    """Return the numbers that fields state; an error begins with the place ``where`` and the name of a field."""
+    try:
+        values = np.fromiter(map(float, fields), np.float64, len(fields))
+        good = b"_" not in b"".join(fields) and (not finite or bool(np.isfinite(values).all()))
+    except ValueError:
+        good = False
+    if good:
+        return values
+    for index, text in enumerate(fields):
+        value = number_in(text)
+        if not math.isfinite(value) and (finite or text.strip(b"+-").lower() not in (b"nan", b"inf", b"infinity")):
+            rule = "a finite number" if finite else "a number"
+            raise ValueError(f"{where}: {name(index)} must be {rule}, got {text.decode(errors='replace')[:40]!r}")
+    return np.array([number_in(text) for text in fields])
 
 
 def numbered_lines(file: Path) -> Iterator[tuple[int, bytes]]:

@@ -260,7 +260,7 @@ class PointFit(Fitted[P]):
 class DiscreteFit(PointFit[Any]):
     """Causes of a :class:`DiscreteBeamModel`, learned from readings.
 
-    Log-likelihoods are of probabilities of bins, not of densities. An undetermined parameter has the standard error NaN.
+    Log-likelihoods are of probabilities of bins, not of densities. Undetermined parameters have the standard error NaN.
 
     Attributes:
         hits: Number of readings with a range.

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import errno
-import math
 import os
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 from gpusense._util.extras import library
 from gpusense._util.files import naming
 from gpusense.logs.bags import ODOMETRY, SCAN, TRANSFORMS, type_store
-from gpusense.logs.records import Pose, Scan
+from gpusense.logs.records import Pose, Scan, even_bearings, pose_fields, transform_fields
 
 _LASER, _BASE, _ODOM = "laser", "base_link", "odom"
 
@@ -69,7 +68,8 @@ class _Writer:
         from rosbags.rosbag1 import Writer as Writer1
         from rosbags.rosbag2 import Writer as Writer2
 
-        self._first, self._store = first, type_store(first)
+        self._store = type_store(first)
+        self._encode = self._store.serialize_ros1 if first else self._store.serialize_cdr
         self._writer: Any = Writer1(path) if first else Writer2(path, version=9)
         self._connections: dict[str, Any] = {}
 
@@ -82,58 +82,52 @@ class _Writer:
 
     def scan(self, scan: Scan) -> None:
         """Write a LaserScan."""
-        scanner = scan.scanner
-        bearings = scanner.bearings
-        first = float(bearings[0]) if len(bearings) else 0.0
-        step = (float(bearings[-1]) - first) / max(len(bearings) - 1, 1)
-        if np.abs(bearings - (first + step * np.arange(len(bearings)))).max(initial=0.0) > 1e-9:
-            raise ValueError("bearings: must have even steps in a LaserScan, got uneven ones")
+        limit, (first, step) = scan.scanner.range_max, even_bearings(scan.scanner, "a LaserScan")
         # Rounding must not turn a range into "no return".
-        nearer = np.minimum(scan.ranges.astype(np.float32), np.nextafter(np.float32(scanner.range_max), np.float32(0)))
-        ranges = np.where(scan.ranges >= scanner.range_max, np.float32(np.inf), nearer)
+        nearer = np.minimum(scan.ranges.astype(np.float32), np.nextafter(np.float32(limit), np.float32(0)))
         self._put(
-            "/scan", SCAN, scan.time, header=self._header(scan.time, _LASER), angle_min=first,
-            angle_max=first + step * (len(bearings) - 1), angle_increment=step, time_increment=0.0, scan_time=0.0,
-            range_min=scanner.range_min, range_max=scanner.range_max, ranges=ranges,
-            intensities=np.zeros(0, np.float32),
+            "/scan", SCAN, scan.time, header=_header(scan.time, _LASER), angle_min=first,
+            angle_max=first + step * (scan.scanner.count - 1), angle_increment=step,
+            range_min=scan.scanner.range_min, range_max=limit,
+            ranges=np.where(scan.ranges >= limit, np.float32(np.inf), nearer),
         )  # fmt: skip
 
     def odometry(self, time: float, pose: Pose) -> None:
         """Write an Odometry message with zero velocities and unknown covariances."""
-        place = self._make("Pose", position=self._make("Point", x=pose[0], y=pose[1], z=0.0),
-                           orientation=self._quaternion(pose[2]))  # fmt: skip
-        still = self._make("Vector3", x=0.0, y=0.0, z=0.0)
-        twist = self._make("Twist", linear=still, angular=still)
-        self._put(
-            "/odom", ODOMETRY, time, header=self._header(time, _ODOM), child_frame_id=_BASE,
-            pose=self._make("PoseWithCovariance", pose=place, covariance=np.zeros(36)),
-            twist=self._make("TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
-        )  # fmt: skip
+        place = {"pose": pose_fields(pose)}
+        self._put("/odom", ODOMETRY, time, header=_header(time, _ODOM), child_frame_id=_BASE, pose=place)
 
     def transform(self, time: float, topic: str, parent: str, child: str, pose: Pose) -> None:
         """Write a transform."""
-        shift = self._make("Vector3", x=pose[0], y=pose[1], z=0.0)
-        one = self._make(
-            "TransformStamped", header=self._header(time, parent), child_frame_id=child,
-            transform=self._make("Transform", translation=shift, rotation=self._quaternion(pose[2])),
-        )  # fmt: skip
+        one = {"header": _header(time, parent), "child_frame_id": child, "transform": transform_fields(pose)}
         self._put(topic, TRANSFORMS, time, transforms=[one])
-
-    def _quaternion(self, yaw: float) -> Any:
-        return self._make("Quaternion", x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2))
-
-    def _header(self, time: float, frame: str) -> Any:
-        seconds, rest = divmod(round(time * 1e9), 1_000_000_000)
-        stamp = self._store.types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=rest)
-        more = {"seq": 0} if self._first else {}
-        return self._store.types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **more)
-
-    def _make(self, name: str, **fields: Any) -> Any:
-        return self._store.types[f"geometry_msgs/msg/{name}"](**fields)
 
     def _put(self, topic: str, name: str, time: float, **fields: Any) -> None:
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(topic, name, typestore=self._store)
-        encode = self._store.serialize_ros1 if self._first else self._store.serialize_cdr
-        message = encode(self._store.types[name](**fields), name)
+        message = self._encode(_message(self._store, name, fields), name)
         self._writer.write(self._connections[topic], round(time * 1e9), message)
+
+
+def _header(time: float, frame: str) -> dict[str, Any]:
+    seconds, rest = divmod(round(time * 1e9), 1_000_000_000)
+    return {"stamp": {"sec": seconds, "nanosec": rest}, "frame_id": frame}
+
+
+def _message(store: Any, kind: str, fields: Mapping[str, Any]) -> Any:
+    """Make a message of a type from the fields that are not zero."""
+    made = {name: _field(store, form, fields.get(name)) for name, form in store.fielddefs[kind][1]}
+    return store.types[kind](**made)
+
+
+def _field(store: Any, form: Any, value: Any) -> Any:
+    """Return a field of a form of rosbags: number or text, message, array or list; zero without a value."""
+    kind, inner = form
+    if kind.name == "NAME":
+        return _message(store, inner, value or {})
+    if kind.name == "BASE":
+        return value if value is not None else "" if inner[0] == "string" else 0
+    (part, of), length = inner
+    if part.name == "NAME":
+        return [_message(store, of, each) for each in value or ()]
+    return np.zeros(length, of[0]) if value is None else value

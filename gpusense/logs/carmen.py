@@ -35,16 +35,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util.files import write_whole
-from gpusense._util.lines import until_cut
-from gpusense.logs.records import Odometry, Pose, Scan
+from gpusense._util.lines import numbers_in, until_cut
+from gpusense.logs.records import Odometry, Pose, Scan, even_bearings
 from gpusense.world.scanner import Scanner
 
 _FRONT = (b"FLASER", b"ROBOTLASER1")
 _REAR = (b"RLASER", b"ROBOTLASER2")
 _KNOWN = (*_FRONT, *_REAR, b"ODOM")
 _TAIL = 3  # time of measurement, host, logger's time
-# Largest deviation of bearings from even steps [rad].
-_EVEN = 1e-9
 
 
 def read(path: Path, *, range_max: float | None, odometry: bool, rear: bool) -> Iterator[Scan | Odometry]:
@@ -142,27 +140,8 @@ def _message_numbers(where: str, fields: Sequence[bytes], count: int) -> NDArray
     name = fields[0].decode()
     if len(fields) != length:
         raise ValueError(f"{where}: {name}: must have {length} fields, got {len(fields)}")
-    body = fields[1 : 1 + count]
-    for index in (length - 3, length - 1):
-        _number(where, fields, index)
-    try:
-        values = np.fromiter(map(float, body), np.float64, count)
-    except ValueError:
-        values = None
-    if values is None or b"_" in b"".join(body):  # Python, unlike C, reads 1_000 as a number
-        return np.array([_number(where, fields, index) for index in range(1, 1 + count)])
-    return values
-
-
-def _number(where: str, fields: Sequence[bytes], index: int) -> float:
-    try:
-        if b"_" in fields[index]:
-            raise ValueError
-        return float(fields[index])
-    except ValueError:
-        text = fields[index].decode(errors="replace")
-        name = fields[0].decode()
-        raise ValueError(f"{where}: {name}: field {index} must be a number, got {text[:40]!r}") from None
+    numbers_in(where, fields[-3::2], lambda index: f"{name}: field {length - 3 + 2 * index}", finite=False)
+    return numbers_in(where, fields[1 : 1 + count], lambda index: f"{name}: field {1 + index}", finite=False)
 
 
 def _time(where: str, fields: Sequence[bytes]) -> float:
@@ -271,10 +250,6 @@ def _geometry(scanner: Scanner) -> str:
     """Return type, start angle, field of view, resolution, maximum range, accuracy and remission mode."""
     if any(scanner.mount):
         raise ValueError(f"mount: must be (0, 0, 0) in a CARMEN log, got {scanner.mount}")
-    bearings = scanner.bearings
-    first = float(bearings[0]) if len(bearings) else 0.0
-    view = float(bearings[-1]) - first if len(bearings) else 0.0
-    step = view / max(len(bearings) - 1, 1)
-    if np.abs(bearings - (first + step * np.arange(len(bearings)))).max(initial=0.0) > _EVEN:
-        raise ValueError("bearings: must have even steps in a CARMEN log, got uneven ones")
+    first, step = even_bearings(scanner, "a CARMEN log")
+    view = float(scanner.bearings[-1]) - first if scanner.count else 0.0
     return f"0 {first!r} {view!r} {step!r} {scanner.range_max!r} 0.0 0"

@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from gpusense._util import checks
-from gpusense._util.lines import number_in, until_cut
+from gpusense._util.lines import numbers_in, until_cut
 from gpusense._util.typing import Floats, Integers
 from gpusense.logs.records import LandmarkRun
 from gpusense.world.landmarks import LandmarkMap
@@ -142,12 +142,8 @@ def _table(path: Path, columns: tuple[str, ...], ordered: bool = False) -> tuple
 def _row(where: str, fields: list[bytes], columns: tuple[str, ...]) -> list[float]:
     if len(fields) != len(columns):
         raise ValueError(f"{where}: must have {len(columns)} fields ({', '.join(columns)}), got {len(fields)}")
-    values = []
-    for name, text in zip(columns, fields, strict=True):
-        value = number_in(text)
-        if not math.isfinite(value):
-            raise ValueError(f"{where}: {name} must be a finite number, got {text.decode(errors='replace')[:40]!r}")
+    values: list[float] = numbers_in(where, fields, columns.__getitem__).tolist()
+    for name, value, text in zip(columns, values, fields, strict=True):
         if name in ("subject", "barcode") and not (value == int(value) and abs(value) < 2**53):
             raise ValueError(f"{where}: {name} must be an integer, got {text.decode(errors='replace')[:40]!r}")
-        values.append(value)
     return values

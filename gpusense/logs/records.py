@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,6 +105,33 @@ class LandmarkRun:
         return f"LandmarkRun({len(self.time)} scans, {len(self.features)} features, {len(self.landmarks)} landmarks)"
 
 
+def quaternion_of(yaw: float) -> dict[str, float]:
+    """Return the fields of geometry_msgs/Quaternion for a rotation about z."""
+    return {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
+
+
+def pose_fields(pose: Pose) -> dict[str, Any]:
+    """Return the fields of geometry_msgs/Pose."""
+    return {"position": {"x": pose[0], "y": pose[1], "z": 0.0}, "orientation": quaternion_of(pose[2])}
+
+
+def transform_fields(pose: Pose) -> dict[str, Any]:
+    """Return the fields of geometry_msgs/Transform."""
+    return {"translation": {"x": pose[0], "y": pose[1], "z": 0.0}, "rotation": quaternion_of(pose[2])}
+
+
+def even_bearings(scanner: Scanner, kind: str) -> tuple[float, float]:
+    """Return the first bearing and the step between bearings [rad], which must be even in a message of a kind."""
+    bearings = scanner.bearings
+    first = float(bearings[0]) if len(bearings) else 0.0
+    step = (float(bearings[-1]) - first) / max(len(bearings) - 1, 1) if len(bearings) else 0.0
+    if np.abs(bearings - (first + step * np.arange(len(bearings)))).max(initial=0.0) > _EVEN:
+        raise ValueError(f"bearings: must have even steps in {kind}, got uneven ones")
+    return first, step
+
+
+# Largest deviation of bearings from even steps [rad].
+_EVEN = 1e-9
 # Least tilt of a laser whose beams run clockwise [rad].
 _UPSIDE_DOWN = 2 * math.pi / 3
 # Check of a mount: number of headings, most pairs of scans, distance and turn between the scans of a pair.

@@ -18,9 +18,7 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
-from gpusense._util.lines import number_in, until_cut
+from gpusense._util.lines import numbers_in, until_cut
 from gpusense._util.typing import Floats
 from gpusense.logs.records import Odometry, Pose, Scan
 from gpusense.world.scanner import Scanner
@@ -74,13 +72,7 @@ def _numbers(where: str, fields: list[bytes]) -> Floats:
         raise ValueError(f"{where}: must begin with L or O, got {name!r}")
     if len(fields) != 1 + count:
         raise ValueError(f"{where}: {name}: must have {1 + count} fields, got {len(fields)}")
-    values = np.empty(count)
-    for k, field in enumerate(fields[1:]):
-        values[k] = number_in(field)
-        if not math.isfinite(values[k]):
-            text = field.decode(errors="replace")[:40]
-            raise ValueError(f"{where}: {name}: field {k + 1} must be a finite number, got {text!r}")
-    return values
+    return numbers_in(where, fields[1:], lambda index: f"{name}: field {1 + index}")
 
 
 def _mount(robot: Pose, laser: Pose) -> Pose:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gpusense._util import checks
 from gpusense._util.typing import Floats, Loss
 from gpusense.positions.fix import EPS, ROUNDINGS, PositionFix, three_bearings, two_rays
-from gpusense.positions.problem import Problem, check_operands, make_problem, subsets
+from gpusense.positions.problem import Problem, make_problem, subsets
 from gpusense.positions.solver import in_line, solve
 
 
@@ -61,10 +62,9 @@ def triangulate(
         ('unique', [2.0, 1.0])
     """
     least, remainder = (3, "an arc") if heading is None else (2, "a ray")
-    check_operands(bearings=bearings)
     problem = make_problem(
-        xy, bearings=bearings, heading=heading, sigma_bearing=sigma, weights=weights, loss=loss, loss_scale=loss_scale,
-        least=least, reason=f", or {remainder} of solutions remains",
+        xy, bearings=checks.array("bearings", bearings), heading=heading, sigma_bearing=sigma, weights=weights,
+        loss=loss, loss_scale=loss_scale, least=least, reason=f", or {remainder} of solutions remains",
     )  # fmt: skip
     status = _no_solution(problem)
     if status:
@@ -111,18 +111,10 @@ def triangulate_triangle(xy: ArrayLike, bearings: ArrayLike, *, sigma: ArrayLike
         >>> gs.triangulate_triangle([(5, 3), (3, 5), (1, 3)], np.radians([-90, 0, 90])).best.round(3).tolist()
         [3.0, 3.0, 1.571]
     """
-    check_operands(bearings=bearings)
-    problem = make_problem(xy, bearings=bearings, sigma_bearing=sigma)
-    if len(problem.xy) != 3:
-        raise ValueError(f"xy: must hold exactly 3 beacons, got {len(problem.xy)}")
-    status = _no_solution(problem)
-    if status:
-        return problem.fix([], status)
-    triple = np.array([[0, 1, 2]])
-    states, rho, clarity = _triples(problem, triple)
-    if not clarity[0] > _triple_blur(problem, triple)[0]:
-        return problem.fix([], _line_or_circle(problem))
-    return _on_circle(problem, triple, clarity, _exact(problem, states, rho[0]))
+    beacons = checks.array("xy", xy, ("M", 2))
+    if len(beacons) != 3:
+        raise ValueError(f"xy: must hold exactly 3 beacons, got {len(beacons)}")
+    return triangulate(beacons, bearings, sigma=sigma)
 
 
 def _angle_rounding(problem: Problem) -> float:

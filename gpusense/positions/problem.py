@@ -188,13 +188,6 @@ class Problem:
         )
 
 
-def check_operands(**values: object) -> None:
-    """Refuse measurements or deviations that are None."""
-    for name, value in values.items():
-        if value is None:
-            raise TypeError(f"{name}: must hold real numbers, got None")
-
-
 def deviations(name: str, sigma: ArrayLike | None, count: int) -> Floats:
     """Return (M,) standard deviations from one number, M numbers, or None for 1."""
     if sigma is None:

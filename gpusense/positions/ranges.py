@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gpusense._util import checks
 from gpusense._util.angles import wrapped
 from gpusense._util.typing import Floats, Loss
 from gpusense.positions.fix import PositionFix, two_circles, wrap
-from gpusense.positions.problem import Problem, check_operands, make_problem, subsets
+from gpusense.positions.problem import Problem, make_problem, subsets
 from gpusense.positions.solver import distinct, in_line, minima, pick, reflect, solve
 
 
@@ -59,10 +60,9 @@ def trilaterate(
         >>> fix
         PositionFix('unique', 1 solution, best=(2, 1.5), deviation=0.128 m)
     """
-    check_operands(ranges=ranges)
     problem = make_problem(
-        xy, ranges=ranges, sigma_range=sigma, weights=weights, loss=loss, loss_scale=loss_scale, least=2,
-        reason=", or a circle of solutions remains",
+        xy, ranges=checks.array("ranges", ranges), sigma_range=sigma, weights=weights, loss=loss, loss_scale=loss_scale,
+        least=2, reason=", or a circle of solutions remains",
     )  # fmt: skip
     if np.hypot(*(problem.xy - problem.xy[0]).T).max() <= problem.noise:
         return problem.fix([], "coincident")
@@ -180,10 +180,10 @@ def locate(
         >>> fix.status, (fix.best + 1e-9).round(3).tolist()
         ('unique', [0.0, 0.0, 0.0])
     """
-    check_operands(ranges=ranges, bearings=bearings, sigma_range=sigma_range, sigma_bearing=sigma_bearing)
+    given = dict(ranges=ranges, bearings=bearings, sigma_range=sigma_range, sigma_bearing=sigma_bearing)
     least, reason = (2, ", or a circle of solutions remains") if heading is None else (1, "")
     problem = make_problem(
-        xy, ranges=ranges, bearings=bearings, heading=heading, sigma_range=sigma_range, sigma_bearing=sigma_bearing,
+        xy, **{name: checks.array(name, value) for name, value in given.items()}, heading=heading,
         names=("sigma_range", "sigma_bearing"), weights=weights, loss=loss, loss_scale=loss_scale, least=least,
         reason=reason,
     )  # fmt: skip

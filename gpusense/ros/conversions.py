@@ -18,17 +18,12 @@ from gpusense.evaluation.tracking import RISK
 from gpusense.localization.nav2 import DEFAULTS, Nav2Options, from_nav2
 from gpusense.localization.pose_algebra import compose_poses, invert_poses
 from gpusense.localization.spread import check_risk
-from gpusense.logs.records import Pose, planar_mount
+from gpusense.logs.records import Pose, planar_mount, pose_fields
 from gpusense.world.messages import field, planar_pose
 from gpusense.world.scanner import Scanner
 
 # Largest negative eigenvalue of a covariance that rounding may cause, relative to its largest variance.
 _ROUNDING = 1e-6
-
-
-def quaternion_of(yaw: float) -> dict[str, float]:
-    """Return the fields of geometry_msgs/Quaternion for a rotation about z."""
-    return {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
 
 
 def pose_matrix(pose: Pose) -> np.ndarray:
@@ -47,16 +42,6 @@ def moved_enough(before: Pose, after: Pose, least: tuple[float, float]) -> bool:
     """Return whether the robot moved by ``least`` (m along x or y, rad), nav2_amcl's condition for an update."""
     turn = abs(math.remainder(after[2] - before[2], 2 * math.pi))
     return abs(after[0] - before[0]) > least[0] or abs(after[1] - before[1]) > least[0] or turn > least[1]
-
-
-def pose_fields(pose: Pose) -> dict[str, Any]:
-    """Return the fields of geometry_msgs/Pose."""
-    return {"position": {"x": pose[0], "y": pose[1], "z": 0.0}, "orientation": quaternion_of(pose[2])}
-
-
-def transform_fields(pose: Pose) -> dict[str, Any]:
-    """Return the fields of geometry_msgs/Transform."""
-    return {"translation": {"x": pose[0], "y": pose[1], "z": 0.0}, "rotation": quaternion_of(pose[2])}
 
 
 def covariance_fields(covariance: np.ndarray) -> list[float]:

@@ -152,8 +152,6 @@ def fit_position_parameters(
         (True, 2.0)
     """
     correlated, fit_mount = checks.boolean("correlated", correlated), checks.boolean("fit_mount", fit_mount)
-    most = checks.integer("max_iterations", max_iterations, low=1)
-    least = checks.real("tolerance", tolerance, above=0)
     base = PositionParameters(region=region, mount=mount)
     pose = checks.array("poses", poses, ("F", 3), largest=checks.FARTHEST)
     z = checks.array("fixes", fixes, (len(pose), 2), finite=False, largest=checks.FARTHEST)
@@ -175,7 +173,7 @@ def fit_position_parameters(
     spread = 1.4826 * float(np.median(np.abs(shown))) or float(np.abs(shown).max()) or 1e-6
     heading = pose[used, 2]
     problem = _Fixes(errors, np.cos(heading), np.sin(heading), inside, correlated, area, start, fit_mount, spread)
-    end = maximize(problem, most, least)
+    end = maximize(problem, max_iterations, tolerance)
     c = problem.covariance(end.theta)
     noise = dict(covariance=c) if correlated else dict(sigma=float(math.exp(-end.theta[1])))
     rand = float(end.theta[0])
@@ -270,8 +268,6 @@ def fit_heading_parameters(
         (True, 0.5, True)
     """
     checks.choice("kind", kind, ("wrapped_normal", "von_mises"))
-    most = checks.integer("max_iterations", max_iterations, low=1)
-    least = checks.real("tolerance", tolerance, above=0)
     pose = checks.array("poses", poses, ("F", 3), largest=checks.FARTHEST)
     z = checks.array("headings", headings, (len(pose),), finite=False, largest=checks.FARTHEST)
     used = np.isfinite(z)
@@ -280,7 +276,7 @@ def fit_heading_parameters(
     numbers = number_blocks(blocks, (len(pose),), used)
     turned = wrapped(wrapped(z[used]) - wrapped(pose[used, 2]))
     problem = _Headings(turned, kind)
-    end = maximize(problem, most, least)
+    end = maximize(problem, max_iterations, tolerance)
     values = problem.values(end.theta)
     offset = wrapped(values["offset"])
     end.theta[2] = offset

@@ -186,8 +186,6 @@ def fit_beacon_parameters(
     degrees = checks.integer("nu", nu, low=1, high=MOST_DEGREES)
     longest = checks.real("range_max", range_max, above=0, high=checks.FARTHEST)
     points = checks.array("xy", xy, ("M", 2), largest=checks.FARTHEST)
-    most = checks.integer("max_iterations", max_iterations, low=1)
-    least = checks.real("tolerance", tolerance, above=0)
     pose, z, index = _readings(poses, ranges, len(points), ids)
     antenna = places_of(pose, mount)
     distances = np.hypot(*(points[index[1]] - antenna[index[0]]).T)
@@ -201,7 +199,7 @@ def fit_beacon_parameters(
         z[used], distances[used], index[1][used], kind, degrees if kind == "student_t" else None, longest,
         {"none": 0, "common": 1, "each": len(points)}[bias], spread or 1e-6 * longest,
     )  # fmt: skip
-    end = maximize(problem, most, least)
+    end = maximize(problem, max_iterations, tolerance)
     return report(problem, end, _parameters(problem, end.theta, degrees, mount), numbers, int((~used).sum()))
 
 

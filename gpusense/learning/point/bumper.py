@@ -113,8 +113,6 @@ def fit_bumper_parameters(
         >>> fit.converged, round(fit.parameters.p_contact, 1), round(fit.parameters.p_false, 2)
         (True, 0.9, 0.02)
     """
-    most = checks.integer("max_iterations", max_iterations, low=1)
-    least = checks.real("tolerance", tolerance, above=0)
     checks.instance("grid", grid, OccupancyGrid)
     wide = BumperParameters(p_contact=1.0, p_false=0.0, sigma=_WIDE * grid.resolution)
     precision: Precision = "float64" if get_backend(backend).info.float64 else "float32"
@@ -133,7 +131,7 @@ def fit_bumper_parameters(
         raise ValueError(f"pressed: must hold one that is not nan, got {table.size} without")
     numbers = number_blocks(blocks, (len(pose),), np.nonzero(used)[0])
     problem = _Bumps(outline_gaps(model, pose)[used], table[used], grid.resolution)
-    end = maximize(problem, most, least)
+    end = maximize(problem, max_iterations, tolerance)
     return report(problem, end, BumperParameters(**problem.values(end.theta)), numbers, int((~used).sum()))
 
 

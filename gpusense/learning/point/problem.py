@@ -157,24 +157,22 @@ class Climb:
 
 def maximize(problem: Problem, max_iterations: int, tolerance: float) -> Climb:
     """Search from the likeliest starts, and return the end with exchangeable parts in canonical order."""
-    end = _best_end(problem, max_iterations, tolerance)
-    theta = problem.ordered(end.theta)
-    if np.array_equal(theta, end.theta):
-        return end
-    # Rounding decides which of several equal maxima a search reaches.
-    return replace(end, theta=theta, free=free_coordinates(problem, theta))
-
-
-def _best_end(problem: Problem, max_iterations: int, tolerance: float) -> Climb:
-    """Return the end of the likeliest search, first on a subset of the readings, then on all."""
+    checks.integer("max_iterations", max_iterations, low=1)
+    checks.real("tolerance", tolerance, above=0)
     every = max(1, problem.readings // _SAMPLE)
     sample = problem.part(every) if every > 1 else problem
     low, high = problem.bounds()
     starts = [np.clip(each, low, high) for each in problem.starts()]
     starts = sorted(starts, key=lambda each: -sample.total(each)[0])[:_CLIMBED]
     ends = [climb(sample, each, max_iterations, tolerance) for each in starts]
-    best = max(ends, key=lambda end: end.value)
-    return best if sample is problem else climb(problem, best.theta, max_iterations, tolerance)
+    end = max(ends, key=lambda end: end.value)
+    # Many readings are searched after a subset of them.
+    end = end if sample is problem else climb(problem, end.theta, max_iterations, tolerance)
+    theta = problem.ordered(end.theta)
+    if np.array_equal(theta, end.theta):
+        return end
+    # Rounding decides which of several equal maxima a search reaches.
+    return replace(end, theta=theta, free=free_coordinates(problem, theta))
 
 
 def climb(problem: Problem, start: Floats, max_iterations: int, tolerance: float) -> Climb:

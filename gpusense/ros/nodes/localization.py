@@ -23,7 +23,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import Empty
 
-from gpusense.logs.records import Pose, planar
+from gpusense.logs.records import Pose, planar, pose_fields, transform_fields
 from gpusense.logs.transform_buffer import BACK
 from gpusense.ros import conversions
 from gpusense.ros.conversions import defaults, mount_of, options_of
@@ -250,7 +250,7 @@ class LocalizationNode(LifecycleNode):
         pose = PoseWithCovarianceStamped()
         pose.header.stamp, pose.header.frame_id = scan.header.stamp, self.options.frames[0]
         x, y, yaw = (float(value) for value in estimate.pose)
-        conversions.fill(pose.pose.pose, conversions.pose_fields((x, y, yaw)))
+        conversions.fill(pose.pose.pose, pose_fields((x, y, yaw)))
         pose.pose.covariance = conversions.covariance_fields(estimate.covariance)
         self.pose.publish(pose)
         if not self.cloud.get_subscription_count():
@@ -270,7 +270,7 @@ class LocalizationNode(LifecycleNode):
         ahead = Time.from_msg(scan.header.stamp) + Duration(seconds=self.options.transform_tolerance)
         sent.header.stamp, sent.header.frame_id = ahead.to_msg(), self.options.frames[0]
         sent.child_frame_id = self.options.frames[1]
-        conversions.fill(sent.transform, conversions.transform_fields(self.localizer.map_to_odometry()))
+        conversions.fill(sent.transform, transform_fields(self.localizer.map_to_odometry()))
         self.broadcaster.publish(TFMessage(transforms=[sent]))
 
     def publish_diagnostics(self) -> None:

@@ -278,16 +278,18 @@ typedef struct {
     ilanes cell[BLOCK_TERMS];
 } EndPoints;
 
-// Return the bound of the rounding errors of scaled places: 2.5 eps of the longest reading in cells plus 0.7 eps, and one
-// for truncation.
+// Return the bound of the rounding errors of scaled places: 2 eps of the longest reading in cells and 3.5 eps (2.5 eps of it
+// where products are rounded), and one for truncation.
 real place_margin(global const real2 *point, const int size) {
-    real longest = 0;
+    real square = 0;
     for (int k = 0; k < size; ++k) {
-        const real length = (point[k].x < 0 ? -point[k].x : point[k].x) + (point[k].y < 0 ? -point[k].y : point[k].y);
-        longest = length > longest ? length : longest;
+        const real here = point[k].x * point[k].x + point[k].y * point[k].y;
+        square = here > square ? here : square;
     }
+    const real longest = sqrt(square), scaled_eps = (1 << SCALE_BITS) * 1.2e-7f;
     // Longer readings are not scaled to 32 bits: all their cells are recomputed.
-    return longest < (1 << (30 - SCALE_BITS)) ? (int)((1 << SCALE_BITS) * 3.6e-7f * (longest + 1)) + 2 : 1 << SCALE_BITS;
+    if (longest >= (1 << (30 - SCALE_BITS))) return 1 << SCALE_BITS;
+    return (int)(scaled_eps * ((FUSES ? 2.02f : 2.52f) * longest + 4)) + 2;
 }
 
 // Find the scaled places of an end point, larger by margin than its coordinates.

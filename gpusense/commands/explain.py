@@ -82,7 +82,7 @@ def _scene(args: argparse.Namespace) -> tuple[OccupancyGrid, Scanner, np.ndarray
     """Return the map, the scanner and the readings."""
     import numpy as np
 
-    from gpusense.commands.demo_scene import make_world
+    from gpusense.commands.demo import make_world
     from gpusense.evaluation import worlds
     from gpusense.world.map_files import read_map
     from gpusense.world.parameters import BeamParameters

@@ -29,6 +29,7 @@ typedef {real}4 real4;
 #endif
 """
 _HEAD = re.compile(r"^kernel void (\w+)\(ARGUMENTS\) \{", re.MULTILINE)
+_KERNEL = re.compile(r"^kernel void .*?^\}", re.MULTILINE | re.DOTALL)
 _WORD = re.compile(r"\w+")
 _COMMENT, _DOUBLE = re.compile(r"//.*"), re.compile(r"\bdouble[24]?\b")
 # Flags of arguments that not all code of a kernel has.
@@ -165,8 +166,16 @@ def assemble(file: str, flags: frozenset[str]) -> str:
         text, scalar = _kept(needed, flags), _scalar_source(needed)
         sources = texts if scalar is None else {scalar: _kept(scalar, flags)} | texts
         texts[needed] = written_in_lanes(text, needed, sources)
-    body = "".join(f'#line 1 "{name}.cl"\n{text}' for name, text in texts.items())
+    *_, last = texts
+    # Only the kernels of the last file, the program's, are launched.
+    kept = {name: text if name == last else _KERNEL.sub(_blank, text) for name, text in texts.items()}
+    body = "".join(f'#line 1 "{name}.cl"\n{text}' for name, text in kept.items())
     return head + _declarations(body) + body
+
+
+def _blank(match: re.Match[str]) -> str:
+    """Return as many empty lines as a match has."""
+    return "\n" * match.group().count("\n")
 
 
 def with_places(log: str, source: str) -> str:

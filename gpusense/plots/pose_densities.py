@@ -127,8 +127,11 @@ def localization_figure(
     (R, C) log-likelihoods over a :func:`pose_lattice` of this extent, by title.
     """
     figure = new_figure(15.0, 9.8)
-    axes = figure.subplots(2, 2)
-    # With a height, Matplotlib does not measure all ticks to place a title.
+    # A constrained layout takes a third of the picture's time: it measures all ticks. So does a title without a height.
+    figure.set_layout_engine("none")
+    axes = figure.subplots(
+        2, 2, gridspec_kw=dict(left=0.044, right=0.9375, bottom=0.07, top=0.944, wspace=0.28, hspace=0.19)
+    )
     for ax in axes.flat:
         draw_map(ax, grid)
     drawn = draw_scan(axes[0, 0], grid, scanner, best, ranges)

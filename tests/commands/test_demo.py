@@ -10,7 +10,7 @@ import pytest
 from support.command_line import SMALL, error_of, script
 from support.paths import ROOT
 
-from gpusense.commands import cli, demo, demo_scene
+from gpusense.commands import cli, demo
 
 # Largest difference of a float32 model from the float64 reference on 60 beams [nats], on its own rounded inputs.
 DEMO_TOLERANCE = 1e-2
@@ -73,7 +73,7 @@ def test_demo_prints_details_on_request(capsys):
 
 
 def test_numpy_scores_a_part_of_many_poses(monkeypatch, capsys):
-    monkeypatch.setattr(demo_scene, "REFERENCE_PARTICLES", 50)
+    monkeypatch.setattr(demo, "REFERENCE_PARTICLES", 50)
     assert cli.main([*SMALL, "--backend", "numpy", "--no-plot", "--json"]) == 0
     for result in json.loads(capsys.readouterr().out)["results"]:
         assert 40 <= result["poses"] == result["error_poses"] <= 50

@@ -37,6 +37,13 @@ def test_every_opencl_kernel_has_a_row_and_every_row_a_kernel() -> None:
     assert sorted(opencl_bodies()) == sorted(KERNELS)
 
 
+def test_a_program_holds_no_kernel_of_another_file() -> None:
+    for file in {row.file for row in KERNELS.values()}:
+        text = assemble(file, frozenset())
+        assert all(KERNELS[kernel].file == file for kernel in re.findall(r"^kernel void (\w+)", text, re.MULTILINE))
+    assert "kernel void cast_ranges(" in assemble("ranges", frozenset())
+
+
 @each_kernel
 def test_opencl_kernels_have_the_axes_of_their_row(kernel: str) -> None:
     for body in opencl_bodies()[kernel]:

@@ -16,7 +16,7 @@ from support.kernel_scenes import PRECISIONS
 from gpusense.interface import sources
 from gpusense.interface.kernel_files import kernel_root, opencl_names, opencl_source, warp_files
 from gpusense.interface.signatures import KERNELS
-from gpusense.interface.sources import parameters, source_text
+from gpusense.interface.sources import assemble, parameters, source_text
 
 each_kernel = pytest.mark.parametrize("kernel", list(KERNELS))
 

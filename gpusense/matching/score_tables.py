@@ -11,17 +11,18 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.interface.structs import ScoreTable
 
-_BYTE = np.dtype(np.uint8)
+_BYTE, _INT = np.dtype(np.uint8), np.dtype(np.int32)
 _NO_FLAGS: frozenset[str] = frozenset()
 # Columns that a kernel with lanes reads at once; the kernel file ``search`` has the same number.
-RUN = 16
+RUN = 32
 # Rows of shifts of a work-item, as in the kernel file.
 SHIFT_ROWS = 8
 # Largest score of a cell.
 TOP = 255
 # Levels between the blocks of a level and the steps of their first cells, and scores in a unit of the losses of folded
-# tables, by kind of device: processors need few images in their caches, and add losses of several points in a byte.
-_STEP, _UNIT = {"cpu": 2, "gpu": 8}, {"cpu": 8, "gpu": 1}
+# tables, by kind of device: processors add losses of several points in a byte, and need few images in their caches, one
+# level less for tables of more cells.
+_STEP, _UNIT, _FEW_CELLS = {"cpu": 3, "gpu": 8}, {"cpu": 4, "gpu": 1}, 1 << 20
 # Cells of a table and of its copies, which kernels index in 32 bits.
 _MOST_CELLS = (1 << 31) - 1
 
@@ -47,10 +48,14 @@ class Folded(NamedTuple):
 
     table: Buffer  # the images
     shape: ScoreTable  # their sizes
-    period: int  # cells of the tables between neighbouring cells of an image
-    step: int  # cells between first cells of neighbouring images
-    offset: int  # column and row of the tables' first cell in the images' source
     unit: int  # scores in a unit of a loss
+    quarters: Buffer | None  # losses of the blocks' quarters, relative to the blocks, as images; None at level 0
+    quarters_shape: ScoreTable  # their sizes
+
+
+def _launched(shape: ScoreTable) -> tuple[int, int, int]:
+    """Return the columns, rows and number of tables with their margins."""
+    return shape.cols + 2 * shape.margin, shape.rows + 2 * shape.margin, shape.tables
 
 
 class ScoreTables:
@@ -66,9 +71,10 @@ class ScoreTables:
         stack = scores[None] if scores.ndim == 2 else scores
         tables, rows, cols = stack.shape
         self.backend, self.levels, self.stride, self._beyond = backend, levels, stride, beyond
+        self._fine = _STEP[backend.info.kind] - (stack.size > _FEW_CELLS)
         # The margin holds all pooled cells that a table's cells reach, and a run of cells beyond them.
         self.shape = ScoreTable(tables, rows, cols, ((1 << levels) - 1) * stride + self.step(levels) - 1 + RUN)
-        cells, info = self._cells(self.shape), backend.info
+        cells, info, self._size = self._cells(self.shape), backend.info, _launched(self.shape)
         if cells > _MOST_CELLS:
             raise ValueError(f"scores: must have at most {_MOST_CELLS} cells with margins, got {stack.shape}")
         # Scores, one table of larger blocks, and the losses of four blocks at each level.
@@ -82,19 +88,15 @@ class ScoreTables:
         padded[:, inside, inside] = stack
         self._levels: list[Buffer] = [backend.upload(padded)]
         self._folded: dict[int, Folded] = {}
-        self._quarters: dict[tuple[int, bool], Buffer] = {}
+        self._quarters: dict[int, Buffer] = {}
 
     @staticmethod
     def _cells(shape: ScoreTable) -> int:
-        return shape.tables * (shape.rows + 2 * shape.margin) * (shape.cols + 2 * shape.margin)
-
-    @property
-    def _size(self) -> tuple[int, int, int]:
-        return self.shape.cols + 2 * self.shape.margin, self.shape.rows + 2 * self.shape.margin, self.shape.tables
+        return math.prod(_launched(shape))
 
     def step(self, level: int) -> int:
         """Return the cells between neighbouring first cells of the folded tables of a level."""
-        return 1 << max(level - _STEP[self.backend.info.kind], 0)
+        return 1 << max(level - self._fine, 0)
 
     def level(self, level: int) -> Buffer:
         """Return the tables of a level; a cell is the largest score of ``2^level`` positions along each axis."""
@@ -112,37 +114,46 @@ class ScoreTables:
         self.backend.compile("pool_scores", _NO_FLAGS)(self._size, table, made, self.shape, reach)
         return made
 
-    def quarters(self, level: int, *, top: bool) -> Buffer:
-        """Return the losses of four blocks of a level that make a block of the next one, in the bytes of numbers.
+    def quarters(self, level: int) -> Buffer:
+        """Return the losses of four blocks of a level, relative to the block of the next one that they make, as bytes.
 
-        They are relative to the score of the larger block or, with ``top``, to the largest score of a cell.
+        A number holds four losses.
         """
-        if (level, top) not in self._quarters:
-            table, made = self.level(level), self.backend.empty(self._cells(self.shape), np.dtype(np.int32))
-            pack = self.backend.compile("pack_quarters", _NO_FLAGS)
-            pack(self._size, table, made, self.shape, (1 << level) * self.stride, int(top))
-            self._quarters[level, top] = made
-        return self._quarters[level, top]
+        if level not in self._quarters:
+            table, made = self.level(level), self.backend.empty(self._cells(self.shape), _INT)
+            self.backend.compile("pack_quarters", _NO_FLAGS)(
+                self._size, table, made, self.shape, self.stride << level
+            )  # fmt: skip
+            self._quarters[level] = made
+        return self._quarters[level]
 
     def folded(self, level: int) -> Folded:
         """Return the losses of a level in tables in which blocks of positions are neighbours.
 
         Their cells begin at multiples of a step, so a cell covers additional cells for points off the multiples.
-        Losses of poses are exact; losses of blocks are rounded down to units.
+        Losses of poses are exact; losses of blocks are rounded down to units. Losses of quarters are exact, and there
+        is an image for each first cell.
         """
-        period, step, unit = self.stride << level, self.step(level), _UNIT[self.backend.info.kind] if level else 1
         if level not in self._folded:
-            lines, stride = self.shape.rows + 2 * self.shape.margin, self.shape.cols + 2 * self.shape.margin
-            images = self.shape.tables * (period // step) ** 2
-            shape = ScoreTable(images, -(-lines // period), -(-stride // period), RUN)
-            if self._cells(shape) > _MOST_CELLS:
-                raise ValueError(f"scores: a search must fold at most {_MOST_CELLS} cells, got {self._cells(shape)}")
-            made = self.backend.empty(self._cells(shape), _BYTE)
-            size = (shape.cols + 2 * RUN, shape.rows + 2 * RUN, shape.tables)
+            period, step, unit = self.stride << level, self.step(level), _UNIT[self.backend.info.kind] if level else 1
+            cols, lines, tables = self._size
+            size = -(-lines // period), -(-cols // period)
+            shape = ScoreTable(tables * (period // step) ** 2, *size, RUN)
+            exact = ScoreTable(tables * period**2, *size, 1)
+            if (most := max(map(self._cells, (shape, exact)))) > _MOST_CELLS:
+                raise ValueError(f"scores: a search must fold at most {_MOST_CELLS} cells, got {most}")
+            made, quarters = self.backend.empty(self._cells(shape), _BYTE), None
             source = self._pooled(self.level(level), step - 1) if step > 1 else self.level(level)
-            fold = self.backend.compile("fold_scores", _NO_FLAGS)
-            fold(size, source, made, self.shape, shape, period, step, self._beyond, unit)
-            # The pooled copy lives until the launch has ended.
+            self.backend.compile("fold_scores", _NO_FLAGS)(
+                _launched(shape), source, made, self.shape, shape, period, step, self._beyond, unit
+            )
+            if level:
+                quarters = self.backend.empty(self._cells(exact), _INT)
+                self.backend.compile("fold_quarters", _NO_FLAGS)(
+                    _launched(exact), self.level(level - 1), made, quarters, self.shape, shape, exact, period, step,
+                    period // 2, self._beyond, unit,
+                )  # fmt: skip
+            # The pooled copy lives until the launches have ended.
             self.backend.synchronize()
-            self._folded[level] = Folded(made, shape, period, step, self.shape.margin, unit)
+            self._folded[level] = Folded(made, shape, unit, quarters, exact)
         return self._folded[level]

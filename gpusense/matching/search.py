@@ -18,8 +18,9 @@ from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
+from gpusense.interface.structs import ScoreTable
 from gpusense.matching.pose_grid import Found, PoseGrid
-from gpusense.matching.score_tables import SHIFT_ROWS, TOP, ScoreTables
+from gpusense.matching.score_tables import RUN, SHIFT_ROWS, TOP, ScoreTables
 
 __all__ = ["Found", "PoseGrid", "Search"]
 
@@ -42,7 +43,8 @@ _READ, _WORKERS = 512, {"gpu": (1 << 17, 1), "cpu": (1 << 10, 64)}
 # Turn of the circle between points that are summed in turns, so that few of them tell about all directions.
 _TURN = (5**0.5 - 1) / 2
 # Arrays that place end points, and the numbers of arrays of placed points for each of them.
-_GIVEN, _MADE = ("end", "heading", "start", "first", "image"), {"point": 2, "folded": 2, "folded image": 1}
+_GIVEN = ("end", "heading", "start", "first", "image")
+_MADE = {"point": 2, "folded": 2, "bound image": 1, "quarter image": 1}
 
 
 class Search:
@@ -123,7 +125,7 @@ class _Run:
 
     def place(self, points: Sequence[np.ndarray], images: Sequence[np.ndarray] | None) -> None:
         """Place the end points of all scans at all headings on the device."""
-        grid, space, folded = self._grid, self._space, self._tables.folded(self._level)
+        grid, space, tables = self._grid, self._space, self._tables
         each = [len(part) for part in points]
         orders = [*map(_order, each)]
         first = np.concatenate([[0], np.cumsum(np.repeat(each, self._turns))]).astype(np.int32)
@@ -135,7 +137,7 @@ class _Run:
         turned = np.stack([np.cos(headings), np.sin(headings)], axis=-1)
         turned = turned if len(turned) == len(each) else turned.repeat(len(each), axis=0)
         given = [ends, turned, grid.start.astype(np.float64), first]
-        if images is not None or self._tables.shape.tables > 1:
+        if images is not None or tables.shape.tables > 1:
             images = [np.full(count, scan) for scan, count in enumerate(each)] if images is None else images
             named = [np.broadcast_to(part, (self._turns, count))[:, order].reshape(-1)
                      for part, count, order in zip(images, each, orders, strict=True)]  # fmt: skip
@@ -149,12 +151,14 @@ class _Run:
         made = [there.empty(name, size * total, _INT) for name, size in _MADE.items()]
         place = backend.compile("place_ends", _NO_FLAGS)
         for begin, end in self._parts_of_items():
-            place((self._most, end - begin), *inputs, *made, begin, end, self._turns, self._tables.stride,
-                  self._level, self._tables.step(self._level).bit_length() - 1, folded.offset)  # fmt: skip
+            place((self._most, end - begin), *inputs, *made, begin, end, self._turns, tables.stride, self._level,
+                  tables.step(self._level).bit_length() - 1, tables.shape.margin)  # fmt: skip
         if there is not space:
             inputs, made = ([space.upload(name, array) for name, array in zip(names, arrays, strict=True)]
                             for names, arrays in ((_GIVEN, inputs), (_MADE, made)))  # fmt: skip
-        self._ends, self._folded_ends = (made[0], inputs[4], inputs[3]), (made[1], made[2], inputs[3])
+        image, first = inputs[4], inputs[3]
+        self._ends = made[0], image, first
+        self._bound_ends, self._quarter_ends = ((made[1], images, first) for images in made[2:])
 
     def _parts_of_items(self) -> list[tuple[int, int]]:
         """Return the first item of each launch, and the one after its last."""
@@ -195,10 +199,11 @@ class _Run:
         folded, rows = self._tables.folded(self._level), self._items * self._height
         self._score = self._space.empty("bounds", rows * self._width, _INT)
         flags = with_lanes_flag(self._backend.info.lanes, "shift_scores", _NO_FLAGS)
+        columns = -(-self._width // RUN) if flags else self._width
         for begin, end in self._parts_of_items():
             self._launch(
-                "shift_scores", (self._width, -(-self._height // SHIFT_ROWS), end - begin), folded.table,
-                *self._folded_ends, self._allowed[self._level], self._score, folded.shape, begin, end, self._height,
+                "shift_scores", (columns, -(-self._height // SHIFT_ROWS), end - begin), folded.table,
+                *self._bound_ends, self._allowed[self._level], self._score, folded.shape, begin, end, self._height,
                 self._width, folded.unit, flags=flags,
             )  # fmt: skip
         self._evaluated += rows * self._width
@@ -210,10 +215,15 @@ class _Run:
             self._turns, self._shift,
         )  # fmt: skip
 
-    def _is_top(self, level: int) -> bool:
-        """Return whether blocks of the next level have bounds that are larger than the sums of their tables."""
+    def _quarters(self, level: int) -> tuple[tuple[Any, ...], ScoreTable, tuple[int, int]]:
+        """Return tables of quarters and end points to divide blocks into blocks of a level, and the tables' sizes.
+
+        The last two numbers are the cells of the tables between 2^n positions, and n.
+        """
+        if level < self._level - 1:
+            return (self._tables.quarters(level), *self._ends), self._tables.shape, (self._tables.stride, 0)
         folded = self._tables.folded(self._level)
-        return level == self._level - 1 and (folded.step > 1 or folded.unit > 1)
+        return (folded.quarters, *self._quarter_ends), folded.quarters_shape, (1, self._level)
 
     def _follow(self) -> None:
         """Raise lower bounds: follow the best parts of promising blocks down to poses."""
@@ -226,12 +236,10 @@ class _Run:
         self._launch("pick_blocks", (self._items,), self._maxima, self._histogram, number, blocks, *numbers,
                      self._level, self._shift, most)  # fmt: skip
         for level in reversed(range(self._level)):
-            top = self._is_top(level)
+            quarters, shape, spacing = self._quarters(level)
             self._launch(
-                "follow_blocks", (count,), self._tables.quarters(level, top=top), *self._ends, self._allowed[level],
-                blocks, self._tables.shape, count, self._grid.height, self._grid.width, -(-self._grid.width >> level),
-                level, self._tables.stride, int(top),
-                flags=self._ahead,
+                "follow_blocks", (count,), *quarters, self._allowed[level], blocks, shape, count, self._grid.height,
+                self._grid.width, -(-self._grid.width >> level), level, *spacing, flags=self._ahead,
             )  # fmt: skip
         self._launch("raise_low", (count,), blocks, self._space.upload("slack", self._slack), self._low, count, most)
         self._evaluated += 4 * self._level * count
@@ -251,13 +259,12 @@ class _Run:
         """Divide chosen blocks from ``begin`` on, but at most ``some``, down to poses."""
         (workers, run), blocks = _WORKERS[self._backend.info.kind], self._chosen
         for level in reversed(range(self._level)):
-            top, parts = self._is_top(level), self._space.empty(f"parts {level}", 4 * self._parts, _INT)
-            first = level == self._level - 1
+            (quarters, shape, spacing), first = self._quarters(level), level == self._level - 1
+            parts = self._space.empty(f"parts {level}", 4 * self._parts, _INT)
             self._launch(
-                "divide_blocks", (workers,), self._tables.quarters(level, top=top), *self._ends, self._allowed[level],
-                blocks, self._low, parts, self._counts, self._tables.shape, begin if first else 0,
-                min(some, self._room) if first else self._parts, self._parts, workers, run, self._grid.height,
-                self._grid.width, -(-self._grid.width >> level), self._turns, level, self._tables.stride, int(top),
+                "divide_blocks", (workers,), *quarters, self._allowed[level], blocks, self._low, parts, self._counts,
+                shape, begin if first else 0, min(some, self._room) if first else self._parts, self._parts, workers,
+                run, self._grid.height, self._grid.width, -(-self._grid.width >> level), self._turns, level, *spacing,
                 flags=self._ahead,
             )  # fmt: skip
             blocks = parts

@@ -50,23 +50,47 @@ def fold_scores(flags, table, out, scores, folded, period, step, beyond, unit):
             target[:, i, j, margin : margin + part.shape[1], margin : margin + part.shape[2]] = (TOP - part) // unit
 
 
-def pack_quarters(flags, table, quarters, scores, reach, top):
-    """Write the losses of the quarters of the block that begins at each cell, as bytes of a number.
-
-    They are relative to the largest of the four scores or, with ``top``, to the largest possible score.
-    """
+def quarters_at(table: np.ndarray, scores: ScoreTable, reach: int) -> np.ndarray:
+    """Return the scores (T, H, W, 4) of the quarters of the blocks that begin at cells."""
     lines, stride = padded_lines(scores), padded_stride(scores)
     images = table[: scores.tables * lines * stride].reshape(scores.tables, lines, stride)
     line, col = (np.minimum(np.arange(size) + reach, size - 1) for size in (lines, stride))
-    four = np.stack([images, images[:, :, col], images[:, line], images[:, line][:, :, col]], axis=-1)
-    most = TOP if top else four.max(axis=-1, keepdims=True)
-    losses = np.ascontiguousarray(most - four, dtype="u1")
-    quarters[: images.size] = losses.view("<u4")[..., 0].astype(np.uint32).view(np.int32).ravel()
+    return np.stack([images, images[:, :, col], images[:, line], images[:, line][:, :, col]], axis=-1)
+
+
+def packed_losses(most: np.ndarray, four: np.ndarray) -> np.ndarray:
+    """Return losses of quarters as bytes of numbers."""
+    losses = np.ascontiguousarray(most[..., None] - four, dtype="u1")
+    packed: np.ndarray = losses.view("<u4").astype(np.uint32).view(np.int32).ravel()
+    return packed
+
+
+def pack_quarters(flags, table, quarters, scores, reach):
+    """Write the losses of the quarters of the block that begins at each cell, relative to the largest of them."""
+    four = quarters_at(table, scores, reach)
+    quarters[: four.size // 4] = packed_losses(four.max(axis=-1), four)
+
+
+def fold_quarters(flags, table, bound, quarters, scores, bounds, folded, period, step, reach, beyond, unit):
+    """Write the losses of the quarters of blocks, relative to the folded table of bounds, as images."""
+    four, side = quarters_at(table, scores, reach), period // step
+    shape = (scores.tables, period, period, padded_lines(folded), padded_stride(folded))
+    images = np.full((*shape, 4), beyond, np.int32)
+    margin, ahead = folded.margin, bounds.margin - folded.margin
+    losses = bound[: bounds.tables * padded_lines(bounds) * padded_stride(bounds)]
+    losses = losses.reshape(scores.tables, side, side, padded_lines(bounds), padded_stride(bounds))
+    losses = losses[..., ahead : ahead + shape[3], ahead : ahead + shape[4]]
+    for i in range(period):
+        for j in range(period):
+            part = four[:, i::period, j::period]
+            images[:, i, j, margin : margin + part.shape[1], margin : margin + part.shape[2]] = part
+    most = TOP - unit * losses.astype(np.int32).repeat(step, axis=1).repeat(step, axis=2)
+    quarters[: most.size] = packed_losses(most, images)
 
 
 def divided(
     quarters: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray, block: np.ndarray,
-    scores: ScoreTable, spacing: int, top: int,
+    scores: ScoreTable, spacing: int, shift: int,
 ) -> np.ndarray:  # fmt: skip
     """Return the scores (M, 4) of the quarters of blocks (M, 4): score less the losses of the item's points."""
     size = padded_lines(scores) * padded_stride(scores)
@@ -77,12 +101,11 @@ def divided(
         mine = np.flatnonzero(block[:, 0] == item)
         step = max(_BLOCK // max(len(begin), 1), 1)
         for chosen in (mine[i : i + step] for i in range(0, len(mine), step)):
-            row = spacing * block[chosen, 1, None] + point[None, points, 1]
-            col = spacing * block[chosen, 2, None] + point[None, points, 0]
+            row = spacing * (block[chosen, 1, None] >> shift) + point[None, points, 1]
+            col = spacing * (block[chosen, 2, None] >> shift) + point[None, points, 0]
             four = quarters[begin + cell_index(scores, row, col)]
-            score = TOP * len(begin) if top else block[chosen, 3]
             for i in range(4):
-                total[chosen, i] = score - (four >> 8 * i & 255).sum(axis=1, dtype=np.int32)
+                total[chosen, i] = block[chosen, 3] - (four >> 8 * i & 255).sum(axis=1, dtype=np.int32)
     return total
 
 
@@ -158,12 +181,12 @@ def choose_blocks(flags, score, best, low, block, count, rows, height, width, tu
 
 def follow_blocks(
     flags, quarters, point, image, first, allowed, block, scores, blocks, height, width, columns, level, spacing,
-    top,
+    shift,
 ):  # fmt: skip
     """Replace blocks by their best allowed quarters of 2^level x 2^level; a block without any has the score -1."""
     here = block[: 4 * blocks].reshape(blocks, 4)
     mine = np.flatnonzero(here[:, 3] >= 0)
-    total = divided(quarters, point, image, first, here[mine], scores, spacing, top)
+    total = divided(quarters, point, image, first, here[mine], scores, spacing, shift)
     parts, within = _quarters_of(here[mine], allowed, height, width, columns, level)
     total = np.where(within, total, -1)
     best = total.argmax(axis=1)
@@ -175,12 +198,12 @@ def follow_blocks(
 
 def divide_blocks(
     flags, quarters, point, image, first, allowed, block, low, part, count, scores, begin, some, room, workers, run,
-    height, width, columns, turns, level, spacing, top,
+    height, width, columns, turns, level, spacing, shift,
 ):  # fmt: skip
     """Divide blocks into quarters of 2^level x 2^level, and collect the allowed ones that reach low of their scan."""
     blocks = min(int(count[level + 1]) - begin, some)
     here = block[4 * begin : 4 * (begin + blocks)].reshape(blocks, 4)
-    total = divided(quarters, point, image, first, here, scores, spacing, top)
+    total = divided(quarters, point, image, first, here, scores, spacing, shift)
     parts, within = _quarters_of(here, allowed, height, width, columns, level)
     number, which = np.nonzero(within & (total >= low[here[:, 0] // turns, None]))
     made = np.column_stack([here[number, 0], parts[number, which], total[number, which]])

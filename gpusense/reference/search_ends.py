@@ -4,10 +4,10 @@ import numpy as np
 
 
 def place_ends(
-    flags, end, heading, start, first, image, point, folded, folded_image, begin, items, turns, stride, level,
-    step_level, offset,
+    flags, end, heading, start, first, image, point, folded, bound_image, quarter_image, begin, items, turns, stride,
+    level, step_level, offset,
 ):  # fmt: skip
-    """Place the end points of scans at headings in cells of the tables, and in cells and images of a folded table."""
+    """Place the end points of scans at headings in cells of the tables, and in cells and images of folded tables."""
     period, side = stride << level, stride << (level - step_level)
     for scan in range(begin // turns, items // turns):
         at, last = int(first[scan * turns]), int(first[(scan + 1) * turns])
@@ -19,5 +19,8 @@ def place_ends(
         cells = np.floor(places).astype(np.int32).reshape(-1, 2)
         point[at:last] = cells
         folded[at:last] = (cells + offset) // period
-        phase = (cells + offset - folded[at:last] * period) >> step_level
-        folded_image[at:last] = (image[at:last] * side + phase[:, 1]) * side + phase[:, 0]
+        phase = cells + offset - folded[at:last] * period
+        for images, count, (col, row) in (
+            (bound_image, side, (phase >> step_level).T), (quarter_image, period, phase.T)
+        ):  # fmt: skip
+            images[at:last] = (image[at:last] * count + row) * count + col

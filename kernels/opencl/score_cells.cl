@@ -1,7 +1,7 @@
 // Cells of consecutive tables of scores, each with a margin of cells around the map.
 
 // Columns of a run that a kernel in lanes reads at once; the margin holds one run.
-#define RUN 16
+#define RUN 32
 // Neighbouring rows of shifts that a work-item sums; the margin holds as many.
 #define SHIFT_ROWS 8
 

@@ -43,20 +43,46 @@ kernel void fold_scores(ARGUMENTS) {
     out[(image * lines + line) * stride + col] = (uchar)((TOP - value) / unit);
 }
 
-// Write the losses of the quarters of the block that begins at each cell, as bytes of a number: upper left, upper right,
-// lower left, lower right. They are relative to the largest of the four scores or, with top, to the largest possible score.
-// A quarter has reach rows and columns. One work-item takes a cell.
+// Return the scores of the quarters of the block that begins at a cell: upper left, upper right, lower left, lower right. A
+// quarter has reach rows and columns.
+int4 quarters_at(global const uchar *cells, const ScoreTable scores, const int line, const int col, const int reach) {
+    const int lines = padded_lines(scores), stride = padded_stride(scores);
+    const int low = min(line + reach, lines - 1) * stride, right = min(col + reach, stride - 1);
+    return (int4)(cells[line * stride + col], cells[line * stride + right], cells[low + col], cells[low + right]);
+}
+
+// Return losses of quarters as bytes of a number.
+int packed_losses(const int most, const int4 four) {
+    return (int)((uint)(most - four.x) | (uint)(most - four.y) << 8 | (uint)(most - four.z) << 16 | (uint)(most - four.w) << 24);
+}
+
+// Write the losses of the quarters of the block that begins at each cell, relative to the largest of the four scores. One
+// work-item takes a cell.
 kernel void pack_quarters(ARGUMENTS) {
     const int col = get_global_id(0), line = get_global_id(1), image = get_global_id(2);
     const int lines = padded_lines(scores), stride = padded_stride(scores);
     if (col >= stride || line >= lines || image >= scores.tables) return;
-    global const uchar *cells = table + image * lines * stride;
-    const int low = min(line + reach, lines - 1) * stride, right = min(col + reach, stride - 1);
-    const uint four[4] = {cells[line * stride + col], cells[line * stride + right], cells[low + col], cells[low + right]};
-    const uint most = top ? TOP : max(max(four[0], four[1]), max(four[2], four[3]));
-    uint packed = 0;
-    for (int i = 0; i < 4; ++i) packed |= (most - four[i]) << (8 * i);
-    quarters[(image * lines + line) * stride + col] = (int)packed;
+    const int4 four = quarters_at(table + image * lines * stride, scores, line, col, reach);
+    const int most = max(max(four.x, four.y), max(four.z, four.w));
+    quarters[(image * lines + line) * stride + col] = packed_losses(most, four);
+}
+
+// Write the losses of the quarters of blocks, relative to the blocks' scores in the folded table of bounds, as images of
+// every period-th row and column: one for each of period^2 first cells. One work-item takes a cell of an image.
+kernel void fold_quarters(ARGUMENTS) {
+    const int col = get_global_id(0), line = get_global_id(1), image = get_global_id(2);
+    const int lines = padded_lines(folded), stride = padded_stride(folded);
+    if (col >= stride || line >= lines || image >= folded.tables) return;
+    const int source = image / (period * period), row_phase = image / period % period, col_phase = image % period;
+    const int whole_row = line - folded.margin, whole_col = col - folded.margin, side = period / step;
+    const int from_line = whole_row * period + row_phase, from_col = whole_col * period + col_phase;
+    const int rows = padded_lines(scores), cols = padded_stride(scores);
+    int4 four = (int4)(beyond);
+    if (whole_row >= 0 && whole_col >= 0 && from_line < rows && from_col < cols)
+        four = quarters_at(table + source * rows * cols, scores, from_line, from_col, reach);
+    const int coarse = (source * side + row_phase / step) * side + col_phase / step;
+    const int loss = bound[coarse * padded_lines(bounds) * padded_stride(bounds) + block_index(bounds, whole_row, whole_col, 0, 0)];
+    quarters[(image * lines + line) * stride + col] = packed_losses(TOP - unit * loss, four);
 }
 
 // Return the scores of a block's quarters: score less the losses of points begin to end - 1. Once all are below least, the
@@ -183,27 +209,30 @@ kernel void choose_blocks(ARGUMENTS) {
     if (k >= rows) return;
     const int item = k / height, least = low[item / turns];
     if (best[2 * k] < least) return;
-    for (int col = 0; col < width; ++col) {
+    // A single addition for the whole row.
+    int some = 0;
+    for (int col = 0; col < width; ++col) some += score[k * width + col] >= least;
+    int n = atomic_add(&count[level], some);
+    for (int col = 0; col < width && n < room; ++col) {
         const int value = score[k * width + col];
         if (value < least) continue;
-        const int n = atomic_add(&count[level], 1);
-        if (n >= room) continue;
         block[4 * n] = item;
         block[4 * n + 1] = k % height << level;
         block[4 * n + 2] = col << level;
         block[4 * n + 3] = value;
+        ++n;
     }
 }
 
 // Replace blocks of positions by their best allowed quarters of 2^level x 2^level, the first of equal ones; a block without
-// an allowed quarter has the score -1. One work-item takes a block.
+// an allowed quarter has the score -1. Cells of the quarters are spacing apart for every 2^shift positions. One work-item takes a
+// block.
 kernel void follow_blocks(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= blocks || block[4 * n + 3] < 0) return;
     const int item = block[4 * n], row = block[4 * n + 1], col = block[4 * n + 2], quarter = 1 << level;
-    const int begin = first[item], end = first[item + 1], score = top ? TOP * (end - begin) : block[4 * n + 3];
-    const int4 sums =
-        divided(quarters, point, image, scores, begin, end, spacing * row, spacing * col, score, -1);
+    const int4 sums = divided(quarters, point, image, scores, first[item], first[item + 1], spacing * (row >> shift),
+                              spacing * (col >> shift), block[4 * n + 3], -1);
     const int total[4] = {sums.x, sums.y, sums.z, sums.w};
     int most = -1;
     for (int i = 0; i < 4; ++i) {
@@ -226,9 +255,8 @@ kernel void divide_blocks(ARGUMENTS) {
     for (int n = run * get_global_id(0); n < blocks; n += n % run == run - 1 ? run * (workers - 1) + 1 : 1) {
         global const int *here = block + 4 * (begin + n);
         const int item = here[0], row = here[1], col = here[2], least = low[item / turns];
-        const int score = top ? TOP * (first[item + 1] - first[item]) : here[3];
-        const int4 sums = divided(quarters, point, image, scores, first[item], first[item + 1], spacing * row,
-                                  spacing * col, score, least);
+        const int4 sums = divided(quarters, point, image, scores, first[item], first[item + 1], spacing * (row >> shift),
+                                  spacing * (col >> shift), here[3], least);
         const int total[4] = {sums.x, sums.y, sums.z, sums.w};
         for (int i = 0; i < 4; ++i) {
             const int part_row = row + i / 2 * quarter, part_col = col + i % 2 * quarter;

@@ -12,8 +12,8 @@ int cell_of(const double place) {
     return cell > place ? cell - 1 : cell;
 }
 
-// Place the end points of a scan at a heading in cells of the tables, and in cells and images of a folded table. One
-// work-item takes a point of an item.
+// Place the end points of a scan at a heading in cells of the tables, in cells of folded tables, and in the images of folded
+// bounds and of folded quarters. One work-item takes a point of an item.
 kernel void place_ends(ARGUMENTS) {
     const int n = get_global_id(0), item = begin + get_global_id(1);
     if (item >= items || n >= first[item + 1] - first[item]) return;
@@ -23,8 +23,9 @@ kernel void place_ends(ARGUMENTS) {
     const int2 cell = (int2)(cell_of(start[2 * scan] + across), cell_of(start[2 * scan + 1] + along));
     const int x = cell.x + offset, y = cell.y + offset, period = stride << level;
     const int2 whole = (int2)(periods(x, stride, level), periods(y, stride, level));
-    const int col = (x - whole.x * period) >> step_level, row = (y - whole.y * period) >> step_level;
+    const int col = x - whole.x * period, row = y - whole.y * period;
     point[k] = cell;
     folded[k] = whole;
-    folded_image[k] = (image[k] * side + row) * side + col;
+    bound_image[k] = (image[k] * side + (row >> step_level)) * side + (col >> step_level);
+    quarter_image[k] = (image[k] * period + row) * period + col;
 }

@@ -66,26 +66,65 @@ def fold_scores(table, out, scores, folded, period, step, beyond, unit):
     out[(image * lines + line) * stride + col] = wp.uint8((TOP - value) // unit)
 
 
+@wp.func
+def quarters_at(
+    table: wp.array(dtype=wp.uint8), scores: ScoreTable, image: wp.int32, line: wp.int32, col: wp.int32, reach: wp.int32
+):  # fmt: skip
+    """Return the scores of the quarters of the block that begins at a cell: upper left, upper right, lower left, lower
+    right. A quarter has reach rows and columns.
+    """
+    lines = padded_lines(scores)
+    stride = padded_stride(scores)
+    here = (image * lines + line) * stride
+    low = (image * lines + wp.min(line + reach, lines - 1)) * stride
+    right = wp.min(col + reach, stride - 1)
+    return wp.vec4i(int(table[here + col]), int(table[here + right]), int(table[low + col]), int(table[low + right]))
+
+
+@wp.func
+def packed_losses(most: wp.int32, four: wp.vec4i):
+    """Return losses of quarters as bytes of a number."""
+    packed = int(0)
+    for i in range(4):
+        packed = packed | ((most - four[i]) << (8 * i))
+    return packed
+
+
 @kernel
-def pack_quarters(table, quarters, scores, reach, top):
-    """Write the losses of the quarters of the block that begins at each cell, as bytes of a number."""
+def pack_quarters(table, quarters, scores, reach):
+    """Write the losses of the quarters of the block that begins at each cell, relative to the largest score."""
     image, line, col = wp.tid()
     lines = padded_lines(scores)
     stride = padded_stride(scores)
     if col >= stride or line >= lines or image >= scores.tables:
         return
-    begin = image * lines * stride
-    low = begin + wp.min(line + reach, lines - 1) * stride
-    right = wp.min(col + reach, stride - 1)
-    here = begin + line * stride
-    four = wp.vec4i(int(table[here + col]), int(table[here + right]), int(table[low + col]), int(table[low + right]))
-    most = wp.max(four)
-    if top != 0:
-        most = int(TOP)
-    packed = int(0)
-    for i in range(4):
-        packed = packed | ((most - four[i]) << (8 * i))
-    quarters[here + col] = packed
+    four = quarters_at(table, scores, image, line, col, reach)
+    quarters[(image * lines + line) * stride + col] = packed_losses(wp.max(four), four)
+
+
+@kernel
+def fold_quarters(table, bound, quarters, scores, bounds, folded, period, step, reach, beyond, unit):
+    """Write the losses of the quarters of blocks as images, relative to the scores in the folded table of bounds."""
+    image, line, col = wp.tid()
+    lines = padded_lines(folded)
+    stride = padded_stride(folded)
+    if col >= stride or line >= lines or image >= folded.tables:
+        return
+    source = image // (period * period)
+    row_phase = image // period % period
+    col_phase = image % period
+    whole_row = line - folded.margin
+    whole_col = col - folded.margin
+    side = period // step
+    from_line = whole_row * period + row_phase
+    from_col = whole_col * period + col_phase
+    four = wp.vec4i(beyond, beyond, beyond, beyond)
+    if whole_row >= 0 and whole_col >= 0 and from_line < padded_lines(scores) and from_col < padded_stride(scores):
+        four = quarters_at(table, scores, source, from_line, from_col, reach)
+    coarse = (source * side + row_phase // step) * side + col_phase // step
+    begin = coarse * padded_lines(bounds) * padded_stride(bounds)
+    loss = int(bound[begin + block_index(bounds, whole_row, whole_col, 0, 0)])
+    quarters[(image * lines + line) * stride + col] = packed_losses(TOP - unit * loss, four)
 
 
 @wp.func
@@ -250,20 +289,25 @@ def choose_blocks(score, best, low, block, count, rows, height, width, turns, le
     least = low[item // turns]
     if best[2 * k] < least:
         return
+    # A single addition for the whole row.
+    some = int(0)
+    for col in range(width):
+        if score[k * width + col] >= least:
+            some = some + 1
+    n = wp.atomic_add(count, level, some)
     for col in range(width):
         value = score[k * width + col]
-        if value >= least:
-            n = wp.atomic_add(count, level, 1)
-            if n < room:
-                block[4 * n] = item
-                block[4 * n + 1] = (k % height) << level
-                block[4 * n + 2] = col << level
-                block[4 * n + 3] = value
+        if value >= least and n < room:
+            block[4 * n] = item
+            block[4 * n + 1] = (k % height) << level
+            block[4 * n + 2] = col << level
+            block[4 * n + 3] = value
+            n = n + 1
 
 
 @kernel
 def follow_blocks(
-    quarters, point, image, first, allowed, block, scores, blocks, height, width, columns, level, spacing, top
+    quarters, point, image, first, allowed, block, scores, blocks, height, width, columns, level, spacing, shift
 ):  # fmt: skip
     """Replace blocks of positions by their best allowed quarters of 2^level x 2^level, the first of equal ones."""
     n = wp.tid()
@@ -275,11 +319,10 @@ def follow_blocks(
     item = block[4 * n]
     row = block[4 * n + 1]
     col = block[4 * n + 2]
-    begin = first[item]
-    end = first[item + 1]
-    if top != 0:
-        score = TOP * (end - begin)
-    total = divided(quarters, point, image, scores, begin, end, spacing * row, spacing * col, score, -1)
+    total = divided(
+        quarters, point, image, scores, first[item], first[item + 1], spacing * (row >> shift), spacing * (col >> shift),
+        score, -1,
+    )  # fmt: skip
     most = int(-1)
     for i in range(4):
         part_row = row + ((i // 2) << level)
@@ -295,7 +338,7 @@ def follow_blocks(
 @kernel
 def divide_blocks(
     quarters, point, image, first, allowed, block, low, part, count, scores, begin, some, room, workers, run, height,
-    width, columns, turns, level, spacing, top,
+    width, columns, turns, level, spacing, shift,
 ):  # fmt: skip
     """Divide count[level + 1] blocks of positions, but at most some from begin on, into quarters of 2^level x 2^level,
     and collect the allowed ones whose scores are at least low of their scan, in no certain order. count[level], which
@@ -310,12 +353,10 @@ def divide_blocks(
         row = block[here + 1]
         col = block[here + 2]
         least = low[item // turns]
-        score = block[here + 3]
-        if top != 0:
-            score = TOP * (first[item + 1] - first[item])
         total = divided(
-            quarters, point, image, scores, first[item], first[item + 1], spacing * row, spacing * col, score, least
-        )
+            quarters, point, image, scores, first[item], first[item + 1], spacing * (row >> shift),
+            spacing * (col >> shift), block[here + 3], least,
+        )  # fmt: skip
         for i in range(4):
             part_row = row + ((i // 2) << level)
             part_col = col + ((i % 2) << level)

@@ -17,10 +17,10 @@ def periods(cell: wp.int32, stride: wp.int32, level: wp.int32):
 
 @kernel
 def place_ends(
-    end, heading, start, first, image, point, folded, folded_image, begin, items, turns, stride, level, step_level,
-    offset,
+    end, heading, start, first, image, point, folded, bound_image, quarter_image, begin, items, turns, stride, level,
+    step_level, offset,
 ):  # fmt: skip
-    """Place the end points of a scan at a heading in cells of the tables, and in cells and images of a folded table."""
+    """Place the end points of a scan at a heading in cells of tables, and in cells and images of folded tables."""
     part, n = wp.tid()
     item = begin + part
     if item >= items:
@@ -40,8 +40,9 @@ def place_ends(
     x = cell.x + offset
     y = cell.y + offset
     whole = wp.vec2i(periods(x, stride, level), periods(y, stride, level))
-    col = (x - whole.x * period) >> step_level
-    row = (y - whole.y * period) >> step_level
+    col = x - whole.x * period
+    row = y - whole.y * period
     point[k] = cell
     folded[k] = whole
-    folded_image[k] = (image[k] * side + row) * side + col
+    bound_image[k] = (image[k] * side + (row >> step_level)) * side + (col >> step_level)
+    quarter_image[k] = (image[k] * period + row) * period + col

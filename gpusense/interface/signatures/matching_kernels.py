@@ -14,9 +14,15 @@ from gpusense.interface.signatures.rows import PLACED, WINDOW, Kernel, kernel
 
 # Points of all scans, sorted by bearing in each scan: x, y [m], bearing in [0, 2 pi), range [m].
 _POINTS = ("real4 point [points]", "int start [scans + 1]")
+
+
+def _size(table: str) -> str:
+    """Return the number of cells of tables with their margins."""
+    return f"{table}.tables * ({table}.rows + 2 * {table}.margin) * ({table}.cols + 2 * {table}.margin)"
+
+
 # Tables of scores, the losses of quarters of blocks, and the end points of scans that read them.
-_CELLS = "uchar table [scores.tables * (scores.rows + 2 * scores.margin) * (scores.cols + 2 * scores.margin)]"
-_QUARTERS = "int quarters [scores.tables * (scores.rows + 2 * scores.margin) * (scores.cols + 2 * scores.margin)]"
+_CELLS, _QUARTERS = f"uchar table [{_size('scores')}]", f"int quarters [{_size('scores')}]"
 _ENDS = ("int2 point [points]", "int image [points]", "int first [items + 1]")
 _NOISY = (*_POINTS, "real noise [scans]")
 # Parts of scans: first point and number of points.
@@ -64,27 +70,32 @@ KERNELS: dict[str, Kernel] = {
     ),
     "pool_scores": kernel(
         "search", "col line image", _CELLS,
-        "out uchar pooled [scores.tables * (scores.rows + 2 * scores.margin) * (scores.cols + 2 * scores.margin)]",
+        f"out uchar pooled [{_size('scores')}]",
         "ScoreTable scores", "int reach",
     ),
     "fold_scores": kernel(
         "search", "col line image", _CELLS,
-        "out uchar out [folded.tables * (folded.rows + 2 * folded.margin) * (folded.cols + 2 * folded.margin)]",
+        f"out uchar out [{_size('folded')}]",
         "ScoreTable scores", "ScoreTable folded", "int period", "int step", "int beyond", "int unit",
     ),
     "pack_quarters": kernel(
-        "search", "col line image", _CELLS, f"out {_QUARTERS}", "ScoreTable scores", "int reach", "int top",
+        "search", "col line image", _CELLS, f"out {_QUARTERS}", "ScoreTable scores", "int reach",
+    ),
+    "fold_quarters": kernel(
+        "search", "col line image", _CELLS, f"uchar bound [{_size('bounds')}]", f"out int quarters [{_size('folded')}]",
+        "ScoreTable scores", "ScoreTable bounds", "ScoreTable folded", "int period", "int step", "int reach",
+        "int beyond", "int unit",
     ),
     "place_ends": kernel(
         "search_ends", "point item", "double end [2 * ends]", "double heading [2 * items]", "double start [2 * scans]",
         "int first [items + 1]", "int image [points]", "out int2 point [points]", "out int2 folded [points]",
-        "out int folded_image [points]", "int begin", "int items", "int turns", "int stride", "int level",
-        "int step_level", "int offset",
+        "out int bound_image [points]", "out int quarter_image [points]", "int begin", "int items", "int turns",
+        "int stride", "int level", "int step_level", "int offset",
     ),
     "shift_scores": kernel(
         "search", "col rows item", _CELLS, *_ENDS, "uchar allowed [height * width]",
         "out int score [items * height * width]", "ScoreTable scores", "int begin", "int items", "int height",
-        "int width", "int unit", in_lanes=True,
+        "int width", "int unit",
     ),
     "row_maxima": kernel(
         "search", "row", "int score [rows * width]", "out int best [2 * rows]", "out int histogram [bins]",
@@ -110,13 +121,13 @@ KERNELS: dict[str, Kernel] = {
     "follow_blocks": kernel(
         "search", "block", _QUARTERS, *_ENDS, "uchar allowed [rows * columns]", "out int block [4 * blocks]",
         "ScoreTable scores", "int blocks", "int height", "int width", "int columns", "int level", "int spacing",
-        "int top",
+        "int shift",
     ),
     "divide_blocks": kernel(
         "search", "worker", _QUARTERS, *_ENDS, "uchar allowed [rows * columns]", "int block [4 * (begin + some)]",
         "int low [scans]", "out int part [4 * room]", "out int count [levels]", "ScoreTable scores", "int begin",
         "int some", "int room", "int workers", "int run", "int height", "int width", "int columns", "int turns",
-        "int level", "int spacing", "int top",
+        "int level", "int spacing", "int shift",
     ),
     "split_scans": kernel(
         "segments", "scan", *_NOISY, "out real cost [points]", "out int stop [points]", "int scans", "int points",

@@ -320,8 +320,8 @@ def follow_blocks(
     row = block[4 * n + 1]
     col = block[4 * n + 2]
     total = divided(
-        quarters, point, image, scores, first[item], first[item + 1], spacing * (row >> shift), spacing * (col >> shift),
-        score, -1,
+        quarters, point, image, scores, first[item], first[item + 1], spacing * (row >> shift),
+        spacing * (col >> shift), score, -1,
     )  # fmt: skip
     most = int(-1)
     for i in range(4):

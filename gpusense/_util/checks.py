@@ -227,10 +227,7 @@ def check_gradients(array: object, name: str, error: Exception) -> None:
 
 
 def nested(name: str, value: object, *, deepest: int, most: int) -> int:
-    """Count the values in nested mappings, lists and tuples, with repetitions.
-
-    Keys of mappings are values. A string counts once more for every 64 characters.
-    """
+    """Count the values in nested mappings (with keys), lists and tuples, and every 64 characters of strings."""
     count = 0
     inner: list[Iterator[Any]] = [iter([value])]
     while inner:
@@ -312,10 +309,7 @@ def is_masked(value: object) -> bool:
 
 
 def filled(value: Any) -> Any:
-    """Return a masked array, or nested lists that contain one, as an array with NaN where masked.
-
-    Masked integers and booleans become float64. Other values are returned unchanged.
-    """
+    """Return a masked array, or nested lists that contain one, as floats with NaN where masked; else the value."""
     if not is_masked(value):
         return value
     data, mask = _parts(value)

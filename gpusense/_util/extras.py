@@ -43,10 +43,7 @@ class MissingLibraryError(ImportError):
 
 
 def library(module: str, purpose: str) -> ModuleType:
-    """Import a module such as ``"pyarrow.parquet"`` of a library in ``REQUIREMENTS``, or raise MissingLibraryError.
-
-    ``purpose`` is the subject of the message, such as ``"a Parquet table"``.
-    """
+    """Import a module such as ``"pyarrow.parquet"`` for a purpose, or raise MissingLibraryError."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

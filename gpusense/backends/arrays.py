@@ -77,10 +77,7 @@ def _adopt(array: Any, backend: Backend, name: str, *, in_place: bool = False) -
 
 
 def host_poses(array: object, name: str, scans: int | None = None, *, single: bool = False) -> np.ndarray:
-    """Return (N, 3) poses in host memory, or the poses of S scans in sequence: C-contiguous float64 numbers.
-
-    ``scans``: S; None without scans; ``single``: whether (N, 3) poses in float32 remain float32 numbers.
-    """
+    """Return (N, 3) host poses, or those of S scans in sequence, as C-contiguous float64; ``single`` keeps float32."""
     read = array if type(array) is np.ndarray else to_host(array, name)
     shape = ("N", 3) if scans is None else (scans, "N", 3)
     if scans is None and isinstance(read, np.ndarray) and read.dtype.kind == "f" and read.shape[1:] == (3,):
@@ -136,11 +133,7 @@ def _bounds_of_many(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def adopt_poses(
     array: object, backend: Backend, name: str, scans: int | None = None, *, in_place: bool = False
 ) -> tuple[Buffer, int, bool, object]:
-    """Return (N, 3) poses on the device, or (S, N, 3) poses of S scans.
-
-    Returns:
-        A flat buffer, the number of all poses, whether they are float32, and the owner of the memory.
-    """
+    """Return device poses as a flat buffer, their number, whether they are float32, and the owner of the memory."""
     adopted = _adopt(array, backend, name, in_place=in_place)
     if not backend.info.float64:
         raise TypeError(f"{name}: must be in host memory on {backend.info.name}, which has no float64 to place them")
@@ -245,13 +238,9 @@ def _check_result(
 
 
 class Result:
-    """The memory of a result: the array ``out=``, or new memory where the poses are.
+    """The memory of a result: the array ``out=``, or new memory where the poses are, of their library.
 
-    ``poses``: the poses as the user passed them, which determine the library of the result; ``out``: the array for the
-    result as the user passed it, or None; ``on_device``: True if the poses are on it.
-
-    Attributes:
-        flat: A flat NumPy array, or a buffer on the device.
+    ``flat``: a flat NumPy array, or a buffer on the device.
     """
 
     def __init__(

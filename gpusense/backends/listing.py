@@ -274,13 +274,10 @@ class FallbackOrder:
 
 
 def best_of(candidates: list[Device], failures: list[Failure] | None = None) -> Device | None:
-    """Return the usable device of the fastest class; among several, the device that scores scans fastest.
+    """Return the usable device of the fastest class; among several, the device that scored scans fastest in its proof.
 
-    The rates were measured with the proofs. A device that is faster by less than ``NOTICED`` is not chosen, so that
-    runs do not change between devices.
-
-    ``candidates``: the devices; unusable ones are removed if ``failures`` is passed; ``failures``: receives the devices
-    that are not usable.
+    A device that is faster by less than ``NOTICED`` is not chosen, so that runs do not change between devices. Unusable
+    candidates are removed, and reported to ``failures`` if that is passed.
     """
     for row in SPEED_CLASSES:
         best, most = None, 0.0

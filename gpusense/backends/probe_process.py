@@ -94,10 +94,9 @@ def run(job: dict[str, Any]) -> Outcome:
 
 
 def run_text(arguments: list[str], job: dict[str, Any], variables: dict[str, str] | None = None) -> Outcome:
-    """Run the interpreter in a child.
+    """Run the interpreter in a child with a job on standard input, one line of JSON with a ``token``.
 
-    ``job``: the program reads it from standard input, as one line of JSON. Its last report must be ``{"done": token}``
-    with the ``token`` that is added to the job.
+    The child's last report must be ``{"done": token}``.
     """
     import secrets
 
@@ -133,10 +132,9 @@ def run_text(arguments: list[str], job: dict[str, Any], variables: dict[str, str
 
 
 def _await(process: subprocess.Popen[bytes], text: bytes, limit: float) -> bool:
-    """Wait for the end of a child, at most a limit of seconds in which it does not wait for a processor.
+    """Wait for the end of a child, at most ``limit`` seconds in which it does not wait for a processor.
 
-    Returns:
-        True if it was ended before it had its limit: a machine that busy gives no verdict on the driver.
+    Return True if it was ended before: a machine that busy gives no verdict on the driver.
     """
     begun, wait, unsent, left = time.monotonic(), limit, text, 0.0
     while wait > 0:

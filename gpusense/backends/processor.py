@@ -130,29 +130,18 @@ class Slot(ABC):
 
 
 class Staging:
-    """Slots of a device, which serve one copy at a time.
-
-    ``make``: allocates the slots, given their number and bytes, when they are needed first.
-    """
+    """Slots of a device, which serve one copy at a time; ``make`` allocates them when they are needed first."""
 
     def __init__(self, make: Callable[[int, int], Sequence[Slot]]) -> None:
         self._make, self._slots = make, list[Slot]()
         self._lock = threading.Lock()
 
     def upload(self, array: np.ndarray, buffer: Any) -> bool:
-        """Copy a C-contiguous array to the head of a buffer; the array may change afterwards.
-
-        Returns:
-            False if a plain copy is faster; nothing was copied then.
-        """
+        """Copy an array, which may change afterwards, to a buffer; return False if a plain copy is faster."""
         return self._run(array, buffer, _send)
 
     def download(self, buffer: Any, out: np.ndarray) -> bool:
-        """Copy the head of a buffer into a C-contiguous array, full on return.
-
-        Returns:
-            False if a plain copy is faster; nothing was copied then.
-        """
+        """Copy the head of a buffer into an array, full on return; return False if a plain copy is faster."""
         return self._run(out, buffer, _receive)
 
     def _run(self, array: np.ndarray, buffer: Any, copy: Callable[..., None]) -> bool:

@@ -78,11 +78,7 @@ def unusable(reason: str, *, passing: bool = False) -> DeviceCheck:
 
 
 def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> DeviceCheck:
-    """Return the verdict on a device: the cached verdict; without one, or with ``anew``, a child's.
-
-    ``setup``: the preparation of the child; see ``library.Library.child_setup``. ``anew``: True if the cached verdict
-    is dropped.
-    """
+    """Return the cached verdict on a device; without one, or with ``anew``, a child's (prepared by ``setup``)."""
     if probe_process.is_off():
         return trust(info)
     key, obstacle = _key(info), probe_process.obstacle()
@@ -116,10 +112,7 @@ def awaits_child(info: BackendInfo) -> bool:
 
 
 def _hangs_first(key: str, verdict: DeviceCheck) -> bool:
-    """Return whether a device hangs for the first time, and note it.
-
-    A busy machine may be the reason, so the next process proves the device once more.
-    """
+    """Return whether a device hangs for the first time, perhaps on a busy machine; the next process tries once more."""
     if not _HANGS.search(verdict.reason) or load_entry(key + _HUNG) is not None:
         return False
     store_entry(key + _HUNG, b"once")
@@ -171,11 +164,7 @@ def _load(key: str) -> DeviceCheck | None:
 
 
 def _prove(info: BackendInfo, setup: Any) -> tuple[DeviceCheck, bool]:
-    """Prove families of kernels in children until each is proved or dropped.
-
-    Returns:
-        The verdict, and whether it is to be kept.
-    """
+    """Prove families of kernels in children until each is proved or dropped; return verdict, and whether to keep it."""
     failures: list[str] = []
     conclusive = True
     while True:

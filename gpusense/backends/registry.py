@@ -168,10 +168,7 @@ class Library(ABC):
         return []
 
     def no_device(self, install: str) -> str:
-        """Return why there is no device, with the remedy.
-
-        ``install``: the command that installs what is absent; empty where all is installed.
-        """
+        """Return why there is no device, with the remedy: the command that installs what is absent, if any."""
         return f"no driver offers a device: {install or 'install or update the driver of its vendor'}"
 
     def is_simulator(self, info: BackendInfo) -> bool:

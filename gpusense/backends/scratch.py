@@ -35,10 +35,7 @@ _STALE = 600
 
 
 def scratch_folder(*, executable: bool = True) -> Path:
-    """Return this process's folder.
-
-    ``executable``: whether the system must allow code from there to run; some drivers only read the files.
-    """
+    """Return this process's folder; ``executable``: whether code from there must be allowed to run."""
     if not executable:
         with contextlib.suppress(OSError):
             return _scratch(True)
@@ -229,12 +226,7 @@ def temporary_place() -> Place | None:
 
 
 def own_folder(place: Path) -> Path:
-    """Return gpusense's folder in a place; make it where it is absent.
-
-    Raises:
-        UnsafeFolderError: Another user could change it, or it holds files and no marker.
-        OSError: It cannot be made.
-    """
+    """Return gpusense's folder in a place, made if absent; UnsafeFolderError if others could change it or have it."""
     folder = Path(os.path.realpath(place)) / OWN
     key = str(folder), _user()
     if key not in _checked or not os.path.lexists(folder / MARKER):
@@ -245,12 +237,7 @@ def own_folder(place: Path) -> Path:
 
 
 def private_folder(place: Path) -> Path:
-    """Return a folder of this user alone, made where it is absent.
-
-    Raises:
-        UnsafeFolderError: Another user could change it.
-        OSError: It cannot be made.
-    """
+    """Return a folder of this user alone, made if absent; UnsafeFolderError if another user could change it."""
     folder = Path(os.path.realpath(place.parent)) / place.name
     make_private(folder)
     return folder

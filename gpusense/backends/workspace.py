@@ -23,11 +23,7 @@ POSE_STATUS = ("pose_status", np.dtype(np.int32))
 
 
 class ChangingProgram:
-    """A program without the arguments that change from call to call.
-
-    Attributes:
-        flags: Flags of its launches.
-    """
+    """A program without the arguments that change from call to call; ``flags``: flags of its launches."""
 
     def __init__(self, backend: Backend, program: Program, changing: Iterable[str]) -> None:
         names = frozenset(changing)
@@ -49,11 +45,7 @@ class ChangingProgram:
 
 
 class PartialResult:
-    """``count`` numbers of a flat or external array.
-
-    Attributes:
-        buffer: The buffer in which launches write them.
-    """
+    """``count`` numbers of a flat or external array; ``buffer``: where launches write them."""
 
     def __init__(
         self, space: Workspace, name: str, target: np.ndarray | Buffer, first: int, count: int, dtype: np.dtype
@@ -140,14 +132,11 @@ class Workspace:
     def run(
         self, key: Hashable, changing: dict[str, Any], make: Callable[[], Program], *, version: int
     ) -> frozenset[str]:
-        """Run a program on this workspace's buffers; programs of earlier calls are kept, and repeated where they fit.
+        """Run a program on this workspace's buffers, kept or made, and return the flags of its launches.
 
-        ``key``: all sizes and flags on which the program depends, and all numbers that seldom change; ``changing``:
-        arguments that change from call to call, by name: numbers, and buffers of other owners; ``make``: function that
-        returns the program; ``version``: the version of the map's table; programs of other versions are dropped.
-
-        Returns:
-            The flags of its launches.
+        ``key``: all sizes and flags on which it depends, and all numbers that seldom change; ``changing``: other
+        arguments by name: numbers, and buffers of other owners; ``version``: of the map's table; programs of other
+        versions are dropped.
         """
         backend = self.backend
         records = backend.info.graphs and backend.in_batch
@@ -213,10 +202,7 @@ class Workspace:
         return self.backend.upload(array, buffer, wait=False)
 
     def hold(self, name: str, key: Hashable, make: Callable[[], np.ndarray]) -> Buffer:
-        """Return a buffer with an array that ``make`` returns; it is copied unless the last one had an equal key.
-
-        Buffers of this name must not be used otherwise.
-        """
+        """Return a buffer for this use with the array of ``make``, copied unless the last one had an equal key."""
         held = self._held.get(name)
         if held is not None and held[0] == key:
             return held[1]
@@ -318,12 +304,7 @@ class ProgramCache(Generic[T]):
 
 
 class RecordedProgram:
-    """The recording of a program.
-
-    Attributes:
-        flags: Flags of its launches.
-        recording: The recording.
-    """
+    """The recording of a program, and the flags of its launches."""
 
     def __init__(self, backend: Backend, program: Program, owners: object = None) -> None:
         self.flags, self.recording = flags_of(program), backend.record(program)

@@ -70,8 +70,5 @@ FLAGS = {
 
 @functools.lru_cache(maxsize=1024)
 def flags_if(**conditions: Hashable) -> frozenset[str]:
-    """Return the flags whose conditions hold: ``flags_if(HIT=z_hit > 0, RAND=z_rand > 0)``.
-
-    Calls of models repeat the conditions of earlier ones.
-    """
+    """Return the flags whose conditions hold: ``flags_if(HIT=z_hit > 0, RAND=z_rand > 0)``."""
     return frozenset([flag for flag, holds in conditions.items() if holds])

@@ -32,10 +32,7 @@ def kernel_root() -> Path:
 
 @functools.cache
 def opencl_source(name: str) -> str:
-    """Return the text of ``opencl/<name>.cl``; each file is read once.
-
-    ``name``: the file's name with its subfolder and without its suffix: ``"beam"``, ``"lanes/beam"``.
-    """
+    """Return the text of ``opencl/<name>.cl``, such as ``"lanes/beam"``; each file is read once."""
     folder = kernel_root() / "opencl"
     try:
         return (folder / f"{name}.cl").read_text(encoding="utf-8")

@@ -37,10 +37,7 @@ _TEAMS = (frozenset({"IN_TEAMS"}), frozenset({"IN_TEAMS", "SMALL_TEAMS"}))
 def with_lanes_flag(
     lanes: int, kernel: str, flags: frozenset[str] | set[str], *, float64: bool = True
 ) -> frozenset[str]:
-    """Return the flags of a launch, with IN_LANES where device and kernel compute in lanes.
-
-    ``float64``: True if the device has float64, which some bodies in lanes need.
-    """
+    """Return the flags of a launch, with IN_LANES where device and kernel compute in lanes, some with float64."""
     return _flagged(lanes, kernel, frozenset(flags), float64)
 
 
@@ -56,10 +53,7 @@ def _flagged(lanes: int, kernel: str, flags: frozenset[str], float64: bool) -> f
 
 
 def with_loops_flag(vector_loops: bool, kernel: str, flags: frozenset[str]) -> frozenset[str]:
-    """Return the flags of a launch, with IN_LANES where the compiler makes vectors of the kernel's loops over readings.
-
-    ``vector_loops``: as in ``BackendInfo``.
-    """
+    """Return the flags of a launch, with IN_LANES where the compiler makes vectors of loops over readings."""
     if not vector_loops or flags & _NO_LOOPS[kernel] or not _IN_LOOPS[kernel] <= flags:
         return flags
     return flags | {"IN_LANES"}
@@ -71,8 +65,6 @@ def with_teams_flags(
     """Return the flags of a launch, including flags of teams on a GPU, and the work-items of an item.
 
     A team is the smallest with a work-item for every two points, or the largest that the device holds.
-
-    ``largest_group``: ``Backend.largest_group`` of the device.
     """
     if kind != "gpu":
         return flags, 1
@@ -125,10 +117,7 @@ def takes_scalar_text(text: str) -> bool:
 
 
 def written_in_lanes(text: str, file: str, sources: dict[str, str]) -> str:
-    """Return a file's text with the functions that it takes from scalar files.
-
-    ``sources``: texts of the scalar file and of the required ones, by name, likewise.
-    """
+    """Return a file's text with the functions that it takes from scalar ``sources``, the texts of files by name."""
     if not takes_scalar_text(text):
         return text
     known = {name for each in (*sources.values(), text) for name in _names_in_lanes(each)}

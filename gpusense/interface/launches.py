@@ -50,11 +50,7 @@ Program = tuple[Launch, ...]
 
 
 def launch(kernel: str, flags: Iterable[str], size: tuple[int, ...], /, **arguments: Any) -> Launch:
-    """Bind the arguments of a kernel by name.
-
-    ``arguments``: arguments of the row, each a buffer, an integer, a real number or a struct. Those that the code of
-    the flags does not take are dropped.
-    """
+    """Bind the arguments of a kernel by name; those that the code of the flags does not take are dropped."""
     flags = frozenset(flags)
     row = _row(kernel, flags)
     try:

@@ -98,10 +98,7 @@ def share(part: float, whole: float) -> str:
 
 
 def component_notes(components: Iterable[tuple[str, float, str]]) -> tuple[list[Omission], list[Note]]:
-    """Return the components of a mixture that are left out (weight 0), and those that are kept.
-
-    ``components``: (name of the weight, its value, cost of the component per particle-beam).
-    """
+    """Return the omitted components of a mixture (weight 0), and the kept ones, from (weight's name, value, cost)."""
     omissions, kept = [], []
     for name, weight, cost in components:
         if weight:
@@ -123,8 +120,7 @@ def precision_notes(precision: str) -> tuple[list[Note], list[Note]]:
 def launch_omissions(code: frozenset[str], least_ordered: tuple[int, int] | None = None) -> list[Omission]:
     """Return the parts that the cloud of the last call makes unnecessary; none before the first call.
 
-    ``code``: the flags of the last call; ``least_ordered``: least numbers of rays and particles from which a beam model
-    orders particles; None for devices and models that never do.
+    ``least_ordered``: rays and particles from which a beam model orders particles; None if it never does.
     """
     omissions = [ORDINARY_HEADINGS] if code and "HUGE_HEADINGS" not in code else []
     if code and "WORLDS" not in code:

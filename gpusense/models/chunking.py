@@ -38,15 +38,9 @@ def chunk_of(backend: Backend, beams: int, itemsize: float = 0) -> int:
 
 
 class Piece:
-    """Particles scored by one program, among the S N particles of S scans in sequence.
+    """Particles ``begin`` to ``end`` - 1 that one program scores, among the S N particles of S scans; ``per_scan``: N.
 
-    Attributes:
-        begin: The first of them.
-        end: The one after the last.
-        per_scan: N, the particles of each scan.
-        count: Their number.
-        part: ``begin`` and ``end``.
-        scans: The first scan and the one after the last.
+    ``part``: (begin, end); ``scans``: the first scan and the one after the last.
     """
 
     __slots__ = ("begin", "count", "end", "part", "per_scan", "scans")
@@ -58,14 +52,10 @@ class Piece:
 
 
 def run_pieces(space: Workspace, whole: Piece, most: int, score: Callable[[Piece], None]) -> None:
-    """Score particles in pieces; a piece that does not fit into memory is retried with half the particles.
-
-    ``space``: holds the buffers, freed before a second try; ``most``: most particles of a piece; a piece of several
-    scans holds whole scans.
+    """Score particles in pieces of at most ``most``, whole scans where there are several; halve pieces that do not fit.
 
     Raises:
-        MemoryError: The smallest piece does not fit, or the map's table does not; the table is tried only once. The
-            owner of the workspace still works for smaller calls.
+        MemoryError: The smallest piece does not fit, or the map's table (tried once); smaller calls still work.
     """
     begin, piece = whole.begin, whole
     while begin < whole.end:
@@ -108,10 +98,7 @@ def finish(space: Workspace, on_device: bool, name: str = "poses") -> None:
 
 
 def finish_all(spaces: Sequence[tuple[Workspace, bool]], name: str = "poses") -> None:
-    """Wait for a call that used one workspace or several of a device to end.
-
-    ``spaces``: each workspace, and whether it had device poses.
-    """
+    """Wait for a call to end; ``spaces``: its workspaces, each with whether it had device poses."""
     flag, dtype = POSE_STATUS
     states = [np.zeros(2, dtype) for _ in spaces]
     for (space, on_device), state in zip(spaces, states, strict=True):

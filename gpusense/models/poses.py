@@ -40,11 +40,10 @@ Part = tuple[int, int]
 
 
 class Poses:
-    """(N, 3) poses of a request.
+    """(N, 3) poses of a request, or (S, N, 3) with ``scans``.
 
-    ``poses``: numbers, or an array on the device; ``scans``: None, or S of (S, N, 3) poses of S scans, one after the
-    other; ``in_place``: an array on the device must be used without a copy, now and later; ``late``: a GPU may bound
-    parts of many host poses, and so reveal values that are not finite, when their corners are asked for first.
+    ``in_place``: an array on the device must be used without a copy, now and later; ``late``: a GPU may bound many host
+    poses when their corners are asked for first.
     """
 
     # Corners of the box of poses on the device, if their owner knows them; they affect only the table.
@@ -83,8 +82,7 @@ class Poses:
     def corners(self, part: Part, backend: Backend, space: Workspace | None = None) -> Corners | None:
         """Return four corners of the box of some poses, at 0 for no poses; None on the device.
 
-        ``part``: the first of them and the one after the last; ``backend``: the device, which bounds them where they
-        are many; ``space``: holds them there; None where no launch follows.
+        ``space``: holds many poses on the device, which bounds them; None where no launch follows.
         """
         if self.host is None:
             return None
@@ -274,9 +272,8 @@ def place(
 ) -> PlacedPoses:  # fmt: skip
     """Upload some poses, and describe their placement in the frame of a window.
 
-    ``part``: the first of them and the one after the last; ``corners``: corners of their box, if the caller has them;
-    ``careful``: True if low parts are needed; ``sees``: True if they cast rays, which need the sights of poses in
-    worlds with shapes.
+    ``careful``: whether low parts are needed; ``sees``: whether they cast rays, which need sights in worlds with
+    shapes.
     """
     count, corners = part[1] - part[0], corners or poses.corners(part, backend, space)
     flags = poses.flags(corners)
@@ -320,11 +317,7 @@ def bounds_poses(backend: Backend) -> bool:
 
 
 def bounds_on_device(backend: Backend, space: Workspace, poses: Buffer, count: int, *, single: bool = False) -> Bounds:
-    """Return the least and the largest x, y and theta of poses, NaN for a column with NaN.
-
-    ``poses``: ``count`` poses on the device; ``count``: their number, not 0; ``single``: True if they are float32
-    numbers, not float64.
-    """
+    """Return the least and the largest x, y and theta of ``count`` poses, not 0; NaN for a column with NaN."""
     program: Program = ()
     flags = flags_if(POSES_FLOAT32=single)
     number, numbers, apart = poses, 3 * count, 0

@@ -84,17 +84,7 @@ class Caster(ABC):
         """Make the table of a window on a device."""
 
     def refresh(self, backend: Backend, inputs: CasterInput, table: Buffer, changed: Window) -> bool:
-        """Update ``table`` in place after obstacles changed.
-
-        Args:
-            backend: The device.
-            inputs: The window after the change.
-            table: Its table before the change.
-            changed: Part of the window with all changed obstacles.
-
-        Returns:
-            False if the caster must make its table again.
-        """
+        """Update the table in place after obstacles in ``changed`` changed; return False if it must be made again."""
         return False
 
     def struct(self) -> structs.Caster:

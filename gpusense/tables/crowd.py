@@ -82,10 +82,7 @@ NO_CROWD = Crowd(0, 0, 0, 0, 0.0)
 
 
 class CrowdTable:
-    """The shapes of all worlds on a device, in the cells of their grids, in a precision each.
-
-    ``frames``: frames of the worlds; see the kernel file ``worlds``; ``resolution``: side of a cell [m].
-    """
+    """The shapes of all worlds on a device, in the cells of their grids, in a precision each."""
 
     def __init__(self, backend: Backend, frames: Buffer, resolution: float, worlds: int) -> None:
         self._backend, self._frames, self._resolution, self._worlds = backend, frames, resolution, worlds

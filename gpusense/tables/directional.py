@@ -12,13 +12,10 @@ _LIMIT = (1 << 31) - 1
 
 
 def directional_table(obstacles: np.ndarray, bins: int, *, pruned: bool, outside: bool) -> np.ndarray:
-    """Build the table: for each angle bin, lines along its direction with sorted beginnings of obstacles.
+    """Return the int32 table: for each angle bin, lines along its direction with sorted beginnings of obstacles.
 
-    ``pruned``: whether to omit obstacles that begin inside another obstacle of the same line; ``outside``: True if
-    space outside the grid is a wall.
-
-    Returns:
-        int32 table.
+    ``pruned``: whether to omit obstacles that begin inside another one of their line; ``outside``: walls around the
+    grid.
     """
     rows, cols = obstacles.shape
     row, col = _exposed(np.pad(obstacles, 1, constant_values=outside), outside)
@@ -68,11 +65,7 @@ def _exposed(padded: np.ndarray, outside: bool) -> tuple[np.ndarray, np.ndarray]
 
 
 def _projected(col: np.ndarray, row: np.ndarray, cos: float, sin: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Project cells onto lines.
-
-    Returns:
-        Line, beginning and end of each projection, along the middle of the cell's part of the line.
-    """
+    """Return line, beginning and end of each cell's projections, along the middle of its part of the line."""
     along, across = (col + 0.5) * cos + (row + 0.5) * sin, (row + 0.5) * cos - (col + 0.5) * sin
     half = (abs(cos) + abs(sin)) / 2
     # A cell that touches a line only with a corner is not on the line.
@@ -95,10 +88,7 @@ def _projected(col: np.ndarray, row: np.ndarray, cos: float, sin: float) -> tupl
 
 
 def _begin_outside(line: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the mask of obstacles that do not begin inside an earlier obstacle of their line.
-
-    Obstacles are sorted by line, then by beginning.
-    """
+    """Return the mask of obstacles (sorted by line, then beginning) that begin outside the earlier ones."""
     # Running maximum of the ends within each line: an offset lifts each line above the previous one.
     lift = (np.max(end) - np.min(begin) + 1) * (line - line[0])
     largest_end = np.maximum.accumulate(end + lift)

@@ -28,13 +28,10 @@ _BLOCK_ROWS = 32
 
 
 def squared_distances(backend: Backend, obstacles: np.ndarray, most: int = NO_OBSTACLE) -> Buffer:
-    """Compute the exact squared distance from each cell's centre to the nearest obstacle's centre [cells^2].
+    """Return (rows, cols) exact squared distances to the nearest obstacle [cells^2], int32; 2^31 - 1 without obstacles.
 
-    ``most``: largest squared distance that matters; larger distances may be any number above ``most``, for a shorter
-    search on GPUs.
-
-    Returns:
-        (rows, cols) int32 on the device; 2^31 - 1 without obstacles.
+    ``most``: largest squared distance that matters; larger ones may be any number above it, for a shorter search on
+    GPUs.
     """
     rows, cols = obstacles.shape
     check_size(rows, cols)
@@ -51,12 +48,9 @@ def squared_distances(backend: Backend, obstacles: np.ndarray, most: int = NO_OB
 def squared_of_stack(
     backend: Backend, space: Workspace, marked: Buffer, shape: tuple[int, int], worlds: int, most: int = NO_OBSTACLE
 ) -> Buffer:
-    """Start computing squared distances [cells^2] in several maps of one size, whose rows are interleaved.
+    """Start computing (rows, worlds, cols) squared distances [cells^2] in maps of one size, whose rows are interleaved.
 
     ``marked``: obstacles as bytes on a processor, else as bits; ``most``: see ``squared_distances``.
-
-    Returns:
-        (rows, worlds, cols) int32.
     """
     (rows, cols), compiled = shape, functools.partial(backend.compile, flags=_NO_FLAGS)
     # Along columns, the columns of all maps are those of one map.

@@ -29,10 +29,8 @@ _LARGEST_REFRESH = 0.5
 class FieldTable:
     """Table of a likelihood field model.
 
-    ``parameters``: parameters of the likelihood field; ``resolution``: side of a cell [m]; ``range_max``: longest range
-    [m]; ``outside``: ``"free"`` or ``"occupied"``: state of space outside the grid; ``weights``: the book's likelihood,
-    or the peer whose terms the cells hold; ``log_table``: whether cells hold terms of the sum instead of distances [m];
-    ``flags``: flags of the model's kernel, to share a program.
+    ``log_table``: whether cells hold terms of the sum instead of distances [m]; ``flags``: flags of the model's kernel,
+    to share a program.
     """
 
     def __init__(
@@ -113,13 +111,7 @@ class FieldTable:
         return worlds.table(key, make).buffer
 
     def refresh(self, backend: Backend, obstacles: np.ndarray, table: Buffer, changed: Window) -> bool:
-        """Update ``table`` in place after obstacles changed, where clamped distances can differ.
-
-        ``obstacles``: (rows, cols) mask of the window after the change; ``table``: its table before the change.
-
-        Returns:
-            False if rebuilding the table is faster.
-        """
+        """Update a table in place after obstacles of a window changed; return False if rebuilding it is faster."""
         rows, cols = obstacles.shape
         density = None if self._overlay is not None else self._density_of(rows, cols)
         if density is None:
@@ -170,11 +162,7 @@ class FieldTable:
         begin: int,
         stride: int,
     ) -> None:
-        """Fill a part of a table.
-
-        ``obstacles``: (rows, cols) bool, with all obstacles within the clamp distance of the part; ``part``: part of
-        ``obstacles`` to fill.
-        """
+        """Fill a part of a table from (rows, cols) obstacles, all within the clamp distance of the part."""
         cap = len(density) - 1
         squared = squared_distances(backend, obstacles, cap - 1)
         backend.compile("fill_field", self._flags)(

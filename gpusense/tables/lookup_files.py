@@ -21,13 +21,7 @@ _FORMAT = "gpusense lookup 2"
 
 
 def describe(obstacles: np.ndarray, limit: float, outside: str, bins: int) -> dict[str, object]:
-    """Describe the inputs of a table.
-
-    ``limit``: longest range [cells]; ``outside``: ``"free"`` or ``"occupied"``: state of space outside the grid.
-
-    Returns:
-        The header of the file.
-    """
+    """Return the header of a file, which describes the table's inputs; ``limit``: longest range [cells]."""
     cells = hashlib.sha256(np.packbits(obstacles).tobytes()).hexdigest()
     rows, cols = obstacles.shape
     return {

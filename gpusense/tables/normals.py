@@ -63,12 +63,10 @@ class Line:
 
 
 class Outlines:
-    """Outlines of a map.
+    """Outlines of a map with F sides.
 
-    Attributes:
-        cell: (F,) flat index of the cell of each side.
-        outward: (F, 2) outward direction of each side.
-        following, preceding: (F,) number of the next and the previous side; the side itself at the map's edge.
+    ``cell``: (F,) flat index of each side's cell; ``outward``: (F, 2) outward direction; ``following``, ``preceding``:
+    (F,) next and previous side, the side itself at the map's edge.
     """
 
     def __init__(self, obstacles: np.ndarray) -> None:
@@ -86,12 +84,7 @@ class Outlines:
         self._middle = 2 * np.stack([col, row], axis=1) + self.outward
 
     def straight_normals(self, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the normals of the straight pieces of outline that contain M sides.
-
-        Returns:
-            (M, 2) unit vectors towards the free side, NaN on a curved outline, and (M,) the index of the span in
-            SPANS, or their number.
-        """
+        """Return (M, 2) normals of straight pieces of outline around M sides, NaN on a curve, and (M,) their spans."""
         normal, place = np.full((len(sides), 2), np.nan), np.full(len(sides), len(SPANS))
         for first in range(0, len(sides), _PART):
             part = slice(first, first + _PART)
@@ -116,11 +109,10 @@ class Outlines:
                 place[remaining[better]] = index
 
     def _moments(self, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Sum moments of the sides behind and ahead of M sides.
+        """Return two arrays (7, REACH + 1, M), for the k preceding and the k following sides of M sides.
 
-        Returns:
-            Two arrays (7, REACH + 1, M), for the k preceding and the k following sides: sums of x, y, x^2, x y and y^2
-            of the middles relative to the side's middle [half cells], and of the outward directions.
+        They are sums of x, y, x^2, x y and y^2 of middles relative to the side's [half cells], and of outward
+        directions.
         """
         start = self._middle[sides]
         result = []
@@ -240,13 +232,9 @@ def surface_normals(grid: OccupancyGrid, *, unknown: Space = "free", outside: Sp
 
 
 def normal_table(obstacles: np.ndarray, window: Window, outside: str, real: np.dtype) -> np.ndarray:
-    """Compute normals in a window of a map and a ring around it, in the layout of the kernel file ``echo``.
+    """Return (rows + 2, cols + 2, 2) normals in a window of a map and a ring around it; see the kernel file ``echo``.
 
-    ``obstacles``: (H, W) bool, the whole map; ``outside``: treatment of space outside the map: ``"free"`` or
-    ``"occupied"``.
-
-    Returns:
-        (rows + 2, cols + 2, 2) in the grid's frame: 0 for free cells, NaN for occupied cells without a normal.
+    They are in the grid's frame: 0 for free cells, NaN for occupied cells without a normal.
     """
     table = np.empty((window.rows + 2, window.cols + 2, 2), real)
     step = max(_STRIP // table.shape[1], 1)
@@ -286,13 +274,9 @@ def _surrounded(obstacles: np.ndarray, part: Window, outside: bool) -> np.ndarra
 
 
 def _disc_normals(obstacles: np.ndarray) -> np.ndarray:
-    """Compute unit normals of exposed cells: occupied cells that share a side with a free cell.
+    """Return (H, W, 2) unit normals of exposed cells, in a map with RADIUS cells around it, towards fewer obstacles.
 
-    ``obstacles``: (H + 2 RADIUS, W + 2 RADIUS) bool: a map and its surroundings.
-
-    Returns:
-        (H, W, 2) float64, x and y in the grid's frame, towards the side with fewer obstacles: 0 for free cells, NaN
-        for occupied cells without exposure or direction.
+    They are 0 for free cells, and NaN for occupied cells without exposure or direction.
     """
     height, width = (side - 2 * RADIUS for side in obstacles.shape)
     inner = obstacles[RADIUS : RADIUS + height, RADIUS : RADIUS + width]
@@ -319,12 +303,10 @@ def _disc_normals(obstacles: np.ndarray) -> np.ndarray:
 
 
 def _replace_straight(normals: np.ndarray, obstacles: np.ndarray) -> None:
-    """Replace the normals of cells at straight pieces of an obstacle's outline, up to its corners.
+    """Replace (H, W, 2) normals of cells at straight pieces of an obstacle's outline, up to its corners.
 
     A cell takes the side with the longest straight piece. At the corner of a block two sides are equally long, and the
     normal is between theirs.
-
-    ``normals``: (H, W, 2) normals; ``obstacles``: (H + 2 MARGIN, W + 2 MARGIN) bool: the map and its surroundings.
     """
     outlines = Outlines(obstacles)
     height, width = normals.shape[:2]
@@ -347,11 +329,7 @@ def _replace_straight(normals: np.ndarray, obstacles: np.ndarray) -> None:
 
 
 def _moments(obstacles: np.ndarray, row: np.ndarray, col: np.ndarray) -> np.ndarray:
-    """Sum the moments of the obstacles in the disc around cells.
-
-    Returns:
-        (6, M) number of obstacles, and sums of x, y, x^2, x y and y^2 of their offsets.
-    """
+    """Return (6, M) numbers of obstacles in discs around cells, and sums of their x, y, x^2, x y and y^2."""
     bits = np.arange(2 * RADIUS + 1)
     width = obstacles.shape[1] - 2 * RADIUS
     # Bit i of a word is cell i of a row of the disc's box.

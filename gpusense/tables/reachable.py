@@ -56,13 +56,10 @@ class ReachableMap:
 
     An interrupt or an error leaves the map as before or as after the call, never in between.
 
-    ``unknown``: treatment of unknown cells: ``"free"`` or ``"occupied"``; ``mount``: the sensor's pose on the robot [m,
-    m, rad]; ``reach``: longest relevant distance from a sensor [cells]; ``prepare``: function that makes the table of a
-    window from its (rows, cols) obstacles; ``crop``: true to prepare only the reachable window, False for the whole
-    map; ``refresh``: function that updates a table in place after obstacles changed in a part of its window, and
-    returns whether it could; otherwise the table is rebuilt; ``obstacles_of``: function that returns the mask of
-    obstacles from the grid and ``unknown``; ``neighbors``: radius of the neighbourhood that determines a cell's state
-    in the mask [cells].
+    ``reach``: longest relevant distance from a sensor [cells]; ``prepare``: makes the table of a window from its (rows,
+    cols) obstacles; ``crop``: whether to prepare the reachable window only; ``refresh``: updates a table in place after
+    obstacles changed in a part of its window, and returns whether it could; ``neighbors``: radius of the neighbourhood
+    that determines a cell's state in the mask [cells].
     """
 
     def __init__(
@@ -119,13 +116,7 @@ class ReachableMap:
         self._state = replace(self._state, table=None, version=self.version + 1)
 
     def ensure(self, corners: Corners | None) -> MapState:
-        """Return the map with its table; rebuild the table if a sensor can reach beyond its window.
-
-        ``corners``: corners of a box around all poses; None for poses anywhere.
-
-        Raises:
-            TableMemoryError: The device cannot hold the table.
-        """
+        """Return the map with its table, rebuilt if a sensor can reach beyond its window."""
         if self._state.window is self._whole and self._state.table is not None:
             return self._state
         if self._crop and corners is not None:
@@ -145,13 +136,7 @@ class ReachableMap:
         return self._state
 
     def update(self, cells: object, place: object) -> OccupancyGrid:
-        """Replace cells of the map; update the table now, or drop it so that the next call rebuilds it.
-
-        ``place``: (row, col) of the cell that ``cells[0, 0]`` replaces.
-
-        Returns:
-            The new map.
-        """
+        """Replace cells of the map from ``place`` on, and return it; update the table now, or drop it."""
         grid = self.grid.with_cells(cells, place)  # type: ignore[arg-type]
         row, col = np.asarray(place).tolist()
         patched, part = self._patched(grid, Window(row, col, *np.asarray(cells).shape))

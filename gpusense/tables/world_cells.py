@@ -38,11 +38,7 @@ def of_grids(
 
 
 def checked_cells(cells: Any, backend: Backend, name: str) -> tuple[Any, np.ndarray]:
-    """Return cells after checking them, and the (M, 2) sizes of the worlds.
-
-    Returns:
-        (M, H, W) int8 in host memory, an array on the device, or a list of (H, W) int8 of several sizes.
-    """
+    """Return (M, H, W) int8 cells, an array on the device or a list of cells of several sizes, and (M, 2) sizes."""
     if arrays.on_device(cells):
         adopted = arrays.adopt_integers(cells, backend, name, ("int8",))
         shape = adopted.shape
@@ -85,10 +81,7 @@ def checked_origins(origin: Any, count: int) -> list[tuple[float, float, float]]
 def frames_of(
     origins: Sequence[tuple[float, float, float]], resolution: float, sizes: np.ndarray, place: np.ndarray
 ) -> np.ndarray:
-    """Return the frames of worlds; see the kernel file ``worlds``.
-
-    ``resolution``: side of a cell [m]; ``sizes``: (M, 2) rows and columns; ``place``: (M,) first cells in tables.
-    """
+    """Return the frames of worlds, whose tables begin at cells ``place`` (M,); see the kernel file ``worlds``."""
     frames = np.zeros((len(origins), 8))
     known: dict[tuple[float, float, float], tuple[float, ...]] = {}
     for number, origin in enumerate(origins):

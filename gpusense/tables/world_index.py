@@ -41,11 +41,7 @@ class ManyWorlds(Protocol):
 
 
 class WorldIndex:
-    """The world of each pose, and the shape that the pose does not see.
-
-    ``world``: (N,) indices of worlds, or one for all poses; None with a single world; ``ignore``: (N,) indices of
-    shapes, -1 for none, or one for all poses; None ignores none.
-    """
+    """The world of each pose, and the shape that the pose does not see, or -1; one for all poses, or None."""
 
     def __init__(self, worlds: ManyWorlds, world: Any, ignore: Any, count: int, backend: Backend) -> None:
         self.worlds = worlds

@@ -161,11 +161,7 @@ def take(job: list[tuple[str, str]] | None) -> None:
 
 
 def _tried(drivers: tuple[Driver, ...], wanted: tuple[Driver, ...] | None) -> tuple[Choice, bool]:
-    """Load all drivers in a child and, if it dies, each driver alone.
-
-    Returns:
-        The choice, and whether it is to be kept.
-    """
+    """Load all drivers in a child, or singly if it dies; return the choice, and whether it is to be kept."""
     together = _try(wanted)
     if not together.failure or not together.conclusive:
         # A child that was not started, or was killed from outside, does not indicate a failure of a driver.

@@ -34,9 +34,7 @@ class DeviceBuffer(cl.Buffer):
 class SharedBuffer(cl.SVMAllocation):
     """Memory that host and device share.
 
-    Attributes:
-        bytes: The memory as an array of the host.
-        view: The same, for copies: assignments of slices take a third of the time of an array's.
+    ``bytes``: the memory as an array of the host; ``view``: for copies, which take a third of the time of the array's.
     """
 
     def __init__(self, context: cl.Context, size: int, settle: Callable[[], None]) -> None:
@@ -58,12 +56,7 @@ class SharedBuffer(cl.SVMAllocation):
 
 
 class SharedPart(cl.SVM):  # type: ignore[type-arg]
-    """A part of memory that host and device share.
-
-    Attributes:
-        bytes: The memory as an array of the host.
-        view: See SharedBuffer.
-    """
+    """A part of memory that host and device share; see ``SharedBuffer``."""
 
     def __init__(self, whole: SharedBuffer | SharedPart, first: int, size: int) -> None:
         self.bytes: np.ndarray = whole.bytes[first : first + size]

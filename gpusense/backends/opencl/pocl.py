@@ -104,11 +104,7 @@ def target_of(device: cl.Device) -> str:
 
 
 def fit_target(device: cl.Device) -> str | None:
-    """Make PoCL compile kernels for the processor for which its library was compiled.
-
-    Returns:
-        The name that was written into PoCL's description of the device; None where nothing was written.
-    """
+    """Make PoCL compile for the processor of its library; return the name that was written, or None."""
     if not is_pocl(device) or not _is_misfit(device):
         return None
     place, name = _find_name(device)
@@ -148,10 +144,7 @@ def _version(device: cl.Device) -> tuple[int, ...] | None:
 
 @functools.cache
 def _has_libraries() -> bool:
-    """Return whether PoCL has libraries for several processors, not only for the machine that compiled it.
-
-    PoCL looks for them relative to its code.
-    """
+    """Return whether PoCL has, next to its code, libraries for several processors, not only for its build machine."""
     try:
         with open("/proc/self/maps", encoding="utf-8", errors="replace") as file:
             places = {line.split()[-1] for line in file if "/libpocl" in line}
@@ -242,11 +235,7 @@ def _has_kernel(file: Path, kernels: Sequence[str]) -> bool:
 
 
 class PoclKernels:
-    """The compiled kernels of this process.
-
-    Attributes:
-        changed: Programs with kernels compiled since the last :meth:`save`, by the keys of their entries.
-    """
+    """The compiled kernels of this process; ``changed``: keys of programs with kernels compiled since :meth:`save`."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

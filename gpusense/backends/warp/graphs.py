@@ -42,11 +42,7 @@ class Capture(NamedTuple):
 
 
 class GraphCache:
-    """Graphs of the calls of one device that repeat, and captures for recordings.
-
-    Attributes:
-        refusal: Why no more graphs are captured; empty while captures are attempted.
-    """
+    """Graphs of repeated calls of one device, and captures for recordings; ``refusal``: why no more are captured."""
 
     def __init__(self, device: wp.Device) -> None:
         self.refusal = ""

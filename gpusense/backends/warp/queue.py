@@ -28,9 +28,7 @@ _MOST_VIEWS = 1024
 class CallQueue:
     """The steps of one call that wait to be started, and page-locked memory for its copies.
 
-    Attributes:
-        steps: The steps in their order.
-        settled: False while the device may still read or write the page-locked memory.
+    ``settled``: False while the device may still read or write that memory.
     """
 
     def __init__(self, device: wp.Device, types: Mapping[Any, Any]) -> None:

@@ -80,11 +80,7 @@ def settings(*, kernels: bool = True) -> Iterator[None]:
 
 
 def load(module: wp.Module, device: wp.Device, group: int) -> None:
-    """Compile a module for a device, or take its code from the cache; within :func:`settings`.
-
-    Raises:
-        Exception: Warp's errors, where the module does not compile.
-    """
+    """Compile a module for a device, or take its code from the cache; within :func:`settings`."""
     name = module.get_module_identifier(block_dim=group)
     host = fingerprint() if device.is_cpu else f"{device.arch}"
     # The name holds a hash of the module's code.

@@ -61,10 +61,7 @@ class Call:
 def known_features(
     prepared: PreparedFeatures, partner: np.ndarray, buckets: Buckets
 ) -> tuple[PreparedFeatures, np.ndarray, float]:
-    """Return the features with a landmark, the places of their landmarks, and the constant term of the false positives.
-
-    ``partner``: (K,) landmark of each, -1 for a false positive, equal at every pose.
-    """
+    """Return the features with a landmark, their landmarks' places, and the constant term of the false positives."""
     known = partner >= 0
     constant = float(prepared.false[prepared.columns[~known]].sum())
     features = PreparedFeatures(
@@ -74,11 +71,9 @@ def known_features(
 
 
 class FeatureModel(PointModel):
-    """Base of the models of features, each of which belongs to a landmark or line of the map, or is a false positive.
+    """Base of the models of features: each belongs to a landmark or line of the map, or is a false positive.
 
     Subclasses make ``_buckets`` and ``_tables`` of their map.
-
-    ``precision``: ``"float32"`` or ``"float64"``; ``specialize``: False leaves nothing out.
     """
 
     parameters: Any
@@ -321,11 +316,7 @@ def common_omissions(mount: Mount, precision: str) -> list[Omission]:
 def feature_omissions(
     prepared: PreparedFeatures, buckets: Buckets, *, name: str, total: int, impossible: int, known: bool
 ) -> list[Omission]:
-    """Return the omissions by the features of a call.
-
-    ``impossible``: number of features that the sensor cannot have measured; ``known``: True if the correspondences are
-    known.
-    """
+    """Return the omissions by the features of a call; ``known``: whether the correspondences are known."""
     omissions, count = [], len(buckets.index)
     silent = total - len(prepared.columns) - impossible
     for number, what, why in (

@@ -116,11 +116,7 @@ class Reach:
 
 
 def reach_of(p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarray, bound: float) -> Reach:
-    """Return the disc outside which exponents are larger than ``bound``.
-
-    ``z``: the range; ignored if it was not measured; ``measured``: whether range, bearing and signature were measured;
-    ``bound``: largest exponent that matters; infinite if all matter.
-    """
+    """Return the disc outside which exponents are larger than ``bound``; ``z``: the range, where it was measured."""
     if bound < 0:
         return Reach(0.0, -1.0, 0.0)
     wide = math.sqrt(bound)
@@ -174,10 +170,9 @@ def prepare_features(
     norm: float,
     gated: bool,
 ) -> PreparedFeatures:
-    """Return the numbers of (F, 3) checked features.
+    """Return the numbers of (F, 3) features, NaN where not measured.
 
-    ``features``: range, bearing and signature, NaN where not measured; ``extent``: largest coordinate of the landmarks
-    in their buckets' frame [m]; ``gated``: whether to bound the landmarks that can matter.
+    ``extent``: largest coordinate of the landmarks in their buckets' frame [m]; ``gated``: whether to bound the discs.
     """
     is_measured = ~np.isnan(features)
     informative = is_measured.any(axis=1)
@@ -219,11 +214,9 @@ def _set_reaches(
     numbers: np.ndarray, p: LandmarkParameters, sensor: Sensor, distances: np.ndarray, measured: np.ndarray,
     bounds: np.ndarray, slack: float,
 ) -> None:  # fmt: skip
-    """Set the discs in which landmarks matter, wider by the rounding errors of distances.
+    """Set the discs in which landmarks matter, wider by the rounding error ``slack`` of a distance [m].
 
-    ``numbers``: (K, FEATURE) numbers of the features; ``distances``: (K,) measured ranges [m]; ``measured``: (K, 3)
-    whether range, bearing and signature were measured; ``bounds``: (K,) largest differences of a landmark's log density
-    from the highest one; ``slack``: rounding error of a distance [m].
+    ``bounds``: (K,) largest differences of a landmark's log density from the highest one.
     """
     # (d + slack)^2 <= 1.01 d^2 + 101 slack^2, and kernels look for 1.01 d^2.
     numbers[:, at.SLACK] = 101 * slack**2
@@ -234,11 +227,7 @@ def _set_reaches(
 
 
 def in_two_parts(numbers: np.ndarray, real: np.dtype, low_parts: Sequence[tuple[int, int]]) -> np.ndarray:
-    """Round numbers, and set columns of low parts to the rounding errors of other columns.
-
-    ``numbers``: (K, FEATURE) float64 numbers; ``low_parts``: pairs of a column of low parts and the column that it
-    belongs to.
-    """
+    """Round (K, FEATURE) numbers; ``low_parts`` pairs a column for rounding errors with the rounded column."""
     with np.errstate(invalid="ignore", over="ignore"):
         high, rest = split(numbers, real)
         low = np.where(np.isfinite(numbers), rest, 0).astype(real)

@@ -271,12 +271,11 @@ def prepare_lines(
     gated: bool,
     grouped: int,
 ) -> PreparedFeatures:
-    """Return the numbers of (F, 7) possible lines.
+    """Return the numbers of (F, 7) possible lines, NaN where left out.
 
-    ``features``: angle, distance, ends and covariance; NaN where left out; ``mount``: the sensor's pose on the robot;
-    ``extent``: largest coordinate of the map in its buckets' frame [m]; ``longest``: half the length of the longest
-    line of the map [m]; ``gated``: whether to bound the lines that can matter; ``grouped``: largest number of features
-    among which overlaps are searched.
+    ``extent``: largest coordinate of the map in its buckets' frame [m]; ``longest``: half the longest line of the map
+    [m]; ``gated``: whether to bound the lines that can matter; ``grouped``: most features among which overlaps are
+    searched.
     """
     columns = np.flatnonzero(~np.isnan(features[:, ANGLE]))
     kept = features[columns]

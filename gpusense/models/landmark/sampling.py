@@ -35,11 +35,7 @@ def draw_features(
     *,
     every: bool,
 ) -> Floats:
-    """Return features of landmarks at poses.
-
-    ``partners``: (F,) landmark of each feature, -1 for a false positive; ``every``: True if every landmark is detected,
-    even out of view.
-    """
+    """Return features of the landmarks ``partners`` (F,), -1 for a false positive; ``every``: also out of view."""
     columns = 2 if p.sigma_signature is None else 3
     features = np.full((len(draws.poses), len(partners), columns), np.nan)
     place, none = mounted(draws.poses, mount), (np.zeros(1), np.zeros(1))
@@ -106,10 +102,9 @@ def draw_lines(
     draws: Draws, partners: NDArray[np.int64], lines: LineMap, p: LineParameters, mount: tuple[float, float, float], *,
     every: bool,
 ) -> Floats:  # fmt: skip
-    """Return (N, F, 4) angle, distance and ends of lines at poses, all NaN for lines that are not visible.
+    """Return (N, F, 4) features of the lines ``partners`` (F,), -1 for a false positive; NaN for lines out of view.
 
-    ``partners``: (F,) line of each feature, -1 for a false positive; ``every``: True if every line is detected, also
-    from behind.
+    ``every``: whether every line is detected, also from behind.
     """
     features = np.full((len(draws.poses), len(partners), 4), np.nan)
     place, none = mounted(draws.poses, mount), (np.zeros(1), np.zeros(1))

@@ -115,10 +115,8 @@ class PointModel(Pickled):
     ) -> Any:
         """Return log p of each pose, computed in parts; 0 without a program.
 
-        ``poses``: (N, 3) poses; ``out``: the array for the result, or None; ``program``: function that makes the
-        program that writes log p of some poses into a buffer; ``left_out``: the omissions by these readings; ``items``:
-        cost of each pose, in readings of a scan; ``itemsize``: bytes that are kept for each pose and item; ``after``:
-        function called with each part after its program has started.
+        ``items``: cost of a pose, in readings of a scan; ``itemsize``: bytes that are kept for each pose and item;
+        ``after``: called with each part after its program has started.
         """
         backend, space, real = self._backend, self._workspace, self._real
         checked = Poses(poses, backend, late=program is not None)
@@ -154,7 +152,7 @@ class PointModel(Pickled):
     ) -> Programmer:  # fmt: skip
         """Return the function that makes the program of a kernel that scores places or residuals; see ``_relative``.
 
-        ``uploads``: arrays to copy with each part, by the kernel's arguments; ``arguments``: its other arguments.
+        ``uploads``: arrays to copy with each part, by the kernel's arguments.
         """
         flags = with_lanes_flag(self._backend.info.lanes, kernel, flags)
 
@@ -171,10 +169,7 @@ class PointModel(Pickled):
         return program
 
     def _relative(self, poses: Poses, part: Part, kernel: str, numbers: dict[str, float]) -> tuple[Buffer, Program]:
-        """Return the places or residuals of some poses, and the launch of the file ``relative`` that computes them.
-
-        ``part``: the first of them and the one after the last; ``kernel``: ``"place_relative"`` or ``"wrap_headings"``.
-        """
+        """Return places or residuals of some poses, and the launch of the kernel that computes them."""
         backend, space, count = self._backend, self._workspace, part[1] - part[0]
         name, width = _PLACED[kernel]
         flags, source = poses.flags(poses.corners(part, backend, space)), poses.buffer(backend, space, part)

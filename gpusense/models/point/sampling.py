@@ -80,12 +80,10 @@ def mounted(poses: Floats, mount: Sequence[float]) -> Floats:
 def within(
     u: Floats, mean: Floats, scale: float | Floats, low: float, high: float, cdf: Distribution, quantile: Distribution
 ) -> Floats:
-    """Return draws of a symmetric distribution on an interval.
+    """Return draws of a symmetric distribution with (N,) means on an interval, for (N,) numbers ``u`` in (0, 1).
 
     For a mean outside the interval, the normaliser is taken at the nearest end, as in the models' densities; the rest
     of the mass is not observed and gives NaN.
-
-    ``u``: (N,) numbers in (0, 1); ``mean``: (N,) means; ``scale``: scale of the distribution, one or (N,).
     """
     # The mean on the side of the upper end, so that the distribution function is not near 1 where mass is small.
     flip = mean < 0.5 * (low + high)
@@ -108,10 +106,7 @@ def normal_within(u: Floats, mean: Floats, sigma: float | Floats, low: float, hi
 
 
 def wrapped_normal_within(u: Floats, mean: Floats, sigma: float, half: float) -> Floats:
-    """Return angles in [-half, half] whose wrapped differences from ``mean`` in [-pi, pi] are normal.
-
-    For a mean outside, the normaliser is taken at the nearest end; the rest of the mass is not observed and gives NaN.
-    """
+    """Return angles in [-half, half] whose wrapped differences from ``mean`` are normal; see ``within``."""
     from scipy.special import ndtri
 
     parts = _arcs(mean, half)

@@ -22,11 +22,7 @@ from gpusense.tables.worlds import Worlds
 
 
 class WaitingCall(BoundCall):
-    """A call that has ended when it returns: a packed call of few particles, or else the ordinary call.
-
-    Attributes:
-        packed: The packed call; None for the ordinary one.
-    """
+    """A call that has ended when it returns: ``packed``, of few particles, or else the ordinary call."""
 
     waits = True
 
@@ -61,11 +57,7 @@ class WaitingCall(BoundCall):
 def bind(
     pipeline: ScanPipeline, lock: threading.Lock, score: Callable[..., Any], poses: Any, ranges: Any, out: Any
 ) -> BoundCall:
-    """Bind arrays; see ``ScanModel.bind``.
-
-    ``score``: ``log_likelihood`` of the model; ``poses``: (N, 3) poses; ``ranges``: (K,) readings; ``out``: the array
-    for the log-likelihoods, or None.
-    """
+    """Bind arrays; ``score``: ``log_likelihood`` of the model. See ``ScanModel.bind``."""
     on_device = _check_bound(poses=poses, ranges=ranges)
     backend, beams, obstacle = pipeline.backend, pipeline.scanner.count, host_task(pipeline)
     if all(on_device) and not obstacle and backend.info.kind == "gpu":
@@ -124,10 +116,7 @@ def bind_worlds(
 def bind_cast(
     caster: MapCaster, cast_rays: Callable[..., Any], poses: Any, vectors: np.ndarray, out: Any, **indices: Any
 ) -> BoundCall:
-    """Bind poses to a call of ``RayCaster.cast``, which ``cast_rays`` makes; ``indices`` are its ``world``, ``ignore``.
-
-    ``vectors``: (K, 2) ray vectors.
-    """
+    """Bind poses to ``cast_rays``, the call of ``RayCaster.cast``; ``indices`` are its ``world`` and ``ignore``."""
     (on_device,) = _check_bound(poses=poses)
     if not (on_device and caster.backend.info.kind == "gpu"):
         result = cast_rays(poses, out=out, **indices)

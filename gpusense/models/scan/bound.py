@@ -86,8 +86,8 @@ class BoundCall(ABC):
 class ReplayedCall(BoundCall):
     """A recorded program on arrays of the device, made anew when the map's table changes.
 
-    ``charted``: the map with its table; ``lock``: held while the buffers of its owner are in use; ``owners``: owners of
-    the memory that calls read and write; ``out``: the result; ``chunk``: the most poses of a piece.
+    ``lock``: held while the buffers of its owner are in use; ``owners``: owners of the memory that calls read and
+    write; ``chunk``: the most poses of a piece.
     """
 
     waits = False
@@ -160,10 +160,7 @@ class ReplayedCall(BoundCall):
 
 
 class RecordedCast(ReplayedCall):
-    """A call of ``RayCaster.cast``; see ``ReplayedCall``.
-
-    ``ray``: the (K,) ray vectors on the device; ``inside``: the worlds of the poses; None in a single map.
-    """
+    """A call of ``RayCaster.cast``; see ``ReplayedCall``."""
 
     def __init__(
         self, caster: MapCaster, poses: Any, vectors: np.ndarray, out: Any, index: Callable[[int], WorldIndex | None]
@@ -188,12 +185,10 @@ class RecordedCast(ReplayedCall):
 class RecordedCall(ReplayedCall):
     """A call of ``log_likelihood``; see ``ReplayedCall``.
 
-    ``pipeline``: the stages of the model; ``poses``, ``ranges``, ``out``: see ``ScanModel.bind``; ``status``: a shared
-    buffer for the non-finite flag, which its owner inspects; None for a private one; ``limits``: the type to which the
-    scanner's limits are rounded; None for the type of the ranges; ``corners``: corners of the box of the poses, where
-    their owner knows them: the map's table may be cropped then; ``inside``: the worlds of the poses, on the device;
-    None in a single map. Ranges may then be (N, K); ``per_beam``: whether to keep the term of each reading, for
-    ``terms``; of few poses in a single map.
+    ``status``: a buffer for the non-finite flag, which its owner inspects; ``limits``: type to which the scanner's
+    limits are rounded, by default the type of the ranges; ``corners``: of the box of the poses, to crop the map's table;
+    ``inside``: the worlds of the poses, in which ranges may be (N, K); ``per_beam``: whether to keep the term of each
+    reading.
     """
 
     def __init__(

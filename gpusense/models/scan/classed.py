@@ -93,10 +93,7 @@ class BeamSelection:
 
     @functools.cached_property
     def of_complete_scan(self) -> tuple[np.ndarray, ...]:
-        """Parts of a scan of ranges alone, as ``ClassedScans`` names them.
-
-        Which readings (K,) are used, their columns (M,), vectors (M, 2), ray offsets (M + 1,), count and constant (1,).
-        """
+        """Used (K,), columns, vectors, ray offsets, count and constant of a scan of ranges; see ``ClassedScans``."""
         used = self.choice.used(np.ones(self.scanner.count, bool))
         columns, count = used.nonzero()[0], np.count_nonzero(used)
         begins = np.arange(count + 1, dtype=np.int32)
@@ -204,22 +201,13 @@ class OmittedReadings(NamedTuple):
 
 
 class ClassedScans:
-    """The readings of S scans that are evaluated at every pose, one scan after the other.
+    """The M readings of S scans that are evaluated at every pose, one scan after the other.
 
-    Attributes:
-        columns: (M,) their positions in their scans, in the order of their rays.
-        readings: (M,) ranges in metres; NaN (missing) and inf (max) only where nothing is left out.
-        vectors: (M, 2) float64 cosines and sines of their bearings.
-        rays: (R, 2) the bearings that are cast.
-        ray_offsets: (R + 1,) int32; readings of ray r are ray_offsets[r] to ray_offsets[r + 1] - 1.
-        ray_counts: (S,) rays of each scan.
-        counts: (S,) readings of each scan.
-        constants: (S,) constant terms: log-likelihoods of the readings that do not depend on the pose.
-        left_out: The other readings of the last scan.
-        scans: S.
-        most_readings: Largest number of readings of a scan.
-        most_rays: Largest number of rays of a scan.
-        shared: Whether several readings share a ray.
+    ``columns``: (M,) their positions in their scans, in the order of their rays; ``readings``: (M,) ranges [m], NaN
+    (missing) and inf (max) only where nothing is left out; ``vectors``: (M, 2) cosines and sines of their bearings;
+    ``rays``: (R, 2) the bearings that are cast; ``ray_offsets``: (R + 1,) first readings of rays; ``ray_counts``,
+    ``counts``, ``constants``: (S,) rays, readings and constant terms of each scan; ``left_out``: the other readings of
+    the last scan; ``shared``: whether several readings share a ray.
     """
 
     __slots__ = (

@@ -80,16 +80,9 @@ def log_hit(
 
 
 def log_short(z: ArrayLike, expected: ArrayLike, rate: ArrayLike) -> Any:
-    """Return the log density of an exponential on [0, z*], renormalised (book equations 6.7 to 6.9).
+    """Return the log density of an exponential on [0, z*] [1/m], renormalised (book equations 6.7 to 6.9).
 
-    See :meth:`gpusense.world.range_causes.ShortDensity.log_pdf` for its evaluation. Rate 0 is the uniform density
-    1 / z*.
-
-    ``z``: readings [m]; ``expected``: expected ranges z* [m]; without a positive one there is no nearer obstacle;
-    ``rate``: lambda_short, >= 0 [1/m].
-
-    Returns:
-        Natural logarithms of densities [1/m] in the broadcast shape; -inf outside [0, z*] and where z* <= 0.
+    -inf outside [0, z*] and where z* <= 0. See :meth:`gpusense.world.range_causes.ShortDensity.log_pdf`.
     """
     z, expected, rate = _arrays(z, expected, rate)
     return _scalar(ShortDensity(rate).log_pdf(z, expected))

@@ -258,11 +258,7 @@ def _jax_log_likelihood(jax: Any, poses: Any, calls: Differentiable) -> Any:
 
 
 def _batches(poses: np.ndarray, axes: int) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """Join batches of (N, 3) or (S, N, 3) poses to one of more poses.
-
-    Returns:
-        (M, 3) or (S, M, 3) poses, and a function that splits results of this leading shape into the batches.
-    """
+    """Join batches of (N, 3) or (S, N, 3) poses; also return the function that splits results."""
     outer, inner = poses.shape[: poses.ndim - axes], poses.shape[poses.ndim - axes :]
     # The scans come first, the batches of a scan after them.
     flat = np.moveaxis(poses.reshape(-1, *inner), 0, axes - 2)

@@ -37,13 +37,9 @@ _NONE, _SCANS, _INSIDE = flags_if(), flags_if(SCANS=True), flags_if(INSIDE=True)
 class FieldPipeline(ScanPipeline):
     """The stages of a likelihood field.
 
-    Attributes:
-        table: Maker of the map's table.
-        components: Flags of the mixture.
-        log_table: Whether cells hold log densities or cubes of densities, not distances.
-        quick: Whether GPUs find cells in working precision, and use more digits only near edges of cells.
-        terms: The numbers of the mixture on the device.
-        guard: Distance from a cell's edge below which an end point needs more digits, by its length + 2 cells.
+    ``components``: flags of the mixture; ``log_table``: whether cells hold log densities or cubes of densities, not
+    distances; ``quick``: whether GPUs find cells in working precision, and use more digits only near edges of cells;
+    ``guard``: distance from a cell's edge below which an end point needs more digits, by its length + 2 cells.
     """
 
     kept_parts = 1 / BLOCK_TERMS

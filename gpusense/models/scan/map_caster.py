@@ -88,10 +88,8 @@ LASER = Cones()
 class MapCaster:
     """The caster of one map, sensor mount and range on one device; models share its table of the map.
 
-    ``mount``: the sensor's pose on the robot; its yaw belongs to the ray vectors; ``range_max``: longest range [m];
-    ``unknown``: treatment of unknown cells: ``"free"`` or ``"occupied"``; ``outside``: treatment of space outside the
-    grid: ``"free"`` or ``"occupied"``; ``crop``: False prepares the whole map at once; ``obstacles_of``: function that
-    returns the mask of a grid's cells that stop a beam, from the grid and ``unknown``.
+    ``mount``: the sensor's pose on the robot; its yaw belongs to the ray vectors; ``crop``: False prepares the whole
+    map at once; ``obstacles_of``: function from a grid and ``unknown`` to the mask of the cells that stop a beam.
     """
 
     def __init__(
@@ -147,11 +145,7 @@ class MapCaster:
         return self._table_bytes + (0 if self._normals is None else self._normals[2])
 
     def normals(self, window: Window, flags: frozenset[str]) -> Buffer | None:
-        """Return the normals of the walls in a window, where flags need them, else None; made once for a window.
-
-        Raises:
-            TableMemoryError: The device cannot hold them.
-        """
+        """Return the normals of the walls in a window, where flags need them, else None; made once for a window."""
         if "INCIDENCE" not in flags:
             return None
         if self._worlds is not None:
@@ -224,11 +218,7 @@ class MapCaster:
         self, poses: object, vectors: np.ndarray, out: object = None, cones: Cones = LASER, *, world: Any = None,
         ignore: Any = None,
     ) -> Any:  # fmt: skip
-        """Cast rays, in pieces that fit the memory.
-
-        ``poses``: (N, 3) poses; ``vectors``: (K, 2) ray vectors, or (K, C, 2) of cones; ``out``: the array for the
-        result, or None; ``world``: (N,) indices of the poses' worlds; ``ignore``: (N,) indices of the shapes that poses
-        do not see.
+        """Cast (K, 2) ray vectors, or (K, C, 2) of cones, in pieces that fit the memory; see ``RayCaster.cast``.
 
         Returns:
             (N, K) expected ranges, or angles of incidence.

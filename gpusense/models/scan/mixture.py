@@ -56,8 +56,7 @@ def mixture_on_device(
 ) -> Mixture:
     """Return a beam model's mixture as arguments of kernels.
 
-    ``range_max``: longest range [m]; ``width``: width of the bins in which the mixture is tabulated [m]; None evaluates
-    it; ``compat``: the program whose weights are reproduced, or None; ``specialize``: False leaves nothing out.
+    ``width``: width of the bins in which it is tabulated [m]; None evaluates it; ``compat``: the peer, or None.
     """
     mixtures, cosines = density.mixtures, density.cosines
     if compat is not None:
@@ -193,15 +192,12 @@ def _terms(
 
 
 def _last_range(p: BeamParameters, range_max: float, real: np.dtype, linear: bool) -> tuple[float, float, float] | None:
-    """Return the numbers (offset, slope, least) of an expected range from which on log p is constant to the last bit.
+    """Return (offset, slope, least) of a range from which on log p is constant to the last bit; None without it.
 
     It is ``max(offset + slope z, least)`` for a reading z. From there on p_hit, divided by its mass, is at most
     2^-(digits + 3) p_rand: ``z* + bias - z >= u (sigma_hit + sigma_growth z*)`` with u from the peak over p_rand. An
     offset above 0 only moves the mean farther away. p_short's normaliser is constant where ``exp(-lambda_short z*)`` is
     below half of the last bit of 1.
-
-    Returns:
-        None if some reading has no such range below range_max.
     """
     rand, digits = _rand(p, range_max), np.finfo(real).nmant
     if not rand or (p.z_short and not (linear and p.lambda_short)):
@@ -272,11 +268,7 @@ class BeamDensity:
 
 
 def density_of(parameters: object, default: BeamParameters, incidence: object, **options: object) -> BeamDensity:
-    """Return the density that the arguments of a beam model choose.
-
-    ``parameters``: the mixture, the table of a sensor, or None; ``default``: the mixture without ``parameters``;
-    ``incidence``: parameters by angle of incidence, or None; ``options``: options that must be None with ``incidence``.
-    """
+    """Return the density that the arguments of a beam model choose; ``options`` must be None with ``incidence``."""
     table = parameters if isinstance(parameters, SensorTable) else None
     # A table of a sensor replaces the mixture.
     mixture = default if parameters is None or table else parameters

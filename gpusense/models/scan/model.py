@@ -252,13 +252,9 @@ class ScanModel(Pickled):
     def start_scoring(
         self, poses: Any, ranges: AnyArray, *, out: Any, before: Callable[[], None] | None = None
     ) -> None:
-        """Start scoring poses on the device; ``finish_scoring``, or any other wait for the device, ends it.
+        """Start scoring (N, 3) device poses by (K,) readings; ``finish_scoring``, or another wait, ends it.
 
-        Args:
-            poses: (N, 3) poses on the device.
-            ranges: (K,) readings [m].
-            out: (N,) array on the device for the log-likelihoods.
-            before: Function called before poses are read, to start the launches that write them.
+        ``before``: called before poses are read, to start the launches that write them.
         """
         key = id(poses), id(out)
         with self._lock, self._workspace:

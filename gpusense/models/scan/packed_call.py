@@ -75,13 +75,10 @@ class _Pack:
 class PackedCall:
     """The recorded program of a number of poses, with the copies of its inputs and of its result.
 
-    Each of poses, ranges and result is None for an array of the host, a type for arrays of the device that are copied,
-    or an array of the device that is used in place. Poses and readings of the host are float64 on the device, exact for
-    float32. Limits of readings are rounded to the precision of the readings, as on the host.
-
-    ``pipeline``: the stages of the model; ``lock``: held while the program is recorded; ``inputs``: the (N, 3) poses
-    and the (K,) readings; ``out``: the (N,) log-likelihoods; ``limits``: the type of the readings; None for the type of
-    readings on the device; ``corners``: corners of the box of the first poses; None for the table of the whole map.
+    Each of poses, ranges (``inputs``) and result (``out``) is None for an array of the host, a type for arrays of the
+    device that are copied, or an array of the device that is used in place. Poses and readings of the host are float64
+    on the device, exact for float32. Limits of readings are rounded to ``limits``, the precision of the readings, as on
+    the host. ``corners``: of the box of the first poses; None for the table of the whole map.
     """
 
     def __init__(
@@ -122,15 +119,7 @@ class PackedCall:
         self._space = Workspace(backend)
 
     def score(self, poses: Any, ranges: Any, out: Any, corners: Corners | None = None) -> bool:
-        """Score poses, and write their log-likelihoods; arrays that are used in place are ignored.
-
-        ``poses``: (N, 3) poses: an array of the host, or a buffer; ``ranges``: (K,) readings, the same; ``out``: (N,)
-        array or buffer for the log-likelihoods; ``corners``: corners of the box of the poses; None for the table of the
-        whole map.
-
-        Returns:
-            False where a pose is not finite; nothing is written on the host then.
-        """
+        """Score poses that are not used in place; return False, and write nothing, if one is not finite."""
         backend, inputs, outputs = self._backend, self._inputs, self._outputs
         log_p, status = outputs.views
         for slot, numbers in zip(self._slots, (poses, ranges), strict=True):
@@ -180,12 +169,9 @@ class _Inputs(NamedTuple):
 
 
 class PackedCallCache:
-    """Ordinary calls of a model that repeat a size of few particles.
+    """Ordinary calls of a model that repeat a size of few particles, with the same bits as others.
 
-    Results have the bits of ordinary calls; a call for which this is not certain is left to the ordinary path.
-
-    Attributes:
-        last: The last call; None if it was not a short one.
+    ``last``: the last call; None if it was not a short one.
     """
 
     def __init__(self, pipeline: ScanPipeline) -> None:

@@ -80,12 +80,9 @@ def make_request(
     world: Any = None,
     ignore: Any = None,
 ) -> Request:
-    """Check the arguments of a call.
+    """Check the arguments of a call of (N, 3) or (S, N, 3) poses; ``known``: poses that were checked before.
 
-    ``context``: the model's device, precision and scanner; ``poses``: (N, 3), or (S, N, 3); ``ranges``: (K,), or (S,
-    K); ``out``: None, or the array for the result; ``per_beam``: true if the log-likelihoods of the readings are
-    requested; ``known``: poses that were checked before; ``worlds``: the worlds of a model of worlds; ``world``: (N,)
-    indices of the poses' worlds; ``ignore``: (N,) indices of the shapes that poses do not see.
+    ``worlds``: the worlds of a model of worlds; ``world``, ``ignore``: see ``RayCaster.cast``.
     """
     backend, real, scanner = context.backend, context.real, context.rules.scanner
     if scanner._first_scans.left and isinstance(poses, (np.ndarray, list, tuple)):
@@ -148,12 +145,7 @@ class ScanLaunch(NamedTuple):
 
 
 class ScanPipeline(ABC):
-    """The stages of one scan model.
-
-    Attributes:
-        context: The device and the rules.
-        map: The map's table.
-    """
+    """The stages of one scan model."""
 
     # Rays of each beam, and numbers that GPUs keep for each reading until they are summed.
     rays_each: int = 1

@@ -131,11 +131,7 @@ class ReadingLayout:
 def device_readings(
     sensing: ReadingLayout, ranges: Buffer, dtype: np.dtype, limits: np.dtype, space: Workspace
 ) -> tuple[Placing, dict[str, Buffer]]:
-    """Allocate places for (K,) readings that are on the device, and describe the launch that fills them.
-
-    Returns:
-        The launch, and the buffers that it fills by name.
-    """
+    """Allocate places for (K,) readings on the device; return the launch that fills them, and these buffers by name."""
     columns, kind, rules = sensing.columns, sensing.max_readings, sensing.context.rules
     filled = sensing.buffers(1, sensing.places, space)
     filled["constant_term"] = space.empty("constant_term", 1, sensing.context.real)
@@ -156,9 +152,6 @@ def device_scans(
     """Allocate places for (S, K) readings on the device, one scan a particle, and return the launch that fills them.
 
     Every reading has a place; a missing one adds nothing. ``resolution``: side of a cell [m].
-
-    Returns:
-        The launch, and the buffers that it fills by name.
     """
     rules, count = sensing.context.rules, len(sensing.columns)
     filled, kind = sensing.buffers(scans, count, space), MAX_LEFT_OUT if rules.z_max <= 0 else MAX_PLACED

@@ -26,11 +26,7 @@ MakeRequest = Callable[[np.ndarray, np.ndarray], Request]
 def measured_savings(
     make_request: MakeRequest, pipeline: ScanPipeline, last: LastCall, plan: Plan, beams: int
 ) -> dict[str, float]:
-    """Time a call with and without each part that flags of the scoring kernel bring back.
-
-    Returns:
-        Median differences [s] of a call with a part and one without it, by the names of the parts.
-    """
+    """Return median differences [s] of a call with and without each part that flags bring back, by their names."""
     scan = last.scan
     if scan is None or not len(scan.readings) or not last.flags:
         raise RuntimeError("measure: must follow a call of log_likelihood with a reading that depends on the pose")

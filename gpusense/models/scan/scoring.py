@@ -62,8 +62,7 @@ def terms_of(pipeline: ScanPipeline, each: np.ndarray, scans: ClassedScans) -> n
 class ResidentPoses:
     """Poses in place on a processor, such as a filter's: only the readings of a scan change from call to call.
 
-    ``request``: A request of these poses; it keeps the arrays alive, so that their identities stay unique; ``last``:
-    receives the facts that ``explain`` reports.
+    ``request`` keeps the arrays alive, so that their identities stay unique.
     """
 
     def __init__(self, pipeline: ScanPipeline, request: Request, space: Workspace, last: LastCall) -> None:

@@ -66,10 +66,7 @@ def order_of(space: Workspace, placed: PlacedPoses, rays: int, real: np.dtype) -
 
 
 def spread_of(items: int, groups: int, enough: int) -> int:
-    """Return log2 of the number of parts into which each of ``items`` work-items is split.
-
-    ``items``: work-items before the split.
-    """
+    """Return log2 of the number of parts into which each of ``items`` work-items is split."""
     spread = 0
     while items << spread < enough and 1 << spread < groups:
         spread += 1

@@ -52,6 +52,9 @@ class Poses:
     # The worlds of the poses; None in a single map.
     inside: WorldIndex | None = None
 
+    # Flags of kernels that place them, in host memory the part of which the corners were asked for last.
+    flags: frozenset[str] = _HUGE
+
     def __init__(
         self, poses: object, backend: Backend, name: str = "poses", *, scans: int | None = None, in_place: bool = False,
         late: bool = False,
@@ -69,6 +72,7 @@ class Poses:
                 poses, backend, name, scans, in_place=in_place
             )
             self._dtype = _SINGLE if single else _DOUBLE
+            self.flags |= _SINGLE_PLAIN if single else _PLAIN
             return
         self.host = arrays.host_poses(poses, name, scans, single=late)
         self.count = len(self.host)
@@ -105,7 +109,12 @@ class Poses:
             arrays.refuse_poses(self.host, self._name, self._scans)
         (x, y, turn), (far_x, far_y, far_turn), reach = *bounds, self.reach
         wide = (x - reach, y - reach, turn - 4 * reach), (far_x + reach, far_y + reach, far_turn + 4 * reach)
-        self._last_corners = part, corners_of(wide if reach else bounds)
+        corners = corners_of(wide if reach else bounds)
+        self._last_corners, huge = (part, corners), max(-corners[0][2], corners[3][2]) > LARGEST_HEADING
+        if self._dtype == _SINGLE:
+            self.flags = _HUGE_SINGLE if huge else _SINGLE_PLAIN
+        else:
+            self.flags = _HUGE if huge else _PLAIN
 
     def ensure_table(
         self, reachable: ReachableMap, part: Part, backend: Backend, space: Workspace | None = None
@@ -117,13 +126,6 @@ class Poses:
     def sights(self) -> int:
         """Numbers of the sights of each pose."""
         return 0 if self.inside is None else self.inside.sights
-
-    def flags(self, corners: Corners | None) -> frozenset[str]:
-        """Return the flags of kernels that place poses with these corners."""
-        huge = corners is None or max(-corners[0][2], corners[3][2]) > LARGEST_HEADING
-        if self._dtype == _SINGLE:
-            return _HUGE_SINGLE if huge else _SINGLE_PLAIN
-        return _HUGE if huge else _PLAIN
 
     def buffer(self, backend: Backend, space: Workspace, part: Part) -> Buffer:
         """Return some poses on the device, uploaded from host memory; None where the host must place them."""
@@ -276,7 +278,7 @@ def place(
     shapes.
     """
     count, corners = part[1] - part[0], corners or poses.corners(part, backend, space)
-    flags = poses.flags(corners)
+    flags = poses.flags
     source, lows = poses.buffer(backend, space, part), 4 * count if careful else 4
     inside = None if poses.inside is None else poses.inside.buffers(backend, space, part, sees=sees)
     if source is None:

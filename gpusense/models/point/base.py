@@ -172,7 +172,8 @@ class PointModel(Pickled):
         """Return places or residuals of some poses, and the launch of the kernel that computes them."""
         backend, space, count = self._backend, self._workspace, part[1] - part[0]
         name, width = _PLACED[kernel]
-        flags, source = poses.flags(poses.corners(part, backend, space)), poses.buffer(backend, space, part)
+        poses.corners(part, backend, space)
+        flags, source = poses.flags, poses.buffer(backend, space, part)
         if source is None:
             assert poses.host is not None
             placed = np.empty((count, width), self._real)

@@ -186,9 +186,9 @@ class RecordedCall(ReplayedCall):
     """A call of ``log_likelihood``; see ``ReplayedCall``.
 
     ``status``: a buffer for the non-finite flag, which its owner inspects; ``limits``: type to which the scanner's
-    limits are rounded, by default the type of the ranges; ``corners``: of the box of the poses, to crop the map's table;
-    ``inside``: the worlds of the poses, in which ranges may be (N, K); ``per_beam``: whether to keep the term of each
-    reading.
+    limits are rounded, by default the type of the ranges; ``corners``: of the box of the poses, to crop the
+    map's table; ``inside``: the worlds of the poses, in which ranges may be (N, K); ``per_beam``: whether to keep the
+    term of each reading.
     """
 
     def __init__(

@@ -23,7 +23,6 @@ from gpusense.tables.reachable import ReachableMap
 from gpusense.tables.world_map import WorldMap, check_worlds
 from gpusense.tables.worlds import Worlds
 from gpusense.world.field_density import FieldDensity
-from gpusense.world.frames import split
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import LikelihoodFieldParameters
 
@@ -115,7 +114,9 @@ class FieldPipeline(ScanPipeline):
             finite = np.isfinite(cells)
             lengths = np.where(finite, cells, 0.0)
         # NumPy multiplies long rows in half the time of pairs.
-        high, low = split((scans.vectors.reshape(-1) * lengths.repeat(2)).reshape(-1, 2), self.real)
+        points = (scans.vectors.reshape(-1) * lengths.repeat(2)).reshape(-1, 2)
+        high = points.astype(self.real)
+        low = (points - high).astype(self.real)
         if not self.specialize:
             high[~finite] = cells[~finite, None]
         arrays = dict(point=high, point_low=low)

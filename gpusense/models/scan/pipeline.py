@@ -165,6 +165,8 @@ class ScanPipeline(ABC):
         self._converted = context.weights.readings if context.weights.is_peer else None
         # Flags, keyed by everything on which they depend.
         self._flags: dict[Hashable, frozenset[str]] = {}
+        # Largest launches, by rays and by whether the terms of readings are kept.
+        self._most: dict[tuple[int, bool], int] = {}
         # Flags to add and to remove while omissions are measured.
         self.trial: tuple[frozenset[str], frozenset[str]] | None = None
 
@@ -242,8 +244,11 @@ class ScanPipeline(ABC):
     def most_particles(self, readings: int, inside: WorldIndex | None, *, per_beam: bool = False) -> int:
         """Return the largest number of particles of a launch, by its rays and the sights of poses in worlds."""
         rays = readings * self.rays_each + (0 if inside is None or self.end_points else inside.sights)
-        kept = 1.0 if per_beam else self.kept_parts if self.backend.info.kind == "gpu" else 0.0
-        return chunk_of(self.backend, rays, self.real.itemsize * kept)
+        most = self._most.get((rays, per_beam))
+        if most is None:
+            kept = 1.0 if per_beam else self.kept_parts if self.backend.info.kind == "gpu" else 0.0
+            most = self._most[rays, per_beam] = chunk_of(self.backend, rays, self.real.itemsize * kept)
+        return most
 
     # ---- readings
 

@@ -41,7 +41,7 @@ def test_a_kernel_that_does_not_compile_names_file_line_and_log(needs, monkeypat
     line = 1 + source("raycast").split("real k_x = COUNT + (real)start")[0].count("\n")
     monkeypatch.setattr(sources, "opencl_source", broken)
     with pytest.raises(RuntimeError) as caught:
-        device._build("ranges", frozenset({"ORIGINS_OUTSIDE"}))
+        device.programs.build("ranges", frozenset({"ORIGINS_OUTSIDE"}))
     message = str(caught.value)
     assert message.startswith("ranges.cl did not compile on ")
     assert f"raycast.cl:{line}:" in message

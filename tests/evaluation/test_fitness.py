@@ -31,7 +31,7 @@ def test_a_device_without_float64_judges_a_log_as_others(needs):
     ]
     single = copy.copy(device)
     single.info = dataclasses.replace(device.info, float64=False)
-    single._launchers, single._programs = {}, {}
+    single._launchers = {}
     found = judged(single, scans)
     assert found.scans == 3 and found.explained > 0.8
     assert found == judged(device, scans)

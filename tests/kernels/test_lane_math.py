@@ -55,7 +55,7 @@ def evaluate(needs):
             f"    store_lanes({function}(load_lanes(get_global_id(0), in)), get_global_id(0), out);\n}}\n"
         )
         source = prelude(float64=double) + "".join(files) + kernel
-        program = backend._built(cl.Program(context, source))
+        program = backend.programs.built(cl.Program(context, source))
         given = cl.Buffer(context, cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR, hostbuf=numbers)
         made, found = cl.Buffer(context, cl.mem_flags.WRITE_ONLY, numbers.nbytes), np.empty_like(numbers)
         program.each(queue, (len(numbers) // lanes,), None, given, made)

@@ -215,6 +215,6 @@ def test_float64_is_switched_on_where_a_file_uses_it():
 def test_a_device_without_float64_cannot_place_poses(needs):
     device = copy.copy(get_backend(needs("opencl")))
     device.info = dataclasses.replace(device.info, float64=False)
-    device._launchers, device._programs = {}, {}
+    device._launchers = {}
     with pytest.raises(ValueError, match=r"placement\.cl: computes in float64, which .* does not have"):
         device.compile("place_poses", frozenset())

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import math
 import os
-import re
+import struct
 import threading
-import warnings
+import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,7 @@ import pyopencl as cl
 
 from gpusense.backends import processor
 from gpusense.backends.base import Adopted, Backend, BackendInfo, Buffer, ProcessBound
-from gpusense.backends.cache import discard_entry, load_entry, program_key, store_entry
 from gpusense.backends.opencl import memory, pocl
-from gpusense.backends.opencl.launch import Launch, OpenCLRecording, new_kernel, watch, without_caches
 from gpusense.backends.opencl.memory import (
     SHARED,
     DeviceBuffer,
@@ -29,18 +27,19 @@ from gpusense.backends.opencl.memory import (
     shares_memory,
     slots_of,
 )  # fmt: skip
+from gpusense.backends.opencl.programs import BoundLaunch, OpenCLRecording, Programs, new_kernel, without_caches
 from gpusense.backends.processor import Staging
 from gpusense.backends.recycled import ResultMemory
+from gpusense.interface import structs
 from gpusense.interface.launches import Program
-from gpusense.interface.signatures import KERNELS
-from gpusense.interface.sources import assemble, relevant, uses_double, with_places
+from gpusense.interface.signatures import KERNELS, Argument, Kernel, lanes_of, team_of
+from gpusense.interface.sources import assemble, relevant, uses_double
 
 # The fill command of one driver hangs beyond 2 GiB.
 _CLEAR = "kernel void clear(global uint *words, const ulong first) { words[first + get_global_id(0)] = 0; }"
 _CLEARED_WORDS = 1 << 28
 # Copies to a GPU of these sizes [bytes] take NVIDIA's driver nearly twice as long if they do not block.
 _SLOW = (64 << 10, 256 << 10)
-_ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
 
 
 class OpenCLBackend(ProcessBound, Backend):
@@ -69,20 +68,11 @@ class OpenCLBackend(ProcessBound, Backend):
         self._queued = self._ended = 0
         self.alignment = memory.alignment_of(device)
         self._launchers: dict[tuple[str, frozenset[str]], Launch] = {}
-        # Programs with the keys of their entries in the cache.
-        self._programs: dict[tuple[str, frozenset[str]], tuple[cl.Program, str]] = {}
-        self._pocl = pocl.pocl_kernels() if pocl.is_pocl(device) else None
-        self._of_bitcode = pocl.takes_bitcode(device)
+        self.programs = Programs(info, device, self._context)
+        self._pocl = self.programs.pocl
         # The last launch, if its groups leave a processor to the calling thread.
         self._most_watched = processor.threads() - 1 if self._pocl is not None else 0
         self._last: cl.Event | None = None
-        # Ranges are the same bits everywhere only if division is rounded correctly, an option on GPUs.
-        rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
-        self.options = ["-cl-fp32-correctly-rounded-divide-sqrt"] if rounded else []
-        if self._pocl is not None:
-            # PoCL would write the number of warnings to the terminal. Its hash of a kernel covers the options, not the
-            # processor.
-            self.options += ["-w", f"-DTARGET_{re.sub(r'[^a-z0-9]', '_', info.target)}"]
 
     @property
     def queue(self) -> cl.CommandQueue:
@@ -140,7 +130,7 @@ class OpenCLBackend(ProcessBound, Backend):
         if size <= 4 * _CLEARED_WORDS:
             cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), 0, size)
             return
-        kernel, words = new_kernel(self._built(cl.Program(self._context, _CLEAR)), "clear"), size // 4
+        kernel, words = new_kernel(self.programs.built(cl.Program(self._context, _CLEAR)), "clear"), size // 4
         for first in range(0, words, _CLEARED_WORDS):
             kernel.set_args(buffer, np.uint64(first))
             cl.enqueue_nd_range_kernel(self._queue, kernel, (min(_CLEARED_WORDS, words - first),), None)
@@ -250,70 +240,120 @@ class OpenCLBackend(ProcessBound, Backend):
         """Return a kernel; its program is built on first use."""
         file = KERNELS[kernel].file
         flags = relevant(file, flags)
-        row = KERNELS[kernel].with_flags(flags)
-        if (file, flags) not in self._programs:
-            self._programs[file, flags] = self._build(file, flags)
-        program, key = self._programs[file, flags]
-        first = None if self._pocl is None else functools.partial(self._pocl.mark, key)
-        name = pocl.own_name(kernel, key) if self._of_bitcode else kernel
-        compiled = new_kernel(program, name)
-        limit = compiled.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, self._device)
-        return Launch(self, compiled, row, flags, limit, first, group_multiple(compiled, self._device))
-
-    def _build(self, file: str, flags: frozenset[str]) -> tuple[cl.Program, str]:
-        """Build the program of a kernel file; return it with its key in the cache."""
         if "FLOAT64" in flags and not self.info.float64:
             raise ValueError(f"precision: must be 'float32' on {self.info.name}, which has no float64, got 'float64'")
         if not self.info.float64 and uses_double(file, flags):
             raise ValueError(f"{file}.cl: computes in float64, which {self.info.name} does not have")
-        source = assemble(file, flags)
-        # Bitcode belongs to the version of LLVM, which the platform's version names.
-        version = [self._device.platform.version] if self._of_bitcode else []
-        key = program_key(self.info, source, [*self.options, *version])
-        # PoCL's kernels are kept singly. For a binary, it would compile every kernel of the program for work-groups of
-        # any size, which takes three times as long as the rest of the build.
-        if self._pocl is None and (program := self._kept(key)) is not None:
-            return program, key
-        try:
-            if self._pocl is not None and self._of_bitcode:
-                return self._built_of_bitcode(self._pocl, file, source, key), key
-            with contextlib.nullcontext() if self._pocl is None else self._pocl.building(key):
-                program = self._built(cl.Program(self._context, source))
-        except cl.RuntimeError as error:
-            log = with_places(str(error), source)
-            raise RuntimeError(f"{file}.cl did not compile on {self.info.name}: {log}") from error
-        if self._pocl is None:
-            binaries: Any = program.get_info(cl.program_info.BINARIES)
-            devices: Any = program.get_info(cl.program_info.DEVICES)
-            if binary := binaries[devices.index(self._device)]:
-                store_entry(key, binary)
-        return program, key
+        compiled, first = self.programs.kernel(kernel, flags)
+        limit = compiled.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, self._device)
+        row = KERNELS[kernel].with_flags(flags)
+        return Launch(self, compiled, row, flags, limit, first, group_multiple(compiled, self._device))
 
-    def _built_of_bitcode(self, compiled: pocl.PoclKernels, file: str, source: str, key: str) -> cl.Program:
-        """Return a program of a kernel file, with unique kernel names."""
-        names = {name: pocl.own_name(name, key) for name, row in KERNELS.items() if row.file == file}
-        options = [*self.options, *(f"-D{name}={other}" for name, other in names.items())]
-        return compiled.built(
-            key,
-            list(names.values()),
-            lambda: self._built(cl.Program(self._context, source), options),
-            lambda bitcode: self._built(cl.Program(self._context, [self._device], [bitcode]), options),
-        )
 
-    def _kept(self, key: str) -> cl.Program | None:
-        """Return the program that an earlier run compiled; None if the driver accepts no stored one."""
-        binary = load_entry(key)
-        if binary is None:
-            return None
-        try:
-            return self._built(cl.Program(self._context, [self._device], [binary]))
-        except cl.Error:
-            discard_entry(key)
-            return None
+# ---- launches: arguments are bound by the signature table
 
-    def _built(self, program: cl.Program, options: list[str] | None = None) -> cl.Program:
-        """Compile a program, or load its binary; the options are the backend's where none are passed."""
-        with warnings.catch_warnings(), without_caches():
-            # Some drivers write a log for every program; pyopencl shows it where PYOPENCL_COMPILER_OUTPUT is set.
-            warnings.simplefilter("ignore", cl.CompilerWarning)
-            return program.build(self.options if options is None else options, [self._device])
+
+# Longest time for which the end of a launch is watched [s].
+_WATCHED = 1e-4
+
+
+def watch(event: cl.Event) -> None:
+    """Return once a launch has ended, or after a short while, without sleeping.
+
+    PoCL's worker ends a short launch earlier than a thread falls asleep and wakes up, which takes 30 to 40 us.
+    """
+    end = time.perf_counter() + _WATCHED
+    while event.command_execution_status > cl.command_execution_status.COMPLETE and time.perf_counter() < end:
+        pass
+
+
+class Launch:
+    """A kernel that binds arguments by the signature table and enqueues its launch."""
+
+    def __init__(
+        self,
+        backend: OpenCLBackend,
+        kernel: cl.Kernel,
+        row: Kernel,
+        flags: frozenset[str],
+        limit: int,
+        first: Callable[[], None] | None = None,
+        multiple: int = 1,
+    ) -> None:
+        self._backend, self._kernel = backend, kernel
+        # Most work-items of a group of the kernel on the device.
+        self.limit = limit
+        # Function that is called once, before the kernel's first launch.
+        self._first = first
+        self._lanes, self._group = (1, row.group)
+        if "IN_LANES" in flags:
+            self._lanes, self._group = (lanes_of(flags) if row.in_lanes else 1), row.lanes_group
+        elif "IN_TEAMS" in flags:
+            self._group = team_of(row, flags)
+        if "IN_TEAMS" not in flags:
+            self._group = min(-(-self._group // multiple) * multiple, limit)
+        self._lock = threading.Lock()
+        real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
+        # With its types set, pyopencl sets all arguments in 1 us; otherwise a single number takes 6 us.
+        self._types = [_set_as(argument, real) for argument in row.arguments]
+        # Places of structs, and functions that pack them into the bytes that the device reads.
+        self._packers = [
+            (place, struct.Struct(structs.layout(argument.type, real)).pack)
+            for place, argument in enumerate(row.arguments)
+            if argument.is_struct
+        ]
+        self._last_structs: list[tuple[Any, bytes]] = [(None, b"")] * len(self._packers)
+        self._last_size: tuple[Any, Any] = (None, None)
+        with without_caches():
+            kernel.set_arg_types(self._types)
+
+    def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
+        """See Launcher.__call__."""
+        if self._first is not None:
+            self._before_first()
+        # Arguments belong to the kernel object, so two threads must not interleave.
+        with self._lock:
+            packed = list(arguments)
+            for number, (place, pack) in enumerate(self._packers):
+                # Calls mostly repeat the last struct.
+                if packed[place] is not self._last_structs[number][0]:
+                    self._last_structs[number] = packed[place], pack(*packed[place])
+                packed[place] = self._last_structs[number][1]
+            if size != self._last_size[0]:
+                self._last_size = size, self._sizes(size)
+            try:
+                self._kernel.set_args(*packed)
+                self._backend.enqueue(self._kernel, *self._last_size[1])
+            except cl.Error as error:
+                raise_clearly(error)
+
+    def bind(self, size: tuple[int, ...], arguments: tuple[Any, ...]) -> BoundLaunch:
+        """Set the arguments of a new kernel object, and start nothing."""
+        if self._first is not None:
+            self._before_first()
+        kernel = new_kernel(self._kernel.program, self._kernel.function_name)
+        with without_caches():
+            kernel.set_arg_types(self._types)
+        packed = list(arguments)
+        for place, pack in self._packers:
+            packed[place] = pack(*packed[place])
+        kernel.set_args(*packed)
+        return BoundLaunch(kernel, *self._sizes(size), arguments)
+
+    def _before_first(self) -> None:
+        """Call the function for the first launch."""
+        if self._first is not None:
+            self._first()
+            self._first = None
+
+    def _sizes(self, size: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Return the size in whole groups, and the group."""
+        group = (self._group, *(1 for _ in size[1:]))
+        return (-(-size[0] // (self._lanes * group[0])) * group[0], *size[1:]), group
+
+
+def _set_as(argument: Argument, real: np.dtype) -> Any:
+    """Return the type with which pyopencl sets an argument; None for buffers."""
+    if argument.is_struct:
+        return np.dtype(("V", struct.calcsize(structs.layout(argument.type, real))))
+    return argument.dtype(real).type if argument.shape is None else None

@@ -76,13 +76,13 @@ def test_bound_calls_on_another_queue(as_gpu, queue, there):
 
 def test_a_bound_call_binds_no_argument_again(as_gpu, queue, there, monkeypatch):
     """A call is three launches with private kernel objects."""
-    from gpusense.backends.opencl import launch as _opencl_launch
+    from gpusense.backends.opencl import programs as _programs
 
     model = FIELD(GRID, NEAR, backend=queue)
     call = model.bind(there(cloud(1)), there(mixed(1)))
-    names, enqueue = [], _opencl_launch.cl.enqueue_nd_range_kernel
+    names, enqueue = [], _programs.cl.enqueue_nd_range_kernel
     monkeypatch.setattr(
-        _opencl_launch.cl, "enqueue_nd_range_kernel",
+        _programs.cl, "enqueue_nd_range_kernel",
         lambda queue, kernel, *sizes: (names.append(kernel.function_name), enqueue(queue, kernel, *sizes))[1],
     )  # fmt: skip
     monkeypatch.setattr(as_gpu, "compile", None)

@@ -9,8 +9,8 @@ from support.matching_scenes import RING, random_pairs
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.backends.opencl import backend as of_backend
-from gpusense.backends.opencl import launch, memory
-from gpusense.backends.opencl.launch import watch
+from gpusense.backends.opencl import memory, programs
+from gpusense.backends.opencl.backend import watch
 
 
 def test_shared_memory_waits_for_its_commands(needs, monkeypatch):
@@ -25,11 +25,11 @@ def test_shared_memory_waits_for_its_commands(needs, monkeypatch):
 
 
 def test_a_recording_waits_for_its_queues(queue, monkeypatch):
-    recording = launch.OpenCLRecording(queue, [], lambda count: None)
+    recording = programs.OpenCLRecording(queue, [], lambda count: None)
     recording(queue)
     waits = []
     monkeypatch.setattr(recording, "_wait_for_all", lambda: waits.append(1))
-    monkeypatch.setattr(launch, "undisturbed", None)
+    monkeypatch.setattr(programs, "undisturbed", None)
     recording.__del__()
     assert waits == [1]
     recording._used.clear()

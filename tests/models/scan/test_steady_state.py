@@ -76,14 +76,15 @@ class Watch:
         monkeypatch.setattr(kind, "upload", watched_upload)
         monkeypatch.setattr(kind, "download", watched_download)
         monkeypatch.setattr(kind, "empty", watched_empty)
-        if hasattr(kind, "_build"):
-            build = kind._build
+        built = "build" if hasattr(device, "programs") else "_build"
+        if hasattr(builder := getattr(device, "programs", device), built):
+            build = getattr(builder, built)
 
-            def watched_build(backend, *arguments):
+            def watched_build(*arguments):
                 self.compiled.append(str(arguments))
-                return build(backend, *arguments)
+                return build(*arguments)
 
-            monkeypatch.setattr(kind, "_build", watched_build)
+            monkeypatch.setattr(builder, built, watched_build)
         self._count_buffers(device, monkeypatch)
 
     def _count_buffers(self, device, monkeypatch) -> None:

@@ -10,6 +10,7 @@ from gpusense.reference.ranges import cast_ranges
 from gpusense.reference.ray import expected_range
 from gpusense.reference.sensor_table import tabulated_density
 from gpusense.reference.sums import particles_of_scans
+from gpusense.reference.worlds import meet_shapes
 
 
 def ray_limit(flags, z, terms, scale):
@@ -28,6 +29,11 @@ def cast_beam(flags, map_table, normals, pose_cell, pose, ray, rays, window, con
         )  # fmt: skip
         return expected_range(flags, t, scale), cosine
     ranges = np.empty(len(pose) * rays, pose.dtype)
+    if "SHAPES" in flags:
+        none = np.empty(0, np.int32)
+        meet_shapes(
+            flags, shapes, world, pose_cell, pose, ray, none, ranges, len(pose), rays, scale.limit, crowd
+        )  # fmt: skip
     cast_ranges(
         flags, map_table, world, shapes, pose_cell, pose, ray, ranges, window, len(pose), rays, caster, scale, crowd
     )

@@ -7,7 +7,7 @@ import numpy as np
 from gpusense.interface.casters import caster_file
 from gpusense.reference.ray import expected_range
 from gpusense.reference.raycast import sectors_of
-from gpusense.reference.shapes import nearest_shape, particles_of_worlds, world_begin, world_window
+from gpusense.reference.shapes import particles_of_worlds, world_begin, world_window
 
 BLOCK = 1 << 15
 
@@ -36,18 +36,14 @@ def cast_in_worlds(flags, map_table, world, pose_cell, pose, ray, window, rays, 
 def cast_ranges(
     flags, map_table, world, shapes, pose_cell, pose, ray, ranges, window, particles, rays, caster, scale, crowd,
 ):  # fmt: skip
-    """Cast all rays of all particles."""
+    """Cast all rays of all particles; see ``meet_shapes``."""
     block = max(BLOCK // max(rays, 1), 1)
     for first in range(0, particles, block):
         part = slice(first, min(first + block, particles))
         own = world[2 * part.start : 2 * part.stop]
         t = cast_in_worlds(flags, map_table, own, pose_cell[part], pose[part], ray, window, rays, scale.limit, caster)
-        if "SHAPES" in flags:
-            lanes = (np.repeat(pose_cell[part], rays, axis=0), np.repeat(pose[part], rays, axis=0))
-            of_rays = np.repeat(own.reshape(-1, 4), rays, axis=0).reshape(-1, 2)
-            beams = np.tile(ray[:rays], (part.stop - first, 1))
-            t = nearest_shape(shapes, of_rays, crowd, *lanes, beams, t)[0]
-        ranges[first * rays : part.stop * rays] = expected_range(flags, t, scale)
+        out = ranges[first * rays : part.stop * rays]
+        out[:] = expected_range(flags, np.minimum(t, out) if "SHAPES" in flags else t, scale)
 
 
 def cast_tiles(

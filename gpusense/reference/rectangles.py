@@ -148,7 +148,7 @@ def free_rows(flags, bits, runs, band, cols, words, begin, end):
 
 def rectangles_scan(
     flags, runs, place, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds, lines,
-    group,
+    group, tall,
 ):  # fmt: skip
     """Find the highest rectangles of sufficient width along columns, from free cells in rows."""
     if worlds > 1:
@@ -156,7 +156,7 @@ def rectangles_scan(
         for w in range(worlds):
             rectangles_scan(
                 flags, rows_of[:, w].reshape(-1), place[w:], rectangles, rows, cols, sectors, first, band, top, left,
-                bottom, right, 1, lines, group,
+                bottom, right, 1, lines, group, tall,
             )  # fmt: skip
         return
     free = runs[: 2 * band * cols].reshape(2, band, cols)

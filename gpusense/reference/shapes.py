@@ -17,9 +17,9 @@ from gpusense.interface import structs
 from gpusense.reference.ray import TINY, ray_direction
 
 DISC, BOX, SEGMENT = 4, 8, 4
-# Ranges of directions of a particle's sights, and the widening of a shape's range.
-SIGHTS = 64
-APART = 2e-3
+# Ranges of directions of a particle's sights, and of a table of beams; widening of a shape's range in quarters of a turn.
+SIGHTS, DIRECTIONS = 64, 1024
+APART = 1.25e-4
 
 
 def world_window(world: np.ndarray, n: int) -> structs.Window:
@@ -40,13 +40,13 @@ def particles_of_worlds(world: np.ndarray, particles: int) -> Iterator[np.ndarra
     yield from np.split(order, np.flatnonzero(np.diff(index[order])) + 1)
 
 
-def sight_of(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the places of directions among the ranges of sights, from 0 to SIGHTS. They grow with the angle."""
+def turned(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return directions as numbers from 0 to 4, which grow with the angle."""
     part = y / (np.abs(x) + np.abs(y))
-    return np.where(x >= 0, 1 + part, 3 - part) * x.dtype.type(SIGHTS / 4)
+    return np.where(x >= 0, 1 + part, 3 - part)
 
 
-def sights_of(
+def directions_of(
     shapes: np.ndarray, world: np.ndarray, crowd: structs.Crowd, i: int, cell: np.ndarray, pose: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the first range of directions in which each particle sees a shape and the one after the last."""
@@ -68,7 +68,8 @@ def sights_of(
         )
         around = (np.abs(turn) <= real(-1e-3) * along) | ((x == 0) & (y == 0)) | ((end_x == 0) & (end_y == 0))
     begin, last = (
-        np.floor(np.where(around, real(0), sight_of(*end) + real(by))) for end, by in ((low, -APART), (high, APART))
+        np.floor(np.where(around, real(0), turned(*end) + real(by)) * real(SIGHTS / 4))
+        for end, by in ((low, -APART), (high, APART))
     )
     none = (i == ignored) | ~np.isfinite(x)
     end = np.where(around, SIGHTS, np.where(last < begin, last + SIGHTS, last) + 1)

@@ -16,9 +16,10 @@ from gpusense.reference.shapes import (
     BOX,
     DISC,
     SIGHTS,
+    nearest_shape,
     particles_of_worlds,
     shape_distance,
-    sights_of,
+    directions_of,
     world_begin,
     world_window,
 )
@@ -112,9 +113,24 @@ def find_sights(flags, shapes, world, pose_cell, pose, sights, particles, crowd)
     found = sights[2 * crowd.begin : 2 * crowd.begin + particles * SIGHTS * words].reshape(particles, SIGHTS, words)
     with np.errstate(all="ignore"):
         for i in range(crowd.discs + crowd.boxes + crowd.segments):
-            ranges = sights_of(shapes, world[: 2 * particles], crowd, i, pose_cell[:particles], pose[:particles])
+            ranges = directions_of(shapes, world[: 2 * particles], crowd, i, pose_cell[:particles], pose[:particles])
             for n, (begin, end) in enumerate(zip(*ranges, strict=True)):
                 found[n, np.arange(begin, end) % SIGHTS, i // 32] |= np.array(1 << i % 32, np.uint32).view(np.int32)
+
+
+def meet_shapes(flags, shapes, world, pose_cell, pose, ray, turns, ranges, particles, rays, limit, crowd):
+    """Find the distances of the nearest shapes along the rays of particles, ``limit`` where none is nearer.
+
+    NumPy's rays test every shape, and need no ``turns``.
+    """
+    block = max((1 << 15) // max(rays, 1), 1)
+    for first in range(0, particles, block):
+        part = slice(first, min(first + block, particles))
+        of_rays = np.repeat(world[2 * part.start : 2 * part.stop].reshape(-1, 4), rays, axis=0).reshape(-1, 2)
+        lanes = (np.repeat(pose_cell[part], rays, axis=0), np.repeat(pose[part], rays, axis=0))
+        beams = np.tile(ray[:rays], (part.stop - first, 1))
+        t = np.full(len(beams), pose.dtype.type(limit))
+        ranges[first * rays : part.stop * rays] = nearest_shape(shapes, of_rays, crowd, *lanes, beams, t)[0]
 
 
 def point_in(points: np.ndarray, here: structs.Frame) -> np.ndarray:

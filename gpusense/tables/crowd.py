@@ -13,6 +13,7 @@ from gpusense.backends.base import Buffer
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import launch
 from gpusense.interface.structs import Crowd, Frame
+from gpusense.reference.shapes import DIRECTIONS, turned
 
 # By kind: numbers of a shape as the user passes it, and in the table.
 _KINDS = {"discs": (3, 4), "boxes": (5, 8), "segments": (4, 4)}
@@ -76,6 +77,19 @@ class Shapes:
             words += [f"{count} {one if count == 1 else many}"] if count else []
         worlds = self.worlds or 0
         return f"Shapes({', '.join(words) or 'none'} in each of {worlds} world{'s' if worlds != 1 else ''})"
+
+
+def turns_of(vectors: np.ndarray) -> np.ndarray:
+    """Return the order of (K, 2) ray vectors by direction; see the kernel file ``shapes``.
+
+    Returns:
+        (1025 + K,) first place of each range of directions among the rays in order, K, and the rays in order.
+    """
+    x, y = vectors.T
+    places = np.floor(turned(x, y) * (DIRECTIONS / 4)).astype(int) % DIRECTIONS
+    order = np.argsort(places, kind="stable")
+    firsts = np.searchsorted(places[order], np.arange(DIRECTIONS + 1))
+    return np.concatenate([firsts, order]).astype(np.int32)
 
 
 NO_CROWD = Crowd(0, 0, 0, 0, 0.0)

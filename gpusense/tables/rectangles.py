@@ -25,7 +25,9 @@ _NO_FLAGS: frozenset[str] = frozenset()
 # The kernel file ``rectangles`` has the same numbers.
 RECTANGLE_REACH = 254
 _STACK = 1024
-_TALL = 64
+# Least cells of a column that a work-item of a GPU takes, and number of work-items that fill any GPU. Where a column
+# begins, its work-item has to find a rectangle from nothing.
+_TALL, _ENOUGH = 64, 1 << 19
 # Rows of a group.
 ROWS = 8
 # Largest maps on GPUs with planes of single rows, and with four sectors [cells].
@@ -163,7 +165,10 @@ def _make(
     words, lines = -(-cols // 32), band * worlds
     quads = -(-(end - begin) // 4)
     backend.compile("free_rows", _NO_FLAGS)((quads, lines), marked, runs, lines, cols, words, begin, end)
-    tiles = -(-min(bottom - top + RECTANGLE_REACH, rows) // _TALL)
-    size = (min(right - left + RECTANGLE_REACH, cols), tiles * sectors, 4 * worlds)
+    height, width = min(bottom - top + RECTANGLE_REACH, rows), min(right - left + RECTANGLE_REACH, cols)
+    tall = _TALL
+    while tall < height and -(-height // (2 * tall)) * sectors * 4 * worlds * width >= _ENOUGH:
+        tall *= 2
+    size = (width, -(-height // tall) * sectors, 4 * worlds)
     scan = backend.compile("rectangles_scan", _NO_FLAGS)
-    scan(size, runs, place, rectangles, *changed_part, worlds, planes.lines(rows), planes.group)
+    scan(size, runs, place, rectangles, *changed_part, worlds, planes.lines(rows), planes.group, tall)

@@ -13,12 +13,11 @@ from gpusense.backends.workspace import Workspace
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import launch
 from gpusense.interface.structs import Crowd, Frame
+from gpusense.reference.shapes import SIGHTS
 from gpusense.tables.crowd import CrowdTable
 from gpusense.world.windows import LONGEST_SIDE
 
 _INT, _BYTE, _SINGLE = np.dtype(np.int32), np.dtype(np.uint8), np.dtype(np.float32)
-# The kernel file ``shapes`` has the same number.
-SIGHTS = 64
 _ON_DEVICE = ("int32", "int64")
 
 

@@ -1,4 +1,5 @@
-// Expected ranges of poses and bearings by any caster. A walk ends at the nearest moving shape.
+// Expected ranges of poses and bearings by any caster. A walk ends at the nearest moving shape, whose
+// distance stands in place of the range; see meet_shapes.
 // requires: caster shapes
 
 // Cast rays: one work-item takes a particle and ray.
@@ -12,7 +13,7 @@ kernel void cast_ranges(ARGUMENTS) {
     const Window seen = window;
 #endif
 #if SHAPES
-    const real limit = nearest_shape(shapes, world, crowd, n, pose_cell[n], pose[n], ray[k], scale.limit).x;
+    const real limit = ranges[(long)n * rays + k];
 #else
     const real limit = scale.limit;
 #endif
@@ -40,7 +41,7 @@ kernel void cast_tiles(ARGUMENTS) {
 #endif
     for (int k = tile_ray(item, spread); k < rays; k += tile_step(spread)) {
 #if SHAPES
-        const real limit = nearest_shape(shapes, world, crowd, n, cell, sensor_pose, ray[k], scale.limit).x;
+        const real limit = ranges[n * rays + k];
 #else
         const real limit = scale.limit;
 #endif

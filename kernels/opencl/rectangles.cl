@@ -22,8 +22,6 @@
 #define RECTANGLE_REACH 254
 // Capacity of the stack of columns that may bound a rectangle.
 #define STACK 256
-// Cells of a column that a work-item of a GPU takes.
-#define TALL 64
 
 // Return the index of a cell in a padded plane.
 int padded(const int row, const int col, const int cols) { return (row + 1) * (cols + 2) + col + 1; }
@@ -33,9 +31,6 @@ int padded_in_groups(const int row, const int col, const int cols, const int gro
     const int in_group = (row + 1) & (group - 1);
     return (row + 1 - in_group) * (cols + 2) + (col + 1) * group + in_group;
 }
-
-// Return a quotient of integers from 0, for dividends up to 4000 and divisors up to 12.
-int divided(const int dividend, const int divisor) { return (dividend * (65536 / divisor + 1)) >> 16; }
 
 // Return the first cell along an axis whose rectangle can contain the cell low or one beyond it. Rectangles extend to
 // larger (way 1) or smaller (way -1) indices.
@@ -126,7 +121,7 @@ kernel void free_rows(ARGUMENTS) {
 }
 
 // Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a sector of
-// TALL cells of a column in a quadrant, from the far end on. height and width are the sides of the highest rectangle of
+// tall cells of a column in a quadrant, from the far end on. height and width are the sides of the highest rectangle of
 // sufficient width, narrower is the width of a rectangle that is one row higher, and bound is the number of rows to the
 // nearest row with this width; wider and nearer are the same of the rows before that one, wider is -1 where they are
 // unknown. From one cell to the next the height grows by one at most, and its rows without the new row allow every
@@ -135,14 +130,16 @@ kernel void rectangles_scan(ARGUMENTS) {
     const int quadrant = get_global_id(2) & 3, w = get_global_id(2) >> 2;
     const int dx = quadrant & 1 ? -1 : 1, dy = quadrant & 2 ? -1 : 1;
     const int sector = get_global_id(1) % sectors, tile = get_global_id(1) / sectors;
-    const int col = reach_begin(dx, left) + get_global_id(0), begin = reach_begin(dy, top) + TALL * tile;
-    const int end = min(begin + TALL, reach_end(dy, bottom, rows));
+    const int col = reach_begin(dx, left) + get_global_id(0), begin = reach_begin(dy, top) + tall * tile;
+    const int end = min(begin + tall, reach_end(dy, bottom, rows));
     if (col >= reach_end(dx, right, cols) || w >= worlds) return;
     global const uchar *column = runs + ((long)(quadrant & 1) * band * worlds + w) * cols + col;
     global ushort *out = rectangles + (long)place[w] * 4 * sectors;
     out += (long)(quadrant * sectors + sector) * lines * (cols + 2);
     const int2 middle = slope(sectors, sector);
     const long line = (long)worlds * cols, step = dy * line;
+    // x * inverse >> 16 is x / middle.y for x up to 4000.
+    const int inverse = 65536 / middle.y + 1;
     int height = 0, width = LONGEST, narrower = 0, bound = 0, wider = LONGEST, nearer = 0, filled = 0;
     ulong four = 0;
     for (int i = 0; i < end - begin; ++i) {
@@ -162,7 +159,7 @@ kernel void rectangles_scan(ARGUMENTS) {
             bound = here <= width ? 0 : bound + 1;
             nearer = here <= wider ? 0 : nearer + 1;
             wider = here <= width ? LONGEST : min(here, wider);
-            height = higher ? height + 1 : min(height, divided(here * middle.x, middle.y));
+            height = higher ? height + 1 : min(height, here * middle.x * inverse >> 16);
             narrower = height == room ? 0 : higher ? min(here, narrower) : least;
             width = height > 0 ? least : LONGEST;
             if (height > 0 && bound >= height) {

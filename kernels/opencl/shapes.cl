@@ -21,43 +21,41 @@ long world_begin(global const int2 *world, const int n, const int each) { return
 #define DISC 4
 #define BOX 8
 #define SEGMENT 4
-// Ranges of directions of a particle's sights.
+// Ranges of directions of a particle's sights, and of a table of beams.
 #define SIGHTS 64
-// Widening of a shape's range of directions, which covers rounding, as a sine and in ranges.
+#define DIRECTIONS 1024
+// Widening of a shape's range of directions, which covers rounding, as a sine and in quarters of a turn.
 #define WIDER (real)1e-5
-#define APART (real)2e-3
-// Factor that covers rounding where a shape is behind what is nearest so far.
-#define FARTHER (real)1.00001
+#define APART (real)1.25e-4
 
 #if SHAPES
-// Return the place of a direction among the ranges of sights, from 0 to SIGHTS. It grows with the angle, at a rate that
-// varies.
-real sight_of(const real x, const real y) {
+// Return a direction as a number from 0 to 4, which grows with the angle, at a rate that varies.
+real turned(const real x, const real y) {
     const real part = y / (fabs(x) + fabs(y));
-    return (x >= 0 ? 1 + part : 3 - part) * (SIGHTS / 4);
+    return x >= 0 ? 1 + part : 3 - part;
 }
 
-// Return the first range of directions in which a shape is seen and the one after the last. From the origin, low and
-// high are the directions of its ends against the clock; a shape all around is seen in all.
-int2 sights_between(const real2 low, const real2 high, const int around) {
-    if (around) return (int2)(0, SIGHTS);
-    const int first = (int)floor(sight_of(low.x, low.y) - APART), last = (int)floor(sight_of(high.x, high.y) + APART);
-    return (int2)(first, (last < first ? last + SIGHTS : last) + 1);
+// Return the first and the last direction in which a shape is seen. From the origin, low and high are the directions of
+// its ends against the clock; a shape all around is seen in all.
+real2 seen_between(const real2 low, const real2 high, const int around) {
+    if (around) return (real2)(0, (real)3.999);
+    const real first = turned(low.x, low.y) - APART, last = turned(high.x, high.y) + APART;
+    return (real2)(first, last < first ? last + 4 : last);
 }
 
-// Return the ranges of directions in which a disc, or a circle around a shape, is seen.
-int2 sights_of_disc(const real x, const real y, const real radius) {
+// Return the directions in which a disc, or a circle around a shape, is seen.
+real2 directions_of_disc(const real x, const real y, const real radius) {
     const real sine = radius / sqrt(x * x + y * y) + WIDER, cosine = sqrt((1 - sine) * (1 + sine));
-    return sights_between((real2)(x * cosine + y * sine, y * cosine - x * sine),
-                          (real2)(x * cosine - y * sine, y * cosine + x * sine), !(sine < (real)0.99));
+    return seen_between((real2)(x * cosine + y * sine, y * cosine - x * sine),
+                        (real2)(x * cosine - y * sine, y * cosine + x * sine), !(sine < (real)0.99));
 }
 
-// Return the ranges of directions in which a segment is seen.
-int2 sights_of_segment(const real x, const real y, const real end_x, const real end_y) {
+// Return the directions in which a segment is seen.
+real2 directions_of_segment(const real x, const real y, const real end_x, const real end_y) {
     const real turn = x * end_y - y * end_x, along = x * end_x + y * end_y;
     const int between = fabs(turn) <= (real)-1e-3 * along || (x == 0 && y == 0) || (end_x == 0 && end_y == 0);
     const real2 one = (real2)(x, y), other = (real2)(end_x, end_y);
-    return turn >= 0 ? sights_between(one, other, between) : sights_between(other, one, between);
+    return turn >= 0 ? seen_between(one, other, between) : seen_between(other, one, between);
 }
 
 // Return the index of a shape's first number.
@@ -66,15 +64,19 @@ int shape_at(const Crowd crowd, const int i) {
     return DISC * (i - boxes) + BOX * (boxes - segments) + SEGMENT * segments;
 }
 
-// Return the first range of directions in which a particle sees a shape and the one after the last.
-int2 sights_of(global const real *shapes, global const int2 *world, const Crowd crowd, const int n, const int i,
-               const int2 cell, const real4 pose) {
+// Return the first and the last direction, relative to a heading (cos, sin), in which a particle sees a shape; the last
+// is below the first where it sees none.
+real2 directions_of(global const real *shapes, global const int2 *world, const Crowd crowd, const int n, const int i,
+                    const int2 cell, const real4 pose, const real2 heading) {
     const int2 seen = world[2 * n + 1];
     global const real *one = shapes + (long)seen.x * crowd.stride + shape_at(crowd, i);
     const real x = (one[0] - cell.x) - pose.x, y = (one[1] - cell.y) - pose.y;
-    if (i == seen.y || !(x - x == 0)) return (int2)(0, 0);
-    if (i < crowd.discs + crowd.boxes) return sights_of_disc(x, y, i < crowd.discs ? one[2] : one[6]);
-    return sights_of_segment(x, y, (one[2] - cell.x) - pose.x, (one[3] - cell.y) - pose.y);
+    if (i == seen.y || !(x - x == 0)) return (real2)(0, -1);
+    const real along = heading.x * x + heading.y * y, aside = heading.x * y - heading.y * x;
+    if (i < crowd.discs + crowd.boxes) return directions_of_disc(along, aside, i < crowd.discs ? one[2] : one[6]);
+    const real end_x = (one[2] - cell.x) - pose.x, end_y = (one[3] - cell.y) - pose.y;
+    return directions_of_segment(along, aside, heading.x * end_x + heading.y * end_y,
+                                 heading.x * end_y - heading.y * end_x);
 }
 
 // Return the index of the first pair of numbers that hold the shapes which a particle may see in a range of directions.
@@ -126,49 +128,30 @@ real2 meet_segment(const real dx, const real dy, const real x, const real y, con
     return (real2)((aside <= 0) & (end_aside >= 0) | (aside >= 0) & (end_aside <= 0) ? met : (real)INFINITY, straight);
 }
 
-// Return a word whose lowest n bits are 1.
-uint lowest_bits(const int n) { return n >= 32 ? 0xffffffffu : n > 0 ? (1u << n) - 1 : 0; }
+// Return the same of shape i of a world, whose numbers begin at one.
+real2 meet_shape(global const real *one, const int i, const Crowd crowd, const int2 cell, const real4 pose,
+                 const real2 direction) {
+    const real4 four = *(global const real4 *)one;
+    const real x = (four.x - cell.x) - pose.x, y = (four.y - cell.y) - pose.y;
+    if (i < crowd.discs) return meet_disc(direction.x, direction.y, x, y, four.z);
+    if (i < crowd.discs + crowd.boxes)
+        return meet_box(direction.x, direction.y, x, y, four.z, four.w, one[4], one[5]);
+    return meet_segment(direction.x, direction.y, x, y, (four.z - cell.x) - pose.x, (four.w - cell.y) - pose.y);
+}
 
 // Return the nearest of the shapes that a particle sees along a ray and of an obstacle at a distance t: the distance in
-// cells, and the cosine of the angle of incidence, 2 where no shape is nearer than t. A kind follows the other, so that
-// work-items of a GPU run the same code. Most shapes are beside the ray, or behind what is nearest so far.
+// cells, and the cosine of the angle of incidence, 2 where no shape is nearer than t.
 real2 nearest_shape(global const real *shapes, global const int2 *world, const Crowd crowd, const int n,
                     const int2 cell, const real4 pose, const real2 ray, const real t) {
     const real2 direction = ray_direction(pose, ray);
-    const real dx = direction.x, dy = direction.y;
-    // Shape i of a kind begins i times its numbers behind these places.
-    global const real *disc = shapes + (long)world[2 * n + 1].x * crowd.stride;
-    global const real *box = disc + (DISC - BOX) * crowd.discs;
-    global const real *segment = box + (BOX - SEGMENT) * (crowd.discs + crowd.boxes);
-    global const int *sights = (global const int *)(world + sight_at(crowd, n, (int)sight_of(dx, dy)));
+    global const real *first = shapes + (long)world[2 * n + 1].x * crowd.stride;
+    const int sight = (int)(turned(direction.x, direction.y) * (SIGHTS / 4));
+    global const int *sights = (global const int *)(world + sight_at(crowd, n, sight));
     real2 nearest = (real2)(t, 2);
     for (int k = 0; k < 2 * crowd.pairs; ++k) {
-        const uint seen = (uint)sights[k], discs = lowest_bits(crowd.discs - 32 * k);
-        const uint boxes = lowest_bits(crowd.discs + crowd.boxes - 32 * k);
-        for (uint left = seen & discs; left != 0; left &= left - 1) {
-            const real4 one = *(global const real4 *)(disc + DISC * (32 * k + lowest_bit(left)));
-            const real x = (one.x - cell.x) - pose.x, y = (one.y - cell.y) - pose.y;
-            if (!(fabs(dx * y - dy * x) <= one.z) || dx * x + dy * y - FARTHER * one.z >= nearest.x) continue;
-            const real2 met = meet_disc(dx, dy, x, y, one.z);
-            if (met.x < nearest.x) nearest = met;
-        }
-        for (uint left = seen & boxes & ~discs; left != 0; left &= left - 1) {
-            global const real4 *both = (global const real4 *)(box + BOX * (32 * k + lowest_bit(left)));
-            const real4 one = both[0], rest = both[1];
-            const real x = (one.x - cell.x) - pose.x, y = (one.y - cell.y) - pose.y;
-            const real along = dx * x + dy * y;
-            if (!(fabs(dx * y - dy * x) <= rest.z) || along - (FARTHER - 1) * along - rest.z >= nearest.x) continue;
-            const real2 met = meet_box(dx, dy, x, y, one.z, one.w, rest.x, rest.y);
-            if (met.x < nearest.x) nearest = met;
-        }
-        for (uint left = seen & ~boxes; left != 0; left &= left - 1) {
-            const real4 one = *(global const real4 *)(segment + SEGMENT * (32 * k + lowest_bit(left)));
-            const real x = (one.x - cell.x) - pose.x, y = (one.y - cell.y) - pose.y;
-            const real end_x = (one.z - cell.x) - pose.x, end_y = (one.w - cell.y) - pose.y;
-            const real aside = dx * y - dy * x, end_aside = dx * end_y - dy * end_x;
-            if ((aside > 0 && end_aside > 0) || (aside < 0 && end_aside < 0)) continue;
-            if (dx * x + dy * y >= nearest.x && dx * end_x + dy * end_y >= nearest.x) continue;
-            const real2 met = meet_segment(dx, dy, x, y, end_x, end_y);
+        for (uint left = (uint)sights[k]; left != 0; left &= left - 1) {
+            const int i = 32 * k + lowest_bit(left);
+            const real2 met = meet_shape(first + shape_at(crowd, i), i, crowd, cell, pose, direction);
             if (met.x < nearest.x) nearest = met;
         }
     }

@@ -94,9 +94,88 @@ kernel void find_sights(ARGUMENTS) {
     const int item = get_global_id(0), count = crowd.discs + crowd.boxes + crowd.segments;
     const int n = item / count, i = item % count;
     if (n >= particles) return;
-    const int2 range = sights_of(shapes, world, crowd, n, i, pose_cell[n], pose[n]);
-    for (int k = range.x; k < range.y; ++k)
+    const real2 seen = directions_of(shapes, world, crowd, n, i, pose_cell[n], pose[n], (real2)(1, 0)) * (SIGHTS / 4);
+    for (int k = (int)floor(seen.x); k <= (int)floor(seen.y); ++k)
         atomic_or(&sights[2 * sight_at(crowd, n, k) + i / 32], (int)(1u << (i % 32)));
+}
+
+// Work-items of a team, and most rays of which it finds the nearest shapes.
+#if IN_TEAMS
+#define TEAM 64
+#define MOST_RAYS 2048
+#else
+#define TEAM 1
+#endif
+
+// Find the distances of the nearest shapes along the rays of particles, limit where none is nearer. A work-item, or with
+// IN_TEAMS a team of them, takes a particle. A shape covers few rays: members share all pairs of a shape and a ray that
+// it covers. turns has the first place of each of DIRECTIONS ranges of directions relative to the
+// heading among the rays in order, their number, and the rays in order.
+kernel void meet_shapes(ARGUMENTS) {
+#if IN_TEAMS
+    local int end[TEAM], base[TEAM];
+    local real nearest[MOST_RAYS];
+    const int n = get_group_id(0), member = get_local_id(0);
+#else
+    const int n = get_global_id(0), member = 0;
+#endif
+    if (n >= particles) return;
+#if !IN_TEAMS
+    global real *nearest = ranges + (long)n * rays;
+#endif
+    const int2 cell = pose_cell[n];
+    const real4 sensor = pose[n];
+    const int count = crowd.discs + crowd.boxes + crowd.segments;
+    global const real *first = shapes + (long)world[2 * n + 1].x * crowd.stride;
+    for (int k = member; k < rays; k += TEAM) nearest[k] = limit;
+    for (int before = 0; before < count; before += TEAM) {
+        int begin = 0, pairs = 0;
+        if (before + member < count) {
+            const real2 seen = directions_of(shapes, world, crowd, n, before + member, cell, sensor, sensor.zw);
+            const int low = (int)floor(seen.x * (DIRECTIONS / 4)), high = (int)floor(seen.y * (DIRECTIONS / 4));
+            const int from = low & (DIRECTIONS - 1), to = from + high - low;
+            begin = turns[from];
+            if (high >= low) pairs = turns[(to & (DIRECTIONS - 1)) + 1] + (to >= DIRECTIONS ? rays : 0) - begin;
+        }
+#if IN_TEAMS
+        int all = pairs;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        end[member] = all;
+        for (int apart = 1; apart < TEAM; apart *= 2) {
+            barrier(CLK_LOCAL_MEM_FENCE);
+            if (member >= apart) all += end[member - apart];
+            barrier(CLK_LOCAL_MEM_FENCE);
+            end[member] = all;
+        }
+        base[member] = begin - (all - pairs);
+        barrier(CLK_LOCAL_MEM_FENCE);
+        pairs = end[TEAM - 1];
+#endif
+        for (int pair = member; pair < pairs; pair += TEAM) {
+            int shape = before, place = begin + pair;
+#if IN_TEAMS
+            int owner = 0;
+            for (int step = TEAM / 2; step > 0; step /= 2) owner += end[owner + step - 1] <= pair ? step : 0;
+            shape += owner;
+            place = base[owner] + pair;
+#endif
+            const int k = turns[DIRECTIONS + 1 + (place >= rays ? place - rays : place)];
+            const real2 direction = ray_direction(sensor, ray[k]);
+            const real t = meet_shape(first + shape_at(crowd, shape), shape, crowd, cell, sensor, direction).x;
+#if IN_TEAMS
+            // The bits of numbers from 0 on grow with them.
+            if (t < limit) atomic_min((volatile local int *)(nearest + k), as_int(t));
+#else
+            if (t < nearest[k]) nearest[k] = t;
+#endif
+        }
+    }
+#if IN_TEAMS
+    barrier(CLK_LOCAL_MEM_FENCE);
+    // PoCL needs loops with the same number of turns for all members.
+    for (int k = member; k - member < rays; k += TEAM)
+        if (k < rays) ranges[(long)n * rays + k] = nearest[k];
+#endif
 }
 #endif
 

@@ -1,18 +1,19 @@
-"""Expected ranges of poses and bearings by any caster. A walk ends at the nearest moving shape."""
+"""Expected ranges of poses and bearings by any caster. A walk ends at the nearest moving shape, see meet_shapes."""
 
 import warp as wp
 
 from .caster import ENTRY, cast_ray
 from .flags import ORDERED, SHAPES, WORLDS
-from .prelude import behind, kernel, reader, work_item, writer
+from .prelude import behind, kernel, loader, reader, work_item, writer
 from .ray import expected_range, tile_place, tile_ray, tile_step
-from .shapes import nearest_shape, world_begin, world_window
+from .shapes import world_begin, world_window
 from .types import real, vec2, vec4
 
 if WORLDS:
     from .raycast import PLANES
 rest_of = behind(ENTRY)
-cell_at, pose_at, ray_at, put = reader(wp.vec2i), reader(vec4), reader(vec2), writer(real)
+cell_at, pose_at, ray_at = reader(wp.vec2i), reader(vec4), reader(vec2)
+range_at, put = loader(real), writer(real)
 
 
 @kernel
@@ -31,7 +32,7 @@ def cast_ranges(
     cell = cell_at(pose_cell, n)
     limit = scale.limit
     if SHAPES:
-        limit = nearest_shape(shapes, world, crowd, n, cell, pose_at(pose, n), ray_at(ray, k), limit).x
+        limit = range_at(ranges, n * rays + k)
     t = cast_ray(table, seen, cell, pose_at(pose, n), ray_at(ray, k), limit, caster)
     put(ranges, n * rays + k, expected_range(t, scale))
 
@@ -60,7 +61,7 @@ def cast_tiles(
     while k < rays:
         limit = scale.limit
         if SHAPES:
-            limit = nearest_shape(shapes, world, crowd, n, cell, sensor_pose, ray_at(ray, k), limit).x
+            limit = range_at(ranges, n * rays + k)
         t = cast_ray(table, seen, cell, sensor_pose, ray_at(ray, k), limit, caster)
         put(ranges, n * rays + k, expected_range(t, scale))
         k += tile_step(spread)

@@ -31,8 +31,6 @@ OCCUPIED = wp.constant(1)
 RECTANGLE_REACH = wp.constant(254)
 # Capacity of the stack of columns that may bound a rectangle.
 STACK = wp.constant(256)
-# Cells of a column that a work-item of a GPU takes.
-TALL = wp.constant(64)
 behind_of, run_at = behind(wp.uint16), reader(wp.uint8)
 put, put_run = writer(wp.uint16), writer(wp.uint8)
 
@@ -52,12 +50,6 @@ def padded_in_groups(row: wp.int32, col: wp.int32, cols: wp.int32, group: wp.int
     """Return the index of a cell in a padded plane of groups of rows, a power of two of them."""
     in_group = (row + 1) & (group - 1)
     return (row + 1 - in_group) * (cols + 2) + (col + 1) * group + in_group
-
-
-@wp.func
-def divided(dividend: wp.int32, divisor: wp.int32):
-    """Return a quotient of integers from 0, for dividends up to 4000 and divisors up to 12."""
-    return (dividend * (65536 // divisor + 1)) >> 16
 
 
 @wp.func
@@ -190,7 +182,7 @@ def free_rows(bits, runs, band, cols, words, begin, end):
 
 @kernel
 def rectangles_scan(
-    runs, place, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds, lines, group
+    runs, place, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, worlds, lines, group, tall
 ):  # fmt: skip
     """Find the rectangles along columns: the higher a rectangle, the narrower."""
     way, tile_item, col_item = wp.tid()
@@ -200,8 +192,8 @@ def rectangles_scan(
     dy = wp.where((quadrant & 2) != 0, -1, 1)
     sector = tile_item % sectors
     col = reach_begin(dx, left) + col_item
-    begin = reach_begin(dy, top) + TALL * (tile_item // sectors)
-    end = wp.min(begin + TALL, reach_end(dy, bottom, rows))
+    begin = reach_begin(dy, top) + tall * (tile_item // sectors)
+    end = wp.min(begin + tall, reach_end(dy, bottom, rows))
     if col >= reach_end(dx, right, cols) or w >= worlds:
         return
     planes = behind_of(rectangles, wp.int64(place[w]) * wp.int64(4 * sectors))
@@ -209,6 +201,8 @@ def rectangles_scan(
     out = (quadrant * sectors + sector) * lines * (cols + 2)
     middle = slope(sectors, sector)
     step = dy * worlds * cols
+    # x * inverse >> 16 is x / middle[1] for x up to 4000.
+    inverse = 65536 // middle[1] + 1
     height = int(0)
     width = int(LONGEST)
     narrower = int(0)
@@ -246,7 +240,7 @@ def rectangles_scan(
                 height += 1
                 narrower = wp.min(here, narrower)
             else:
-                height = wp.min(height, divided(here * middle[0], middle[1]))
+                height = wp.min(height, (here * middle[0] * inverse) >> 16)
                 narrower = least
             if height == room:
                 narrower = int(0)

@@ -13,14 +13,14 @@ import math
 
 import warp as wp
 
-from .bits import ALL_BITS, lowest_bit
+from .bits import lowest_bit
 from .prelude import reader
 from .ray import ray_direction
 from .types import Crowd, Window, real, vec2, vec4
 
 DISC, BOX, SEGMENT = wp.constant(4), wp.constant(8), wp.constant(4)
-# Ranges of directions of a particle's sights.
-SIGHTS = wp.constant(64)
+# Ranges of directions of a particle's sights, and of a table of beams.
+SIGHTS, DIRECTIONS = wp.constant(64), wp.constant(1024)
 cell_at = reader(wp.vec2i)
 
 
@@ -43,43 +43,44 @@ def world_begin(world: wp.array(dtype=wp.vec2i), n: wp.int32, each: wp.int32):
 number_at, four_at = reader(real), reader(real, 4)
 ZERO, ONE, TWO, MINUS_ONE = real(0.0), real(1.0), real(2.0), real(-1.0)
 TINY, NEVER, ALWAYS, UNKNOWN = real(1e-30), real(math.inf), real(-math.inf), real(math.nan)
-# Widening of a shape's range of directions, which covers rounding, as a sine and in ranges.
-WIDER, APART = real(1e-5), real(2e-3)
-# Factor that covers rounding where a shape is behind what is nearest so far.
-FARTHER = real(1.00001)
-THREE, QUARTER, NEAR, OPPOSITE = real(3.0), real(SIGHTS / 4), real(0.99), real(-1e-3)
+# Widening of a shape's range of directions, which covers rounding, as a sine and in quarters of a turn.
+WIDER, APART = real(1e-5), real(1.25e-4)
+THREE, TURN, QUARTER, NEAR, OPPOSITE = real(3.0), real(4.0), real(SIGHTS / 4), real(0.99), real(-1e-3)
+NEARLY_ALL = real(3.999)
 
 
 @wp.func
-def sight_of(x: real, y: real):
-    """Return the place of a direction among the ranges of sights, from 0 to SIGHTS."""
+def turned(x: real, y: real):
+    """Return a direction as a number from 0 to 4, which grows with the angle, at a rate that varies."""
     part = y / (wp.abs(x) + wp.abs(y))
-    return wp.where(x >= ZERO, ONE + part, THREE - part) * QUARTER
+    return wp.where(x >= ZERO, ONE + part, THREE - part)
 
 
 @wp.func
-def sights_between(low: vec2, high: vec2, around: wp.bool):
-    """Return the first range of directions in which a shape is seen and the one after the last."""
+def seen_between(low: vec2, high: vec2, around: wp.bool):
+    """Return the first and the last direction in which a shape is seen. From the origin, low and high are the
+    directions of its ends against the clock; a shape all around is seen in all.
+    """
     if around:
-        return wp.vec2i(0, SIGHTS)
-    begin = int(wp.floor(sight_of(low.x, low.y) - APART))
-    last = int(wp.floor(sight_of(high.x, high.y) + APART))
-    return wp.vec2i(begin, wp.where(last < begin, last + SIGHTS, last) + 1)
+        return vec2(ZERO, NEARLY_ALL)
+    first = turned(low.x, low.y) - APART
+    last = turned(high.x, high.y) + APART
+    return vec2(first, wp.where(last < first, last + TURN, last))
 
 
 @wp.func
-def sights_of_disc(x: real, y: real, radius: real):
-    """Return the ranges of directions in which a disc, or a circle around a shape, is seen."""
+def directions_of_disc(x: real, y: real, radius: real):
+    """Return the directions in which a disc, or a circle around a shape, is seen."""
     sine = radius / wp.sqrt(x * x + y * y) + WIDER
     cosine = wp.sqrt((ONE - sine) * (ONE + sine))
     low = vec2(x * cosine + y * sine, y * cosine - x * sine)
     high = vec2(x * cosine - y * sine, y * cosine + x * sine)
-    return sights_between(low, high, not (sine < NEAR))
+    return seen_between(low, high, not (sine < NEAR))
 
 
 @wp.func
-def sights_of_segment(x: real, y: real, end_x: real, end_y: real):
-    """Return the ranges of directions in which a segment is seen."""
+def directions_of_segment(x: real, y: real, end_x: real, end_y: real):
+    """Return the directions in which a segment is seen."""
     turn = x * end_y - y * end_x
     along = x * end_x + y * end_y
     at_end = (x == ZERO and y == ZERO) or (end_x == ZERO and end_y == ZERO)
@@ -87,8 +88,8 @@ def sights_of_segment(x: real, y: real, end_x: real, end_y: real):
     one = vec2(x, y)
     other = vec2(end_x, end_y)
     if turn >= ZERO:
-        return sights_between(one, other, between)
-    return sights_between(other, one, between)
+        return seen_between(one, other, between)
+    return seen_between(other, one, between)
 
 
 @wp.func
@@ -100,22 +101,28 @@ def shape_at(crowd: Crowd, i: wp.int32):
 
 
 @wp.func
-def sights_of(
+def directions_of(
     shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: Crowd, n: wp.int32, i: wp.int32,
-    cell: wp.vec2i, pose: vec4,
+    cell: wp.vec2i, pose: vec4, heading: vec2,
 ):  # fmt: skip
-    """Return the first range of directions in which a particle sees a shape and the one after the last."""
+    """Return the first and the last direction, relative to a heading (cos, sin), in which a particle sees a shape;
+    the last is below the first where it sees none.
+    """
     seen = world[2 * n + 1]
     one = seen.x * crowd.stride + shape_at(crowd, i)
     x = (number_at(shapes, one) - real(cell.x)) - pose.x
     y = (number_at(shapes, one + 1) - real(cell.y)) - pose.y
     if i == seen.y or not (x - x == ZERO):
-        return wp.vec2i(0, 0)
+        return vec2(ZERO, MINUS_ONE)
+    along = heading.x * x + heading.y * y
+    aside = heading.x * y - heading.y * x
     if i < crowd.discs + crowd.boxes:
-        return sights_of_disc(x, y, number_at(shapes, one + wp.where(i < crowd.discs, 2, 6)))
+        return directions_of_disc(along, aside, number_at(shapes, one + wp.where(i < crowd.discs, 2, 6)))
     end_x = (number_at(shapes, one + 2) - real(cell.x)) - pose.x
     end_y = (number_at(shapes, one + 3) - real(cell.y)) - pose.y
-    return sights_of_segment(x, y, end_x, end_y)
+    return directions_of_segment(
+        along, aside, heading.x * end_x + heading.y * end_y, heading.x * end_y - heading.y * end_x
+    )
 
 
 @wp.func
@@ -191,12 +198,22 @@ def meet_segment(dx: real, dy: real, x: real, y: real, end_x: real, end_y: real)
 
 
 @wp.func
-def lowest_bits(n: wp.int32):
-    """Return a word whose lowest n bits are 1."""
-    bits = ALL_BITS
-    if n < 32:
-        bits = (wp.uint32(1) << wp.uint32(wp.max(n, 0))) - wp.uint32(1)
-    return bits
+def meet_shape(
+    shapes: wp.array(dtype=real), one: wp.int32, i: wp.int32, crowd: Crowd, cell: wp.vec2i, pose: vec4,
+    direction: vec2,
+):  # fmt: skip
+    """Return the same of shape i of a world, whose numbers begin at one."""
+    four = four_at(shapes, one)
+    x = (four[0] - real(cell.x)) - pose.x
+    y = (four[1] - real(cell.y)) - pose.y
+    if i < crowd.discs:
+        return meet_disc(direction.x, direction.y, x, y, four[2])
+    if i < crowd.discs + crowd.boxes:
+        rest = four_at(shapes, one + 4)
+        return meet_box(direction.x, direction.y, x, y, four[2], four[3], rest[0], rest[1])
+    end_x = (four[2] - real(cell.x)) - pose.x
+    end_y = (four[3] - real(cell.y)) - pose.y
+    return meet_segment(direction.x, direction.y, x, y, end_x, end_y)
 
 
 @wp.func
@@ -204,60 +221,22 @@ def nearest_shape(
     shapes: wp.array(dtype=real), world: wp.array(dtype=wp.vec2i), crowd: Crowd, n: wp.int32, cell: wp.vec2i,
     pose: vec4, ray: vec2, t: real,
 ):  # fmt: skip
-    """Return the nearest of the shapes that a particle sees along a ray and of an obstacle at a distance t."""
+    """Return the nearest of the shapes that a particle sees along a ray and of an obstacle at a distance t: the
+    distance in cells, and the cosine of the angle of incidence, 2 where no shape is nearer than t.
+    """
     direction = ray_direction(pose, ray)
-    dx = direction.x
-    dy = direction.y
-    # Shape i of a kind begins i times its numbers behind these places.
-    disc = cell_at(world, 2 * n + 1).x * crowd.stride
-    box = disc + (DISC - BOX) * crowd.discs
-    segment = box + (BOX - SEGMENT) * (crowd.discs + crowd.boxes)
-    sights = sight_at(crowd, n, int(sight_of(dx, dy)))
+    first = cell_at(world, 2 * n + 1).x * crowd.stride
+    sights = sight_at(crowd, n, int(turned(direction.x, direction.y) * QUARTER))
     nearest = vec2(t, TWO)
     for k in range(2 * crowd.pairs):
         both = cell_at(world, sights + (k >> 1))
-        seen = wp.uint32(wp.where((k & 1) == 0, both.x, both.y))
-        discs = lowest_bits(crowd.discs - 32 * k)
-        boxes = lowest_bits(crowd.discs + crowd.boxes - 32 * k)
-        left = seen & discs
+        left = wp.uint32(wp.where((k & 1) == 0, both.x, both.y))
         while left != wp.uint32(0):
-            four = four_at(shapes, disc + DISC * (32 * k + lowest_bit(left)))
+            i = 32 * k + lowest_bit(left)
             left = left & (left - wp.uint32(1))
-            x = (four[0] - real(cell.x)) - pose.x
-            y = (four[1] - real(cell.y)) - pose.y
-            if wp.abs(dx * y - dy * x) <= four[2] and dx * x + dy * y - FARTHER * four[2] < nearest.x:
-                met = meet_disc(dx, dy, x, y, four[2])
-                if met.x < nearest.x:
-                    nearest = met
-        left = seen & boxes & (discs ^ ALL_BITS)
-        while left != wp.uint32(0):
-            one = box + BOX * (32 * k + lowest_bit(left))
-            left = left & (left - wp.uint32(1))
-            four = four_at(shapes, one)
-            rest = four_at(shapes, one + 4)
-            x = (four[0] - real(cell.x)) - pose.x
-            y = (four[1] - real(cell.y)) - pose.y
-            along = dx * x + dy * y
-            if wp.abs(dx * y - dy * x) <= rest[2] and along - (FARTHER - ONE) * along - rest[2] < nearest.x:
-                met = meet_box(dx, dy, x, y, four[2], four[3], rest[0], rest[1])
-                if met.x < nearest.x:
-                    nearest = met
-        left = seen & (boxes ^ ALL_BITS)
-        while left != wp.uint32(0):
-            four = four_at(shapes, segment + SEGMENT * (32 * k + lowest_bit(left)))
-            left = left & (left - wp.uint32(1))
-            x = (four[0] - real(cell.x)) - pose.x
-            y = (four[1] - real(cell.y)) - pose.y
-            end_x = (four[2] - real(cell.x)) - pose.x
-            end_y = (four[3] - real(cell.y)) - pose.y
-            aside = dx * y - dy * x
-            end_aside = dx * end_y - dy * end_x
-            beside = (aside > ZERO and end_aside > ZERO) or (aside < ZERO and end_aside < ZERO)
-            behind = dx * x + dy * y >= nearest.x and dx * end_x + dy * end_y >= nearest.x
-            if not beside and not behind:
-                met = meet_segment(dx, dy, x, y, end_x, end_y)
-                if met.x < nearest.x:
-                    nearest = met
+            met = meet_shape(shapes, first + shape_at(crowd, i), i, crowd, cell, pose, direction)
+            if met.x < nearest.x:
+                nearest = met
     return nearest
 
 

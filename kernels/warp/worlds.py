@@ -9,12 +9,25 @@ import math
 
 import warp as wp
 
-from .flags import SEES, SHAPES
+from .flags import IN_TEAMS, SEES, SHAPES
 from .heading import cos_sin
 from .placement import FARTHEST, ZERO, place_pose, within_reach
-from .prelude import kernel, work_item
-from .shapes import BOX, DISC, SIGHTS, shape_distance, sight_at, sights_of, world_window
-from .types import Frame, Window, real, vec2
+from .prelude import kernel, reader, work_item, writer
+from .ray import ray_direction
+from .shapes import (
+    BOX,
+    DIRECTIONS,
+    DISC,
+    QUARTER,
+    SIGHTS,
+    directions_of,
+    meet_shape,
+    shape_at,
+    shape_distance,
+    sight_at,
+    world_window,
+)
+from .types import Frame, Window, real, vec2, vec4
 
 # Cells above this one are unknown.
 MOST_KNOWN = wp.constant(127)
@@ -22,8 +35,46 @@ FRAME_NUMBERS = wp.constant(8)
 RING = wp.constant(2)
 # Largest number of a shape.
 LARGEST_SHAPE = wp.constant(wp.float64(1e6))
+# Most rays of a particle of which a team finds the nearest shapes.
+MOST_RAYS = 2048
 # Distance from a world to which its segments and boxes reach [cells].
 BEYOND = wp.constant(wp.float64(16384.0))
+
+
+# Bodies of functions of a team that shares pairs of a shape and a ray: of a GPU, or of a single member.
+_BY_TEAM = """
+#if defined(__CUDA_ARCH__) && {team} > 1
+{shared}
+#else
+{alone}
+#endif
+"""
+_MEMORY = "__shared__ int memory[2 * {team} + {most}]; return (unsigned long long)(size_t)memory;"
+_SHARE_PAIRS = """
+int *end = (int *)(size_t)memory;
+const int member = threadIdx.x;
+int all = pairs;
+__syncthreads();
+end[member] = all;
+for (int apart = 1; apart < {team}; apart *= 2) {{
+    __syncthreads();
+    if (member >= apart) all += end[member - apart];
+    __syncthreads();
+    end[member] = all;
+}}
+end[{team} + member] = begin - (all - pairs);
+__syncthreads();
+return end[{team} - 1];
+"""
+_PLACE_OF = """
+const int *end = (const int *)(size_t)memory;
+int owner = 0;
+for (int step = {team} / 2; step > 0; step /= 2) owner += end[owner + step - 1] <= pair ? step : 0;
+return wp::vec_t<2, int>(owner, end[{team} + owner] + pair);
+"""
+_BEGIN_AT = "((float *)(size_t)memory)[2 * {team} + k] = t;"
+_KEEP_LEAST = "atomicMin((int *)(size_t)memory + 2 * {team} + k, __float_as_int(t));"
+_LEAST_AT = "return ((const float *)(size_t)memory)[2 * {team} + k];"
 
 
 @kernel
@@ -145,10 +196,115 @@ def find_sights(shapes, world, pose_cell, pose, sights, particles, crowd):
     i = item % count
     if n >= particles:
         return
-    directions = sights_of(shapes, world, crowd, n, i, pose_cell[n], pose[n])
-    for k in range(directions.x, directions.y):
+    seen = directions_of(shapes, world, crowd, n, i, pose_cell[n], pose[n], vec2(NUMBER_ONE, NUMBER_ZERO))
+    for k in range(int(wp.floor(seen.x * QUARTER)), int(wp.floor(seen.y * QUARTER)) + 1):
         # Each bit is added to a word once.
         wp.atomic_add(sights, 2 * sight_at(crowd, n, k) + (i >> 5), int(wp.uint32(1) << wp.uint32(i & 31)))
+
+
+# Members of a team.
+TEAM = 64 if IN_TEAMS else 1
+EACH = real(DIRECTIONS / 4)
+cell_at, pose_at, ray_at, turn_at, put = reader(wp.vec2i), reader(vec4), reader(vec2), reader(wp.int32), writer(real)
+
+
+def by_team(shared, alone):
+    """Return the body of a function of a team, or of a single member."""
+    return _BY_TEAM.format(team=TEAM, shared=shared.format(team=TEAM, most=MOST_RAYS), alone=alone)
+
+
+# Return the number of members that share a particle.
+@wp.func_native(by_team("return {team};", "return 1;"))
+def members() -> wp.int32: ...
+
+
+# Return the address of the memory: ends and places of the members' pairs, and the least distance of each ray.
+@wp.func_native(by_team(_MEMORY, "return 0;"))
+def team_memory() -> wp.uint64: ...
+
+
+# Share each member's pairs and the place of its first ray, and return the number of pairs of all.
+@wp.func_native(by_team(_SHARE_PAIRS, "return pairs;"))
+def share_pairs(memory: wp.uint64, begin: wp.int32, pairs: wp.int32) -> wp.int32: ...
+
+
+# Return the member whose shape a pair has, and the place of its ray.
+@wp.func_native(by_team(_PLACE_OF, "return wp::vec_t<2, int>(0, begin + pair);"))
+def place_of(memory: wp.uint64, begin: wp.int32, pair: wp.int32) -> wp.vec2i: ...
+
+
+# Begin with a distance of a ray, whose place among all is i.
+@wp.func_native(by_team(_BEGIN_AT, "values.data[i] = t;"))
+def begin_at(memory: wp.uint64, values: wp.array(dtype=real), i: wp.int32, k: wp.int32, t: real): ...
+
+
+# Keep a distance if it is the least; the bits of numbers from 0 on grow with them.
+@wp.func_native(by_team(_KEEP_LEAST, "if (t < values.data[i]) values.data[i] = t;"))
+def keep_least(memory: wp.uint64, values: wp.array(dtype=real), i: wp.int32, k: wp.int32, t: real): ...
+
+
+# Wait for all members.
+@wp.func_native(by_team("__syncthreads();", ""))
+def wait(): ...
+
+
+# Return the least distance of a ray.
+@wp.func_native(by_team(_LEAST_AT, "return values.data[i];"))
+def least_at(memory: wp.uint64, values: wp.array(dtype=real), i: wp.int32, k: wp.int32) -> real: ...
+
+
+@kernel
+def meet_shapes(shapes, world, pose_cell, pose, ray, turns, ranges, particles, rays, limit, crowd):
+    """Find the distances of the nearest shapes along the rays of particles, limit where none is nearer.
+
+    A work-item, or with IN_TEAMS a team of them, takes a particle. A shape covers few rays: members share all pairs
+    of a shape and a ray that it covers. turns has the first place of each of DIRECTIONS ranges of directions
+    relative to the heading among the rays in order, their number, and the rays in order.
+    """
+    item = work_item(wp.tid())
+    n = item // TEAM
+    member = item % TEAM
+    if n >= particles or member >= members():
+        return
+    memory = team_memory()
+    cell = cell_at(pose_cell, n)
+    sensor = pose_at(pose, n)
+    first = cell_at(world, 2 * n + 1).x * crowd.stride
+    count = crowd.discs + crowd.boxes + crowd.segments
+    k = int(member)
+    while k < rays:
+        begin_at(memory, ranges, n * rays + k, k, limit)
+        k += members()
+    before = int(0)
+    while before < count:
+        begin = int(0)
+        pairs = int(0)
+        if before + member < count:
+            heading = vec2(sensor.z, sensor.w)
+            seen = directions_of(shapes, world, crowd, n, before + member, cell, sensor, heading)
+            low = int(wp.floor(seen.x * EACH))
+            high = int(wp.floor(seen.y * EACH))
+            since = low & (DIRECTIONS - 1)
+            to = since + high - low
+            begin = turn_at(turns, since)
+            if high >= low:
+                pairs = turn_at(turns, (to & (DIRECTIONS - 1)) + 1) - begin + wp.where(to >= DIRECTIONS, rays, 0)
+        for pair in range(member, share_pairs(memory, begin, pairs), members()):
+            found = place_of(memory, begin, pair)
+            shape = before + found[0]
+            place = found[1]
+            k = turn_at(turns, DIRECTIONS + 1 + wp.where(place >= rays, place - rays, place))
+            direction = ray_direction(sensor, ray_at(ray, k))
+            t = meet_shape(shapes, first + shape_at(crowd, shape), shape, crowd, cell, sensor, direction).x
+            if t < limit:
+                keep_least(memory, ranges, n * rays + k, k, t)
+        before += members()
+    wait()
+    k = int(member)
+    if members() > 1:
+        while k < rays:
+            put(ranges, n * rays + k, least_at(memory, ranges, n * rays + k, k))
+            k += members()
 
 
 @wp.func

@@ -177,8 +177,9 @@ def test_rays_among_many_shapes_have_the_bits_of_the_reference(precision: Any, b
         worlds = gs.Worlds(np.zeros((1, 120, 120), np.int8), 0.1, ORIGINS[1], backend=name)
         worlds.shapes = shapes
         caster = gs.RayCaster(worlds, RANGE, backend=name, precision=precision)
-        found.append(caster.cast(poses, BEARINGS, ignore=ignore))
-    np.testing.assert_array_equal(found[1], found[0])
+        found.append([caster.cast(poses, bearings, ignore=ignore) for bearings in (BEARINGS, [2.0, -7.0, 0.0, 2.0])])
+    np.testing.assert_array_equal(found[1][0], found[0][0])
+    np.testing.assert_array_equal(found[1][1], found[0][1], err_msg="bearings in any order")
 
 
 def test_gpus_have_the_same_ranges(as_gpu: Any, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:

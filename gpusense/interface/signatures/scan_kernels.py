@@ -157,6 +157,7 @@ KERNELS: dict[str, Kernel] = {
     "rectangles_scan": kernel(
         "rectangles", "col tile quadrant", "uchar runs [2 * band * cols * worlds]", "int place [worlds]",
         "out ushort rectangles [4 * sectors * lines * (cols + 2)]", *_CHANGED, "int lines", "int group",
+        "int tall",
     ),
     "fill_lookup": kernel(
         "lookup_table", "bin cell", "ushort rectangles [map]", "real2 ray [bins]",
@@ -200,6 +201,11 @@ KERNELS: dict[str, Kernel] = {
     "find_sights": kernel(
         "worlds", "item", "real shapes [crowd.stride]", "int2 world [2 * particles]", *POSES,
         "out int sights [2 * crowd.begin]", "int particles", "Crowd crowd",
+    ),
+    "meet_shapes": kernel(
+        "worlds", "item", "real shapes [crowd.stride]", "int2 world [2 * particles]", *POSES, "real2 ray [rays]",
+        "int turns [1025 + rays]", "out real ranges [particles * rays]", "int particles", "int rays", "real limit",
+        "Crowd crowd", team=64,
     ),
     "place_shapes": kernel(
         "worlds", "shape world", "coordinate raw [worlds * count * numbers]", _FRAMES,

@@ -170,9 +170,10 @@ class RecordedCast(ReplayedCall):
         placed.inside = index(placed.count)
         result = Result(poses, out, (placed.count, self._rays), caster.real, backend, on_device=True)
         self._ranges, array = result.flat, result.user_array()
-        self._ray = backend.upload(vectors.astype(caster.real))
-        chunk = chunk_of(backend, self._rays + placed.sights, caster.real.itemsize)
-        super().__init__(backend, caster.map, caster.lock, placed, (poses, array), array, Workspace(backend), chunk)
+        space = Workspace(backend)
+        self._ray = caster.rays(vectors, space)
+        chunk = chunk_of(backend, self._rays, caster.real.itemsize)
+        super().__init__(backend, caster.map, caster.lock, placed, (poses, array), array, space, chunk)
 
     def _piece(self, begin: int, end: int) -> Program:
         caster, rays = self._caster, self._rays

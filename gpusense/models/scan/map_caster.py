@@ -7,7 +7,7 @@ import math
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import PartialResult, Workspace
 from gpusense.interface import structs
 from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import with_lanes_flag
+from gpusense.interface.lanes import with_lanes_flag, with_teams_flags
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.structs import RangeScale
@@ -28,6 +28,7 @@ from gpusense.models.scan import tiles
 from gpusense.models.scan.sampling import Drawing
 from gpusense.tables import casters
 from gpusense.tables.casters import Caster, CasterInput
+from gpusense.tables.crowd import turns_of
 from gpusense.tables.lookup_files import describe, write_lookup
 from gpusense.tables.reachable import MapState, ObstaclesOf, ReachableMap, TableMemoryError, obstacles_of
 from gpusense.tables.rectangles import rectangles_of_worlds
@@ -83,6 +84,15 @@ def require_exact(argument: str, method: Caster) -> None:
 
 
 LASER = Cones()
+# Most rays of a pose for which work-items find shapes together; the kernel file ``worlds`` has the same number.
+_MOST_RAYS_OF_TEAM = 2048
+
+
+class Rays(NamedTuple):
+    """Rays on a device."""
+
+    vectors: Buffer  # their vectors
+    turns: Buffer | None  # their order by direction, see ``turns_of``; None in a single map
 
 
 class MapCaster:
@@ -230,7 +240,7 @@ class MapCaster:
         result = Result(poses, out, (checked.count, rays), self.real, self.backend, on_device=checked.on_device)
         if checked.count * rays:
             with self.lock, self._workspace:
-                ray = self._ray(vectors)
+                ray = self.rays(vectors, self._workspace)
                 chunk = chunk_of(self.backend, rays * cones.rays + checked.sights, self.real.itemsize)
                 run_pieces(
                     self._workspace, Piece(0, checked.count, checked.count), chunk,
@@ -239,10 +249,13 @@ class MapCaster:
                 finish(self._workspace, checked.on_device)
         return result.user_array()
 
-    def _ray(self, vectors: np.ndarray) -> Buffer:
+    def rays(self, vectors: np.ndarray, space: Workspace) -> Rays:
         """Return ray vectors on the device, copied where the last call had others."""
         key = vectors.shape, vectors.tobytes()
-        return self._workspace.hold("ray", key, lambda: vectors.astype(self.real))
+        ray, turns = space.hold("ray", key, lambda: vectors.astype(self.real)), None
+        if self._worlds is not None:
+            turns = space.hold("turns", key, lambda: turns_of(vectors.astype(self.real).reshape(-1, 2)))
+        return Rays(ray, turns)
 
     def draw(self, poses: Poses, vectors: np.ndarray, flat: Any, cones: Cones, drawing: Drawing) -> None:
         """Draw readings at S N poses into flat memory, in pieces that fit the device's memory.
@@ -253,7 +266,7 @@ class MapCaster:
         if not poses.count * rays:
             return
         with self.lock, self._workspace as space:
-            ray = self._ray(vectors)
+            ray = self.rays(vectors, space)
             chunk = chunk_of(self.backend, rays * cones.rays + poses.sights, 2 * self.real.itemsize)
             # Random numbers depend on the index of a particle among all, so scans may be split.
             run_pieces(
@@ -263,11 +276,11 @@ class MapCaster:
             finish(space, poses.on_device)
 
     def _draw(
-        self, poses: Poses, piece: Piece, ray: Buffer, rays: int, flat: Any, cones: Cones, drawing: Drawing
+        self, poses: Poses, piece: Piece, ray: Rays, rays: int, flat: Any, cones: Cones, drawing: Drawing
     ) -> None:
         """Start drawing the readings of a piece."""
         space, count, info = self._workspace, piece.count, self.backend.info
-        placed, state = self._place(poses, piece.part, space)
+        placed, state = self._place(poses, piece.part, space, cones)
         cosines = space.empty("cosines", count * rays if "INCIDENCE" in cones.flags else 1, self.real)
         result = PartialResult(space, "ranges", flat, piece.begin * rays, count * rays, self.real)
         self._run(placed, state, ray, rays, cones, self._flags(placed, cones) | {"COSINES"}, result.buffer, cosines)
@@ -280,22 +293,23 @@ class MapCaster:
             space.wait()
             drawing.on_host(piece.begin, count, rays, flat[piece.begin * rays : piece.end * rays], incidence)
 
-    def _cast(self, poses: Poses, piece: Piece, ray: Buffer, rays: int, flat: Any, cones: Cones) -> None:
+    def _cast(self, poses: Poses, piece: Piece, ray: Rays, rays: int, flat: Any, cones: Cones) -> None:
         space, count = self._workspace, piece.count
-        placed, state = self._place(poses, piece.part, space)
+        placed, state = self._place(poses, piece.part, space, cones)
         result = PartialResult(space, "ranges", flat, piece.begin * rays, count * rays, self.real)
         other = space.empty("echoes", count * rays, self.real) if "INCIDENCE" in cones.flags else None
         both = (other, result.buffer) if cones.incidence else (result.buffer, other)
         self._run(placed, state, ray, rays, cones, self._flags(placed, cones), *both)
         result.deliver()
 
-    def _place(self, poses: Poses, part: Part, space: Workspace) -> tuple[PlacedPoses, MapState]:
+    def _place(self, poses: Poses, part: Part, space: Workspace, cones: Cones = LASER) -> tuple[PlacedPoses, MapState]:
         """Place some poses in a window of the map; also return the map with its table."""
         corners = poses.corners(part, self.backend, space)
         state = self.map.ensure(corners or poses.hull)
-        return place(poses, part, state.frame, self.backend, space, self.real, corners, sees=True), state
+        sees = "CONES" in cones.flags
+        return place(poses, part, state.frame, self.backend, space, self.real, corners, sees=sees), state
 
-    def program(self, poses: Poses, part: Part, ray: Buffer, rays: int, ranges: Buffer, space: Workspace) -> Program:
+    def program(self, poses: Poses, part: Part, ray: Rays, rays: int, ranges: Buffer, space: Workspace) -> Program:
         """Return the launches of a bound call that cast the rays of some poses to ranges."""
         placed, state = self._place(poses, part, space)
         flags, results = self._flags(placed, LASER), dict(ranges=ranges)
@@ -307,7 +321,7 @@ class MapCaster:
         return self.flags | self._precision_flags | cones.flags | placed.world_flags | outside
 
     def _run(
-        self, placed: PlacedPoses, state: MapState, ray: Buffer, rays: int, cones: Cones, flags: frozenset[str],
+        self, placed: PlacedPoses, state: MapState, ray: Rays, rays: int, cones: Cones, flags: frozenset[str],
         ranges: Buffer, incidence: Buffer,
     ) -> None:  # fmt: skip
         """Cast the rays of placed poses to ranges and, with INCIDENCE, angles of incidence; repeat kept programs."""
@@ -325,13 +339,13 @@ class MapCaster:
         )  # fmt: skip
 
     def _program(
-        self, placed: PlacedPoses, table: Buffer, ray: Buffer, rays: int, cones: Cones, flags: frozenset[str],
+        self, placed: PlacedPoses, table: Buffer, ray: Rays, rays: int, cones: Cones, flags: frozenset[str],
         results: dict[str, Buffer], order: tiles.Order | None,
     ) -> Program:  # fmt: skip
         """Return the launches that cast the rays of placed poses."""
         count, ranges = placed.count, results["ranges"]
         common = dict(
-            map_table=table, pose_cell=placed.cell, pose=placed.pose, ray=ray, window=placed.frame.window,
+            map_table=table, pose_cell=placed.cell, pose=placed.pose, ray=ray.vectors, window=placed.frame.window,
             particles=count, rays=rays, caster=self.method.struct(), scale=self.scale, ranges=ranges,
             **placed.places(),
         )  # fmt: skip
@@ -339,14 +353,34 @@ class MapCaster:
             heard = dict(normals=results["normals"], incidence=results["incidence"], cone=cones.struct)
             return (launch("cast_echoes", flags, (rays, count), **common, **heard),)
         flags -= {"COSINES"}
+        shapes = self._meet_shapes(placed, ray, rays, flags, ranges)
         if self.backend.info.kind == "gpu" and not (self._worlds is not None and rays >= tiles.LEAST_OF_ONE_POSE):
             flags |= flags_if(ORDERED=order is not None)
             items, spread = tiles.tiles_of(count, rays)
             if order is None:
-                return (launch("cast_tiles", flags, (items,), **common, spread=spread),)
+                return *shapes, launch("cast_tiles", flags, (items,), **common, spread=spread)
             return (
+                *shapes,
                 *order.launches(),
                 launch("cast_tiles", flags, (items,), **common, order=order.order, spread=spread),
             )
         flags = with_lanes_flag(self.backend.info.lanes, "cast_ranges", flags)
-        return (launch("cast_ranges", flags, (rays, count), **common),)
+        return *shapes, launch("cast_ranges", flags, (rays, count), **common)
+
+    def _meet_shapes(
+        self, placed: PlacedPoses, ray: Rays, rays: int, flags: frozenset[str], ranges: Buffer
+    ) -> Program:  # fmt: skip
+        """Return the launch that leaves the distances of moving shapes in place of ranges; none without shapes."""
+        if "SHAPES" not in flags:
+            return ()
+        info, flags = self.backend.info, flags & {"SHAPES", "FLOAT64"}
+        # Teams keep as many numbers of 32 bits.
+        kind = "cpu" if "FLOAT64" in flags or rays > _MOST_RAYS_OF_TEAM else info.kind
+        flags, team = with_teams_flags(kind, "meet_shapes", flags, 1 << 30, self.backend.largest_group)
+        return (
+            launch(
+                "meet_shapes", flags, (placed.count * team,), **placed.places(), pose_cell=placed.cell,
+                pose=placed.pose, ray=ray.vectors, turns=ray.turns, ranges=ranges, particles=placed.count, rays=rays,
+                limit=self.limit,
+            ),
+        )  # fmt: skip

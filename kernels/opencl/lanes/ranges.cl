@@ -1,5 +1,5 @@
 // Expected ranges of poses and bearings, LANES rays at once: cast_ranges of ranges.cl.
-// requires: lanes/caster lanes/rays lanes/shapes
+// requires: lanes/caster lanes/rays shapes
 
 // Rays of a work-item, whatever the precision.
 #define WORK_RAYS 16
@@ -17,18 +17,19 @@ kernel void cast_ranges(ARGUMENTS) {
     for (int first = begin; first < begin + WORK_RAYS && first < rays; first += LANES) {
         lanes x, y;
         load_ray_lanes(ray, first, rays, 1, &x, &y);
-        const lanes met = cast_ray_lanes(map_table, seen, pose_cell[n], pose[n], x, y, scale.limit, caster);
-#if SHAPES
-        const lanes t = nearest_shape_lanes(shapes, world, crowd, n, pose_cell[n], pose[n], x, y, met).hi;
-#else
-        const lanes t = met;
-#endif
-        const lanes range = range_lanes(t, scale);
         global real *out = ranges + (long)n * rays + first;
+        real single[LANES];
+#if SHAPES
+        for (int i = 0; i < LANES; ++i) single[i] = out[min(i, rays - 1 - first)];
+        const lanes limit = load_lanes(0, single);
+#else
+        const lanes limit = scale.limit;
+#endif
+        const lanes t = cast_ray_lanes(map_table, seen, pose_cell[n], pose[n], x, y, limit, caster);
+        const lanes range = range_lanes(t, scale);
         if (first + LANES <= rays) {
             store_lanes(range, 0, out);
         } else {
-            real single[LANES];
             store_lanes(range, 0, single);
             for (int i = 0; first + i < rays; ++i) out[i] = single[i];
         }

@@ -2,7 +2,7 @@
 // requires: shapes lanes/rays lanes/error_free
 
 #if SHAPES
-// in lanes: sight_of meet_disc meet_box meet_segment
+// in lanes: turned meet_disc meet_box meet_segment
 
 // Return the nearest of the shapes that a particle sees along rays and of obstacles at distances t.
 LanePair nearest_shape_lanes(global const real *shapes, global const int2 *world, const Crowd crowd, const int n,
@@ -11,7 +11,7 @@ LanePair nearest_shape_lanes(global const real *shapes, global const int2 *world
     direct_lanes(pose, ray_x, ray_y, &dx, &dy);
     global const real *first = shapes + (long)world[2 * n + 1].x * crowd.stride;
     lane_int sight[LANES];
-    store_lanes(to_ilanes(sight_of_lanes(dx, dy)), 0, sight);
+    store_lanes(to_ilanes(turned_lanes(dx, dy) * (SIGHTS / 4)), 0, sight);
     int at[LANES];
     for (int i = 0; i < LANES; ++i) at[i] = sight_at(crowd, n, (int)sight[i]);
     LanePair nearest = {t, 2};

@@ -17,8 +17,9 @@ from gpusense.interface import structs
 from gpusense.reference.ray import TINY, ray_direction
 
 DISC, BOX, SEGMENT = 4, 8, 4
-# Ranges of directions of a particle's sights, and of a table of beams; widening of a shape's range in quarters of a turn.
+# Ranges of directions of a particle's sights, and of a table of beams.
 SIGHTS, DIRECTIONS = 64, 1024
+# Widening of a shape's range, in quarters of a turn.
 APART = 1.25e-4
 
 

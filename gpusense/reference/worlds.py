@@ -16,10 +16,10 @@ from gpusense.reference.shapes import (
     BOX,
     DISC,
     SIGHTS,
+    directions_of,
     nearest_shape,
     particles_of_worlds,
     shape_distance,
-    directions_of,
     world_begin,
     world_window,
 )

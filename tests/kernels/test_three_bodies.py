@@ -87,7 +87,7 @@ ON_PURPOSE = [
         "a ray tests the shapes near its direction; in the reference it tests every shape",
     ),
     Purpose(
-        "worlds", "sharing by_team members team_memory share_pairs place_of begin_at keep_least wait least_at", (WARP,),
+        "worlds", "by_team members team_memory share_pairs place_of begin_at keep_least wait least_at", (WARP,),
         "a kernel in OpenCL has its team's memory",
     ),
     Purpose("icp_step", "add_to_blocks close_blocks", KERNELS_ONLY, "points come one after another"),

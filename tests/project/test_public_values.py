@@ -7,7 +7,6 @@ NumPy, writes nothing to standard error, and raises nothing else.
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import re
 import warnings
 from collections.abc import Iterator
@@ -20,33 +19,17 @@ from support.public_calls import Call, calls
 
 import gpusense as gs
 
-# Results, which only the package makes, and names that are no calls.
-RESULTS = {
-    "BeamFit", "BoundCall", "Device", "Diagnosis", "DiscreteFit", "Estimate", "FeatureMap", "Features", "FilterState",
-    "IncidenceFit", "Integrity", "Judgement",
-    "LandmarkFit", "Location", "MapMatch", "MotionFit", "Odometry", "PlausibilityWarning", "PointFit", "PoseLikelihood",
-    "PoseMode", "PoseVerdict", "PositionFix", "Reading", "Scan", "ScanChain", "ScanMatch", "Stretch", "Weights",
-}  # fmt: skip
-# Methods for the package's own use, of enumerations and exceptions, or that draw a picture.
-METHODS = {
-    "BeamModel.bind_terms", "LikelihoodFieldModel.bind_terms",
-    "BeamModel.start_scoring", "LikelihoodFieldModel.start_scoring", "LikelihoodFieldModel.sample",
-    "PoseLikelihood.plot", "RayCaster.save_table", "OdometryMotion.sampled", "OdometryMotion.sampled_turns",
-    "OmniMotion.sampled", "VelocityMotion.sampled", "ScanMatch.changed", "ScanMatch.joined", "ScanMatch.moved",
-    "ScanMatch.ordered", "ScanMatch.replaced", "PoseMonitor.restore", "Shapes.counts", "Worlds.allocate",
-    "Worlds.marked", "Worlds.obstacles", "Worlds.put", "Worlds.stacks", "Worlds.table", "Worlds.watch",
-}  # fmt: skip
-FUNCTIONS = {"devices"}
 # Calls whose results have NaN for what is unknown: errors of parameters, missing readings, shares of no evidence.
 UNKNOWN = re.compile(
     r"fit_\w+|DiscreteBeamModel\.learn|suspicious_landmarks|chain_scans|\w+\.incidence|\w+\.sample|deskew_scan"
     r"|wrap_angle|ParticleFilter\.correct|PoseMonitor\.update|trilaterate|triangulate\w*|locate|locate_scan"
-    r"|judge_trajectory|pose_likelihood|LandmarkMap|read_log"
+    r"|judge_trajectory|pose_likelihood|LandmarkMap|read_log|Shapes"
 )
 # Other names of arguments in messages: fields of a mapping, readings of a sensor, the map of a model.
 ALIASES = {
     "DiscreteBeamModel.from_dict": ("fields",), "IncidenceParameters.from_dict": ("fields",),
-    "ParticleFilter.correct": ("ranges",), "ParticleFilter.initialize_uniform": ("map",),
+    "ParticleFilter.correct": ("ranges",), "PoseMonitor.update": ("readings",),
+    "ParticleFilter.initialize_uniform": ("map",),
 }  # fmt: skip
 # Calls of seconds draw one value.
 HEAVY = {
@@ -171,28 +154,6 @@ def test_drawn_values_give_a_right_result_or_a_named_error(name: str, capfd: pyt
 @pytest.mark.parametrize("name", calls())
 def test_all_values_give_a_right_result_or_a_named_error(name: str, capfd: pytest.CaptureFixture[str]) -> None:
     check(name, trials(name, calls()[name]), capfd)
-
-
-def test_the_registry_has_every_public_signature() -> None:
-    registered = {name: set(call.arguments) for name, call in calls().items()}
-    missing = []
-    for name in gs.__all__:
-        value = getattr(gs, name)
-        if inspect.isclass(value):
-            public = [(f"{name}.{each}", getattr(value, each)) for each in dir(value) if not each.startswith("_")]
-            named = [(key, method) for key, method in public if callable(method) and key not in METHODS]
-            signatures = named if name in RESULTS else [(name, value), *named]
-        else:
-            signatures = [(name, value)] if callable(value) and name not in FUNCTIONS else []
-        if name in ("PlausibilityWarning", "Reading"):
-            continue
-        for key, signature in signatures:
-            kinds = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-            found = inspect.signature(signature).parameters.values()
-            wanted = {each.name for each in found if each.name != "self" and each.kind not in kinds}
-            if wanted != registered.get(key, set()) and not (wanted == set() and key in registered):
-                missing.append((key, wanted ^ registered.get(key, set())))
-    assert missing == []
 
 
 def test_the_valid_arguments_are_accepted(capfd: pytest.CaptureFixture[str]) -> None:

@@ -48,6 +48,14 @@ def test_a_kernel_that_does_not_compile_names_file_line_and_log(needs, monkeypat
     assert "nonsense" in message
 
 
+def test_places_in_the_whole_source_become_places_in_files():
+    source = sources.assemble("ranges", frozenset())
+    number = 1 + source.split("real k_x = COUNT + (real)start")[0].count("\n")
+    line = 1 + sources.opencl_source("raycast").split("real k_x = COUNT + (real)start")[0].count("\n")
+    assert sources.with_places(f"<kernel>:{number}:15: error", source) == f"raycast.cl:{line}:15: error"
+    assert sources.with_places("<kernel>:1:1: error", source) == "<kernel>:1:1: error"
+
+
 def test_a_device_that_is_gone_says_so(needs, monkeypatch):
     import pyopencl as cl
 

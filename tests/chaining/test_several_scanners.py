@@ -216,9 +216,3 @@ def test_bad_values(changes: dict, message: str) -> None:
     arguments = {"scans": [np.ones(181), np.ones(181)], "scanner": [AHEAD, BACK], "sensor": [0, 1]} | changes
     with pytest.raises(ValueError, match=message):
         gs.chain_scans(arguments.pop("scans"), arguments.pop("scanner"), backend="numpy", **arguments)
-
-
-@pytest.mark.parametrize("scanner", [[], [FRONT, 3], "scanner", 5])
-def test_bad_scanners(scanner: object) -> None:
-    with pytest.raises(TypeError, match="scanner: must be a Scanner or a sequence of them"):
-        gs.chain_scans([np.ones(181)], scanner, backend="numpy")

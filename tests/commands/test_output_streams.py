@@ -21,23 +21,6 @@ from gpusense.commands import cli, output
 from gpusense.sweeps.tasks import jobs_of
 
 
-def test_write_whole_replaces_or_leaves_as_it_was(tmp_path):
-    path = tmp_path / "report.csv"
-    files.write_whole(path, lambda stream: stream.write(b"first"))
-    assert path.read_bytes() == b"first"
-
-    def fail(stream):
-        stream.write(b"half")
-        raise RuntimeError("stopped")
-
-    with pytest.raises(RuntimeError, match="stopped"):
-        files.write_whole(path, fail)
-    assert path.read_bytes() == b"first"
-    files.write_whole(path, lambda stream: stream.write(b"second"))
-    assert path.read_bytes() == b"second"
-    assert [file.name for file in tmp_path.iterdir()] == ["report.csv"]
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="symbolic links need a privilege on Windows")
 def test_write_whole_follows_a_link(tmp_path):
     target, link = tmp_path / "target.csv", tmp_path / "link.csv"

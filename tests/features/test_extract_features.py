@@ -342,18 +342,3 @@ def test_bad_arguments_are_named(change, error, words):
     arguments = {"ranges": np.ones(90), "scanner": ring(90), "backend": "numpy"} | change
     with pytest.raises(error, match=words):
         gs.extract_features(**arguments)
-
-
-def test_features_can_be_chosen():
-    scanner = ring(360)
-    found = gs.extract_features(square_room(scanner), scanner, backend="numpy")
-    assert len(found[:2]) == 2 and len(found[found.size > 3]) == 4 and len(found[[0, 4]]) == 2
-    assert [one.kind[0] for one in found] == found.kind.tolist()
-    assert repr(found) == "Features(4 lines, 4 corners)" and repr(found[:0]) == "Features(none)"
-    assert get_backend("numpy").info.backend == "numpy"
-    with pytest.raises(ValueError, match="kind: must be"):
-        found["wall"]
-    with pytest.raises(TypeError, match="index: must be"):
-        found[1.5]
-    with pytest.raises(ValueError, match="kind: must be"):
-        found.range_bearing("wall")

@@ -204,11 +204,6 @@ def test_broken_files_are_named(name, surveyed, tmp_path):
     assert str(caught.value).startswith(f"{path}:{line}: ")
 
 
-def test_missing_files_are_named(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        gs.FeatureMap.load(tmp_path / "none.csv")
-
-
 def test_features_seen_too_seldom_are_no_landmarks(surveyed):
     poses = corridor_path(160)[:1]
     features = gs.extract_features(scans_at(poses, 1), SCANNER)
@@ -231,13 +226,3 @@ def test_bad_arguments_are_named(change, error, words):
     features = gs.extract_features(scans_at(poses, 1), SCANNER, backend="numpy")
     with pytest.raises(error, match=words):
         gs.map_features(**({"features": features, "poses": poses} | change))
-
-
-def test_bad_maps_are_named():
-    grid = gs.OccupancyGrid(np.zeros((4, 4), np.int8), resolution=0.05)
-    for change, error, words in (
-        ({"grid": 3}, TypeError, "grid: must be an OccupancyGrid"),
-        ({"range_max": -1}, ValueError, "range_max: must be"), ({"kinds": "hallway"}, ValueError, "kinds: must be"),
-    ):  # fmt: skip
-        with pytest.raises(error, match=words):
-            gs.landmarks_of_map(**({"grid": grid, "backend": "numpy"} | change))

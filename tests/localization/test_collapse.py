@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 import gpusense as gs
 from gpusense.interface import constants as c
@@ -21,22 +20,6 @@ def follow(backend, prior, sigma, far, corrections, **options):
         found.append(pf.estimate())
         distinct.append(len(np.unique(pf.host_particles(), axis=0)))
     return distinct, found
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "prior, sigma, far", [(10.0, 0.1, 40.0), (1.0, 1e-3, 4.0), (100.0, 0.1, 300.0), (10.0, 0.1, 0.0)]
-)
-def test_particles_reach_a_fix_that_is_far_from_all_of_them(backend, prior, sigma, far):
-    distinct, found = follow(backend, prior, sigma, far, 4)
-    for one, particles in zip(found, distinct, strict=True):
-        deviations = np.sqrt(np.diag(one.covariance)[:2])
-        assert (deviations > sigma / 4).all()
-        assert (np.abs(one.pose[:2] - (far, 0.0)) < 4 * deviations + sigma / 2).all(), one
-        assert one.effective_sample_size < 1.2 * particles + 5
-    # The first correction cannot use the whole fix, and reports it.
-    assert found[0].used < 0.7 and found[-1].used == 1.0
-    assert np.abs(found[-1].pose[:2] - (far, 0.0)).max() < 4 * sigma
 
 
 def test_a_plain_filter_says_that_one_particle_has_all_the_weight():

@@ -79,25 +79,6 @@ def test_motion_noise_is_learned_from_references_at_some_steps():
     assert apart[1] < 0.2 * motion.alpha[1]
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("repeated", [0.0, 0.4, 0.7])
-def test_motion_noise_that_repeats_from_step_to_step_is_inflated(repeated):
-    """Sums of errors with a correlation of rho^k over k steps have (1 + rho) / (1 - rho) times the variance."""
-    rng, inflation = np.random.default_rng(4), []
-    for _ in range(8):
-        drawn = rng.normal(0, (0.05, 0.02, 0.02), (400, 3))
-        for k in range(1, 400):
-            drawn[k, 0] = repeated * drawn[k - 1, 0] + np.sqrt(1 - repeated**2) * drawn[k, 0]
-        truth, odometry = np.zeros((401, 3)), np.zeros((401, 3))
-        odometry[:, 0] = np.arange(401)
-        for k, noise in enumerate(drawn):
-            truth[k + 1] = gs.compose_poses(truth[k], noise + np.array([1.0, 0.0, 0.0]))
-        motion = gs.fit_odometry_motion(odometry, truth, systematic=False).motion
-        inflation.append((motion.sampled_turns(0.0, 1.0, 0.0).deviation[1] / 0.05) ** 2)
-    # Means of 8 fits have a deviation of 4 to 9 %.
-    assert np.mean(inflation) == pytest.approx((1 + repeated) / (1 - repeated), rel=0.2)
-
-
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("jitter", [0.0, 0.0005, 0.003])
 def test_motion_noise_of_a_robot_that_stands_stays_near_the_default(jitter):

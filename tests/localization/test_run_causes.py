@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense.evaluation.steps import read_steps
 from gpusense.localization.diagnosis import Diagnosis
 from gpusense.localization.run_causes import RunEvidence, diagnose_run, likely_cause
 from gpusense.localization.scan_motion import Moment, ScanMotion, scan_motion
@@ -101,18 +100,6 @@ def test_wrong_maps_are_told_from_wrong_scales(backend, grid, run) -> None:
     for row, column in np.ndindex(5, 7):
         blocks[30 * row + 8 : 30 * row + 20, 28 * column + 6 : 28 * column + 21] = 100
     assert diagnosed(backend, gs.OccupancyGrid(blocks, 0.1), run).cause == "map"
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("scale", [0.9, 1.1])
-def test_the_scale_of_a_real_map_is_measured(backend, data_dir, scale) -> None:
-    fr079 = gs.read_map(data_dir / "carmen_logs" / "derived_maps" / "freiburg-079_even_05cm.yaml")
-    steps = read_steps(data_dir / "carmen_logs" / "freiburg-079-corrected.log.gz", every=2, offset=1, limit=80)
-    scanner = steps[0].scan.scanner
-    scaled = gs.OccupancyGrid(fr079.cells, fr079.resolution / scale, fr079.origin)
-    model = gs.LikelihoodFieldModel(scaled, scanner, PARAMETERS, backend=backend, beams=90)
-    found = diagnose_run(model, [Moment(one.scan.ranges, one.scan.pose, one.odometry, one.scan.time) for one in steps])
-    assert found.cause == "scale" and found.scale == pytest.approx(scale, rel=0.03)
 
 
 def test_a_moved_map_is_told_from_a_robot_that_was_carried_away(backend, grid, run) -> None:

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
-from matplotlib.image import imread
 from support.feature_scenes import floor_plan
 
 import gpusense as gs
@@ -99,12 +98,6 @@ def test_scan_ends_where_its_readings_say():
     assert np.array(beams.get_segments()) == pytest.approx(np.stack([[start, start], ends], axis=1), abs=1e-6)
 
 
-def test_scan_without_ranges_draws_the_robot_alone():
-    scanner = gs.Scanner([0.0, 1.0], 5.0)
-    _, ax = new_axes()
-    assert plots.draw_scan(ax, lone_cell(TURNED), scanner, (0, 0, 0), [math.inf, math.nan]) == 0
-
-
 def test_particles_are_coloured_by_likelihood_with_the_best_on_top():
     poses = np.array([[1.0, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0]])
     _, ax = new_axes()
@@ -114,13 +107,6 @@ def test_particles_are_coloured_by_likelihood_with_the_best_on_top():
     assert cloud.get_clim() == (-5.0, -1.0)
     assert np.isfinite(cloud.get_array()).all()
     assert plots.draw_particles(ax, poses, [-1.0, -100.0, -np.inf, -5.0], depth=50).get_clim() == (-51.0, -1.0)
-
-
-@pytest.mark.parametrize("log_p", [[], [0.0], [-np.inf, -np.inf], [7.0, 7.0]])
-def test_particles_without_differences_have_a_scale(log_p):
-    _, ax = new_axes()
-    low, high = plots.draw_particles(ax, np.zeros((len(log_p), 3)), log_p).get_clim()
-    assert low < high
 
 
 @pytest.mark.parametrize("spacing", [0.1, 0.3, 0.7, 100.0])
@@ -154,15 +140,6 @@ def test_density_is_drawn_where_its_poses_are():
     assert colour_at(figure, ax, x, y) == pytest.approx(to_rgb(drawing.SCALE[-1]), abs=0.02)
     x, y = poses.reshape(*free.shape, 3)[6, 8, :2]
     assert colour_at(figure, ax, x, y) == pytest.approx(to_rgb(drawing.SCALE[0]), abs=0.02)
-
-
-def test_colour_bar_says_what_it_shows():
-    figure, ax = new_axes()
-    cloud = plots.draw_particles(ax, np.zeros((2, 3)), [-3.0, -1.0])
-    plots.add_colour_bar(ax, cloud, "log P(z | x, m) [nats]")
-    figure.canvas.draw()
-    (bar,) = ax.child_axes
-    assert bar.get_ylabel() == "log P(z | x, m) [nats]"
 
 
 @pytest.mark.parametrize("suffix", ["png", "PDF", "svg"])
@@ -234,19 +211,3 @@ def test_a_track_is_titled_by_its_verdict_and_faint_before_convergence(converged
     figure = ax.figure
     figure.canvas.draw()
     assert ax.get_legend().get_window_extent().y1 < ax.get_window_extent().y0
-
-
-def test_a_saved_png_has_the_layout_of_matplotlib(tmp_path):
-    pictures = []
-    for ours in (True, False):
-        figure = gs.plots.new_figure(3.0, 2.0)
-        ax = figure.subplots()
-        gs.plots.draw_map(ax, gs.worlds.building(0, (12.0, 10.0)))
-        ax.set(title="a title", ylabel="a label\nof two lines")
-        engine = figure.get_layout_engine()
-        # Each time, the layout begins with the last one.
-        for _ in range(2):
-            gs.plots.save(figure, tmp_path / "a.png") if ours else figure.savefig(tmp_path / "a.png")
-            pictures.append(imread(tmp_path / "a.png"))
-        assert figure.get_layout_engine() is engine
-    assert np.array_equal(pictures[:2], pictures[2:]) and not np.array_equal(pictures[0], pictures[1])

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import runpy
-import sys
-
 import numpy as np
 import pytest
 from scipy import stats
-from support.paths import ROOT
 
-import gpusense as gs
 from gpusense.plots import drawing as plots
 from gpusense.plots import positions as position_plots
 
@@ -86,26 +81,6 @@ def test_log_density_is_the_product_of_gaussians(heading):
     np.testing.assert_allclose(both, alone + bearings, rtol=1e-9, atol=1e-6)
 
 
-def test_ellipse_and_density_agree():
-    """On the 95 % ellipse of a precise fix the density is chi-squared's quantile / 2 below its maximum."""
-    fix = gs.trilaterate(XY, RANGES, sigma=1e-3)
-    ax = axes()
-    position_plots.draw_fix(ax, fix)
-    (ellipse,) = ax.patches
-    turn = np.linspace(0, 2 * np.pi, 50)
-    points = ellipse.get_patch_transform().transform(np.column_stack([np.cos(turn), np.sin(turn)]))
-    edge = position_plots.position_log_density(points, XY, ranges=RANGES, sigma_range=1e-3)
-    top = position_plots.position_log_density(fix.best, XY, ranges=RANGES, sigma_range=1e-3)
-    np.testing.assert_allclose(top - edge, stats.chi2.ppf(0.95, 2) / 2, rtol=2e-2)
-    position_plots.draw_fix(axes(), gs.trilaterate(XY[:2], [1.0, 1.0]))  # An unknown covariance draws no ellipse.
-
-
-def test_density_is_drawn_below_its_maximum():
-    ax = axes()
-    image = position_plots.draw_position_density(ax, [[-100.0, -3.0], [-5.0, -1.0]], EXTENT, depth=10)
-    np.testing.assert_array_equal(image.get_array(), [[-10.0, -2.0], [-4.0, 0.0]])
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -120,12 +95,3 @@ def test_bad_input(options, message):
     with pytest.raises(ValueError) as caught:
         position_plots.position_log_density(**{"points": [0.0, 0.0], "xy": XY, **options})
     assert str(caught.value) == message
-
-
-def test_the_example_draws(tmp_path, monkeypatch, capsys):
-    target = tmp_path / "picture.png"
-    monkeypatch.setattr(sys, "argv", ["beacons.py", str(target)])
-    runpy.run_path(str(ROOT / "examples" / "beacons.py"))
-    out = capsys.readouterr().out
-    assert "Distances only: two: two circles cross" in out and out.count("unique: one solution") == 2
-    assert target.read_bytes().startswith(b"\x89PNG")

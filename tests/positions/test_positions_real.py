@@ -71,22 +71,3 @@ def test_two_fiducials(sightings):
         error[2] = turn
     scaled = [e @ np.linalg.solve(f.covariance[0], e) for e, f in zip(away, poses, strict=True)]
     assert 1.0 < np.median(scaled) < 4.0
-
-
-def cylinders(ranges):
-    """Return bearings and ranges of cylinders in a scan of the LEGO robot: between a fall and a rise of the range."""
-    bearings = (np.arange(ranges.size) - 330) * 0.006135923 - 0.0698
-    seen = ranges > 0.02
-    found, inside = [], []
-    active = False
-    for k in range(1, ranges.size - 1):
-        jump = (ranges[k + 1] - ranges[k - 1]) / 2 if seen[k - 1] and seen[k + 1] else 0.0
-        if jump < -0.1:
-            active, inside = True, []
-        elif jump > 0.1 and active:
-            if inside:
-                found.append((bearings[inside].mean(), ranges[inside].mean()))
-            active = False
-        elif active and seen[k]:
-            inside.append(k)
-    return np.array(found).reshape(-1, 2).T

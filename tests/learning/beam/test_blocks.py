@@ -2,34 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
-from support.learning_data import RANGE_MAX, TYPICAL, draw, point, problem_of
+from support.learning_data import RANGE_MAX, TYPICAL, draw
 
 import gpusense as gs
-from gpusense.learning.beam.report import block_gradients
 
 
 def errors(fit: gs.BeamFit) -> np.ndarray:
     return np.array(list(fit.standard_errors.values()))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("bias", [0.0, 0.3])
-def test_gradients_of_blocks_add_up_to_the_gradient(bias: float, backend: str) -> None:
-    z, expected = draw(TYPICAL, 700, 2, low=0, high=1)
-    problem = problem_of(z, expected, backend=backend)
-    labels = np.arange(700) // 9
-    problem.pairs = dataclasses.replace(problem.pairs, block=labels)
-    at = point(0.6, 0.15, 0.05, 0.2, sigma=1.5, rate=0.4, bias=bias)
-    sums, counts = block_gradients(problem, at)
-    gradient = problem.value(at).gradient
-    assert counts.tolist() == np.bincount(labels).tolist()
-    np.testing.assert_allclose(sums.sum(axis=0), gradient, rtol=1e-9, atol=1e-9 * np.abs(sums).sum())
-    alone = problem_of(z[labels == 5], expected[labels == 5], backend="numpy").value(at).gradient
-    np.testing.assert_allclose(sums[5], alone, rtol=1e-9, atol=1e-9)
 
 
 def test_independent_readings_have_the_same_errors_in_blocks(needs) -> None:

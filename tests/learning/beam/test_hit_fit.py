@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,10 +28,6 @@ def drawn(truth: gs.BeamParameters, count: int = COUNT) -> tuple[np.ndarray, np.
 @functools.cache
 def fitted(truth: gs.BeamParameters, hit: str) -> gs.BeamFit:
     return gs.fit_beam_parameters(*drawn(truth), RANGE, backend="numpy", hit=hit)
-
-
-def bic(fit: gs.BeamFit, parameters: int) -> float:
-    return parameters * np.log(COUNT) - 2 * fit.log_likelihood
 
 
 def test_degrees_of_freedom_are_found() -> None:
@@ -85,29 +80,6 @@ def test_the_fit_is_that_of_scipy(backend: str) -> None:
         assert getattr(fit.parameters, name) == pytest.approx(value, rel=0.01 * fit.independent_errors[name] / value)
     # Standard errors equal those from SciPy's second derivatives, and over blocks of independent readings.
     assert fit.standard_errors["hit_dof"] == pytest.approx(fit.independent_errors["hit_dof"], rel=0.3)
-
-
-@pytest.mark.long
-def test_bic_prefers_the_shape_of_the_readings() -> None:
-    # The normal has 5 free parameters, Student's t one more.
-    assert bic(fitted(STUDENT, "student"), 6) < bic(fitted(STUDENT, "normal"), 5) - 10
-    assert bic(fitted(NORMAL, "normal"), 5) < bic(fitted(NORMAL, "student"), 6)
-    heavy = fitted(NORMAL, "student")
-    assert heavy.log_likelihood >= fitted(NORMAL, "normal").log_likelihood - 1e-2
-    assert heavy.parameters.hit_dof > 20
-
-
-@pytest.mark.long
-def test_growth_offset_and_shape_are_fitted_together() -> None:
-    truth = STUDENT.replace(range_bias=0.03, sigma_growth=0.015, hit_dof=4.0)
-    z, expected = drawn(truth)
-    options: Any = dict(backend="numpy", range_bias=True, sigma_growth=True, blocks=np.arange(COUNT) // 10)
-    fit = gs.fit_beam_parameters(z, expected, RANGE, hit="student", responsibilities=True, **options)
-    errors = fit.standard_errors | {"range_bias": fit.range_bias_error}
-    for name in ("sigma_hit", "sigma_growth", "range_bias", "hit_dof"):
-        assert abs(getattr(fit.parameters, name) - getattr(truth, name)) < 4 * errors[name], name
-    np.testing.assert_allclose(fit.responsibilities.sum(axis=1), 1, rtol=1e-9)
-    assert fit.log_likelihood > gs.fit_beam_parameters(z, expected, RANGE, **options).log_likelihood
 
 
 def test_without_ranges_nothing_determines_the_shape() -> None:

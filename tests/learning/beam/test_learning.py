@@ -161,22 +161,6 @@ def test_hill_climbing_leaves_a_ridge_that_no_coordinate_climbs(needs) -> None:
     assert not fit.converged and "no convergence within 8 iterations" in fit.status
 
 
-@pytest.mark.long
-def test_the_genetic_search_needs_no_good_start(needs) -> None:
-    backend = needs("opencl")
-    z, expected = draw(TYPICAL, 200, 3)
-    best = gs.fit_beam_parameters(z, expected, RANGE_MAX, backend=backend)
-    start = gs.BeamParameters(0.05, 0.05, 0.85, 0.05, 9.0, 100.0)
-    fit = gs.fit_beam_parameters(
-        z, expected, RANGE_MAX, method="genetic", initial=start, backend=backend, max_iterations=25
-    )
-    assert abs(fit.log_likelihood - best.log_likelihood) < 1e-6
-    again = gs.fit_beam_parameters(
-        z, expected, RANGE_MAX, method="genetic", initial=start, backend=backend, max_iterations=25
-    )
-    assert (values(fit) == values(again)).all()
-
-
 # Expected ranges near range_max truncate a wide p_hit; near ones truncate p_short.
 @pytest.mark.parametrize(
     ("truth", "span", "name"),
@@ -250,15 +234,6 @@ def test_readings_are_classed_and_counted() -> None:
         4 + np.count_nonzero(~kept),
     )
     np.testing.assert_allclose(values(fit), values(plain), rtol=1e-7)
-
-
-def test_float32_readings_of_range_max_are_max_readings() -> None:
-    z, expected = draw(TYPICAL, 500, 10)
-    z = np.where(np.isinf(z), 0.7, z / RANGE_MAX * 0.7).astype(np.float32)
-    expected = np.minimum(expected / RANGE_MAX * 0.7, 0.7).astype(np.float32)
-    expected[0] = np.float32(0.7)
-    fit = gs.fit_beam_parameters(z, expected, 0.7, backend="numpy")
-    assert fit.max_readings == np.count_nonzero(z == np.float32(0.7)) > 0
 
 
 def test_restarts_never_end_lower_and_repeat() -> None:

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize_scalar
 from support.learning_data import TYPICAL, draw
 
 import gpusense as gs
@@ -32,22 +31,6 @@ def test_the_reported_offset_is_that_of_the_joint_fit(seed: int, needs) -> None:
     assert plain.range_bias == pytest.approx(joint.range_bias, abs=1e-3 * joint.range_bias_error)
     assert plain.range_bias_error == pytest.approx(joint.range_bias_error, rel=1e-4)
     assert not plain.bias_fitted and plain.log_likelihood < joint.log_likelihood
-
-
-@pytest.mark.long
-def test_the_reported_offset_is_the_maximum_of_the_profile(needs) -> None:
-    """Away from both ends, fits without an offset of readings moved by b have the profile's log-likelihood."""
-    rng = np.random.default_rng(5)
-    expected = rng.uniform(3, 7, 3000)
-    z = expected + 0.05 + rng.normal(0, 0.1, 3000)
-    backend = needs("opencl")
-
-    def loss(bias: float) -> float:
-        return -gs.fit_beam_parameters(z - bias, expected, 10.0, backend=backend).log_likelihood
-
-    best = minimize_scalar(loss, bounds=(-0.1, 0.2), method="bounded", options={"xatol": 1e-5}).x
-    fit = gs.fit_beam_parameters(z, expected, 10.0, backend=backend)
-    assert fit.range_bias == pytest.approx(best, abs=0.02 * fit.range_bias_error)
 
 
 def test_no_offset_is_reported_away_from_an_optimum() -> None:

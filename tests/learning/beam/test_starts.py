@@ -47,16 +47,6 @@ def highest() -> float:
     return brute_force(*two_modes(), 8.0, 20)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("method", ["em", "gradient", "hill_climb"])
-def test_of_two_modes_the_one_at_the_expected_range_is_correct(method: str, highest: float, needs) -> None:
-    z, expected = two_modes()
-    fit = gs.fit_beam_parameters(z, expected, 8.0, method=method, backend=needs("opencl"))
-    assert fit.converged and fit.log_likelihood == pytest.approx(highest, abs=1e-2)
-    assert fit.log_likelihood > -3.0 and fit.parameters.sigma_hit < 0.015
-    assert fit.parameters.z_rand == pytest.approx(0.5, abs=0.01)
-
-
 def test_the_status_reports_that_another_start_is_better() -> None:
     z, expected = two_modes()
     wide = gs.BeamParameters(0.98, 0.0, 0.0, 0.02, 1.4, 1.0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import math
 
 import numpy as np
@@ -14,35 +13,6 @@ import gpusense as gs
 from gpusense.learning.discrete.fit import NAMES, count_pairs
 
 BINS = 989
-
-
-def two_widths(seed: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """Draw narrow and ten times wider readings, a few at random and a few without return."""
-    rng = np.random.default_rng(seed)
-    range_max = float(rng.choice([8, 20, 50, 100]))
-    expected = rng.uniform(0.05, 0.6, 2000) * range_max
-    sigma = range_max * float(np.exp(rng.uniform(np.log(1e-4), np.log(0.01))))
-    offset = range_max * float(rng.choice([0, 0.002, 0.01, 0.05]))
-    wide = float(rng.choice([0.1, 0.3, 0.5, 0.7]))
-    z, u = expected + rng.normal(0, sigma, 2000), rng.uniform(size=2000)
-    z = np.where(u < wide, expected + offset + rng.normal(0, 10 * sigma, 2000), z)
-    z[u > 0.93] = rng.uniform(0, range_max, int((u > 0.93).sum()))
-    z[u > 0.98] = np.inf
-    return np.abs(z), expected, range_max
-
-
-@pytest.mark.long
-@pytest.mark.sampled(0.5)
-@pytest.mark.parametrize("seed", [4, 5])
-def test_no_point_of_a_grid_is_likelier_than_the_fit(seed: int) -> None:
-    z, expected, range_max = two_widths(seed)
-    table = gs.DiscreteBeamModel.learn(z, expected, range_max, BINS)
-    assert table.fit is not None and table.fit.converged
-    counts = count_pairs(z, expected, range_max, BINS)
-    rates = np.array([1e-4, 1e-2, 0.3, 3.0]) / range_max * 10
-    grid = itertools.product(rates, rates, (0.1, 0.3, 0.6, 0.95), np.geomspace(2e-4, 0.2, 10) * range_max)
-    highest = max(counts.log_likelihood(gs.DiscreteCauses(*map(float, causes))) for causes in grid)
-    assert table.fit.log_likelihood > highest
 
 
 def test_a_flat_direction_leaves_the_other_standard_errors() -> None:
@@ -182,16 +152,6 @@ def test_a_scan_is_the_sum_of_look_ups_on_every_backend(name, precision, backend
         assert (one.log_likelihood(poses, SCAN) == log_p).all()
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("gpu", [True, False])
-def test_tiles_and_orders_change_nothing(gpu, as_gpu):
-    _, _, poses = scene()
-    many = np.tile(poses, (300, 1))
-    expected = model(TABLES["separate"]).log_likelihood(poses, SCAN)
-    found = model(TABLES["separate"], as_gpu(gpu)).log_likelihood(many, SCAN)
-    np.testing.assert_array_equal(found, np.tile(expected, 300))
-
-
 @pytest.mark.long_on("warp")
 def test_max_readings_depend_on_what_is_expected(backend):
     """A wall ahead makes no return unlikely; with and without a wall, the probability is the table's."""
@@ -208,15 +168,6 @@ def test_max_readings_depend_on_what_is_expected(backend):
     assert (np.count_nonzero(parts, axis=1) == 3).all()
 
 
-@pytest.mark.parametrize("selection", ["numpy", "opencl"])
-def test_cones_are_looked_up_too(selection, needs):
-    grid, _, poses = scene()
-    ring = gs.Scanner([0.0, 0.5, math.pi], RANGE, cone=0.3, cone_rays=5)
-    one = gs.BeamModel(grid, ring, TABLES["separate"], backend=needs(selection))
-    _, parts = one.log_likelihood(poses, [1.3, INF, 3.9], per_beam=True)
-    np.testing.assert_array_equal(parts, looked_up(TABLES["separate"], [1.3, INF, 3.9], one.expected_ranges(poses)))
-
-
 @pytest.mark.long_on("warp")
 def test_impossible_readings_are_minus_infinity(backend):
     """Zero noise and no random triggers exclude readings behind the wall and "no return"."""
@@ -225,15 +176,6 @@ def test_impossible_readings_are_minus_infinity(backend):
     log_p, parts = one.log_likelihood(poses, [INF] + [NAN] * (scanner.count - 1), per_beam=True)
     assert np.isneginf(log_p).all() and np.isneginf(parts[:, 0]).all() and not np.isnan(parts).any()
     assert np.isfinite(one.log_likelihood(poses, [NAN] * 8 + [INF] * 4)).all()
-
-
-def test_the_plan_says_so():
-    _, _, poses = scene()
-    one = model(TABLES["separate"])
-    one.log_likelihood(poses, SCAN)
-    text = one.explain()
-    assert text.startswith("discrete beam model, ") and "a table of 38 x 38 steps" in text
-    assert "z_max" not in text and "log-domain" not in text and one.parameters is TABLES["separate"]
 
 
 def simulated(causes: gs.DiscreteCauses, count: int, bins: int = BINS, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

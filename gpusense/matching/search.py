@@ -145,6 +145,11 @@ class _Run:
         # The host places them for devices without float64.
         backend = self._backend if self._backend.info.float64 else get_backend("numpy")
         there = space if backend is self._backend else Workspace(backend)
+        # Some devices wait for launches before they copy, so all numbers are copied first.
+        self._low = space.upload("low", np.maximum(self._floor, 0).astype(np.int32))
+        self._slacks = space.upload("slack", self._slack)
+        self._histogram = space.upload("histogram", np.zeros(len(self._best) * BINS, np.int32))
+        self._clear_counts()
         inputs = [there.upload(name, array) for name, array in zip(_GIVEN, given, strict=False)]
         if len(given) < len(_GIVEN):
             inputs.append(there.empty("table 0", total, _INT, zero=True))
@@ -168,7 +173,6 @@ class _Run:
     def search(self) -> None:
         """Find first lower bounds, then divide all blocks whose bounds reach them."""
         self._bound()
-        self._low = self._space.upload("low", np.maximum(self._floor, 0).astype(np.int32))
         self._follow()
         begin, some = 0, 1 << 30
         self._choose()
@@ -178,6 +182,7 @@ class _Run:
             chosen = int(counts[-1])
             if chosen > self._room:
                 self._search.room = chosen
+                self._clear_counts()
                 self._choose()
                 continue
             if counts[:-1].max(initial=0) > self._parts:
@@ -208,7 +213,6 @@ class _Run:
             )  # fmt: skip
         self._evaluated += rows * self._width
         self._maxima = self._space.empty("row maxima", 2 * rows, _INT)
-        self._histogram = self._space.upload("histogram", np.zeros(len(self._best) * BINS, np.int32))
         self._shift = max((TOP * self._most).bit_length() - BINS.bit_length() + 1, 0)
         self._launch(
             "row_maxima", (rows,), self._score, self._maxima, self._histogram, rows, self._width, self._height,
@@ -241,15 +245,17 @@ class _Run:
                 "follow_blocks", (count,), *quarters, self._allowed[level], blocks, shape, count, self._grid.height,
                 self._grid.width, -(-self._grid.width >> level), level, *spacing, flags=self._ahead,
             )  # fmt: skip
-        self._launch("raise_low", (count,), blocks, self._space.upload("slack", self._slack), self._low, count, most)
+        self._launch("raise_low", (count,), blocks, self._slacks, self._low, count, most)
         self._evaluated += 4 * self._level * count
+
+    def _clear_counts(self) -> None:
+        self._counts = self._space.upload("count", np.zeros(self._level + 1, np.int32))
 
     def _choose(self) -> None:
         """Collect the blocks whose bounds reach the lower bound of their scan."""
         rows = self._items * self._height
         self._room = max(self._search.room, _ROOM * len(self._best))
         self._chosen = self._space.empty("chosen", 4 * self._room, _INT)
-        self._counts = self._space.upload("count", np.zeros(self._level + 1, np.int32))
         self._launch(
             "choose_blocks", (rows,), self._score, self._maxima, self._low, self._chosen, self._counts, rows,
             self._height, self._width, self._turns, self._level, self._room,

@@ -31,7 +31,7 @@ _NAMES = {
     "learning.discrete.table": ("DiscreteBeamModel",),
     "learning.fitted": ("BeamFit", "DiscreteFit", "LandmarkFit", "PointFit"),
     "learning.landmark.fit": ("fit_landmark_parameters",),
-    "learning.landmark.suspicious": ("suspicious_landmarks",),
+    "learning.landmark.pairs": ("suspicious_landmarks",),
     "learning.point.absolute": ("fit_heading_parameters", "fit_position_parameters"),
     "learning.point.beacons": ("fit_beacon_parameters",),
     "learning.point.bumper": ("fit_bumper_parameters",),

@@ -30,7 +30,7 @@ from gpusense.learning.fitted import DiscreteFit as DiscreteFit
 from gpusense.learning.fitted import LandmarkFit as LandmarkFit
 from gpusense.learning.fitted import PointFit as PointFit
 from gpusense.learning.landmark.fit import fit_landmark_parameters as fit_landmark_parameters
-from gpusense.learning.landmark.suspicious import suspicious_landmarks as suspicious_landmarks
+from gpusense.learning.landmark.pairs import suspicious_landmarks as suspicious_landmarks
 from gpusense.learning.point.absolute import fit_heading_parameters as fit_heading_parameters
 from gpusense.learning.point.absolute import fit_position_parameters as fit_position_parameters
 from gpusense.learning.point.beacons import fit_beacon_parameters as fit_beacon_parameters

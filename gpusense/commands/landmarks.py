@@ -16,7 +16,7 @@ from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
     from gpusense.learning.fitted import LandmarkFit
-    from gpusense.learning.landmark.suspicious import Suspicions
+    from gpusense.learning.landmark.pairs import Suspicions
     from gpusense.logs.records import LandmarkRun
 
 HELP = "Fit the noise of landmark readings in a recorded run, check the map, and localise the robot."
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     """Fit the noise, check the map, associate, localise, and print the results; after Ctrl-C, of the scans so far."""
     from gpusense.evaluation import landmark_runs
     from gpusense.evaluation.tracking import Track, summary
-    from gpusense.learning.landmark.suspicious import suspicious_landmarks
+    from gpusense.learning.landmark.pairs import suspicious_landmarks
     from gpusense.logs.mrclam import read_mrclam
     from gpusense.models.landmark.model import LandmarkModel
 

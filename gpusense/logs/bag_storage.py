@@ -1,21 +1,29 @@
-"""Read the messages of a bag's file as bytes: the interface, and SQLite databases.
+"""Read the messages of a bag's file as bytes, even if the file is cut off: SQLite databases, MCAP, and bags of ROS 1.
 
-A killed recorder, a full disk or an interrupted copy cuts a database off; it is read up to the cut. The header states
-its size; see https://www.sqlite.org/fileformat.html.
+A killed recorder, a full disk or an interrupted copy cuts a file off; it is read up to the cut. The header of a
+database states its size. An MCAP file or a bag of ROS 1 then has no index, or the index of a longer file, so its chunks
+are found by walking through it. Lengths in headers are compared with the file before memory is allocated, and a chunk
+is decompressed up to the size in its header.
+
+Formats: https://www.sqlite.org/fileformat.html, https://wiki.ros.org/Bags/Format/2.0, https://mcap.dev/spec.
 """
 
 from __future__ import annotations
 
+import bz2
 import contextlib
+import heapq
 import importlib
+import io
 import os
 import shutil
 import struct
 import urllib.parse
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 from gpusense._util.lines import inflated
 
@@ -122,3 +130,247 @@ class Sqlite(Storage):
                     return
                 if number in chosen:
                     yield Raw(time, chosen[number], data)
+
+
+# Kinds of records in MCAP: header, footer, schema, channel, message, chunk, index of messages, end of the data.
+_M_HEADER, _M_FOOTER, _M_SCHEMA, _M_CHANNEL, _M_MESSAGE, _M_CHUNK, _M_INDEX = 1, 2, 3, 4, 5, 6, 7
+_M_LAST = 15
+# Kinds of records in ROS 1: message, header of the bag, index of messages, chunk, connection.
+_R_MESSAGE, _R_BAG, _R_INDEX, _R_CHUNK, _R_CONNECTION = 2, 3, 4, 5, 7
+
+
+class _Chunk(NamedTuple):
+    """A chunk of messages, or a message outside chunks: offset in the file, and time of the first message."""
+
+    start: int
+    place: int
+    length: int
+    compression: bytes
+    size: int
+    checksum: int
+    whole: bool
+
+
+class _Chunked(Storage):
+    """File of chunks that contain messages, and possibly descriptions of their topics."""
+
+    def __init__(self, file: Path) -> None:
+        super().__init__(file)
+        self._topics: dict[int, Topic] = {}
+        self._numbers: Counter[int] = Counter()
+        self._chunks: list[_Chunk] = []
+        with file.open("rb") as stream:
+            self._walk(stream, file.stat().st_size)
+        if self.cut or not self._topics:
+            self._numbers.clear()
+            for chunk in self._chunks:
+                for number, _, _ in self._within(chunk):
+                    self._numbers[number] += 1
+        for number, topic in self._topics.items():
+            self.counts[topic] += self._numbers[number]
+        self.start = min((chunk.start for chunk in self._chunks), default=0)
+
+    def messages(self, wanted: Callable[[Topic], bool]) -> Iterator[Raw]:
+        chosen = {number: topic for number, topic in self._topics.items() if wanted(topic)}
+        parts = [self._sorted(at, chunk, chosen) for at, chunk in enumerate(self._chunks)] if chosen else []
+        for time, _, place, topic, data in heapq.merge(*parts, key=lambda each: each[:3]):
+            if place >= 0:
+                yield Raw(time, topic, data)
+
+    def _sorted(self, at: int, chunk: _Chunk, chosen: dict[int, Topic]) -> Iterator[tuple[int, int, int, Topic, bytes]]:
+        """Yield the messages of a chunk by time, after an entry that delays the chunk until its time."""
+        yield chunk.start, at, -1, Topic("", ""), b""
+        found = [
+            (time, at, place, chosen[number], data)
+            for place, (number, time, data) in enumerate(self._within(chunk)) if number in chosen
+        ]  # fmt: skip
+        yield from sorted(found, key=lambda each: each[:3])
+
+    def _within(self, chunk: _Chunk) -> Iterator[tuple[int, int, bytes]]:
+        """Yield topic, time [ns] and bytes of the messages in a chunk, and record the topics that it describes."""
+        with self.file.open("rb") as stream:
+            stream.seek(chunk.place)
+            data = _decompressed(stream.read(chunk.length), chunk)
+        yield from self._parse(data)
+
+    def _walk(self, stream: BinaryIO, size: int) -> None:
+        """Find chunks and topics."""
+        raise NotImplementedError
+
+    def _parse(self, data: bytes) -> Iterator[tuple[int, int, bytes]]:
+        """Yield topic, time [ns] and bytes of the messages in the data of a chunk."""
+        raise NotImplementedError
+
+
+def _decompressed(data: bytes, chunk: _Chunk) -> bytes:
+    """Decompress a chunk, or as much as possible of a chunk that is cut off."""
+    if chunk.compression in (b"", b"none"):
+        return data
+    makers: dict[bytes, Callable[[], Any]] = {
+        b"bz2": bz2.BZ2Decompressor,
+        b"lz4": lambda: importlib.import_module("lz4.frame").LZ4FrameDecompressor(),
+        b"zstd": lambda: zstd().ZstdDecompressor(),
+    }
+    if chunk.compression not in makers:
+        raise ValueError(f"must have chunks of a known compression, got {chunk.compression[:20]!r}")
+    if chunk.size > LARGEST:
+        raise ValueError(f"chunk: must hold at most {LARGEST} bytes, got {chunk.size}")
+    if not chunk.whole:
+        return bytes(makers[chunk.compression]().decompress(data, chunk.size))
+    found = inflated(makers[chunk.compression], data, chunk.size)
+    if len(found) != chunk.size or (chunk.checksum and zlib.crc32(found) != chunk.checksum):
+        raise ValueError(f"chunk: must hold the {chunk.size} bytes that its header states, got other ones")
+    return found
+
+
+class Mcap(_Chunked):
+    """An MCAP file."""
+
+    def _walk(self, stream: BinaryIO, size: int) -> None:
+        self._kinds: dict[int, str] = {}
+        stream.seek(len(MCAP))
+        while len(head := stream.read(9)) == 9:
+            kind, length = struct.unpack("<BQ", head)
+            place = stream.tell()
+            whole = length <= size - place
+            if kind == _M_FOOTER:
+                return
+            if not 0 < kind <= _M_LAST or (not whole and kind != _M_CHUNK):
+                break
+            if kind == _M_CHUNK:
+                self._add_chunk(stream, length, whole)
+            elif kind == _M_MESSAGE:
+                number, time = struct.unpack("<H4xQ", stream.read(14))
+                self._numbers[number] += 1
+                self._chunks.append(_Chunk(time, place - 9, length + 9, b"", length + 9, 0, True))
+            elif kind in (_M_HEADER, _M_SCHEMA, _M_CHANNEL, _M_INDEX):
+                self._take(kind, stream.read(length))
+            stream.seek(place + length)
+        self.cut = True
+
+    def _add_chunk(self, stream: BinaryIO, length: int, whole: bool) -> None:
+        place = stream.tell()
+        head = stream.read(32)
+        if len(head) == 32:
+            start, _, size, checksum, name = struct.unpack("<QQQII", head)
+            compression = stream.read(min(name, 100))
+            if len(inner := stream.read(8)) == 8:
+                begin, (packed,) = stream.tell(), struct.unpack("<Q", inner)
+                if whole and begin + packed > place + length:
+                    raise ValueError("chunk: must end within its record, got a longer one")
+                self._chunks.append(_Chunk(start, begin, packed, compression, size, checksum, whole))
+
+    def _take(self, kind: int, data: bytes) -> None:
+        """Record the description of a topic, or the number of messages of a topic in a chunk."""
+        if kind == _M_HEADER and data[4:8] != b"ros2":
+            raise ValueError(f"must have the profile ros2, got {data[4:24]!r}")
+        if kind == _M_SCHEMA:
+            self._kinds[struct.unpack_from("<H", data)[0]] = _text(data, 2)[0]
+        elif kind == _M_CHANNEL:
+            number, schema = struct.unpack_from("<HH", data)
+            name, end = _text(data, 4)
+            encoding, _ = _text(data, end)
+            if encoding != "cdr":
+                raise ValueError(f"{name}: must be encoded as cdr, got {encoding[:20]!r}")
+            self._topics[number] = Topic(self._kinds.get(schema, ""), name)
+        elif kind == _M_INDEX:
+            number, length = struct.unpack_from("<HI", data)
+            self._numbers[number] += length // 16
+
+    def _parse(self, data: bytes) -> Iterator[tuple[int, int, bytes]]:
+        at = 0
+        while at + 9 <= len(data):
+            kind, length = struct.unpack_from("<BQ", data, at)
+            at += 9
+            if length > len(data) - at:
+                return
+            if kind == _M_MESSAGE:
+                number, time = struct.unpack_from("<H4xQ", data, at)
+                yield number, time, data[at + 22 : at + length]
+            elif kind in (_M_SCHEMA, _M_CHANNEL):
+                self._take(kind, data[at : at + length])
+            at += length
+
+
+def _text(data: bytes, at: int) -> tuple[str, int]:
+    """Return a text and the offset behind it."""
+    (length,) = struct.unpack_from("<I", data, at)
+    return data[at + 4 : at + 4 + length].decode(), at + 4 + length
+
+
+class Ros1(_Chunked):
+    """A bag of ROS 1."""
+
+    def _walk(self, stream: BinaryIO, size: int) -> None:
+        stream.seek(len(ROS1))
+        index, started = 0, False
+        for kind, fields, length, whole in _ros1_records(stream, size):
+            place = stream.tell()
+            if kind == _R_CHUNK:
+                start = self._chunks[-1].start if self._chunks else 0
+                (inflated_size,) = struct.unpack("<I", fields[b"size"])
+                compression = fields.get(b"compression", b"")
+                self._chunks.append(_Chunk(start, place, length, compression, inflated_size, 0, whole))
+            elif kind == _R_BAG:
+                (index,) = struct.unpack("<Q", fields[b"index_pos"])
+                if fields.get(b"encryptor"):
+                    raise ValueError(f"must not be encrypted, got {fields[b'encryptor'][:40]!r}")
+            elif whole and kind == _R_INDEX and self._chunks:
+                data = stream.read(length)
+                self._numbers[struct.unpack("<I", fields[b"conn"])[0]] += length // 12
+                first = min((s * 10**9 + ns for s, ns, _ in struct.iter_unpack("<III", data)), default=None)
+                chunk = self._chunks[-1]
+                if first is not None:
+                    self._chunks[-1] = chunk._replace(start=min(first, chunk.start) if started else first)
+                    started = True
+            elif whole and kind == _R_CONNECTION:
+                self._take(fields, stream.read(length))
+            started = started and kind != _R_CHUNK
+            stream.seek(place + length)
+            self.cut = not whole
+        self.cut = self.cut or stream.tell() < size or not 0 < index < size
+
+    def _take(self, fields: dict[bytes, bytes], data: bytes) -> None:
+        """Record a connection."""
+        package, _, name = _fields(data)[b"type"].decode().rpartition("/")
+        topic = fields[b"topic"].decode()
+        topic = "/" * topic.startswith("/") + "/".join(part for part in topic.split("/") if part)
+        self._topics[struct.unpack("<I", fields[b"conn"])[0]] = Topic(f"{package.split('/')[0]}/msg/{name}", topic)
+
+    def _parse(self, data: bytes) -> Iterator[tuple[int, int, bytes]]:
+        stream = io.BytesIO(data)
+        for kind, fields, length, whole in _ros1_records(stream, len(data)):
+            content = stream.read(length)
+            if whole and kind == _R_CONNECTION:
+                self._take(fields, content)
+            elif whole and kind == _R_MESSAGE:
+                seconds, rest = struct.unpack("<II", fields[b"time"])
+                yield struct.unpack("<I", fields[b"conn"])[0], seconds * 10**9 + rest, content
+
+
+def _ros1_records(stream: BinaryIO, end: int) -> Iterator[tuple[int, dict[bytes, bytes], int, bool]]:
+    """Yield kind, fields, length of the data, and whether the data are complete, at the data of each record."""
+    while len(head := stream.read(4)) == 4:
+        (length,) = struct.unpack("<I", head)
+        header = stream.read(min(length, end - stream.tell()))
+        if len(head := stream.read(4)) < 4:
+            yield 0, {}, 0, False
+            return
+        (length,) = struct.unpack("<I", head)
+        fields = _fields(header)
+        if len(kind := fields.get(b"op", b"")) != 1:
+            stream.seek(-len(header) - 8, os.SEEK_CUR)
+            return
+        yield kind[0], fields, length, length <= end - stream.tell()
+
+
+def _fields(header: bytes) -> dict[bytes, bytes]:
+    """Return the fields of a header by name."""
+    found, at = {}, 0
+    while at + 4 <= len(header):
+        (length,) = struct.unpack("<I", header[at : at + 4])
+        name, mark, value = header[at + 4 : at + 4 + length].partition(b"=")
+        if mark:
+            found[name] = value
+        at += 4 + length
+    return found

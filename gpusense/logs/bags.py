@@ -25,8 +25,7 @@ import numpy as np
 from gpusense._util.extras import library
 from gpusense._util.lines import most_bytes
 from gpusense._util.notices import warn_user
-from gpusense.logs.bag_chunks import Mcap, Ros1
-from gpusense.logs.bag_storage import MCAP, ROS1, SQLITE, ZSTD, Sqlite, Storage, Topic, unpacked, zstd
+from gpusense.logs.bag_storage import MCAP, ROS1, SQLITE, ZSTD, Mcap, Ros1, Sqlite, Storage, Topic, unpacked, zstd
 
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 ECHOES = "sensor_msgs/msg/MultiEchoLaserScan"

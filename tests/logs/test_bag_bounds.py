@@ -14,7 +14,7 @@ import pytest
 from support.bags import BASE, LASER, Writer
 
 import gpusense as gs
-from gpusense.logs import bag_chunks, bag_storage, bags
+from gpusense.logs import bag_storage, bags
 from gpusense.logs.bag_poses import read_poses
 
 TIMES = np.arange(5.0) + 10
@@ -111,8 +111,7 @@ def written(folder: Path, kind: str, size: int = 3) -> Path:
 def test_compressed_bags_are_read_up_to_their_bounds(tmp_path: Path, monkeypatch: Any, kind: str) -> None:
     path = written(tmp_path, kind, 200_000)
     assert [len(scan.ranges) for scan in gs.read_log(path)] == [200_000] * 2
-    for module in (bag_chunks, bag_storage):
-        monkeypatch.setattr(module, "LARGEST", 100_000)
+    monkeypatch.setattr(bag_storage, "LARGEST", 100_000)
     monkeypatch.setattr(bags, "most_bytes", lambda size: 100_000)
     bags._read.cache_clear()
     tracemalloc.start()
@@ -135,8 +134,8 @@ def test_a_chunk_holds_no_more_than_its_header_states(name: str) -> None:
     data = pack(zeros)
 
     def read(packed: bytes, size: int, whole: bool = True) -> bytes:
-        chunk = bag_chunks._Chunk(0, 0, len(packed), name.encode(), size, 0, whole)
-        return bag_chunks._decompressed(packed, chunk)
+        chunk = bag_storage._Chunk(0, 0, len(packed), name.encode(), size, 0, whole)
+        return bag_storage._decompressed(packed, chunk)
 
     assert len(data) < 300_000 and read(data, len(zeros)) == zeros
     tracemalloc.start()

@@ -10,7 +10,7 @@ from support.model_world import BEARINGS, RANGE, cloud, make, room, same_bits, s
 
 import gpusense as gs
 from gpusense._util import checks
-from gpusense.learning.discrete.fit import count_pairs
+from gpusense.learning.discrete.table import count_pairs
 
 GRID = room()
 POSES = cloud(GRID, 12)

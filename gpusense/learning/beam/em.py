@@ -262,26 +262,31 @@ class _Search:
         return Climb(self.best, self.trace, False, [f"no convergence within {max_iterations} iterations"])
 
 
-def climb_gradient(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
-    """Run L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995) with the analytic gradient, restarted as long as it gains."""
-    return _by_gradient(_Search(problem, start, watch), max_iterations, tolerance)
+def climb_by_scipy(
+    problem: Problem, start: Point, *, method: str, seed: int, max_iterations: int, tolerance: float, watch: Watch
+) -> Climb:
+    """Run a method of SciPy, restarted as long as it gains.
 
+    ``"gradient"`` is L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995) with the analytic gradient. ``"genetic"`` puts
+    differential evolution (Storn and Price 1997) over all the bounds before it.
 
-def _by_gradient(search: _Search, max_iterations: int, tolerance: float) -> Climb:
-    options = {"maxfun": 20 * max_iterations, "maxcor": 20, "ftol": 1e-15, "gtol": 1e-12}
-    return _restarted(search, "L-BFGS-B", options, max_iterations, tolerance, tolerance)
-
-
-def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
-    """Run Powell's method (1964), without derivatives, restarted until it gains nothing.
-
-    Its line searches accept bounds and make progress in the long, narrow valleys of this likelihood, where a simplex
-    (Nelder and Mead) collapses. The first directions are the coordinates. If no direction gains although derivatives
-    exclude an optimum, the search restarts along randomly rotated directions.
+    ``"hill_climb"`` is Powell's method (1964), without derivatives. Its line searches accept bounds and make progress
+    in the long, narrow valleys of this likelihood, where a simplex (Nelder and Mead) collapses. The first directions
+    are the coordinates. If no direction gains although derivatives exclude an optimum, the search restarts along
+    randomly rotated directions.
     """
-    options = {"xtol": 1e-4, "ftol": 1e-13}
     search = _Search(problem, start, watch)
-    return _restarted(search, "Powell", options, max_iterations, tolerance, 10 * tolerance, _TURNS)
+    if method == "hill_climb":
+        options = {"xtol": 1e-4, "ftol": 1e-13}
+        return _restarted(search, "Powell", options, max_iterations, tolerance, 10 * tolerance, _TURNS)
+    if method == "genetic":
+        _evolve(search, start, seed, max_iterations)
+        max_iterations += len(search.trace)
+    options = {"maxfun": 20 * max_iterations, "maxcor": 20, "ftol": 1e-15, "gtol": 1e-12}
+    climb = _restarted(search, "L-BFGS-B", options, max_iterations, tolerance, tolerance)
+    if method == "genetic":
+        climb.notes.append("the last steps are of method 'gradient'")
+    return climb
 
 
 def _restarted(
@@ -315,34 +320,18 @@ def _restarted(
     return search.exhausted(max_iterations)
 
 
-def climb_genetic(
-    problem: Problem, start: Point, *, seed: int, max_iterations: int, tolerance: float, watch: Watch
-) -> Climb:
-    """Run differential evolution (Storn and Price 1997) over all the bounds, then L-BFGS-B."""
+def _evolve(search: _Search, start: Point, seed: int, max_iterations: int) -> None:
+    """Run differential evolution from a start."""
     from scipy.optimize import differential_evolution
 
-    search = _Search(problem, start, watch)
-    coordinates = search.coordinates
-    if len(coordinates.places):
-        # Weights far below one reading are left to L-BFGS-B.
-        narrow = np.log(10 * problem.total)
-        middle = coordinates.vector(start)
-        limits = coordinates.limits.copy()
-        for i, place in enumerate(coordinates.places):
-            if place <= RAND:
-                limits[i] = np.clip((middle[i] - narrow, middle[i] + narrow), *coordinates.limits[i])
-        differential_evolution(
-            search.cost,
-            limits,
-            x0=middle,
-            rng=seed,
-            maxiter=max_iterations,
-            popsize=10,
-            tol=1e-6,
-            atol=1e-9,
-            polish=False,
-            callback=search.end_iteration,
-        )
-    climb = _by_gradient(search, max_iterations + len(search.trace), tolerance)
-    climb.notes.append("the last steps are of method 'gradient'")
-    return climb
+    coordinates, total = search.coordinates, search.problem.total
+    if not len(coordinates.places):
+        return
+    # Weights far below one reading are left to L-BFGS-B.
+    narrow, middle, limits = np.log(10 * total), coordinates.vector(start), coordinates.limits.copy()
+    some = coordinates.places <= RAND
+    limits[some] = np.clip((middle + np.array([[-narrow], [narrow]])).T, limits[:, :1], limits[:, 1:])[some]
+    differential_evolution(
+        search.cost, limits, x0=middle, rng=seed, maxiter=max_iterations, popsize=10, tol=1e-6, atol=1e-9,
+        polish=False, callback=search.end_iteration,
+    )  # fmt: skip

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,7 +25,7 @@ from gpusense.learning.beam.device_sums import (
     open_device,
     start_of,
 )
-from gpusense.learning.beam.em import Climb, Watch, climb_em, climb_genetic, climb_gradient, climb_hill
+from gpusense.learning.beam.em import Climb, Watch, climb_by_scipy, climb_em
 from gpusense.learning.beam.growth import fit_jointly, fit_shape
 from gpusense.learning.beam.optimum import Search
 from gpusense.learning.beam.pairs import HIT, SHORT, Bounds, Pairs, Point, first_guess, make_pairs, random_start
@@ -169,17 +170,12 @@ def fit_pairs(
 
 
 def _climb(options: Options, problem: Problem, start: Point, watch: Watch) -> Climb:
-    settings = {"max_iterations": options.max_iterations, "tolerance": options.tolerance, "watch": watch}
-    match "em" if start.shape.limits else options.method:
-        case "em":
-            return climb_em(problem, start, **settings)  # type: ignore[arg-type]
-        case "em-book":
-            return textbook_em(problem, start, **settings)  # type: ignore[arg-type]
-        case "gradient":
-            return climb_gradient(problem, start, **settings)  # type: ignore[arg-type]
-        case "hill_climb":
-            return climb_hill(problem, start, **settings)  # type: ignore[arg-type]
-    return climb_genetic(problem, start, seed=options.seed, **settings)  # type: ignore[arg-type]
+    settings: dict[str, Any] = dict(max_iterations=options.max_iterations, tolerance=options.tolerance, watch=watch)
+    if options.method == "em" or start.shape.limits:
+        return climb_em(problem, start, **settings)
+    if options.method == "em-book":
+        return textbook_em(problem, start, **settings)
+    return climb_by_scipy(problem, start, method=options.method, seed=options.seed, **settings)
 
 
 @contextlib.contextmanager

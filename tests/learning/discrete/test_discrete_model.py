@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense.learning.discrete.fit import NAMES, count_pairs
+from gpusense.learning.discrete.table import NAMES, count_pairs
 
 BINS = 989
 
@@ -230,7 +230,7 @@ def test_readings_are_counted_by_class_and_step(monkeypatch):
     assert (
         found == wanted and whole.missing == np.count_nonzero(~(z >= 0)) and whole.counts.sum() + whole.missing == 500
     )
-    monkeypatch.setattr("gpusense.learning.discrete.fit._BLOCK", 64)
+    monkeypatch.setattr("gpusense.learning.discrete.table._READINGS", 64)
     for one, two in zip(
         dataclasses.astuple(whole),
         dataclasses.astuple(count_pairs(z.reshape(20, 25), expected.reshape(20, 25), RANGE, 5)),

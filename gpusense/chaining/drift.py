@@ -217,10 +217,7 @@ def _fixed(poses: Floats) -> Floats:
 
 
 def pose_covariances(solution: Solution) -> Floats:
-    """Return the covariances (N, 3, 3) of poses, given the first one.
-
-    A direction that no link observes has a variance of about 1e6 m^2 or rad^2.
-    """
+    """Return the covariances (N, 3, 3) of poses, given the first one; about 1e6 where no link observes a direction."""
     count = len(solution.poses)
     result = np.zeros((count, 3, 3))
     if count > 1:

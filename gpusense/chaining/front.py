@@ -278,10 +278,7 @@ class Front:
 
 
 def moved_scans(odometry: Floats | None, readings: Floats, step: tuple[float, float]) -> Integers:
-    """Return the indices of scans after motion since the previously chosen scan.
-
-    The robot has moved if the odometer has moved by a step, or if the readings differ although the odometer rests.
-    """
+    """Return the indices of scans after a step of the odometer, or with other readings, since the last chosen scan."""
     if odometry is None or step == (0.0, 0.0):
         return np.arange(len(readings))
     chosen, last = [0], odometry[0].tolist()

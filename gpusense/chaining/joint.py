@@ -87,10 +87,7 @@ def fitted_odometry(front: Front, links: Links, reported: Floats) -> OdometryMot
 
 
 def constant_motion_links(poses: Floats, keys: NDArray[np.int64], jumped: Flags, links: Links) -> Links:
-    """Return links of constant motion along directions that other links leave open; their errors accumulate.
-
-    ``jumped`` (M - 1,) marks jumps of the time from a node to the next without a match.
-    """
+    """Return links of constant motion where links leave directions open; ``jumped`` (M - 1,) marks unmatched jumps."""
     second = np.arange(1, len(poses))[_is_open(len(poses), links)]
     first = keys[np.searchsorted(keys, second) - 1]
     steps = relative(poses, np.arange(len(poses) - 1), np.arange(1, len(poses)))
@@ -246,10 +243,7 @@ class Joint:
         return chained(np.zeros(3), moved)
 
     def pairs(self) -> tuple[Integers, Integers]:
-        """Pair nodes with the preceding and following nodes of other scanners; return earlier and later ones (L,).
-
-        The nodes are key scans, and scans with open directions in the matches to their predecessors.
-        """
+        """Pair key scans and scans with open directions with other scanners' scans around: (L,) earlier, later."""
         count, pairs = len(self.nodes), []
         before, after = np.full((len(self.fronts), count), -1), np.full((len(self.fronts), count), -1)
         for index, of in enumerate(self.of):

@@ -125,10 +125,7 @@ def odometry_links(motion: OdometryMotion, before: Floats, after: Floats) -> tup
 
 
 def fitted_motion(odometry: Floats, poses: Floats, joined: NDArray[np.bool]) -> OdometryMotion:
-    """Fit the noise of an odometer to matched poses (M, 3); return the default without enough data.
-
-    ``joined`` (M - 1,) marks motions between successive key scans that a match determines in all directions.
-    """
+    """Fit an odometer's noise to poses (M, 3), at motions ``joined`` (M - 1,) by full matches, if there are enough."""
     # Use the longest stretch without a gap.
     ends = np.flatnonzero(~np.concatenate([[False], joined, [False]]))
     longest = int(np.argmax(np.diff(ends)))

@@ -95,10 +95,7 @@ NEAR = (0.5, 0.3)
 
 
 class Matcher:
-    """Matcher of a scanner's (S, K) readings [m].
-
-    ``motion`` (S, 3) holds the motions of the robot during the scans; None if scans are instantaneous.
-    """
+    """Matcher of a scanner's (S, K) readings [m]; ``motion`` (S, 3) is the robot's during the scans, None at rest."""
 
     def __init__(self, readings: Floats, scanner: Scanner, options: ChainOptions) -> None:
         self.readings, self.scanner, self._options = readings, scanner, options
@@ -108,10 +105,7 @@ class Matcher:
     def match(
         self, first: Integers, second: Integers, guess: Floats, window: tuple[float, float] | None = None
     ) -> ScanMatch:
-        """Return the poses of L >= 1 second scans in the frames of first ones, from (L, 3) guesses.
-
-        ``window`` holds the half widths of the search [m, rad]; None for the default of ``match_scan``.
-        """
+        """Match L >= 1 second scans to first ones, from (L, 3) guesses, within half widths ``window`` [m, rad]."""
         return match_log(
             self.readings, self.scanner, first, second, guess, self._noise, self._device, self._options.precision,
             WINDOW if window is None else window, self.motion,
@@ -179,10 +173,7 @@ class Matcher:
 
 
 class TeamMatcher:
-    """Matcher of scans of several scanners of a robot.
-
-    ``sensor`` (S,) and ``place`` (S,) are the scanners of all scans, and their indices among their scanners' scans.
-    """
+    """Matcher for several scanners: ``sensor`` (S,) is the scanner of each scan, ``place`` (S,) its index there."""
 
     def __init__(self, matchers: Sequence[Matcher], sensor: Integers, place: Integers) -> None:
         self._matchers, self._sensor, self._place = matchers, sensor, place

@@ -165,10 +165,7 @@ _NONE = np.zeros(0, np.int64)
 
 
 def agreeing(matches: Links, poses: Floats, needed: Floats) -> Flags:
-    """Return the mask (L,) of matches that enough other matches of the same passages support.
-
-    ``needed`` (L,) is the necessary evidence of a match's group; 0: none.
-    """
+    """Return the mask (L,) of matches that others of their passages support by ``needed`` (L,) evidence; 0: none."""
     if not len(matches):
         return np.zeros(0, bool)
     table = _consistent(matches, poses)
@@ -193,10 +190,7 @@ def _supported(table: Any, kept: Flags) -> Flags:
 
 
 def _groups(table: Any, kept: Flags, matches: Links) -> tuple[Integers, Floats, Integers]:
-    """Group the kept matches that agree directly or through others.
-
-    Returns (K,) group of each, (G,) evidence of each group, and (G,) different scans on the side with fewer.
-    """
+    """Return (K,) groups of agreeing kept matches, (G,) evidence, and (G,) different scans on the smaller side."""
     from scipy.sparse.csgraph import connected_components
 
     rows = np.flatnonzero(kept)

@@ -31,10 +31,7 @@ class ScanDevice:
         self._arrays = {"point": points.point.astype(real), "start": points.start, "noise": noise.astype(real)}
 
     def split(self, penalty: float, point: np.ndarray) -> np.ndarray:
-        """Return, for each point in splitting order, the end of the segment that begins there, or -1.
-
-        ``penalty`` is the least reduction of the cost for replacing a line by two.
-        """
+        """Return the end of the segment that begins at each ordered point, or -1; a split must gain ``penalty``."""
         points = self._sizes["points"]
         stop = np.empty(points, _INT)
         with self._space as space:
@@ -136,10 +133,7 @@ class Segments:
 
 
 def find_segments(device: ScanDevice, points: ScanPoints, noise: np.ndarray) -> Segments:
-    """Split scans into segments, and fit lines to them.
-
-    The segments of a scan are sorted by bearing from its cut on, see :func:`_cut`.
-    """
+    """Split scans into segments by bearing, from each scan's cut on (see :func:`_cut`), and fit lines to them."""
     if not len(points.point):
         nothing = np.zeros(0, np.int64)
         return _described(points, np.zeros(len(noise), bool), noise, nothing, nothing, nothing, np.zeros((0, 6)))

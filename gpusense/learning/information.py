@@ -18,10 +18,7 @@ FEW_BLOCKS = 10
 
 
 def number_blocks(blocks: object, shape: tuple[int, ...], of: NDArray[Any]) -> Integers | None:
-    """Return the blocks of some readings, numbered from 0; None without blocks.
-
-    ``blocks`` labels all readings, of the shape ``shape``; ``of`` holds flat indices of the used ones, or their mask.
-    """
+    """Number the labels ``blocks`` of the used readings ``of`` (flat indices or mask); None without blocks."""
     if blocks is None:
         return None
     labels: Integers = checks.array("blocks", blocks, shape, dtype=np.int64).ravel()
@@ -39,10 +36,7 @@ def notes_on_blocks(count: int) -> list[str]:
 
 
 def scaled_axes(curve: Floats, least: float = 1e-300) -> tuple[Floats, Floats, Floats]:
-    """Return (m,) scales that bring the diagonal of an (m, m) curvature to 1, its ascending eigenvalues, and axes.
-
-    Elements of the diagonal below ``least`` count as this.
-    """
+    """Return (m,) scales to a unit diagonal of an (m, m) curvature, ascending eigenvalues, and axes."""
     scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(curve)), least))
     size, axes = np.linalg.eigh(curve * np.outer(scale, scale))
     return scale, size, axes

@@ -111,11 +111,7 @@ def _intensities(message: object, beams: int) -> NDArray[np.float32] | None:
 
 
 def shared_beams(place: str, found: Counter[Geometry], range_min: float | None, range_max: float | None) -> Beams:
-    """Choose the beams of most scans of a laser, or beams of a full turn if they vary from scan to scan.
-
-    ``range_min`` and ``range_max`` replace the most frequent values of the messages [m]. Warns if some scans have other
-    beams or limits, or beams vary.
-    """
+    """Choose the beams of most scans of a laser, or of a full turn if they vary; limits [m] replace the messages'."""
     angles_of: Counter[Angles] = Counter()
     nearest: Counter[float] = Counter()
     farthest: Counter[float] = Counter()

@@ -95,10 +95,7 @@ def odometry_topic(known: Sequence[str], scans: str, wanted: str | None) -> str:
 def chosen_track(
     place: str, track: Track, topics: Sequence[str], transforms: TransformBuffer, laser: str, wanted: str | None
 ) -> Track:
-    """Choose the messages of a topic as odometry, else the motion of the robot's base in an odometry frame.
-
-    ``wanted`` is the topic or frame that the user requests. Warns if several choices exist.
-    """
+    """Choose the ``wanted`` topic or frame as odometry, else a topic, else the base's motion in an odometry frame."""
     parents = {link.parent for link in transforms.links()}
     frames = sorted(each for each in parents if "odom" in each.rpartition("/")[2])
     if not track.poses:
@@ -214,10 +211,7 @@ class _Skipped:
 
 
 def survey(path: Path, topic: str | None, frame: str | None, odometry_from: str | None) -> Bag:
-    """Read everything except readings; arguments as for :func:`gpusense.read_log`.
-
-    Warns if messages are skipped, a choice was made, or odometry is not level or does not overlap in time.
-    """
+    """Read everything except readings, with warnings; arguments as for :func:`gpusense.read_log`."""
     topics = topics_of(path)
     chosen = _scan_topic(path, topics, topic)
     odometers = topics.get(ODOMETRY, [])

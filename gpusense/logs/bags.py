@@ -62,10 +62,7 @@ def topics_of(path: Path) -> dict[str, list[str]]:
 
 
 def messages(path: Path, wanted: Mapping[str, set[str] | None]) -> Iterator[Message]:
-    """Read messages of the wanted topics of each type, None for all, in the bag's order.
-
-    Multi-echo scans become scans of the first echo.
-    """
+    """Read messages of the wanted topics of each type (None for all) in order; of several echoes the first one."""
 
     def chosen(topic: Topic) -> bool:
         names = wanted.get(_known(topic).kind, set())

@@ -126,10 +126,7 @@ def _lasers(bag: Bag, given: Pose | None, range_min: float | None, range_max: fl
 
 
 def _mounted(bag: Bag, given: Pose | None) -> dict[str, _Laser]:
-    """Return the lasers with their mounts, by their frames.
-
-    Warns if a mount contradicts transforms, is not level, moves, is assumed, or serves several lasers.
-    """
+    """Return the lasers with their mounts by their frames, and warn of doubtful mounts."""
     bases = _bases(bag)
     found: dict[str, _Laser] = {}
     reasons: dict[str, str] = {}

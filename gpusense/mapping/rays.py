@@ -92,10 +92,7 @@ class RayEnds:
         return result
 
     def boxes(self, count: int, frame: GridFrame) -> np.ndarray:
-        """Return the (S, 4) least column and row and largest column and row of each scan's rays [cells].
-
-        Scans without rays get infinite bounds in reverse order.
-        """
+        """Return the (S, 4) bounds of each scan's rays, columns and rows [cells], reversed infinities without rays."""
         both = np.stack([frame.to_cells(xy) for xy in (self.start, self.end)])
         boxes = np.tile([np.inf, np.inf, -np.inf, -np.inf], (count, 1))
         # Rays are sorted by scan.
@@ -234,11 +231,7 @@ class BandCounts:
             yield slice(first, first + size), hits, misses
 
     def occupancies(self, out: np.ndarray, model: tuple[float, float, float]) -> None:
-        """Write the occupancies of the band into the (H, W) int8 cells of the map.
-
-        Cells without a ray keep their value. ``model`` is the occupancy of a cell after one hit and an even prior,
-        after one miss, and before any ray.
-        """
+        """Write the occupancies of cells with rays into the (H, W) int8 map; ``model`` is p_hit, p_miss and p_prior."""
         flat = self._band.cut(out).reshape(-1)
         few = np.arange(_FEW, dtype=_INT)
         table = _per_cent(np.repeat(few, _FEW), np.tile(few, _FEW), model)

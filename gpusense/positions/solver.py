@@ -65,11 +65,7 @@ def descend(problem: Problem, start: Floats, line: tuple[Floats, Floats] | None,
 def minima(
     problem: Problem, starts: Sequence[Floats] | Floats, line: tuple[Floats, Floats] | None = None
 ) -> tuple[Floats, Floats]:
-    """Return (S, d) different minima with costs near the lowest, the lowest first, and their (S,) costs.
-
-    Non-finite states of the (N, d) starts are ignored. The search follows the best states, each at least APART from the
-    previous ones.
-    """
+    """Return (S, d) different minima near the lowest, sorted, and their (S,) costs, from finite (N, d) starts."""
     pending = np.asarray(starts, np.float64).reshape(-1, problem.dimension)
     pending = pending[np.isfinite(pending).all(axis=1)]
     pending = pending[np.argsort(problem.costs(pending), kind="stable")]
@@ -101,11 +97,7 @@ def distinct(problem: Problem, states: Floats) -> tuple[Floats, Floats]:
 
 
 def pick(states: Floats, costs: Floats, *, known_sigma: bool) -> tuple[Floats, str]:
-    """Pick the solutions among minima, the lowest first, and the status.
-
-    If the noise is unknown, the lowest minimum is the solution; otherwise all minima that the noise cannot distinguish
-    from it are.
-    """
+    """Pick the lowest minimum, with known noise all that it cannot distinguish; return them and the status."""
     if not known_sigma or len(states) < 2:
         return states[:1], "unique"
     near = costs - costs[0] < AMBIGUOUS
@@ -119,10 +111,7 @@ def solve(problem: Problem, starts: Sequence[Floats] | Floats, *, known_sigma: b
 
 
 def in_line(points: Floats, noise: float) -> tuple[Floats, Floats] | None:
-    """Return the line through points: a point and a unit vector, from the first point to the farthest.
-
-    Return None if the points are not in line within rounding. They must not all coincide.
-    """
+    """Return the line from the first of different points to the farthest (point, unit vector), None unless in line."""
     offset = points - points[0]
     away = np.hypot(offset[:, 0], offset[:, 1])
     far = int(np.argmax(away))

@@ -67,10 +67,7 @@ class Watcher:
             self._monitor.reset()
 
     def add_scan(self, message: Any, laser: np.ndarray) -> None:
-        """Take a sensor_msgs/LaserScan, and the (4, 4) pose of its laser on the robot.
-
-        An invalid scan is ignored, and ``problem`` states the reason.
-        """
+        """Take a sensor_msgs/LaserScan and the (4, 4) pose of its laser; ``problem`` tells why a scan is invalid."""
         try:
             scanner, fields = laser_scan(message, laser, (None, self.range_max))
             self.problem = None

@@ -250,10 +250,7 @@ def short_runs(
 
 
 def _next_rate(parts: Floats, z: Floats, expected: Floats, rate: Floats, bounds: Bounds) -> Floats:
-    """Return (C,) lambda_short at which the mean length of short readings equals the truncated exponentials' mean.
-
-    ``parts`` holds the (m, C) responsibilities of short readings; the rate stays where no reading is short.
-    """
+    """Return (C,) lambda_short that fit the mean length of short readings of (m, C) responsibilities ``parts``."""
     lengths = (parts * z).sum(axis=0)
     likely = (parts * ShortDensity(rate).mean(expected)).sum(axis=0)
     known = (lengths > 0) & (likely > 0)

@@ -125,10 +125,7 @@ def range_resolution(reading: NDArray[np.floating]) -> float:
 
 
 def impossible_ranges(kinds: NDArray[np.uint8], expected: NDArray[np.floating], range_max: float) -> NDArray[np.bool_]:
-    """Return the (n,) mask of expected ranges outside [0, range_max] whose reading is not missing.
-
-    A ray without an obstacle has the expected range range_max, possibly rounded to float32.
-    """
+    """Return the (n,) mask of expected ranges outside [0, range_max], rounded to their type, with a reading."""
     limit = max(float(expected.dtype.type(range_max)), range_max)
     return (kinds != Reading.MISSING) & ~((expected >= 0) & (expected <= limit))
 

@@ -244,11 +244,7 @@ class Problem:
         return hessian
 
     def free(self, value: Value) -> NDArray[np.bool_]:
-        """Return the mask of coordinates that may move at a point.
-
-        A weight of 0 stays 0, and the largest weight follows from the others. A shape stays at a bound that the
-        gradient points across, and where its cause accounts for no reading.
-        """
+        """Return the mask of coordinates that may move: no weight of 0, not the largest one, no shape at a bound."""
         point, bounds = value.point, self.bounds
         free = np.append(point.weights > 0, [True, True, self.fit_bias])
         free[int(np.argmax(point.weights))] = False

@@ -98,12 +98,7 @@ def _errors(problem: Problem, value: Value) -> tuple[dict[str, float], dict[str,
 
 
 def _standard_errors(problem: Problem, value: Value, scatter: Floats | None = None) -> dict[str, float]:
-    """Compute the standard error of each parameter by name, from the scatter over blocks if there are any.
-
-    The covariance is the inverse of minus the second derivatives by the free coordinates, transformed to the parameters
-    by their derivatives. The error is NaN for a held parameter (0, at a bound, or of a cause without readings), and
-    infinite if the readings hold no information about it.
-    """
+    """Compute standard errors by name, over blocks with their scatter: NaN if held, infinite without information."""
     assert value.hessian is not None
     free = problem.free(value)
     places = np.flatnonzero(free)
@@ -159,10 +154,7 @@ def _held(problem: Problem, value: Value) -> dict[str, str]:
 
 
 def _bias(problem: Problem, value: Value, climb: Climb, options: Options, start: Point) -> tuple[float, float, float]:
-    """Return the offset of correct ranges and its standard errors: over blocks, and for independent readings.
-
-    An unfitted offset comes from a further search over all parameters; NaN if a search did not converge.
-    """
+    """Return the offset of correct ranges, by another search unless fitted, with its errors over blocks and without."""
     if problem.fit_bias:
         errors, independent = _errors(problem, value)
         return value.point.bias, errors[NAMES[BIAS]], independent[NAMES[BIAS]]
@@ -226,10 +218,7 @@ def block_gradients(problem: Problem, point: Point) -> tuple[Floats, NDArray[np.
 
 
 def _terms(z: Floats, expected: Floats, parts: Floats, point: Point, range_max: float) -> dict[int, Floats]:
-    """Return the gradient of each hit's log p by coordinate, without the weights' normalisation.
-
-    ``parts`` holds the (m, 3) responsibilities of hit, short and rand for (m,) readings and expected ranges [m].
-    """
+    """Return each hit's gradient of log p by coordinate, for (m, 3) responsibilities of hit, short and rand."""
     hit, short, rand = parts.T
     shape, mean = point.shape, np.clip(expected + point.bias, 0, range_max)
     _, by_sigma, by_mean = truncated(z - mean, mean, range_max, point.sigma, shape)

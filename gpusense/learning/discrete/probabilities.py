@@ -193,10 +193,7 @@ def bins_of(ranges: NDArray[np.float64], range_max: float, bins: int) -> NDArray
 
 
 def check_pairs(ranges: object, expected: object, range_max: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return float64 readings, NaN for missing and inf for no return, and expected ranges, inf for no obstacle.
-
-    range_max is rounded to their dtypes, as in ``classify``.
-    """
+    """Return float64 readings (NaN missing, inf no return) and expected ranges (inf no obstacle), classed by dtype."""
     z = checks.array("ranges", ranges, finite=False, dtype=None)
     z_exp = checks.array("expected", expected, z.shape, finite=False, dtype=None)
     kinds = reading_classes(z, 0.0, range_max)

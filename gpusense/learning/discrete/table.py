@@ -225,11 +225,7 @@ _READINGS = 1 << 20
 def learn_causes(
     ranges: object, expected: object, range_max: float, bins: int, blocks: object = None
 ) -> tuple[DiscreteCauses, DiscreteFit]:
-    """Learn the most likely causes; see ``DiscreteBeamModel.learn``.
-
-    Newton steps move the logarithms of rates and sigma_hit and the log odds of detection, within bounds beyond which
-    the table does not change. They follow the best of several starts; the highest end is the result.
-    """
+    """Learn the most likely causes by Newton steps within bounds; see ``DiscreteBeamModel.learn``."""
     data = count_pairs(ranges, expected, range_max, bins)
     problem, labels = _Causes(data), None
     end = maximize(problem, _ITERATIONS, _TOLERANCE)
@@ -294,10 +290,7 @@ class _Causes(Problem):
         return {name: getattr(causes, name) for name in NAMES}
 
     def starts(self) -> list[Floats]:
-        """Make starts from the shares of readings before, at and behind the expected step.
-
-        Each start takes readings within another number of steps as correct.
-        """
+        """Make starts from shares of readings before, at and behind the expected step, for several widths."""
         data, starts = self.data, []
         reach, total = data.bins * data.width, float(data.counts.sum())
         known, none = data.rows < data.bins, data.steps == data.bins

@@ -87,10 +87,7 @@ def _limits(pairs: Pairs) -> tuple[Floats, Floats]:
 
 
 def _first_guess(pairs: Pairs, initial: LandmarkParameters | None) -> Floats:
-    """Make the start from the user's parameters, or from the typical residual of each feature's nearest landmark.
-
-    The default assumes one false positive in ten features.
-    """
+    """Make the start: the user's, or typical residuals of nearest landmarks and one false positive in ten."""
     low, high = _limits(pairs)
     if initial is not None:
         start = [getattr(initial, name) for name in SIGMAS]

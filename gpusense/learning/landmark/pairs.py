@@ -119,10 +119,7 @@ def in_view(sensors: Floats, xy: Floats, limits: Limits) -> tuple[Integers, Inte
 def make_pairs(
     sensors: Floats, features: Floats, xy: Floats, signatures: Floats | None, known: Integers | None, limits: Limits
 ) -> Pairs:
-    """Pair (F, 3) features with their known (F,) landmarks, -1 for none, or else with all landmarks in view.
-
-    Missing parts of features are NaN. ``sensors`` holds the (F, 3) poses of the sensor.
-    """
+    """Pair (F, 3) features at (F, 3) poses with known (F,) landmarks, -1 for none, or with all landmarks in view."""
     if known is None:
         feature, landmark = in_view(sensors, xy, limits)
         count = np.bincount(feature, minlength=len(features))
@@ -319,10 +316,7 @@ def suspicious_landmarks(
 
 
 def _exchanges(judged: np.ndarray, count: np.ndarray, log_p: Floats, agree: Floats) -> list[Exchange]:
-    """Return disjoint exchanges among the judged landmarks, the largest gain first.
-
-    Rows of ``log_p`` and ``agree`` (M, M) are labels of features, columns positions.
-    """
+    """Return disjoint exchanges, the largest gain first, by (M, M) tables of labels' features at positions."""
     candidates = []
     for place, j in enumerate(judged):
         for k in judged[place + 1 :]:

@@ -164,7 +164,6 @@ class Loops:
         self._tried = first[last], second[last], level[last], guess[last]
 
     def _matched(self, first: Integers, second: Integers, window: tuple[float, float]) -> Links:
-        """Return the sure matches of candidates."""
         parts = []
         guess = relative(self.solution.poses, first, second)
         for begin in range(0, len(first), BATCH):

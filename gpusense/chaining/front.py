@@ -139,7 +139,6 @@ class Front:
         return True
 
     def _follow(self, part: Integers) -> None:
-        """Match nodes to their predecessors."""
         first, second = self.nodes[part - 1], self.nodes[part]
         still = np.zeros((len(part), 3))
         guess = still if self._odometry is None else pose_difference(self._odometry[first], self._odometry[second])

@@ -170,7 +170,6 @@ def _raised(rise: Floats, links: Links, count: int, fails: int) -> Flags:
 
 
 def _moved(poses: Floats, step: Floats) -> Floats:
-    """Return poses (N, 3) after a step (N, 3) in the world."""
     result = poses + step
     result[:, 2] = wrap_angle(result[:, 2])
     return result
@@ -205,7 +204,6 @@ def pose_jacobians(poses: Floats, first: NDArray[np.int64], second: NDArray[np.i
 
 
 def _weights(squared: Floats, kernel: float) -> Floats:
-    """Return Cauchy's weights of links by their squared distances."""
     weights: Floats = 1 / (1 + squared / kernel**2) if np.isfinite(kernel) else np.ones(len(squared))
     return weights
 
@@ -217,5 +215,4 @@ def _costs(squared: Floats, kernel: float) -> Floats:
 
 
 def _cost(squared: Floats, kernel: float) -> float:
-    """Return the sum of Cauchy's kernels."""
     return float(np.sum(_costs(squared, kernel)))

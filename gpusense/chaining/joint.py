@@ -298,7 +298,6 @@ def _information(deviation: Floats) -> Floats:
 
 
 def _below(keys: Sequence[int], count: int) -> Integers:
-    """Return the key scans among the first nodes."""
     values = np.array(keys, np.int64)
     return values[values < count]
 

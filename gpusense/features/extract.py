@@ -166,7 +166,6 @@ def find_corners(segments: Segments, straight: np.ndarray, mount: tuple[float, f
 
 
 def _along(vertex: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Return the coordinates of points along lines."""
     place: np.ndarray = -np.sin(angle) * vertex[:, 0] + np.cos(angle) * vertex[:, 1]
     return place
 

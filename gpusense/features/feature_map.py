@@ -157,7 +157,6 @@ def _rows(path: Path) -> Iterator[tuple[str, list[float], int]]:
 
 
 def _row(words: list[str]) -> tuple[str, list[float], int]:
-    """Return kind, numbers and count of a line."""
     if len(words) != len(_COLUMNS):
         raise ValueError(f"must have {len(_COLUMNS)} columns")
     x, y, signature, kind, theta, size, xx, xy, yy, count = words

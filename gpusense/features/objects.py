@@ -279,7 +279,6 @@ def _jambs(
 
 
 def _on_wall(segments: Segments, wall: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return whether the other side continues the wall."""
     c, s, d = np.cos(segments.angle[wall]), np.sin(segments.angle[wall]), segments.distance[wall]
     good = np.ones(len(wall), bool)
     deviation = np.sqrt(segments.covariance[wall, 0, 0] + segments.covariance[other, 0, 0])

@@ -233,7 +233,6 @@ def features_of(found: dict[str, Found]) -> Features:
 
 
 def _covariances(part: Found) -> tuple[np.ndarray, np.ndarray]:
-    """Return covariance and information (F, 3, 3) of features."""
     rows = part.observed
     columns = rows.transpose(0, 2, 1)
     information = columns @ np.linalg.inv(part.covariance) @ rows

@@ -69,7 +69,6 @@ class ScanDevice:
         return found.astype(np.float64)
 
     def _run(self, kernel: str, size: int, **arguments: Any) -> None:
-        """Launch a kernel on the points."""
         placed = {key: self._space.upload(key, value) for key, value in self._arrays.items() if key not in arguments}
         self._backend.run((launch(kernel, self._flags, (size,), **placed, **self._sizes, **arguments),))
 

@@ -52,7 +52,6 @@ class Fitted(Generic[P]):
         return plain_fields(self)
 
     def _rows(self) -> list[FitRow]:
-        """List the rows of the table."""
         return [
             FitRow(name, value, error, self.held.get(name, ""))
             for name, error in self.standard_errors.items()
@@ -68,7 +67,6 @@ class Fitted(Generic[P]):
         return self._short({name: value for name, value in values if value is not None})
 
     def _short(self, values: dict[str, Any]) -> str:
-        """Format the values and the end of the search on one line."""
         text = ", ".join(f"{name}={v!r}" if isinstance(v, str) else f"{name}={v:.4g}" for name, v in values.items())
         return f"{type(self).__name__}({text}, converged={self.converged})"
 

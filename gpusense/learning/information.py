@@ -1,4 +1,4 @@
-"""Number the blocks of correlated readings, and compute Newton steps and standard errors from the information."""
+"""Number the blocks of correlated readings, and compute standard errors from the information."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FEW_BLOCKS = 10
 
 
 def number_blocks(blocks: object, shape: tuple[int, ...], of: NDArray[Any]) -> Integers | None:
-    """Number the labels ``blocks`` of the used readings ``of`` (flat indices or mask); None without blocks."""
+    """Return the blocks of the used readings ``of`` (flat indices or mask), numbered from 0; None without blocks."""
     if blocks is None:
         return None
     labels: Integers = checks.array("blocks", blocks, shape, dtype=np.int64).ravel()
@@ -36,27 +36,10 @@ def notes_on_blocks(count: int) -> list[str]:
 
 
 def scaled_axes(curve: Floats, least: float = 1e-300) -> tuple[Floats, Floats, Floats]:
-    """Return (m,) scales to a unit diagonal of an (m, m) curvature, ascending eigenvalues, and axes."""
+    """Return (m,) scales of an (m, m) curvature to a unit diagonal (at least ``least``), its eigenvalues and axes."""
     scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(curve)), least))
     size, axes = np.linalg.eigh(curve * np.outer(scale, scale))
     return scale, size, axes
-
-
-def newton_direction(
-    gradient: Floats, second: Floats, places: NDArray[np.integer], least: float = 1e-300
-) -> tuple[Floats, float]:
-    """Return the (m,) Newton step, uphill even if the function is not concave, and its predicted gain [nats].
-
-    The gain is half the slope along the step. The step is 0 along coordinates outside ``places``.
-    """
-    step = np.zeros(len(gradient))
-    if not len(places):
-        return step, 0.0
-    scale, size, axes = scaled_axes(-second[np.ix_(places, places)], least)
-    slope = axes.T @ (scale * gradient[places])
-    along = slope / np.maximum(np.abs(size), 1e-9)
-    step[places] = scale * (axes @ along)
-    return step, 0.5 * float(slope @ along)
 
 
 def errors_of(curve: Floats, rows: Floats, scatter: Floats | None = None, flat: float = _FLAT) -> Floats:

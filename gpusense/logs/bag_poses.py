@@ -70,7 +70,6 @@ def _names(known: dict[str, str], has_transforms: bool) -> str:
 
 
 def _of_topic(path: Path, kind: str, topic: str, map_frame: str) -> PoseTrack:
-    """Read the messages of a topic."""
     track, covariances, frames = Track(topic), [], set()
     skipped, reason = 0, ""
     for message in messages(path, {kind: {topic}}):
@@ -112,7 +111,6 @@ def _covariance(message: object) -> Floats | None:
 
 
 def _of_transforms(path: Path, times: Floats, map_frame: str) -> PoseTrack:
-    """Look up the robot's base in the map's frame."""
     buffer, skipped = TransformBuffer(), 0
     for message in messages(path, {TRANSFORMS: None}):
         for each in message.fields.transforms:

@@ -194,7 +194,6 @@ class _Chunked(Storage):
         yield from self._parse(data)
 
     def _walk(self, stream: BinaryIO, size: int) -> None:
-        """Find chunks and topics."""
         raise NotImplementedError
 
     def _parse(self, data: bytes) -> Iterator[tuple[int, int, bytes]]:
@@ -365,7 +364,6 @@ def _ros1_records(stream: BinaryIO, end: int) -> Iterator[tuple[int, dict[bytes,
 
 
 def _fields(header: bytes) -> dict[bytes, bytes]:
-    """Return the fields of a header by name."""
     found, at = {}, 0
     while at + 4 <= len(header):
         (length,) = struct.unpack("<I", header[at : at + 4])

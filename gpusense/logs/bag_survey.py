@@ -251,7 +251,6 @@ def frame_of(message: object) -> str:
 
 
 def _scan_topic(path: Path, topics: dict[str, list[str]], topic: str | None) -> str:
-    """Return the topic of the scans."""
     known = topics.get(SCAN, []) or topics.get(ECHOES, [])
     if not known:
         others = ", ".join(f"{name} ({kind})" for kind, names in sorted(topics.items()) for name in names)

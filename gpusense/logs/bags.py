@@ -127,7 +127,6 @@ def type_store(first: bool) -> Any:
 
 
 def _decoder(path: Path) -> Callable[[bytes, str], Any]:
-    """Return the function that decodes a message of a type."""
     first = is_ros1(path)
     library("rosbags.typesys", f"{path}: a ROS bag")
     store = type_store(first)
@@ -222,7 +221,6 @@ def _folder() -> Path:
 
 
 def _decompressed(file: Path) -> Path:
-    """Decompress a file, up to a bound."""
     out = _folder() / file.with_suffix("").name
     room = min(most_bytes(file.stat().st_size), shutil.disk_usage(tempfile.gettempdir()).free * 9 // 10)
     with file.open("rb") as packed, zstd().open(packed, "rb") as stream, out.open("wb") as target:

@@ -55,7 +55,6 @@ def _records(
     path: Path, lines: Iterator[tuple[int, bytes]], names: tuple[bytes, bytes], range_max: float | None, *,
     odometry: bool,
 ) -> Iterator[Scan | Odometry]:  # fmt: skip
-    """Read the records of numbered lines."""
     scanners: dict[tuple[float, ...], Scanner] = {}
     old_range_max = range_max
     for where, fields in _messages(path, lines):
@@ -159,7 +158,6 @@ def _pose(where: str, values: NDArray[np.float64]) -> Pose:
 
 
 def _old_step(count: int) -> float:
-    """Return the step between FLASER's bearings [rad]."""
     degrees = 180.0 / max(count, 1)
     for common in (1.0, 0.5, 0.25):
         if abs(degrees - common) <= 0.01 * common:

@@ -176,7 +176,6 @@ def format_of(file: Path) -> Format:
 
 
 def _ros_options(form: Format, mount: ArrayLike | None, **others: object) -> dict[str, object]:
-    """Return the checked options of ROS bags."""
     for name in ("topic", "frame", "odometry_from"):
         if others[name] is not None and not isinstance(others[name], str):
             raise TypeError(f"{name}: must be a string or None, got {checks.show(others[name])}")
@@ -248,6 +247,5 @@ def _wrong_laser(form: Format, names: Sequence[object]) -> ValueError:
 
 
 def _of(index: int, records: Iterator[Scan | Odometry]) -> Iterator[tuple[int, Scan | Odometry]]:
-    """Yield records with the index of their laser."""
     for record in records:
         yield index, record

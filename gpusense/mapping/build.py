@@ -217,14 +217,12 @@ class MapBuilder:
 
 
 def _readings(name: str, value: Any, scanner: Scanner) -> np.ndarray:
-    """Return the readings (S, K) of a scanner."""
     read = float64_readings(checks.array(name, value, ("S", scanner.count), finite=False, dtype=None), scanner)
     scanner._first_scans.look_at(name, read)
     return read
 
 
 def _occupancy(p_hit: float, p_miss: float, p_prior: float) -> tuple[float, float, float]:
-    """Check the probabilities of the inverse sensor model."""
     hit, miss = checks.real("p_hit", p_hit, above=0.5, below=1), checks.real("p_miss", p_miss, above=0, below=0.5)
     return hit, miss, checks.real("p_prior", p_prior, above=0, below=1)
 

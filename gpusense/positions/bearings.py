@@ -146,7 +146,6 @@ def _triple_blur(problem: Problem, triples: NDArray[np.intp], state: Floats | No
 
 
 def _line_or_circle(problem: Problem) -> str:
-    """Return the status of bearings that do not determine a pose."""
     return "in line" if in_line(problem.xy, problem.noise) else "circle"
 
 

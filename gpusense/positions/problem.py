@@ -264,7 +264,6 @@ def _not_negative(name: str, values: ArrayLike, count: int, largest: float) -> F
 
 
 def _check_number(used: NDArray[np.bool], least: int, reason: str) -> None:
-    """Refuse fewer than ``least`` beacons of positive weight."""
     number = int(np.count_nonzero(used))
     if number >= least:
         return

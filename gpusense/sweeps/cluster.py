@@ -134,7 +134,6 @@ class DaskExecutor(Terminable):
         return workers
 
     def _usable(self, workers: Mapping[str, Any]) -> int:
-        """Return the number of workers that take jobs."""
         return sum(bool(one["resources"].get(_RESOURCE) or not self._pinned) for one in workers.values())
 
     @property

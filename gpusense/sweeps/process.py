@@ -93,7 +93,6 @@ def error_text(error: BaseException) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Convert NumPy's numbers to Python's."""
     return value.item() if hasattr(value, "item") else value
 
 
@@ -329,7 +328,6 @@ def _begin(device: str, sent: Mapping[str, Any]) -> None:
 
 
 def _end_with(parent: Any) -> None:
-    """Wait for the end of the parent, and end the process."""
     while parent.is_alive() and os.getppid() == parent.pid:
         parent.join(5.0)
     os._exit(1)

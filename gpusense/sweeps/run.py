@@ -137,7 +137,6 @@ def run(
 
 
 def _window(executor: Executor) -> int:
-    """Return the number of jobs to submit at once, by the present number of workers."""
     return int(getattr(executor, "window", _QUEUED * getattr(executor, "slots", os.cpu_count() or 1)))
 
 

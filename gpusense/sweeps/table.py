@@ -99,7 +99,6 @@ class Table:
         return (*FIRST, *dict.fromkeys(middle), *LAST)
 
     def _rewrite(self, rows: Iterable[Row], columns: tuple[str, ...]) -> None:
-        """Replace the file by one with these rows."""
         text = _lines(columns, [dict(zip(columns, columns, strict=True)), *rows])
         write_whole(self.path, lambda stream: stream.write(text))
         self._stream.close()
@@ -200,7 +199,6 @@ def _text(value: Any) -> str:
 
 
 def _lines(columns: Sequence[str], rows: Iterable[Mapping[str, str]]) -> bytes:
-    """Return rows as lines of a CSV file."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerows([row.get(name, "") for name in columns] for row in rows)
@@ -249,5 +247,4 @@ def _write_parquet(path: Path, names: Sequence[str], rows: Sequence[Row]) -> Non
 
 
 def _pyarrow() -> Any:
-    """Return the Parquet module of pyarrow."""
     return library("pyarrow.parquet", "a Parquet table, in place of a .csv one,")

@@ -28,7 +28,7 @@ import numpy as np
 from gpusense._util.typing import Floats
 from gpusense.learning.beam.pairs import BIAS, FORM, HIT, RAND, RATE, SHORT, SIGMA, Point
 from gpusense.learning.beam.problem import NOTHING, SMALL_FORM, Problem, Value
-from gpusense.learning.information import newton_direction
+from gpusense.learning.information import scaled_axes
 
 # Longest step of a log shape.
 _LONGEST = 2.0
@@ -96,7 +96,6 @@ def em_step(problem: Problem, value: Value, *, second: bool = False) -> Value:
 
 
 def _shaped(problem: Problem, point: Point, weights: Floats, step: Floats) -> Point:
-    """Return the point with new weights and moved shapes."""
     return replace(point.moved(step, problem.bounds), weights=weights)
 
 
@@ -152,10 +151,15 @@ def newton_step(problem: Problem, value: Value) -> tuple[Value, float]:
 
 
 def free_direction(problem: Problem, value: Value) -> tuple[Floats, float]:
-    """Return the Newton step along the free coordinates, and its predicted gain [nats]."""
+    """Return the Newton step along the free coordinates, uphill even if not concave, and its predicted gain [nats]."""
     assert value.hessian is not None
-    places = np.flatnonzero(problem.free(value))
-    return newton_direction(value.gradient, value.hessian, places, 1e-12 * problem.total + 1e-300)
+    step, places = np.zeros(len(value.gradient)), np.flatnonzero(problem.free(value))
+    scale, size, axes = scaled_axes(-value.hessian[np.ix_(places, places)], 1e-12 * problem.total + 1e-300)
+    slope = axes.T @ (scale * value.gradient[places])
+    along = slope / np.maximum(np.abs(size), 1e-9)
+    step[places] = scale * (axes @ along)
+    # Half the slope along the step.
+    return step, 0.5 * float(slope @ along)
 
 
 def without_needless(problem: Problem, value: Value) -> Value:
@@ -321,7 +325,6 @@ def _restarted(
 
 
 def _evolve(search: _Search, start: Point, seed: int, max_iterations: int) -> None:
-    """Run differential evolution from a start."""
     from scipy.optimize import differential_evolution
 
     coordinates, total = search.coordinates, search.problem.total

@@ -162,10 +162,8 @@ def fit_pairs(
             best = max(
                 (search.method(problem, each, watch) for each in (start, *more)), key=lambda c: c.value.objective
             )
-        elif chosen:
-            best = search.from_user(start, more)
         else:
-            best = search.from_readings(start, more)
+            best = search.run(start, more, chosen=chosen)
     return report(problem, best, options, start)
 
 

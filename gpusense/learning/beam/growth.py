@@ -93,7 +93,6 @@ def _sampled(problem: Problem) -> Problem:
 
 
 def _climb(problem: Problem, start: Point, options: Options) -> Climb:
-    """Search from a start until the starts can be ranked."""
     tolerance = max(options.tolerance, _ROUGHLY)
     return climb_em(
         problem, start, max_iterations=options.max_iterations, tolerance=tolerance, watch=lambda iteration, value: None

@@ -89,23 +89,19 @@ class IncidenceFit:
 
     def _repr_html_(self) -> str:
         names = list(self.pooled.standard_errors)
-        edges = np.degrees(self.parameters.edges)
-        bins = [f"{low:.0f} to {high:.0f}" for low, high in pairwise(edges)]
-        rows = [
-            (name, count, *(getattr(fit.parameters, each) for each in names))
-            for name, count, fit in zip(bins, self.counts, self.fits, strict=True)
-        ]
+        bins = self._rows()[1 : 1 + len(self.fits)]
+        rows = [(name, count, *(getattr(fit.parameters, each) for each in names)) for name, count, fit in bins]
         return card("IncidenceFit", rows, head=("incidence [deg]", "readings", *names), detail=str(self))
+
+    def _rows(self) -> list[tuple[str, int, BeamFit]]:
+        bins = [f"{low:.0f} to {high:.0f}" for low, high in pairwise(np.degrees(self.parameters.edges))]
+        rows = [("all", sum(self.counts), self.pooled), *zip(bins, self.counts, self.fits, strict=True)]
+        return rows + ([] if self.no_surface is None else [("no surface", self.no_surface_count, self.no_surface)])
 
     def __str__(self) -> str:
         names = [*self.pooled.standard_errors, *(["range_bias"] if self.pooled.bias_fitted else [])]
         lines = [f"{'incidence [deg]':16}{'readings':>10}" + "".join(f"{name:>14}" for name in names)]
-        edges = np.degrees(self.parameters.edges)
-        bins = [f"{low:.0f} to {high:.0f}" for low, high in pairwise(edges)]
-        rows = list(zip(["all", *bins], [sum(self.counts), *self.counts], [self.pooled, *self.fits], strict=True))
-        if self.no_surface is not None:
-            rows.append(("no surface", self.no_surface_count, self.no_surface))
-        for name, count, fit in rows:
+        for name, count, fit in self._rows():
             numbers = "".join(f"{getattr(fit.parameters, parameter):14.5g}" for parameter in names)
             lines.append(f"{name:16}{count:10}{numbers}{'' if fit.converged else '  ' + fit.status}")
         lines.append(

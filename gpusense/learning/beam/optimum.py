@@ -46,15 +46,16 @@ class Search:
     method: Method  # the search from one start
     watch: Watch  # function called after each iteration
 
-    def from_readings(self, start: Point, more: list[Point], known: Point | None = None) -> Climb:
-        """Search from the likeliest start, and from starts that exceed the result.
+    def run(self, start: Point, more: list[Point], *, chosen: bool = False, known: Point | None = None) -> Climb:
+        """Search from a start ``chosen`` by the user, or else from the likeliest one and those that exceed the result.
 
-        Starts with the causes of ``start`` are chosen from the readings; each of ``more`` is followed to its maximum.
-        ``known`` may lack some of these causes.
+        Other starts have the causes of ``start`` and come from the readings; ``known`` may lack some causes. Each of
+        ``more`` is followed to its maximum. Notes report lower ends, and a likelier start than the chosen one.
         """
-        values = [self.problem.value(point) for point in (start, known) if point is not None] + self._others(start)
-        values = sorted(values, key=lambda value: -value.objective)
-        causes = start.weights > 0
+        causes, others = start.weights > 0, self._others(start)
+        values = [self.problem.value(point) for point in (start, known) if point is not None]
+        if not chosen:
+            values = sorted(values + others, key=lambda value: -value.objective)
         climb = self._climb(values[0].point, causes)
         for value in values[1:]:
             if value.objective > climb.value.objective + _SAME:
@@ -62,15 +63,8 @@ class Search:
         ends = [climb, *(self._climb(point, causes) for point in more)]
         best = max(ends, key=_objective)
         best.notes += _lower([best.value.objective - end.value.objective for end in ends])
-        return best
-
-    def from_user(self, start: Point, more: list[Point]) -> Climb:
-        """Search from a user's start and further starts; a note reports a higher likelihood elsewhere."""
-        ends = [self._climb(point, start.weights > 0) for point in (start, *more)]
-        best = max(ends, key=_objective)
-        best.notes += _lower([best.value.objective - end.value.objective for end in ends])
-        higher = max((value.objective for value in self._others(start)), default=-math.inf) - best.value.objective
-        if higher > _SAME:
+        higher = max((value.objective for value in others), default=-math.inf) - best.value.objective
+        if chosen and higher > _SAME:
             best.notes.append(f"another start is at least {higher:.3g} nats higher: leave out 'initial'")
         return best
 
@@ -270,7 +264,6 @@ def _log_components(sample: Sample, z: Floats, expected: Floats, sigma: Floats, 
 
 
 def _different(one: Point, other: Point) -> bool:
-    """Return whether two points are far enough apart to lead to different maxima."""
     ratios = math.log(one.sigma / other.sigma), math.log(one.rate / other.rate)
     shapes = max(map(abs, ratios)) > math.log(_FACTOR)
     moved = abs(one.bias - other.bias) > min(one.sigma, other.sigma)

@@ -204,7 +204,6 @@ class Problem:
         return replace(value, gradient=gradient, hessian=hessian)
 
     def _form_step(self, point: Point) -> float:
-        """Return the step of the differences by the coordinate of the shape."""
         share = _FORM_STEPS[self.device.real == np.float64]
         return share * max(float(point.shape.coordinates[0]), SMALL_FORM)
 
@@ -259,7 +258,6 @@ class Problem:
         return np.append(free, np.array(form, bool))
 
     def _form_is_free(self, value: Value, place: int) -> bool:
-        """Return whether a coordinate of the shape of hits may move."""
         at, slope = value.point.shape.coordinates[place], value.gradient[FORM + place]
         low, high = value.point.shape.limits[place]
         near = _AT * max(abs(at), low)

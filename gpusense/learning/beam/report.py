@@ -114,7 +114,6 @@ def _standard_errors(problem: Problem, value: Value, scatter: Floats | None = No
 
 
 def _jacobian(point: Point) -> Floats:
-    """Return the derivatives of the parameters by the coordinates."""
     shape = point.shape
     count = FORM + len(shape.limits)
     jacobian = np.zeros((count, count))
@@ -167,7 +166,7 @@ def _bias(problem: Problem, value: Value, climb: Climb, options: Options, start:
         best = _climb_joint(options, joint, value.point, lambda iteration, value: None)
     else:
         search = Search(joint, partial(_climb_joint, options), lambda iteration, value: None)
-        best = search.from_readings(start, [], value.point)
+        best = search.run(start, [], known=value.point)
     if not best.converged:
         return math.nan, math.nan, math.nan
     errors, independent = _errors(joint, joint.value(best.value.point, second=True))

@@ -277,7 +277,6 @@ def _p_detect(counts: tuple[int, float] | None, start: float, held: dict[str, st
 
 
 def _mean(pairs: Pairs, value: Value, part: int) -> float:
-    """Return the mean residual of features from landmarks."""
     measured = ~np.isnan(pairs.residuals[:, part])
     weight = value.responsibility[measured]
     return float(weight @ pairs.residuals[measured, part] / weight.sum()) if weight.sum() > 0 else math.nan
@@ -308,7 +307,6 @@ def _held(pairs: Pairs, values: dict[str, float], value: Value) -> dict[str, str
 
 
 def _status(pairs: Pairs, value: Value, converged: bool, held: dict[str, str]) -> str:
-    """Return the status in words."""
     notes = ["converged" if converged else "stopped: more iterations are needed"]
     used = np.unique(pairs.landmark[value.responsibility > 0.5])
     if len(used) == 1:

@@ -38,7 +38,6 @@ class _Beacons(Problem):
 
     @property
     def _first(self) -> int:
-        """Place of the first bias."""
         return 4 if self.kind == "mixture" else 2
 
     def bounds(self) -> tuple[Floats, Floats]:

@@ -155,7 +155,6 @@ class LocalizationNode(LifecycleNode):
             self._made.append((self.destroy_timer, timer))
 
     def _publish(self) -> None:
-        """Create publishers, and record their destructors."""
         add = self.create_lifecycle_publisher
         self.pose = add(PoseWithCovarianceStamped, "amcl_pose", latched())
         self.cloud = add(ParticleCloud or PoseArray, "particle_cloud", qos_profile_sensor_data)

@@ -96,7 +96,7 @@ def test_a_cause_that_a_search_left_out_too_early_comes_back() -> None:
 
     seen: list[int] = []
     start = Point(np.array([0.5, 0.2, 0.0, 0.3]), 0.2, 1.0)
-    end = Search(problem, climb, lambda iteration, value: seen.append(iteration)).from_user(start, [])
+    end = Search(problem, climb, lambda iteration, value: seen.append(iteration)).run(start, [], chosen=True)
     best = gs.fit_beam_parameters(z, expected, 10.0, backend="numpy")
     assert len(runs) == 2 and end.value.point.weights[1] > 0.1
     assert end.value.objective == pytest.approx(best.log_likelihood, abs=1e-6)

@@ -170,11 +170,8 @@ def _extents(segments: Segments, lines: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def _one_each(scan: np.ndarray, angle: np.ndarray, length: np.ndarray) -> np.ndarray:
     """Choose the pair of each scan and axis with the longest shorter wall (2, P), then the longest pair."""
-
-    def on_another_axis(k: int, j: int) -> bool:
-        return abs(math.remainder(angle[k] - angle[j], math.pi)) > _ONE_AXIS
-
-    return np.sort(first_apart(np.lexsort((-length.max(axis=0), -length.min(axis=0), scan)), scan, on_another_axis))
+    order = np.lexsort((-length.max(axis=0), -length.min(axis=0), scan))
+    return np.sort(first_apart(order, scan, lambda k, j: abs(math.remainder(angle[k] - angle[j], math.pi)) > _ONE_AXIS))
 
 
 def first_apart(order: np.ndarray, scan: np.ndarray, are_apart: Callable[[int, int], bool]) -> np.ndarray:

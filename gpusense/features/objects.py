@@ -255,11 +255,9 @@ def _one_each(segments: Segments, gaps: _Gaps, sure: np.ndarray) -> np.ndarray:
     order = np.lexsort((ends[:, 1] - ends[:, 0], ~sure, segments.scan[wall]))
     middle = segments.place(wall, ends[:, :2].mean(axis=1))
     width = ends[:, 1] - ends[:, 0]
-
-    def do_not_overlap(k: int, j: int) -> bool:
-        return bool(np.hypot(*(middle[j] - middle[k])) > 0.5 * (width[j] + width[k]))
-
-    return first_apart(order, segments.scan[wall], do_not_overlap)
+    return first_apart(
+        order, segments.scan[wall], lambda k, j: math.dist(middle[j], middle[k]) > 0.5 * (width[j] + width[k])
+    )
 
 
 def _jambs(

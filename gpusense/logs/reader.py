@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import importlib
+import itertools
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -226,7 +227,10 @@ def read_lasers(
         if options.get("mount") is not None:
             raise ValueError(f"mount: must be left out for {len(sensors)} lasers, whose transforms have them, got one")
     topics: Sequence[str | None] = sensors or (None,)
-    each = [_of(index, _records(form, path, topic, index == 0, options)) for index, topic in enumerate(topics)]
+    each = [
+        zip(itertools.repeat(index), _records(form, path, topic, index == 0, options))
+        for index, topic in enumerate(topics)
+    ]
     return each[0] if len(each) == 1 else heapq.merge(*each, key=lambda one: one[1].time)
 
 
@@ -244,8 +248,3 @@ def _records(
 def _wrong_laser(form: Format, names: Sequence[object]) -> ValueError:
     rule = f"must be only one of 'front' and 'rear' for {form.name}, which states no mounts"
     return ValueError(f"sensors: {rule}, got {', '.join(map(str, names))}")
-
-
-def _of(index: int, records: Iterator[Scan | Odometry]) -> Iterator[tuple[int, Scan | Odometry]]:
-    for record in records:
-        yield index, record

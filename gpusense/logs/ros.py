@@ -127,7 +127,7 @@ def _lasers(bag: Bag, given: Pose | None, range_min: float | None, range_max: fl
 
 def _mounted(bag: Bag, given: Pose | None) -> dict[str, _Laser]:
     """Return the lasers with their mounts by their frames, and warn of doubtful mounts."""
-    bases = _bases(bag)
+    bases = [bag.track.base] if bag.track.base else bases_of(bag.transforms) or list(BASES)
     found: dict[str, _Laser] = {}
     reasons: dict[str, str] = {}
     for frame in bag.lasers:
@@ -193,13 +193,6 @@ def _by_transforms(bag: Bag, base: str, frame: str) -> _Laser:
         first, last = float(times[0]), float(times[-1])
         laser.at = lambda time: buffer.look_up(base, frame, min(max(time, first), last))
     return laser
-
-
-def _bases(bag: Bag) -> list[str]:
-    """Return candidates for the robot's base frame, the likeliest first."""
-    if bag.track.base:
-        return [bag.track.base]
-    return bases_of(bag.transforms) or list(BASES)
 
 
 def _compare(bag: Bag, given: Pose, place: Pose) -> None:

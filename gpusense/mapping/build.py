@@ -170,11 +170,12 @@ class MapBuilder:
         for band, parts in zip(self._bands, chosen, strict=True):
             self._counts = BandCounts(self._backend, self._frame, self._shape, band)
             for part in parts:
-                self._counts.add(self._rays_of(part))
+                key = part.tobytes()
+                self._counts.add(self._kept.pop(key) if key in self._kept else self._survey.rays(part))
                 done += len(part)
                 if done < total:
                     yield done / total
-            self._write(self._counts, self._cells)
+            self._counts.occupancies(self._cells, self._occupancy)
             self._rays, self._counts, self._finished = self._rays + self._counts.rays, None, self._finished + 1
         yield 1.0
 
@@ -182,14 +183,6 @@ class MapBuilder:
         """Return the indices of the scans with rays that meet a band."""
         low, high = self._rows.T
         return np.flatnonzero((high >= band.row - 1) & (low <= band.row + band.rows + 1))
-
-    def _rays_of(self, part: np.ndarray) -> RayEnds:
-        """Return the rays of some scans, and drop stored rays."""
-        key = part.tobytes()
-        return self._kept.pop(key) if key in self._kept else self._survey.rays(part)
-
-    def _write(self, counts: BandCounts, cells: np.ndarray) -> None:
-        counts.occupancies(cells, self._occupancy)
 
     @property
     def rays(self) -> int:
@@ -212,7 +205,7 @@ class MapBuilder:
         if self._finished < len(self._bands):
             cells = cells.copy()
             if self._counts is not None:
-                self._write(self._counts, cells)
+                self._counts.occupancies(cells, self._occupancy)
         return grid_of_checked(cells, *self._frame, occupied_threshold=self._threshold)
 
 

@@ -74,7 +74,9 @@ def triangulate(
     if heading is None and not (clarity > _triple_blur(problem, sets)).any():
         return problem.fix([], _line_or_circle(problem))
     if len(problem.xy) == least:
-        return _on_circle(problem, sets, clarity, _exact(problem, starts, rho[0]))
+        # Without redundant bearings, the closed form is the solution.
+        status = "at a beacon" if problem.at_beacon(starts[0]) else "behind" if rho[0].min() < 0 else "unique"
+        return _on_circle(problem, sets, clarity, problem.fix([] if status == "behind" else starts, status))
     linear = _nearest_point(problem) if heading is not None else _linear_pose(problem)
     states, status = solve(problem, np.vstack([linear, starts]), known_sigma=sigma is not None)
     if status == "unique" and np.abs(problem.residuals(states[:1])).max() > np.pi / 2:
@@ -194,13 +196,6 @@ def _triples(problem: Problem, triples: NDArray[np.intp]) -> tuple[Floats, Float
     assert problem.bearings is not None
     point, heading, rho, clarity = three_bearings(problem.points[triples], problem.bearings[triples])
     return np.column_stack([point.real, point.imag, heading]), rho, clarity
-
-
-def _exact(problem: Problem, states: Floats, rho: Floats) -> PositionFix:
-    """Make the result without redundant bearings: the closed form's solution, if it is valid."""
-    if problem.at_beacon(states[0]):
-        return problem.fix(states, "at a beacon")
-    return problem.fix([], "behind") if rho.min() < 0 else problem.fix(states, "unique")
 
 
 def _nearest_point(problem: Problem) -> Floats:

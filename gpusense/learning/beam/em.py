@@ -104,13 +104,16 @@ def m_step(problem: Problem, value: Value) -> Floats:
     sums, point, prior = value.sums, value.point, problem.prior
     free = problem.free(value)
     step = np.zeros(FORM + len(point.shape.limits))
-    pseudo, pseudo_squares = prior.of_hits(point)
+    # Squares of pseudo-hits are as many as the pseudo-hits, plus the derivative by log sigma.
+    (first, second), pseudo = prior.derivatives(point), float(prior.counts[HIT])
     if value.totals[HIT] > NOTHING:
         squares = float(sums[11])
         likely = squares - sums[4]
         slope = -2 * squares - sums[7]
-        step[SIGMA] = _log_step(squares + pseudo_squares, likely + pseudo, 2 + slope / max(likely + pseudo, 1e-300))
-        curve = sums[9] + prior.curve_of_bias(point) * point.sigma**2
+        step[SIGMA] = _log_step(
+            squares + first[SIGMA] + pseudo, likely + pseudo, 2 + slope / max(likely + pseudo, 1e-300)
+        )
+        curve = sums[9] + second[BIAS, BIAS] * point.sigma**2
         if free[BIAS] and curve < 0:
             step[BIAS] = -value.gradient[BIAS] * point.sigma**2 / curve
     if free[RATE] or value.totals[SHORT] > NOTHING:
@@ -261,10 +264,6 @@ class _Search:
             return Climb(self.best, self.trace, True)
         return Climb(self.best, self.trace, False, [f"no progress, with {left:.2g} nats left to gain"])
 
-    def exhausted(self, max_iterations: int) -> Climb:
-        """Return the end of a search that took all iterations."""
-        return Climb(self.best, self.trace, False, [f"no convergence within {max_iterations} iterations"])
-
 
 def climb_by_scipy(
     problem: Problem, start: Point, *, method: str, seed: int, max_iterations: int, tolerance: float, watch: Watch
@@ -321,7 +320,7 @@ def _restarted(
                 return end
             turns -= 1
             directions = np.linalg.qr(rng.normal(size=directions.shape))[0]
-    return search.exhausted(max_iterations)
+    return Climb(search.best, search.trace, False, [f"no convergence within {max_iterations} iterations"])
 
 
 def _evolve(search: _Search, start: Point, seed: int, max_iterations: int) -> None:

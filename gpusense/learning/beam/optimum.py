@@ -16,6 +16,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,15 +83,13 @@ class Search:
             point = self._revived(climb.value, causes) if climb.converged else None
             if point is None:
                 return climb
-            following = self.method(self.problem, point, self._watch_after(len(climb.trace) - 1))
+            done = len(climb.trace) - 1
+            watch = partial(lambda done, iteration, value: self.watch(done + iteration, value), done)
+            following = self.method(self.problem, point, watch)
             if following.value.objective <= climb.value.objective + _SAME:
                 return climb
             climb = replace(following, trace=climb.trace + following.trace[1:])
         return climb
-
-    def _watch_after(self, done: int) -> Watch:
-        """Return the watch of a search that continues after some iterations."""
-        return lambda iteration, value: self.watch(done + iteration, value)
 
     def _revived(self, value: Value, causes: NDArray[np.bool_]) -> Point | None:
         """Return a likelier point where a cause of weight 0 gets some weight, or None."""

@@ -111,10 +111,6 @@ class Prior:
         by_sigma, both = ((after - before) / (2 * _STEP) for before, after in zip(*grown, strict=True))
         return by_sigma, both, (moved[1][1] - moved[0][1]) / (2 * _STEP * point.sigma)
 
-    def curve_of_bias(self, point: Point) -> float:
-        """Return the second derivative of the hits' part by the offset."""
-        return float(self.counts[HIT]) * self._curves(point)[2] if self.counts[HIT] > 0 else 0.0
-
     def derivatives(self, point: Point) -> tuple[Floats, Floats]:
         """Return the (7,) first and (7, 7) second derivatives of the shapes' part by the coordinates."""
         first, second = np.zeros(7), np.zeros((7, 7))
@@ -127,11 +123,6 @@ class Prior:
             second[SIGMA, BIAS] = second[BIAS, SIGMA] = hits * both
         second[RATE, RATE] = -short * point.rate / self.rate
         return first, second
-
-    def of_hits(self, point: Point) -> tuple[float, float]:
-        """Return the number of pseudo-hits and their weighted sum of squares in units of the point's sigma."""
-        hits = float(self.counts[HIT])
-        return hits, hits * (self._slopes(point)[0] + 1) if hits > 0 else 0.0
 
 
 NO_PRIOR = Prior(np.zeros(4))

@@ -94,7 +94,8 @@ def _errors(problem: Problem, value: Value) -> tuple[dict[str, float], dict[str,
     independent = _standard_errors(problem, value)
     if problem.pairs.block is None:
         return dict(independent), independent
-    return _standard_errors(problem, value, block_scatter(problem, value.point)), independent
+    sums, counts = block_gradients(problem, value.point)
+    return _standard_errors(problem, value, scatter_of(sums[counts > 0])), independent
 
 
 def _standard_errors(problem: Problem, value: Value, scatter: Floats | None = None) -> dict[str, float]:
@@ -188,12 +189,6 @@ def _responsibilities(device: DeviceSums, pairs: Pairs, point: Point) -> NDArray
 
 # Number of readings per pass.
 _PART = 1 << 18
-
-
-def block_scatter(problem: Problem, point: Point) -> Floats:
-    """Return the scatter of the log-likelihood's gradient over blocks; NaN for fewer than 2 blocks."""
-    sums, counts = block_gradients(problem, point)
-    return scatter_of(sums[counts > 0])
 
 
 def block_gradients(problem: Problem, point: Point) -> tuple[Floats, NDArray[np.intp]]:

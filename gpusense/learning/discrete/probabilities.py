@@ -102,7 +102,8 @@ def shared_causes(
             short + ShortDensity(lambda_short * width).log_mass(np.arange(bins), 1, reached),
             np.full((len(rows), bins), rand + RandomDensity(bins).log_peak(1.0)),
         ])  # fmt: skip
-        left = _tails(np.logaddexp.reduce(mass, axis=0), np.full((len(rows), 1), none))
+        whole = np.concatenate([np.logaddexp.reduce(mass, axis=0), np.full((len(rows), 1), none)], axis=1)
+        left = np.logaddexp.accumulate(whole[:, ::-1], axis=1)[:, ::-1]
         triggers = _ratio(mass, left[:, :-1])
         others = [np.logaddexp(np.logaddexp(mass[k - 1], mass[k - 2]), left[:, 1:]) for k in range(3)]
         return log_table(triggers, _ratio(np.stack(others), left[:, :-1]))
@@ -171,12 +172,6 @@ def _log_h(x: Floats) -> Floats:
     far = t * (1 - 3 * t * (1 - 5 * t * (1 - 7 * t * (1 - 9 * t * (1 - 11 * t * (1 - 13 * t))))))
     log_h: Floats = -0.5 * x * x - _LOG_ROOT_2PI + np.log(np.where(x > _FAR, far, near))
     return log_h
-
-
-def _tails(log_mass: Floats, log_none: Floats) -> Floats:
-    """Return the (rows, bins + 1) log mass from each step on, the remainder included."""
-    all_columns = np.concatenate([log_mass, log_none], axis=1)[:, ::-1]
-    return np.logaddexp.accumulate(all_columns, axis=1)[:, ::-1]
 
 
 def _ratio(log_part: Floats, log_whole: Floats) -> Floats:

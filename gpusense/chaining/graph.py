@@ -133,7 +133,8 @@ def solve(
         information = links.information * _weights(squared, kernel)[:, None, None]
         pull = np.einsum("lij,lj->li", information, residual)
         step = equations.step(*equations.at(at, information, pull, damping))
-        tried = [_moved(at, step)] + ([_moved_along(at, step)] if settle else [])
+        tried = [at + step] + ([_moved_along(at, step)] if settle else [])
+        tried[0][:, 2] = wrap_angle(tried[0][:, 2])
         trials = [(trial, links.residuals(trial)) for trial in tried]
         distances = [links.squared(off) for _, off in trials]
         costs = [_cost(there, kernel) for there in distances]
@@ -167,12 +168,6 @@ def _raised(rise: Floats, links: Links, count: int, fails: int) -> Flags:
         near[links.first[some]] = near[links.second[some]] = True
         some = near[links.first] | near[links.second]
     return near
-
-
-def _moved(poses: Floats, step: Floats) -> Floats:
-    result = poses + step
-    result[:, 2] = wrap_angle(result[:, 2])
-    return result
 
 
 def _moved_along(poses: Floats, step: Floats) -> Floats:

@@ -136,7 +136,9 @@ class Joint:
         # (M,) ascending indices of the matched scans in the log, and the front end of each.
         self.nodes, self.owner = whole[order], owner[order]
         self.of = [np.searchsorted(self.nodes, nodes) for nodes in own]  # each front end's nodes among all
-        self.keys = np.sort(np.concatenate([of[_below(front.keys, len(of))] for front, of in self._each()]))
+        self.keys = np.sort(
+            np.concatenate([of[[key for key in front.keys if key < len(of)]] for front, of in self._each()])
+        )
         # (L, M - 1) knowledge of each motion: -1 no scans, 0 no match, 1 with open directions, 2 full.
         self._trust = self._of_motions(
             lambda front: np.where(front.p_right < SURE, 0, np.where(front.lost > 0, 1, 2)), -1
@@ -295,11 +297,6 @@ def _information(deviation: Floats) -> Floats:
     """Return the information (L, 3, 3) of couplings from the deviations of couplings and mounts."""
     diagonal = 1 / (np.array([_MOUNTS, _MOUNTS, _MOUNTS_TURN]) ** 2 + deviation[:, [0, 0, 1]] ** 2)
     return diagonal[:, :, None] * np.eye(3)
-
-
-def _below(keys: Sequence[int], count: int) -> Integers:
-    values = np.array(keys, np.int64)
-    return values[values < count]
 
 
 def _steps_of(of: Integers, count: int) -> tuple[Integers, Flags]:

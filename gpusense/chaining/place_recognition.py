@@ -16,7 +16,7 @@ import numpy as np
 from gpusense._util.typing import Flags, Floats, Integers
 from gpusense.chaining.links import Links, relative
 from gpusense.localization.pose_algebra import compose_poses, invert_poses, wrap_angle
-from gpusense.matching.points import ScanPoints, scan_points
+from gpusense.matching.points import scan_points
 from gpusense.world.sensor_scans import SensorScans
 
 # Least share of common cells of a scan.
@@ -39,15 +39,9 @@ def place_points_of(data: SensorScans, scans: Integers) -> list[Floats]:
         some = np.flatnonzero(sensor == one)
         points = scan_points(data.readings[one][place[some]], scanner, np.dtype(np.float32))
         for k, scan in enumerate(some.tolist()):
-            result[scan] = _place_points(points, scanner.mount[:2], k)
-    return result
-
-
-def _place_points(points: ScanPoints, mount: tuple[float, float], scan: int) -> Floats:
-    """Return (P, 2) end points of a scan in the robot's frame, without the farthest ones."""
-    part = points.point[points.start[scan] : points.start[scan + 1]].astype(np.float64)
-    near = part[:, 3] <= _FAR * max(float(points.rms_range(np.array([scan]))[0]), 1e-3)
-    result: Floats = part[near, :2] + np.array(mount)
+            part = points.point[points.start[k] : points.start[k + 1]].astype(np.float64)
+            near = part[:, 3] <= _FAR * max(float(points.rms_range(np.array([k]))[0]), 1e-3)
+            result[scan] = part[near, :2] + np.array(scanner.mount[:2])
     return result
 
 

@@ -70,7 +70,9 @@ def _records(
         if name.startswith("ROBOT"):
             config, ranges, poses = _robot_laser(where, fields)
             start, view, step, stated_max = config[1:5].tolist()
-            geometry = start, _robot_step(view, step, ranges.size), ranges.size, range_max or stated_max
+            # Both view and step are rounded to 1e-6.
+            finer = view / (ranges.size - 1) if ranges.size > 1 else step
+            geometry = start, finer if abs(finer - step) <= 1e-6 else step, ranges.size, range_max or stated_max
         else:
             ranges, poses = _old_laser(where, fields)
             if old_range_max is None:
@@ -94,13 +96,9 @@ def _messages(path: Path, lines: Iterator[tuple[int, bytes]]) -> Iterator[tuple[
                 any_message = True
                 yield f"{path}:{number}", fields
     if not any_message:
-        found = f"got none in {number} lines{_other_use(path)}"
+        other = "; a map is passed by --map or read by gs.read_map" if path.suffix in (".yaml", ".yml", ".pgm") else ""
+        found = f"got none in {number} lines{other}"
         raise ValueError(f"{path}: must hold laser or ODOM messages of CARMEN, {found}")
-
-
-def _other_use(path: Path) -> str:
-    """Return the option to which a file belongs that is no log; empty if its name does not tell."""
-    return "; a map is passed by --map or read by gs.read_map" if path.suffix in (".yaml", ".yml", ".pgm") else ""
 
 
 def _old_laser(where: str, fields: Sequence[bytes]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -163,12 +161,6 @@ def _old_step(count: int) -> float:
         if abs(degrees - common) <= 0.01 * common:
             degrees = common
     return math.radians(degrees)
-
-
-def _robot_step(view: float, step: float, count: int) -> float:
-    """Return the step between ROBOTLASER's bearings [rad], from ``view`` and ``step``, both rounded to 1e-6."""
-    finer = view / (count - 1) if count > 1 else step
-    return finer if abs(finer - step) <= 1e-6 else step
 
 
 def _scanner(where: str, start: float, step: float, count: float, range_max: float) -> Scanner:

@@ -72,7 +72,9 @@ def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:
         values: dict[str, Any] = {}
         error = trace = ""
         try:
-            values = {name: _plain(value) for name, value in task_of(job)(job, _STORES[key]).items()}
+            found = task_of(job)(job, _STORES[key])
+            # Python's numbers in place of NumPy's.
+            values = {name: value.item() if hasattr(value, "item") else value for name, value in found.items()}
         except KeyboardInterrupt:
             # In this process the interrupt is the user's, and ends the sweep.
             raise
@@ -90,10 +92,6 @@ def error_text(error: BaseException) -> str:
     except Exception:
         text = f"{type(error).__name__} without a text"
     return " ".join(text.split())[:_LONGEST]
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if hasattr(value, "item") else value
 
 
 # Most consecutive processes that end before taking a call.

@@ -85,18 +85,14 @@ class Table:
         more = [name for name in row if name not in self.columns]
         self.rows[row["key"]] = row
         if more or not self.columns:
-            self._rewrite(self.rows.values(), self._merged(row))
+            middle = [name for name in (*self.columns, *row) if name not in (*FIRST, *LAST)]
+            self._rewrite(self.rows.values(), (*FIRST, *dict.fromkeys(middle), *LAST))
         else:
             with naming(self.path):
                 self._stream.write(_lines(self.columns, [row]))
                 self._stream.flush()
                 os.fsync(self._stream.fileno())
         return row
-
-    def _merged(self, row: Iterable[str]) -> tuple[str, ...]:
-        """Return the columns, extended by the columns of a row."""
-        middle = [name for name in (*self.columns, *row) if name not in (*FIRST, *LAST)]
-        return (*FIRST, *dict.fromkeys(middle), *LAST)
 
     def _rewrite(self, rows: Iterable[Row], columns: tuple[str, ...]) -> None:
         text = _lines(columns, [dict(zip(columns, columns, strict=True)), *rows])

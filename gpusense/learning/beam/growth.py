@@ -195,15 +195,10 @@ class _Growing(hosted.Problem):
 
     def _by_shape(self, theta: Floats) -> list[Floats]:
         """Return the derivatives of the log density of hits by the coordinates of the shape, by differences."""
-        sigma, mean, u = self._hits_at(theta)
-        ends = mean / sigma, (self.range_max - mean) / sigma
-        return by_shape(u, *ends, self._shape_at(theta), self._shape_of, self.kind.limits)
-
-    def _hits_at(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return the scale and mean of hits, and the readings' distances from the mean in scales."""
         sigma = math.exp(theta[_SIGMA]) + theta[_GROWTH] * self.expected
         mean = np.clip(self.expected + (theta[_BIAS] if self.fit_bias else 0.0), 0, self.range_max)
-        return sigma, mean, (self.reading - mean) / sigma
+        ends = mean / sigma, (self.range_max - mean) / sigma
+        return by_shape((self.reading - mean) / sigma, *ends, self._shape_at(theta), self._shape_of, self.kind.limits)
 
     def _shape_of(self, coordinates: Floats) -> HitShape:
         """Return the shape at coordinates; many readings look up masses in a table."""

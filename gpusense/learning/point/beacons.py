@@ -79,7 +79,8 @@ class _Beacons(Problem):
         return ordered
 
     def log_p(self, theta: Floats) -> tuple[Floats, Floats]:
-        bias = self._bias(theta)
+        biases = theta[self._first :]
+        bias = biases[self.ids] if self.biases > 1 else float(biases.sum())
         mean = self.distances + bias
         residual = (self.ranges - self.distances) - bias
         rand = theta[1]
@@ -109,12 +110,6 @@ class _Beacons(Problem):
             place = self.ids if self.biases > 1 else np.zeros(len(mean), np.int64)
             gradient[np.arange(len(mean)), self._first + place] = by_bias
         return log_p, gradient
-
-    def _bias(self, theta: Floats) -> Floats:
-        biases = theta[self._first :]
-        if self.biases > 1:
-            return biases[self.ids]
-        return np.full(len(self.ranges), biases[0] if self.biases else 0.0)
 
     def values(self, theta: Floats) -> dict[str, float]:
         values = {"sigma_range": math.exp(theta[0])}
@@ -199,7 +194,17 @@ def fit_beacon_parameters(
         {"none": 0, "common": 1, "each": len(points)}[bias], spread or 1e-6 * longest,
     )  # fmt: skip
     end = maximize(problem, max_iterations, tolerance)
-    return report(problem, end, _parameters(problem, end.theta, degrees, mount), numbers, int((~used).sum()))
+    values = {name: value for name, value in problem.values(end.theta).items() if not name.startswith("bias")}
+    biases = tuple(end.theta[problem._first :].tolist())
+    parameters = BeaconParameters(
+        **values,
+        bias=biases if len(biases) > 1 else sum(biases, 0.0),
+        kind=kind,
+        nu=degrees,
+        range_max=longest,
+        mount=mount,
+    )
+    return report(problem, end, parameters, numbers, int((~used).sum()))
 
 
 def _readings(poses: ArrayLike, ranges: ArrayLike, beacons: int, ids: object) -> tuple[Floats, Floats, list[Integers]]:
@@ -217,13 +222,6 @@ def _readings(poses: ArrayLike, ranges: ArrayLike, beacons: int, ids: object) ->
         raise ValueError(f"ids: indices must be in [0, {beacons}), got {columns[at]} at index {at}")
     z = checks.array("ranges", ranges, (len(columns),), finite=False)
     return pose, z, [np.arange(len(columns)), columns]
-
-
-def _parameters(problem: _Beacons, theta: Floats, nu: int, mount: tuple[float, float]) -> BeaconParameters:
-    values = {name: value for name, value in problem.values(theta).items() if not name.startswith("bias")}
-    biases = tuple(theta[problem._first :].tolist())
-    bias = 0.0 if not biases else biases[0] if len(biases) == 1 else biases
-    return BeaconParameters(**values, bias=bias, kind=problem.kind, nu=nu, range_max=problem.range_max, mount=mount)  # type: ignore[arg-type]
 
 
 def _half_sample_mode(values: Floats) -> float:

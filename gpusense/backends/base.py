@@ -126,6 +126,10 @@ class Backend(ABC):
     def synchronize(self) -> None:
         """Wait until every launch and copy has ended."""
 
+    def exchange(self, inputs: Buffer, given: int, results: Buffer, taken: int, dtype: np.dtype) -> Exchange:
+        """Return an exchange of ``given`` float64 inputs and ``taken`` results of a type, at the heads of buffers."""
+        return Exchange(self, inputs, np.zeros(given), results, np.empty(taken, dtype))
+
     def run(self, program: Program) -> None:
         """Start the launches of a program in their order."""
         for one in program:
@@ -219,6 +223,43 @@ class _ProgramRecording(Recording):
 
     def explain(self) -> str:
         return f"{pluralize(len(self._program), 'launch')} one by one: {self._backend.info.selection} has no graphs"
+
+
+class Exchange:
+    """Copies around a recording: of all its inputs to the device, and of all its results to the host.
+
+    Attributes:
+        given: The inputs, to be written after ``begin``.
+    """
+
+    def __init__(self, backend: Backend, inputs: Buffer, given: np.ndarray, results: Buffer, taken: np.ndarray) -> None:
+        self.given, self._backend = given, backend
+        self._inputs, self._results, self._taken, self._busy = inputs, results, taken, False
+
+    def begin(self) -> np.ndarray:
+        """Return ``given``, which no unfinished copy reads."""
+        if self._busy:
+            self._backend.synchronize()
+            self._busy = False
+        return self.given
+
+    def start(self, recording: Recording, *, between: Callable[[], None] | None = None) -> None:
+        """Copy the inputs, run ``between``, and start a recording; each has only one exchange."""
+        self._busy = True
+        self._backend.refill(self.given, self._inputs)
+        if between is not None:
+            between()
+        recording()
+
+    def finish(self) -> np.ndarray:
+        """Wait for the results of the last start, and return a copy."""
+        taken = self._backend.download(self._results, np.empty_like(self._taken))
+        self._busy = False
+        return taken
+
+    def explain(self, recording: Recording) -> str:
+        """Return in one line how a recording is started."""
+        return recording.explain()
 
 
 # ---- a device as models see it, and its bond to the process that opened it

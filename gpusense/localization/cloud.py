@@ -64,9 +64,13 @@ class Cloud(Particles):
         self._meanwhile: Callable[[], None] | None = None
         self._expected: Sequence[SensorReadings] = ()
         self._judges: list[MapJudge] = []
-        # Inputs of a recorded correction that are not yet on the device, and readings of other arrays of the device.
+        # Inputs of a recorded correction, and readings of other arrays of the device; whether results are on their way.
+        self._exchange = self.backend.exchange(
+            self.inputs.buffer, self.inputs.size, self.results.buffer, self.results.size, _DOUBLE
+        )
         self._given: np.ndarray | None = None
         self._adopted: Sequence[tuple[Buffer, Buffer, int]] = ()
+        self._is_running = False
 
     def place(self, poses: np.ndarray) -> None:
         """Replace all particles by (N, 3) poses of equal weight, and reset the state of corrections."""
@@ -85,6 +89,7 @@ class Cloud(Particles):
     def _begin_change(self) -> None:
         """Invalidate the results on the host, and save the particles that the change may overwrite."""
         self._results = self._known = self._estimated_of = self._refined_of = None
+        self._is_running = False
         self._meanwhile, self._expected, self._judges, self._given, self._adopted = None, (), [], None, ()
         for one in self._snapshots:
             snapshot = one()
@@ -133,7 +138,7 @@ class Cloud(Particles):
             self.copy_state(self.places.state, planned[0].state)
         for stage in planned:
             last, deep = stage.most == 1, settings
-            self._results = None
+            self._change_results()
             if recorded:
                 self._replay(indices, stage)
             else:
@@ -155,7 +160,7 @@ class Cloud(Particles):
 
     def _give(self, settings: np.ndarray, readings: list[SensorReadings]) -> None:
         """Set the inputs of a recorded correction."""
-        self._given, adopted = np.empty(self.inputs.size), []
+        self._given, adopted = self._exchange.begin(), []
         self._given[self.inputs.spans[0]] = settings
         for index, reading in readings:
             target = self.readings[index]
@@ -188,7 +193,14 @@ class Cloud(Particles):
             program, owners = self._program((sensors, self.count, stage.source), indices, stage.source)
             program = move + program + self._weighing(stage) + self._judging()
             recorded = self._recordings.keep(key, RecordedProgram(self.backend, program, owners))
-        self._start(recorded, read=stage.most > 1 or self._estimates_too)
+        self.backend.check_process()
+        self._exchange.start(recorded.recording, between=self._copy_adopted if self._adopted else None)
+        self._is_running = True
+
+    def _copy_adopted(self) -> None:
+        """Start copying readings of arrays on the device."""
+        for source, target, size in self._adopted:
+            self.backend.copy(source, target, size)
 
     def _program(self, key: Hashable, indices: list[int], source: int) -> tuple[Program, object]:
         """Return the launches that score the poses of a buffer, and the owners of their memory."""
@@ -211,7 +223,7 @@ class Cloud(Particles):
         while is_starved(numbers, settings, stage.number, self.count):
             settings = deeper(settings)
             self.upload_settings(settings)
-            self._results = None
+            self._change_results()
             self.backend.run(self._weighing(stage) + self._judging())
             numbers = self._state_of(stage.state)
         return numbers, settings
@@ -263,31 +275,10 @@ class Cloud(Particles):
         """Draw into the other buffer."""
         self._stages.run((stage.key, drawn, self.count, "draw"), lambda: self.draw(stage, drawn))
 
-    def _start(self, recorded: RecordedProgram, *, read: bool) -> None:
-        """Start a stage, and copy a correction's inputs and results with it: one graph of a CUDA device."""
-        backend, given, self._given = self.backend, self._given, None
-        if given is not None:
-            self.held(given)
-        backend.begin_batch()
-        try:
-            if given is not None:
-                backend.upload(given, self.inputs.buffer, wait=False)
-                for source, target, size in self._adopted:
-                    backend.copy(source, target, size)
-            recorded({})
-            if read and backend.in_batch:
-                results = backend.download(self.results.buffer, np.empty(self.results.size), wait=False)
-                backend.submit()
-                self._use_wait()
-                backend.synchronize()
-                self._results = results
-        finally:
-            backend.end_batch()
-
     def explain(self) -> str:
         """Describe how the last recorded step starts."""
         recorded = self._recordings.items()
-        return recorded[-1][1].recording.explain() if recorded else "launches one by one"
+        return self._exchange.explain(recorded[-1][1].recording) if recorded else "launches one by one"
 
     # ---- copies to the host
 
@@ -356,7 +347,8 @@ class Cloud(Particles):
         """Return the estimate; compute it unless the last correction did."""
         places = self.places
         if self._estimated_of != (places, count):
-            self._results, self._judges = None, []
+            self._judges = []
+            self._change_results()
             # Clouds of varying size rarely repeat a size.
             self._estimates.run((places.shown, places.weight, count), lambda: self._estimating(places, count))
             self._estimated_of = places, count
@@ -371,7 +363,7 @@ class Cloud(Particles):
         """Return the second pass of the present estimate; compute it unless the last correction did."""
         places, self._was_refined = self.places, True
         if self._refined_of != (places, count):
-            self._results = None
+            self._change_results()
             self._estimates.run(
                 (places.shown, places.weight, count, "refined"), lambda: self._estimating(places, count, self.refined)
             )
@@ -385,8 +377,15 @@ class Cloud(Particles):
     def _read_results(self) -> np.ndarray:
         """Return states and estimate, copied once after each change."""
         if self._results is None:
-            self._results = self._read(self.results.buffer, self.results.size)
+            if self._is_running:
+                self._results, self._is_running = self._exchange.finish(), False
+            else:
+                self._results = self._read(self.results.buffer, self.results.size)
         return self._results
+
+    def _change_results(self) -> None:
+        """Drop the results on the host, which launches are about to change."""
+        self._results, self._is_running = None, False
 
     def contents(self, count: int) -> Contents:
         """Return a copy of all particles; ``count`` of them are shown."""

@@ -44,15 +44,17 @@ class Learner:
     MEMORY: ClassVar[tuple[str, ...]] = ("correlation", "seen", "learned", "lessons")
 
     def __init__(self, model: ScanModel) -> None:
-        self._model, self._backend = model, model.backend
+        self._model = model
         self.correlation = BeamCorrelation()
         # A temperature and its correlation; learning replaces the correlation.
         self._known: tuple[BeamCorrelation, float] | None = None
         # Number of scans, and the number of the last lesson's scan.
         self.seen, self.learned = 0, -1
         self.lessons: tuple[Lesson, ...] = ()
-        # Poses and readings of a started lesson, which the device may still read.
-        self._given: np.ndarray | None = None
+        # The recording that scores readings, and its exchange, once a lesson needs them; the last started lesson that
+        # was received, and its terms.
+        self._ready: Any = None
+        self._received: tuple[Lesson | None, Any] = None, None
 
     @property
     def temperature(self) -> float:
@@ -87,12 +89,17 @@ class Learner:
         self.learned = self.seen
 
     def receive(self) -> None:
-        """Complete the terms of a started lesson, or let the call of the next one follow changes of the map."""
-        stage = self.lessons[0].stage if self.lessons else _LEARNED
-        if stage == _STARTED:
-            self._backend.synchronize()
-        elif stage == _KEPT:
-            self._bound[1].refresh()
+        """Complete the terms of a started lesson, and let the program of the next one follow changes of the map."""
+        for number, lesson in enumerate(self.lessons):
+            if lesson.stage == _KEPT:
+                self._ready = self._bound[1].exchange(self._bound[0])
+                return
+            if lesson.stage == _STARTED and lesson.result is None:
+                # A repeated correction needs them again, after another lesson has used the exchange.
+                if self._received[0] is not lesson:
+                    self._received = lesson, self._ready[1].finish()
+                received = lesson._replace(result=self._received[1])
+                self.lessons = *self.lessons[:number], received, *self.lessons[number + 1 :]
 
     def work(self, *, doubted: bool) -> None:
         """Continue the oldest lesson, or end and start lessons of the first scans; drop all if scans are doubted."""
@@ -113,12 +120,10 @@ class Learner:
         """Return a lesson after its next stage; the device completes started terms before it is idle."""
         result, stage = lesson.result, lesson.stage
         if stage == _KEPT:
-            inputs, call = self._bound
-            given = self._given = np.empty(inputs.size)
-            given[inputs.spans[0]] = poses_around(lesson.pose, lesson.axes).reshape(-1)
-            given[inputs.spans[1]] = lesson.ranges
-            self._backend.refill(given, inputs.buffer)
-            result = call.start_terms()
+            (recording, exchange), (poses, ranges) = self._ready, self._bound[0].spans
+            given = exchange.begin()
+            given[poses], given[ranges] = poses_around(lesson.pose, lesson.axes).reshape(-1), lesson.ranges
+            exchange.start(recording)
         elif stage == _STARTED:
             result = self._bound[1].terms(result, lesson.ranges)
         elif stage == _SUMMED:
@@ -135,7 +140,7 @@ class Learner:
     @functools.cached_property
     def _bound(self) -> tuple[Packed, Any]:
         """Poses and readings of a lesson on the device, and the call that scores them; None if the host must score."""
-        backend, count, precision = self._backend, self._model.scanner.count, np.dtype(self._model.precision)
+        backend, count, precision = self._model.backend, self._model.scanner.count, np.dtype(self._model.precision)
         inputs = Packed(backend, (3 * _POSES, count))
         poses = backend.view(inputs.parts[0], (_POSES, 3), _DOUBLE)
         out = backend.view(backend.empty_external(_POSES, precision), (_POSES,), precision)

@@ -63,7 +63,8 @@ class Sensor:
     def begin_lesson(self, pose: np.ndarray, covariance: np.ndarray, reading: tuple[Any, ...]) -> None:
         """Begin to learn from the last scan at the estimated pose."""
         if self.learner is not None:
-            self.learner.begin(pose, covariance, reading, self.values_of(reading) if self.records(reading) else None)
+            ranges = self.values_of(reading).copy() if self.records(reading) else None
+            self.learner.begin(pose, covariance, reading, ranges)
 
     def values_of(self, reading: tuple[Any, ...]) -> np.ndarray:
         """Return the ranges of a scan on the host, in float64."""

@@ -62,7 +62,8 @@ def test_a_correction_is_one_graph_with_a_copy_of_its_inputs_and_one_of_its_resu
         pf.correct(ranges)
         pf.estimate()
         if step > 4 and pf._cloud.summary().stages == 1:
-            assert copies == ["upload", "download"]
+            # The copies are part of the graph.
+            assert not copies
             assert pf.explain().endswith("launches and 2 copies")
 
 

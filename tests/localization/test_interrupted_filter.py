@@ -17,7 +17,7 @@ from support.interrupts import Line, executed_lines, interrupt
 from support.tracking_scene import field
 
 import gpusense as gs
-from gpusense.backends.workspace import RecordedProgram
+from gpusense.backends.base import Exchange
 from gpusense.localization import journal, lessons, rival, sensors, starts
 
 # Rooms with lines to interrupt: lower rooms do not use filters.
@@ -147,7 +147,7 @@ def fail_in_every_call(name: str, backend: str, monkeypatch: pytest.MonkeyPatch)
     pf.correct(readings(pf, 3))
     after, count = everything(pf), [0]
     owners = [(one, call) for one in pf.models for call in ("start_scoring", "log_likelihood") if hasattr(one, call)]
-    for owner, call in (*owners, (RecordedProgram, "__call__")):
+    for owner, call in (*owners, (Exchange, "start")):
         inner = getattr(owner, call)
 
         def failing(*arguments, inner=inner, **options):

@@ -14,11 +14,11 @@ import numpy as np
 import warp as wp
 
 from gpusense._util.memory import prefer_large_pages
-from gpusense.backends.base import Adopted, Backend, BackendInfo, ProcessBound, Recording
+from gpusense.backends.base import Adopted, Backend, BackendInfo, Exchange, ProcessBound, Recording
 from gpusense.backends.processor import Staging
 from gpusense.backends.recycled import ResultMemory
 from gpusense.backends.warp.arrays import adopted, has_protocol, slots_of
-from gpusense.backends.warp.graphs import GraphCache, WarpRecording
+from gpusense.backends.warp.graphs import GraphCache, GraphExchange, WarpRecording
 from gpusense.backends.warp.launch import SCALARS, Launch, host_view
 from gpusense.backends.warp.pieces import SharedLaunch, shared
 from gpusense.backends.warp.queue import CallQueue
@@ -192,6 +192,11 @@ class WarpBackend(ProcessBound, Backend):
         self._wait()
         if queue is not None:
             queue.deliver()
+
+    def exchange(self, inputs: wp.array, given: int, results: wp.array, taken: int, dtype: np.dtype) -> Exchange:
+        if not self.info.graphs:
+            return super().exchange(inputs, given, results, taken, dtype)
+        return GraphExchange(self, self._device, self._graphs, (inputs, given), (results, taken))
 
     def begin_batch(self) -> None:
         if not self.info.graphs:

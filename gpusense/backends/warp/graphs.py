@@ -11,11 +11,12 @@ import threading
 from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple
 
+import numpy as np
 import warp as wp
 
-from gpusense.backends.base import Recording
+from gpusense.backends.base import Backend, Exchange, Recording
 from gpusense.backends.processor import HELPERS
-from gpusense.backends.warp.queue import Step, as_graph, one_by_one, start_each
+from gpusense.backends.warp.queue import Copy, Step, as_graph, one_by_one, start_each
 
 _LOG = logging.getLogger("gpusense")
 
@@ -183,7 +184,7 @@ class WarpRecording(Recording, Step):
     def __init__(self, device: wp.Device, graphs: GraphCache, steps: list[Step]) -> None:
         self._device, self._graphs, self._steps = device, graphs, steps
         self.key = next(self._numbers)
-        self.launches = sum(step.launches for step in steps)
+        self.launches, self.copies = sum(step.launches for step in steps), sum(step.copies for step in steps)
         self._graph: Any = None
         # Whether the driver refuses a graph of these launches.
         self._refused = False
@@ -191,6 +192,8 @@ class WarpRecording(Recording, Step):
         # True once they were started singly: this loads modules, for which a capture must not wait.
         self._loaded = False
         self._streams: dict[int, wp.Stream] = {}
+        # The recording with copies of its exchange.
+        self.exchanged: WarpRecording | None = None
         # The streams on which they were started since the last wait; the processor has none.
         self._used: set[wp.Stream | None] = set()
         self._lock = threading.Lock()
@@ -244,3 +247,40 @@ class WarpRecording(Recording, Step):
         if address not in self._streams:
             self._streams[address] = wp.Stream(self._device, cuda_stream=address)
         return self._streams[address]
+
+
+class GraphExchange(Exchange):
+    """An exchange through page-locked memory, whose copies are part of the graph of a recording."""
+
+    def __init__(
+        self, backend: Backend, device: wp.Device, graphs: GraphCache, inputs: tuple[wp.array, int],
+        results: tuple[wp.array, int],
+    ) -> None:  # fmt: skip
+        here = dict(device="cpu", pinned=device.is_cuda)
+        given, taken = (wp.zeros(count, dtype=array.dtype, **here) for array, count in (inputs, results))
+        super().__init__(backend, inputs[0], given.numpy(), results[0], taken.numpy())
+        self._device, self._graphs = device, graphs
+        self._copies = Copy(inputs[0], given, inputs[1]), Copy(taken, results[0], results[1])
+        # True if the last start copies the results.
+        self._takes = False
+
+    def start(self, recording: Recording, *, between: Callable[[], None] | None = None) -> None:
+        self._takes = False
+        if between is not None or not isinstance(recording, WarpRecording):
+            super().start(recording, between=between)
+            return
+        self._busy = self._takes = True
+        if recording.exchanged is None:
+            to_device, to_host = self._copies
+            recording.exchanged = WarpRecording(self._device, self._graphs, [to_device, recording, to_host])
+        recording.exchanged()
+
+    def explain(self, recording: Recording) -> str:
+        return (getattr(recording, "exchanged", None) or recording).explain()
+
+    def finish(self) -> np.ndarray:
+        if not self._takes:
+            return super().finish()
+        self._backend.synchronize()
+        self._busy = False
+        return self._taken.copy()

@@ -16,8 +16,8 @@ import numpy as np
 
 from gpusense.backends import Backend, arrays
 from gpusense.backends.arrays import Result
-from gpusense.backends.base import Adopted, Buffer
-from gpusense.backends.workspace import POSE_STATUS, ProgramCache, RecordedProgram, Workspace
+from gpusense.backends.base import Adopted, Buffer, Exchange, Recording
+from gpusense.backends.workspace import POSE_STATUS, Packed, ProgramCache, RecordedProgram, Workspace
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.launches import Program
 from gpusense.models.chunking import chunk_of, finish
@@ -221,6 +221,7 @@ class RecordedCall(ReplayedCall):
         if status is not None:
             self._space.share(POSE_STATUS[0], status, 2, _INT)
         self._first: Program = ()
+        self._exchange: tuple[Buffer, Exchange] | None = None
         if own_scans:
             self._readings = self._placed_scans(adopted, placed.count)
         else:
@@ -242,21 +243,18 @@ class RecordedCall(ReplayedCall):
         self._current()
         return self._program()
 
-    def refresh(self) -> None:
-        """Record the program anew if the map has changed; not within a batch."""
-        self._current()
+    def exchange(self, inputs: Packed) -> tuple[Recording, Exchange]:
+        """Return the recording for the present map, and its exchange of the inputs and of results for ``terms``."""
+        recording, backend = self._current().recording, self._pipeline.backend
+        if self._exchange is None or self._exchange[0] is not self._parts:
+            count = self._poses.count * self._readings.readings
+            exchange = backend.exchange(inputs.buffer, inputs.size, self._parts, count, self._pipeline.real)
+            self._exchange = self._parts, exchange
+        return recording, self._exchange[1]
 
-    def start_terms(self) -> np.ndarray:
-        """Start a call as part of this thread's batch; the device fills the result, for ``terms``, before it is idle.
-
-        The call must be recorded for the present map.
-        """
-        self.begin()
-        each = np.empty((self._poses.count, self._readings.readings), self._pipeline.real)
-        return self._pipeline.backend.download(self._parts, each, wait=False)
-
-    def terms(self, each: np.ndarray, ranges: np.ndarray) -> np.ndarray:
-        """Return the (N, K) terms of readings ``ranges`` from the result of ``start_terms``."""
+    def terms(self, results: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+        """Return the (N, K) terms of readings ``ranges`` from the results of an exchange."""
+        each = results.reshape(self._poses.count, -1)
         return terms_of(self._pipeline, each, self._pipeline.classed(ranges[None]))
 
     def _placed_readings(self, adopted: Adopted, limits: np.dtype) -> Readings:

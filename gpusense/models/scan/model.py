@@ -274,7 +274,7 @@ class ScanModel(Pickled):
             finish(self._workspace, on_device=True)
 
     def bind_terms(self, poses: Any, ranges: Any, out: Any) -> RecordedCall | None:
-        """Bind (N, 3) poses and (K,) float64 readings on the device to a call for ``RecordedCall.start_terms``.
+        """Bind (N, 3) poses and (K,) float64 readings on the device to a call for ``RecordedCall.terms``.
 
         A model whose readings the host must prepare returns None.
         """

@@ -234,14 +234,14 @@ class Belief(NamedTuple):
         if repeats:
             new = fresh = new_part(ratio, ratio, STAYS)
         alike = self.alike * math.exp(-way / ALIKE_LENGTH - turn / ALIKE_TURN)
-        stays, added = self.wrong * (1 - found), (1 - self.wrong) * lost
+        wrong = self.wrong
+        stays, added = wrong * (1 - found), (1 - wrong) * lost
         # A place that became wrong since must also repeat the last scan to look alike.
         added_alike = ALIKE * (1 - rho)
         after = stays * _changed(alike, new) + added * _changed(added_alike, fresh)
-        return self._replace(
-            log_odds=math.log(after) - math.log1p(-stays - added), ratio=ratio, pose=pose, scans=0, chosen=False,
-            alike=(stays * alike + added * added_alike) / after,
-        )  # fmt: skip
+        log_odds = math.log(after) - math.log1p(-stays - added)
+        alike = (stays * alike + added * added_alike) / after
+        return Belief(log_odds, ratio, pose, 0, False, alike, self.compared)
 
     def compared_with(self, pose: tuple[float, float, float], ratio: float) -> Belief:
         """Return the belief after comparing the last judged pose with other places; a ratio of NaN compares nothing."""

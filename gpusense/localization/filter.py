@@ -110,10 +110,11 @@ class ParticleFilter(Transactional):
 
     def _moved(self) -> Tracker:
         """Return the particles after the motion of the last ``predict``."""
-        self._parts.check_started()
-        if self._parts.tracker.progress.motion is not None:
+        tracker = self._parts.tracker
+        tracker.check_started()
+        if tracker.progress.motion is not None:
             self._move()
-        return self._parts.tracker
+        return tracker
 
     # ---- starts
 
@@ -186,11 +187,12 @@ class ParticleFilter(Transactional):
             RuntimeError: the filter is not initialised.
             TypeError, ValueError: an argument breaks its rule.
         """
-        self._parts.check_started()
+        tracker, rival = self._parts.tracker, self._parts.recovery.rival
+        tracker.check_started()
         sampled = self.motion.sampled(*motion)
-        if self._parts.tracker.progress.motion is None and self._parts.recovery.active is None:
+        if tracker.progress.motion is None and (rival is None or not rival.active):
             # A single assignment, indivisible by interrupts.
-            self._parts.tracker.follow(sampled)
+            tracker.follow(sampled)
         else:
             self._follow(sampled)
 
@@ -226,7 +228,6 @@ class ParticleFilter(Transactional):
             KeyError: a model that is not the filter's.
             TypeError, ValueError: readings that the model refuses.
         """
-        self._parts.check_started()
         self._parts.correct(readings)
 
     @atomic

@@ -20,7 +20,7 @@ from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.pose_algebra import compose_poses, wrap_angle
 from gpusense.localization.rival import Recovery
-from gpusense.localization.sensors import Sensor, SensorReadings, copied, grid_of, readings_of
+from gpusense.localization.sensors import Sensor, SensorReadings, grid_of, readings_of
 from gpusense.localization.spread import Distances, margins_of, share_off, share_off_of, spread_of, verdict_label
 from gpusense.localization.state import Options
 from gpusense.localization.tracker import Tracker, is_together
@@ -43,18 +43,14 @@ class FilterCore:
         # Readings of the last correction by the index of their sensor.
         self.last: dict[int, tuple[Any, ...]] = {}
         self._learners = [sensor.learner for sensor in sensors if sensor.learner is not None]
+        self._owners = self.verdict, *self._learners, self.tracker, cloud, self.recovery
         self._margins = margins_of(sensors)
 
     def changing(self) -> tuple[Any, ...]:
         """Return the objects whose state a call may change, and keep their present buffers."""
-        return self, self.verdict, *self._learners, *self.tracker.changing(), *self.recovery.changing()
-
-    def check_started(self) -> None:
-        """Refuse to continue without particles."""
-        if not self.tracker.started:
-            raise RuntimeError(
-                "ParticleFilter: must be initialised first, by initialize, initialize_uniform or initialize_from"
-            )
+        self.tracker.cloud.keep()
+        rival = self.recovery.rival
+        return (self, *self._owners) if rival is None else (self, *self._owners, *rival.changing())
 
     # ---- starts
 
@@ -101,11 +97,12 @@ class FilterCore:
 
     def correct(self, readings: Any) -> None:
         """Weigh the particles by readings; see ``ParticleFilter.correct``."""
-        # Copies, since the caller may reuse the arrays for the next readings; the verdict compares their identity.
-        used = [(index, tuple(map(copied, reading))) for index, reading in readings_of(readings, self.sensors)]
+        tracker, verdict, share = self.tracker, self.verdict, self.options.beam_skip
+        tracker.check_started()
+        used = readings_of(readings, self.sensors)
         if not used:
             return
-        tracker, verdict, share, everything = self.tracker, self.verdict, self.options.beam_skip, dict(used)
+        everything = dict(used)
         if verdict.watches(everything):
             verdict.predicted(*tracker.moved_particles(), everything)
         if share is not None:
@@ -113,8 +110,9 @@ class FilterCore:
             if is_together(tracker.mean_and_covariance()[1]):
                 used = skipped(self.sensors, used, particles, verdict.anywhere(), share)
         for learner in self._learners:
-            learner.receive()
-        judged = verdict.expected(everything, tracker.progress.motion)
+            if learner.lessons:
+                learner.receive()
+        judged = verdict.expected(used, tracker.progress.motion)
         tracker.weigh(used, judged=judged, meanwhile=functools.partial(self._use_wait, everything))
         tracker.learn(used, self.recovery.is_doubted)
         self.recovery.corrected(used, self.last)
@@ -122,10 +120,10 @@ class FilterCore:
     def _use_wait(self, readings: dict[int, tuple[Any, ...]]) -> None:
         """Count a correction, and advance the lessons of earlier ones unless scans contradict the pose."""
         self.last = readings
-        doubted = self.recovery.is_doubted()
-        self.verdict.corrected()
         for learner in self._learners:
-            learner.work(doubted=doubted)
+            if learner.lessons:
+                learner.work(doubted=self.recovery.is_doubted())
+        self.verdict.corrected()
 
     def reset(self) -> None:
         """Replace half of the particles by poses that make the last readings likely, moved by all later motion."""

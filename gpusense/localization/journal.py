@@ -30,24 +30,20 @@ R = TypeVar("R")
 class Journal:
     """The complete state of objects at one moment, and the call that may change them."""
 
-    __slots__ = ("_frame", "_objects")
+    __slots__ = ("_objects", "frame")
 
     def __init__(self, owners: Iterable[Any], frame: FrameType | None = None) -> None:
-        # Faster than choosing attributes, which ``restore`` does.
-        self._frame, self._objects = frame, [(one, one.__dict__.copy()) for one in owners]
+        # Faster than choosing attributes, which ``restore`` does. The frame refers back to this object.
+        self.frame, self._objects = frame, [(one, one.__dict__.copy()) for one in owners]
 
     def is_running(self) -> bool:
         """Return whether the present call is within the journal's call."""
         frame: FrameType | None = sys._getframe(1)
         while frame is not None:
-            if frame is self._frame:
+            if frame is self.frame:
                 return True
             frame = frame.f_back
         return False
-
-    def close(self) -> None:
-        """Drop the reference to the call's frame, which refers back to this object."""
-        self._frame = None
 
     def restore(self) -> None:
         """Restore everything; an interrupted restoration is repeated."""
@@ -85,7 +81,8 @@ def atomic(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P]
     @functools.wraps(method)
     def call(self: W, /, *args: P.args, **kwargs: P.kwargs) -> R:
         with self._calls:
-            self.settle()
+            if self._journal is not None:
+                self.settle()
             if self._journal is not None:
                 # A call within an atomic call.
                 return method(self, *args, **kwargs)
@@ -99,7 +96,7 @@ def atomic(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P]
                 self._journal = None
                 raise
             finally:
-                journal.close()
+                journal.frame = None
 
     return call
 
@@ -110,7 +107,8 @@ def consistent(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W
     @functools.wraps(method)
     def call(self: W, /, *args: P.args, **kwargs: P.kwargs) -> R:
         with self._calls:
-            self.settle()
+            if self._journal is not None:
+                self.settle()
             return method(self, *args, **kwargs)
 
     return call

@@ -105,7 +105,6 @@ class Learner:
         """Continue the oldest lesson, or end and start lessons of the first scans; drop all if scans are doubted."""
         if doubted:
             self.lessons, self.learned = (), -1
-        if not self.lessons:
             return
         first, *rest = self.lessons
         if first.stage == _KEPT or self.seen > DEFAULTS.calibrations:

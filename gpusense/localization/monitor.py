@@ -12,7 +12,7 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 from gpusense.localization import starts
 from gpusense.localization.diagnosis import Diagnosis, diagnose
-from gpusense.localization.sensors import copied, readings_of, sensors_of
+from gpusense.localization.sensors import readings_of, sensors_of
 from gpusense.localization.spread import (
     LOST,
     Distances,
@@ -140,10 +140,10 @@ class PoseMonitor:
         Raises:
             TypeError, ValueError: an argument breaks its rule.
         """
-        # Copies, since the verdict and diagnose read the arrays later, when the caller may have reused them.
+        # Copies, since the caller may reuse the arrays before the verdict and diagnose read them.
         place = checks.array("pose", pose, (3,)).copy()
         spread = np.zeros((3, 3)) if covariance is None else _checked(covariance).copy()
-        readings = {index: tuple(map(copied, reading)) for index, reading in readings_of(ranges, self._sensors)}
+        readings = dict(readings_of(ranges, self._sensors))
         for index, reading in readings.items():
             if self._sensors[index].calibrates:
                 scanner = self._sensors[index].model.scanner

@@ -142,6 +142,10 @@ class Particles:
             self.block = weight_block(self.backend, count)
         self.places, self.count = places, count
 
+    def keep(self) -> None:
+        """Keep the present buffers in the next steps."""
+        self.kept = self.places
+
     # ---- launches
 
     def motion(self, origin: int, target: int, kind: int) -> Program:

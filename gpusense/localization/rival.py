@@ -35,7 +35,7 @@ from gpusense.localization.rival_search import RivalSearch, are_apart, can_searc
 from gpusense.localization.sensors import SensorReadings
 from gpusense.localization.spread import FAR, FAR_TURN, WIDE, deviations
 from gpusense.localization.tracker import Progress, Tracker
-from gpusense.localization.verdict import Verdict, sightings
+from gpusense.localization.verdict import Verdict, VerdictState, sightings
 
 # Log Bayes factors of a winning and a losing rival; scans to win for a converged rival, and for a rival with several
 # places; largest number of scans.
@@ -73,8 +73,9 @@ class Rival:
         self._search = RivalSearch(tracker.sensors)
 
     def changing(self) -> tuple[Any, ...]:
-        """Return the objects whose state a correction may change, and keep their present buffers."""
-        return self, *self._tracker.changing()
+        """Return the objects whose state a call may change, and keep their present buffers."""
+        self._tracker.cloud.keep()
+        return self, self._tracker, self._tracker.cloud
 
     def state(self) -> tuple[dict[str, Any], Contents, dict[str, Any]]:
         """Return the rival as plain data: its state, its particles and their memory."""
@@ -220,10 +221,6 @@ class Recovery:
         """The competing rival, or None."""
         return self.rival if self.rival is not None and self.rival.active else None
 
-    def changing(self) -> tuple[Any, ...]:
-        """Return the objects whose state a call may change, and keep their present buffers."""
-        return (self,) if self.rival is None else (self, *self.rival.changing())
-
     def restart(self) -> None:
         """Forget the rival for new particles."""
         self.everywhere = 0
@@ -241,7 +238,7 @@ class Recovery:
 
     def is_doubted(self) -> bool:
         """Return whether the last judged scans contradict the pose, or a rival competes with it."""
-        return self.active is not None or not self._tracker.together or self._verdict.doubts
+        return self.active is not None or not self._tracker.together or self._verdict.doubts(self._verdict.state)
 
     def corrected(self, readings: list[SensorReadings], last: Mapping[int, tuple[Any, ...]]) -> None:
         """Compare the particles with their rival, judge their pose, and search for a rival if scans contradict it.
@@ -250,26 +247,28 @@ class Recovery:
         ``last`` holds all beams of the readings.
         """
         tracker, verdict, rival = self._tracker, self._verdict, self.active
-        searches = self._searches and rival is None and (verdict.due or self._is_wanted())
+        before = verdict.state
         if rival is not None:
             self._compare(rival, readings)
         if not verdict.is_informed_by(last):
             return
         pose, covariance = tracker.mean_and_covariance()
         verdict.judge(pose, covariance, last, tracker.cloud.summary().evidence)
-        if searches and self._is_wanted():
+        if self._searches and rival is None and self._is_wanted(before):
             prior = 0.0 if self.everywhere else PRIOR
             self.everywhere = max(self.everywhere - 1, 0)
             step = tracker.progress.step
             ratio = self._made().start(pose, covariance, list(last.items()), step=step, prior=prior)
             verdict.compared(pose, covariance, ratio)
 
-    def _is_wanted(self) -> bool:
-        """Return whether the pose is contradicted or due for comparison, and the particles are not too wide."""
-        tracker = self._tracker
+    def _is_wanted(self, before: VerdictState) -> bool:
+        """Return whether to search, by the verdict of ``before`` and the present one."""
+        tracker, verdict = self._tracker, self._verdict
         if tracker.wide or (self.everywhere and not tracker.together):
             return False
-        return bool(self.everywhere) or self.is_doubted()
+        if self.everywhere or not tracker.together:
+            return True
+        return verdict.doubts(verdict.state) and (verdict.doubts(before) or verdict.is_due(before))
 
     def _compare(self, rival: Rival, readings: list[SensorReadings]) -> None:
         """Correct the rival, and replace the particles if it has won."""

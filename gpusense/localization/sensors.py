@@ -179,12 +179,12 @@ def grid_of(sensors: Sequence[Sensor]) -> OccupancyGrid | None:
 
 
 def readings_of(readings: Any, sensors: Sequence[Sensor]) -> list[SensorReadings]:
-    """Return the valid readings in the order of the sensors.
+    """Return copies of the valid readings in the order of the sensors, since the caller may reuse their arrays.
 
     A tuple that begins with an array holds several arguments of a reading; any other tuple is an array.
     """
     if type(readings) is np.ndarray and len(sensors) == 1:
-        return [(0, (readings,))]
+        return [(0, (readings.copy(),))]
     if isinstance(readings, Mapping):
         index = {id(sensor.model): i for i, sensor in enumerate(sensors)}
         for model in readings:
@@ -196,11 +196,7 @@ def readings_of(readings: Any, sensors: Sequence[Sensor]) -> list[SensorReadings
     else:
         pairs = [] if readings is None else [(0, readings)]
     several = [(i, value if _is_several(value) else (value,)) for i, value in pairs]
-    # Convert lists to arrays, to refuse ragged ones by name.
-    return [
-        (i, tuple(checks.as_array("readings", part, masked=True) if isinstance(part, list) else part for part in value))
-        for i, value in several
-    ]
+    return [(i, tuple(map(_copied, value))) for i, value in several]
 
 
 def _is_several(value: Any) -> bool:
@@ -208,6 +204,8 @@ def _is_several(value: Any) -> bool:
     return isinstance(value, tuple) and len(value) > 0 and (isinstance(value[0], list) or np.ndim(value[0]) > 0)
 
 
-def copied(part: Any) -> Any:
-    """Return a copy of a NumPy array, and any other part of a reading unchanged."""
+def _copied(part: Any) -> Any:
+    """Return a copy of a NumPy array or of a list as an array, which refuses ragged ones by name."""
+    if isinstance(part, list):
+        return checks.as_array("readings", part, masked=True)
     return part.copy() if isinstance(part, np.ndarray) else part

@@ -59,12 +59,14 @@ class Tracker:
         # Number of poses for recovery to inject, and half widths of the box around each.
         self.pool: tuple[int, starts.Spread] = 0, (0.0, 0.0, 0.0)
 
-    def changing(self) -> tuple[Any, ...]:
-        """Return the objects whose state a call may change; the call will not overwrite their present buffers."""
-        self.cloud.kept = self.cloud.places
-        return self, self.cloud
-
     # ---- particles
+
+    def check_started(self) -> None:
+        """Refuse to continue without particles."""
+        if not self.started:
+            raise RuntimeError(
+                "ParticleFilter: must be initialised first, by initialize, initialize_uniform or initialize_from"
+            )
 
     def key(self) -> starts.Key:
         """Return the two words of the seed, and the number of a new step."""

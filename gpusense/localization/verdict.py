@@ -22,7 +22,7 @@ from gpusense._util import checks
 from gpusense.localization.beam_consistency import BeamConsistency, beam_consistency
 from gpusense.localization.belief import Belief, evidence_of_scan, motion_between, ratio_of_features
 from gpusense.localization.motion import STILL, SampledMotion
-from gpusense.localization.sensors import Sensor
+from gpusense.localization.sensors import Sensor, SensorReadings
 from gpusense.localization.spread import TRACKING, spread_of
 from gpusense.models.landmark.base import FeatureModel
 
@@ -139,20 +139,17 @@ class Verdict:
         # Faster than ``_replace``.
         self.state = VerdictState(state.belief.counted(), state.corrections + 1, *state[2:])
 
-    @property
-    def due(self) -> bool:
-        """Return whether a single judgement of this correction may begin a search."""
-        return self.state.corrections % (_SELDOM if self.state.belief.wrong <= _SURE else _INTERVAL) == 0
+    def is_due(self, state: VerdictState) -> bool:
+        """Return whether a single judgement after a state may begin a search."""
+        return state.corrections % (_SELDOM if state.belief.wrong <= _SURE else _INTERVAL) == 0
 
     def doubt(self) -> None:
         """Restart at a pose from a search; the scans of the search are no evidence for it."""
         places = self.state.places + 1
         self.state = self.state._replace(belief=Belief.anywhere(after=places - 1), judged=-1, places=places)
 
-    @property
-    def doubts(self) -> bool:
-        """Return whether the scans contradict the pose, or few beams of the last judged ones agree with it."""
-        state = self.state
+    def doubts(self, state: VerdictState) -> bool:
+        """Return whether the scans of a state contradict the pose, or few of the last judged beams agree with it."""
         return state.explained < _FEW or (self.informed and state.belief.wrong > _DOUBT)
 
     @property
@@ -178,40 +175,32 @@ class Verdict:
         scans = sightings(self._sensors, readings, pose, covariance)
         ratio, explained = evidence_of_scan(scans)
         belief = state.belief
-        x, y, theta = (float(value) for value in pose)
+        x, y, theta = pose.tolist()
         if spread.apart:
             belief = belief.widened()
         elif spread.wide:
             belief = belief.judged((x, y, theta), math.nan)
         else:
-            ratios = [ratio, float(np.mean(state.ratios)) if state.ratios else math.nan]
-            known = [ratio for ratio in ratios if not math.isnan(ratio)]
-            belief = belief.judged((x, y, theta), sum(known) if known else math.nan)
-        places = 0 if belief.wrong < TRACKING else state.places
-        self.state = state._replace(
-            belief=belief,
-            judged=state.corrections,
-            explained=explained,
-            ratios=(),
-            places=places,
-            evidence=evidence,
-        )
+            if state.ratios:
+                of_features = float(np.mean(state.ratios))
+                ratio = of_features if math.isnan(ratio) else ratio + of_features
+            belief = belief.judged((x, y, theta), ratio)
+        places, count = 0 if belief.wrong < TRACKING else state.places, state.corrections
+        self.state = VerdictState(belief, count, count, explained, state.gains, (), places, evidence)
         return explained
 
-    def expected(
-        self, readings: Mapping[int, tuple[Any, ...]], motion: SampledMotion | None
-    ) -> list[tuple[int, tuple[Any, ...]]]:
+    def expected(self, readings: Sequence[SensorReadings], motion: SampledMotion | None) -> list[SensorReadings]:
         """Return the scans that will probably be judged after the next correction, for judging them within it."""
         # A sure pose will probably stay near the last judged pose.
         if self._pose is None or self._is_near((motion or STILL).after(self._pose.tolist()), 1):
             return []
         scans = []
-        for index, (ranges, *_) in readings.items():
-            sensor = self._sensors[index]
+        for index, reading in readings:
+            sensor, ranges = self._sensors[index], reading[0]
             # The model checks, and refuses or converts, other types.
             plain = type(ranges) is np.ndarray and ranges.dtype.kind == "f"
             if sensor.calibrates and plain and ranges.shape == (sensor.model.scanner.count,):
-                scans.append((index, (ranges,)))
+                scans.append((index, reading))
         return scans
 
     def _is_near(self, pose: np.ndarray | Sequence[float], later: int = 0) -> bool:

@@ -140,21 +140,23 @@ class FilterCore:
         """Return the estimate by "mean", "cluster" or "best"."""
         tracker, verdict, rival = self.tracker, self.verdict, self.recovery.rival
         cloud, shown = tracker.cloud, tracker.shown
-        mean, covariance = tracker.mean_and_covariance()
+        _, (mean, covariance), spread = tracker.described()
+        summary = cloud.summary()
         # Copies, which belong to the caller.
-        pose, covariance, summary = mean.copy(), covariance.copy(), cloud.summary()
-        about = covariance
-        if method == "best":
-            pose = tracker.host_particles()[int(np.argmax(cloud.host_weights(shown)))]
-        elif method == "cluster":
-            pose, covariance = clustered(tracker.host_particles(), cloud.host_weights(shown))
+        pose, covariance = mean.copy(), covariance.copy()
+        about, far = covariance, spread
         if method != "mean":
+            if method == "best":
+                pose = tracker.host_particles()[int(np.argmax(cloud.host_weights(shown)))]
+            else:
+                pose, covariance = clustered(tracker.host_particles(), cloud.host_weights(shown))
+                spread = spread_of(covariance)
             offset = pose - mean
             offset[2] = wrap_angle(offset[2])
             about = about + np.outer(offset, offset)
-        spread = spread_of(covariance)
-        if (spread if method == "mean" else spread_of(about)).narrow:
-            share, distances = share_off(about), None
+            far = spread_of(about)
+        if far.narrow:
+            share, distances = share_off(about, far), None
         else:
             particles = cloud.snapshot(shown)
             share = cloud.far_share(shown) if method == "mean" else share_off_of(*particles(), pose)

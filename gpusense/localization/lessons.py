@@ -90,7 +90,8 @@ class Learner:
 
     def receive(self) -> None:
         """Complete the terms of a started lesson, and let the program of the next one follow changes of the map."""
-        for number, lesson in enumerate(self.lessons):
+        may_start = 2 if self.seen <= DEFAULTS.calibrations else 1
+        for number, lesson in enumerate(self.lessons[:may_start]):
             if lesson.stage == _KEPT:
                 self._ready = self._bound[1].exchange(self._bound[0])
                 return

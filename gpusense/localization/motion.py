@@ -55,12 +55,15 @@ class MotionModel(Protocol):
         """Return the numbers of one step."""
 
 
-def _odometer(name: str, pose: object) -> tuple[float, float, float]:
-    """Return a checked pose of an odometer; arrays of three numbers would take most of the time of a step's motion."""
-    values = pose
-    if not (type(values) is np.ndarray and values.shape == (3,) and values.dtype == np.float64):
-        values = checks.array(name, pose, (3,))
-    x, y, theta = values.tolist()
+def _odometer(name: str, pose: Any) -> tuple[float, float, float]:
+    """Return a checked pose of an odometer; the general check would take most of the time of a step's motion."""
+    if type(pose) is np.ndarray and pose.shape == (3,) and pose.dtype == np.float64:
+        values = pose.tolist()
+    elif type(pose) in (tuple, list) and [type(one) for one in pose] == [float] * 3:
+        values = pose
+    else:
+        values = checks.array(name, pose, (3,)).tolist()
+    x, y, theta = values
     if not (abs(x) <= checks.FARTHEST and abs(y) <= checks.FARTHEST and abs(theta) <= checks.FARTHEST):
         checks.array(name, pose, (3,), largest=checks.FARTHEST)
     return x, y, theta

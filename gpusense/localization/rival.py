@@ -252,8 +252,8 @@ class Recovery:
             self._compare(rival, readings)
         if not verdict.is_informed_by(last):
             return
-        pose, covariance = tracker.mean_and_covariance()
-        verdict.judge(pose, covariance, last, tracker.cloud.summary().evidence)
+        _, (pose, covariance), spread = tracker.described()
+        verdict.judge(pose, covariance, last, tracker.cloud.summary().evidence, spread)
         if self._searches and rival is None and self._is_wanted(before):
             prior = 0.0 if self.everywhere else PRIOR
             self.everywhere = max(self.everywhere - 1, 0)

@@ -132,7 +132,12 @@ class Sensor:
         Float64 ranges on the device are returned instead, for a copy there.
         """
         ranges, self._placed = reading[0], (reading, None)
-        if type(ranges) is not np.ndarray:
+        plain = type(ranges) is np.ndarray
+        if plain and ranges.dtype == _DOUBLE and ranges.shape == (self.readings,):
+            values[...] = ranges
+            self._placed = reading, values
+            return None
+        if not plain:
             if arrays.on_device(ranges) and self.backend.reads(ranges):
                 adopted = self.backend.adopt(ranges, "ranges")
                 if adopted.dtype == _DOUBLE and adopted.shape == (self.readings,) and adopted.contiguous:

@@ -54,8 +54,10 @@ def deviations(covariance: Floats) -> tuple[float, float]:
 
 
 class Spread(NamedTuple):
-    """Classes of a covariance, by the largest standard deviations of position and heading."""
+    """Standard deviations of a covariance, and classes by them."""
 
+    position: float  # the position's largest standard deviation [m]
+    heading: float  # the heading's [rad]
     wide: bool  # true if the position's exceeds 0.5 m, or the heading's 0.25 rad
     # True if the position's exceeds 1 m, or the heading's 0.5 rad: the distribution may cover several places.
     apart: bool
@@ -68,7 +70,7 @@ def spread_of(covariance: Floats) -> Spread:
     """Classify a (3, 3) covariance of x, y [m] and heading [rad]."""
     position, heading = deviations(covariance)
     return Spread(
-        position > WIDE or heading > WIDE_TURN, position > FAR or heading > FAR_TURN,
+        position, heading, position > WIDE or heading > WIDE_TURN, position > FAR or heading > FAR_TURN,
         position < _NARROW and heading < _NARROW_TURN,
     )  # fmt: skip
 
@@ -83,17 +85,18 @@ def verdict_label(p_lost: float, wrong: float, *, wide: bool, apart: bool) -> Wo
     return "uncertain" if wide or apart or p_lost > TRACKING else "tracking"
 
 
-def share_off(covariance: Floats) -> float:
+def share_off(covariance: Floats, spread: Spread | None = None) -> float:
     """Return the probability that a normal error with a (3, 3) covariance is beyond 1 m or 0.5 rad.
 
     Position and heading are treated as independent, correct to second order in each.
     """
-    large, heading = deviations(covariance)
+    large, heading, *_, narrow = spread_of(covariance) if spread is None else spread
     if math.isinf(large):
         return 1.0
-    trace = max(float(covariance[0, 0] + covariance[1, 1]), 0.0)
-    small = math.sqrt(max(trace - large * large, 0.0))
-    within = _within_disc(large, small) * _within(FAR_TURN, heading)
+    within = _within(FAR_TURN, heading)
+    if not narrow:
+        trace = max(float(covariance[0, 0] + covariance[1, 1]), 0.0)
+        within *= _within_disc(large, math.sqrt(max(trace - large * large, 0.0)))
     return min(max(1.0 - within, 0.0), 1.0)
 
 

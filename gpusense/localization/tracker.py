@@ -20,7 +20,7 @@ from gpusense.localization.estimates import covariance_of, sample_size_of
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import STILL, SampledMotion
 from gpusense.localization.sensors import Sensor, SensorReadings
-from gpusense.localization.spread import WIDE
+from gpusense.localization.spread import WIDE, Spread, spread_of
 from gpusense.localization.state import Options, settings_of_step
 
 # Bins of the cloud [m, rad], error bound of its density, and normal quantile of the bound's probability.
@@ -54,8 +54,8 @@ class Tracker:
         self.started, self.progress, self.shown, self.wide = False, Progress(), options.most, 0
         # True if the particles are known to be concentrated; number of corrections.
         self.together, self.corrections = False, 0
-        # An estimate from the kernels, with its mean and covariance.
-        self._moments: tuple[np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
+        # The last result of ``described``.
+        self._moments: tuple[np.ndarray, tuple[np.ndarray, np.ndarray], Spread] | None = None
         # Number of poses for recovery to inject, and half widths of the box around each.
         self.pool: tuple[int, starts.Spread] = 0, (0.0, 0.0, 0.0)
 
@@ -120,10 +120,15 @@ class Tracker:
 
     def mean_and_covariance(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and covariance of the shown particles, arrays that do not change."""
+        return self.described()[1]
+
+    def described(self) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], Spread]:
+        """Return the estimate from the kernels, its mean and covariance, and the covariance's spread."""
         numbers, known = self.cloud.estimate(self.shown), self._moments
         if known is None or known[0] is not numbers:
-            known = self._moments = numbers, (numbers[:3], covariance_of(numbers))
-        return known[1]
+            covariance = covariance_of(numbers)
+            known = self._moments = numbers, (numbers[:3], covariance), spread_of(covariance)
+        return known
 
     # ---- state
 

@@ -23,7 +23,7 @@ from gpusense.localization.beam_consistency import BeamConsistency, beam_consist
 from gpusense.localization.belief import Belief, evidence_of_scan, motion_between, ratio_of_features
 from gpusense.localization.motion import STILL, SampledMotion
 from gpusense.localization.sensors import Sensor, SensorReadings
-from gpusense.localization.spread import TRACKING, spread_of
+from gpusense.localization.spread import TRACKING, Spread, spread_of
 from gpusense.models.landmark.base import FeatureModel
 
 # Random poses.
@@ -163,12 +163,13 @@ class Verdict:
         covariance: np.ndarray,
         readings: Mapping[int, tuple[Any, ...]],
         evidence: float = -math.inf,
+        spread: Spread | None = None,
     ) -> float:
         """Judge a pose (3,) by the last readings, unless they add almost nothing to a sure pose.
 
         Return the share of explained beams, or NaN. The evidence is log p(last | earlier readings) of the particles.
         """
-        state, spread = self.state, spread_of(covariance)
+        state, spread = self.state, spread_of(covariance) if spread is None else spread
         self._pose = pose
         if not spread.wide and evidence >= state.evidence - _DROP and self._is_near(pose):
             return state.explained

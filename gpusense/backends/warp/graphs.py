@@ -281,6 +281,7 @@ class GraphExchange(Exchange):
     def finish(self) -> np.ndarray:
         if not self._takes:
             return super().finish()
-        self._backend.synchronize()
+        if self._device.is_cuda:
+            wp.synchronize_stream(self._device.stream)
         self._busy = False
         return self._taken.copy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import time
 from collections.abc import Callable
@@ -72,8 +73,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.no_plot:
         check_library("matplotlib", "the picture, which --no-plot leaves out,")
         check_writable(args.output)
-    parts = _Parts()
-    parts.begin("devices, scene and references")
+    marks = [("devices, scene and references", time.perf_counter())]
     # Children prove new devices, so this process has time for the rest.
     with ThreadPoolExecutor(1) as other:
         prepared = other.submit(_prepare, args)
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     with working(scores, 2 * len(backends) + 1) as shown:
 
         def step(name: str) -> None:
-            parts.begin(name)
+            marks.append((name, time.perf_counter()))
             shown(name)
 
         _score_all(scene, references, backends, scores, failures, selected=args.backend is not None, step=step)
@@ -92,29 +92,15 @@ def run(args: argparse.Namespace) -> int:
         if not args.no_plot and {score.name for score in scores} == {BEAM, FIELD}:
             draw(scene, scores, args.output)
             written = args.output
-    parts.begin("report")
+    marks.append(("", time.perf_counter()))
+    seconds = {name: after - begin for (name, begin), (_, after) in itertools.pairwise(marks)}
     if args.json:
-        output.document(_document(scene, args.seed, scores, failures, written) | {"seconds": parts.seconds})
+        output.document(_document(scene, args.seed, scores, failures, written) | {"seconds": seconds})
     else:
         _report(scene, scores, failures, written)
     if args.verbose:
-        print("\nSeconds: " + ", ".join(f"{name} {seconds:.2f}" for name, seconds in parts.seconds.items()))
+        print("\nSeconds: " + ", ".join(f"{name} {taken:.2f}" for name, taken in seconds.items()))
     return 1 if failures else 0
-
-
-class _Parts:
-    """Seconds of the parts of a run, by name."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._name, self._begin = "", 0.0
-
-    def begin(self, name: str) -> None:
-        """End the last part, and begin another."""
-        now = time.perf_counter()
-        if self._name:
-            self.seconds[self._name] = now - self._begin
-        self._name, self._begin = name, now
 
 
 def _prepare(args: argparse.Namespace) -> tuple[Scene, dict[str, np.ndarray]]:

@@ -21,7 +21,7 @@ from gpusense.backends.warp.arrays import adopted, has_protocol, slots_of
 from gpusense.backends.warp.graphs import GraphCache, GraphExchange, WarpRecording
 from gpusense.backends.warp.launch import SCALARS, Launch, host_view
 from gpusense.backends.warp.pieces import SharedLaunch, shared
-from gpusense.backends.warp.queue import CallQueue
+from gpusense.backends.warp.queue import CallQueue, Copy
 from gpusense.backends.warp.settings import LOCK, initialize, load, settings
 from gpusense.interface.kernel_files import warp_files, warp_source
 from gpusense.interface.launches import Program
@@ -151,11 +151,15 @@ class WarpBackend(ProcessBound, Backend):
         if not size:
             # Warp takes a count of 0 as the whole array.
             return
+        from_size, to_size = (wp.types.type_size_in_bytes(array.dtype) for array in (source, target))
         queue = self.batch()
         if queue is not None:
+            if begin == to == 0 and source.dtype is target.dtype:
+                # One graph of the whole call, if the call repeats its arrays.
+                queue.steps.append(Copy(target, source, size // to_size))
+                return
             # The copy follows all deferred work.
             self._flush(queue)
-        from_size, to_size = (wp.types.type_size_in_bytes(array.dtype) for array in (source, target))
         wp.copy(target, source, dest_offset=to // to_size, src_offset=begin // from_size, count=size // from_size)
 
     def wrap_external(self, buffer: wp.array, shape: tuple[int, ...], dtype: np.dtype) -> wp.array:

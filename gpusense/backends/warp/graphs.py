@@ -80,7 +80,8 @@ class GraphCache:
                     return
                 _remember(self._seen, key, None, _MOST_SEEN)
         _note(steps, one_by_one, reason)
-        start_each(steps, None)
+        for step in steps:
+            step.replay()
 
     def capture(self, steps: list[Step]) -> Capture:
         """Capture the steps of a recording and start none of them."""
@@ -200,6 +201,9 @@ class WarpRecording(Recording, Step):
 
     def start(self, stream: wp.Stream | None) -> None:
         start_each(self._steps, stream)
+
+    def replay(self) -> None:
+        self()
 
     def note(self, started: str) -> None:
         self._started = started

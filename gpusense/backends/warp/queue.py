@@ -105,6 +105,10 @@ class Step(ABC):
     def start(self, stream: wp.Stream | None) -> None:
         """Start it on a stream, or on the device's current one."""
 
+    def replay(self) -> None:
+        """Start it on the device's current stream, as a graph where it has one."""
+        self.start(None)
+
     def note(self, started: str) -> None:  # noqa: B027
         """Note how the call with this step is started."""
 

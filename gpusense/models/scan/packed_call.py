@@ -122,12 +122,12 @@ class PackedCall:
         """Score poses that are not used in place; return False, and write nothing, if one is not finite."""
         backend, inputs, outputs = self._backend, self._inputs, self._outputs
         log_p, status = outputs.views
-        for slot, numbers in zip(self._slots, (poses, ranges), strict=True):
-            if type(slot) is tuple:
-                backend.copy(numbers, *slot)
-            elif slot is not None:
-                slot[...] = numbers
         with self._space:
+            for slot, numbers in zip(self._slots, (poses, ranges), strict=True):
+                if type(slot) is tuple:
+                    backend.copy(numbers, *slot)
+                elif slot is not None:
+                    slot[...] = numbers
             if inputs.host.size:
                 backend.upload(inputs.host, inputs.on_device, wait=False)
             self._recorded.begin(corners)

@@ -197,6 +197,23 @@ def test_arrays_on_the_device_repeat_a_recording(case, batching):
         model.log_likelihood(to_device(np.zeros((COUNT, 3), np.int32)), scan[:beams])
 
 
+@pytest.mark.parametrize("there", [(True, True), (True, False)])
+@pytest.mark.parametrize("kind", MODELS)
+def test_arrays_that_stay_in_place_are_copied_by_the_graph(kind, there, batching):
+    device, started = batching
+    model, plain = (kind(GRID, NEAR, backend=device) for _ in range(2))
+    poses, ranges = (to_device(one) if on else one for one, on in zip((cloud(0), mixed(0)), there, strict=True))
+    plain.log_likelihood(cloud(0), mixed(0))
+    out = to_device(np.zeros(COUNT, np.float32))
+    for seed in range(6):
+        poses.assign(cloud(seed))
+        before = len(started)
+        model.log_likelihood(poses, ranges, out=out)
+        assert seed < 4 or len(started) == before + 1
+        assert differing(out.numpy(), plain.log_likelihood(cloud(seed), mixed(0))) == 0
+    assert model._short.last.explain().endswith(" launches and 4 copies")
+
+
 @pytest.mark.parametrize("kind", MODELS)
 def test_bound_calls_copy_the_arrays_of_the_host_alone(kind, batching):
     model = kind(GRID, NEAR, backend=batching[0])

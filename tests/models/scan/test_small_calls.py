@@ -305,11 +305,12 @@ def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(batching, 
         for _ in range(3):
             model.log_likelihood(cloud(count, count), scan(1))
     # Two entries in use are never evicted for others, to avoid evicting in turn.
-    assert len(device._graphs._graphs) == 2 and len(device._graphs._seen) <= 2 and len(started) == 4
+    assert len(device._graphs._graphs) == 2 and len(device._graphs._seen) <= 2
+    held = {*device._graphs._graphs}
     monkeypatch.setattr(_warp_graphs, "_STALE", 2)
     for _ in range(4):
         model.log_likelihood(cloud(50, 50), scan(1))
-    assert len(device._graphs._graphs) == 2 and len(started) > 4
+    assert len(device._graphs._graphs) == 2 and {*device._graphs._graphs} != held
 
     def refuse(*arguments, **options):
         raise RuntimeError("no graphs here")

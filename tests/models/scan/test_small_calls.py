@@ -296,7 +296,7 @@ def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(batching, 
 
     from gpusense.backends.warp import graphs as _warp_graphs
 
-    device, started = batching
+    device = batching[0]
     monkeypatch.setattr(_warp_graphs, "_MOST_GRAPHS", 2)
     monkeypatch.setattr(_warp_graphs, "_MOST_SEEN", 2)
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=device)

@@ -14,9 +14,20 @@ from numpy.typing import NDArray
 
 from gpusense._util.angles import wrapped
 from gpusense._util.typing import Flags, Floats, Integers
-from gpusense.chaining.following import matched_again, matched_by_motion, motions_around, weakened
 from gpusense.chaining.links import MATCH, Links, chained, filled_motion, partial_motion, relative, scan_motions
-from gpusense.chaining.matcher import GROUP, GUIDED_GROUP, NEAR, SURE, ChainOptions, Matcher, jumps_of
+from gpusense.chaining.matcher import (
+    GROUP,
+    GUIDED_GROUP,
+    NEAR,
+    SURE,
+    ChainOptions,
+    Matcher,
+    jumps_of,
+    matched_again,
+    matched_by_motion,
+    motions_around,
+    weakened,
+)
 from gpusense.localization.pose_algebra import compose_poses, invert_poses, pose_difference, wrap_angle
 from gpusense.matching.result import ScanMatch
 from gpusense.world.scanner import Scanner

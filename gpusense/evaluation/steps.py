@@ -15,9 +15,9 @@ from gpusense._util.typing import Floats
 from gpusense.evaluation.trajectory_files import nearest_index, poses_at, read_tum
 from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
 from gpusense.logs import Odometry, Pose, Scan
-from gpusense.logs.bag_poses import PoseTrack, read_poses
 from gpusense.logs.reader import LogOptions, format_of, read_laser, read_lasers
 from gpusense.logs.records import check_scanner
+from gpusense.logs.ros import PoseTrack, read_poses
 from gpusense.world.scanner import Scanner
 
 # Logged poses count as copied odometry if no step differs by more than this [m, rad].
@@ -171,7 +171,7 @@ def posed_scans(
 ) -> tuple[str, list[Step]]:
     """Return the steps of a log that have a pose of a localiser, as their reference, and the origin of the poses.
 
-    ``source``: A TUM trajectory as a path, or a topic of a bag as for :func:`gpusense.logs.bag_poses.read_poses`. None
+    ``source``: A TUM trajectory as a path, or a topic of a bag as for :func:`gpusense.logs.ros.read_poses`. None
     takes the likeliest poses of a bag, and the logged poses of another log.
     """
     times = [step.scan.time for step in steps]

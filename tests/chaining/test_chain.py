@@ -12,7 +12,7 @@ from support.selection import present
 
 import gpusense as gs
 from gpusense.chaining.chain import Chainer
-from gpusense.chaining.following import motions_around
+from gpusense.chaining.matcher import motions_around
 from gpusense.chaining.place_recognition import overlaps
 
 

@@ -15,7 +15,7 @@ from support.bags import BASE, LASER, Writer
 
 import gpusense as gs
 from gpusense.logs import bag_storage, bags
-from gpusense.logs.bag_poses import read_poses
+from gpusense.logs.ros import read_poses
 
 TIMES = np.arange(5.0) + 10
 

@@ -28,7 +28,7 @@ import numpy as np
 from gpusense._util.typing import Floats
 from gpusense.learning.beam.pairs import BIAS, FORM, HIT, RAND, RATE, SHORT, SIGMA, Point
 from gpusense.learning.beam.problem import NOTHING, SMALL_FORM, Problem, Value
-from gpusense.learning.information import scaled_axes
+from gpusense.learning.fitted import scaled_axes
 
 # Longest step of a log shape.
 _LONGEST = 2.0

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers
-from gpusense.learning.information import number_blocks
+from gpusense.learning.fitted import number_blocks
 from gpusense.world.hit_shapes import NORMAL, HitShape, name_of, shape_of
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.plausible import look_at_readings

@@ -25,8 +25,7 @@ from gpusense.learning.beam.em import Climb, Watch, climb_em
 from gpusense.learning.beam.optimum import Search
 from gpusense.learning.beam.pairs import BIAS, FORM, HIT, MAX, NAMES, RAND, RATE, SHORT, SIGMA, Pairs, Point
 from gpusense.learning.beam.problem import NOTHING, Problem, Value
-from gpusense.learning.fitted import BeamFit
-from gpusense.learning.information import errors_of, notes_on_blocks, scatter_of
+from gpusense.learning.fitted import BeamFit, errors_of, notes_on_blocks, scatter_of
 from gpusense.learning.point.densities import by_shape, truncated
 from gpusense.world.range_causes import ShortDensity
 from gpusense.world.scanner import Reading

@@ -21,8 +21,7 @@ from gpusense.learning.discrete.probabilities import (
     separate_causes,
     shared_causes,
 )
-from gpusense.learning.fitted import DiscreteFit
-from gpusense.learning.information import number_blocks
+from gpusense.learning.fitted import DiscreteFit, number_blocks
 from gpusense.learning.point.problem import Problem, maximize, report
 from gpusense.peers.weights import check_weights
 from gpusense.world.parameters import BeamParameters

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util import checks
 from gpusense._util.angles import wrapped
 from gpusense._util.typing import Floats
-from gpusense.learning.fitted import PointFit
-from gpusense.learning.information import number_blocks
+from gpusense.learning.fitted import PointFit, number_blocks
 from gpusense.learning.point.densities import von_mises, wrapped_normal
 from gpusense.learning.point.problem import Problem, maximize, mix, of_weight, places_of, report
 from gpusense.world.sensor_parameters import HeadingParameters, PositionParameters

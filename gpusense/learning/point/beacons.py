@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers
-from gpusense.learning.fitted import PointFit
-from gpusense.learning.information import number_blocks
+from gpusense.learning.fitted import PointFit, number_blocks
 from gpusense.learning.point.densities import truncated
 from gpusense.learning.point.problem import Problem, maximize, mix, of_weight, places_of, report
 from gpusense.world.hit_shapes import NORMAL, StudentHit

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import Floats, Precision, Space
 from gpusense.backends import Selection, get_backend
-from gpusense.learning.fitted import PointFit
-from gpusense.learning.information import number_blocks
+from gpusense.learning.fitted import PointFit, number_blocks
 from gpusense.learning.point.problem import Problem, maximize, mix, of_weight, report
 from gpusense.models.point.bumper import BumperModel
 from gpusense.world.grid import OccupancyGrid

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers
-from gpusense.learning.fitted import P, PointFit
-from gpusense.learning.information import FEW_BLOCKS, errors_of, notes_on_blocks, scatter_of
+from gpusense.learning.fitted import FEW_BLOCKS, P, PointFit, errors_of, notes_on_blocks, scatter_of
 
 
 def places_of(poses: Floats, mount: object) -> Floats:

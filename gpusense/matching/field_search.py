@@ -38,8 +38,6 @@ from gpusense.world.scanner import classify_ranges
 _BLOCK, _MOST_LEVELS = 0.8, 5
 # Tiles along a side of a cell for bilinear fields, if this many table cells suffice.
 _TILES, _MOST_TABLE_CELLS = (4, 2, 1), 1 << 25
-# Most blocks of poses that are bounded together, by kind of device.
-_MOST_BLOCKS = {"cpu": 1 << 25, "gpu": 1 << 27}
 # Rounding of a log-likelihood, in steps for each hit.
 _ROUNDING = 2e-3
 # Larger than the number of any pose.
@@ -57,18 +55,6 @@ class Candidates(NamedTuple):
     scan: np.ndarray  # (M,) scan of each pose
     best: np.ndarray  # (S,) row of the likeliest pose of each scan
     evaluated: int  # poses and blocks of poses that were evaluated, on average over the scans of a search
-
-    @classmethod
-    def joined(cls, parts: Sequence[Candidates]) -> Candidates:
-        """Return the poses of several searches, at least one."""
-        if len(parts) == 1:
-            return parts[0]
-        begins, scans = (np.cumsum([0, *map(len, column)]).tolist()
-                         for column in ([part.poses for part in parts], [part.best for part in parts]))  # fmt: skip
-        poses, score, log_p = (np.concatenate([part[k] for part in parts]) for k in range(3))
-        scan, best = (np.concatenate([part[k] + begin for begin, part in zip(offsets, parts, strict=False)])
-                      for k, offsets in ((3, scans), (4, begins)))  # fmt: skip
-        return cls(poses, score, log_p, scan, best, sum(part.evaluated * len(part.best) for part in parts) // scans[-1])
 
 
 class FieldSearch:
@@ -152,17 +138,14 @@ class FieldSearch:
         cells = [part / self.grid.resolution for part in points]
         most = [math.ceil(depth * TOP * len(part)) for part in points]
         if self._tiles:
-            return Candidates.joined([
-                self._find_between(model, scan, part, searched, allowed, slack)
-                for scan, part, slack in zip(ranges, cells, most, strict=True)
-            ])  # fmt: skip
-        level = self._search.first_level(cells, searched)
-        most_blocks = _MOST_BLOCKS[self._search.tables.backend.info.kind]
-        each = max(most_blocks // max(searched.count >> 2 * level, 1), 1)
-        parts = [slice(begin, begin + each) for begin in range(0, len(points), each)]
-        return Candidates.joined([
-            self._find_on(model, ranges[part], cells[part], most[part], searched, allowed) for part in parts
-        ])  # fmt: skip
+            parts = [self._find_between(model, scan, part, searched, allowed, slack)
+                     for scan, part, slack in zip(ranges, cells, most, strict=True)]  # fmt: skip
+            poses, score, evaluated = zip(*parts, strict=True)
+            counts, unknown = [*map(len, score)], np.full(sum(map(len, score)), np.nan)
+            scan, first = np.repeat(np.arange(len(parts)), counts), np.cumsum([0, *counts[:-1]])
+            return Candidates(np.concatenate(poses), np.concatenate(score), unknown, scan, first,
+                              sum(evaluated) // len(parts))  # fmt: skip
+        return self._find_on(model, ranges, cells, most, searched, allowed)
 
     def _find_on(
         self, model: LikelihoodFieldModel, ranges: np.ndarray, cells: Sequence[np.ndarray], most: Sequence[int],
@@ -193,8 +176,11 @@ class FieldSearch:
     def _find_between(
         self, model: LikelihoodFieldModel, ranges: np.ndarray, cells: np.ndarray, searched: PoseGrid,
         allowed: np.ndarray | None, most: int,
-    ) -> Candidates:  # fmt: skip
-        """Return the likeliest poses of a bilinear field: all whose bounds reach a known likelihood."""
+    ) -> tuple[np.ndarray, np.ndarray, int]:  # fmt: skip
+        """Return the likeliest poses (M, 3) of a scan in a bilinear field, and their scores, by falling score.
+
+        All poses whose bounds reach a known likelihood are evaluated; the last number counts them and their blocks.
+        """
         # A cell of the tables lies between four centres, also in the ring outside the map.
         shifted = PoseGrid(searched.start + 0.5, searched.headings, searched.height, searched.width)
 
@@ -225,9 +211,7 @@ class FieldSearch:
         score = self._steps(model, ranges, len(cells), poses)
         order = np.lexsort((heading, col, row, -score))
         order = order[score[order] >= score.max() - most]
-        scan = np.zeros(len(order), np.intp)
-        return Candidates(poses[order], score[order] / (TOP * len(cells)), np.full(len(order), np.nan), scan, scan[:1],
-                          evaluated)  # fmt: skip
+        return poses[order], score[order] / (TOP * len(cells)), evaluated
 
     def _steps(self, model: LikelihoodFieldModel, ranges: np.ndarray, hits: int, poses: np.ndarray) -> np.ndarray:
         """Return the log-likelihoods of the hits at poses as scores."""

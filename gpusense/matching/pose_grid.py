@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,6 +56,19 @@ class Found:
     score: np.ndarray  # (M,) its score, the sum of cells over the scan's points
     evaluated: int  # poses and blocks that were evaluated
     complete: np.ndarray  # (S,) whether all poses of a scan within ``slack`` of its best one are here
+
+    @classmethod
+    def joined(cls, parts: Sequence[Found]) -> Found:
+        """Return the poses of searches of some scans after the other, at least one."""
+        if len(parts) == 1:
+            return parts[0]
+        begins = np.cumsum([0, *(len(part.complete) for part in parts)])
+        scan = np.concatenate([part.scan + begin for part, begin in zip(parts, begins, strict=False)])
+        row, col, heading, score, complete = (
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("row", "col", "heading", "score", "complete")
+        )
+        return cls(scan, row, col, heading, score, sum(part.evaluated for part in parts), complete)
 
     @property
     def best(self) -> np.ndarray:

@@ -35,8 +35,9 @@ _MOST_SUMS = {"cpu": 1 << 29, "gpu": 1 << 32}
 # Room at first for chosen blocks of a scan, room for their parts on each level by kind of device, a sixteenth of which
 # each scan adds, and most poses that are kept of a scan.
 _ROOM, _PARTS, _MOST_KEPT = 1 << 17, {"cpu": 1 << 18, "gpu": 1 << 20}, 1 << 18
-# Most items of one launch: some drivers allow 65535 groups along the last axis.
-_MOST_ITEMS = 1 << 15
+# Most items of several scans that are searched together, since some drivers allow 65535 groups along the last axis, and
+# most blocks whose bounds are kept, by kind of device.
+_MOST_ITEMS, _MOST_BLOCKS = 1 << 15, {"cpu": 1 << 25, "gpu": 1 << 27}
 # Poses of a scan that are read together with their number; by kind of device, work-items that divide blocks, and the
 # neighbouring blocks that each of them takes at a time.
 _READ, _WORKERS = 512, {"gpu": (1 << 17, 1), "cpu": (1 << 10, 64)}
@@ -71,13 +72,23 @@ class Search:
         by row, column and heading. A scan without points scores 0 everywhere. No pose is returned without an allowed
         position.
         """
-        level = self.first_level(points, grid) if level is None else level
-        run = _Run(self, grid, slack, self.masks(grid, allowed), level, floor)
-        with self.space:
-            run.place(points, images)
-            run.search()
+        level, scans = self.first_level(points, grid) if level is None else level, len(points)
+        if images is None and self.tables.shape.tables > 1:
+            images = [np.full(len(part), scan) for scan, part in enumerate(points)]
+        masks, slacks = self.masks(grid, allowed), np.broadcast_to(slack, scans)
+        turns = grid.headings.shape[1]
+        blocks = turns * -(-grid.height >> level) * -(-grid.width >> level)
+        each = max(min(_MOST_ITEMS // turns, _MOST_BLOCKS[self.tables.backend.info.kind] // blocks), 1)
+        found = []
+        for part in (slice(begin, begin + each) for begin in range(0, scans, each)):
+            some = PoseGrid(grid.start[part], grid.headings[part], grid.height, grid.width)
+            run = _Run(self, some, slacks[part], masks, level, floor)
+            with self.space:
+                run.place(points[part], None if images is None else images[part])
+                run.search()
+            found.append(run.found())
         self.tables.drop_levels()
-        return run.found()
+        return Found.joined(found)
 
     def first_level(self, points: Sequence[np.ndarray], grid: PoseGrid) -> int:
         """Return the level whose blocks are bounded first."""
@@ -137,8 +148,7 @@ class _Run:
         turned = np.stack([np.cos(headings), np.sin(headings)], axis=-1)
         turned = turned if len(turned) == len(each) else turned.repeat(len(each), axis=0)
         given = [ends, turned, grid.start.astype(np.float64), first]
-        if images is not None or tables.shape.tables > 1:
-            images = [np.full(count, scan) for scan, count in enumerate(each)] if images is None else images
+        if images is not None:
             named = [np.broadcast_to(part, (self._turns, count))[:, order].reshape(-1)
                      for part, count, order in zip(images, each, orders, strict=True)]  # fmt: skip
             given.append(np.concatenate([*named, [0]]).astype(np.int32))
@@ -154,21 +164,16 @@ class _Run:
         if len(given) < len(_GIVEN):
             inputs.append(there.empty("table 0", total, _INT, zero=True))
         made = [there.empty(name, size * total, _INT) for name, size in _MADE.items()]
-        place = backend.compile("place_ends", _NO_FLAGS)
-        for begin, end in self._parts_of_items():
-            place((self._most, end - begin), *inputs, *made, begin, end, self._turns, tables.stride, self._level,
-                  tables.step(self._level).bit_length() - 1, tables.shape.margin)  # fmt: skip
+        backend.compile("place_ends", _NO_FLAGS)(
+            (self._most, self._items), *inputs, *made, self._items, self._turns, tables.stride, self._level,
+            tables.step(self._level).bit_length() - 1, tables.shape.margin,
+        )  # fmt: skip
         if there is not space:
             inputs, made = ([space.upload(name, array) for name, array in zip(names, arrays, strict=True)]
                             for names, arrays in ((_GIVEN, inputs), (_MADE, made)))  # fmt: skip
         image, first = inputs[4], inputs[3]
         self._ends = made[0], image, first
         self._bound_ends, self._quarter_ends = ((made[1], images, first) for images in made[2:])
-
-    def _parts_of_items(self) -> list[tuple[int, int]]:
-        """Return the first item of each launch, and the one after its last."""
-        begins = range(0, self._items, _MOST_ITEMS)
-        return [(begin, min(begin + _MOST_ITEMS, self._items)) for begin in begins]
 
     def search(self) -> None:
         """Find first lower bounds, then divide all blocks whose bounds reach them."""
@@ -205,12 +210,11 @@ class _Run:
         self._score = self._space.empty("bounds", rows * self._width, _INT)
         flags = with_lanes_flag(self._backend.info.lanes, "shift_scores", _NO_FLAGS)
         columns = -(-self._width // RUN) if flags else self._width
-        for begin, end in self._parts_of_items():
-            self._launch(
-                "shift_scores", (columns, -(-self._height // SHIFT_ROWS), end - begin), folded.table,
-                *self._bound_ends, self._allowed[self._level], self._score, folded.shape, begin, end, self._height,
-                self._width, folded.unit, flags=flags,
-            )  # fmt: skip
+        self._launch(
+            "shift_scores", (columns, -(-self._height // SHIFT_ROWS), self._items), folded.table, *self._bound_ends,
+            self._allowed[self._level], self._score, folded.shape, self._items, self._height, self._width, folded.unit,
+            flags=flags,
+        )  # fmt: skip
         self._evaluated += rows * self._width
         self._maxima = self._space.empty("row maxima", 2 * rows, _INT)
         self._shift = max((TOP * self._most).bit_length() - BINS.bit_length() + 1, 0)

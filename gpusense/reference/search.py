@@ -109,7 +109,7 @@ def divided(
     return total
 
 
-def shift_scores(flags, table, point, image, first, allowed, score, scores, begin, items, height, width, unit):
+def shift_scores(flags, table, point, image, first, allowed, score, scores, items, height, width, unit):
     """Sum the losses of each item's points at all shifts by less than height rows and width columns, and write scores.
 
     A shift that is not allowed has -1.
@@ -117,7 +117,7 @@ def shift_scores(flags, table, point, image, first, allowed, score, scores, begi
     size = padded_lines(scores) * padded_stride(scores)
     total = score[: items * height * width].reshape(items, height, width)
     rows, cols = np.arange(height)[:, None], np.arange(width)[None, :]
-    for item in range(begin, items):
+    for item in range(items):
         total[item] = TOP * (first[item + 1] - first[item])
         for k in range(first[item], first[item + 1]):
             cells = table[int(image[k]) * size + cell_index(scores, point[k, 1] + rows, point[k, 0] + cols)]

@@ -4,12 +4,12 @@ import numpy as np
 
 
 def place_ends(
-    flags, end, heading, start, first, image, point, folded, bound_image, quarter_image, begin, items, turns, stride,
-    level, step_level, offset,
+    flags, end, heading, start, first, image, point, folded, bound_image, quarter_image, items, turns, stride, level,
+    step_level, offset,
 ):  # fmt: skip
     """Place the end points of scans at headings in cells of the tables, and in cells and images of folded tables."""
     period, side = stride << level, stride << (level - step_level)
-    for scan in range(begin // turns, items // turns):
+    for scan in range(items // turns):
         at, last = int(first[scan * turns]), int(first[(scan + 1) * turns])
         count = (last - at) // turns
         x, y = end[2 * (at // turns) : 2 * (at // turns + count)].reshape(count, 2).T

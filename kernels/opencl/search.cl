@@ -112,7 +112,7 @@ int4 divided(global const int *quarters, global const int2 *point, global const 
 // Sum the losses of each item's points at all shifts by less than height rows and width columns, and write the scores; a
 // shift that is not allowed has -1. One work-item takes SHIFT_ROWS rows of a column of an item.
 kernel void shift_scores(ARGUMENTS) {
-    const int col = get_global_id(0), row = SHIFT_ROWS * get_global_id(1), item = begin + get_global_id(2);
+    const int col = get_global_id(0), row = SHIFT_ROWS * get_global_id(1), item = get_global_id(2);
     if (col >= width || row >= height || item >= items) return;
     int some = 0;
     for (int i = 0; i < SHIFT_ROWS && row + i < height; ++i) some |= allowed[(row + i) * width + col];

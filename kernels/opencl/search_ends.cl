@@ -15,7 +15,7 @@ int cell_of(const double place) {
 // Place the end points of a scan at a heading in cells of the tables, in cells of folded tables, and in the images of folded
 // bounds and of folded quarters. One work-item takes a point of an item.
 kernel void place_ends(ARGUMENTS) {
-    const int n = get_global_id(0), item = begin + get_global_id(1);
+    const int n = get_global_id(0), item = get_global_id(1);
     if (item >= items || n >= first[item + 1] - first[item]) return;
     const int scan = item / turns, side = stride << (level - step_level), k = first[item] + n, m = 2 * (first[scan * turns] / turns + n);
     const double cosine = heading[2 * item], sine = heading[2 * item + 1];

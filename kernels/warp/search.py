@@ -159,12 +159,11 @@ def divided(
 
 
 @kernel
-def shift_scores(table, point, image, first, allowed, score, scores, begin, items, height, width, unit):
+def shift_scores(table, point, image, first, allowed, score, scores, items, height, width, unit):
     """Sum the losses of each item's points at all shifts by less than height rows and width columns, and write the
     scores; a shift that is not allowed has -1.
     """
-    part, block, col = wp.tid()
-    item = begin + part
+    item, block, col = wp.tid()
     row = SHIFT_ROWS * block
     if col >= width or row >= height or item >= items:
         return

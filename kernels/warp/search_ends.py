@@ -17,12 +17,11 @@ def periods(cell: wp.int32, stride: wp.int32, level: wp.int32):
 
 @kernel
 def place_ends(
-    end, heading, start, first, image, point, folded, bound_image, quarter_image, begin, items, turns, stride, level,
+    end, heading, start, first, image, point, folded, bound_image, quarter_image, items, turns, stride, level,
     step_level, offset,
 ):  # fmt: skip
     """Place the end points of a scan at a heading in cells of tables, and in cells and images of folded tables."""
-    part, n = wp.tid()
-    item = begin + part
+    item, n = wp.tid()
     if item >= items:
         return
     k = first[item] + n

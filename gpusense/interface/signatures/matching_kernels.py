@@ -89,13 +89,13 @@ KERNELS: dict[str, Kernel] = {
     "place_ends": kernel(
         "search_ends", "point item", "double end [2 * ends]", "double heading [2 * items]", "double start [2 * scans]",
         "int first [items + 1]", "int image [points]", "out int2 point [points]", "out int2 folded [points]",
-        "out int bound_image [points]", "out int quarter_image [points]", "int begin", "int items", "int turns",
-        "int stride", "int level", "int step_level", "int offset",
+        "out int bound_image [points]", "out int quarter_image [points]", "int items", "int turns", "int stride",
+        "int level", "int step_level", "int offset",
     ),
     "shift_scores": kernel(
         "search", "col rows item", _CELLS, *_ENDS, "uchar allowed [height * width]",
-        "out int score [items * height * width]", "ScoreTable scores", "int begin", "int items", "int height",
-        "int width", "int unit",
+        "out int score [items * height * width]", "ScoreTable scores", "int items", "int height", "int width",
+        "int unit",
     ),
     "row_maxima": kernel(
         "search", "row", "int score [rows * width]", "out int best [2 * rows]", "out int histogram [bins]",

@@ -8,7 +8,7 @@ typedef uint8 unaligned __attribute__((aligned(1)));
 // shift that is not allowed has -1. One work-item takes SHIFT_ROWS rows of RUN shifts of an item. The losses of together
 // points fit a byte, and those of 256 times as many points fit 16 bits.
 kernel void shift_scores(ARGUMENTS) {
-    const int col = RUN * get_global_id(0), row = SHIFT_ROWS * get_global_id(1), item = begin + get_global_id(2);
+    const int col = RUN * get_global_id(0), row = SHIFT_ROWS * get_global_id(1), item = get_global_id(2);
     if (col >= width || row >= height || item >= items) return;
     const int rows = height - row < SHIFT_ROWS ? height - row : SHIFT_ROWS, cols = width - col < RUN ? width - col : RUN;
     int some = 0;

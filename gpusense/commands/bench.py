@@ -28,7 +28,7 @@ from gpusense.evaluation.machine import machine, machine_line
 if TYPE_CHECKING:
     from gpusense.evaluation.benchmark.runner import Plan
 
-HELP = "Measure error against run time of every caster and model, and name the fastest method within an error."
+HELP = "Name the fastest method within an error or a time."
 FIRST = ("quick", "html", "map", "max_error", "max_time")
 SHARED = ("json",)
 

@@ -14,7 +14,7 @@ from gpusense.evaluation.machine import machine_line
 if TYPE_CHECKING:
     from gpusense.backends import Device
 
-HELP = "List the devices that gpusense can use, with remedies for absent or unusable devices."
+HELP = "List the devices, with a remedy for each that is absent."
 FIRST = ()
 SHARED = ("verbose",)
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from gpusense.world.grid import OccupancyGrid
     from gpusense.world.scanner import Scanner
 
-HELP = "Report the parts that the kernels omit, keep or could omit for a scene, with reasons."
+HELP = "Report what the kernels leave out for a scene, and why."
 FIRST = ("map", "log", "model", "parameters", "measure")
 SHARED = ("range", "model", "backend", "seed", "verbose")
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gpusense.features.result import Features
     from gpusense.logs import Scan
 
-HELP = "Extract lines, corners, doors, hallways, poles and reflectors from the scans of a log."
+HELP = "Extract lines, corners, doors and poles from scans."
 FIRST = ("log", "reference", "kinds", "map_out", "plot")
 SHARED = ("reference", "choice", "backend", "verbose")
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from gpusense.evaluation.range_data import RangeData
     from gpusense.localization.motion_fit import MotionFit
 
-HELP = "Fit the beam model's parameters to a recorded log in a map, or to pairs of readings and expected ranges."
+HELP = "Fit the beam model's parameters to a log, or to pairs."
 FIRST = ("map", "log", "reference", "holdout", "out")
 SHARED = ("reference", "pairs", "backend", "seed", "verbose")
 CODES = {1: "the fit did not converge"}

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from gpusense.models.scan.model import ScanModel
     from gpusense.world.grid import OccupancyGrid
 
-HELP = "Judge the poses of any localiser in a recording: when they were right, when lost, and why."
+HELP = "Judge the poses of any localiser: when right, when lost."
 FIRST = ("map", "log", "poses", "plot", "truth")
 SHARED = ("choice", "backend", "json")
 CODES = {0: "the poses were not lost", 1: "they were, or no scan had a reading to judge by"}

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from gpusense.learning.landmark.pairs import Suspicions
     from gpusense.logs.records import LandmarkRun
 
-HELP = "Fit the noise of landmark readings in a recorded run, check the map, and localise the robot."
+HELP = "Fit, check and localise a recorded run among landmarks."
 FIRST = ("folder", "robot", "known", "particles", "drift")
 SHARED = ("backend", "seed", "verbose")
 CODES = {1: "lost at the end"}

@@ -16,7 +16,7 @@ from gpusense.commands.signals import working
 if TYPE_CHECKING:
     import numpy as np
 
-HELP = "Draw the likelihood of a scan over all positions and headings of a map."
+HELP = "Draw the likelihood of a scan over all poses of a map."
 FIRST = ("map", "log", "scan", "out", "model")
 SHARED = ("range", "field", "backend", "verbose")
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from gpusense.localization.nav2 import Nav2Options
     from gpusense.world.grid import OccupancyGrid
 
-HELP = "Localise a robot along a recorded log with a particle filter."
+HELP = "Localise a robot along a log with a particle filter."
 FIRST = ("map", "log", "everywhere", "start", "plot")
 SHARED = ("beams", "choice", "backend", "seed", "verbose")
 CODES = {0: "the verdict is 'tracking'", 1: "uncertain or lost at the end, or no reading there to judge by"}

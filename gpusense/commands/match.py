@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gpusense.logs import Scan
     from gpusense.world.grid import OccupancyGrid
 
-HELP = "Match the scans of a recorded log to each other, or to a map."
+HELP = "Match the scans of a log to each other, or to a map."
 FIRST = ("log", "map", "reference", "tum", "plot")
 SHARED = ("reference", "choice", "backend", "seed", "verbose")
 

@@ -17,7 +17,7 @@ from gpusense.localization.defaults import DEFAULTS
 if TYPE_CHECKING:
     from gpusense.evaluation.scoring import Fitness, LogScore, Model
 
-HELP = "Score particles with the scans of a recorded log, and rank the logged poses among them."
+HELP = "Rank the logged poses of a log among particles."
 FIRST = ("map", "log", "reference", "parameters", "plot")
 SHARED = ("reference", "choice", "model", "backend", "seed", "verbose")
 CODES = {0: "the log fits the map", 1: "it does not or the verdict is uncertain"}

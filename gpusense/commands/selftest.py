@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gpusense.backends import Backend
     from gpusense.evaluation.tolerances import Check
 
-HELP = "Check that the backends present agree with the float64 truth and with each other."
+HELP = "Check that the backends agree with the float64 truth."
 FIRST = ("backend", "stiff")
 SHARED = ("verbose",)
 CODES = {0: "every difference is within its tolerance", 1: "one is not", 2: "bad input or an absent device"}

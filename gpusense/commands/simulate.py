@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from gpusense.world.grid import OccupancyGrid
     from gpusense.world.parameters import BeamParameters
 
-HELP = "Make the log of a robot that drives through a map, with noise, people and changes of the world."
+HELP = "Make the log of a robot that drives through a map."
 FIRST = ("world", "map", "log_out", "map_out", "scans")
 SHARED = ("seed", "json")
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gpusense.sweeps.job import Job
     from gpusense.sweeps.run import Sweep
 
-HELP = "Run many jobs from a plan, on processes or a Dask cluster, into a table that survives crashes."
+HELP = "Run many jobs from a plan into one table."
 FIRST = ("table", "processes", "device", "resume", "plot")
 SHARED = ("verbose",)
 CODES = {1: "some jobs failed", 2: "bad input, or the cluster ended"}

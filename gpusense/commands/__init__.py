@@ -2,12 +2,12 @@
 
 A command module has
 
-- ``HELP: str``, the line that ``gpusense --help`` shows, and optionally ``DESCRIPTION``, which its help shows instead;
+- optionally ``DESCRIPTION: str``, which its help shows in place of its line in :data:`gpusense.commands.cli.COMMANDS`;
 - ``FIRST``, the options that lead its help, and ``SHARED``, its options of :data:`gpusense.commands.arguments.SHARED`;
 - ``EPILOG: str``, the end of its help, with examples, and optionally ``CODES``, meanings of exit codes;
 - ``add_options(add) -> None``, which adds further options by :class:`gpusense.commands.arguments.Options`;
 - ``run(args) -> int``, which returns the exit code.
 
-Importing a command module is cheap: backends, drawing and rich are imported on use. A ValueError, TypeError, OSError or
-MemoryError of ``run`` is printed as one line on standard error.
+Only the module of the chosen command is imported; drawing and rich are imported on use. A ValueError, TypeError,
+OSError or MemoryError of ``run`` is printed as one line on standard error.
 """

@@ -211,7 +211,7 @@ class Output:
         return path
 
 
-picture, table, trajectory = Output(".png", ".pdf", ".svg"), Output(".csv"), Output(".tum", ".txt")
+picture, csv_file, tum_file = Output(".png", ".pdf", ".svg"), Output(".csv"), Output(".tum", ".txt")
 
 
 def output_folder(*suffixes: str) -> Callable[[str], Path]:

@@ -7,10 +7,11 @@ import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gpusense._util.files import write_whole
 from gpusense._util.typing import PRECISIONS
+from gpusense.backends import devices
 from gpusense.commands import output
 from gpusense.commands.arguments import (
     BACKEND_HELP,
@@ -22,13 +23,15 @@ from gpusense.commands.arguments import (
     whole_number,
 )
 from gpusense.commands.signals import working
+from gpusense.evaluation.benchmark.candidates import candidates
 from gpusense.evaluation.benchmark.choice import choices, parse_error, parse_time
+from gpusense.evaluation.benchmark.report import document, model_rows, to_json
+from gpusense.evaluation.benchmark.runner import Outcome, Plan, steps
+from gpusense.evaluation.benchmark.runner import run as run_plan
+from gpusense.evaluation.benchmark.scenes import sources
 from gpusense.evaluation.machine import machine, machine_line
+from gpusense.plots.error_page import error_page
 
-if TYPE_CHECKING:
-    from gpusense.evaluation.benchmark.runner import Plan
-
-HELP = "Name the fastest method within an error or a time."
 FIRST = ("quick", "html", "map", "max_error", "max_time")
 SHARED = ("json",)
 
@@ -107,10 +110,6 @@ def _limit(parse: Callable[[str], Any]) -> Callable[[str], Any]:
 
 def run(args: argparse.Namespace) -> int:
     """Measure and write the report; after Ctrl-C write and print the points so far."""
-    from gpusense.evaluation.benchmark.report import document
-    from gpusense.evaluation.benchmark.runner import Outcome, steps
-    from gpusense.evaluation.benchmark.runner import run as run_plan
-
     plan, absent = make_plan(args)
     outcome = Outcome([], [])
     with working(outcome.points, steps(plan)) as step:
@@ -136,10 +135,6 @@ def run(args: argparse.Namespace) -> int:
 
 def make_plan(args: argparse.Namespace) -> tuple[Plan, list[str]]:
     """Make the plan of a run, and list absent devices with their reasons."""
-    from gpusense.evaluation.benchmark.candidates import candidates
-    from gpusense.evaluation.benchmark.runner import Plan
-    from gpusense.evaluation.benchmark.scenes import sources
-
     numbers = {name: getattr(args, name) for name in _FIELDS if getattr(args, name) is not None}
     chosen = candidates(args.problem or PROBLEMS, quick=args.quick)
     if args.method:
@@ -160,8 +155,6 @@ def make_plan(args: argparse.Namespace) -> tuple[Plan, list[str]]:
 
 
 def _absent_devices(selections: Sequence[str] | None) -> list[str]:
-    from gpusense.backends import devices
-
     return [] if selections else [f"{device.name}: {device.reason}" for device in devices() if not device.available]
 
 
@@ -181,17 +174,12 @@ def command_of(words: Sequence[str]) -> str:
 
 def write_report(folder: Path, report: Mapping[str, Any]) -> None:
     """Write the report as JSON atomically; create the folder if missing."""
-    from gpusense.evaluation.benchmark.report import to_json
-
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / "report.json", lambda stream: stream.write(to_json(report).encode()))
 
 
 def write_page(file: Path, report: Mapping[str, Any]) -> None:
     """Write the interactive page of a report atomically."""
-    from gpusense.evaluation.benchmark.report import model_rows
-    from gpusense.plots.error_page import error_page
-
     page = error_page(model_rows(report), text=f"{report['date']}. {machine_line()}")
     write_whole(file, lambda stream: stream.write(page.encode()))
 

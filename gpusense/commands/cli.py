@@ -13,7 +13,7 @@ import re
 import sys
 import textwrap
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from types import ModuleType
 from typing import Any, NoReturn
 
@@ -21,11 +21,26 @@ from gpusense._util.extras import explained
 from gpusense._version import __version__
 from gpusense.commands import arguments, signals
 
-# Modules of gpusense.commands, in the order of the help.
-COMMANDS = (
-    "devices", "selftest", "demo", "explain", "simulate", "map", "score", "localize", "judge", "fit", "match",
-    "likelihood-map", "features", "landmarks", "ros", "sweep", "bench",
-)  # fmt: skip
+# Modules of gpusense.commands with their help, in its order.
+COMMANDS = {
+    "devices": "List the devices, with a remedy for each that is absent.",
+    "selftest": "Check that the backends agree with the float64 truth.",
+    "demo": "Localise a robot in a generated building on every device.",
+    "explain": "Report what the kernels leave out for a scene, and why.",
+    "simulate": "Make the log of a robot that drives through a map.",
+    "map": "Build an occupancy grid from the scans of a log.",
+    "score": "Rank the logged poses of a log among particles.",
+    "localize": "Localise a robot along a log with a particle filter.",
+    "judge": "Judge the poses of any localiser: when right, when lost.",
+    "fit": "Fit the beam model's parameters to a log, or to pairs.",
+    "match": "Match the scans of a log to each other, or to a map.",
+    "likelihood-map": "Draw the likelihood of a scan over all poses of a map.",
+    "features": "Extract lines, corners, doors and poles from scans.",
+    "landmarks": "Fit, check and localise a recorded run among landmarks.",
+    "ros": "Localise inside ROS 2, or watch another localiser.",
+    "sweep": "Run many jobs from a plan into one table.",
+    "bench": "Name the fastest method within an error or a time.",
+}
 ALIASES = {"localise": "localize"}
 
 # Meanings of the exit codes where a command states none.
@@ -188,10 +203,9 @@ def _settle() -> None:
 
 
 def _dispatch(argv: list[str]) -> int:
-    # Import only the chosen command: an import error in another command must not affect it.
     argv = [ALIASES.get(argv[0], argv[0]), *argv[1:]] if argv else argv
-    names = (argv[0],) if argv and argv[0] in COMMANDS else COMMANDS
-    parser = _build(names)
+    # Import only the chosen command: an import error in another command must not affect it.
+    parser = _build([name for name in (*argv[:1], *os.environ.get("COMP_LINE", "").split()[1:2]) if name in COMMANDS])
     if "_ARGCOMPLETE" in os.environ:
         import argcomplete
 
@@ -208,25 +222,26 @@ def _dispatch(argv: list[str]) -> int:
     return code
 
 
-def _build(names: Sequence[str]) -> Parser:
-    """Build the parser of these commands."""
+def _build(loaded: Iterable[str]) -> Parser:
+    """Build the parser with the options of some commands."""
     parser = Parser(
         prog="gpusense", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=Layout, allow_abbrev=False
     )
     parser.add_argument("--version", action="version", version=f"gpusense {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
-    for name in names:
-        module = importlib.import_module(f"gpusense.commands.{name.replace('-', '_')}")
+    for name, text in COMMANDS.items():
         command = commands.add_parser(
-            name, help=module.HELP, description=getattr(module, "DESCRIPTION", module.HELP), epilog=_epilog(module),
-            formatter_class=Layout, allow_abbrev=False, add_help=False,
-        )  # fmt: skip
-        add = arguments.Options(command, module.FIRST)
-        module.add_options(add)
-        for option in module.SHARED:
-            arguments.SHARED[option](add)
-        command.usage = f"{add.usage} [options]"
-        command.set_defaults(run=module.run)
+            name, help=text, description=text, formatter_class=Layout, allow_abbrev=False, add_help=False
+        )
+        if name in loaded:
+            module = importlib.import_module(f"gpusense.commands.{name.replace('-', '_')}")
+            command.description, command.epilog = getattr(module, "DESCRIPTION", text), _epilog(module)
+            add = arguments.Options(command, module.FIRST)
+            module.add_options(add)
+            for option in module.SHARED:
+                arguments.SHARED[option](add)
+            command.usage = f"{add.usage} [options]"
+            command.set_defaults(run=module.run)
     return parser
 
 

@@ -31,7 +31,6 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.scanner import Scanner
 
-HELP = "Localise a robot in a generated building on every device."
 FIRST = ("particles", "backend", "output")
 SHARED = ("seed", "verbose")
 CODES = {1: "a device failed (the report has its error)"}

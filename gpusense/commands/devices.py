@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING
 
+from gpusense._util import notices
+from gpusense.backends import Device, default_failures, devices, get_backend
 from gpusense.commands import output
 from gpusense.commands.arguments import Options
 from gpusense.commands.output import driver_text
 from gpusense.evaluation.machine import machine_line
 
-if TYPE_CHECKING:
-    from gpusense.backends import Device
-
-HELP = "List the devices, with a remedy for each that is absent."
 FIRST = ()
 SHARED = ("verbose",)
 
@@ -41,8 +38,6 @@ def add_options(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the devices; for absent devices, also the reason and the remedy."""
-    from gpusense.backends import devices
-
     listed: list[Device] = devices(anew=args.prove)
     auto, auto_error = _auto()
     listed = _with_failures(listed)
@@ -69,8 +64,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _with_failures(listed: list[Device]) -> list[Device]:
     """Return the devices; a device that ``"auto"`` failed to open counts as unusable, with the reason."""
-    from gpusense.backends import default_failures
-
     reasons = {selection: reason for selection, reason in default_failures() if selection}
     return [
         replace(device, available=False, reason=reasons[device.selection])
@@ -88,9 +81,6 @@ def _status(device: Device) -> str:
 
 def _auto() -> tuple[str | None, str | None]:
     """Return the selection of 'auto', or the error of opening it, which this command only reports."""
-    from gpusense._util import notices
-    from gpusense.backends import get_backend
-
     try:
         with notices.held() as lines:
             backend = get_backend("auto")

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
+
+import numpy as np
 
 from gpusense._util.typing import CasterName
 from gpusense.commands import output
 from gpusense.commands.arguments import Options, scan_model, whole_number
+from gpusense.commands.demo import make_world
 from gpusense.commands.output import counted
 from gpusense.commands.scans import OPTIONS, add_log, read_scan
+from gpusense.evaluation import worlds
+from gpusense.interface.plan import Plan
+from gpusense.models.scan.savings import poses_on
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.map_files import read_map
+from gpusense.world.parameters import BeamParameters
+from gpusense.world.scanner import Scanner
 
-if TYPE_CHECKING:
-    import numpy as np
-
-    from gpusense.interface.plan import Plan
-    from gpusense.world.grid import OccupancyGrid
-    from gpusense.world.scanner import Scanner
-
-HELP = "Report what the kernels leave out for a scene, and why."
 FIRST = ("map", "log", "model", "parameters", "measure")
 SHARED = ("range", "model", "backend", "seed", "verbose")
 
@@ -50,8 +52,6 @@ def add_options(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Score the scene, and print the report of its model."""
-    from gpusense.models.scan.savings import poses_on
-
     grid, scanner, ranges = _scene(args)
     if args.caster is not None and args.model == "field":
         raise ValueError(f"--caster: must be left out with the field, got {args.caster}")
@@ -80,13 +80,6 @@ def _print(plan: Plan) -> None:
 
 def _scene(args: argparse.Namespace) -> tuple[OccupancyGrid, Scanner, np.ndarray]:
     """Return the map, the scanner and the readings."""
-    import numpy as np
-
-    from gpusense.commands.demo import make_world
-    from gpusense.evaluation import worlds
-    from gpusense.world.map_files import read_map
-    from gpusense.world.parameters import BeamParameters
-
     if args.log is not None and args.map is None:
         raise ValueError(f"--map: must come with --log, got --log {args.log} alone")
     if args.log is None:

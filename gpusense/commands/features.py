@@ -5,22 +5,23 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from gpusense.commands import output
-from gpusense.commands.arguments import Options, picture, positive_number, table, whole_number
+from gpusense.commands.arguments import Options, csv_file, picture, positive_number, whole_number
 from gpusense.commands.output import counted, draw, write_table
 from gpusense.commands.scans import add_log, read_scans
 from gpusense.commands.signals import working
+from gpusense.features.extract import extract_features
+from gpusense.features.feature_map import MAP_KINDS, FeatureMap
+from gpusense.features.landmarks import landmarks_of_map, map_features
+from gpusense.features.result import KINDS, Features, joined
+from gpusense.logs import Scan
+from gpusense.plots.features import features_figure, landmarks_figure
+from gpusense.world.map_files import read_map
 
-if TYPE_CHECKING:
-    from gpusense.features.feature_map import FeatureMap
-    from gpusense.features.result import Features
-    from gpusense.logs import Scan
-
-HELP = "Extract lines, corners, doors and poles from scans."
 FIRST = ("log", "reference", "kinds", "map_out", "plot")
 SHARED = ("reference", "choice", "backend", "verbose")
 
@@ -50,8 +51,8 @@ def add_options(add: Options) -> None:
     add("--kinds KIND...", f"{', '.join(_KINDS)} (default: all)", _KINDS)
     add("--noise M", "standard deviation of ranges [m] (default: by each scan)", positive_number)
     add("--least N", "smallest number of scans that must show a landmark", whole_number(low=1), 2)
-    add("--out CSV", "write all features", table)
-    add("--map-out CSV", "write landmarks", table)
+    add("--out CSV", "write all features", csv_file)
+    add("--map-out CSV", "write landmarks", csv_file)
     add("--plot FILE", "draw the scan with the most features", picture)
     add("--map-plot FILE", "draw the landmarks", picture)
 
@@ -76,9 +77,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _extract(args: argparse.Namespace, scans: list[tuple[int, Scan]]) -> Features:
-    from gpusense.features.extract import extract_features
-    from gpusense.features.result import KINDS
-
     ranges = np.array([scan.ranges for _, scan in scans])
     kinds, scanner = args.kinds or KINDS, scans[0][1].scanner
     light = [np.full(ranges.shape[1], np.nan) if scan.intensities is None else scan.intensities for _, scan in scans]
@@ -87,16 +85,11 @@ def _extract(args: argparse.Namespace, scans: list[tuple[int, Scan]]) -> Feature
 
 
 def _landmark_kinds(args: argparse.Namespace) -> tuple[str, ...]:
-    from gpusense.features.feature_map import MAP_KINDS
-
     return tuple(kind for kind in MAP_KINDS if args.kinds is None or kind in args.kinds)
 
 
 def _of_map(args: argparse.Namespace) -> int:
     """Make landmarks from a map."""
-    from gpusense.features.landmarks import landmarks_of_map
-    from gpusense.world.map_files import read_map
-
     for option in ("out", "plot", "reference"):
         if getattr(args, option) is not None:
             raise ValueError(f"--{option}: must not be given with --map-in, which has no scans")
@@ -115,10 +108,6 @@ def _report(
     args: argparse.Namespace, scans: list[tuple[int, Scan]], parts: list[Features], posed: bool, seconds: float
 ) -> None:
     """Print and write the features of all scans, or of the scans before an interrupt."""
-    from gpusense.features.landmarks import map_features
-    from gpusense.features.result import joined
-    from gpusense.plots.features import features_figure
-
     features = joined(parts, _CALL)
     done = min(_CALL * len(parts), len(scans))
     landmarks = None
@@ -166,8 +155,6 @@ def _landmark_rows(landmarks: FeatureMap) -> list[dict[str, Any]]:
 
 
 def _write_landmarks(args: argparse.Namespace, landmarks: FeatureMap, grid: Any) -> None:
-    from gpusense.plots.features import landmarks_figure
-
     if args.map_out is not None:
         landmarks.save(args.map_out)
     draw(args.map_plot, lambda: landmarks_figure(landmarks, grid))

@@ -6,20 +6,28 @@ import argparse
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gpusense._util.files import write_whole
 from gpusense._util.progress import progress
 from gpusense.commands import output
 from gpusense.commands.arguments import Options, output_folder, whole_number
 from gpusense.commands.fit_results import DOUBT, FitResult, PartialFit, is_doubtful, print_fit
+from gpusense.commands.parameter_files import parameters_yaml
 from gpusense.commands.scans import OPTIONS, add_log, read_chosen_steps, read_scans
+from gpusense.evaluation import range_data
+from gpusense.evaluation.range_data import RangeData, compare_held_out
+from gpusense.evaluation.steps import references_to_learn_from, with_references
+from gpusense.evaluation.trajectory_files import read_tum
+from gpusense.learning.beam.fit import fit_beam_parameters
+from gpusense.learning.beam.incidence import fit_incidence_parameters
+from gpusense.localization.motion_fit import MotionFit, fit_odometry_motion
+from gpusense.plots import fits as fit_plots
+from gpusense.plots.drawing import save
+from gpusense.world.hit_shapes import SHAPES
+from gpusense.world.map_files import read_map
+from gpusense.world.scanner import Reading
 
-if TYPE_CHECKING:
-    from gpusense.evaluation.range_data import RangeData
-    from gpusense.localization.motion_fit import MotionFit
-
-HELP = "Fit the beam model's parameters to a log, or to pairs."
 FIRST = ("map", "log", "reference", "holdout", "out")
 SHARED = ("reference", "pairs", "backend", "seed", "verbose")
 CODES = {1: "the fit did not converge"}
@@ -59,8 +67,6 @@ _PAIRS_BLOCK = 100
 
 def add_options(add: Options) -> None:
     """Add the command's options."""
-    from gpusense.world.hit_shapes import SHAPES
-
     add("--map YAML", "a map_server map; needs --log", Path)
     add_log(add, "a log with corrected poses, or any with --reference; needs --map", required=False)
     add("--pairs CSV", "a file of columns separated by commas instead: reading [m], expected range [m] and, if known, "
@@ -117,9 +123,6 @@ def _check_sources(args: argparse.Namespace) -> None:
 
 
 def _read(args: argparse.Namespace) -> RangeData:
-    from gpusense.evaluation import range_data
-    from gpusense.world.map_files import read_map
-
     chosen = {"every": args.every, "offset": args.offset, "limit": args.limit}
     range_min = args.range_min or 0.0
     if args.pairs is not None:
@@ -139,11 +142,6 @@ def _read(args: argparse.Namespace) -> RangeData:
 
 
 def _fit(args: argparse.Namespace, data: RangeData, motion: MotionFit | None, partial: PartialFit) -> FitResult:
-    from gpusense.evaluation.range_data import compare_held_out
-    from gpusense.learning.beam.fit import fit_beam_parameters
-    from gpusense.learning.beam.incidence import fit_incidence_parameters
-    from gpusense.world.scanner import Reading
-
     data, rest = data.halves() if args.holdout else (data, None)
     sensor = {"range_max": data.range_max, "range_min": data.range_min, "backend": args.backend}
     known = data.block[data.kinds != Reading.MISSING]
@@ -168,10 +166,6 @@ def _fit(args: argparse.Namespace, data: RangeData, motion: MotionFit | None, pa
 
 def _motion(args: argparse.Namespace) -> MotionFit | None:
     """Learn the noise of the odometry from the chosen scans; None if it is not requested."""
-    from gpusense.evaluation.steps import references_to_learn_from, with_references
-    from gpusense.evaluation.trajectory_files import read_tum
-    from gpusense.localization.motion_fit import fit_odometry_motion
-
     if not args.fit_motion:
         return None
     steps = read_chosen_steps(args)
@@ -197,10 +191,6 @@ def _document(result: FitResult, files: list[Path]) -> dict[str, Any]:
 
 def _write(folder: Path, result: FitResult) -> list[Path]:
     """Write the files of a fit, each atomically, and return their paths."""
-    from gpusense.commands.parameter_files import parameters_yaml
-    from gpusense.plots import fits as fit_plots
-    from gpusense.plots.drawing import save
-
     folder.mkdir(parents=True, exist_ok=True)
     text = parameters_yaml(result).encode()
     file = folder / "parameters.yaml"

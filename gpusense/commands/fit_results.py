@@ -5,18 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from gpusense.commands import output
 from gpusense.commands.output import length, rounded
 from gpusense.evaluation.machine import machine_line
-
-if TYPE_CHECKING:
-    from gpusense.evaluation.range_data import HeldOut, RangeData
-    from gpusense.learning.beam.incidence import IncidenceFit
-    from gpusense.learning.fitted import BeamFit
-    from gpusense.localization.motion_fit import MotionFit
-    from gpusense.world.parameters import BeamParameters
+from gpusense.evaluation.range_data import HeldOut, RangeData
+from gpusense.learning.beam.incidence import IncidenceFit
+from gpusense.learning.fitted import BeamFit
+from gpusense.localization.motion_fit import MotionFit
+from gpusense.world.parameters import BeamParameters
 
 # A fit with less weight of correct ranges, a larger deviation of them [m], or more unexplained readings is doubtful.
 _LEAST_HIT, _MOST_DEVIATION, _MOST_UNEXPLAINED = 0.3, 0.5, 0.25

@@ -7,25 +7,27 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from gpusense.commands import output
-from gpusense.commands.arguments import Options, Output, picture, positive_number, table
+from gpusense.commands.arguments import Options, Output, csv_file, picture, positive_number
 from gpusense.commands.output import counted, draw, length, write_table
 from gpusense.commands.scans import add_log, options_named, read_chosen_steps
 from gpusense.commands.signals import working
+from gpusense.evaluation.integrity import Integrity, integrity
+from gpusense.evaluation.judging import Judgement, Stretch, TrajectoryJudge, errors_of
+from gpusense.evaluation.steps import Step, posed_scans
+from gpusense.evaluation.trajectory_files import read_tum
+from gpusense.logs import Scan
+from gpusense.models.scan.field import LikelihoodFieldModel
+from gpusense.models.scan.model import ScanModel
+from gpusense.plots.judgements import judgement_figure
+from gpusense.plots.viewer import Recording
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.map_files import read_map
 
-if TYPE_CHECKING:
-    from gpusense.evaluation.integrity import Integrity
-    from gpusense.evaluation.judging import Judgement, Stretch
-    from gpusense.evaluation.steps import Step
-    from gpusense.logs import Scan
-    from gpusense.models.scan.model import ScanModel
-    from gpusense.world.grid import OccupancyGrid
-
-HELP = "Judge the poses of any localiser: when right, when lost."
 FIRST = ("map", "log", "poses", "plot", "truth")
 SHARED = ("choice", "backend", "json")
 CODES = {0: "the poses were not lost", 1: "they were, or no scan had a reading to judge by"}
@@ -72,17 +74,12 @@ def add_options(add: Options) -> None:
     )
     add("--alert-limit M", "with --truth: largest error that is safe [m]", positive_number, 0.5)
     add("--plot FILE", "draw the track on the map coloured by p_lost, p_lost and radius over time, and errors", picture)
-    add("--csv FILE", "write a row for each pose", table)
+    add("--csv FILE", "write a row for each pose", csv_file)
     add("--record FILE", "record the run for the viewer Rerun", Output(".rrd"))
 
 
 def run(args: argparse.Namespace) -> int:
     """Judge the poses, and print the results; after Ctrl-C, the results so far."""
-    from gpusense.evaluation.judging import TrajectoryJudge
-    from gpusense.evaluation.steps import posed_scans
-    from gpusense.evaluation.trajectory_files import read_tum
-    from gpusense.world.map_files import read_map
-
     grid = read_map(args.map)
     truth = None if args.truth is None else read_tum(args.truth)
     steps = read_chosen_steps(args)
@@ -106,8 +103,6 @@ def _source(text: str) -> str | Path:
 
 def _models(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step]) -> list[ScanModel]:
     """Return the likelihood field of each scanner."""
-    from gpusense.models.scan.field import LikelihoodFieldModel
-
     scanners = dict.fromkeys(step.scan.scanner for step in steps)
     return [LikelihoodFieldModel(grid, one, backend=args.backend) for one in scanners]
 
@@ -120,11 +115,6 @@ def _report(
     truth: tuple[np.ndarray, np.ndarray] | None,
 ) -> None:  # fmt: skip
     """Write the files, and print the results."""
-    from gpusense.evaluation.integrity import integrity
-    from gpusense.evaluation.judging import errors_of
-    from gpusense.plots.judgements import judgement_figure
-    from gpusense.plots.viewer import Recording
-
     errors, rated = np.full(len(found.times), math.nan), None
     if truth is not None:
         errors = errors_of(found, *truth)

@@ -6,20 +6,21 @@ import argparse
 import math
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gpusense.commands import output
 from gpusense.commands.arguments import Options, not_negative_number, positive_number, range_number, whole_number
 from gpusense.commands.output import counted, degrees, length
 from gpusense.commands.signals import working
+from gpusense.evaluation import landmark_runs
+from gpusense.evaluation.tracking import Track, summary
+from gpusense.learning.fitted import LandmarkFit
+from gpusense.learning.landmark.pairs import Suspicions, suspicious_landmarks
 from gpusense.localization.defaults import DEFAULTS
+from gpusense.logs.mrclam import read_mrclam
+from gpusense.logs.records import LandmarkRun
+from gpusense.models.landmark.model import LandmarkModel
 
-if TYPE_CHECKING:
-    from gpusense.learning.fitted import LandmarkFit
-    from gpusense.learning.landmark.pairs import Suspicions
-    from gpusense.logs.records import LandmarkRun
-
-HELP = "Fit, check and localise a recorded run among landmarks."
 FIRST = ("folder", "robot", "known", "particles", "drift")
 SHARED = ("backend", "seed", "verbose")
 CODES = {1: "lost at the end"}
@@ -71,12 +72,6 @@ def add_options(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fit the noise, check the map, associate, localise, and print the results; after Ctrl-C, of the scans so far."""
-    from gpusense.evaluation import landmark_runs
-    from gpusense.evaluation.tracking import Track, summary
-    from gpusense.learning.landmark.pairs import suspicious_landmarks
-    from gpusense.logs.mrclam import read_mrclam
-    from gpusense.models.landmark.model import LandmarkModel
-
     if args.field_of_view is not None and args.field_of_view > 2 * math.pi:
         raise ValueError(f"--field-of-view: must be in (0, 2 pi], got {args.field_of_view:g}")
     recorded = read_mrclam(args.folder, args.robot, range_max=args.range_max, field_of_view=args.field_of_view)

@@ -5,18 +5,17 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from gpusense.commands import output
 from gpusense.commands.arguments import Options, picture, positive_number, scan_model, whole_number
 from gpusense.commands.output import grouped
 from gpusense.commands.scans import add_log, read_scan
 from gpusense.commands.signals import working
+from gpusense.matching.pose_likelihood import prepare_tiles, refine_modes
+from gpusense.world.map_files import read_map
 
-if TYPE_CHECKING:
-    import numpy as np
-
-HELP = "Draw the likelihood of a scan over all poses of a map."
 FIRST = ("map", "log", "scan", "out", "model")
 SHARED = ("range", "field", "backend", "verbose")
 
@@ -53,9 +52,6 @@ def add_options(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compute and draw the likelihoods; after Ctrl-C, the tiles so far."""
-    from gpusense.matching.pose_likelihood import prepare_tiles, refine_modes
-    from gpusense.world.map_files import read_map
-
     grid = read_map(args.map)
     scan = read_scan(args)
     model = scan_model(args, grid, scan.scanner, temperature=args.temperature)

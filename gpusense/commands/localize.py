@@ -7,7 +7,7 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,25 +19,29 @@ from gpusense.commands.arguments import (
     picture,
     positive_number,
     temperature,
-    trajectory,
+    tum_file,
     whole_number,
 )
+from gpusense.commands.localize_report import Recorder, report
 from gpusense.commands.parameter_files import Localization, read_localization
 from gpusense.commands.scans import add_log, options_named, read_chosen_steps
 from gpusense.commands.signals import working
+from gpusense.evaluation.steps import Step, references_to_learn_from, with_references
+from gpusense.evaluation.tracking import Track, follow, start
+from gpusense.evaluation.trajectory_files import read_tum
 from gpusense.localization.defaults import DEFAULTS
+from gpusense.localization.filter import ParticleFilter
+from gpusense.localization.motion import MotionModel, OdometryMotion
+from gpusense.localization.motion_fit import fit_odometry_motion
+from gpusense.localization.nav2 import Nav2Options
+from gpusense.models.scan.beam import BeamModel
+from gpusense.models.scan.field import LikelihoodFieldModel
+from gpusense.plots.viewer import Animation, Recording
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.map_files import read_map
+from gpusense.world.parameters import BeamParameters
 from gpusense.world.scanner import Scanner
 
-if TYPE_CHECKING:
-    from gpusense.commands.localize_report import Recorder
-    from gpusense.evaluation.steps import Step
-    from gpusense.evaluation.tracking import Track
-    from gpusense.localization.filter import ParticleFilter
-    from gpusense.localization.motion import MotionModel
-    from gpusense.localization.nav2 import Nav2Options
-    from gpusense.world.grid import OccupancyGrid
-
-HELP = "Localise a robot along a log with a particle filter."
 FIRST = ("map", "log", "everywhere", "start", "plot")
 SHARED = ("beams", "choice", "backend", "seed", "verbose")
 CODES = {0: "the verdict is 'tracking'", 1: "uncertain or lost at the end, or no reading there to judge by"}
@@ -103,7 +107,7 @@ def add_options(add: Options) -> None:
         f"particles anywhere, or neither (default: {DEFAULTS.recovery})", ("sensor", "augmented", "none"))  # fmt: skip
     add("--beam-skip P", "skip beams, such as on people, that less than this share of the particles explains",
         positive_number)  # fmt: skip
-    add("--tum FILE", "write the trajectory for evo", trajectory)
+    add("--tum FILE", "write the trajectory for evo", tum_file)
     add("--tum-from", "where the trajectory begins: at the first scan whose verdict is 'tracking', or at the first one",
         ("tracking", "start"), "tracking")  # fmt: skip
     add("--plot FILE", "draw map, particles, estimated and reference poses", picture)
@@ -113,10 +117,6 @@ def add_options(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Localise, and print the results; after Ctrl-C, the results so far."""
-    from gpusense.commands.localize_report import report
-    from gpusense.evaluation.tracking import Track, follow, start
-    from gpusense.world.map_files import read_map
-
     read = read_parameters(args)
     grid = read_map(args.map)
     steps = read_chosen(args, read)
@@ -138,12 +138,8 @@ def _recorders(args: argparse.Namespace, pf: ParticleFilter, scans: int) -> dict
     """Return the recorders of the run by their files."""
     recorders: dict[Path, Recorder] = {}
     if args.record is not None:
-        from gpusense.plots.viewer import Recording
-
         recorders[args.record] = Recording(pf.grid)
     if args.animate is not None:
-        from gpusense.plots.viewer import Animation
-
         recorders[args.animate] = Animation(pf.grid, scans)
     return recorders
 
@@ -170,9 +166,6 @@ def read_parameters(args: argparse.Namespace) -> Localization:
 
 def read_chosen(args: argparse.Namespace, read: Localization) -> list[Step]:
     """Read the chosen scans, with the poses of ``--reference`` if set."""
-    from gpusense.evaluation.steps import with_references
-    from gpusense.evaluation.trajectory_files import read_tum
-
     steps = read_chosen_steps(args)
     if read.nav2 is not None:
         near, far = read.nav2.range_limits
@@ -209,11 +202,6 @@ def start_of(args: argparse.Namespace, nav2: Nav2Options | None) -> tuple[Any, A
 
 def make_filter(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step], read: Localization) -> ParticleFilter:
     """Make the filter, with a model for each laser; options of the command line override the file."""
-    from gpusense.localization.filter import ParticleFilter
-    from gpusense.models.scan.beam import BeamModel
-    from gpusense.models.scan.field import LikelihoodFieldModel
-    from gpusense.world.parameters import BeamParameters
-
     scanners = {step.sensor: step.scan.scanner for step in steps}
     for sensor, name in enumerate(args.topic):
         if sensor not in scanners:
@@ -243,10 +231,6 @@ def make_filter(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step]
 
 def _motion(args: argparse.Namespace, steps: list[Step], read: Localization) -> MotionModel:
     """Return the motion model from the options, or else from the file of parameters."""
-    from gpusense.evaluation.steps import references_to_learn_from
-    from gpusense.localization.motion import OdometryMotion
-    from gpusense.localization.motion_fit import fit_odometry_motion
-
     options = dict(alpha=args.motion_noise, sideways=args.sideways, reverse=args.reverse)
     given = {name: value for name, value in options.items() if value is not None}
     if args.fit_motion:

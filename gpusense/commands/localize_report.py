@@ -7,22 +7,25 @@ import math
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gpusense.commands import output
 from gpusense.commands.judge import print_stretches, stretch_rows
 from gpusense.commands.output import degrees, draw, length
 from gpusense.commands.scans import scan_times
+from gpusense.evaluation.judging import stretches_of_track
 from gpusense.evaluation.machine import machine_line
+from gpusense.evaluation.tracking import RISK, Track, summary
+from gpusense.evaluation.trajectory_files import write_tum
+from gpusense.localization.diagnosis import Diagnosis
+from gpusense.localization.filter import ParticleFilter
+from gpusense.localization.run_causes import CAUSES_OF_RUNS, diagnose_run
+from gpusense.localization.scan_motion import Moment
 from gpusense.localization.spread import WIDE, WIDE_TURN
+from gpusense.plots.runs import track_figure
+from gpusense.plots.viewer import Animation, Recording
 
-if TYPE_CHECKING:
-    from gpusense.evaluation.tracking import Track
-    from gpusense.localization.diagnosis import Diagnosis
-    from gpusense.localization.filter import ParticleFilter
-    from gpusense.plots.viewer import Animation, Recording
-
-    Recorder = Recording | Animation
+Recorder = Recording | Animation
 
 
 # Results other than a single number.
@@ -34,11 +37,6 @@ def report(
     args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: int, recorders: dict[Path, Recorder]
 ) -> dict[str, Any]:
     """Write the files, print the results of the scans (before an interrupt), and return their summary."""
-    from gpusense.evaluation.judging import stretches_of_track
-    from gpusense.evaluation.tracking import RISK, summary
-    from gpusense.evaluation.trajectory_files import write_tum
-    from gpusense.plots.runs import track_figure
-
     result, stretches = summary(track), stretches_of_track(track)
     found = _diagnosis(pf, track, tracking=result["verdict"] == "tracking")
     result["evidence"] = None if found is None else asdict(found) | {"text": found.text}
@@ -70,9 +68,6 @@ def report(
 
 def _diagnosis(pf: ParticleFilter, track: Track, *, tracking: bool) -> Diagnosis | None:
     """Return the evidence of a run; for a run that tracks, only if its odometry, mount or times are wrong."""
-    from gpusense.localization.run_causes import CAUSES_OF_RUNS, diagnose_run
-    from gpusense.localization.scan_motion import Moment
-
     moments = [
         Moment(step.scan.ranges, pose, step.odometry, step.scan.time, step.sensor)
         for step, pose in zip(track.steps, track.poses, strict=True)

@@ -7,26 +7,29 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from gpusense.chaining.chain import Chainer
+from gpusense.chaining.result import REASONS, ScanChain
 from gpusense.commands import output
-from gpusense.commands.arguments import Options, Output, number, picture, positive_number, table, trajectory
+from gpusense.commands.arguments import Options, Output, csv_file, number, picture, positive_number, tum_file
 from gpusense.commands.output import counted, draw, grouped, write_table
 from gpusense.commands.scans import add_log, read_scans_of_lasers, scan_times, scanners_of
 from gpusense.commands.signals import working
+from gpusense.evaluation.steps import check_poses
+from gpusense.evaluation.trajectory_files import write_tum
+from gpusense.logs import Scan
+from gpusense.mapping.build import MapBuilder
+from gpusense.plots.runs import chain_figure
+from gpusense.world.grid import OccupancyGrid
 from gpusense.world.images import MODES
+from gpusense.world.map_files import write_map
 
-if TYPE_CHECKING:
-    from gpusense.chaining.result import ScanChain
-    from gpusense.logs import Scan
-    from gpusense.mapping.build import MapBuilder
-    from gpusense.world.grid import OccupancyGrid
+Scans = list[tuple[int, Scan]]
 
-    Scans = list[tuple[int, Scan]]
 
-HELP = "Build an occupancy grid from the scans of a log."
 FIRST = ("log", "out", "plot", "chain", "resolution")
 SHARED = ("reference", "choice", "backend", "verbose")
 
@@ -65,8 +68,8 @@ def add_options(add: Options) -> None:
         "has none)")  # fmt: skip
     add("--no-odometry", "chain the scans without the log's odometry")
     add("--no-loops", "do not search for revisited places")
-    add("--tum FILE", "write the poses of a chain for evo", trajectory)
-    add("--poses CSV", "write the poses of a chain with covariances and doubts", table)
+    add("--tum FILE", "write the poses of a chain for evo", tum_file)
+    add("--poses CSV", "write the poses of a chain with covariances and doubts", csv_file)
     add("--plot FILE", "draw the map with trajectory, closures and doubtful stretches of a chain", picture)
     add("--out YAML", "the map, next to its image", Output(".yaml"), required=True)
     add("--mode", "trinary: white, black and grey; scale: shades, a PNG; raw: per cent as greys, almost black",
@@ -81,9 +84,6 @@ def add_options(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Build and write the map; after Ctrl-C, the map of the scans so far."""
-    from gpusense.evaluation.steps import check_poses
-    from gpusense.mapping.build import MapBuilder
-
     if args.chain and args.reference is not None:
         raise ValueError("--chain: must not be used with --reference, which has the poses, got both")
     scans, sensor = read_scans_of_lasers(args)
@@ -112,8 +112,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _write(args: argparse.Namespace, grid: OccupancyGrid) -> Path:
     """Write the map, and return the path of its image."""
-    from gpusense.world.map_files import write_map
-
     transparent = args.mode == "scale" and bool(grid.unknown.any())
     form: Literal["pgm", "png"] = "png" if transparent else "pgm"
     write_map(grid, args.out, mode=args.mode, image_format=form)
@@ -180,8 +178,6 @@ def _is_chained(args: argparse.Namespace, scans: Scans) -> bool:
 
 def _chain_log(args: argparse.Namespace, scans: Scans, sensor: list[int]) -> ChainedScans:
     """Chain the scans of lasers; after Ctrl-C, the scans so far."""
-    from gpusense.chaining.chain import Chainer
-
     readings = [scan.ranges for _, scan in scans]
     odometry = None if args.no_odometry else _odometry(scans)
     times = np.array([scan.time for _, scan in scans])
@@ -219,9 +215,6 @@ def _odometry(scans: Scans) -> np.ndarray | None:
 
 def _write_chain(args: argparse.Namespace, chained: ChainedScans, grid: OccupancyGrid) -> None:
     """Write the requested files: trajectory, poses with covariances, picture."""
-    from gpusense.evaluation.trajectory_files import write_tum
-    from gpusense.plots.runs import chain_figure
-
     if args.tum is not None:
         # If beams are in reverse order, poses belong to the end of scans.
         at = np.array([scan.time for _, scan in chained.scans]) + chained.chain.later
@@ -263,8 +256,6 @@ def _chain_document(args: argparse.Namespace, chained: ChainedScans) -> dict[str
 
 def _print_chain(chained: ChainedScans) -> None:
     """Print the verdict on a chain, its closures and its doubtful stretches."""
-    from gpusense.chaining.result import REASONS
-
     chain = chained.chain
     way = float(np.hypot(*np.diff(chain.poses[:, :2], axis=0).T).sum())
     share = chain.doubtful.mean() if len(chain.poses) else 0.0

@@ -11,19 +11,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gpusense.commands import output
-from gpusense.commands.arguments import Options, not_negative_number, picture, positive_number, table, trajectory
+from gpusense.commands.arguments import Options, csv_file, not_negative_number, picture, positive_number, tum_file
 from gpusense.commands.output import counted, degrees, draw, length, write_table
 from gpusense.commands.scans import add_log, read_scans, scan_times
 from gpusense.commands.signals import working
+from gpusense.evaluation.matching import LogMatches, differences, joined, match_log, summary, trajectory
+from gpusense.evaluation.trajectory_files import write_tum
+from gpusense.logs import Scan
+from gpusense.matching.result import STATUSES
+from gpusense.plots.runs import match_figure
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.map_files import read_map
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from gpusense.evaluation.matching import LogMatches
-    from gpusense.logs import Scan
-    from gpusense.world.grid import OccupancyGrid
-
-HELP = "Match the scans of a log to each other, or to a map."
 FIRST = ("log", "map", "reference", "tum", "plot")
 SHARED = ("reference", "choice", "backend", "seed", "verbose")
 
@@ -51,17 +53,14 @@ def add_options(add: Options) -> None:
     add("--turn DEG", "change headings of guesses by up to this [degrees]", not_negative_number, 0.0)
     add("--method", "method of match_scan", ("auto", "icp", "gauss_newton", "correlative"), "auto")
     add("--noise M", "standard deviation of ranges [m] (default: by match_scan, from the scans)", positive_number)
-    add("--out CSV", "write poses, deviations and statuses", table)
+    add("--out CSV", "write poses, deviations and statuses", csv_file)
     add("--tum FILE", "write the trajectory: matches chained from the first scan on, or poses in the map; a failed "
-        "match is replaced by its guess", trajectory)  # fmt: skip
+        "match is replaced by its guess", tum_file)  # fmt: skip
     add("--plot FILE", "draw the match with the largest correction, before and after", picture)
 
 
 def run(args: argparse.Namespace) -> int:
     """Match the scans and print the results; after Ctrl-C, the results so far."""
-    from gpusense.evaluation.matching import match_log
-    from gpusense.world.map_files import read_map
-
     grid = None if args.map is None else read_map(args.map)
     scans = read_scans(args, posed=False)
     parts: list[LogMatches] = []
@@ -87,8 +86,6 @@ def _report(
     seconds: float,
 ) -> None:
     """Print and write the results of all matches, or of the matches before an interrupt."""
-    from gpusense.evaluation.matching import joined, summary
-
     matches = joined(parts)
     total = summary(matches) | {"milliseconds_each": 1e3 * seconds / len(matches.match)}
     if args.out is not None:
@@ -111,8 +108,6 @@ def _report(
 
 def _print(total: dict[str, Any]) -> None:
     """Print the share of matches that converged, their errors or corrections, and the reasons of the others."""
-    from gpusense.matching.result import STATUSES
-
     count, statuses = total["matches"], total["statuses"]
     good = statuses.get("converged", 0) + statuses.get("unobservable", 0)
     known = total["wrong"] is not None
@@ -144,9 +139,6 @@ def _document(matches: LogMatches, total: dict[str, Any], chosen: int) -> dict[s
 
 def _write_tum(path: Path, scans: list[tuple[int, Scan]], matches: LogMatches) -> None:
     """Write the trajectory of the matched scans from the first scan's logged pose or odometry."""
-    from gpusense.evaluation.matching import trajectory
-    from gpusense.evaluation.trajectory_files import write_tum
-
     first = scans[0][1]
     poses = trajectory(matches, np.array(first.odometry if first.pose is None else first.pose))
     times, indices = scan_times([scan.time for _, scan in scans[: len(poses)]])
@@ -155,9 +147,6 @@ def _write_tum(path: Path, scans: list[tuple[int, Scan]], matches: LogMatches) -
 
 def _worst(grid: OccupancyGrid | None, scans: dict[int, Scan], matches: LogMatches) -> Figure:
     """Draw the match with the largest correction."""
-    from gpusense.evaluation.matching import differences
-    from gpusense.plots.runs import match_figure
-
     distance, turn = differences(matches.match.pose, matches.guess)
     worst = int(np.argmax(distance + turn * matches.match.lever / 10))
     first, second = matches.indices[worst]

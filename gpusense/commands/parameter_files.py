@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gpusense._util import checks
 from gpusense._util.documents import read_mapping
-
-if TYPE_CHECKING:
-    from gpusense.commands.fit_results import FitResult
-    from gpusense.localization.nav2 import Nav2Options
-    from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
+from gpusense.commands.fit_results import FitResult
+from gpusense.localization.motion import OdometryMotion
+from gpusense.localization.nav2 import Nav2Options, from_nav2, has_parameters
+from gpusense.world.hit_shapes import SHAPE_PARAMETERS
+from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 
 
 def read_parameters(path: Path, name: str) -> BeamParameters | LikelihoodFieldParameters:
     """Read the mapping ``beam_model`` or ``likelihood_field`` of a YAML file."""
-    from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
-
     make = BeamParameters.from_dict if name == "beam_model" else LikelihoodFieldParameters.from_dict
     values = read_mapping(checks.existing_file(path)).get(name)
     made: BeamParameters | LikelihoodFieldParameters = _made(path, name, values, make)
@@ -41,9 +39,6 @@ class Localization:
 
 def read_localization(path: Path, node: str | None = None) -> Localization:
     """Read ``beam_model`` and ``odometry_motion`` of a YAML file, or the parameters of nav2_amcl's ``node``."""
-    from gpusense.localization.motion import OdometryMotion
-    from gpusense.localization.nav2 import from_nav2, has_parameters
-
     content = read_mapping(checks.existing_file(path))
     models = [name for name in ("beam_model", "likelihood_field") if name in content]
     if has_parameters(content) and not models and "odometry_motion" not in content:
@@ -79,8 +74,6 @@ def _made(path: Path, name: str, values: Any, make: Any) -> Any:
 def parameters_yaml(result: FitResult) -> str:
     """Format the fitted parameters as YAML for gpusense and for nav2_amcl."""
     import yaml
-
-    from gpusense.world.hit_shapes import SHAPE_PARAMETERS
 
     def block(name: str, mapping: dict[str, Any]) -> str:
         return str(yaml.safe_dump({name: mapping}, sort_keys=False)).rstrip()

@@ -12,7 +12,6 @@ from gpusense._util.documents import read_mapping
 from gpusense.commands.arguments import Options, finite_number
 from gpusense.localization.nav2_file import FITTED
 
-HELP = "Localise inside ROS 2, or watch another localiser."
 FIRST = ("map", "params_file", "start", "anywhere", "odom_topic")
 SHARED = ("backend",)
 CODES = {0: "interrupted or terminated", 1: "the node could not start (its log has the reason)"}

@@ -10,14 +10,13 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gpusense.commands.arguments import Options, finite_number
-
-if TYPE_CHECKING:
-    from gpusense.evaluation.steps import Step
-    from gpusense.logs import Scan
-    from gpusense.logs.reader import LogOptions
+from gpusense.evaluation.steps import Step, chosen_scans, read_steps, with_one_scanner, with_poses
+from gpusense.evaluation.trajectory_files import poses_at, read_tum
+from gpusense.logs import Scan
+from gpusense.logs.reader import LogOptions, read_laser
 
 FORMATS = "CARMEN or Wean Hall, plain or .gz; a bag of ROS 1 (.bag) or of ROS 2 (folder, .db3, .mcap)"
 OPTIONS = {
@@ -65,8 +64,6 @@ def options_named() -> Iterator[None]:
 
 def read_scans(args: argparse.Namespace, *, posed: bool = True) -> list[tuple[int, Scan]]:
     """Read the chosen scans of ``--log`` with their indices; if ``posed``, each must have a pose."""
-    from gpusense.evaluation.steps import chosen_scans, with_one_scanner, with_poses
-
     with options_named():
         scans = chosen_scans(
             args.log, every=args.every, offset=args.offset, limit=args.limit, topic=args.topic, **log_options(args)
@@ -78,8 +75,6 @@ def read_scans(args: argparse.Namespace, *, posed: bool = True) -> list[tuple[in
 
 def read_scan(args: argparse.Namespace) -> Scan:
     """Read the scan ``--scan`` of ``--log``, the first one by default."""
-    from gpusense.logs.reader import read_laser
-
     wanted, index = args.scan or 0, 0
     with options_named():
         for scan in read_laser(args.log, args.topic, **log_options(args)):
@@ -91,8 +86,6 @@ def read_scan(args: argparse.Namespace) -> Scan:
 
 def read_chosen_steps(args: argparse.Namespace) -> list[Step]:
     """Read the chosen scans of ``--log`` with raw odometry, of one laser or of several by time."""
-    from gpusense.evaluation.steps import read_steps
-
     sensors = [args.topic] if isinstance(args.topic, str) else args.topic or ()
     with options_named():
         return read_steps(
@@ -129,8 +122,6 @@ def scanners_of(scans: list[tuple[int, Scan]], sensor: list[int]) -> dict[str, A
 
 def _referenced(args: argparse.Namespace, scans: list[Scan]) -> list[tuple[int, Scan]]:
     """Return the scans with poses in the trajectory of ``--reference``, and their numbers."""
-    from gpusense.evaluation.trajectory_files import poses_at, read_tum
-
     poses = poses_at([scan.time for scan in scans], *read_tum(args.reference))
     known = [
         (k, replace(scan, pose=pose))

@@ -5,19 +5,26 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from gpusense.commands import output
 from gpusense.commands.arguments import Options, picture, scan_model, temperature, whole_number
 from gpusense.commands.output import counted, degrees, draw, grouped, length
 from gpusense.commands.scans import add_log, read_scans
 from gpusense.commands.signals import working
+from gpusense.evaluation.scoring import (
+    Fitness,
+    FitnessOfLog,
+    LogScore,
+    LogScoring,
+    Model,
+    ParticleSampler,
+    summary,
+    temperature_of_log,
+)
 from gpusense.localization.defaults import DEFAULTS
+from gpusense.plots.runs import scores_figure
+from gpusense.world.map_files import read_map
 
-if TYPE_CHECKING:
-    from gpusense.evaluation.scoring import Fitness, LogScore, Model
-
-HELP = "Rank the logged poses of a log among particles."
 FIRST = ("map", "log", "reference", "parameters", "plot")
 SHARED = ("reference", "choice", "model", "backend", "seed", "verbose")
 CODES = {0: "the log fits the map", 1: "it does not or the verdict is uncertain"}
@@ -52,10 +59,6 @@ def add_options(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Score the scans and print the results; after Ctrl-C, the results so far."""
-    from gpusense.evaluation.scoring import FitnessOfLog, LogScoring, ParticleSampler, temperature_of_log
-    from gpusense.plots.runs import scores_figure
-    from gpusense.world.map_files import read_map
-
     sampler = ParticleSampler(args.particles, seed=args.seed)
     grid = read_map(args.map)
     scans = read_scans(args)
@@ -78,8 +81,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _report(args: argparse.Namespace, model: Model, score: LogScore, fitness: Fitness, chosen: int) -> None:
     """Print the results of all scans, or of the scans before an interrupt."""
-    from gpusense.evaluation.scoring import summary
-
     if args.json:
         facts = {
             "parameters": model.parameters.to_dict(), "temperature": model.temperature,
@@ -110,8 +111,6 @@ def pose_name(args: argparse.Namespace) -> str:
 
 def _print(score: LogScore, pose: str) -> None:
     """Print the rank of the true pose, and the error of the weighted mean."""
-    from gpusense.evaluation.scoring import summary
-
     s = summary(score)
     output.fact("device", f"{score.device.selection} ({score.device.name}): {counted(len(score.scans), 'scan')}, "
                 f"{grouped(score.particles)} particles each")  # fmt: skip

@@ -5,22 +5,20 @@ from __future__ import annotations
 import argparse
 import time
 import warnings
+from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING
 
+from gpusense._util.typing import PRECISIONS
+from gpusense.backends import Backend, devices
 from gpusense.commands import output
 from gpusense.commands.arguments import BACKEND_HELP, Options
 from gpusense.commands.output import driver_text
 from gpusense.commands.signals import HELD, working
+from gpusense.evaluation import selftest, stiff
 from gpusense.evaluation.machine import machine_line
+from gpusense.evaluation.tolerances import Check
+from gpusense.world.plausible import PlausibilityWarning
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from gpusense.backends import Backend
-    from gpusense.evaluation.tolerances import Check
-
-HELP = "Check that the backends agree with the float64 truth."
 FIRST = ("backend", "stiff")
 SHARED = ("verbose",)
 CODES = {0: "every difference is within its tolerance", 1: "one is not", 2: "bad input or an absent device"}
@@ -54,10 +52,6 @@ def add_options(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare the backends and print a table of the differences; after Ctrl-C, the differences so far."""
-    from gpusense.backends import devices
-    from gpusense.evaluation import selftest
-    from gpusense.world.plausible import PlausibilityWarning
-
     begin, backends = time.perf_counter(), selftest.chosen_backends(args.backend)
     checks: list[Check] = []
     with warnings.catch_warnings():
@@ -90,9 +84,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _run_stiff(backends: Sequence[Backend], checks: list[Check]) -> None:
     """Run the catalogue of stiff cases on each backend in each precision."""
-    from gpusense._util.typing import PRECISIONS
-    from gpusense.evaluation import stiff
-
     jobs = [(backend, name) for backend in backends for name in PRECISIONS[: 1 + backend.info.float64]]
     with working(checks, len(jobs)) as step:
         for backend, precision in jobs:
@@ -102,8 +93,6 @@ def _run_stiff(backends: Sequence[Backend], checks: list[Check]) -> None:
 
 def _print_result(count: int, breaches: int, backends: Sequence[Backend], interrupted: str, seconds: float) -> None:
     """Print the verdict, and the backends under test, with the kernels that their proofs excluded."""
-    from gpusense.backends import devices
-
     if breaches:
         output.result(f"FAILED: {breaches} of {count} comparisons beyond tolerance")
     else:

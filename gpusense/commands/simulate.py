@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from gpusense._util.files import check_writable
 from gpusense.commands import output
 from gpusense.commands.arguments import (
     Options,
@@ -16,18 +20,21 @@ from gpusense.commands.arguments import (
     not_negative_number,
     positive_number,
     range_number,
-    trajectory,
+    tum_file,
     whole_number,
 )
 from gpusense.commands.output import counted
+from gpusense.commands.parameter_files import Localization, read_localization
+from gpusense.evaluation.buildings import WORLDS
+from gpusense.evaluation.simulation.run import MOTION, READINGS, SimulatedRun, kind_of, simulate_run, write_run
+from gpusense.evaluation.trajectory_files import read_tum, write_tum
+from gpusense.localization.motion import OdometryMotion
+from gpusense.logs.bag_writer import check_bag
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.map_files import read_map, write_map
+from gpusense.world.parameters import BeamParameters
+from gpusense.world.scanner import Scanner
 
-if TYPE_CHECKING:
-    from gpusense.evaluation.simulation.run import SimulatedRun
-    from gpusense.localization.motion import OdometryMotion
-    from gpusense.world.grid import OccupancyGrid
-    from gpusense.world.parameters import BeamParameters
-
-HELP = "Make the log of a robot that drives through a map."
 FIRST = ("world", "map", "log_out", "map_out", "scans")
 SHARED = ("seed", "json")
 
@@ -60,7 +67,7 @@ def add_options(add: Options) -> None:
         "ROS 2 (default: by the name, ros1 for .bag and carmen for others)", ("carmen", "ros1", "ros2"))  # fmt: skip
     add("--map-out YAML", "write the robot's map", Output(".yaml"))
     add("--world-out YAML", "write the true world, without people", Output(".yaml"))
-    add("--tum FILE", "write the true poses of the robot", trajectory)
+    add("--tum FILE", "write the true poses of the robot", tum_file)
     _add_run(add)
     _add_world(add)
     _add_sensors(add)
@@ -101,10 +108,6 @@ def _add_sensors(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate, and write the files."""
-    from gpusense.evaluation.simulation.run import simulate_run, write_run
-    from gpusense.evaluation.trajectory_files import read_tum, write_tum
-    from gpusense.world.map_files import read_map, write_map
-
     args.format = _check_output(args)
     grid = read_map(args.map) if args.map else _generated(args.world, args.seed)
     world = None if args.true_map is None else read_map(args.true_map)
@@ -128,10 +131,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_output(args: argparse.Namespace) -> str:
     """Return the format of the log, after checking that it can be written."""
-    from gpusense._util.files import check_writable
-    from gpusense.evaluation.simulation.run import kind_of
-    from gpusense.logs.bag_writer import check_bag
-
     kind = kind_of(args.log_out) if args.format is None else str(args.format)
     if kind == "carmen":
         check_writable(args.log_out)
@@ -145,8 +144,6 @@ def _check_output(args: argparse.Namespace) -> str:
 
 def _generated(name: str, seed: int) -> OccupancyGrid:
     """Return a generated world by a name such as ``office`` or ``office:3``."""
-    from gpusense.evaluation.buildings import WORLDS
-
     kind, colon, number = name.partition(":")
     if kind not in WORLDS or (colon and not (number.isascii() and number.isdigit() and len(number) < 10)):
         raise ValueError(f"--world: must be one of {', '.join(WORLDS)}, or with a seed as in office:3, got {name!r}")
@@ -154,8 +151,6 @@ def _generated(name: str, seed: int) -> OccupancyGrid:
 
 
 def _scanner(args: argparse.Namespace) -> Any:
-    from gpusense.world.scanner import Scanner
-
     if args.view >= 360:
         raise ValueError(f"--view: must be below 360, got {args.view:g}")
     view = math.radians(args.view)
@@ -168,13 +163,6 @@ def _scanner(args: argparse.Namespace) -> Any:
 
 def _noise(args: argparse.Namespace) -> tuple[BeamParameters, OdometryMotion]:
     """Return the mixture of the readings and the noise of the odometry."""
-    import dataclasses
-
-    from gpusense.commands.parameter_files import Localization, read_localization
-    from gpusense.evaluation.simulation.run import MOTION, READINGS
-    from gpusense.localization.motion import OdometryMotion
-    from gpusense.world.parameters import BeamParameters
-
     given = Localization(None, {}) if args.parameters is None else read_localization(args.parameters)
     parameters = given.sensor if isinstance(given.sensor, BeamParameters) else READINGS
     if args.noise is not None:
@@ -186,8 +174,6 @@ def _noise(args: argparse.Namespace) -> tuple[BeamParameters, OdometryMotion]:
 
 
 def _report(args: argparse.Namespace, made: SimulatedRun) -> None:
-    import numpy as np
-
     steps = np.hypot(*np.diff(made.poses[:, :2], axis=0).T)
     length = float(steps[~made.kidnapped[1:]].sum())
     changed = int(np.count_nonzero(made.world.occupied != made.grid.occupied)) if args.true_map is None else None

@@ -14,7 +14,7 @@ from support.command_line import error_of
 import gpusense as gs
 from gpusense.commands import output
 from gpusense.commands.cli import main
-from gpusense.evaluation import range_data, scoring
+from gpusense.evaluation import scoring
 from gpusense.evaluation.worlds import building, free_pose, simulate_scan
 from gpusense.learning.beam import fit as learning
 
@@ -114,7 +114,7 @@ def test_a_fit_interrupted_after_its_search_prints_it(capsys, recorded, monkeypa
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(range_data, "compare_held_out", interrupted)
+    monkeypatch.setattr("gpusense.commands.fit.compare_held_out", interrupted)
     assert main(fit(recorded, "--holdout")) == 130
     assert "this fit had ended" in capsys.readouterr().out
 

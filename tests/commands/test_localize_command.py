@@ -124,7 +124,7 @@ def test_an_interrupted_run_keeps_what_it_has(place, capsys, monkeypatch):
             if len(track.steps) == 3:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(tracking, "follow", stop_after_three)
+    monkeypatch.setattr("gpusense.commands.localize.follow", stop_after_three)
     tum = place / "part.tum"
     assert cli.main(call(place, "--tum", str(tum))) == 130
     assert "interrupted: results of 3 of 12 scans" in capsys.readouterr().out

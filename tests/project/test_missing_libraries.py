@@ -106,6 +106,7 @@ def test_a_library_that_does_not_load_says_why(place, monkeypatch, capsys):
 
 
 def test_a_module_of_gpusense_that_is_absent_keeps_its_traceback(place, monkeypatch):
+    monkeypatch.delitem(sys.modules, "gpusense.commands.localize", raising=False)
     monkeypatch.setitem(sys.modules, "gpusense.commands.localize_report", None)
     with pytest.raises(ModuleNotFoundError, match="localize_report"):
         cli.main(LOCALIZE)

@@ -115,8 +115,10 @@ def _report(
         poses = np.array([scan.pose for _, scan in scans[:done]])
         landmarks = map_features(features, poses, kinds=_landmark_kinds(args), least=args.least)
         _write_landmarks(args, landmarks, None)
-    if args.out is not None:
-        _write(args.out, features, scans)
+    deviations = np.sqrt(np.einsum("fii->fi", features.covariance))
+    index = np.array([index for index, _ in scans])[features.scan]
+    columns = (index, features.kind, *features.pose.T, *deviations.T, features.size, features.score)
+    write_table(args.out, **dict(zip(_COLUMNS, columns, strict=True)))
     most = int(np.bincount(features.scan, minlength=done).argmax())
     shown = scans[most][1]
     draw(args.plot, lambda: features_figure(features.of_scan(most), shown.ranges, shown.scanner))
@@ -158,11 +160,3 @@ def _write_landmarks(args: argparse.Namespace, landmarks: FeatureMap, grid: Any)
     if args.map_out is not None:
         landmarks.save(args.map_out)
     draw(args.map_plot, lambda: landmarks_figure(landmarks, grid))
-
-
-def _write(path: Path, features: Features, scans: list[tuple[int, Scan]]) -> None:
-    """Write a row per feature: scan, kind, pose, deviations, size and score."""
-    deviations = np.sqrt(np.einsum("fii->fi", features.covariance))
-    index = np.array([index for index, _ in scans])[features.scan]
-    columns = (index, features.kind, *features.pose.T, *deviations.T, features.size, features.score)
-    write_table(path, _COLUMNS, zip(*columns, strict=True))

@@ -107,9 +107,6 @@ def _models(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step]) ->
     return [LikelihoodFieldModel(grid, one, backend=args.backend) for one in scanners]
 
 
-_COLUMNS = ("scan", "time", "x", "y", "theta", "p_lost", "verdict", "explained", "radius", "error")
-
-
 def _report(
     args: argparse.Namespace, grid: OccupancyGrid, found: Judgement, source: str, scans: Sequence[Scan],
     truth: tuple[np.ndarray, np.ndarray] | None,
@@ -121,10 +118,11 @@ def _report(
         known = np.isfinite(errors)
         times = found.times[known] if (np.diff(found.times[known]) > 0).all() else None
         rated = integrity(errors[known], found.radii[known], alert_limit=args.alert_limit, times=times)
-    if args.csv is not None:
-        clock = [f"{time:.6f}" for time in found.times]
-        numbers = (found.p_lost, found.verdicts, found.explained, found.radii, errors)
-        write_table(args.csv, _COLUMNS, zip(found.index, clock, *found.poses.T, *numbers, strict=True))
+    x, y, theta = found.poses.T
+    write_table(
+        args.csv, scan=found.index, time=[f"{time:.6f}" for time in found.times], x=x, y=y, theta=theta,
+        p_lost=found.p_lost, verdict=found.verdicts, explained=found.explained, radius=found.radii, error=errors,
+    )  # fmt: skip
     draw(args.plot, lambda: judgement_figure(grid, found, rated, errors))
     if args.record is not None:
         Recording(grid, "judge").write_judgement(found, scans, args.record)

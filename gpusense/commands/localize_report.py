@@ -12,11 +12,10 @@ from typing import Any
 from gpusense.commands import output
 from gpusense.commands.judge import print_stretches, stretch_rows
 from gpusense.commands.output import degrees, draw, length
-from gpusense.commands.scans import scan_times
+from gpusense.commands.scans import write_trajectory
 from gpusense.evaluation.judging import stretches_of_track
 from gpusense.evaluation.machine import machine_line
 from gpusense.evaluation.tracking import RISK, Track, summary
-from gpusense.evaluation.trajectory_files import write_tum
 from gpusense.localization.diagnosis import Diagnosis
 from gpusense.localization.filter import ParticleFilter
 from gpusense.localization.run_causes import CAUSES_OF_RUNS, diagnose_run
@@ -41,16 +40,14 @@ def report(
     found = _diagnosis(pf, track, tracking=result["verdict"] == "tracking")
     result["evidence"] = None if found is None else asdict(found) | {"text": found.text}
     first = 0 if args.tum_from == "start" else len(track.poses) if track.converged is None else track.converged
-    if args.tum is not None:
-        times, indices = scan_times([step.scan.time for step in track.steps])
-        write_tum(args.tum, times[first:], track.poses[first:], indices=indices)
+    times = [step.scan.time for step in track.steps]
+    write_trajectory(args.tum, times, track.poses, first)
     draw(args.plot, lambda: track_figure(pf, track))
     for path, recorder in recorders.items():
         recorder.write(track, path)
     if args.json:
         poses = [[step.index, *pose.tolist()] for step, pose in zip(track.steps, track.poses, strict=True)]
         document = {"filter": repr(pf), "summary": result, "scans_chosen": chosen}
-        times = [step.scan.time for step in track.steps]
         document |= {"poses": poses, "times": times, "stretches": stretch_rows(stretches), "risk": RISK}
         output.report(document, args)
         return result

@@ -16,10 +16,9 @@ from gpusense.chaining.result import REASONS, ScanChain
 from gpusense.commands import output
 from gpusense.commands.arguments import Options, Output, csv_file, number, picture, positive_number, tum_file
 from gpusense.commands.output import counted, draw, grouped, write_table
-from gpusense.commands.scans import add_log, read_scans_of_lasers, scan_times, scanners_of
+from gpusense.commands.scans import add_log, read_scans_of_lasers, scanners_of, write_trajectory
 from gpusense.commands.signals import working
 from gpusense.evaluation.steps import check_poses
-from gpusense.evaluation.trajectory_files import write_tum
 from gpusense.logs import Scan
 from gpusense.mapping.build import MapBuilder
 from gpusense.plots.runs import chain_figure
@@ -150,11 +149,8 @@ def _report(
 
 # Steps of the progress bar during the search for loops.
 _ROUNDS = 20
-# Columns of a file of poses.
-_COLUMNS = (
-    "scan", "time", "x", "y", "theta", "var_x", "cov_xy", "cov_xtheta", "var_y", "cov_ytheta", "var_theta", "doubtful",
-    "laser",
-)  # fmt: skip
+# Columns of the upper triangle of a covariance.
+_COVARIANCES = ("var_x", "cov_xy", "cov_xtheta", "var_y", "cov_ytheta", "var_theta")
 
 
 @dataclass
@@ -182,10 +178,8 @@ def _chain_log(args: argparse.Namespace, scans: Scans, sensor: list[int]) -> Cha
     odometry = None if args.no_odometry else _odometry(scans)
     times = np.array([scan.time for _, scan in scans])
     known = bool((np.diff(times) >= 0).all())
-    each = [
-        [scan.duration for (_, scan), k in zip(scans, sensor, strict=True) if k == one] for one in sorted(set(sensor))
-    ]
-    durations = [float(np.median(some)) if known else 0.0 for some in each]
+    spans, lasers = np.array([scan.duration for _, scan in scans]), np.array(sensor)
+    durations = [float(np.median(spans[lasers == one])) if known else 0.0 for one in sorted(set(sensor))]
     chainer = Chainer(
         readings, odometry=odometry, times=times if known else None, close_loops=not args.no_loops,
         duration=durations if len(durations) > 1 else durations[0], backend=args.backend, **scanners_of(scans, sensor),
@@ -215,29 +209,19 @@ def _odometry(scans: Scans) -> np.ndarray | None:
 
 def _write_chain(args: argparse.Namespace, chained: ChainedScans, grid: OccupancyGrid) -> None:
     """Write the requested files: trajectory, poses with covariances, picture."""
-    if args.tum is not None:
-        # If beams are in reverse order, poses belong to the end of scans.
-        at = np.array([scan.time for _, scan in chained.scans]) + chained.chain.later
-        rows = np.arange(len(at))
-        if len(np.unique(chained.chain.sensor)) > 1:
-            # Write one pose per time of several lasers.
-            rows = np.unique(at, return_index=True)[1]
-        times, indices = scan_times(at[rows].tolist())
-        write_tum(args.tum, times, chained.chain.poses[rows], indices=indices)
-    if args.poses is not None:
-        _write_poses(args.poses, chained)
-    draw(args.plot, lambda: chain_figure(grid, chained.chain))
-
-
-def _write_poses(path: Path, chained: ChainedScans) -> None:
-    """Write a row per scan: index, time, pose, upper triangle of the covariance, whether doubtful, laser."""
     chain = chained.chain
-    upper = chain.covariance[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-    scans = [
-        (index, f"{scan.time + later:.6f}") for (index, scan), later in zip(chained.scans, chain.later, strict=True)
-    ]
-    numbers = (*chain.poses.T, *upper.T, chain.doubtful.astype(int), chain.sensor)
-    write_table(path, _COLUMNS, zip(*zip(*scans, strict=True), *numbers, strict=True))
+    # If beams are in reverse order, poses belong to the end of scans.
+    at = np.array([scan.time for _, scan in chained.scans]) + chain.later
+    # Write one pose per time of several lasers.
+    rows = np.unique(at, return_index=True)[1] if len(np.unique(chain.sensor)) > 1 else np.arange(len(at))
+    write_trajectory(args.tum, at[rows].tolist(), chain.poses[rows])
+    x, y, theta = chain.poses.T
+    upper = zip(_COVARIANCES, chain.covariance[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].T, strict=True)
+    write_table(
+        args.poses, scan=[index for index, _ in chained.scans], time=[f"{time:.6f}" for time in at], x=x, y=y,
+        theta=theta, **dict(upper), doubtful=chain.doubtful.astype(int), laser=chain.sensor,
+    )  # fmt: skip
+    draw(args.plot, lambda: chain_figure(grid, chain))
 
 
 def _chain_document(args: argparse.Namespace, chained: ChainedScans) -> dict[str, Any]:

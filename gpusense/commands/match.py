@@ -13,10 +13,9 @@ import numpy as np
 from gpusense.commands import output
 from gpusense.commands.arguments import Options, csv_file, not_negative_number, picture, positive_number, tum_file
 from gpusense.commands.output import counted, degrees, draw, length, write_table
-from gpusense.commands.scans import add_log, read_scans, scan_times
+from gpusense.commands.scans import add_log, read_scans, write_trajectory
 from gpusense.commands.signals import working
 from gpusense.evaluation.matching import LogMatches, differences, joined, match_log, summary, trajectory
-from gpusense.evaluation.trajectory_files import write_tum
 from gpusense.logs import Scan
 from gpusense.matching.result import STATUSES
 from gpusense.plots.runs import match_figure
@@ -88,13 +87,12 @@ def _report(
     """Print and write the results of all matches, or of the matches before an interrupt."""
     matches = joined(parts)
     total = summary(matches) | {"milliseconds_each": 1e3 * seconds / len(matches.match)}
-    if args.out is not None:
-        match = matches.match
-        deviations = np.sqrt(np.einsum("sii->si", match.covariance))
-        columns = (*matches.indices.T, *match.pose.T, *deviations.T, match.score, match.status)
-        write_table(args.out, _COLUMNS, zip(*columns, strict=True))
-    if args.tum is not None:
-        _write_tum(args.tum, scans, matches)
+    match, first = matches.match, scans[0][1]
+    deviations = np.sqrt(np.einsum("sii->si", match.covariance))
+    columns = (*matches.indices.T, *match.pose.T, *deviations.T, match.score, match.status)
+    write_table(args.out, **dict(zip(_COLUMNS, columns, strict=True)))
+    poses = trajectory(matches, np.array(first.odometry if first.pose is None else first.pose))
+    write_trajectory(args.tum, [scan.time for _, scan in scans[: len(poses)]], poses)
     draw(args.plot, lambda: _worst(grid, dict(scans), matches))
     if args.json:
         output.report(_document(matches, total, len(scans)), args)
@@ -135,14 +133,6 @@ def _document(matches: LogMatches, total: dict[str, Any], chosen: int) -> dict[s
         for i, (first, second) in enumerate(matches.indices)
     ]
     return {"scans_chosen": chosen, "summary": total, "matches": rows}
-
-
-def _write_tum(path: Path, scans: list[tuple[int, Scan]], matches: LogMatches) -> None:
-    """Write the trajectory of the matched scans from the first scan's logged pose or odometry."""
-    first = scans[0][1]
-    poses = trajectory(matches, np.array(first.odometry if first.pose is None else first.pose))
-    times, indices = scan_times([scan.time for _, scan in scans[: len(poses)]])
-    write_tum(path, times, poses, indices=indices)
 
 
 def _worst(grid: OccupancyGrid | None, scans: dict[int, Scan], matches: LogMatches) -> Figure:

@@ -102,15 +102,17 @@ def draw(path: Path | None, make: Callable[[], Figure]) -> None:
         save(make(), path)
 
 
-def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a CSV file; numbers have nine digits, and NaN is an empty field."""
+def write_table(path: Path | None, **columns: Iterable[Any]) -> None:
+    """Write a CSV file of named columns, if a path is passed; numbers have nine digits, and NaN is an empty field."""
+    if path is None:
+        return
 
     def text(value: Any) -> str:
         if isinstance(value, (float, np.floating)):
             return "" if math.isnan(value) else f"{value:.9g}"
         return str(value)
 
-    lines = [",".join(columns), *(",".join(map(text, row)) for row in rows)]
+    lines = [",".join(columns), *(",".join(map(text, row)) for row in zip(*columns.values(), strict=True))]
     write_whole(path, lambda stream: stream.write(("\n".join(lines) + "\n").encode()))
 
 

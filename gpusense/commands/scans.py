@@ -7,14 +7,14 @@ import contextlib
 import itertools
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from gpusense.commands.arguments import Options, finite_number
 from gpusense.evaluation.steps import Step, chosen_scans, read_steps, with_one_scanner, with_poses
-from gpusense.evaluation.trajectory_files import poses_at, read_tum
+from gpusense.evaluation.trajectory_files import poses_at, read_tum, write_tum
 from gpusense.logs import Scan
 from gpusense.logs.reader import LogOptions, read_laser
 
@@ -133,10 +133,13 @@ def _referenced(args: argparse.Namespace, scans: list[Scan]) -> list[tuple[int, 
     return known
 
 
-def scan_times(times: list[float]) -> tuple[list[float], bool]:
-    """Return the times of scans for a trajectory, or indices and True unless times increase."""
-    if all(one < two for one, two in itertools.pairwise(times)):
-        return times, False
-    rule = "the times of the log do not increase: the trajectory has the indices of the scans instead"
-    sys.stderr.write(f"gpusense: --tum: {rule}\n")
-    return [float(i) for i in range(len(times))], True
+def write_trajectory(path: Path | None, times: Sequence[float], poses: Sequence[Any], first: int = 0) -> None:
+    """Write the poses of scans from ``first`` on for evo, if a file is passed; by indices unless times increase."""
+    if path is None:
+        return
+    indices = not all(one < two for one, two in itertools.pairwise(times))
+    if indices:
+        rule = "the times of the log do not increase: the trajectory has the indices of the scans instead"
+        sys.stderr.write(f"gpusense: --tum: {rule}\n")
+    at = range(len(times)) if indices else times
+    write_tum(path, at[first:], poses[first:], indices=indices)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -114,23 +114,38 @@ def run(args: argparse.Namespace) -> int:
     outcome = Outcome([], [])
     with working(outcome.points, steps(plan)) as step:
         run_plan(plan, step, outcome)
-    report = document(plan, outcome, arguments_of(args, plan), machine(), absent, command_of(sys.argv[1:]))
+    words = ["gpusense", *(Path(word).name if Path(word).is_absolute() else word for word in sys.argv[1:])]
+    report = document(plan, outcome, arguments_of(args, plan), machine(), absent, shlex.join(words))
     if args.output is not None:
-        write_report(args.output, report)
+        args.output.mkdir(parents=True, exist_ok=True)
+        write_whole(args.output / "report.json", lambda stream: stream.write(to_json(report).encode()))
     if args.html is not None:
-        write_page(args.html, report)
+        page = error_page(model_rows(report), text=f"{report['date']}. {machine_line()}")
+        write_whole(args.html, lambda stream: stream.write(page.encode()))
     if args.json:
         output.document(report)
     else:
-        found = list(choices(report, dict(args.max_error), args.max_time))
-        for _, answer, _ in found:
-            output.result(answer)
-        for backend in dict.fromkeys(backend for backend, _, _ in found):
-            print(f"\nbest methods on {backend}")
-            rows = [row for place, _, rows in found if place == backend for row in rows]
-            output.table(["problem", "method", "error", "time"], rows, right=["error", "time"])
-        _print_rest(report, args.output)
+        _print(report, args)
     return 0
+
+
+def _print(report: Mapping[str, Any], args: argparse.Namespace) -> None:
+    """Print the answers, the best methods of each device, and failures."""
+    found, points = list(choices(report, dict(args.max_error), args.max_time)), report["points"]
+    for _, answer, _ in found:
+        output.result(answer)
+    for backend in dict.fromkeys(backend for backend, _, _ in found):
+        print(f"\nbest methods on {backend}")
+        rows = [row for place, _, rows in found if place == backend for row in rows]
+        output.table(["problem", "method", "error", "time"], rows, right=["error", "time"])
+    print()
+    for point in points:
+        if point["status"] in ("failed", "unstable"):
+            place = ", ".join(point[name] for name in ("scene", "cloud", "backend", "method"))
+            output.fact(point["status"], f"{place}: {point['reason']}")
+    left = sum(point["status"] == "left out" for point in points)
+    output.fact("points", f"{len(points)}, {left} left out; errors against {report['truth']['device']}, float64")
+    output.files(args.html, args.output and args.output / "report.json")
 
 
 def make_plan(args: argparse.Namespace) -> tuple[Plan, list[str]]:
@@ -151,11 +166,8 @@ def make_plan(args: argparse.Namespace) -> tuple[Plan, list[str]]:
         args.precision or (PRECISIONS[:1] if args.quick else PRECISIONS),
         **({"seconds": 5.0} | (QUICK if args.quick else {}) | numbers),
     )  # fmt: skip
-    return plan, [*_absent_devices(args.backend), *failures]
-
-
-def _absent_devices(selections: Sequence[str] | None) -> list[str]:
-    return [] if selections else [f"{device.name}: {device.reason}" for device in devices() if not device.available]
+    absent = [] if args.backend else [f"{one.name}: {one.reason}" for one in devices() if not one.available]
+    return plan, [*absent, *failures]
 
 
 def arguments_of(args: argparse.Namespace, plan: Plan) -> dict[str, Any]:
@@ -165,34 +177,3 @@ def arguments_of(args: argparse.Namespace, plan: Plan) -> dict[str, Any]:
         "precisions": list(plan.precisions), "max_error": [list(one) for one in args.max_error],
         "max_time": args.max_time, "problems": list(args.problem or PROBLEMS), "methods": args.method or [],
     }  # fmt: skip
-
-
-def command_of(words: Sequence[str]) -> str:
-    """Format a command line of this program, with names instead of absolute paths."""
-    return shlex.join(["gpusense", *(Path(word).name if Path(word).is_absolute() else word for word in words)])
-
-
-def write_report(folder: Path, report: Mapping[str, Any]) -> None:
-    """Write the report as JSON atomically; create the folder if missing."""
-    folder.mkdir(parents=True, exist_ok=True)
-    write_whole(folder / "report.json", lambda stream: stream.write(to_json(report).encode()))
-
-
-def write_page(file: Path, report: Mapping[str, Any]) -> None:
-    """Write the interactive page of a report atomically."""
-    page = error_page(model_rows(report), text=f"{report['date']}. {machine_line()}")
-    write_whole(file, lambda stream: stream.write(page.encode()))
-
-
-def _print_rest(report: Mapping[str, Any], folder: Path | None) -> None:
-    """Print the points without a result, their number, and the machine."""
-    points = report["points"]
-    print()
-    for point in points:
-        if point["status"] in ("failed", "unstable"):
-            print(f"{point['status']}: {point['scene']}, {point['cloud']}, {point['backend']}, {point['method']}: "
-                  f"{point['reason']}")  # fmt: skip
-    left = sum(point["status"] == "left out" for point in points)
-    print(f"{len(points)} points, {left} left out; truth: {report['truth']['device']}, float64")
-    print(machine_line())
-    print(f"written: {folder}" if folder is not None else "all points: --output DIR")

@@ -10,7 +10,6 @@ from gpusense.backends import Device, default_failures, devices, get_backend
 from gpusense.commands import output
 from gpusense.commands.arguments import Options
 from gpusense.commands.output import driver_text
-from gpusense.evaluation.machine import machine_line
 
 FIRST = ()
 SHARED = ("verbose",)
@@ -57,8 +56,7 @@ def run(args: argparse.Namespace) -> int:
     for device in listed:
         if device.reason:
             output.fact(device.selection or device.backend, device.reason)
-    if args.verbose:
-        print(machine_line())
+    output.details(args)
     return 0
 
 

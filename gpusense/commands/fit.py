@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from gpusense.evaluation.trajectory_files import read_tum
 from gpusense.learning.beam.fit import fit_beam_parameters
 from gpusense.learning.beam.incidence import fit_incidence_parameters
 from gpusense.localization.motion_fit import MotionFit, fit_odometry_motion
-from gpusense.plots import fits as fit_plots
+from gpusense.plots import fits
 from gpusense.plots.drawing import save
 from gpusense.world.hit_shapes import SHAPES
 from gpusense.world.map_files import read_map
@@ -60,8 +59,6 @@ examples:
       --fit-motion --out fitted
   gpusense fit --pairs readings.csv --range-max 8 --range-bias"""
 
-# Pictures of --out.
-_PICTURES = ("readings.png", "density.png", "trace.png", "surface.png")
 _PAIRS_BLOCK = 100
 
 
@@ -100,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
         if is_doubtful(result.fit):
             sys.stderr.write(f"gpusense: {DOUBT}\n")
     else:
-        print_fit(result, files, verbose=args.verbose, paired=args.pairs is not None)
+        print_fit(args, result, files)
     return int(not result.fit.converged)
 
 
@@ -175,40 +172,28 @@ def _motion(args: argparse.Namespace) -> MotionFit | None:
 
 
 def _document(result: FitResult, files: list[Path]) -> dict[str, Any]:
-    held_out = [{**asdict(row), "parameters": row.parameters.to_dict()} for row in result.held_out]
     return {
-        "range_max": result.data.range_max,
-        "readings": len(result.data.ranges),
-        "blocks": len(set(result.data.block.tolist())),
-        "fit": result.fit.to_dict(),
-        "incidence": None if result.incidence is None else result.incidence.to_dict(),
-        "motion": None if result.motion is None else asdict(result.motion),
-        "held_out_readings": result.held_out_readings,
-        "held_out": held_out,
-        "files": files,
-    }
+        "range_max": result.data.range_max, "readings": len(result.data.ranges),
+        "blocks": len(set(result.data.block.tolist())), "fit": result.fit.to_dict(),
+        "incidence": result.incidence and result.incidence.to_dict(), "motion": result.motion,
+        "held_out_readings": result.held_out_readings, "held_out": result.held_out, "files": files,
+    }  # fmt: skip
 
 
 def _write(folder: Path, result: FitResult) -> list[Path]:
     """Write the files of a fit, each atomically, and return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    text = parameters_yaml(result).encode()
-    file = folder / "parameters.yaml"
+    text, file = parameters_yaml(result).encode(), folder / "parameters.yaml"
     write_whole(file, lambda stream: stream.write(text))
-    parameters = result.fit.parameters
-    distances = fit_plots.distances_of(result.data)
-    figures = [
-        fit_plots.readings_figure(result.data, distances),
-        fit_plots.density_figure(result.data, parameters, distances),
-        fit_plots.trace_figure(result.fit.trace, result.fit.method),
-        fit_plots.surface_figure(result.data, parameters),
-    ]
-    names = list(_PICTURES)
+    data, parameters, distances = result.data, result.fit.parameters, fits.distances_of(result.data)
+    figures = {
+        "readings.png": fits.readings_figure(data, distances),
+        "density.png": fits.density_figure(data, parameters, distances),
+        "trace.png": fits.trace_figure(result.fit.trace, result.fit.method),
+        "surface.png": fits.surface_figure(data, parameters),
+    }
     if result.incidence is not None:
-        figures.append(fit_plots.incidence_figure(result.incidence))
-        names.append("incidence.png")
-    written = [file]
-    for name, figure in zip(names, figures, strict=True):
+        figures["incidence.png"] = fits.incidence_figure(result.incidence)
+    for name, figure in figures.items():
         save(figure, folder / name)
-        written.append(folder / name)
-    return written
+    return [file, *(folder / name for name in figures)]

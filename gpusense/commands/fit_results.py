@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import math
 from dataclasses import dataclass
 from pathlib import Path
 
 from gpusense.commands import output
 from gpusense.commands.output import length, rounded
-from gpusense.evaluation.machine import machine_line
 from gpusense.evaluation.range_data import HeldOut, RangeData
 from gpusense.learning.beam.incidence import IncidenceFit
 from gpusense.learning.fitted import BeamFit
@@ -74,7 +74,7 @@ class PartialFit:
             output.fact(name, f"{value:.6g}" if isinstance(value, float) else str(value))
 
 
-def print_fit(result: FitResult, files: list[Path], *, verbose: bool, paired: bool) -> None:
+def print_fit(args: argparse.Namespace, result: FitResult, files: list[Path]) -> None:
     """Print the verdict, the parameters with their errors, advice, and the written files."""
     fit, p = result.fit, result.fit.parameters
     readings = fit.hits + fit.max_readings
@@ -84,7 +84,7 @@ def print_fit(result: FitResult, files: list[Path], *, verbose: bool, paired: bo
         f"{verdict}: {100 * p.z_hit:.0f} % of the readings are correct, with a deviation of "
         f"{length(p.sigma_hit)}; {100 * unexplained:.2g} % are unexplained"
     )
-    source = "the expected ranges" if paired else "the poses or the map"
+    source = "the expected ranges" if args.pairs is not None else "the poses or the map"
     if doubtful:
         output.fact("doubt", DOUBT)
     elif unexplained > _USUAL_UNEXPLAINED:
@@ -104,8 +104,7 @@ def print_fit(result: FitResult, files: list[Path], *, verbose: bool, paired: bo
     if files:
         print()
     output.files(*files)
-    if verbose:
-        print(f"\n{fit}\nrange_max {result.data.range_max:.6g} m, {len(result.data.ranges)} readings\n{machine_line()}")
+    output.details(args, f"{fit}\nrange_max {result.data.range_max:.6g} m, {len(result.data.ranges)} readings")
 
 
 def is_doubtful(fit: BeamFit) -> bool:

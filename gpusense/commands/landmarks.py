@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gpusense.commands import output
-from gpusense.commands.arguments import Options, not_negative_number, positive_number, range_number, whole_number
+from gpusense.commands.arguments import Options, not_negative_number, range_number, whole_number
 from gpusense.commands.output import counted, degrees, length
 from gpusense.commands.signals import working
 from gpusense.evaluation import landmark_runs
@@ -66,16 +66,11 @@ def add_options(add: Options) -> None:
     add("--scans S", "largest number of scans (default: all)", whole_number(low=1))
     add("--range-max M", "the sensor's largest range [m] (default: the next metre above the largest reading)",
         range_number)  # fmt: skip
-    add("--field-of-view RAD", "the sensor's field of view [rad] (default: 5 %% more than the readings' span)",
-        positive_number)  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
     """Fit the noise, check the map, associate, localise, and print the results; after Ctrl-C, of the scans so far."""
-    if args.field_of_view is not None and args.field_of_view > 2 * math.pi:
-        raise ValueError(f"--field-of-view: must be in (0, 2 pi], got {args.field_of_view:g}")
-    recorded = read_mrclam(args.folder, args.robot, range_max=args.range_max, field_of_view=args.field_of_view)
-    recorded = landmark_runs.first_scans(recorded, args.scans)
+    recorded = landmark_runs.first_scans(read_mrclam(args.folder, args.robot, range_max=args.range_max), args.scans)
     # Suspicions need the recorded landmarks even with --unknown.
     fit = landmark_runs.fit_run(recorded)
     doubts = suspicious_landmarks(recorded.poses, recorded.features, recorded.landmarks, recorded.ids, fit.parameters)

@@ -123,7 +123,11 @@ def run(args: argparse.Namespace) -> int:
     pf = make_filter(args, grid, steps, read)
     pose, covariance = start_of(args, read.nav2) or (None, None)
     start(pf, steps, everywhere=args.everywhere, pose=pose, covariance=covariance)
-    track, recorders = Track(), _recorders(args, pf, len(steps))
+    track, recorders = Track(), dict[Path, Recorder]()
+    if args.record is not None:
+        recorders[args.record] = Recording(pf.grid)
+    if args.animate is not None:
+        recorders[args.animate] = Animation(pf.grid, len(steps))
     with working(track.steps, len(steps)) as step:
         step("starting")
         for one in follow(pf, steps, track):
@@ -132,16 +136,6 @@ def run(args: argparse.Namespace) -> int:
                 recorder.add(pf, track, one)
     found = report(args, pf, track, len(steps), recorders)
     return int(found["verdict"] != "tracking" or found["explained_at_end"] is None)
-
-
-def _recorders(args: argparse.Namespace, pf: ParticleFilter, scans: int) -> dict[Path, Recorder]:
-    """Return the recorders of the run by their files."""
-    recorders: dict[Path, Recorder] = {}
-    if args.record is not None:
-        recorders[args.record] = Recording(pf.grid)
-    if args.animate is not None:
-        recorders[args.animate] = Animation(pf.grid, scans)
-    return recorders
 
 
 def _text(track: Track, step: Step) -> str:

@@ -14,7 +14,6 @@ from gpusense.commands.judge import print_stretches, stretch_rows
 from gpusense.commands.output import degrees, draw, length
 from gpusense.commands.scans import write_trajectory
 from gpusense.evaluation.judging import stretches_of_track
-from gpusense.evaluation.machine import machine_line
 from gpusense.evaluation.tracking import RISK, Track, summary
 from gpusense.localization.diagnosis import Diagnosis
 from gpusense.localization.filter import ParticleFilter
@@ -58,8 +57,7 @@ def report(
     if args.tum is not None and first:
         output.fact("", f"without the first {first} of {len(track.poses)} scans, before the verdict is 'tracking'; "
                     "--tum-from start writes them")  # fmt: skip
-    if args.verbose:
-        _print_details(pf, result)
+    output.details(args, _details(pf, result))
     return result
 
 
@@ -86,7 +84,9 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track
     output.interrupted(result["scans"], chosen)
     if result["verdict"] == "tracking" and result["evidence"] is not None:
         output.fact("but", result["evidence"]["text"])
-    output.fact("last pose", f"{_pose(track.poses[-1])}; deviations {_deviations(deviations)}")
+    (x, y, theta), (dx, dy, turn) = track.poses[-1], deviations
+    output.fact("last pose", f"{x:.2f} m, {y:.2f} m, {math.degrees(theta):.1f} degrees; deviations {length(dx)}, "
+                f"{length(dy)}, {degrees(turn)} degrees")  # fmt: skip
     milliseconds = float(f"{sum(result[f'ms_{part}'] for part in _PARTS):.2g}")
     output.fact("scans", f"{result['scans']}, {milliseconds:g} ms each")
     if result["scans"] > 1 and not result["odometry_moves"]:
@@ -114,36 +114,24 @@ def _print_errors(result: dict[str, Any]) -> None:
         output.fact("", f"before: median {length(result['early_median'])}")
 
 
-def _print_details(pf: ParticleFilter, result: dict[str, Any]) -> None:
-    """Print calibration, times, options of the filter, and the machine."""
+def _details(pf: ParticleFilter, result: dict[str, Any]) -> str:
+    """Return calibration, times and options of the filter."""
     s = {name: "-" if value is None else f"{value:.3g}" for name, value in result.items() if name not in _NO_NUMBER}
-    print()
+    lines = []
     if result["error_median"] is not None and not result["references_repeat_odometry"]:
-        print(
-            f"error of one step     median {s['relative_median']} m, 95 % below {s['relative_95']} m\n"
+        ranks = " ".join(f"{100 * share:.0f}" for share in result["rank_histogram"])
+        lines = [
+            f"error of one step     median {s['relative_median']} m, 95 % below {s['relative_95']} m",
             f"coverage              {s['coverage_50']} of the 50 %, {s['coverage_80']} of the 80 % and "
-            f"{s['coverage_95']} of the 95 % regions; median NEES {s['nees_median']} (2.37 is right)\n"
-            f"width of 95 %         {s['width_95']} m, {s['width_heading_95']} rad\n"
-            f"ranks of references   {_ranks(result['rank_histogram'])} % in tenths (10 each is right)"
-        )
-    print(
-        f"effective sample size median {s['effective_sample_size_median']}; temperature {s['temperature']}\n"
-        f"ms per scan           predict {s['ms_predict']}, correct {s['ms_correct']}, "
-        f"estimate {s['ms_estimate']}\n{pf!r}\n{machine_line()}",
-    )
-
-
-def _pose(pose: Any) -> str:
-    x, y, theta = pose
-    return f"{x:.2f} m, {y:.2f} m, {math.degrees(theta):.1f} degrees"
-
-
-def _deviations(values: list[float]) -> str:
-    return f"{length(values[0])}, {length(values[1])}, {degrees(values[2])} degrees"
-
-
-def _ranks(histogram: list[float]) -> str:
-    return " ".join(f"{100 * share:.0f}" for share in histogram)
+            f"{s['coverage_95']} of the 95 % regions; median NEES {s['nees_median']} (2.37 is right)",
+            f"width of 95 %         {s['width_95']} m, {s['width_heading_95']} rad",
+            f"ranks of references   {ranks} % in tenths (10 each is right)",
+        ]
+    return "\n".join([
+        *lines, f"effective sample size median {s['effective_sample_size_median']}; temperature {s['temperature']}",
+        f"ms per scan           predict {s['ms_predict']}, correct {s['ms_correct']}, estimate {s['ms_estimate']}",
+        repr(pf),
+    ])  # fmt: skip
 
 
 def _verdict(result: dict[str, Any], deviations: list[float]) -> str:

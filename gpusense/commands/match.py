@@ -95,10 +95,13 @@ def _report(
     write_trajectory(args.tum, [scan.time for _, scan in scans[: len(poses)]], poses)
     draw(args.plot, lambda: _worst(grid, dict(scans), matches))
     if args.json:
-        output.report(_document(matches, total, len(scans)), args)
+        names = ("pose", "covariance", "score", "iterations", "converged", "eigenvalues", "status")
+        columns = (*matches.indices.T, *(getattr(match, name) for name in names))
+        rows = [dict(zip(("reference", "scan", *names), row, strict=True)) for row in zip(*columns, strict=True)]
+        output.report({"scans_chosen": len(scans), "summary": total, "matches": rows}, args)
         return
     _print(total)
-    output.interrupted(len(matches.match), len(scans) - (grid is None), "matches")
+    output.interrupted(len(match), len(scans) - (grid is None), "matches")
     output.files(args.out, args.plot, args.tum)
     output.details(args, f"score: median {total['score_median']:.3f}\n{total['milliseconds_each']:.3g} ms each with "
                    "the first call's compilation")  # fmt: skip
@@ -123,16 +126,6 @@ def _print(total: dict[str, Any]) -> None:
     for status, number in statuses.items():
         if status != "converged":
             output.fact("status", f"{number} {status}: {STATUSES[status]}")
-
-
-def _document(matches: LogMatches, total: dict[str, Any], chosen: int) -> dict[str, Any]:
-    match = matches.match
-    names = ("pose", "covariance", "score", "iterations", "converged", "eigenvalues", "status")
-    rows = [
-        {"reference": int(first), "scan": int(second)} | {name: getattr(match, name)[i] for name in names}
-        for i, (first, second) in enumerate(matches.indices)
-    ]
-    return {"scans_chosen": chosen, "summary": total, "matches": rows}
 
 
 def _worst(grid: OccupancyGrid | None, scans: dict[int, Scan], matches: LogMatches) -> Figure:

@@ -17,6 +17,7 @@ import numpy as np
 
 from gpusense._util.files import write_whole
 from gpusense._util.progress import is_terminal
+from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
     import argparse
@@ -38,8 +39,6 @@ def document(document: dict[str, Any]) -> None:
 
 def report(facts: dict[str, Any], args: argparse.Namespace | None = None) -> None:
     """Print facts as a JSON document, between the options of a command and the machine."""
-    from gpusense.evaluation.machine import machine
-
     hidden = ("run", "command", "json")
     options = {} if args is None else {"options": {k: v for k, v in vars(args).items() if k not in hidden}}
     document({**options, **facts, "machine": machine()})
@@ -79,12 +78,10 @@ def interrupted(done: int, total: int, noun: str = "scans") -> None:
         print(f"interrupted: results of {done} of {total} {noun}")
 
 
-def details(args: argparse.Namespace, text: str) -> None:
+def details(args: argparse.Namespace, *texts: str) -> None:
     """Print details and the machine, with ``--verbose``."""
     if args.verbose:
-        from gpusense.evaluation.machine import machine_line
-
-        print(f"\n{text}\n{machine_line()}")
+        print("", *texts, machine_line(), sep="\n")
 
 
 def files(*paths: os.PathLike[str] | None) -> None:

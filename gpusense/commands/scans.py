@@ -133,7 +133,7 @@ def _referenced(args: argparse.Namespace, scans: list[Scan]) -> list[tuple[int, 
     return known
 
 
-def write_trajectory(path: Path | None, times: Sequence[float], poses: Sequence[Any], first: int = 0) -> None:
+def write_trajectory(path: Path | None, times: Sequence[float], poses: Any, first: int = 0) -> None:
     """Write the poses of scans from ``first`` on for evo, if a file is passed; by indices unless times increase."""
     if path is None:
         return

@@ -15,7 +15,6 @@ from gpusense.commands.arguments import BACKEND_HELP, Options
 from gpusense.commands.output import driver_text
 from gpusense.commands.signals import HELD, working
 from gpusense.evaluation import selftest, stiff
-from gpusense.evaluation.machine import machine_line
 from gpusense.evaluation.tolerances import Check
 from gpusense.world.plausible import PlausibilityWarning
 
@@ -77,8 +76,7 @@ def run(args: argparse.Namespace) -> int:
         if shown := checks if args.verbose else breaches:
             print()
             output.table(_COLUMNS, [_row(check) for check in shown], right=("largest difference", "tolerance"))
-        if args.verbose:
-            print(f"\n{machine_line()}")
+        output.details(args)
     return int(bool(breaches))
 
 

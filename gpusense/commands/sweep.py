@@ -9,14 +9,12 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any
 
 from gpusense._util import checks
 from gpusense._util.progress import progress
 from gpusense.commands import output
 from gpusense.commands.arguments import BACKEND_HELP, Options, picture, positive_number, whole_number
 from gpusense.commands.output import counted
-from gpusense.evaluation.machine import machine_line
 from gpusense.plots.drawing import save
 from gpusense.plots.runs import sweep_figure
 from gpusense.sweeps.cluster import DaskExecutor, security_of
@@ -96,18 +94,17 @@ def run(args: argparse.Namespace) -> int:
 
 def _list(jobs: tuple[Job, ...], *, as_json: bool) -> int:
     if as_json:
-        output.document({"jobs": [{"key": job.key, **_fields(job)} for job in jobs]})
+        names = ("key", "task", "map", "log", "model", "seed")
+        output.document({"jobs": [
+            {name: getattr(job, name) for name in names} | {"options": dict(job.options), "labels": dict(job.labels)}
+            for job in jobs
+        ]})  # fmt: skip
         return 0
+    output.result(counted(len(jobs), "job"))
     for job in jobs:
         texts = [f"{name}={value}" for name, value in job.labels]
         print(job.key, job.task, *(texts or (job.log, job.map, job.model)))
-    print(f"\n{counted(len(jobs), 'job')}")
     return 0
-
-
-def _fields(job: Job) -> dict[str, Any]:
-    plain = {name: getattr(job, name) for name in ("task", "map", "log", "model", "seed")}
-    return {**plain, "options": dict(job.options), "labels": dict(job.labels)}
 
 
 def _swept(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Sweep:
@@ -182,8 +179,7 @@ def _report(args: argparse.Namespace, ended: Sweep, seconds: float) -> None:
     if args.plot is not None and not _drawn(ended.table, args.plot):
         args.plot = None
     if args.json:
-        figures = {name: getattr(ended, name) for name in ("jobs", "done", "failed", "skipped", "repeated")}
-        output.report({"table": args.table, "plot": args.plot, **figures, "seconds": seconds})
+        output.report({**vars(ended), "plot": args.plot, "seconds": seconds})
         return
     verdict = "DONE" if not ended.failed else f"{ended.failed} FAILED"
     before = f", {ended.skipped} were in the table before" if ended.skipped else ""
@@ -193,8 +189,7 @@ def _report(args: argparse.Namespace, ended: Sweep, seconds: float) -> None:
     if ended.repeated:
         output.fact("repeated", f"{ended.repeated} runs ended with their worker and were started again")
     output.files(args.table, args.plot)
-    if args.verbose:
-        print(f"\n{machine_line()}")
+    output.details(args)
 
 
 def _drawn(table: str, path: Path) -> bool:

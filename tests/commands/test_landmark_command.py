@@ -117,7 +117,6 @@ def test_bad_files(capsys, folder, tmp_path, file, text, message):
         (["--robot", "0"], "argument --robot: must be an integer >= 1, got 0"),
         (["--robot", "1", "--known", "--unknown"], "argument --unknown: not allowed with argument --known"),
         (["--robot", "1", "--particles", "1"], "argument --particles: must be an integer >= 2, got 1"),
-        (["--robot", "1", "--field-of-view", "7"], "--field-of-view: must be in (0, 2 pi], got 7"),
         (["--robot", "1", "--drift", "-1", "0"], "argument --drift: must be a finite number >= 0, got '-1'"),
         (["--robot", "2"], "{}/Robot2_Measurement.dat: must exist, got no such file"),
         (["--robot", "1", "--range-max", "1"], None),

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 import gpusense as gs
-from gpusense.plots.judgements import judgement_figure
+from gpusense.plots.runs import judgement_figure
 
 WIDTH, COLOURS = 1100, 256
 TARGET = Path(__file__).parent / "img" / "demo.png"

@@ -112,7 +112,7 @@ def __getattr__(name: str) -> Any:
 # ``plots`` lies above the rooms whose results have pictures: only this module may name both.
 pictures.register(
     "pose likelihood",
-    lambda result, path: importlib.import_module("gpusense.plots.pose_maps").pose_likelihood_figure(result, path),
+    lambda result, path: importlib.import_module("gpusense.plots.pose_densities").pose_likelihood_figure(result, path),
 )
 
 

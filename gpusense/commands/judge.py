@@ -23,7 +23,7 @@ from gpusense.evaluation.trajectory_files import read_tum
 from gpusense.logs import Scan
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.models.scan.model import ScanModel
-from gpusense.plots.judgements import judgement_figure
+from gpusense.plots.runs import judgement_figure
 from gpusense.plots.viewer import Recording
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.map_files import read_map

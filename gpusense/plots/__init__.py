@@ -11,8 +11,7 @@ from gpusense.plots.drawing import (
     save,
 )
 from gpusense.plots.features import draw_features, draw_landmarks
-from gpusense.plots.pose_densities import draw_particles
-from gpusense.plots.pose_maps import draw_likelihood_field, draw_pose_likelihood
+from gpusense.plots.pose_densities import draw_likelihood_field, draw_particles, draw_pose_likelihood
 from gpusense.plots.positions import (
     draw_beacons,
     draw_fix,

@@ -74,7 +74,8 @@ def test_the_answer_comes_first_on_the_terminal(tmp_path, capsys):
     assert lines[1:3] == ["", "best methods on numpy"] and lines[3].split() == ["problem", "method", "error", "time"]
     table = lines[3 : lines.index("", 3)]
     assert max(map(len, table)) <= 80 and 3 <= len(table) <= 4 and table[2].startswith("likelihood field  field  ")
-    assert lines[-2].startswith("points     4, 0 left out; ") and lines[-1].split() == ["written", f"{folder}/report.json"]
+    assert lines[-2].startswith("points     4, 0 left out; ")
+    assert lines[-1].split() == ["written", f"{folder}/report.json"]
     written = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     assert ("fewer beams", "every", 4) in {(p["variant"], p["knob"], p["value"]) for p in written["points"]}
 

@@ -25,7 +25,7 @@ from gpusense.backends.base import Backend, Launcher, Recording
 from gpusense.backends.proxy import Proxy
 from gpusense.evaluation.benchmark.report import commit
 from gpusense.evaluation.machine import machine
-from gpusense.evaluation.steps import chosen_scans, with_poses
+from gpusense.evaluation.steps import read_steps, with_poses
 from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
 from gpusense.interface.launches import Launch, Program
 
@@ -165,7 +165,7 @@ def odd_scans(data: Path, name: str, limit: int | None = None) -> tuple[gs.Occup
     folder = data / "carmen_logs"
     grid = gs.read_map(folder / "derived_maps" / f"{name}_even_05cm.yaml")
     log = folder / f"{name}-corrected.log.gz"
-    return grid, with_poses(chosen_scans(log, every=2, offset=1, limit=limit), log)
+    return grid, with_poses(read_steps(log, every=2, offset=1, limit=limit), log)
 
 
 # ---- launches

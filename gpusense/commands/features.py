@@ -12,8 +12,9 @@ import numpy as np
 from gpusense.commands import output
 from gpusense.commands.arguments import Options, csv_file, picture, positive_number, whole_number
 from gpusense.commands.output import counted, draw, write_table
-from gpusense.commands.scans import add_log, read_scans
+from gpusense.commands.scans import add_log, read_posed_steps
 from gpusense.commands.signals import working
+from gpusense.evaluation.steps import with_poses
 from gpusense.features.extract import extract_features
 from gpusense.features.feature_map import MAP_KINDS, FeatureMap
 from gpusense.features.landmarks import landmarks_of_map, map_features
@@ -64,7 +65,8 @@ def run(args: argparse.Namespace) -> int:
     if args.map_in is not None:
         return _of_map(args)
     posed = args.map_out is not None or args.map_plot is not None
-    scans = read_scans(args, posed=posed)
+    steps = read_posed_steps(args)
+    scans = with_poses(steps, args.log) if posed else [(step.index, step.scan) for step in steps]
     parts: list[Features] = []
     begun = time.perf_counter()
     with working(parts, len(scans)) as step:

@@ -197,9 +197,6 @@ def start_of(args: argparse.Namespace, nav2: Nav2Options | None) -> tuple[Any, A
 def make_filter(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step], read: Localization) -> ParticleFilter:
     """Make the filter, with a model for each laser; options of the command line override the file."""
     scanners = {step.sensor: step.scan.scanner for step in steps}
-    for sensor, name in enumerate(args.topic):
-        if sensor not in scanners:
-            raise ValueError(f"--topic: must have scans that are chosen, got none of {name}")
     parameters, nav2 = read.sensor, read.nav2
     beams = args.beams or (DEFAULTS.beams if nav2 is None else nav2.max_beams)
     kind: Any = BeamModel if isinstance(parameters, BeamParameters) else LikelihoodFieldModel

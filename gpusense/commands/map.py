@@ -16,18 +16,14 @@ from gpusense.chaining.result import REASONS, ScanChain
 from gpusense.commands import output
 from gpusense.commands.arguments import Options, Output, csv_file, number, picture, positive_number, tum_file
 from gpusense.commands.output import counted, draw, grouped, write_table
-from gpusense.commands.scans import add_log, read_scans_of_lasers, scanners_of, write_trajectory
+from gpusense.commands.scans import add_log, read_posed_steps, scanners_of, write_trajectory
 from gpusense.commands.signals import working
-from gpusense.evaluation.steps import check_poses
-from gpusense.logs import Scan
+from gpusense.evaluation.steps import Step, with_poses
 from gpusense.mapping.build import MapBuilder
 from gpusense.plots.runs import chain_figure
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.images import MODES
 from gpusense.world.map_files import write_map
-
-Scans = list[tuple[int, Scan]]
-
 
 FIRST = ("log", "out", "plot", "chain", "resolution")
 SHARED = ("reference", "choice", "backend", "verbose")
@@ -85,17 +81,17 @@ def run(args: argparse.Namespace) -> int:
     """Build and write the map; after Ctrl-C, the map of the scans so far."""
     if args.chain and args.reference is not None:
         raise ValueError("--chain: must not be used with --reference, which has the poses, got both")
-    scans, sensor = read_scans_of_lasers(args)
-    chained, chosen = None, len(scans)
-    if _is_chained(args, scans):
-        chained = _chain_log(args, scans, sensor)
-        scans, sensor = chained.scans, sensor[: len(chained.scans)]
-    check_poses(scans, args.log)
+    steps = read_posed_steps(args)
+    chained, chosen = None, len(steps)
+    if _is_chained(args, steps):
+        chained = _chain_log(args, steps)
+        steps = chained.steps
+    scans = with_poses(steps, args.log)
     builder = MapBuilder(
         [scan.ranges for _, scan in scans], [scan.pose or (0.0, 0.0, 0.0) for _, scan in scans],
         resolution=args.resolution, origin=None, shape=None, range_limit=args.range_limit, clear_max=args.clear_max,
         p_hit=args.p_hit, p_miss=args.p_miss, p_prior=0.5, occupied_threshold=65, backend=args.backend, each=_SCANS,
-        motion=None if chained is None else chained.chain.motions, **scanners_of(scans, sensor),
+        motion=None if chained is None else chained.chain.motions, **scanners_of(steps),
     )  # fmt: skip
     done = 0.0
     with working((builder,), max(builder.parts, 1)) as step:
@@ -157,14 +153,14 @@ _COVARIANCES = ("var_x", "cov_xy", "cov_xtheta", "var_y", "cov_ytheta", "var_the
 class ChainedScans:
     """Scans with poses from a chain."""
 
-    scans: Scans
+    steps: list[Step]
     chain: ScanChain
     seconds: float
 
 
-def _is_chained(args: argparse.Namespace, scans: Scans) -> bool:
+def _is_chained(args: argparse.Namespace, steps: list[Step]) -> bool:
     """Return whether a chain finds the poses, and check the options that need a chain."""
-    chained = args.chain or (args.reference is None and any(scan.pose is None for _, scan in scans))
+    chained = args.chain or (args.reference is None and any(step.scan.pose is None for step in steps))
     for name in ("tum", "poses", "plot", "no_odometry", "no_loops"):
         if not chained and getattr(args, name):
             option = name.replace("_", "-")
@@ -172,35 +168,35 @@ def _is_chained(args: argparse.Namespace, scans: Scans) -> bool:
     return chained
 
 
-def _chain_log(args: argparse.Namespace, scans: Scans, sensor: list[int]) -> ChainedScans:
+def _chain_log(args: argparse.Namespace, steps: list[Step]) -> ChainedScans:
     """Chain the scans of lasers; after Ctrl-C, the scans so far."""
-    readings = [scan.ranges for _, scan in scans]
-    odometry = None if args.no_odometry else _odometry(scans)
-    times = np.array([scan.time for _, scan in scans])
+    readings = [step.scan.ranges for step in steps]
+    odometry = None if args.no_odometry else _odometry(steps)
+    times = np.array([step.scan.time for step in steps])
     known = bool((np.diff(times) >= 0).all())
-    spans, lasers = np.array([scan.duration for _, scan in scans]), np.array(sensor)
-    durations = [float(np.median(spans[lasers == one])) if known else 0.0 for one in sorted(set(sensor))]
+    spans, lasers = np.array([(step.scan.duration, step.sensor) for step in steps]).T
+    durations = [float(np.median(spans[lasers == one])) if known else 0.0 for one in np.unique(lasers)]
     chainer = Chainer(
         readings, odometry=odometry, times=times if known else None, close_loops=not args.no_loops,
-        duration=durations if len(durations) > 1 else durations[0], backend=args.backend, **scanners_of(scans, sensor),
+        duration=durations if len(durations) > 1 else durations[0], backend=args.backend, **scanners_of(steps),
     )  # fmt: skip
     begun, done = time.perf_counter(), 0
-    with working((chainer,), len(scans) + _ROUNDS) as step:
+    with working((chainer,), len(steps) + _ROUNDS) as step:
         for word in chainer.steps():
             for _ in range(max(chainer.scans - done, 1)):
                 step(word)
             done = chainer.scans
     chain = chainer.chain()
     placed = [
-        (index, replace(scan, pose=tuple(pose)))
-        for (index, scan), pose in zip(scans, chain.poses.tolist(), strict=False)
+        replace(step, scan=replace(step.scan, pose=tuple(pose)))
+        for step, pose in zip(steps, chain.poses.tolist(), strict=False)
     ]
     return ChainedScans(placed, chain, time.perf_counter() - begun)
 
 
-def _odometry(scans: Scans) -> np.ndarray | None:
+def _odometry(steps: list[Step]) -> np.ndarray | None:
     """Return the odometry of scans; None, with a message, if it is absent or constant."""
-    poses = np.array([scan.odometry for _, scan in scans])
+    poses = np.array([step.scan.odometry for step in steps])
     if len(poses) > 1 and (poses == poses[0]).all():
         sys.stderr.write("gpusense: the odometry of the log never changes: the scans are chained without it\n")
         return None
@@ -211,14 +207,14 @@ def _write_chain(args: argparse.Namespace, chained: ChainedScans, grid: Occupanc
     """Write the requested files: trajectory, poses with covariances, picture."""
     chain = chained.chain
     # If beams are in reverse order, poses belong to the end of scans.
-    at = np.array([scan.time for _, scan in chained.scans]) + chain.later
+    at = np.array([step.scan.time for step in chained.steps]) + chain.later
     # Write one pose per time of several lasers.
     rows = np.unique(at, return_index=True)[1] if len(np.unique(chain.sensor)) > 1 else np.arange(len(at))
     write_trajectory(args.tum, at[rows].tolist(), chain.poses[rows])
     x, y, theta = chain.poses.T
     upper = zip(_COVARIANCES, chain.covariance[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].T, strict=True)
     write_table(
-        args.poses, scan=[index for index, _ in chained.scans], time=[f"{time:.6f}" for time in at], x=x, y=y,
+        args.poses, scan=[step.index for step in chained.steps], time=[f"{time:.6f}" for time in at], x=x, y=y,
         theta=theta, **dict(upper), doubtful=chain.doubtful.astype(int), laser=chain.sensor,
     )  # fmt: skip
     draw(args.plot, lambda: chain_figure(grid, chain))

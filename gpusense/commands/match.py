@@ -13,7 +13,7 @@ import numpy as np
 from gpusense.commands import output
 from gpusense.commands.arguments import Options, csv_file, not_negative_number, picture, positive_number, tum_file
 from gpusense.commands.output import counted, degrees, draw, length, write_table
-from gpusense.commands.scans import add_log, read_scans, write_trajectory
+from gpusense.commands.scans import add_log, read_posed_steps, write_trajectory
 from gpusense.commands.signals import working
 from gpusense.evaluation.matching import LogMatches, differences, joined, match_log, summary, trajectory
 from gpusense.logs import Scan
@@ -61,7 +61,7 @@ def add_options(add: Options) -> None:
 def run(args: argparse.Namespace) -> int:
     """Match the scans and print the results; after Ctrl-C, the results so far."""
     grid = None if args.map is None else read_map(args.map)
-    scans = read_scans(args, posed=False)
+    scans = [(step.index, step.scan) for step in read_posed_steps(args)]
     parts: list[LogMatches] = []
     begun = time.perf_counter()
     calls = match_log(

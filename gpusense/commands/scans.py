@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gpusense.commands.arguments import Options, finite_number
-from gpusense.evaluation.steps import Step, chosen_scans, read_steps, with_one_scanner, with_poses
+from gpusense.evaluation.steps import Step, read_steps, with_poses
 from gpusense.evaluation.trajectory_files import poses_at, read_tum, write_tum
 from gpusense.logs import Scan
 from gpusense.logs.reader import LogOptions, read_laser
@@ -62,15 +62,9 @@ def options_named() -> Iterator[None]:
         raise ValueError(f"--{OPTIONS[found[1]]}: {str(error)[found.end() :]}") from None
 
 
-def read_scans(args: argparse.Namespace, *, posed: bool = True) -> list[tuple[int, Scan]]:
-    """Read the chosen scans of ``--log`` with their indices; if ``posed``, each must have a pose."""
-    with options_named():
-        scans = chosen_scans(
-            args.log, every=args.every, offset=args.offset, limit=args.limit, topic=args.topic, **log_options(args)
-        )
-    if args.reference is not None:
-        scans = [(scans[k][0], scan) for k, scan in _referenced(args, [scan for _, scan in scans])]
-    return (with_poses if posed else with_one_scanner)(scans, args.log)
+def read_scans(args: argparse.Namespace) -> list[tuple[int, Scan]]:
+    """Read the chosen scans of ``--log`` with their indices; each must have a pose."""
+    return with_poses(read_posed_steps(args), args.log)
 
 
 def read_scan(args: argparse.Namespace) -> Scan:
@@ -88,49 +82,34 @@ def read_chosen_steps(args: argparse.Namespace) -> list[Step]:
     """Read the chosen scans of ``--log`` with raw odometry, of one laser or of several by time."""
     sensors = [args.topic] if isinstance(args.topic, str) else args.topic or ()
     with options_named():
-        return read_steps(
+        steps = read_steps(
             args.log, every=args.every, offset=args.offset, limit=args.limit, sensors=sensors, **log_options(args)
         )
-
-
-def read_scans_of_lasers(args: argparse.Namespace) -> tuple[list[tuple[int, Scan]], list[int]]:
-    """Read the chosen scans of all lasers of ``--topic`` by time, and the laser of each."""
-    if len(args.topic) < 2:
-        # Scans of other scanners may lack poses.
-        topic = args.topic[0] if args.topic else None
-        scans = read_scans(argparse.Namespace(**{**vars(args), "topic": topic}), posed=False)
-        return scans, [0] * len(scans)
-    steps = read_chosen_steps(args)
-    chosen = list(enumerate(step.scan for step in steps))
-    if args.reference is not None:
-        chosen = _referenced(args, [scan for _, scan in chosen])
-    sensor = [steps[k].sensor for k, _ in chosen]
-    for index, name in enumerate(args.topic):
-        if index not in sensor:
+    for index, name in enumerate(sensors):
+        if all(step.sensor != index for step in steps):
             raise ValueError(f"--topic: must have scans that are chosen, got none of {name}")
-    return [(steps[k].index, scan) for k, scan in chosen], sensor
+    return steps
 
 
-def scanners_of(scans: list[tuple[int, Scan]], sensor: list[int]) -> dict[str, Any]:
-    """Return the library's arguments ``scanner`` and ``sensor`` for scans of one or several lasers."""
-    scanners = {one: scan.scanner for one, (_, scan) in zip(sensor, scans, strict=True)}
-    if len(scanners) == 1:
-        return {"scanner": scans[0][1].scanner}
-    numbers = {one: k for k, one in enumerate(sorted(scanners))}
-    return {"scanner": [scanners[one] for one in numbers], "sensor": [numbers[one] for one in sensor]}
-
-
-def _referenced(args: argparse.Namespace, scans: list[Scan]) -> list[tuple[int, Scan]]:
-    """Return the scans with poses in the trajectory of ``--reference``, and their numbers."""
-    poses = poses_at([scan.time for scan in scans], *read_tum(args.reference))
-    known = [
-        (k, replace(scan, pose=pose))
-        for k, (scan, pose) in enumerate(zip(scans, poses, strict=True))
-        if pose is not None
-    ]
-    if len(known) < len(scans):
-        sys.stderr.write(f"gpusense: --reference: has poses of {len(known)} of {len(scans)} chosen scans\n")
+def read_posed_steps(args: argparse.Namespace) -> list[Step]:
+    """Read the chosen scans of ``--log``, with the poses of ``--reference`` if set; scans without one are skipped."""
+    steps = read_chosen_steps(args)
+    if args.reference is None:
+        return steps
+    poses = poses_at([step.scan.time for step in steps], *read_tum(args.reference))
+    known = [replace(step, scan=replace(step.scan, pose=pose)) for step, pose in zip(steps, poses, strict=True) if pose]
+    if len(known) < len(steps):
+        sys.stderr.write(f"gpusense: --reference: has poses of {len(known)} of {len(steps)} chosen scans\n")
     return known
+
+
+def scanners_of(steps: list[Step]) -> dict[str, Any]:
+    """Return the library's arguments ``scanner`` and ``sensor`` for scans of one or several lasers."""
+    scanners = {step.sensor: step.scan.scanner for step in steps}
+    if len(scanners) == 1:
+        return {"scanner": steps[0].scan.scanner}
+    numbers = {one: k for k, one in enumerate(sorted(scanners))}
+    return {"scanner": [scanners[one] for one in numbers], "sensor": [numbers[step.sensor] for step in steps]}
 
 
 def write_trajectory(path: Path | None, times: Sequence[float], poses: Any, first: int = 0) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from gpusense._util.typing import Floats
 from gpusense.evaluation.trajectory_files import nearest_index, poses_at, read_tum
 from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
 from gpusense.logs import Odometry, Pose, Scan
-from gpusense.logs.reader import LogOptions, format_of, read_laser, read_lasers
+from gpusense.logs.reader import LogOptions, format_of, read_lasers
 from gpusense.logs.records import check_scanner
 from gpusense.logs.ros import PoseTrack, read_poses
 from gpusense.world.scanner import Scanner
@@ -85,50 +84,16 @@ def read_steps(
     return steps
 
 
-def chosen_scans(
-    path: str | os.PathLike[str],
-    *,
-    every: int = 1,
-    offset: int = 0,
-    limit: int | None = None,
-    topic: str | None = None,
-    **options: Unpack[LogOptions],
-) -> list[tuple[int, Scan]]:
-    """Read scans of a log with their indices: ``offset``, ``offset + every``, ..., at most ``limit`` scans.
-
-    ``limit``: Largest number of scans; None for all. ``topic``: The laser, see :func:`gpusense.logs.reader.read_laser`;
-    None for the only or main laser.
-    """
-    last = None if limit is None else offset + every * limit
-    scans = read_laser(path, topic, **options)
-    chosen = list(itertools.islice(enumerate(scans), offset, last, every))
-    if not chosen:
-        raise ValueError(f"log: must have a scan of index {offset}, the first one chosen, got fewer scans in {path}")
-    return chosen
-
-
-def with_poses(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> list[tuple[int, Scan]]:
-    """Return numbered scans of a log, which must have poses and one scanner."""
-    check_poses(scans, path)
-    return with_one_scanner(scans, path)
-
-
-def check_poses(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> None:
-    """Check that numbered scans of a log have poses."""
-    for index, scan in scans:
-        if scan.pose is None:
-            rule = "every scan must have a pose, of its own or by --reference"
+def with_poses(steps: Sequence[Step], path: str | os.PathLike[str]) -> list[tuple[int, Scan]]:
+    """Return the numbered scans of steps of a log, which must have poses."""
+    for step in steps:
+        if step.scan.pose is None:
             raise ValueError(
-                f"log: {rule}, got none at scan {index} of {path}; trajectories for --reference: of a SLAM program, of "
-                "'gpusense localize --tum' in a map, of 'gpusense map --tum' without one"
+                f"log: every scan must have a pose, of its own or by --reference, got none at scan {step.index} of "
+                f"{path}; trajectories for --reference: of a SLAM program, of 'gpusense localize --tum' in a map, of "
+                "'gpusense map --tum' without one"
             )
-
-
-def with_one_scanner(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> list[tuple[int, Scan]]:
-    """Return numbered scans of a log, which must have one scanner."""
-    for index, scan in scans:
-        check_scanner(scan, scans[0][1].scanner, f"scan {index} of {path}")
-    return scans
+    return [(step.index, step.scan) for step in steps]
 
 
 def repeats_odometry(steps: Sequence[Step]) -> bool:

@@ -113,7 +113,7 @@ def test_temperature_is_calibrated_from_the_log_or_given(capsys, recorded):
     options = ["--model", "field", "--particles", "50", "--backend", "numpy"]
     _, out, _ = run(capsys, recorded, *options, "--json")
     grid = gs.read_map(recorded / "map.yaml")
-    scans = [scan for _, scan in steps.chosen_scans(recorded / "run.log")]
+    scans = [step.scan for step in steps.read_steps(recorded / "run.log")]
     model = gs.LikelihoodFieldModel(grid, scans[0].scanner, backend="numpy")
     poses = np.array([scan.pose for scan in scans])
     wanted = gs.calibrate_temperature(model, np.array([scan.ranges for scan in scans]), poses)

@@ -62,20 +62,15 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         output.report(_document(plan) | ({"sources": texts} if args.sources else {}))
         return 0
-    _print(plan)
+    output.result(f"{counted(len(plan.omissions), 'part')} left out, {len(plan.kept)} kept, {len(plan.could_go)} that "
+                  f"another choice would leave out: {plan.title}")  # fmt: skip
+    for part in plan.omissions:
+        output.fact(f"- {part.what}:", f"{part.why}; saves {part.saves}{plan.saving(part)}")
     if args.verbose:
         print(f"\n{plan}")
     for kernel, text in texts.items():
         print(f"\n{kernel}:\n{text.rstrip()}")
     return 0
-
-
-def _print(plan: Plan) -> None:
-    """Print the numbers of parts, and the omitted parts with reasons and savings."""
-    output.result(f"{counted(len(plan.omissions), 'part')} left out, {len(plan.kept)} kept, {len(plan.could_go)} that "
-                  f"another choice would leave out: {plan.title}")  # fmt: skip
-    for part in plan.omissions:
-        output.fact(f"- {part.what}:", f"{part.why}; saves {part.saves}{plan.saving(part)}")
 
 
 def _scene(args: argparse.Namespace) -> tuple[OccupancyGrid, Scanner, np.ndarray]:
@@ -100,13 +95,10 @@ def _scene(args: argparse.Namespace) -> tuple[OccupancyGrid, Scanner, np.ndarray
 def _document(plan: Plan) -> dict[str, Any]:
     """Return a plan as JSON."""
     measured = plan.measured or {}
-    return {
-        "title": plan.title,
-        "flags": sorted(plan.code),
-        "left_out": [
-            {"part": part.what, "reason": part.why, "saves": part.saves, "measured_s": measured.get(part.what)}
-            for part in plan.omissions
-        ],
-        "kept": [{"part": note.what, "reason": note.why} for note in plan.kept],
-        "could_go": [{"part": note.what, "reason": note.why} for note in plan.could_go],
-    }
+    left_out = [
+        {"part": part.what, "reason": part.why, "saves": part.saves, "measured_s": measured.get(part.what)}
+        for part in plan.omissions
+    ]
+    kept, could_go = ([{"part": one.what, "reason": one.why} for one in some] for some in (plan.kept, plan.could_go))
+    flags = sorted(plan.code)
+    return {"title": plan.title, "flags": flags, "left_out": left_out, "kept": kept, "could_go": could_go}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,23 +87,19 @@ def _extract(args: argparse.Namespace, scans: list[tuple[int, Scan]]) -> Feature
     return extract_features(ranges, scanner, kinds, args.backend, noise=noise, intensities=np.array(light))
 
 
-def _landmark_kinds(args: argparse.Namespace) -> tuple[str, ...]:
-    return tuple(kind for kind in MAP_KINDS if args.kinds is None or kind in args.kinds)
-
-
 def _of_map(args: argparse.Namespace) -> int:
     """Make landmarks from a map."""
     for option in ("out", "plot", "reference"):
         if getattr(args, option) is not None:
             raise ValueError(f"--{option}: must not be given with --map-in, which has no scans")
     grid = read_map(args.map_in)
-    landmarks = landmarks_of_map(grid, kinds=_landmark_kinds(args), backend=args.backend)
-    _write_landmarks(args, landmarks, grid)
+    landmarks = landmarks_of_map(grid, kinds=_kinds(args, MAP_KINDS), backend=args.backend)
+    rows = _write_landmarks(args, landmarks, grid)
     if args.json:
-        output.report({"landmarks": _landmark_rows(landmarks)}, args)
+        output.report({"landmarks": rows}, args)
         return 0
-    output.result(f"{counted(len(landmarks.kind), 'landmark')} in the map: {_kinds(landmarks.kind)}")
-    _print_files(args)
+    output.result(f"{counted(len(rows), 'landmark')} in the map: {_counts_text(landmarks.kind)}")
+    output.files(args.map_out, args.map_plot)
     return 0
 
 
@@ -110,13 +107,11 @@ def _report(
     args: argparse.Namespace, scans: list[tuple[int, Scan]], parts: list[Features], posed: bool, seconds: float
 ) -> None:
     """Print and write the features of all scans, or of the scans before an interrupt."""
-    features = joined(parts, _CALL)
-    done = min(_CALL * len(parts), len(scans))
-    landmarks = None
+    features, done, rows = joined(parts, _CALL), min(_CALL * len(parts), len(scans)), None
     if posed:
         poses = np.array([scan.pose for _, scan in scans[:done]])
-        landmarks = map_features(features, poses, kinds=_landmark_kinds(args), least=args.least)
-        _write_landmarks(args, landmarks, None)
+        landmarks = map_features(features, poses, kinds=_kinds(args, MAP_KINDS), least=args.least)
+        rows = _write_landmarks(args, landmarks, None)
     deviations = np.sqrt(np.einsum("fii->fi", features.covariance))
     index = np.array([index for index, _ in scans])[features.scan]
     columns = (index, features.kind, *features.pose.T, *deviations.T, features.size, features.score)
@@ -124,41 +119,38 @@ def _report(
     most = int(np.bincount(features.scan, minlength=done).argmax())
     shown = scans[most][1]
     draw(args.plot, lambda: features_figure(features.of_scan(most), shown.ranges, shown.scanner))
-    counts = {str(kind): int(count) for kind, count in zip(*np.unique(features.kind, return_counts=True), strict=True)}
+    counts, each = _counts(features.kind), 1e3 * seconds / done
     if args.json:
-        rows = None if landmarks is None else _landmark_rows(landmarks)
-        facts = {"scans": done, "counts": counts, "milliseconds_each": 1e3 * seconds / done, "landmarks": rows}
-        output.report(facts, args)
+        output.report({"scans": done, "counts": counts, "milliseconds_each": each, "landmarks": rows}, args)
         return
-    output.result(f"{counted(len(features.kind), 'feature')} in {counted(done, 'scan')}: "
-                  f"{len(features.kind) / done:.2g} a scan")  # fmt: skip
+    total = len(features.kind)
+    output.result(f"{counted(total, 'feature')} in {counted(done, 'scan')}: {total / done:.2g} a scan")
     if counts:
         output.fact("a scan", ", ".join(f"{kind} {count / done:.2g}" for kind, count in counts.items()))
-    if landmarks is not None:
-        output.fact("landmarks", f"{len(landmarks.kind)}, each in {args.least} scans or more: {_kinds(landmarks.kind)}")
+    if rows is not None:
+        made = f"{len(rows)}, each in {args.least} scans or more: {_counts_text(landmarks.kind)}"
+        output.fact("landmarks", made)
     output.interrupted(done, len(scans))
-    _print_files(args)
-    output.details(args, f"{1e3 * seconds / done:.3g} ms each with the first call's compilation")
-
-
-def _kinds(kinds: np.ndarray) -> str:
-    """Return the number of each kind in words."""
-    names, counts = np.unique(kinds, return_counts=True)
-    return ", ".join(counted(int(count), str(name)) for name, count in zip(names, counts, strict=True)) or "none"
-
-
-def _print_files(args: argparse.Namespace) -> None:
     output.files(args.out, args.map_out, args.plot, args.map_plot)
+    output.details(args, f"{each:.3g} ms each with the first call's compilation")
 
 
-def _landmark_rows(landmarks: FeatureMap) -> list[dict[str, Any]]:
-    return [
-        {"kind": str(kind), "pose": pose, "size": float(size), "count": int(count)}
-        for kind, pose, size, count in zip(landmarks.kind, landmarks.pose, landmarks.size, landmarks.count, strict=True)
-    ]
+def _kinds(args: argparse.Namespace, every: Sequence[str]) -> tuple[str, ...]:
+    return tuple(kind for kind in every if args.kinds is None or kind in args.kinds)
 
 
-def _write_landmarks(args: argparse.Namespace, landmarks: FeatureMap, grid: Any) -> None:
+def _counts(kinds: np.ndarray) -> dict[str, int]:
+    return dict(zip(*(values.tolist() for values in np.unique(kinds, return_counts=True)), strict=True))
+
+
+def _counts_text(kinds: np.ndarray) -> str:
+    return ", ".join(counted(count, kind) for kind, count in _counts(kinds).items()) or "none"
+
+
+def _write_landmarks(args: argparse.Namespace, landmarks: FeatureMap, grid: Any) -> list[dict[str, Any]]:
+    """Write and draw landmarks, if requested, and return their rows for ``--json``."""
     if args.map_out is not None:
         landmarks.save(args.map_out)
     draw(args.map_plot, lambda: landmarks_figure(landmarks, grid))
+    columns = (landmarks.kind.tolist(), landmarks.pose, landmarks.size, landmarks.count)
+    return [dict(zip(("kind", "pose", "size", "count"), row, strict=True)) for row in zip(*columns, strict=True)]

@@ -138,23 +138,20 @@ def _report(
 
 
 def headline(found: Judgement) -> str:
-    """Return the verdict in one line."""
-    total, right = found.duration(), found.duration("tracking")
+    """Return the verdict in one line, the worst stretches first."""
+    total, unsure, begin = _seconds(found.duration()), found.duration("uncertain"), float(found.times[0])
     if not found.informed:
-        return f"no verdict: no scan of {_seconds(total)} has a reading to judge by"
+        return f"NO VERDICT: no scan of {total} has a reading to judge by"
     if len(found.times) == 1:
         (verdict,) = found.verdicts
-        return f"{'right' if verdict == 'tracking' else verdict} at its only pose; p_lost {found.p_lost[0]:.2g}"
-    lost = [one for one in found.stretches if one.verdict == "lost"]
-    parts = [f"right for {_seconds(right, unit=False)} of {_seconds(total)}"]
-    unsure = found.duration("uncertain")
-    if lost:
-        parts.append(_lost(lost, float(found.times[0])))
-    if unsure:
-        parts.append(f"uncertain for {_seconds(unsure)}")
-    if len(parts) == 1:
-        parts.append(f"p_lost at most {found.p_lost.max():.2g}")
-    return "; ".join(parts)
+        word = "RIGHT" if verdict == "tracking" else verdict.upper()
+        return f"{word} at its only pose; p_lost {found.p_lost[0]:.2g}"
+    parts = [_lost([one for one in found.stretches if one.verdict == "lost"], begin)] if found.lost else []
+    parts += [f"uncertain for {_seconds(unsure)}"] if unsure else []
+    parts.append(f"right for {_seconds(found.duration('tracking'), unit=False)} of {total}")
+    parts += [f"p_lost at most {found.p_lost.max():.2g}"] if len(parts) == 1 else []
+    word, space, rest = "; ".join(parts).partition(" ")
+    return f"{word.upper()}{space}{rest}"
 
 
 def _lost(lost: Sequence[Stretch], begin: float) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gpusense.commands.arguments import Options, finite_number
-from gpusense.evaluation.steps import Step, read_steps, with_poses
+from gpusense.evaluation.steps import Step, check_scanners, read_steps, with_poses
 from gpusense.evaluation.trajectory_files import poses_at, read_tum, write_tum
 from gpusense.logs import Scan
 from gpusense.logs.reader import LogOptions, read_laser
@@ -78,13 +78,14 @@ def read_scan(args: argparse.Namespace) -> Scan:
     raise ValueError(f"--scan: must be below the log's number of scans, {index}, got {wanted}")
 
 
-def read_chosen_steps(args: argparse.Namespace) -> list[Step]:
+def read_chosen_steps(args: argparse.Namespace, *, odometry: bool = True) -> list[Step]:
     """Read the chosen scans of ``--log`` with raw odometry, of one laser or of several by time."""
     sensors = [args.topic] if isinstance(args.topic, str) else args.topic or ()
     with options_named():
         steps = read_steps(
-            args.log, every=args.every, offset=args.offset, limit=args.limit, sensors=sensors, **log_options(args)
-        )
+            args.log, every=args.every, offset=args.offset, limit=args.limit, sensors=sensors, odometry=odometry,
+            **log_options(args),
+        )  # fmt: skip
     for index, name in enumerate(sensors):
         if all(step.sensor != index for step in steps):
             raise ValueError(f"--topic: must have scans that are chosen, got none of {name}")
@@ -93,13 +94,15 @@ def read_chosen_steps(args: argparse.Namespace) -> list[Step]:
 
 def read_posed_steps(args: argparse.Namespace) -> list[Step]:
     """Read the chosen scans of ``--log``, with the poses of ``--reference`` if set; scans without one are skipped."""
-    steps = read_chosen_steps(args)
+    steps = read_chosen_steps(args, odometry=False)
     if args.reference is None:
+        check_scanners(steps, args.log)
         return steps
     poses = poses_at([step.scan.time for step in steps], *read_tum(args.reference))
     known = [replace(step, scan=replace(step.scan, pose=pose)) for step, pose in zip(steps, poses, strict=True) if pose]
     if len(known) < len(steps):
         sys.stderr.write(f"gpusense: --reference: has poses of {len(known)} of {len(steps)} chosen scans\n")
+    check_scanners(known, args.log)
     return known
 
 

@@ -49,6 +49,7 @@ def read_steps(
     offset: int = 0,
     limit: int | None = None,
     sensors: Sequence[str] = (),
+    odometry: bool = True,
     **options: Unpack[LogOptions],
 ) -> list[Step]:
     """Read scans of a log with raw odometry.
@@ -56,13 +57,13 @@ def read_steps(
     Logs with corrected poses often repeat them as odometry, with wheel readings between the scans that start at the
     corrected pose of the previous scan. The odometry is then chained from these readings.
 
-    ``limit``: Largest number of scans; None for all. Nothing is read after the last one.
+    ``limit``: Largest number of scans; None for all. Nothing is read after the last one. ``odometry``: Whether to read
+    wheel readings between the scans, and to check that all scans of a laser have one scanner.
     """
     chained, last, between = np.zeros(3), None, None
     steps: list[Step] = []
     counts = [0] * max(len(sensors), 1)
-    scanners: dict[int, Scanner] = {}
-    for sensor, record in read_lasers(path, sensors, **options):
+    for sensor, record in read_lasers(path, sensors, odometry=odometry, **options):
         if isinstance(record, Odometry):
             between = record.pose
             continue
@@ -73,7 +74,6 @@ def read_steps(
         last, between = record, None
         count = counts[sensor]
         if count >= offset and (count - offset) % every == 0:
-            check_scanner(record, scanners.setdefault(sensor, record.scanner), f"scan {count}")
             x, y, theta = (float(value) for value in chained)
             steps.append(Step(count, record, (x, y, theta), sensor, record.pose))
             if len(steps) == limit:
@@ -81,7 +81,16 @@ def read_steps(
         counts[sensor] += 1
     if not steps:
         raise ValueError(f"log: must have a scan of index {offset}, the first one chosen, got fewer scans in {path}")
+    if odometry:
+        check_scanners(steps, path)
     return steps
+
+
+def check_scanners(steps: Sequence[Step], path: str | os.PathLike[str]) -> None:
+    """Check that all scans of each laser of a log have one scanner."""
+    scanners: dict[int, Scanner] = {}
+    for step in steps:
+        check_scanner(step.scan, scanners.setdefault(step.sensor, step.scan.scanner), f"scan {step.index} of {path}")
 
 
 def with_poses(steps: Sequence[Step], path: str | os.PathLike[str]) -> list[tuple[int, Scan]]:

@@ -210,9 +210,11 @@ def read_laser(
 def read_lasers(
     path: str | os.PathLike[str],
     sensors: Sequence[str] = (),
+    *,
+    odometry: bool = True,
     **options: Unpack[LogOptions],
 ) -> Iterator[tuple[int, Scan | Odometry]]:
-    """Yield the index of a laser in ``sensors`` with its scan, or 0 with an odometry reading.
+    """Yield the index of a laser in ``sensors`` with its scan, or 0 with an odometry reading if ``odometry``.
 
     ``sensors`` names topics of a ROS bag's lasers, with mounts from transforms, or ``"front"`` or ``"rear"`` for a
     CARMEN log, which states no mounts. None is the laser that ``read_log`` takes.
@@ -228,7 +230,7 @@ def read_lasers(
             raise ValueError(f"mount: must be left out for {len(sensors)} lasers, whose transforms have them, got one")
     topics: Sequence[str | None] = sensors or (None,)
     each = [
-        zip(itertools.repeat(index), _records(form, path, topic, index == 0, options))
+        zip(itertools.repeat(index), _records(form, path, topic, odometry and index == 0, options))
         for index, topic in enumerate(topics)
     ]
     return each[0] if len(each) == 1 else heapq.merge(*each, key=lambda one: one[1].time)

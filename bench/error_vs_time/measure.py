@@ -13,6 +13,7 @@ states the commit of a copy without a repository.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Iterator
@@ -33,6 +34,7 @@ from gpusense.commands import bench
 from gpusense.commands.arguments import Options
 from gpusense.evaluation.benchmark.report import document, plain
 from gpusense.evaluation.benchmark.runner import Outcome, Plan, run
+from gpusense.evaluation.benchmark.scenes import MapSource
 from gpusense.evaluation.machine import machine
 
 SIZE = ["--particles", "10000", "--beams", "360", "--repeats", "15"]
@@ -41,27 +43,32 @@ QUICK = ["--particles", "512", "--beams", "60", "--repeats", "3", "--checked", "
 ALIKE = ("particles", "checked", "beams", "repeats", "seconds", "seed", "build_limit")
 # Scenes to measure first.
 FIRST = ("building", "basement", "intel", "clutter", "willow", "spielberg")
+# Recorded maps by the names of their scenes: files below the folder in the variable GPUSENSE_DATA.
+MAPS = {
+    "basement": "ros_maps/basement_hallways_5cm.yaml", "spielberg": "ros_maps/Spielberg_map.yaml",
+    "willow": "ros_maps/willow-full.yaml", "intel": "carmen_logs/derived_maps/intel_even_05cm.yaml",
+}  # fmt: skip
 
 
 def plans_of(arguments: argparse.Namespace) -> tuple[list[Plan], dict[str, Any], list[str]]:
     """Return a plan for each scene, exact methods in float64 included, the arguments, and notes on absent programs."""
     parser = argparse.ArgumentParser(add_help=False)
     bench.add_options(Options(parser))
-    words = [
-        *(QUICK if arguments.quick else SIZE),
-        "--build-limit",
-        str(arguments.build_limit),
-        "--seconds",
-        str(arguments.point_seconds),
-    ]
+    limits = ["--build-limit", str(arguments.build_limit), "--seconds", str(arguments.point_seconds)]
+    words = [*(QUICK if arguments.quick else SIZE), *limits]
     words += [word for name in arguments.backend for word in ("--backend", name)]
-    words += [word for name in arguments.scene or () for word in ("--scene", name)]
     given = parser.parse_args(words)
     whole, absent = bench.make_plan(given)
     if not arguments.no_peers:
         whole = replace(whole, candidates=[*whole.candidates, *(one for one in outside() if not one.missing)])
         absent += dict.fromkeys(f"{one.outside}: {one.missing}" for one in outside() if one.missing)
-    sources = sorted(whole.sources, key=lambda one: FIRST.index(one.name) if one.name in FIRST else len(FIRST))
+    folder = Path(os.environ.get("GPUSENSE_DATA", ""))
+    known = {source.name: source for source in whole.sources}
+    known |= {name: MapSource(name, file, folder / file) for name, file in MAPS.items() if (folder / file).is_file()}
+    if unknown := set(arguments.scene or ()) - set(known):
+        raise ValueError(f"--scene: must be one of {', '.join(known)}, got {', '.join(unknown)}")
+    chosen = [known[name] for name in arguments.scene or known]
+    sources = sorted(chosen, key=lambda one: FIRST.index(one.name) if one.name in FIRST else len(FIRST))
     exact = [one for one in whole.candidates if one.exact and not one.outside]
     plans = [
         replace(whole, sources=[source], candidates=chosen, precisions=[precision])
@@ -148,7 +155,7 @@ def main() -> None:
     """Measure the needs and scenes, and write the reports."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--backend", action="append", required=True, help="selection string, repeatable")
-    parser.add_argument("--scene", action="append", help="scene of gpusense bench, repeatable; default: all")
+    parser.add_argument("--scene", action="append", help="scene of gpusense bench or of MAPS, repeatable; default: all")
     parser.add_argument("--no-tasks", action="store_true", help="without the report of needs.py")
     parser.add_argument("--no-models", action="store_true", help="without the report of gpusense bench")
     parser.add_argument("--quick", action="store_true", help="512 particles, 60 beams, to see whether all runs")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import shlex
 import sys
 from collections.abc import Callable, Mapping
@@ -25,10 +26,10 @@ from gpusense.commands.arguments import (
 from gpusense.commands.signals import working
 from gpusense.evaluation.benchmark.candidates import candidates
 from gpusense.evaluation.benchmark.choice import choices, parse_error, parse_time
-from gpusense.evaluation.benchmark.report import document, model_rows, to_json
+from gpusense.evaluation.benchmark.report import document, model_rows
 from gpusense.evaluation.benchmark.runner import Outcome, Plan, steps
 from gpusense.evaluation.benchmark.runner import run as run_plan
-from gpusense.evaluation.benchmark.scenes import sources
+from gpusense.evaluation.benchmark.scenes import GENERATED, sources
 from gpusense.evaluation.machine import machine, machine_line
 from gpusense.plots.error_page import error_page
 
@@ -53,9 +54,6 @@ error and time. Nats are the KL divergence of the posterior around the true pose
 a comparable temperature; per cent are rays wrong by more than a cell, cells the range error that 95 % of the rays keep.
 Times are calls of --particles times --beams.
 
-Scenes: 'building' and 'clutter' are generated. If GPUSENSE_DATA names the folder of recorded data, 'basement',
-'spielberg', 'willow' and 'intel' are added; --map adds others.
-
 --output DIR receives report.json with all points and the reasons of failures. --html FILE writes the
 interactive page of docs/error-vs-time.md for this measurement: time over error, the method for a budget, and
 performance profiles.
@@ -63,7 +61,7 @@ performance profiles.
 examples:
   gpusense bench --quick --html bench.html
   gpusense bench --output results --backend opencl --backend warp:cpu
-  gpusense bench --scene basement --method exact --method lookup \\
+  gpusense bench --scene building --method exact --method lookup \\
       --problem ranges
   gpusense bench --map office.yaml --particles 10000 --beams 60 \\
       --max-error "0.01 nats" --max-time "1 ms\""""
@@ -74,7 +72,7 @@ def add_options(add: Options) -> None:
     add("--output DIR", "folder for the report, created if absent", output_folder())
     add("--html FILE", "interactive page of the measurement, one file that works offline", Output(".html"))
     add("--quick", "small maps, few values of the knobs, float32: half a minute plus compiling")
-    add("--scene NAME*", "a scene; may be repeated (default: all)")
+    add("--scene *", "a generated scene; may be repeated (default: both, without --map)", GENERATED)
     add("--map YAML*", "a map_server map as a further scene; may be repeated", Path, [])
     add("--backend DEVICE*", f"{BACKEND_HELP}; may be repeated (default: all present except simulators)")
     add("--problem *", "a problem; may be repeated (default: all)", PROBLEMS)
@@ -118,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
     report = document(plan, outcome, arguments_of(args, plan), machine(), absent, shlex.join(words))
     if args.output is not None:
         args.output.mkdir(parents=True, exist_ok=True)
-        write_whole(args.output / "report.json", lambda stream: stream.write(to_json(report).encode()))
+        write_whole(args.output / "report.json", lambda stream: stream.write(json.dumps(report, indent=1).encode()))
     if args.html is not None:
         page = error_page(model_rows(report), text=f"{report['date']}. {machine_line()}")
         write_whole(args.html, lambda stream: stream.write(page.encode()))

@@ -195,7 +195,6 @@ def test_profiles_in_a_browser(tmp_path: Path) -> None:
     assert "make(march)" in body["tip"] and "gpusense bench (2026-01-01, commit abc)" in body["tip"]
 
 
-@pytest.mark.usefixtures("no_data")
 def test_the_command_writes_its_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "own.html"
     argv = ["bench", "--quick", "--particles", "8", "--checked", "6", "--beams", "7", "--repeats", "1",

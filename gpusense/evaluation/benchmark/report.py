@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import re
 import subprocess
@@ -55,18 +54,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
     return value
-
-
-def to_json(report: Mapping[str, Any]) -> str:
-    """Format a report as JSON with one line per list element, so that two reports can be diffed."""
-    parts = []
-    for key, value in report.items():
-        if isinstance(value, list) and value:
-            lines = ",\n".join(f"  {json.dumps(item, allow_nan=False)}" for item in value)
-            parts.append(f"{json.dumps(key)}: [\n{lines}\n ]")
-        else:
-            parts.append(f"{json.dumps(key)}: {json.dumps(value, allow_nan=False)}")
-    return "{\n " + ",\n ".join(parts) + "\n}\n"
 
 
 def commit() -> str | None:

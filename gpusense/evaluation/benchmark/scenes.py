@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import hashlib
 import math
-import os
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,15 +25,6 @@ CLOUDS = ("global", "tracking")
 """Uniform over the free cells and all headings; normal around the true pose, restricted to free space."""
 SIGMA_POSITION, SIGMA_HEADING = 0.5, 0.25  # of the tracking cloud [m, rad]
 RANGE_MAX = 30.0
-
-DATA = "GPUSENSE_DATA"
-RECORDED = {
-    "basement": "ros_maps/basement_hallways_5cm.yaml",
-    "spielberg": "ros_maps/Spielberg_map.yaml",
-    "willow": "ros_maps/willow-full.yaml",
-    "intel": "carmen_logs/derived_maps/intel_even_05cm.yaml",
-}
-"""Recorded maps by the name of their scene: files below the folder in the variable GPUSENSE_DATA."""
 
 # Width and height of the generated maps, in full and in quick runs [m].
 _SIZES = {"building": (50.0, 50.0), "clutter": (50.0, 50.0)}
@@ -108,24 +98,13 @@ class Scene:
 
 
 def sources(names: Sequence[str] | None = None, maps: Sequence[Path] = (), *, quick: bool = False) -> list[MapSource]:
-    """List the maps of a run by names of scenes; None for ``maps`` alone, or else for all available scenes."""
+    """List the maps of a run: generated ones by ``names``, and ``maps``; all generated ones if neither is passed."""
     sizes = _QUICK_SIZES if quick else _SIZES
-    known = {name: MapSource(name, f"generated, {w:g} x {h:g} m", None, (w, h)) for name, (w, h) in sizes.items()}
-    folder = os.environ.get(DATA, "")
-    if folder:
-        present = {name: Path(folder, file) for name, file in RECORDED.items()}
-        known |= {name: MapSource(name, RECORDED[name], path) for name, path in present.items() if path.is_file()}
-    for name in names or ():
-        if name in known:
-            continue
-        absent = f"; {name!r} is below the folder that {DATA} names, got {folder!r}" if name in RECORDED else ""
-        raise ValueError(f"scene: must be one of {', '.join(known)}, got {name!r}{absent}")
-    if names:
-        chosen = [known[name] for name in dict.fromkeys(names)]
-    elif maps:
-        chosen = []
-    else:
-        chosen = [source for source in known.values() if source.path is None or not quick]
+    chosen = [
+        MapSource(name, f"generated, {width:g} x {height:g} m", None, (width, height))
+        for name, (width, height) in sizes.items()
+        if name in (names or ()) or not (names or maps)
+    ]
     chosen += [MapSource(path.stem, path.name, path) for path in maps]
     if len({source.name for source in chosen}) < len(chosen):
         raise ValueError(f"map: every scene must have a name of its own, got {', '.join(s.name for s in chosen)}")

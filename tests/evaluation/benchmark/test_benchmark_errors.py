@@ -14,8 +14,6 @@ from gpusense.evaluation.benchmark import accuracy, candidates, scenes
 from gpusense.evaluation.tolerances import TOLERANCES
 from gpusense.evaluation.worlds import is_free
 
-pytestmark = pytest.mark.usefixtures("no_data")
-
 
 @pytest.mark.parametrize("name", scenes.GENERATED)
 def test_scenes_follow_from_their_seed(name):
@@ -44,23 +42,15 @@ def test_is_free_outside_and_in_walls():
     assert is_free(grid, poses[:, :2]).tolist() == [True, False, False, True, False, False]
 
 
-def test_recorded_maps_need_the_data(tmp_path, monkeypatch):
+def test_maps_are_scenes(tmp_path):
     assert [source.name for source in scenes.sources()] == list(scenes.GENERATED)
-    with pytest.raises(ValueError, match="GPUSENSE_DATA"):
-        scenes.sources(["intel"])
     grid = scenes.clutter(0, (4.0, 3.0), 0.1)
-    (tmp_path / "ros_maps").mkdir()
-    gs.write_map(grid, tmp_path / scenes.RECORDED["willow"])
-    monkeypatch.setenv(scenes.DATA, str(tmp_path))
-    assert [source.name for source in scenes.sources()] == [*scenes.GENERATED, "willow"]
-    (own,) = scenes.sources(maps=[tmp_path / scenes.RECORDED["willow"]])
-    assert (own.name, own.origin) == ("willow-full", "willow-full.yaml")
+    gs.write_map(grid, tmp_path / "willow.yaml")
+    (own,) = scenes.sources(maps=[tmp_path / "willow.yaml"])
+    assert (own.name, own.origin) == ("willow", "willow.yaml")
     np.testing.assert_array_equal(own.grid(0).occupied, grid.occupied)
-
-
-def test_recorded_scenes_are_found(monkeypatch, data_dir):
-    monkeypatch.setenv(scenes.DATA, str(data_dir))
-    assert {source.name for source in scenes.sources()} == {*scenes.GENERATED, *scenes.RECORDED}
+    with pytest.raises(ValueError, match="every scene must have a name of its own, got willow, willow"):
+        scenes.sources(maps=[tmp_path / "willow.yaml"] * 2)
 
 
 # Errors

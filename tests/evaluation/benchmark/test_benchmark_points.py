@@ -15,8 +15,6 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation.benchmark import accuracy, candidates, runner
 
-pytestmark = pytest.mark.usefixtures("no_data")
-
 
 def test_methods_are_those_of_the_package():
     own = candidates.candidates(candidates.PROBLEMS)

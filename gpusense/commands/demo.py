@@ -91,14 +91,13 @@ def run(args: argparse.Namespace) -> int:
         if not args.no_plot and {score.name for score in scores} == {BEAM, FIELD}:
             draw(scene, scores, args.output)
             written = args.output
-    marks.append(("", time.perf_counter()))
-    seconds = {name: after - begin for (name, begin), (_, after) in itertools.pairwise(marks)}
+    marks.append(("report", time.perf_counter()))
+    seconds = {name: end - begin for (name, begin), (_, end) in itertools.pairwise(marks)}
     if args.json:
         output.document(_document(scene, args.seed, scores, failures, written) | {"seconds": seconds})
     else:
         _report(scene, scores, failures, written)
-    if args.verbose:
-        print("\nSeconds: " + ", ".join(f"{name} {taken:.2f}" for name, taken in seconds.items()))
+    output.details(args, "Seconds: " + ", ".join(f"{name} {spent:.2f}" for name, spent in seconds.items()))
     return 1 if failures else 0
 
 
@@ -146,16 +145,9 @@ def draw(scene: Scene, scores: list[Score], path: Path) -> None:
         densities[f"{name.capitalize()}: every position at the best heading; ring: the truth"] = density
     shown = slice(None, None, -(-len(scene.poses) // DRAWN_PARTICLES))
     figure = pose_densities.localization_figure(
-        scene.grid,
-        scene.scanner,
-        scene.ranges,
-        scene.truth,
-        best,
-        beam.poses[:-1][shown],
-        beam.log_p[:-1][shown],
-        densities,
-        extent,
-    )
+        scene.grid, scene.scanner, scene.ranges, scene.truth, best, beam.poses[:-1][shown], beam.log_p[:-1][shown],
+        densities, extent,
+    )  # fmt: skip
     title = f"Where is the robot?   P(z | x, m) of one scan, {scene.beams} of its {BEAMS} beams, by gpusense"
     figure.suptitle(title, fontsize=15)
     figure.supxlabel(NOTE, fontsize=9, color="#52606d")
@@ -168,13 +160,11 @@ def _fastest(scores: list[Score], name: str) -> Score:
 
 def _report(scene: Scene, scores: list[Score], failures: list[str], written: Path | None) -> None:
     """Print the likeliest pose, the table of devices, and the file of the picture."""
-    particles = grouped(len(scene.poses) - 1)
     for name in dict.fromkeys(score.name for score in scores):
         metres, degrees = _fastest(scores, name).off
-        text = (
-            f"{name}: the likeliest of {particles} poses is {metres:.2f} m and {degrees:.1f} degrees off the true pose"
-        )
-        output.result(f"{text[0].upper()}{text[1:]}.")
+        count = grouped(len(scene.poses) - 1)
+        output.result(f"{name.capitalize()}: the likeliest of {count} poses is {metres:.2f} m and {degrees:.1f} degrees "
+                      "off the true pose.")  # fmt: skip
     columns = ["backend", "model", "first call [s]", "next call [s]", "rate [M/s]", "error"]
     rows = [
         [
@@ -187,12 +177,11 @@ def _report(scene: Scene, scores: list[Score], failures: list[str], written: Pat
     output.table(columns, rows, right=columns[2:])
     print()
     output.fact("rate", "particle-beams a second of whole calls, NumPy arrays in and out")
-    output.fact("error", "largest error of log p [nats], by the NumPy reference in float64 at one pose in "
-                      f"{scene.checked.step}; NumPy scores these poses alone")  # fmt: skip
-    output.fact("poses", "half all over the building, half around the true one")
-    print("".join(f"\nfailed: {failure}\n" for failure in failures), end="")
-    if written is not None:
-        output.files(written)
+    output.fact("error", "of log p [nats], the largest at the poses that the NumPy reference scores in float64, one in "
+                f"{scene.checked.step}")  # fmt: skip
+    for failure in failures:
+        output.fact("failed", failure)
+    output.files(written)
 
 
 def _document(
@@ -201,8 +190,7 @@ def _document(
     """Build the report for ``--json``; times in seconds, errors in nats."""
     results = []
     for score in scores:
-        device = score.model.device
-        metres, degrees = score.off
+        device, (metres, degrees) = score.model.device, score.off
         results.append({
             "backend": device.selection, "device": device.name, "kind": device.kind, "driver": device.driver,
             "model": score.name, "precision": score.model.precision, "first_call_s": score.first_s,
@@ -210,20 +198,15 @@ def _document(
             "particle_beams_per_s": score.rate, "largest_error": score.errors.max(), "error_poses": len(score.errors),
             "rank_of_true_pose": score.rank, "log_p_of_true_pose": score.log_p[-1], "poses": len(score.poses) - 1,
             "best_log_p": score.log_p[:-1].max(), "best_pose": score.best, "best_pose_off_m": metres,
-            "best_pose_off_degrees": degrees,
-            "explain": score.model.explain(),
+            "best_pose_off_degrees": degrees, "explain": score.model.explain(),
         })  # fmt: skip
     return {
-        "machine": machine(),
-        "seed": seed,
+        "machine": machine(), "seed": seed,
         "world": {"size_m": SIZE, "shape": scene.grid.shape, "resolution_m": scene.grid.resolution},
         "scan": {"beams": BEAMS, "beams_used": scene.beams, "range_max_m": RANGE_MAX, "ranges_m": scene.ranges},
-        "particles": len(scene.poses) - 1,
-        "true_pose": scene.truth,
-        "results": results,
-        "failures": failures,
+        "particles": len(scene.poses) - 1, "true_pose": scene.truth, "results": results, "failures": failures,
         "picture": written,
-    }
+    }  # fmt: skip
 
 
 # ---- the scene, its models, and their scores

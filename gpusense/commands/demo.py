@@ -162,9 +162,8 @@ def _report(scene: Scene, scores: list[Score], failures: list[str], written: Pat
     """Print the likeliest pose, the table of devices, and the file of the picture."""
     for name in dict.fromkeys(score.name for score in scores):
         metres, degrees = _fastest(scores, name).off
-        count = grouped(len(scene.poses) - 1)
-        output.result(f"{name.capitalize()}: the likeliest of {count} poses is {metres:.2f} m and {degrees:.1f} degrees "
-                      "off the true pose.")  # fmt: skip
+        off, count = f"{metres:.2f} m and {degrees:.1f} degrees off the true pose", grouped(len(scene.poses) - 1)
+        output.result(f"{name.capitalize()}: the likeliest of {count} poses is {off}.")
     columns = ["backend", "model", "first call [s]", "next call [s]", "rate [M/s]", "error"]
     rows = [
         [

@@ -31,6 +31,9 @@ from gpusense.interface.sources import relevant
 _MOST_NUMBERS = (1 << 31) - 1
 # Largest copy that a thread reads through its cached memory of each type [bytes].
 _FEW_BYTES = 1 << 10
+# Number of arrays of the device whose last copies are known. Graphs contain only copies that repeat: arrays at changing
+# addresses would each need another graph.
+_MOST_PARTNERS = 128
 
 
 class WarpBackend(ProcessBound, Backend):
@@ -50,6 +53,8 @@ class WarpBackend(ProcessBound, Backend):
         # The queue of each thread that has a batch, and the queues that no call uses.
         self._thread = threading.local()
         self._queues: list[CallQueue] = []
+        # By the address of an array, the array of the device that it was last copied to or from; the newest last.
+        self._partners: dict[int, int] = {}
         # By the flags that change code, and by all flags of a launch.
         self._launchers: dict[tuple[str, frozenset[str]], Launch | SharedLaunch] = {}
         self._asked: dict[tuple[str, frozenset[str]], Launch | SharedLaunch] = {}
@@ -154,13 +159,23 @@ class WarpBackend(ProcessBound, Backend):
         from_size, to_size = (wp.types.type_size_in_bytes(array.dtype) for array in (source, target))
         queue = self.batch()
         if queue is not None:
-            if begin == to == 0 and source.dtype is target.dtype:
-                # One graph of the whole call, if the call repeats its arrays.
+            if begin == to == 0 and source.dtype is target.dtype and self._repeats(target.ptr, source.ptr):
+                # One graph of the whole call.
                 queue.steps.append(Copy(target, source, size // to_size))
                 return
             # The copy follows all deferred work.
             self._flush(queue)
         wp.copy(target, source, dest_offset=to // to_size, src_offset=begin // from_size, count=size // from_size)
+
+    def _repeats(self, *addresses: int) -> bool:
+        """Return whether the last copy of either of two arrays was to or from the other, and note this one."""
+        partners, repeated = self._partners, True
+        for one, other in (addresses, addresses[::-1]):
+            repeated &= partners.pop(one, None) == other
+            partners[one] = other
+        while len(partners) > _MOST_PARTNERS:
+            del partners[next(iter(partners))]
+        return repeated
 
     def wrap_external(self, buffer: wp.array, shape: tuple[int, ...], dtype: np.dtype) -> wp.array:
         return buffer if buffer.shape == shape else buffer.reshape(shape)

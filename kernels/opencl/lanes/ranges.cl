@@ -4,12 +4,35 @@
 // Rays of a work-item, whatever the precision.
 #define WORK_RAYS 16
 
+#if WORLDS
+// Particles that fetch a table together, and bytes of a line of the caches.
+#define FETCHERS 16
+#define CACHE_LINE 64
+
+// Fetch a part of the table of the world in which the next FETCHERS particles begin, so that it arrives while this
+// world's rays are cast. Particles that change worlds one by one, or cast few rays in large worlds, fetch nothing.
+void fetch_next_world(global const entry *tables, global const int2 *world, const int n, const int particles,
+                      const int begin, const int rays) {
+    const int next = (n | (FETCHERS - 1)) + 1, items = FETCHERS * ((rays + WORK_RAYS - 1) / WORK_RAYS);
+    if (next + 1 >= particles || world[2 * next].x == world[2 * n].x || world[2 * next].x != world[2 * next + 2].x)
+        return;
+    const Window seen = world_window(world, next);
+    const long lines = (long)PLANES * (seen.rows + 2) * (seen.cols + 2) * sizeof(entry) / CACHE_LINE;
+    if (lines > 2 * FETCHERS * rays) return;
+    const long item = (n % FETCHERS) * (items / FETCHERS) + begin / WORK_RAYS;
+    const size_t table = (size_t)(tables + world_begin(world, next, PLANES));
+    for (long line = lines * item / items; line < lines * (item + 1) / items; ++line)
+        __builtin_prefetch((const void *)(table + line * CACHE_LINE), 0, 2);
+}
+#endif
+
 // Cast rays: one work-item takes a particle and WORK_RAYS rays.
 kernel void cast_ranges(ARGUMENTS) {
     const int begin = WORK_RAYS * get_global_id(0), n = get_global_id(1);
     if (n >= particles) return;
 #if WORLDS
     const Window seen = world_window(world, n);
+    fetch_next_world(map_table, world, n, particles, begin, rays);
     map_table += world_begin(world, n, PLANES);
 #else
     const Window seen = window;

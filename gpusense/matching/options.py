@@ -16,6 +16,7 @@ from gpusense.interface.structs import MatchRules
 from gpusense.matching.columns import Column, any_of, columns_of
 from gpusense.matching.icp import PlacedPairs
 from gpusense.matching.points import GAP
+from gpusense.matching.pose_grid import distinct_poses
 
 # Points that are used while the scale shrinks, and for each start of a search.
 COARSE_POINTS, _SEARCH_POINTS = 200, 30
@@ -256,29 +257,14 @@ def distinct(poses: np.ndarray, score: np.ndarray, known: np.ndarray, capture: f
 
     Return (C,) numbers of rows, ascending, and (C, 3) poses.
     """
-    # Only starts that may be refined, row by row; each choice drops those that are near it.
-    least = score.max(axis=1) - _PROMISING
-    row, start = np.nonzero(score > least[:, None])
-    left, last = score[row, start], known
-    x, y, turn = (poses[row, start, k] for k in range(3))
-    which, chosen = [], []
-    for _ in range(min(_REFINED, score.shape[1])):
-        near = np.flatnonzero(np.hypot(x - last[row, 0], y - last[row, 1]) < _APART * capture)
-        same = np.zeros(len(row), bool)
-        same[near] = np.abs(wrapped(turn[near] - last[row[near], 2])) < _APART_TURN
-        row, left, x, y, turn = (values[~same] for values in (row, left, x, y, turn))
-        if not len(row):
-            break
-        ends = row[1:] != row[:-1]
-        begins = np.flatnonzero(np.append(True, ends))
-        group = np.cumsum(np.append(False, ends))
-        # The first of several equal ones.
-        best = np.flatnonzero(left == np.maximum.reduceat(left, begins)[group])
-        best = best[np.append(True, np.diff(group[best]) != 0)]
-        which.append(row[best])
-        chosen.append(np.stack([x[best], y[best], turn[best]], axis=1))
-        last = last.copy()
-        last[row[best]] = chosen[-1]
-    numbers = np.concatenate([*which, np.zeros(0, np.intp)])
-    order = np.argsort(numbers, kind="stable")
-    return numbers[order], np.concatenate([*chosen, np.zeros((0, 3))])[order]
+    # Only starts that may be refined, after the known poses.
+    row, start = np.nonzero(score > score.max(axis=1, keepdims=True) - _PROMISING)
+    falling = np.argsort(-score[row, start], kind="stable")
+    rows = np.concatenate([np.arange(len(known)), row[falling]])
+    tried = np.concatenate([known, poses[row, start][falling]])
+    order = np.argsort(rows, kind="stable")
+    first = np.searchsorted(rows[order], np.arange(len(known)))
+    most = 1 + min(_REFINED, score.shape[1])
+    chosen = order[distinct_poses(tried[order], most, _APART * capture, _APART_TURN, rows[order], first)]
+    chosen = chosen[chosen >= len(known)]
+    return rows[chosen], tried[chosen]

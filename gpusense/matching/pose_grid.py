@@ -99,8 +99,8 @@ def distinct_poses(
     while len(left) and len(chosen) < count:
         # The last choice of each scan that has poses left.
         x, y, heading = columns - np.repeat(poses[chosen[-1]].T, np.diff(np.append(firsts, len(of))), axis=1)
-        far = x * x + y * y > radius * radius
-        near = (~far).nonzero()[0]
+        near = x * x + y * y <= radius * radius
+        far = ~near
         far[near] = np.abs(wrapped(heading[near])) > angle
         left, columns, of = left[far], columns[:, far], of[far]
         firsts = np.append(True, of[1:] != of[:-1])[: len(of)].nonzero()[0]

@@ -43,6 +43,8 @@ PAGE = Path("docs/error-vs-time.md")
 IMAGES = Path("docs/img")
 STANDING = Path("bench/error_vs_time/standing.csv")
 NEEDS = tuple(SHOWN)
+# Scans of the drive in reports that do not state them.
+DRIVE = {"scans": 60, "settling": 10}
 # Methods with a knob that other implementations share.
 TABLES = ("cddt", "lookup", "march, centre")
 
@@ -161,6 +163,16 @@ def listing(found: Sequence[Source]) -> list[str]:
     return table(("report", "devices", "date", "commit", "not measured", "command"), lines, 6)
 
 
+def drive(found: Sequence[Source]) -> list[str]:
+    """Return the sentence on the scans of the drive that count."""
+    drives = {tuple(one.report.get("drive", DRIVE).values()) for one in found if one.kind == "tasks"}
+    return [
+        f"The first {settling} of {scans} scans count neither for errors nor for times"
+        + ("; a filter's first 60 scans also teach the temperature." if settling < 60 else ".")
+        for scans, settling in sorted(drives)[:1]
+    ]
+
+
 def picture(name: str) -> Path:
     """Return the path of a need's figure."""
     return IMAGES / f"error-vs-time-{name.replace(' ', '-')}.svg"
@@ -203,7 +215,7 @@ def files(folder: Path = RESULTS, last: Standing | None = None) -> dict[Path, st
         "lead": lead(rows, devices, standing), "answers": answers(rows, devices, WISHES, standing),
         "peers": peers(rows),
         "matchers": rivals(rows, "matching", "a match"), "filters": rivals(rows, "localisation", "a scan"),
-        "maps": by_map(rows, devices), "reports": listing(found), "limit": [str(LIMIT)],
+        "drive": drive(found), "maps": by_map(rows, devices), "reports": listing(found), "limit": [str(LIMIT)],
     }  # fmt: skip
     for need in NEEDS:
         blocks[need] = methods(rows, need, devices, fronts=need == "localisation") if need in needs else ["(none yet)"]

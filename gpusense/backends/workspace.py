@@ -343,11 +343,6 @@ class RepeatedPrograms:
         else:
             self._seen.keep(key, True)
 
-    @property
-    def last(self) -> Recording:
-        """The recording that was made last; there must be one."""
-        return self._programs.items()[-1][1]
-
     def clear(self) -> None:
         """Drop all programs."""
         self._programs.clear()

@@ -58,11 +58,8 @@ class Cloud(Particles):
         # present one compute the estimate; the same for the second pass, of one correction.
         self._asked, self._was_asked, self._estimates_too = 0, False, False
         self._was_refined, self._refines_too = False, False
-        # Number of sensors of the present correction, and the host's work while the device runs its first stage; scans
-        # to judge until judges expect them; judges until they receive the result.
+        # Number of sensors of the present correction; judges until they receive the result.
         self._used = 0
-        self._meanwhile: Callable[[], None] | None = None
-        self._expected: Sequence[SensorReadings] = ()
         self._judges: list[MapJudge] = []
         # Inputs of a recorded correction, and readings of other arrays of the device; whether results are on their way.
         self._exchange = self.backend.exchange(
@@ -88,9 +85,9 @@ class Cloud(Particles):
 
     def _begin_change(self) -> None:
         """Invalidate the results on the host, and save the particles that the change may overwrite."""
-        self._results = self._known = self._estimated_of = self._refined_of = None
-        self._is_running = False
-        self._meanwhile, self._expected, self._judges, self._given, self._adopted = None, (), [], None, ()
+        self._change_results()
+        self._known = self._estimated_of = self._refined_of = None
+        self._judges, self._given, self._adopted = [], None, ()
         for one in self._snapshots:
             snapshot = one()
             if snapshot is not None and snapshot.places.free() != self.kept.free():
@@ -121,7 +118,7 @@ class Cloud(Particles):
         """
         indices = [index for index, _ in readings]
         self._begin_change()
-        self._used, self._meanwhile, self._expected = len(indices), meanwhile, judged
+        self._used = len(indices)
         self._asked, self._was_asked = self._asked + 1 if self._was_asked else 0, False
         self._estimates_too = self._asked >= _ASKED
         self._refines_too, self._was_refined = self._estimates_too and self._was_refined, False
@@ -140,10 +137,12 @@ class Cloud(Particles):
             last, deep = stage.most == 1, settings
             self._change_results()
             if recorded:
-                self._replay(indices, stage)
+                self._replay(indices, stage, judged)
             else:
-                self._call(readings, stage)
-            self._use_wait()
+                self._call(readings, stage, judged)
+            if meanwhile is not None:
+                meanwhile()
+            judged, meanwhile = (), None
             if not last:
                 numbers, deep = self._deepen(stage, settings)
                 last = numbers[stage.number * STAGE + LEFT] == 0.0
@@ -169,7 +168,7 @@ class Cloud(Particles):
                 adopted.append((source, target, self._scored[index].readings * _DOUBLE.itemsize))
         self._adopted = adopted
 
-    def _call(self, readings: Sequence[SensorReadings], stage: Stage) -> None:
+    def _call(self, readings: Sequence[SensorReadings], stage: Stage, judged: Sequence[SensorReadings]) -> None:
         """Start the log-likelihoods of a stage call by call, and weigh."""
         poses = self.poses_of(stage.source)
         before = None if stage.kind is None else functools.partial(self._move, stage.origin, stage.source, stage.kind)
@@ -179,14 +178,14 @@ class Cloud(Particles):
         key = (stage.key, self.count, len(readings), self._estimates_too, self._refines_too)
         self._stages.run(key, lambda: self._weighing(stage))
         # Prepare scans while the device works.
-        versions = self._prepare_judges()
+        versions = self._prepare_judges(judged)
         if versions:
             self._stages.run((versions, "judge"), self._judging)
 
-    def _replay(self, indices: list[int], stage: Stage) -> None:
+    def _replay(self, indices: list[int], stage: Stage, judged: Sequence[SensorReadings]) -> None:
         """Run a stage of a correction by sensors ``indices`` as one recorded program."""
         sensors = tuple([(index, self._scored[index].version) for index in indices])
-        key = (sensors, stage, self.count, self._estimates_too, self._refines_too, self._prepare_judges())
+        key = (sensors, stage, self.count, self._estimates_too, self._refines_too, self._prepare_judges(judged))
         recorded = self._recordings.get(key)
         if recorded is None:
             move = () if stage.kind is None else self.motion(stage.origin, stage.source, stage.kind)
@@ -219,13 +218,14 @@ class Cloud(Particles):
 
     def _deepen(self, stage: Stage, settings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Repeat a stage's weighing on lower rungs while too few particles have weight; return state and settings."""
-        numbers = self._state_of(stage.state)
+        place = self.results.spans[stage.state]
+        numbers = self._read_results()[place]
         while is_starved(numbers, settings, stage.number, self.count):
             settings = deeper(settings)
             self.upload_settings(settings)
             self._change_results()
             self.backend.run(self._weighing(stage) + self._judging())
-            numbers = self._state_of(stage.state)
+            numbers = self._read_results()[place]
         return numbers, settings
 
     def _weighing(self, stage: Stage) -> Program:
@@ -242,15 +242,15 @@ class Cloud(Particles):
         triples = zip(self._judges, self.scans, self.judged, strict=False)
         return tuple(one for judge, *buffers in triples for one in judge.launches(self.estimated, *buffers))
 
-    def _prepare_judges(self) -> Hashable:
+    def _prepare_judges(self, scans: Sequence[SensorReadings]) -> Hashable:
         """Let judges expect the scans of a correction that estimates the pose; return the key of their launches.
 
         The beams are inputs of a recorded correction, or are copied to the device.
         """
         if not self._estimates_too:
             return ()
-        expected, self._expected, given = self._expected, (), self._given
-        for index, reading in expected:
+        given = self._given
+        for index, reading in scans:
             sensor, place = self._scored[index], len(self._judges)
             judge = sensor.judge()
             scan = np.empty(JUDGED) if given is None else given[self.inputs.spans[1 + len(self.readings) + place]]
@@ -259,12 +259,6 @@ class Cloud(Particles):
                 if given is None:
                     self.backend.refill(self.held(scan), self.scans[place])
         return tuple([judge.version for judge in self._judges])
-
-    def _use_wait(self) -> None:
-        """Do the host's work of a correction while the device runs its first stage."""
-        meanwhile, self._meanwhile = self._meanwhile, None
-        if meanwhile is not None:
-            meanwhile()
 
     def _estimating(self, places: BufferSlots, count: int, refined: Buffer | None = None) -> Program:
         """Return the launches of the estimate, or of its second pass."""
@@ -369,10 +363,6 @@ class Cloud(Particles):
             )
             self._refined_of = places, count
         return self._read_results()[self.results.spans[3]]
-
-    def _state_of(self, index: int) -> np.ndarray:
-        """Return a state."""
-        return self._read_results()[self.results.spans[index]]
 
     def _read_results(self) -> np.ndarray:
         """Return states and estimate, copied once after each change."""

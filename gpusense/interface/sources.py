@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import re
-from dataclasses import dataclass
 
 from gpusense.interface import casters, structs
 from gpusense.interface.flags import FLAGS
@@ -221,19 +220,9 @@ def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
 # resolve them without knowing the flags.
 
 
-_DIRECTIVE = re.compile(r"\s*#\s*(\w*)\s*(.*?)\s*(//.*)?$")
-_CONDITION = re.compile(r"(!?)\s*([A-Z0-9_]+)$")
-_PASSED = ("define", "pragma")
-
-
-@dataclass
-class _Branches:
-    """An open ``#if`` and the state of its branches."""
-
-    line: int  # line number of the ``#if``
-    taken: bool  # the current branch is kept
-    done: bool  # this branch or an earlier one is kept
-    ended: bool = False  # ``#else`` has been read
+_RULE = "a directive must be #if FLAG or #if !FLAG, its #elif, #else or #endif, #define of no flag, or #pragma"
+_PASSED = re.compile(r"\s*#\s*(?:pragma\b|define\s+(\w+))")
+_CONDITION = re.compile(r"\s*#\s*(?:(if|elif)\s*(!?)\s*([A-Z0-9_]+)|(else|endif))\s*(?://.*)?$")
 
 
 @functools.lru_cache(maxsize=512)
@@ -243,59 +232,34 @@ def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
     Lines keep their numbers, so that a compiler's message names the place in the file.
     """
     kept: list[str] = []
-    open_branches: list[_Branches] = []
+    # For each open #if: its line, whether the branch is taken, and whether an earlier one was; None after #else.
+    branches: list[tuple[int, bool, bool | None]] = []
     continued = False
     for number, line in enumerate(text.splitlines(), 1):
         # A line that continues a macro is not a directive.
-        match = None if continued else _DIRECTIVE.match(line)
+        directive = not continued and line.lstrip().startswith("#")
         continued = line.endswith("\\")
-        keep = all(each.taken for each in open_branches)
-        if match is not None:
-            where = f"{name}:{number}"
-            if continued and match.group(1) not in _PASSED:
-                raise ValueError(f"{where}: a directive must stand on one line, got {line.strip()!r}")
-            keep = _directive(where, number, match.group(1), match.group(2), flags, open_branches) and keep
-        kept.append(line if keep else "")
-    if open_branches:
-        raise ValueError(f"{name}:{open_branches[-1].line}: #if must have an #endif, got none")
+        passed = _PASSED.match(line) if directive else None
+        if directive and (passed[1] in FLAGS if passed else not _follows(line, number, flags, branches)):
+            raise ValueError(f"{name}:{number}: {_RULE}, got {line.strip()!r}")
+        kept.append(line if (passed or not directive) and all(taken for _, taken, _ in branches) else "")
+    if branches:
+        raise ValueError(f"{name}:{branches[-1][0]}: #if must have an #endif, got none")
     return "\n".join(kept) + "\n"
 
 
-def _directive(
-    where: str, number: int, word: str, rest: str, flags: frozenset[str], open_branches: list[_Branches]
-) -> bool:
-    """Process a directive, and return whether it is left to the compiler."""
-    if word in _PASSED:
-        defined = re.match(r"\w*", rest)
-        if word == "define" and defined is not None and defined.group() in FLAGS:
-            raise ValueError(f"{where}: #define must name no flag, got {defined.group()}")
-        return True
+def _follows(line: str, number: int, flags: frozenset[str], branches: list[tuple[int, bool, bool | None]]) -> bool:
+    """Open, change or close a branch, and return whether a line is a condition that may stand there."""
+    match = _CONDITION.match(line)
+    if match is None or not (match[4] or match[3] in FLAGS):
+        return False
+    word, true = match[1] or match[4], bool(match[4]) or (match[3] in flags) != (match[2] == "!")
     if word == "if":
-        taken = _is_true(where, rest, flags)
-        open_branches.append(_Branches(number, taken, taken))
+        branches.append((number, true, true))
+        return True
+    if not branches or (branches[-1][2] is None and word != "endif"):
         return False
-    if word not in ("elif", "else", "endif"):
-        rule = "a directive must be #if, #elif, #else, #endif, #define or #pragma"
-        raise ValueError(f"{where}: {rule}, got {f'#{word} {rest}'.strip()!r}")
-    if not open_branches:
-        raise ValueError(f"{where}: #{word} must come after an #if, got none")
-    if word != "elif" and rest:
-        raise ValueError(f"{where}: #{word} must stand alone, got {f'#{word} {rest}'!r}")
-    last = open_branches[-1]
-    if word == "endif":
-        open_branches.pop()
-        return False
-    if last.ended:
-        raise ValueError(f"{where}: #{word} must come before the #else of line {last.line}'s #if, got it after")
-    true = _is_true(where, rest, flags) if word == "elif" else True
-    last.taken, last.ended = true and not last.done, word == "else"
-    last.done = last.done or last.taken
-    return False
-
-
-def _is_true(where: str, condition: str, flags: frozenset[str]) -> bool:
-    """Return whether a condition holds."""
-    match = _CONDITION.match(condition)
-    if match is None or match.group(2) not in FLAGS:
-        raise ValueError(f"{where}: condition must be one known flag, got {condition!r}")
-    return (match.group(2) in flags) != (match.group(1) == "!")
+    begin, _, done = branches.pop()
+    if word != "endif":
+        branches.append((begin, true and not done, None if word == "else" else done or true))
+    return True

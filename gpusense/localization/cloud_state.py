@@ -10,7 +10,7 @@ import numpy as np
 
 from gpusense.interface import constants as c
 from gpusense.localization.particles import BufferSlots
-from gpusense.reference.tempering import left_of
+from gpusense.reference.weighing import left_of
 
 # Lowest depth of a ladder: distances of a million deviations differ by 2^-39 on its last rung.
 _DEEPEST = c.LOWEST**5

@@ -4,7 +4,157 @@
 // of the previous one is taken; the rest of b is left to the next stage of the correction (annealing: Neal, "Annealed
 // importance sampling", 2001). Weights are rounded to integers below 2^53 / N, so that their sums are exact in any
 // order.
-// requires: tempering
+// The depth d is 1. If the last rung leaves too few particles, the host repeats the stage with a smaller d. Recovery:
+// augmented MCL, "Probabilistic Robotics" table 8.3, with the mean likelihood per beam.
+// requires: elementary
+
+#define SHARE 19
+#define THRESHOLD 20
+#define SCALE 21
+#define PER_BEAM_SCALE 22
+#define SLOW_RATE 23
+#define FAST_RATE 24
+#define MOST_INJECTED 25
+#define TEMPERATURE 27
+#define DEPTH 60
+#define RUNGS 8
+// 2^-(RUNGS - 1).
+#define LOWEST 0.0078125
+#define WEIGHT_SUMS (2 * RUNGS + 1)
+// Places in the state: numbers of a stage, then numbers that outlast it.
+#define LEFT 0
+#define TOTAL 1
+#define SAMPLE_SIZE 2
+#define RESAMPLED 3
+#define DEGENERATE 4
+#define RUNG 5
+#define STAGE 8
+#define EVIDENCE 48
+#define SLOW 49
+#define FAST 50
+#define INJECTED 51
+
+// Return 8 numbers from first on, and missing in place of those from end on: a work-item waits once for all of them.
+double8 eight_at(global const double *values, const int first, const int end, const double missing) {
+    const int count = end - first;
+    values += first;
+    return (double8)(count > 0 ? values[0] : missing, count > 1 ? values[1] : missing, count > 2 ? values[2] : missing,
+                     count > 3 ? values[3] : missing, count > 4 ? values[4] : missing, count > 5 ? values[5] : missing,
+                     count > 6 ? values[6] : missing, count > 7 ? values[7] : missing);
+}
+
+// Sum of integers over a block; in lanes, a sum per lane.
+typedef double Total;
+
+// Return the sum of 8 numbers, rounded down to integers.
+Total sum_eight(const double8 numbers) {
+    const double8 a = floor(numbers);
+    return a.s0 + a.s1 + a.s2 + a.s3 + a.s4 + a.s5 + a.s6 + a.s7;
+}
+
+// Return the number that a sum is.
+double sum_of(const Total total) { return total; }
+
+// Write 8 weights from first on and their cumulative sums; return the sum of all so far.
+double write_eight(const double8 weights, const double scale, const double before, global double *weight,
+                   global double *ends, const int first, const int end) {
+    const double8 whole = floor(weights * scale);
+    double sum = before;
+#pragma unroll
+    for (int i = 0; i < 8; i++) {
+        sum += ((const double *)&whole)[i];
+        if (first + i < end) weight[first + i] = ((const double *)&weights)[i], ends[first + i] = sum;
+    }
+    return sum;
+}
+
+// Return the largest of the scores from begin to before end.
+double largest_of(global const double *largest, const int begin, const int end) {
+    double8 high = -INFINITY;
+    for (int g = begin; g < end; g += 16) {
+        const double8 one = eight_at(largest, g, end, -INFINITY), two = eight_at(largest, g + 8, end, -INFINITY);
+        const double8 higher = one > two ? one : two;
+        high = higher > high ? higher : high;
+    }
+    const double4 four = high.lo > high.hi ? high.lo : high.hi;
+    const double2 two = four.lo > four.hi ? four.lo : four.hi;
+    return two.x > two.y ? two.x : two.y;
+}
+
+// Return the largest score; -inf if all particles with a weight are impossible next to particles without.
+double possible_of(global const double *totals, const double largest) {
+    return totals[RUNGS - 1] > 0.0 ? largest : -INFINITY;
+}
+
+// Return the column of sums with the weights of a rung; the column of the previous weights where none is possible.
+int column_of(const double high, const int rung) {
+    return high == -INFINITY ? 2 * RUNGS : rung;
+}
+
+// Return the sum of a column over all blocks before one: over the blocks before it in its group, and over the groups
+// before it.
+double sum_before(global const double *sums, global const double *joined, const int b, const int fan, const int column) {
+    const double before = sums[(long)b * WEIGHT_SUMS + column];
+    return b < fan ? before : before + joined[(long)(b / fan) * WEIGHT_SUMS + column];
+}
+
+// Return the likelihoods of 8 scores relative to the largest, on the last rung; 1 where none is possible or nothing is
+// left. Their squares belong to the rung before: an error of 2^-53 grows to 2^-46 on the first rung.
+double8 tempered(const double8 scores, const double largest, const double left) {
+    if (largest == -INFINITY || left == 0.0) return 1.0;
+    const double8 a = LOWEST * left * (scores - largest);
+    return (double8)(exp_of(a.s0), exp_of(a.s1), exp_of(a.s2), exp_of(a.s3), exp_of(a.s4), exp_of(a.s5), exp_of(a.s6),
+                     exp_of(a.s7));
+}
+
+// Return the part of the temperature that earlier stages have left.
+double left_of(global const double *state, const int stage) {
+    return stage > 0 ? state[(stage - 1) * STAGE + LEFT] : 1.0;
+}
+
+// Return the first rung with the effective sample size least, or the last rung.
+int rung_of(global const double *totals, global const double *settings, const double least) {
+    int rung = RUNGS - 1;
+    for (int k = RUNGS - 2; k >= 0; k--) {
+        if (totals[k] * totals[k] >= least * settings[SCALE] * totals[RUNGS + k]) rung = k;
+    }
+    return rung;
+}
+
+// Update the averages of the likelihood per beam, and the share of particles to inject.
+void follow_evidence(const double total, const double before, const double largest, global const double *settings,
+                     global double *state) {
+    if (largest == -INFINITY || !(total > 0.0) || !(before > 0.0)) return;
+    const double evidence = largest + log_of(total / before);
+    const double scaled = settings[PER_BEAM_SCALE] * evidence;
+    const double mean = exp_of(scaled < 700.0 ? scaled : 700.0);
+    const int first = state[SLOW] == 0.0;
+    const double slow = first ? mean : state[SLOW] + settings[SLOW_RATE] * (mean - state[SLOW]);
+    const double fast = first ? mean : state[FAST] + settings[FAST_RATE] * (mean - state[FAST]);
+    const double share = slow > 0.0 ? 1.0 - fast / slow : 0.0;
+    const double least = share > 0.0 ? share : 0.0;
+    state[EVIDENCE] = evidence, state[SLOW] = slow, state[FAST] = fast;
+    state[INJECTED] = least < settings[MOST_INJECTED] ? least : settings[MOST_INJECTED];
+}
+
+// Write the state of a stage that uses a rung; at stage 0, follow the evidence of the whole temperature.
+void set_stage(global const double *totals, global const double *settings, global double *state, const double high,
+               const double left, const int rung, const int particles, const int stage, const int stages) {
+    if (stage == 0 && settings[DEPTH] == 1.0) follow_evidence(totals[0], totals[2 * RUNGS], high, settings, state);
+    const double size = totals[rung] * totals[rung] / (settings[SCALE] * totals[RUNGS + rung]);
+    double part = left * settings[DEPTH];
+    for (int k = 0; k < rung; k++) part *= 0.5;
+    const double rest = left - part;
+    const int wanted = size < settings[THRESHOLD] * (double)particles || rest > 0.0 ||
+                       (stage == 0 && state[INJECTED] > 0.0);
+    global double *own = state + stage * STAGE;
+    own[LEFT] = stage + 1 < stages ? rest : 0.0;
+    own[TOTAL] = totals[column_of(high, rung)];
+    own[SAMPLE_SIZE] = size;
+    own[RESAMPLED] = wanted ? 1.0 : 0.0;
+    own[DEGENERATE] = high == -INFINITY ? 1.0 : 0.0;
+    own[RUNG] = part;
+}
 
 // Rows that a work-item reads before it adds any up.
 #define ROWS_AT_ONCE 16

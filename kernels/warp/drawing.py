@@ -10,12 +10,146 @@ from a pool: free cells, or the modes of a likelihood map.
 
 import warp as wp
 
-from .draws import copies_of, copy_particle, draw_particle, found_at, found_residual, is_copied, mark_of, start_of
+from .motion import wrap_once
+from .philox import random_words, uniform_of
 from .prelude import kernel
 
-STRATIFIED, TOTAL, STAGE = (wp.constant(place) for place in (26, 1, 8))
-WEIGHT_SUMS = wp.constant(17)
-ZERO, RESIDUAL = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(2.0))
+SEED, STEP, JITTER, FARTHEST_X, FARTHEST_THETA, POOL = (wp.constant(place) for place in (0, 2, 12, 13, 14, 15))
+SCALE, STRATIFIED, WEIGHT_SUMS = (wp.constant(place) for place in (21, 26, 17))
+LEFT, TOTAL, RESAMPLED, STAGE, INJECTED = (wp.constant(place) for place in (0, 1, 3, 8, 51))
+DRAW_STREAM, DRAW_STREAMS = wp.constant(16), wp.constant(4)
+RESIDUAL, LEAST_WEIGHT = wp.constant(wp.float64(2.0)), wp.constant(wp.float64(1e-6))
+ZERO, ONE, TWO = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0)), wp.constant(wp.float64(2.0))
+
+
+@wp.func
+def found_at(ends: wp.array(dtype=wp.float64), mark: wp.float64, particles: wp.int32):
+    """Return the first index whose cumulative weight exceeds a mark."""
+    low = int(0)
+    high = particles - 1
+    while low < high:
+        middle = low + (high - low) // 2
+        if ends[middle] > mark:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+@wp.func
+def copies_of(ends: wp.array(dtype=wp.float64), total: wp.float64, drawn: wp.int32, n: wp.int32):
+    """Return the deterministic copies of residual resampling: the integer part of the expected number of copies."""
+    weight = ends[n]
+    if n > 0:
+        weight = ends[n] - ends[n - 1]
+    copies = ZERO
+    if total > ZERO:
+        copies = wp.floor(wp.float64(drawn) * weight / total)
+    return copies
+
+
+@wp.func
+def found_residual(
+    ends: wp.array(dtype=wp.float64), copies: wp.array(dtype=wp.float64), fraction: wp.float64, total: wp.float64,
+    particles: wp.int32, drawn: wp.int32,
+):  # fmt: skip
+    """Return the first index whose cumulative residual weight exceeds a fraction of all residual weights."""
+    each = total / wp.float64(drawn)
+    mark = fraction * (ends[particles - 1] - copies[particles - 1] * each)
+    low = int(0)
+    high = particles - 1
+    while low < high:
+        middle = low + (high - low) // 2
+        if ends[middle] - copies[middle] * each > mark:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+@wp.func
+def mark_of(fraction: wp.float64, total: wp.float64):
+    """Return the mark at a fraction of the total, clamped to below the total."""
+    return wp.min(wp.floor(fraction * total), total - ONE)
+
+
+@wp.func
+def is_copied(state: wp.array(dtype=wp.float64), stage: wp.int32, particles: wp.int32, drawn: wp.int32):
+    """Return whether particles are copied, because no resampling is due."""
+    due = state[stage * STAGE + RESAMPLED] != ZERO or drawn != particles
+    return not due or not (state[stage * STAGE + TOTAL] > ZERO)
+
+
+@wp.func
+def copy_particle(
+    source: wp.array(dtype=wp.float64), weight: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.float64),
+    total: wp.float64, target: wp.array(dtype=wp.float64), after: wp.array(dtype=wp.float64), particles: wp.int32,
+    n: wp.int32,
+):  # fmt: skip
+    """Copy particle n with its weight, relative to the mean weight."""
+    copied = n % particles
+    for axis in range(3):
+        target[3 * n + axis] = source[3 * copied + axis]
+    kept = ONE
+    if total > ZERO:
+        kept = wp.max(weight[copied] / (total / (settings[SCALE] * wp.float64(particles))), LEAST_WEIGHT)
+        if weight[copied] == ZERO:
+            kept = weight[copied]
+    after[n] = kept
+
+
+@wp.func
+def words_of(settings: wp.array(dtype=wp.float64), stage: wp.int32, index: wp.uint32, stream: wp.int32):
+    """Return the random words of a draw in a stream of its stage."""
+    of_stage = wp.uint32(DRAW_STREAM + DRAW_STREAMS * stage + stream)
+    step = wp.uint32(settings[STEP])
+    return random_words(index, step, of_stage, wp.uint32(settings[SEED]), wp.uint32(settings[SEED + 1]))
+
+
+@wp.func
+def start_of(settings: wp.array(dtype=wp.float64), stage: wp.int32, index: wp.uint32):
+    """Return the random number of a draw's mark; systematic resampling uses the number of index 0 for all draws."""
+    words = words_of(settings, stage, index, 0)
+    return uniform_of(words[0])
+
+
+@wp.func
+def draw_particle(
+    source: wp.array(dtype=wp.float64), ends: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.float64),
+    state: wp.array(dtype=wp.float64), pool: wp.array(dtype=wp.float64), target: wp.array(dtype=wp.float64),
+    after: wp.array(dtype=wp.float64), particles: wp.int32, stage: wp.int32, n: wp.int32, chosen: wp.int32,
+):  # fmt: skip
+    """Draw particle n from the one with index chosen: move it by jitter where a stage follows, or inject a pose."""
+    index = wp.uint32(n)
+    x = source[3 * chosen]
+    y = source[3 * chosen + 1]
+    theta = source[3 * chosen + 2]
+    after[n] = ONE
+    if state[stage * STAGE + LEFT] > ZERO:
+        total = state[stage * STAGE + TOTAL]
+        words = words_of(settings, stage, index, 1)
+        one = 3 * found_at(ends, mark_of(uniform_of(words[0]), total), particles)
+        other = 3 * found_at(ends, mark_of(uniform_of(words[1]), total), particles)
+        dx = source[one] - source[other]
+        dy = source[one + 1] - source[other + 1]
+        turn = wrap_once(source[one + 2] - source[other + 2])
+        far_x = wp.max(wp.abs(dx), wp.abs(dy)) / settings[FARTHEST_X]
+        far = wp.max(wp.max(far_x, wp.abs(turn) / settings[FARTHEST_THETA]), ONE)
+        part = settings[JITTER] / far
+        x += part * dx
+        y += part * dy
+        theta = wrap_once(theta + part * turn)
+    if stage == 0 and state[INJECTED] > ZERO and settings[POOL] > ZERO:
+        some = words_of(settings, stage, index, 2)
+        more = words_of(settings, stage, index, 3)
+        if uniform_of(some[0]) < state[INJECTED]:
+            row = 3 * int(wp.min(wp.floor(uniform_of(some[1]) * settings[POOL]), settings[POOL] - ONE))
+            x = pool[row] + (TWO * uniform_of(more[0]) - ONE) * settings[POOL + 1]
+            y = pool[row + 1] + (TWO * uniform_of(more[1]) - ONE) * settings[POOL + 2]
+            theta = wrap_once(pool[row + 2] + (TWO * uniform_of(more[2]) - ONE) * settings[POOL + 3])
+    target[3 * n] = x
+    target[3 * n + 1] = y
+    target[3 * n + 2] = theta
 
 
 @kernel

@@ -11,7 +11,6 @@ constant float SINE[SINES] = {
     -2.505210838544172e-08f, 1.6059043836821613e-10f, -7.647163731819816e-13f,
 };
 
-// Return sin(r / 2) of angles in [-pi, pi].
 LanePair half_sine_lanes(const LanePair residual) {
     const lanes high = 0.5f * residual.hi, low = 0.5f * residual.lo, z = high * high;
     lanes series = 0;
@@ -19,7 +18,6 @@ LanePair half_sine_lanes(const LanePair residual) {
     return two_sum_lanes(high, low + high * (z * series));
 }
 
-// Return the log of the ratio of the sum over all turns to the normal of the nearest turn.
 lanes log_other_turns_lanes(const LanePair residual, const float decay) {
     const ilanes back = residual.hi < 0;
     const lanes size = back ? -residual.hi : residual.hi, low = back ? -residual.lo : residual.lo;

@@ -19,7 +19,6 @@ lanes atan_lanes(const lanes t) {
     return steep ? QUARTER_TURN - arc : arc;
 }
 
-// Return the log of a truncated normal.
 lanes log_normal_lanes(const LanePair residual, const lanes near, const lanes far, const float2 scale,
                        const float2 peak) {
     const LanePair exponent = bounded_square_lanes(scaled_pair_lanes(residual, scale.x, scale.y));
@@ -31,7 +30,6 @@ lanes log_normal_lanes(const LanePair residual, const lanes near, const lanes fa
 
 // in lanes: t_mass
 
-// Return the log of a truncated Student t.
 lanes log_student_t_lanes(const LanePair residual, const lanes near, const lanes far, global const BeaconTerms *terms,
                           global const real *series, const int count) {
     const LanePair squared = bounded_square_lanes(scaled_pair_lanes(residual, terms->scale, terms->scale_low));
@@ -42,7 +40,6 @@ lanes log_student_t_lanes(const LanePair residual, const lanes near, const lanes
     return (terms->peak - terms->power * (log_lanes(x.hi) + x.lo / x.hi)) - log_lanes(0.5f * (below + above));
 }
 
-// Return log p of one range at distances.
 lanes log_range_lanes(const LanePair d, global const real *beacon, global const BeaconTerms *terms,
                       global const real *series,
                       const int count, const int kind) {

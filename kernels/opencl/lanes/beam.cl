@@ -5,7 +5,6 @@
 // processors mispredict; consecutive densities have no branch, so that processors compute several at once.
 #define VECTORS 4
 
-// Return the distances in cells to which the rays of readings are cast.
 lanes ray_limit_lanes(const lanes z, global const MixtureTerms *terms, const RangeScale scale) {
 #if STOPS
     const lanes reach = terms->last_offset + terms->last_slope * z;
@@ -35,7 +34,6 @@ INLINE DensityParts reading_parts_lanes(const lanes z, const EchoLanes echo, glo
 #endif
 }
 
-// Return the terms of readings in the sum.
 lanes reading_term_lanes(const lanes z, const DensityParts parts, global const MixtureTerms *terms, const ilanes bin_at) {
 #if SENSOR_TABLE
     lanes term = parts.hit;

@@ -44,7 +44,6 @@ ilanes look_up_lanes(global const int *table, const Particles *particle, const r
     return GATHER(ilanes, table, index);
 }
 
-// Return the gaps between outline and obstacle, negative where they overlap; squared distances are in cells.
 LanePair gap_lanes(const ilanes squared, global const ContactTerms *terms) {
     const LanePair whole = two_sum_lanes(to_lanes(squared >> 12) * 4096, to_lanes(squared & 4095));
     const lanes d = sqrt(whole.hi);
@@ -74,7 +73,6 @@ lanes log_above_lanes(const LanePair x) {
     return above;
 }
 
-// Return the log probabilities that a segment is pressed, or that it is not.
 lanes log_bump_lanes(const ilanes squared, const int pressed, global const ContactTerms *terms) {
     const LanePair x = scaled_pair_lanes(gap_lanes(squared, terms), terms->scale, terms->scale_low);
     const ilanes overlaps = x.hi < 0;

@@ -19,7 +19,6 @@ doubles floor_lanes(const doubles x) {
     return x < INTEGERS ? below : x;
 }
 
-// Return whether a comparison holds in any lane.
 int any_of_lanes(const choices holds) {
     const long4 four = holds.lo | holds.hi;
     const long2 two = four.lo | four.hi;

@@ -1,6 +1,6 @@
 // Draws of LANES neighbours with ascending marks: the first is searched, and the others are found by walking on from
 // it. See drawing.cl.
-// requires: lanes/types draws
+// requires: lanes/types drawing
 
 // A work-item takes LANES particles.
 kernel void draw_particles(ARGUMENTS) {

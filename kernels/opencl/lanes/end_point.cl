@@ -1,13 +1,11 @@
 // Cells of end points in lanes: functions of end_point.cl for LANES numbers at once, with the same bits.
 // requires: end_point lanes/error_free
 
-// Clamp i to [0, last].
 ilanes within_lanes(const ilanes i, const int last) {
     const ilanes raised = i > 0 ? i : (ilanes)0;
     return raised < last ? raised : (ilanes)last;
 }
 
-// Return the whole cells below an offset, with the remainder in [0, 1) and 1 minus it.
 ilanes whole_cells_lanes(const LanePair offset, LanePair *rest, LanePair *to_next) {
     const lanes up = offset.hi + (real)0.5;
     ilanes nearest = to_ilanes(up);

@@ -18,7 +18,6 @@ LanePair difference_lanes(const float c, const float c_low, const LanePair a) {
     return two_sum_lanes(sum.hi, sum.lo + (c_low - a.lo));
 }
 
-// Return the direction of a feature in the world: the heading, turned by the bearing.
 LanePlace direction_lanes(const LanePlace heading, global const real *feature) {
     const float c = feature[COSINE], s = feature[SINE], c_low = feature[COSINE_LOW], s_low = feature[SINE_LOW];
     const LanePair cc = fused_product_lanes(heading.x.hi, (lanes)c), ss = fused_product_lanes(heading.y.hi, (lanes)s);
@@ -74,7 +73,6 @@ LanePair angle_pair_lanes(const LanePlace off, const LanePlace turned) {
 }
 
 #if FIELD
-// Return the mass of the normal around landmarks' bearings on the field of view; bearings are clamped to its ends.
 lanes field_mass_lanes(const LanePair angle, global const real *feature, const float field) {
     const float scale = feature[BEARING_SCALE], whole = 2 * HALF_TURN;
     lanes left = (feature[UPPER] - angle.hi) + (feature[UPPER_LOW] - angle.lo);
@@ -98,7 +96,6 @@ lanes field_mass_lanes(const LanePair angle, global const real *feature, const f
 }
 #endif
 
-// Add (residual * scale)^2 to an exponent.
 LanePair add_square_lanes(const LanePair total, const LanePair residual, const float scale, const float scale_low) {
     const LanePair u = fused_product_lanes(residual.hi, (lanes)scale);
     const lanes u_low = u.lo + (residual.hi * scale_low + residual.lo * scale);

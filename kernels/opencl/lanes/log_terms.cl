@@ -7,14 +7,12 @@ typedef struct {
     LanePair x, y;
 } LanePlace;
 
-// Return the offset from the sensors to a landmark or beacon.
 LanePlace offset_lanes(const real4 landmark, const LanePlace place) {
     const LanePair x = two_sum_lanes((lanes)landmark.x, -place.x.hi), y = two_sum_lanes((lanes)landmark.y, -place.y.hi);
     return (LanePlace){two_sum_lanes(x.hi, x.lo + (landmark.z - place.x.lo)),
                        two_sum_lanes(y.hi, y.lo + (landmark.w - place.y.lo))};
 }
 
-// Return the length of an offset.
 LanePair distance_pair_lanes(const LanePlace off) {
     const LanePair xx = fused_product_lanes(off.x.hi, off.x.hi), yy = fused_product_lanes(off.y.hi, off.y.hi);
     const LanePair sum = two_sum_lanes(xx.hi, yy.hi);
@@ -60,7 +58,6 @@ LanePlace load_places(global const real4 *place, const int first, const int coun
     return some;
 }
 
-// Return the square of a sum of two numbers; roots are clamped, so that nothing becomes infinite.
 LanePair bounded_square_lanes(const LanePair u) {
     const ilanes large = (u.hi > LARGEST_ROOT) | (u.hi < -LARGEST_ROOT);
     const lanes high = large ? (lanes)LARGEST_ROOT : u.hi, low = large ? (lanes)0 : u.lo;
@@ -76,7 +73,6 @@ LanePair scaled_pair_lanes(const LanePair a, const float scale, const float scal
 
 // in lanes: log_one_plus
 
-// Return the log of the sum of two probabilities, from their logs; -inf only where both are 0.
 lanes either_lanes(const lanes a, const lanes b) {
     const ilanes larger = a > b;
     const lanes high = larger ? a : b, low = larger ? b : a;

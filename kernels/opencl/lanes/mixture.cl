@@ -39,7 +39,6 @@ INLINE lanes mean_range_lanes(const lanes expected, global const MixtureTerms *t
 #endif
 }
 
-// Return the distances from the means of p_hit to range_max, which keep their digits where they are short.
 INLINE lanes above_mean_lanes(const lanes expected, const int any_clamped, global const MixtureTerms *terms, const ilanes bin_at) {
 #if BIAS
     const LanePair last = two_sum_lanes((lanes)terms->range_max, -(lanes)(TERM(range_bias)));
@@ -61,7 +60,6 @@ ilanes is_clamped_lanes(const lanes mean, const lanes expected, global const Mix
 }
 #endif
 
-// Return sigma_hit / sigma at ranges: the first number times (1 + the second).
 LanePair hit_scale_lanes(const lanes expected, global const MixtureTerms *terms, const ilanes bin_at) {
 #if GROWTH
 #if EXACT_EXPONENT
@@ -95,7 +93,6 @@ INLINE LanePair hit_offset_lanes(const lanes z, const lanes expected, const lane
 #endif
 }
 
-// Return (z - mean)^2 / (2 sigma^2) as sums of two numbers.
 LanePair normal_exponent_lanes(const lanes z, const lanes expected, const lanes mean, const int any_clamped,
                                const LanePair scale, global const MixtureTerms *terms, const ilanes bin_at) {
     LanePair off = hit_offset_lanes(z, expected, mean, any_clamped, terms, bin_at);
@@ -128,7 +125,6 @@ LanePair normal_exponent_lanes(const lanes z, const lanes expected, const lanes 
 #endif
 }
 
-// Return the exponents of a hit's density as sums of two numbers.
 LanePair hit_exponent_lanes(const lanes z, const lanes expected, const lanes mean, const int any_clamped,
                             const LanePair scale, global const MixtureTerms *terms, const ilanes bin_at) {
     const LanePair t = normal_exponent_lanes(z, expected, mean, any_clamped, scale, terms, bin_at);

@@ -43,7 +43,6 @@ lanes crossed_lanes(const lanes t, const lanes speed, const lanes a, const lanes
 
 // in lanes: turn_of
 
-// Return the angle bins with the nearest centres.
 ilanes angle_bin_lanes(const lanes dx, const lanes dy, const int bins) {
     const ilanes nearest = to_ilanes(turn_of_lanes(dx, dy) * (real)bins + (real)0.5);
     return nearest >= bins ? nearest - bins : nearest;

@@ -23,7 +23,6 @@ void normal_at_lanes(global const real2 *normals, const Window window, const ila
     *y = off ? beyond : GATHER(lanes, second, at);
 }
 
-// Find the normals of the cells in which rays end at distances t.
 void hit_normal_lanes(global const real2 *normals, const Window window, const int2 cell, const real4 pose,
                       const lanes dx, const lanes dy, const lanes t, lanes *x, lanes *y) {
     const ilanes right = dx >= 0, up = dy >= 0;

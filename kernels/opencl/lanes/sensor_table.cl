@@ -1,7 +1,6 @@
 // Densities of LANES readings from a table: sensor_table.cl in lanes.
 // requires: lanes/types
 
-// Return the bins of ranges; the last one, after the cells, is for range_max and more.
 ilanes range_bin_lanes(const lanes range, const MixtureTables tables, const real range_max) {
     // Missing readings (NaN) are in no cell either.
     const ilanes below = range < range_max, bin = to_ilanes((below ? range : (lanes)0) * tables.per_metre);
@@ -9,7 +8,6 @@ ilanes range_bin_lanes(const lanes range, const MixtureTables tables, const real
     return below ? within : (ilanes)tables.cells;
 }
 
-// Return log p of readings for expected ranges.
 lanes tabulated_density_lanes(const lanes z, const lanes expected, global const real *sensor,
                               const MixtureTables tables, const real range_max) {
     const ilanes column = range_bin_lanes(expected, tables, range_max);

@@ -4,7 +4,6 @@
 #if SHAPES
 // in lanes: turned meet_disc meet_box meet_segment
 
-// Return the nearest of the shapes that a particle sees along rays and of obstacles at distances t.
 LanePair nearest_shape_lanes(global const real *shapes, global const int2 *world, const Crowd crowd, const int n,
                              const int2 cell, const real4 pose, const lanes ray_x, const lanes ray_y, const lanes t) {
     lanes dx, dy;

@@ -1,10 +1,9 @@
 // Weights of 8 particles at once: the kernels of weighing.cl on vectors that a processor reads, adds and writes whole.
 // Sums of integer weights are exact in any order.
-// requires: tempering lanes/elementary
+// requires: weighing lanes/elementary
 
 typedef doubles Total_lanes;
 
-// Return 8 numbers from first on, and missing in place of those from end on.
 doubles eight_at_lanes(global const double *values, const int first, const int end, const double missing) {
     if (end - first >= DOUBLES) return vload8(0, values + first);
     const choices there = (choices)(0, 1, 2, 3, 4, 5, 6, 7) < (long)(end - first);
@@ -18,7 +17,6 @@ Total_lanes sum_eight_lanes(const doubles numbers) { return floor_lanes(numbers)
 // Return the sum of all lanes.
 double sum_of_lanes(const Total_lanes total) { return sum_doubles(total); }
 
-// Write 8 weights from first on and their cumulative sums; return the sum of all so far.
 double write_eight_lanes(const doubles weights, const double scale, const double before, global double *weight,
                          global double *ends, const int first, const int end) {
     const doubles whole = floor_lanes(weights * scale);
@@ -34,7 +32,6 @@ double write_eight_lanes(const doubles weights, const double scale, const double
     return sum;
 }
 
-// Return the likelihoods of scores relative to the largest on the last rung; 1 where none is possible or nothing is left.
 doubles tempered_lanes(const doubles scores, const double largest, const double left) {
     return largest == -INFINITY || left == 0.0 ? (doubles)1.0 : exp_of_lanes(LOWEST * left * (scores - largest));
 }

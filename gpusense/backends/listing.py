@@ -192,7 +192,7 @@ def _absent(entry: Entry, name: str, kind: str, reason: str) -> Device:
 def _device(info: BackendInfo, library: Library, verdict: DeviceCheck | None = None) -> Device:
     """Return a device as users see it; without a verdict it is taken to be available."""
     verdict = proof.trust(info) if verdict is None else verdict
-    reason = proof.with_remedy(verdict.reason, verdict.remedy)
+    reason = proof.with_remedy(verdict.reason)
     kind = "simulator" if library.is_simulator(info) else info.kind
     driver = info.driver if BY_NAME[info.backend].compiles else ""
     return Device(
@@ -288,7 +288,7 @@ def best_of(candidates: list[Device], failures: list[Failure] | None = None) -> 
                     best, most = device, verdict.rate
             elif failures is not None:
                 candidates.remove(device)
-                reason = proof.with_remedy(verdict.reason, verdict.remedy)
+                reason = proof.with_remedy(verdict.reason)
                 line = f"{_name_of(device)} is unusable: {reason}"
                 failures.append(Failure(device.selection, reason, line, not verdict.passing))
         if best is not None:

@@ -55,7 +55,6 @@ class DeviceCheck:
     lanes: int  # lanes that were proved; 1 if only scalar kernels were
     float64: bool  # whether float64 kernels were proved
     reason: str = ""  # the failures, empty where nothing failed
-    remedy: str = ""  # the remedy for them
     rate: float = 0.0  # calls of a scan per second, the rank of a device in its class; 0 if not measured
     # True if the failure is due to the state of the machine, without a proof; such a verdict is not cached.
     passing: bool = False
@@ -74,7 +73,7 @@ def trust(info: BackendInfo) -> DeviceCheck:
 
 def unusable(reason: str, *, passing: bool = False) -> DeviceCheck:
     """Return the verdict on a device that no model can run on."""
-    return DeviceCheck(False, 1, False, reason, remedy_for(reason), passing=passing)
+    return DeviceCheck(False, 1, False, reason, passing=passing)
 
 
 def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> DeviceCheck:
@@ -105,7 +104,7 @@ def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> D
 
 def awaits_child(info: BackendInfo) -> bool:
     """Return whether a verdict on a device takes a child."""
-    if probe_process.is_off() or probe_process.obstacle():
+    if not probe_process.can_start():
         return False
     key = _key(info)
     return key not in _known and _load(key) is None
@@ -127,23 +126,19 @@ def name_of(info: BackendInfo) -> str:
 def summary(info: BackendInfo, verdict: DeviceCheck) -> str:
     """Return the failures of a device and their consequence, in one line."""
     if not verdict.usable:
-        return f"{name_of(info)} is unusable: {with_remedy(verdict.reason, verdict.remedy)}"
-    return f"{name_of(info)}: {with_remedy(f'{verdict.reason}, and so these are not used', verdict.remedy)}"
+        return f"{name_of(info)} is unusable: {with_remedy(verdict.reason)}"
+    return f"{name_of(info)}: {with_remedy(verdict.reason, ', and so these are not used')}"
 
 
-def with_remedy(reason: str, remedy: str) -> str:
-    """Return a failure and its remedy, if any, in one line."""
-    return f"{reason}; {remedy}" if remedy else reason
+def with_remedy(reason: str, consequence: str = "") -> str:
+    """Return a failure with its consequence and the remedy, in one line; empty without a failure."""
+    remedy = next((remedy for pattern, remedy in _REMEDIES if re.search(pattern, reason)), _OTHERWISE)
+    return "; ".join(filter(None, (reason + consequence, remedy))) if reason else ""
 
 
 def apply(info: BackendInfo, verdict: DeviceCheck) -> BackendInfo:
     """Return a device as the verdict leaves it."""
     return dataclasses.replace(info, lanes=verdict.lanes, float64=verdict.float64)
-
-
-def remedy_for(reason: str) -> str:
-    """Return the remedy for a failure."""
-    return next((remedy for pattern, remedy in _REMEDIES if re.search(pattern, reason)), _OTHERWISE)
 
 
 def _key(info: BackendInfo) -> str:
@@ -188,9 +183,8 @@ def _prove(info: BackendInfo, setup: Any) -> tuple[DeviceCheck, bool]:
 
 def _verdict(info: BackendInfo, failures: list[str], outcome: probe_process.Outcome) -> DeviceCheck:
     """Return the verdict on a device as it was proved."""
-    reason = "; ".join(failures)
     rate = next((float(report["rate"]) for report in outcome.said if "rate" in report), 0.0)
-    return DeviceCheck(True, info.lanes, info.float64, reason, remedy_for(reason) if reason else "", rate)
+    return DeviceCheck(True, info.lanes, info.float64, "; ".join(failures), rate)
 
 
 def _failure(outcome: probe_process.Outcome) -> tuple[str, str]:

@@ -57,7 +57,7 @@ def machine(monkeypatch):
 
 
 BROKEN = RuntimeError("clCreateContext failed:\nOUT_OF_RESOURCES")
-KEPT = DeviceCheck(False, 1, False, "scalar kernels hang", "update the driver")
+KEPT = DeviceCheck(False, 1, False, "scalar kernels fail")
 PASSING = dataclasses.replace(KEPT, reason="no folder", passing=True)
 
 
@@ -109,7 +109,7 @@ def test_a_verdict_is_reported_by_the_process_that_makes_it(machine, caplog):
     """Later processes with another compiled device are silent."""
     machine([GPU, WARP], {"opencl:0:0": KEPT})
     assert get_backend("auto").info.selection == "warp:cpu" and caplog.messages == []
-    text = "opencl:0:0 (A GPU, Driver 1) is unusable: scalar kernels hang; update the driver"
+    text = "opencl:0:0 (A GPU, Driver 1) is unusable: scalar kernels fail; update the driver"
     made = listing.FallbackOrder([listing.Failure("opencl:0:0", "", text, True)])
     held = ["another warning", text]
     made.report(WARP, held)

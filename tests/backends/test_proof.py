@@ -87,7 +87,7 @@ def test_a_setting_that_fails_gives_way_to_the_next_more_modest_one(driver, capl
     assert (verdict.usable, verdict.lanes, verdict.float64) == left
     for family, lanes in fails:
         assert (f"{family} of {lanes}" if family == VECTORS else family) in verdict.reason
-    assert verdict.remedy
+    assert proof.with_remedy(verdict.reason) > verdict.reason
     (line,) = caplog.messages
     assert "opencl:0:0 (Some device, Driver 1)" in line and verdict.reason in line and "\n" not in line
     left_info = proof.apply(INFO, verdict)

@@ -11,7 +11,7 @@ from gpusense.backends.base import Backend, BackendInfo
 from gpusense.backends.opencl import drivers, pocl
 from gpusense.backends.opencl.backend import OpenCLBackend
 from gpusense.backends.opencl.memory import check_in_order
-from gpusense.backends.proof import remedy_for, with_remedy
+from gpusense.backends.proof import with_remedy
 from gpusense.backends.registry import Absent, Library
 
 # Variables that hide drivers and devices.
@@ -98,7 +98,7 @@ class OpenCLLibrary(Library):
     def absent(self) -> list[Absent]:
         chosen = drivers.choice()
         failed = [*chosen.left_out, *([("OpenCL", chosen.failure)] if chosen.failure else [])]
-        absent = [Absent(name, "cpu", f"it {with_remedy(failure, remedy_for(failure))}") for name, failure in failed]
+        absent = [Absent(name, "cpu", f"it {with_remedy(failure)}") for name, failure in failed]
         if reason := silence_of_pocl():
             absent.append(Absent("PoCL (no device)", "cpu", reason))
         return absent

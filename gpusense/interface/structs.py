@@ -305,11 +305,10 @@ class MatchRules(NamedTuple):
 class BeamRules(NamedTuple):
     """Companions of a scan's rays, and rules for its readings; see the kernel file ``beam_consistency``.
 
-    The kernel reads the part of the map from the column ``left`` and the row ``top`` on. Companions start ``beside``
-    off the beam, or at the position's deviation up to ``most_beside`` [m]. They diverge by ``apart``, or by the
-    deviation of the heading up to ``most_apart``, and by ``cone`` [rad]. Tolerances of readings are ``part`` of them,
-    at least ``least`` and the deviation of the position; rays are walked up to ``limit`` [m]. Walls have the value
-    ``occupied`` or more.
+    Companions start ``beside`` off the beam, or at the position's deviation up to ``most_beside`` [m]. They diverge by
+    ``apart``, or by the deviation of the heading up to ``most_apart``, and by ``cone`` [rad]. Tolerances of readings
+    are ``part`` of them, at least ``least`` and the deviation of the position; rays are walked up to ``limit`` [m].
+    Walls have the value ``occupied`` or more.
     """
 
     beside: double
@@ -322,8 +321,6 @@ class BeamRules(NamedTuple):
     limit: double
     range_max: double
     occupied: int
-    left: int
-    top: int
 
 
 STRUCTS: dict[str, type[tuple[Any, ...]]] = {

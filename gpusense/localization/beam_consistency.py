@@ -227,7 +227,7 @@ class MapJudge:
     def expects(self, scanner: Scanner, ranges: Floats, values: Floats, scan: Floats) -> bool:
         """Prepare for judging a scan in a correction at its estimated pose; return False without beams.
 
-        ``ranges``: the scan (K,) as it is judged later; ``values``: its float64 readings; ``scan``: (JUDGED,) array to
+        ``ranges``: the scan (K,) that is judged later; ``values``: its float64 readings; ``scan``: (JUDGED,) array to
         be filled with its beams.
         """
         setting, self._known = self._set(scanner), None
@@ -294,6 +294,6 @@ def _setting_of(grid: OccupancyGrid, scanner: Scanner) -> _Setting:
     rules = BeamRules(
         max(BESIDE, side), max(_MOST_BESIDE, side), _APART, _MOST_APART, scanner.cone / 2,
         max(_LEAST, _LEAST_CELLS * side), _PART, min(_FARTHEST, scanner.range_max), scanner.range_max,
-        grid.occupied_threshold, 0, 0,
+        grid.occupied_threshold,
     )  # fmt: skip
     return _Setting(scanner, turn, scanner.bearings + turn, frame_of(grid, scanner.mount), rules)

@@ -3,8 +3,8 @@
 A correction that begins a lesson only keeps its scan and estimate. In later corrections, while the device works on the
 step, the host first starts the terms of the readings at poses around the estimate, behind the launches of the step,
 then computes their scores in three parts, and then adds them to the correlation. A correction does one part of the
-oldest lesson; among the first scans, which are all lessons, it ends one and starts the next. A lesson therefore ends a
-fixed number of corrections later on every device.
+oldest lesson. The first scans are all lessons; then a correction ends one and starts the next. A lesson therefore ends
+a fixed number of corrections later on every device.
 """
 
 from __future__ import annotations

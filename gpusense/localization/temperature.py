@@ -227,7 +227,7 @@ class BeamCorrelation:
         return (ahead * (self._around / math.tau)).astype(np.int64) % self._around
 
     def _compare(self, scores: Scores, axes: np.ndarray, follows: bool) -> None:
-        """Correlate a scan's sectors with those of the last scan."""
+        """Correlate the sectors of a scan and of the last one."""
         if follows and self._previous is not None:
             now, then = scores.sectors, np.einsum("ji,jt->it", axes, self._previous[0])
             squares = ((now * now + then * then) * (scores.seen & self._previous[1])).sum() / 2

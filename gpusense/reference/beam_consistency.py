@@ -35,7 +35,7 @@ def is_wall(value: np.ndarray, occupied: int) -> np.ndarray:
 
 
 def walk_ray(
-    start: np.ndarray, slope: np.ndarray, steps: np.ndarray, cells: np.ndarray, part: tuple[int, int], rows: int,
+    start: np.ndarray, slope: np.ndarray, steps: np.ndarray, cells: np.ndarray, rows: int,
     cols: int, occupied: int,
 ) -> np.ndarray:  # fmt: skip
     """Return the distances (2, R) along rays to the first wall, and to the first unknown cell before it [cells].
@@ -43,15 +43,14 @@ def walk_ray(
     They are infinite for none. A pair of walls that share a corner stops a ray.
 
     ``start``: (2, R) columns and rows where rays begin [cells]; ``slope``: (2, R) directions; ``steps``: (R,) numbers
-    of steps; ``cells``: values of the cells of a part of the map; ``part``: column and row of the map at which the part
-    begins; ``occupied``: least value of a wall.
+    of steps; ``cells``: values of the cells of the map; ``occupied``: least value of a wall.
     """
     # All steps of all rays in sequence.
     ray = np.arange(len(steps)).repeat(steps)
     number = np.arange(len(ray))
     number -= (steps.cumsum() - steps).repeat(steps)
     distance = STEP * number
-    col, row = (_cells_along(start[axis], slope[axis], steps, distance) - np.int32(part[axis]) for axis in (0, 1))
+    col, row = (_cells_along(start[axis], slope[axis], steps, distance) for axis in (0, 1))
     # As unsigned numbers, negative indices exceed every limit.
     within = (col.view(np.uint32) < cols) & (row.view(np.uint32) < rows)
     index = row.astype(np.int64)
@@ -86,14 +85,14 @@ def _cells_along(start: np.ndarray, slope: np.ndarray, steps: np.ndarray, distan
 
 def walk_beside(
     direction: np.ndarray, origin: tuple[float, float], companion: tuple[float, float], steps: np.ndarray,
-    cells: np.ndarray, part: tuple[int, int], rows: int, cols: int, cell: float, occupied: int,
+    cells: np.ndarray, rows: int, cols: int, cell: float, occupied: int,
 ) -> np.ndarray:  # fmt: skip
     """Return the distances (2, 3, B) [m] along beams and their companions on both sides.
 
     ``direction``: (B,) directions of the beams in the map's frame [rad]; ``origin``: where the beams begin [m];
     ``companion``: companions' offset from a beam at its start [m], and angle of divergence [rad]; ``steps``: (B,)
-    numbers of steps; ``cells``: values of the cells of a part of the map; ``part``: column and row of the map at which
-    the part begins; ``cell``: side of a cell [m]; ``occupied``: least value of a wall.
+    numbers of steps; ``cells``: values of the cells of the map; ``cell``: side of a cell [m]; ``occupied``: least value
+    of a wall.
     """
     slope = np.empty((2, len(SIDES), len(direction)))
     slope[0], slope[1] = cos_sin(direction + SIDES * companion[1])
@@ -104,7 +103,7 @@ def walk_beside(
     start /= cell
     np.minimum(np.maximum(start, -AFAR, out=start), AFAR, out=start)
     first = walk_ray(
-        start.reshape(2, -1), slope.reshape(2, -1), np.tile(steps, len(SIDES)), cells, part, rows, cols, occupied
+        start.reshape(2, -1), slope.reshape(2, -1), np.tile(steps, len(SIDES)), cells, rows, cols, occupied
     )
     return first.reshape(slope.shape) * cell
 
@@ -153,8 +152,7 @@ def judge_beams(flags, cells, estimate, scan, judged, frame, rules, rows, cols, 
     steps = (np.minimum(after, rules.limit) / (cell * STEP)).astype(np.int64) + 1
     # A ray gives no evidence beyond the first unknown cell.
     end = np.where(returned, before, reading)
-    part = rules.left, rules.top
-    first, unknown = walk_beside(direction, origin, companion, steps, cells, part, rows, cols, cell, rules.occupied)
+    first, unknown = walk_beside(direction, origin, companion, steps, cells, rows, cols, cell, rules.occupied)
     seen, own = unknown >= np.minimum(first, end), first[0]
     alone = within & (own >= before) & (own <= after) & seen[0]
     nearest, farthest, seen = first.min(axis=0), first.max(axis=0), seen.all(axis=0)

@@ -65,22 +65,21 @@ int is_wall(const int value, const int occupied) {
 }
 
 // Return the distances along a ray to the first wall, and to the first unknown cell before it [cells]; infinite for none.
-// A pair of walls that share a corner stops a ray. The steps are those from begin to before end. The cells are a part
-// of the map, which begins at a column and a row of the map.
+// A pair of walls that share a corner stops a ray. The steps are those from begin to before end.
 double2 walk_ray(const double2 start, const double2 slope, const int begin, const int end, global const uchar *cells,
-                 const int2 part, const int rows, const int cols, const int occupied) {
+                 const int rows, const int cols, const int occupied) {
     double2 first = (double2)(INFINITY, INFINITY);
     int col_before = 0, row_before = 0, value_before = OFF;
     if (begin > 0) {
         const double distance = STEP * (begin - 1);
-        col_before = floor_of(slope.x * distance + start.x) - part.x;
-        row_before = floor_of(slope.y * distance + start.y) - part.y;
+        col_before = floor_of(slope.x * distance + start.x);
+        row_before = floor_of(slope.y * distance + start.y);
         value_before = value_at(cells, col_before, row_before, rows, cols);
     }
     for (int k = begin; k < end; ++k) {
         const double distance = STEP * k;
-        const int col = floor_of(slope.x * distance + start.x) - part.x;
-        const int row = floor_of(slope.y * distance + start.y) - part.y;
+        const int col = floor_of(slope.x * distance + start.x);
+        const int row = floor_of(slope.y * distance + start.y);
         // Nothing is new in the same cell.
         if (col == col_before && row == row_before && k > 0) continue;
         const int value = value_at(cells, col, row, rows, cols);
@@ -101,14 +100,14 @@ double2 walk_ray(const double2 start, const double2 slope, const int begin, cons
 // Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1), which starts next to it and
 // diverges.
 double2 walk_beside(const double side, const double direction, const double2 origin, const double2 companion,
-                    const int steps, global const uchar *cells, const int2 part, const int rows, const int cols,
+                    const int steps, global const uchar *cells, const int rows, const int cols,
                     const double cell, const int occupied, const Walkers team) {
     const double2 along = cos_sin(direction), slope = cos_sin(direction + side * companion.y);
     const double shift = side * companion.x;
     const double x = (origin.x - shift * along.y) / cell, y = (origin.y + shift * along.x) / cell;
     const double2 start = (double2)(fmin(fmax(x, -AFAR), AFAR), fmin(fmax(y, -AFAR), AFAR));
     const int share = (steps + team.members - 1) / team.members, begin = team.member * share;
-    const double2 own = walk_ray(start, slope, begin, min(begin + share, steps), cells, part, rows, cols, occupied);
+    const double2 own = walk_ray(start, slope, begin, min(begin + share, steps), cells, rows, cols, occupied);
     double2 first = least_of_team(own, team);
     if (first.y > first.x) first.y = INFINITY;
     return first * cell;
@@ -157,7 +156,6 @@ kernel void judge_beams(ARGUMENTS) {
     const double2 companion = (double2)(fmin(fmax(rules.beside, deviation.x), rules.most_beside),
                                         fmin(fmax(rules.apart, deviation.y), rules.most_apart) + rules.cone);
     const double direction = scan[b] + estimate[2], cell = frame.resolution;
-    const int2 part = (int2)(rules.left, rules.top);
     const int returned = scan[beams + b] < rules.range_max, occupied = rules.occupied;
     const double reading = returned ? scan[beams + b] : rules.range_max;
     const double tolerance = fmax(fmax(rules.least, near), rules.part * reading);
@@ -165,15 +163,15 @@ kernel void judge_beams(ARGUMENTS) {
     const int within = returned && reading <= rules.limit, steps = (int)(fmin(after, rules.limit) / (cell * STEP)) + 1;
     // A ray gives no evidence beyond the first unknown cell.
     const double end = returned ? before : reading;
-    const double2 own = walk_beside(0, direction, origin, companion, steps, cells, part, rows, cols, cell, occupied, team);
+    const double2 own = walk_beside(0, direction, origin, companion, steps, cells, rows, cols, cell, occupied, team);
     int kind = BEAM_NOTHING;
     if (within && own.x >= before && own.x <= after && own.y >= fmin(own.x, end)) {
         kind = BEAM_AGREES;
     } else {
         const double2 left =
-            walk_beside(1, direction, origin, companion, steps, cells, part, rows, cols, cell, occupied, team);
+            walk_beside(1, direction, origin, companion, steps, cells, rows, cols, cell, occupied, team);
         const double2 right =
-            walk_beside(-1, direction, origin, companion, steps, cells, part, rows, cols, cell, occupied, team);
+            walk_beside(-1, direction, origin, companion, steps, cells, rows, cols, cell, occupied, team);
         const double nearest = fmin(own.x, fmin(left.x, right.x)), farthest = fmax(own.x, fmax(left.x, right.x));
         const int seen = own.y >= fmin(own.x, end) && left.y >= fmin(left.x, end) && right.y >= fmin(right.x, end);
         if (seen && within && isinf(nearest)) kind = BEAM_SHORT;

@@ -79,7 +79,7 @@ def is_wall(value: wp.int32, occupied: wp.int32):
 
 @wp.func
 def walk_ray(
-    start: wp.vec2d, slope: wp.vec2d, begin: wp.int32, end: wp.int32, cells: wp.array(dtype=wp.uint8), part: wp.vec2i,
+    start: wp.vec2d, slope: wp.vec2d, begin: wp.int32, end: wp.int32, cells: wp.array(dtype=wp.uint8),
     rows: wp.int32, cols: wp.int32, occupied: wp.int32,
 ):  # fmt: skip
     """Return the distances along a ray to the first wall, and to the first unknown cell before it [cells]."""
@@ -90,14 +90,14 @@ def walk_ray(
     value_before = int(OFF)
     if begin > 0:
         last = STEP * wp.float64(begin - 1)
-        col_before = wp.int32(wp.floor(slope.x * last + start.x)) - part[0]
-        row_before = wp.int32(wp.floor(slope.y * last + start.y)) - part[1]
+        col_before = wp.int32(wp.floor(slope.x * last + start.x))
+        row_before = wp.int32(wp.floor(slope.y * last + start.y))
         value_before = value_at(cells, col_before, row_before, rows, cols)
     k = begin + 0
     while k < end:
         distance = STEP * wp.float64(k)
-        col = wp.int32(wp.floor(slope.x * distance + start.x)) - part[0]
-        row = wp.int32(wp.floor(slope.y * distance + start.y)) - part[1]
+        col = wp.int32(wp.floor(slope.x * distance + start.x))
+        row = wp.int32(wp.floor(slope.y * distance + start.y))
         value = value_at(cells, col, row, rows, cols)
         stops = is_wall(value, occupied)
         if col != col_before and row != row_before and value != OFF and value_before != OFF:
@@ -126,7 +126,7 @@ if IN_TEAMS:
 @wp.func
 def walk_beside(
     side: wp.float64, direction: wp.float64, origin: wp.vec2d, companion: wp.vec2d, steps: wp.int32,
-    cells: wp.array(dtype=wp.uint8), part: wp.vec2i, rows: wp.int32, cols: wp.int32, cell: wp.float64,
+    cells: wp.array(dtype=wp.uint8), rows: wp.int32, cols: wp.int32, cell: wp.float64,
     occupied: wp.int32, member: wp.int32,
 ):  # fmt: skip
     """Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1)."""
@@ -137,10 +137,10 @@ def walk_beside(
     y = (origin.y + shift * along.x) / cell
     start = wp.vec2d(wp.min(wp.max(x, MINUS_AFAR), AFAR), wp.min(wp.max(y, MINUS_AFAR), AFAR))
     if not IN_TEAMS:
-        return walk_ray(start, slope, 0, steps, cells, part, rows, cols, occupied) * cell
+        return walk_ray(start, slope, 0, steps, cells, rows, cols, occupied) * cell
     share = (steps + walkers() - 1) / walkers()
     begin = member * share
-    own = walk_ray(start, slope, begin, wp.min(begin + share, steps), cells, part, rows, cols, occupied)
+    own = walk_ray(start, slope, begin, wp.min(begin + share, steps), cells, rows, cols, occupied)
     first = least_of_team(own)
     if first.y > first.x:
         first = wp.vec2d(first.x, FOREVER)
@@ -197,7 +197,6 @@ def judge_beams(cells, estimate, scan, judged, frame, rules, rows, cols, beams):
     direction = scan[b] + estimate[2]
     cell = frame.resolution
     wall = rules.occupied
-    part = wp.vec2i(rules.left, rules.top)
     returned = reading < rules.range_max
     if not returned:
         reading = rules.range_max
@@ -208,14 +207,14 @@ def judge_beams(cells, estimate, scan, judged, frame, rules, rows, cols, beams):
     steps = wp.int32(wp.min(after, rules.limit) / (cell * STEP)) + 1
     # A ray gives no evidence beyond the first unknown cell.
     end = wp.where(returned, before, reading)
-    own = walk_beside(ZERO, direction, origin, companion, steps, cells, part, rows, cols, cell, wall, member)
+    own = walk_beside(ZERO, direction, origin, companion, steps, cells, rows, cols, cell, wall, member)
     seen = own.y >= wp.min(own.x, end)
     kind = NOTHING
     if within and own.x >= before and own.x <= after and seen:
         kind = AGREES
     else:
-        left = walk_beside(ONE, direction, origin, companion, steps, cells, part, rows, cols, cell, wall, member)
-        right = walk_beside(MINUS_ONE, direction, origin, companion, steps, cells, part, rows, cols, cell, wall, member)
+        left = walk_beside(ONE, direction, origin, companion, steps, cells, rows, cols, cell, wall, member)
+        right = walk_beside(MINUS_ONE, direction, origin, companion, steps, cells, rows, cols, cell, wall, member)
         nearest = wp.min(own.x, wp.min(left.x, right.x))
         farthest = wp.max(own.x, wp.max(left.x, right.x))
         seen = seen and left.y >= wp.min(left.x, end) and right.y >= wp.min(right.x, end)

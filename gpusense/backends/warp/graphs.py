@@ -254,7 +254,7 @@ class WarpRecording(Recording, Step):
 
 
 class GraphExchange(Exchange):
-    """An exchange through page-locked memory, whose copies are part of the graph of a recording."""
+    """An exchange through page-locked memory; the graph of a recording includes its copies."""
 
     def __init__(
         self, backend: Backend, device: wp.Device, graphs: GraphCache, inputs: tuple[wp.array, int],

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.interface.constants import CLIMB, GRADIENT_NUMBERS
+from gpusense.reference.placement import place_pose
 
 # Places of a climb's numbers: the best pose (3), its log-likelihood, gradient (3) and information (6), the start (2),
 # damping, steps, whether the last step was small, and whether the climb has ended.
@@ -31,11 +32,14 @@ def damped_step(climb: np.ndarray) -> np.ndarray:
     return limited
 
 
-def climb_step(flags, gradient, poses, climb, scans, parts, most, small, yaw_cos, yaw_sin):
-    """Judge the poses that were evaluated, numbers in the grid's frame, and take the next step of each climb."""
-    everyone, pose = climb[: CLIMB * scans].reshape(scans, CLIMB), poses[: 3 * parts * scans].reshape(scans, parts, 3)
+def climb_step(
+    flags, gradient, poses, climb, pose_cell, pose, pose_low, pose_status, scans, parts, most, small, yaw_cos, yaw_sin,
+    frame, window,
+):  # fmt: skip
+    """Judge the poses that were evaluated, numbers in the grid's frame, and take and place each climb's next step."""
+    everyone, tried = climb[: CLIMB * scans].reshape(scans, CLIMB), poses[: 3 * parts * scans].reshape(scans, parts, 3)
     rows = np.flatnonzero(everyone[:, ENDED] == 0)
-    at, trial = everyone[rows], pose[rows, 0]
+    at, trial = everyone[rows], tried[rows, 0]
     numbers = gradient[: GRADIENT_NUMBERS * parts * scans].reshape(scans, parts, -1)[rows].sum(axis=1, dtype=np.float64)
     off, far = trial - at[:, :3], trial[:, :2] - at[:, START : START + 2]
     first = at[:, STEPS] < 0
@@ -49,5 +53,8 @@ def climb_step(flags, gradient, poses, climb, scans, parts, most, small, yaw_cos
     at[:, CALM] = ~first & (np.maximum(np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 2])) < small)
     at[:, STEPS] += 1
     at[:, ENDED] = (at[:, CALM] != 0) | (at[:, STEPS] >= most)
-    pose[rows] = (at[:, :3] + np.where(at[:, ENDED, None] != 0, 0, damped_step(at)))[:, None]
+    tried[rows] = (at[:, :3] + np.where(at[:, ENDED, None] != 0, 0, damped_step(at)))[:, None]
     everyone[rows] = at
+    for n in rows:
+        part = slice(parts * n, parts * (n + 1))
+        place_pose(flags, tried[n], pose_cell[part], pose[part], pose_low[part], pose_status, frame, window)

@@ -1,5 +1,6 @@
 // Steps of damped Gauss-Newton (Levenberg) from poses to maxima of an interpolated likelihood field. Damping and the
 // stopping rule are the same in all directions, so that ends turn with the map.
+// requires: placement
 
 // Numbers of a climb: the best pose (3), its log-likelihood, gradient (3) and information (6), the pose to start from (2),
 // damping, steps, whether the last step was small, and whether the climb has ended.
@@ -39,22 +40,23 @@ void damped_step(global const double *climb, double *step) {
 }
 
 // Judge the poses that were evaluated, and take the next step of each climb. Each scan has parts neighbouring poses, all
-// equal, whose numbers in the grid's frame are added. Poses of climbs that have ended stay. One work-item takes a scan.
+// equal, whose numbers in the grid's frame are added. The next poses are placed as place_poses does. Poses of climbs that
+// have ended stay. One work-item takes a scan.
 kernel void climb_step(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= scans || climb[CLIMB * n + ENDED] != 0) return;
-    global double *at = climb + CLIMB * n, *pose = poses + 3 * parts * n;
+    global double *at = climb + CLIMB * n, *tried = poses + 3 * parts * n;
     double numbers[GRADIENT_NUMBERS] = {0};
     for (int part = 0; part < parts; ++part)
         for (int k = 0; k < GRADIENT_NUMBERS; ++k) numbers[k] += gradient[GRADIENT_NUMBERS * (parts * n + part) + k];
-    const double off_x = pose[0] - at[0], off_y = pose[1] - at[1], turn = fabs(pose[2] - at[2]);
-    const double far_x = pose[0] - at[START], far_y = pose[1] - at[START + 1];
+    const double off_x = tried[0] - at[0], off_y = tried[1] - at[1], turn = fabs(tried[2] - at[2]);
+    const double far_x = tried[0] - at[START], far_y = tried[1] - at[START + 1];
     const bool first = at[STEPS] < 0, within = far_x * far_x + far_y * far_y <= FARTHEST_CLIMB * FARTHEST_CLIMB;
     const bool better = first || (numbers[0] >= at[VALUE] && within);
     if (better) {
         const double c = yaw_cos, s = yaw_sin, x = numbers[1], y = numbers[2];
         const double xx = numbers[4], xy = numbers[5], yy = numbers[8], xt = numbers[6], yt = numbers[9];
-        for (int k = 0; k < 3; ++k) at[k] = pose[k];
+        for (int k = 0; k < 3; ++k) at[k] = tried[k];
         at[VALUE] = numbers[0];
         at[SLOPE] = c * x - s * y;
         at[SLOPE + 1] = s * x + c * y;
@@ -75,5 +77,7 @@ kernel void climb_step(ARGUMENTS) {
     at[ENDED] = at[CALM] != 0 || at[STEPS] >= most;
     double step[3] = {0, 0, 0};
     if (at[ENDED] == 0) damped_step(at, step);
-    for (int k = 0; k < 3 * parts; ++k) pose[k] = at[k % 3] + step[k % 3];
+    for (int k = 0; k < 3 * parts; ++k) tried[k] = at[k % 3] + step[k % 3];
+    for (int part = parts * n; part < parts * (n + 1); ++part)
+        place_pose(part, poses, pose_cell, pose, pose_low, pose_status, frame, window);
 }

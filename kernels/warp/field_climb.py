@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from .placement import place_pose
 from .prelude import kernel
 
 # Numbers of a climb: the best pose (3), its log-likelihood, gradient (3) and information (6), the pose to start from
@@ -48,7 +49,10 @@ def damped_step(climb: wp.array(dtype=wp.float64), at: wp.int32):
 
 
 @kernel
-def climb_step(gradient, poses, climb, scans, parts, most, small, yaw_cos, yaw_sin):
+def climb_step(
+    gradient, poses, climb, pose_cell, pose, pose_low, pose_status, scans, parts, most, small, yaw_cos, yaw_sin, frame,
+    window,
+):  # fmt: skip
     """Judge the poses that were evaluated, and take the next step of each climb."""
     n = wp.tid()
     if n >= scans:
@@ -60,12 +64,12 @@ def climb_step(gradient, poses, climb, scans, parts, most, small, yaw_cos, yaw_s
     for part in range(parts):
         for k in range(13):
             numbers[k] = numbers[k] + wp.float64(gradient[GRADIENT_NUMBERS * (parts * n + part) + k])
-    pose = 3 * parts * n
-    off_x = poses[pose] - climb[at]
-    off_y = poses[pose + 1] - climb[at + 1]
-    turn = wp.abs(poses[pose + 2] - climb[at + 2])
-    far_x = poses[pose] - climb[at + START]
-    far_y = poses[pose + 1] - climb[at + START + 1]
+    tried = 3 * parts * n
+    off_x = poses[tried] - climb[at]
+    off_y = poses[tried + 1] - climb[at + 1]
+    turn = wp.abs(poses[tried + 2] - climb[at + 2])
+    far_x = poses[tried] - climb[at + START]
+    far_y = poses[tried + 1] - climb[at + START + 1]
     first = climb[at + STEPS] < ZERO
     within = far_x * far_x + far_y * far_y <= FARTHEST_CLIMB * FARTHEST_CLIMB
     better = first or (numbers[0] >= climb[at + VALUE] and within)
@@ -76,7 +80,7 @@ def climb_step(gradient, poses, climb, scans, parts, most, small, yaw_cos, yaw_s
         xx, xy, xt = numbers[4], numbers[5], numbers[6]
         yy, yt = numbers[8], numbers[9]
         for k in range(3):
-            climb[at + k] = poses[pose + k]
+            climb[at + k] = poses[tried + k]
         climb[at + VALUE] = numbers[0]
         climb[at + SLOPE] = c * x - s * y
         climb[at + SLOPE + 1] = s * x + c * y
@@ -102,4 +106,5 @@ def climb_step(gradient, poses, climb, scans, parts, most, small, yaw_cos, yaw_s
         step = damped_step(climb, at)
     for part in range(parts):
         for k in range(3):
-            poses[pose + 3 * part + k] = climb[at + k] + step[k]
+            poses[tried + 3 * part + k] = climb[at + k] + step[k]
+        place_pose(parts * n + part, poses, pose_cell, pose, pose_low, pose_status, frame, window)

@@ -46,9 +46,10 @@ KERNELS: dict[str, Kernel] = {
     ),
     "climb_step": kernel(
         "field_climb", "scan", f"real gradient [{GRADIENT_NUMBERS} * parts * scans]",
-        "out double poses [3 * parts * scans]", f"out double climb [{CLIMB} * scans]", "int scans", "int parts",
-        "int most", "double small", "double yaw_cos",
-        "double yaw_sin",
+        "out double poses [3 * parts * scans]", f"out double climb [{CLIMB} * scans]",
+        "out int2 pose_cell [parts * scans]", "out real4 pose [parts * scans]", "out real4 pose_low [parts * scans]",
+        "out int pose_status [2]", "int scans", "int parts", "int most", "double small", "double yaw_cos",
+        "double yaw_sin", "Frame frame", WINDOW,
     ),
     "fit_lines": kernel(
         "line_fit", "beam scan", *_POINTS, "int which [chosen]", "out real4 line [points]", "int scans", "int points",

@@ -138,20 +138,30 @@ class Climbs(Gradients):
         program, gradient, placed = self._placed(pose, readings)
         numbers = dict(scans=count, parts=parts, most=_MOST_STEPS, small=self._small, yaw_cos=self._turn[0],
                        yaw_sin=self._turn[1])  # fmt: skip
+        arguments = placed.arguments()
+        del arguments["particles"]
         if backend.info.float64:
             there = space.upload("climb", end)
-            step = launch("climb_step", flags, (count,), gradient=gradient, poses=placed.source, climb=there, **numbers)
-            climb = ChangingProgram(backend, (*program, step), ())
+            step = launch(
+                "climb_step", flags | placed.flags, (count,), gradient=gradient, climb=there, **numbers, **arguments
+            )  # fmt: skip
+            climb = ChangingProgram(backend, (program[-1], step), ())
+            backend.run(program[:-1])
             while not end[:, ENDED].all():
                 for _ in range(_STEPS_AT_ONCE[backend.info.kind]):
                     climb({})
                 space.read(there, end)
             return
-        climb_step = get_backend("numpy").compile("climb_step", flags)
+        # The host places poses of the next step by another call.
+        climb_step, real = get_backend("numpy").compile("climb_step", flags), self._pipeline.real
+        room = np.empty(2 * len(pose), np.int32), *np.empty((2, 4 * len(pose)), real), np.zeros(2, np.int32)
         while not end[:, ENDED].all():
             backend.run(program)
             space.read(gradient, rows)
-            climb_step((count,), rows.reshape(-1), pose.reshape(-1), end.reshape(-1), *numbers.values())
+            climb_step(
+                (count,), rows.reshape(-1), pose.reshape(-1), end.reshape(-1), *room, *numbers.values(),
+                arguments["frame"], arguments["window"],
+            )  # fmt: skip
             program = self._placed(pose, readings)[0]
 
     def _placed(self, pose: np.ndarray, readings: Readings) -> tuple[Program, Buffer, PlacedPoses]:

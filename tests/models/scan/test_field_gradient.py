@@ -10,6 +10,7 @@ from support.kernel_scenes import run
 
 import gpusense as gs
 from gpusense.backends import get_backend
+from gpusense.interface.structs import Frame, Window
 from gpusense.models.scan import field_gradient
 
 SCANNER = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.05, count=80, range_max=6.0, mount=(0.3, -0.1, 0.4))
@@ -124,8 +125,9 @@ def test_steps_of_climbs_are_those_of_the_reference(name, real, needs):
     climbs[:, 16], climbs[:5, 16], climbs[:, 17:] = 7, -1, 0
     climbs[5:8, 13], climbs[8:12, 18], climbs[12:15, :3] = 6, 1, poses[24:30:2] + 1e-5
     flags = frozenset({"FLOAT64"}) if real is np.float64 else frozenset()
-    call = ("climb_step", flags, (20,), numbers.astype(real).ravel(), poses.ravel(), climbs[:20].ravel(), 20, 2, 9)
-    call += (1e-4, 0.8, 0.6)
+    call = ("climb_step", flags, (20,), numbers.astype(real).ravel(), poses.ravel(), climbs[:20].ravel())
+    call += (np.zeros(80, np.int32), *np.zeros((2, 160), real), np.zeros(2, np.int32), 20, 2, 9, 1e-4, 0.8, 0.6)
+    call += (Frame(0.1, -0.2, 0.05, 0.1, 0.2, 0.8, 0.6), Window(-400, -400, 900, 900))
     expected, got = run(get_backend("numpy"), *call), run(get_backend(needs(name)), *call)
     assert np.isin(expected["climb"].reshape(20, 19)[:, 17], [0, 1]).all()
     for output, values in expected.items():

@@ -10,7 +10,7 @@ import pytest
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import beam_tolerance, differing
-from gpusense.interface.kernel_files import opencl_names, opencl_source
+from gpusense.interface.kernel_files import opencl_names
 from gpusense.interface.signatures import KERNELS, LANES
 from gpusense.interface.sources import assemble, relevant, required_files
 
@@ -197,10 +197,10 @@ def test_programs_in_lanes_begin_in_their_folder():
         assert scalar[-1] == file
         if f"lanes/{file}" in opencl_names():
             assert wide[-1] == f"lanes/{file}"
-            assert "lanes/types" in wide
-            assert file not in wide or "kernel void" not in opencl_source(file)
             assert "IN_LANES" in relevant(file, frozenset({"IN_LANES"}))
-            assert f'#line 1 "lanes/{file}.cl"' in assemble(file, frozenset({"IN_LANES"}))
+            program = assemble(file, frozenset({"IN_LANES"}))
+            own = program[program.index(f'#line 1 "lanes/{file}.cl"') :]
+            assert own.count("kernel void") == program.count("kernel void") > 0
         else:
             assert wide == scalar
             assert "IN_LANES" not in relevant(file, frozenset({"IN_LANES"}))

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gpusense._util import checks
 from gpusense._util.documents import read_mapping
-from gpusense.commands.fit_results import FitResult
 from gpusense.localization.motion import OdometryMotion
 from gpusense.localization.nav2 import Nav2Options, from_nav2, has_parameters
 from gpusense.world.hit_shapes import SHAPE_PARAMETERS
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
+
+if TYPE_CHECKING:
+    from gpusense.commands.fit import FitResult
 
 
 def read_parameters(path: Path, name: str) -> BeamParameters | LikelihoodFieldParameters:

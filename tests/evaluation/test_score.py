@@ -11,6 +11,7 @@ import yaml
 
 import gpusense as gs
 from gpusense.commands.cli import main
+from gpusense.commands.parameter_files import read_localization
 from gpusense.evaluation import scoring, steps
 from gpusense.evaluation.worlds import building, free_pose, simulate_scan
 
@@ -140,8 +141,14 @@ def test_parameters_come_from_a_file(capsys, recorded, tmp_path):
     options = ["--particles", "50", "--backend", "numpy", "--limit", "1", "--json", "--parameters", str(file)]
     code, out, _ = run(capsys, recorded, *options)
     assert (code, json.loads(out)["parameters"]) == (0, gs.BeamParameters(sigma_hit=0.07).to_dict())
-    code, out, _ = run(capsys, recorded, *options, "--set", "sigma_hit=0.2")
-    assert json.loads(out)["parameters"]["sigma_hit"] == 0.2
+    code, out, _ = run(capsys, recorded, *options, "--set", "sigma_hit=0.2", "hit=student")
+    found = json.loads(out)["parameters"]
+    assert (found["sigma_hit"], found["hit"]) == (0.2, "student")
+    field = gs.LikelihoodFieldParameters(sigma_hit=0.3)
+    file.write_text(yaml.safe_dump({"likelihood_field": field.to_dict()}))
+    code, out, _ = run(capsys, recorded, *options, "--model", "field")
+    assert json.loads(out)["parameters"] == field.to_dict()
+    assert read_localization(file).sensor == field
 
 
 @pytest.mark.parametrize(

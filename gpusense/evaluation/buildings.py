@@ -21,7 +21,6 @@ _NARROWEST_ROOM, _WIDEST_ROOM = 3.2, 6.0
 Rng = np.random.Generator
 _Box = tuple[float, float, float, float]  # x0, y0, x1, y1
 _SIDE = 0.05
-_WALL = 4  # cells
 
 
 def building(seed: int = 0, size: tuple[float, float] = (30.0, 20.0), resolution: float = 0.05) -> OccupancyGrid:
@@ -187,45 +186,40 @@ def named_world(name: str, seed: int = 0) -> OccupancyGrid:
     return WORLDS[checks.choice("name", name, tuple(WORLDS))](number)
 
 
-def _unknown(width: float, height: float) -> np.ndarray:
-    return np.full((round(height / _SIDE), round(width / _SIDE)), -1, np.int8)
-
-
-def _box(cells: np.ndarray, x0: float, y0: float, x1: float, y1: float, value: int) -> None:
-    a, b, c, d = (round(one / _SIDE) for one in (x0, y0, x1, y1))
-    cells[b:d, a:c] = value
-
-
 def _corridor(seed: int) -> OccupancyGrid:
-    rng, cells = np.random.default_rng(seed), _unknown(42.0, 4.0)
-    _box(cells, 0.8, 0.8, 41.2, 3.2, 100)
-    _box(cells, 1.0, 1.0, 41.0, 3.0, 0)
+    rng, drawing = np.random.default_rng(seed), _Drawing(42.0, 4.0, _SIDE)
+    drawing.fill((0.8, 0.8, 41.2, 3.2), _OCCUPIED)
+    drawing.fill((1.0, 1.0, 41.0, 3.0), _FREE)
     for y, x in ((0.9, rng.uniform(4, 18)), (3.0, rng.uniform(22, 36))):  # doors, in niches of 0.1 m
-        _box(cells, x, y, x + 1.0, y + 0.1, 0)
-    return OccupancyGrid(cells, _SIDE)
+        drawing.fill((x, y, x + 1.0, y + 0.1), _FREE)
+    return OccupancyGrid(drawing.cells, _SIDE)
 
 
 def _hall(seed: int) -> OccupancyGrid:
-    rng, cells = np.random.default_rng(seed), _unknown(32.0, 22.0)
-    _box(cells, 0.8, 0.8, 31.2, 21.2, 100)
-    _box(cells, 1.0, 1.0, 31.0, 21.0, 0)
+    rng, drawing = np.random.default_rng(seed), _Drawing(32.0, 22.0, _SIDE)
+    drawing.fill((0.8, 0.8, 31.2, 21.2), _OCCUPIED)
+    drawing.fill((1.0, 1.0, 31.0, 21.0), _FREE)
     for y in np.arange(3.5, 19.0, 3.0):
         for x in np.arange(3.0, 28.0, 4.5):
             if rng.random() > 0.15:
-                _box(cells, x, y, x + 3.0, y + 0.8, 100)
-    return OccupancyGrid(cells, _SIDE)
+                drawing.fill((x, y, x + 3.0, y + 0.8), _OCCUPIED)
+    return OccupancyGrid(drawing.cells, _SIDE)
 
 
 def _twins(seed: int) -> OccupancyGrid:
-    rng, half = np.random.default_rng(seed), np.full((120, 300), 100, np.int8)
-    half[4:, 4:-4] = 0
-    _box(half, 3.0, 2.0, 5.0, 2.6, 100)
-    _box(half, 9.0, 0.2, 9.5, 3.5, 100)
-    cells = np.vstack([half, np.full((_WALL, 300), 100, np.int8), half[::-1, ::-1]])
-    cells[120 : 120 + _WALL, 140:160] = 0  # a door, in the middle
+    rng, drawing = np.random.default_rng(seed), _Drawing(15.0, 12.2, _SIDE)
+    drawing.fill((0.0, 0.0, 15.0, 6.2), _OCCUPIED)
+    for box, value in (
+        ((0.2, 0.2, 14.8, 6.0), _FREE),
+        ((3.0, 2.0, 5.0, 2.6), _OCCUPIED),
+        ((9.0, 0.2, 9.5, 3.5), _OCCUPIED),
+    ):
+        drawing.fill(box, value)
+    drawing.cells[124:] = drawing.cells[119::-1, ::-1]
+    drawing.cells[120:124, 140:160] = _FREE  # a door, in the middle
     x = rng.uniform(1.0, 12.0)
-    _box(cells, x, 4.5, x + 0.4, 4.9, 100)
-    return OccupancyGrid(cells, _SIDE)
+    drawing.fill((x, 4.5, x + 0.4, 4.9), _OCCUPIED)
+    return OccupancyGrid(drawing.cells, _SIDE)
 
 
 WORLDS: dict[str, Callable[[int], OccupancyGrid]] = {

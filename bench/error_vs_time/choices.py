@@ -79,9 +79,9 @@ def value(number: float, unit: str) -> str:
     return f"{number:.3g}" if unit == "cells" else error_text(number, unit)
 
 
-def own(rows: Iterable[Row], need: str, device: str, scene: str = ALL) -> list[Row]:
+def own(rows: Iterable[Row], need: str, device: str) -> list[Row]:
     """Return gpusense's rows of a need on a device."""
-    return [row for row in rows if (row.need, row.device, row.scene) == (need, device, scene) and not row.outside]
+    return [row for row in rows if (row.need, row.device, row.scene) == (need, device, ALL) and not row.outside]
 
 
 def chosen(rows: Sequence[Row], wish: Wish, device: str, standing: str = "") -> tuple[Row | None, bool]:
@@ -116,7 +116,9 @@ def answer(rows: Sequence[Row], wish: Wish, device: str, standing: str = "") -> 
     row, kept = chosen(rows, wish, device, standing)
     if row is None:
         return "-"
-    figures = _figures(row, SHOWN[wish.need][0])
+    measure = SHOWN[wish.need][0]
+    unit = row.units[measure]
+    figures = f"{time_text(row.seconds)}, {value(row.errors[measure], unit)}{' nats' * (unit == 'nats')}"
     return f"**{row.text}**: {figures}" if kept else f"none; nearest: {row.text}, {figures}"
 
 
@@ -149,11 +151,6 @@ def _elapsed(row: Row, measure: str) -> str:
     """Return time and error; on a processor, the median of the elapsed time is in parentheses."""
     elapsed = "" if "NVIDIA" in row.device else f" ({time_text(row.quartiles[1])} elapsed)"
     return f"{time_text(row.seconds)}{elapsed}, {value(row.errors[measure], row.units[measure])}"
-
-
-def _figures(row: Row, measure: str) -> str:
-    unit = row.units[measure]
-    return f"{time_text(row.seconds)}, {value(row.errors[measure], unit)}{' nats' * (unit == 'nats')}"
 
 
 def answers(rows: Sequence[Row], devices: Sequence[str], wishes: Sequence[Wish], standing: Standing) -> list[str]:

@@ -61,14 +61,12 @@ def chart(rows: Sequence[Row], need: str, devices: Sequence[str]) -> str:
         chosen = [row for row in rows if (row.need, row.device, row.scene) == (need, device, ALL)]
         if not chosen:
             continue
-        unit = chosen[0].units[measure]
-        words = {"share": "share", "relative": "relative", "nats": "nats", "m": "m", "cells": "cells"}[unit]
         kept = best([row for row in chosen if not row.outside], measure)
         marks = [
             Mark(row.errors[measure], row.seconds, row.text, row.method, any(row is one for one in kept))
             for row in chosen
         ]
-        charts.append(Chart(device, f"{measure} [{words}]", marks))
+        charts.append(Chart(device, f"{measure} [{chosen[0].units[measure]}]", marks))
     return drawing(charts)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ from gpusense._util.progress import progress
 from gpusense.commands import output
 from gpusense.commands.arguments import Options, output_folder, whole_number
 from gpusense.commands.output import length, rounded
-from gpusense.commands.parameter_files import parameters_yaml
 from gpusense.commands.scans import OPTIONS, add_log, read_chosen_steps, read_scans
 from gpusense.evaluation import range_data
 from gpusense.evaluation.range_data import HeldOut, RangeData, compare_held_out
@@ -26,7 +25,7 @@ from gpusense.learning.fitted import BeamFit
 from gpusense.localization.motion_fit import MotionFit, fit_odometry_motion
 from gpusense.plots import fits
 from gpusense.plots.drawing import save
-from gpusense.world.hit_shapes import SHAPES
+from gpusense.world.hit_shapes import SHAPE_PARAMETERS, SHAPES
 from gpusense.world.map_files import read_map
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.scanner import Reading
@@ -329,3 +328,40 @@ def _print_motion(fit: MotionFit) -> None:
     output.fact("odometry", f"{fit.motion}, from {fit.steps} steps ({path}) with {fit.references} reference poses")
     if fit.undetermined:
         output.fact("", f"at most the default, because the log does not determine them: {', '.join(fit.undetermined)}")
+
+
+def parameters_yaml(result: FitResult) -> str:
+    """Format the fitted parameters as YAML for gpusense and for nav2_amcl."""
+    import yaml
+
+    def block(name: str, mapping: dict[str, Any]) -> str:
+        # PyYAML writes no tuples.
+        plain = {key: list(value) if isinstance(value, tuple) else value for key, value in mapping.items()}
+        return str(yaml.safe_dump({name: plain}, sort_keys=False)).rstrip()
+
+    fit, values = result.fit, result.fit.parameters.to_dict()
+    values = {name: value if isinstance(value, str) else float(value) for name, value in values.items()}
+    lines = [
+        f"# gpusense fit: {fit.hits} ranges and {fit.max_readings} readings without return; {fit.status}",
+        "# For gpusense: gs.BeamParameters.from_dict(...) takes the mapping beam_model.",
+        block("beam_model", values),
+    ]
+    if result.incidence is not None:
+        lines.append("# For gpusense: gs.IncidenceParameters.from_dict(...).")
+        lines.append(block("incidence_model", result.incidence.parameters.to_dict()))
+    if result.motion is not None:
+        lines += [
+            "# For 'gpusense localize --parameters': OdometryMotion. nav2_amcl lacks least, sideways and systematic:",
+            "# alpha alone is too little noise there.",
+            block("odometry_motion", asdict(result.motion.motion)),
+        ]
+    own = ("range_bias", "sigma_growth", *SHAPE_PARAMETERS)
+    shared = {name: value for name, value in values.items() if name not in own}
+    nav2 = {"laser_model_type": "beam", **shared, "laser_max_range": float(result.data.range_max)}
+    lines += [
+        "# For nav2_amcl: paste below amcl's ros__parameters. Its beam model sums cubes of densities that are not",
+        "# normalised, so the likeliest parameters need not be the best ones there. laser_likelihood_max_dist belongs",
+        "# to its likelihood field, which this fit does not cover. It has no range_bias, and normal hits only.",
+        block("amcl", {"ros__parameters": nav2}),
+    ]
+    return "\n".join(lines) + "\n"

@@ -1,20 +1,16 @@
-"""Read and write files of parameters: ``gpusense fit`` writes them, other commands read them."""
+"""Read files of parameters, which ``gpusense fit`` writes."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gpusense._util import checks
 from gpusense._util.documents import read_mapping
 from gpusense.localization.motion import OdometryMotion
 from gpusense.localization.nav2 import Nav2Options, from_nav2, has_parameters
-from gpusense.world.hit_shapes import SHAPE_PARAMETERS
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
-
-if TYPE_CHECKING:
-    from gpusense.commands.fit import FitResult
 
 
 def read_parameters(path: Path, name: str) -> BeamParameters | LikelihoodFieldParameters:
@@ -71,46 +67,3 @@ def _made(path: Path, name: str, values: Any, make: Any) -> Any:
         return make(values)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {name}: {error}") from None
-
-
-def parameters_yaml(result: FitResult) -> str:
-    """Format the fitted parameters as YAML for gpusense and for nav2_amcl."""
-    import yaml
-
-    def block(name: str, mapping: dict[str, Any]) -> str:
-        return str(yaml.safe_dump({name: mapping}, sort_keys=False)).rstrip()
-
-    values = {
-        name: value if isinstance(value, str) else float(value)
-        for name, value in result.fit.parameters.to_dict().items()
-    }
-    lines = [
-        f"# gpusense fit: {result.fit.hits} ranges and {result.fit.max_readings} readings without return; "
-        f"{result.fit.status}",
-        "# For gpusense: gs.BeamParameters.from_dict(...) takes the mapping beam_model.",
-        block("beam_model", values),
-    ]
-    if result.incidence is not None:
-        lines.append("# For gpusense: gs.IncidenceParameters.from_dict(...).")
-        lines.append(block("incidence_model", result.incidence.parameters.to_dict()))
-    if result.motion is not None:
-        lines.append(
-            "# For 'gpusense localize --parameters': OdometryMotion. nav2_amcl lacks least, sideways and systematic:"
-        )
-        lines.append("# alpha alone is too little noise there.")
-        lines.append(block("odometry_motion", _plain(asdict(result.motion.motion))))
-    own = ("range_bias", "sigma_growth", *SHAPE_PARAMETERS)
-    shared = {name: value for name, value in values.items() if name not in own}
-    nav2 = {"laser_model_type": "beam", **shared, "laser_max_range": float(result.data.range_max)}
-    lines += [
-        "# For nav2_amcl: paste below amcl's ros__parameters. Its beam model sums cubes of densities that are not",
-        "# normalised, so the likeliest parameters need not be the best ones there. laser_likelihood_max_dist belongs",
-        "# to its likelihood field, which this fit does not cover. It has no range_bias, and normal hits only.",
-        block("amcl", {"ros__parameters": nav2}),
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _plain(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a mapping with lists instead of tuples."""
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}

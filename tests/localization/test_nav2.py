@@ -65,7 +65,7 @@ def test_a_file(tmp_path: Path) -> None:
 
 
 def test_what_the_command_fit_wrote(tmp_path: Path) -> None:
-    from gpusense.commands.parameter_files import parameters_yaml
+    from gpusense.commands.fit import parameters_yaml
 
     rng = np.random.default_rng(0)
     expected = rng.uniform(1, 9, 4000)

@@ -33,7 +33,7 @@ QUICK = (
     "evaluation/test_score.py", "interface", "kernels/test_kernel_casts.py", "kernels/test_kernel_flags.py",
     "kernels/test_kernel_signatures.py", "kernels/test_three_bodies.py", "localization", "logs",
     "models/scan/test_raycast_worlds.py", "models/scan/test_densities.py", "models/scan/test_sonar.py",
-    "models/test_bad_input_models.py", "models/test_repr.py", "project/test_docstrings.py", "project/test_layout.py",
+    "models/test_bad_input_models.py", "project/test_docstrings.py", "project/test_layout.py",
     "project/test_project_files.py", "project/test_site.py", "project/test_types.py", "project/test_words.py",
     "tables", "world",
 )  # fmt: skip

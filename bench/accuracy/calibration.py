@@ -20,8 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
 from common import make_parser, note, parse, publish, table
-from support.calibration import BINS, FUNCTIONS, posterior_ranks, uniformity
-from support.calibration_scenes import MAKERS, make_scene
+from support.calibration_scenes import BINS, FUNCTIONS, MAKERS, make_scene, posterior_ranks, uniformity
 
 
 def main() -> int:

@@ -297,21 +297,6 @@ def test_a_run_that_is_interrupted_keeps_what_it_has(lap: tuple[np.ndarray, ...]
     assert len(chainer.chain().poses) == len(scans)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"scans": np.ones((0, 181))}, "scans: must hold at least one scan"),
-        ({"times": [1.0, 0.5]}, r"times: must not decrease, got 0.5 after 1.0 at scan 1"),
-        ({"duration": 0.1}, "duration: must be 0 without times"),
-        ({"step": (-0.1, 0.0)}, r"step\[0\]"),
-    ],
-)
-def test_bad_values(changes: dict, message: str) -> None:
-    arguments = {"scans": np.ones((2, 181)), "scanner": FRONT, "backend": "numpy"} | changes
-    with pytest.raises(ValueError, match=message):
-        gs.chain_scans(arguments.pop("scans"), arguments.pop("scanner"), **arguments)
-
-
 def test_a_recorded_log_closes_its_loops_rightly(data_dir: Path, needs) -> None:
     scans = list(gs.read_log(data_dir / "carmen_logs/seattle-corrected.log.gz"))[:160]
     truth = np.array([scan.pose for scan in scans])

@@ -199,16 +199,12 @@ def test_an_interrupt_keeps_the_scans_of_all_lasers_so_far(lap: tuple, needs, mo
         ({"sensor": None}, "sensor: must say which of the 2 scanners each scan is of, got None"),
         ({"sensor": [0, 2]}, "sensor: must be in 0 to 1, got 2 at scan 1"),
         ({"sensor": [0, -1]}, "sensor: must be in 0 to 1, got -1 at scan 1"),
-        ({"sensor": [0]}, "sensor: must have the index of the scanner of each of the 2 scans"),
-        ({"sensor": [0.0, 1.0]}, "sensor: must have the index of the scanner of each of the 2 scans, got float64"),
         ({"sensor": [0, 0]}, "sensor: every scanner must have a scan, got none of scanner 1"),
         ({"scanner": FRONT}, "sensor: must be None with a single scanner"),
         (
             {"scans": [np.ones(181), np.ones(7)]},
             "scans: scan 1 must have the 181 readings of scanner 1, got shape .7,.",
         ),
-        ({"duration": [0.1]}, "duration"),
-        ({"duration": [0.1, -0.1]}, "duration"),
         ({"duration": [0.0, 0.1]}, "duration: must be 0 without times"),
     ],
 )

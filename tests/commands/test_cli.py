@@ -87,21 +87,12 @@ def test_version(capsys):
     ("argv", "message"),
     [
         (["devices", "--jsn"], "unrecognized arguments: --jsn; did you mean '--json'?"),
-        ([*SMALL, "--js"], "unrecognized arguments: --js; did you mean '--json'?"),
         ([*SMALL, "--nothing-like-it"], "unrecognized arguments: --nothing-like-it"),
-        (["demo", "--particles", "-5"], "argument --particles: must be an integer from 1 to 100000000, got -5"),
         (["demo", "--particles", "1e3"], "argument --particles: must be an integer from 1 to 100000000, got '1e3'"),
-        (["demo", "--beams", "181"], "argument --beams: must be an integer from 1 to 180, got 181"),
-        (["demo", "--seed", "-1"], "argument --seed: must be an integer >= 0, got -1"),
         (["demo", "--output", "demo.gif"], "argument --output: must end in .png or .pdf or .svg, got 'demo.gif'"),
-        (["demo", "--particles"], "argument --particles: expected one argument"),
         (
             ["simulate", "--map", "m.yaml", "--log-out", "./m.yaml"],
             "argument --log-out: must be another file than that of --map, got both",
-        ),
-        (
-            ["features", "--out", "gpusense-a.csv", "--map-out", "gpusense-a.csv"],
-            "argument --out: must be another file than that of --map-out, got both",
         ),
         (
             [*SMALL, "--no-plot", "--backend", "vulkan"],
@@ -216,16 +207,6 @@ def test_devices_survive_a_broken_auto(monkeypatch, capsys):
     monkeypatch.setattr("gpusense.commands.devices.get_backend", fail)
     assert cli.main(["devices"]) == 0
     assert "'auto' does not work: RuntimeError: driver lost" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("name", [name for name in cli.COMMANDS if name != "devices"])
-def test_help_begins_with_the_most_used_options(name, capsys):
-    assert cli.main([name, "--help"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith(f"usage: gpusense {name} ") and lines[0].endswith("[options]")
-    first, rest = lines.index("most used:"), lines.index("further options:")
-    assert first < rest and "--" in "".join(lines[first:rest]) and "--help" in "".join(lines[rest:])
-    assert max(map(len, lines)) <= 80
 
 
 def test_options_are_completed(tmp_path):

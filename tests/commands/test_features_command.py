@@ -106,9 +106,6 @@ def test_an_interrupt_keeps_the_results_so_far(capsys, log, monkeypatch):
     [
         ([], "--log: must be given"),
         (["--log", "LOG", "--map-in", "map.yaml"], "--log: must be given"),
-        (["--log", "absent.log"], "absent.log: must exist"),
-        (["--log", "LOG", "--kinds", "window"], "invalid choice"),
-        (["--log", "LOG", "--noise", "0"], "--noise"),
         (["--log", "LOG", "--out", "features.txt"], "--out"),
         (["--map-in", "map.yaml", "--plot", "scan.png"], "--plot: must not be given"),
     ],

@@ -161,9 +161,6 @@ def test_scans_without_a_reading_give_no_verdict(tmp_path, capsys):
         ("covariance", ["--poses", "/tf"], "--poses: must be known by the transforms"),
         ("tf", ["--poses", "/tf", "--map-frame", "world"], "world"),
         ("covariance", ["--risk", "0.001"], "--risk: must be at least 0.01"),
-        ("covariance", ["--risk", "2"], "--risk: must be"),
-        ("covariance", ["--alert-limit", "0"], "must be a finite number > 0"),
-        ("covariance", ["--poses", "absent.tum"], "absent.tum"),
         ("covariance", ["--truth", "absent.tum"], "absent.tum"),
     ],
 )

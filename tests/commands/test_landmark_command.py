@@ -111,25 +111,6 @@ def test_bad_files(capsys, folder, tmp_path, file, text, message):
     assert error_of(["landmarks", "--folder", str(tmp_path), "--robot", "1"], capsys) == f"{tmp_path}/{message}"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--robot", "0"], "argument --robot: must be an integer >= 1, got 0"),
-        (["--robot", "1", "--known", "--unknown"], "argument --unknown: not allowed with argument --known"),
-        (["--robot", "1", "--particles", "1"], "argument --particles: must be an integer >= 2, got 1"),
-        (["--robot", "1", "--drift", "-1", "0"], "argument --drift: must be a finite number >= 0, got '-1'"),
-        (["--robot", "2"], "{}/Robot2_Measurement.dat: must exist, got no such file"),
-        (["--robot", "1", "--range-max", "1"], None),
-    ],
-)
-def test_bad_arguments(capsys, folder, arguments, message):
-    found = error_of(["landmarks", "--folder", str(folder), *arguments], capsys)
-    if message is None:
-        assert found.startswith("features: range must be in [0, 1] (range_max), got ")
-    else:
-        assert found == message.format(folder)
-
-
 def test_broken_gzip_is_named(capsys, swapped, tmp_path):
     for name in swapped.iterdir():
         (tmp_path / name.name).write_bytes(name.read_bytes())

@@ -9,7 +9,7 @@ import warnings
 import numpy as np
 import pytest
 from support.bags import BASE, Writer
-from support.command_line import error_of, script
+from support.command_line import error_of
 from support.room_log import write_room_map
 
 import gpusense as gs
@@ -68,14 +68,6 @@ def test_each_command_takes_a_topic(place, capsys, name):
     assert error_of(command(place, name, "run", "--topic", "/top"), capsys).startswith("--topic: must be one of /front")
 
 
-@pytest.mark.parametrize("name", READERS)
-def test_help_names_bags_and_lasers(capsys, name):
-    assert cli.main([name, "--help"]) == 0
-    text = " ".join(capsys.readouterr().out.split())
-    for part in ("a bag of ROS 1 (.bag) or of ROS 2 (folder, .db3, .mcap)", "--topic NAME", "--mount X Y THETA"):
-        assert part in text, part
-
-
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", READERS)
 def test_a_bag_without_transforms_warns_of_the_mount(place, capsys, name):
@@ -87,17 +79,6 @@ def test_a_bag_without_transforms_warns_of_the_mount(place, capsys, name):
         warnings.simplefilter("error")
         assert cli.main([*argv, "--mount", "0.2", "0", "0"]) in (0, 1)
     capsys.readouterr()
-
-
-def test_the_warning_is_one_line_once(place, tmp_path):
-    argv = command(place, "fit", "run.bag", "--fit-motion")
-    done = script(f"from gpusense.commands.cli import main; sys.exit(main({argv!r}))", cwd=tmp_path)
-    assert done.returncode in (0, 1)
-    assert [line for line in done.stderr.splitlines() if "warning" in line] == [
-        f"gpusense: warning: {place / 'run.bag'}: has no transforms from base_link to laser: no transform names "
-        "base_link or laser; the laser is taken to be at the robot's centre, with mount (0, 0, 0); give its place "
-        "as mount= or --mount"
-    ]
 
 
 def test_a_mount_is_used(place, capsys):

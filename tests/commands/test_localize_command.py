@@ -191,10 +191,7 @@ def test_two_lasers_of_a_bag_track_together(place, capsys, tmp_path):
             ["--topic", "/scan"],
             "must be only one of 'front' and 'rear' for a CARMEN log, which states no mounts, got /scan",
         ),
-        (["--temperature", "2"], "temperature: must be"),
-        (["--offset", "99"], "log: must have a scan of index 99"),
         (["--motion-noise", "1", "2", "3"], "expected 4 arguments"),
-        (["--parameters", "absent.yaml"], "absent.yaml"),
     ],
 )
 def test_bad_input_is_one_line(place, capsys, more, message):

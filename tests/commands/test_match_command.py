@@ -6,7 +6,6 @@ import json
 
 import numpy as np
 import pytest
-from support.command_line import error_of
 from support.matching_scenes import ROOM, segments_scan
 
 import gpusense as gs
@@ -81,16 +80,3 @@ def test_results_so_far_are_kept_when_interrupted(capsys, log, monkeypatch):
     monkeypatch.setattr(matching, "match_scan", interrupted)
     assert main(["match", "--backend", "numpy", "--log", str(log)]) == 130
     assert "interrupted: results of 3 of 7 matches" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--limit", "1"], "log: must have two scans to match, got 1"),
-        (["--offset", "90"], "log: must have a scan of index 90"),
-        (["--backend", "tpu"], "backend"),
-        (["--shift", "-1"], "argument --shift: must be a finite number >= 0"),
-    ],
-)
-def test_bad_input_is_one_line(capsys, log, arguments, message):
-    assert message in error_of(["match", "--log", str(log), *arguments], capsys)

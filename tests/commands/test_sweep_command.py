@@ -67,9 +67,7 @@ def test_jobs_are_listed(place, capsys):
     [
         (["--retry-failed"], "--retry-failed: must come with --resume"),
         (["--device", "numpy", "--processes", "3"], "--processes: must be the number of --device, 2, got 3"),
-        (["--table", "t.txt"], "table: must end in .csv or .parquet"),
         (["--plot", "t.txt"], "must end in .png"),
-        (["--job-timeout", "0"], "--job-timeout: must be a finite number > 0, got '0'"),
         (["--tls-ca", "a.pem"], "must be given together, and with --dask and an address, got --tls-ca"),
         (
             ["--dask", "tls://127.0.0.1:9", "--tls-ca", "no.pem", "--tls-cert", "no.pem", "--tls-key", "no.pem"],

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.calibration import assert_uniform, posterior_ranks
-from support.calibration_scenes import MAKERS, make_scene
+from support.calibration_scenes import MAKERS, assert_uniform, make_scene, posterior_ranks
 
 import gpusense as gs
 

@@ -157,7 +157,6 @@ def test_parameters_come_from_a_file(capsys, recorded, tmp_path):
         ("beam_model: {z_hit: 2}", "beam", "parameters.yaml: beam_model: z_hit + z_short + z_max + z_rand: must be 1"),
         ("beam_model: 3", "beam", "parameters.yaml: must hold a mapping beam_model, got 3"),
         ("{}", "beam", "parameters.yaml: must hold a mapping beam_model, got None"),
-        ("[", "beam", "parameters.yaml: must be plain YAML, got an error"),
         ("beam_model: {}", "field", "parameters.yaml: must hold a mapping likelihood_field, got None"),
     ],
 )
@@ -194,14 +193,9 @@ def test_impossible_particles_are_reported_and_json_has_no_nan(capsys, recorded)
     "arguments, complaint",
     [
         (["--offset", "99"], "scan of index 99"),
-        (["--set", "z_hit=0.9"], "must be 1"),
         (["--set", "z_hit"], "--set: must be NAME=VALUE, got z_hit"),
         (["--model", "field", "--set", "lambda_short=1"], "must be one of z_hit, z_max"),
         (["--set", "interpolation=bilinear"], "got 'interpolation'"),
-        (["--backend", "opencl:no such device"], "no such device"),
-        (["--temperature", "2"], "temperature"),
-        (["--particles", "1"], "particles"),
-        (["--plot", "picture.txt"], "picture.txt"),
     ],
 )
 def test_bad_input_is_one_line(capsys, recorded, arguments, complaint):

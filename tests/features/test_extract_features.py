@@ -8,8 +8,7 @@ import math
 import numpy as np
 import pytest
 from support.feature_scenes import Floor, floor_plan
-from support.feature_scores import Score, score_scan
-from support.feature_truth import truth_of
+from support.feature_scores import Score, score_scan, truth_of
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -328,17 +327,3 @@ def test_kinds_are_those_asked_for():
         found = gs.extract_features(ranges, scanner, kinds=kinds)
         wanted = [kinds] if isinstance(kinds, str) else list(kinds)
         assert found.kind.tolist() == every[np.isin(every.kind, wanted)].kind.tolist()
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "words"),
-    [
-        ({"kinds": "window"}, ValueError, "kinds: must be"),
-        ({"kinds": ["line", "wall"]}, ValueError, "kinds: must be"),
-        ({"backend": "abacus"}, ValueError, "backend: must be"),
-    ],
-)
-def test_bad_arguments_are_named(change, error, words):
-    arguments = {"ranges": np.ones(90), "scanner": ring(90), "backend": "numpy"} | change
-    with pytest.raises(error, match=words):
-        gs.extract_features(**arguments)

@@ -211,18 +211,3 @@ def test_features_seen_too_seldom_are_no_landmarks(surveyed):
     assert len(gs.map_features(features, poses, least=1)) > 0
     assert len(gs.map_features(features[:0], np.zeros((0, 3)))) == 0
     assert repr(gs.map_features(features[:0], np.zeros((0, 3)))) == "FeatureMap(none)"
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "words"),
-    [
-        ({"poses": np.zeros((1, 3))}, ValueError, "poses: must have a pose of each of 2 scans, got 1"),
-        ({"kinds": "hallway"}, ValueError, "kinds: must be"),
-        ({"pose_deviation": (-1.0, 0.0)}, ValueError, "pose_deviation: must be at least 0"),
-    ],
-)
-def test_bad_arguments_are_named(change, error, words):
-    poses = corridor_path(160)[:2]
-    features = gs.extract_features(scans_at(poses, 1), SCANNER, backend="numpy")
-    with pytest.raises(error, match=words):
-        gs.map_features(**({"features": features, "poses": poses} | change))

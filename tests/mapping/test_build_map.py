@@ -1,11 +1,10 @@
-"""Maps from scans: counts against a walk in fractions, log-odds, extent, options, and agreement on recorded scans."""
+"""Maps from scans: counts against a walk in integers, log-odds, extent, options, and agreement on recorded scans."""
 
 from __future__ import annotations
 
 import functools
 import math
 import tracemalloc
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -22,24 +21,20 @@ from gpusense.world.windows import Window
 UNIT = 4096
 
 
-def fraction_cells(start, end):
-    """Return the cells of a ray in order of the fractions at boundaries; x precedes y at ties."""
-    x, y = (Fraction(int(v), UNIT) for v in start)
-    dx, dy = (Fraction(int(v), UNIT) - w for v, w in zip(end, (x, y), strict=True))
-    col, row = math.floor(x), math.floor(y)
-    goal = math.floor(x + dx), math.floor(y + dy)
-    cells = [(row, col)]
-    while (col, row) != goal:
-        ways = []
-        for axis, (place, now, size, target) in enumerate(((x, col, dx, goal[0]), (y, row, dy, goal[1]))):
-            if now != target:
-                ways.append((((now + 1 if size > 0 else now) - place) / size, axis))
-        if min(ways)[1] == 0:
-            col += 1 if dx > 0 else -1
-        else:
-            row += 1 if dy > 0 else -1
-        cells.append((row, col))
-    return cells
+def integer_cells(start, end):
+    """Yield the cells of a ray between points in units of 1/4096 cell, from counts of crossings; x precedes y."""
+    (x, y), (to_x, to_y) = start, end
+    step = [1 if to_x >= x else -1, 1 if to_y >= y else -1]
+    first = [UNIT - v % UNIT if s > 0 else v % UNIT for v, s in zip(start, step, strict=True)]
+    size, total = (abs(to_x - x), abs(to_y - y)), [abs(b // UNIT - a // UNIT) for a, b in zip(start, end, strict=True)]
+    done = [0, 0]
+    while True:
+        yield y // UNIT + step[1] * done[1], x // UNIT + step[0] * done[0]
+        if done == total:
+            return
+        next_x, next_y = ((first[k] + done[k] * UNIT) * size[1 - k] for k in (0, 1))
+        in_x = done[0] < total[0] and (done[1] == total[1] or next_x <= next_y)
+        done[0 if in_x else 1] += 1
 
 
 def rays():
@@ -55,27 +50,15 @@ def rays():
 
 
 @pytest.mark.long_on("warp")
-def test_counts_are_those_of_a_walk_in_fractions(backend):
+def test_counts_are_those_of_a_walk_in_integers(backend):
     start, end, hit = rays()
     hits, misses = np.zeros((20, 30), np.int32), np.zeros((20, 30), np.int32)
     counted = run(
-        get_backend(backend),
-        "count_rays",
-        frozenset(),
-        (150,),
-        start >> 12,
-        start & (UNIT - 1),
-        end >> 12,
-        end & (UNIT - 1),
-        hit,
-        hits.copy(),
-        misses.copy(),
-        20,
-        30,
-        150,
-    )
+        get_backend(backend), "count_rays", frozenset(), (150,), start >> 12, start & (UNIT - 1), end >> 12,
+        end & (UNIT - 1), hit, hits.copy(), misses.copy(), 20, 30, 150,
+    )  # fmt: skip
     for one in range(150):
-        cells = fraction_cells(start[one], end[one])
+        cells = list(integer_cells(start[one].tolist(), end[one].tolist()))
         for i, (row, col) in enumerate(cells):
             if 0 <= row < 20 and 0 <= col < 30:
                 (hits if hit[one] and i == len(cells) - 1 else misses)[row, col] += 1
@@ -167,22 +150,6 @@ def test_odd_scans_agree_with_the_map_of_the_even_ones(tmp_path, data_dir):
         for model in (gs.LikelihoodFieldModel(each, scanner) for each in (grid, derived))
     ]
     assert log_p[0] > log_p[1]
-
-
-def integer_cells(start, end):
-    """Yield the cells of a ray between points in units of 1/4096 cell, from counts of crossings."""
-    (x, y), (to_x, to_y) = start, end
-    step = [1 if to_x >= x else -1, 1 if to_y >= y else -1]
-    first = [UNIT - v % UNIT if s > 0 else v % UNIT for v, s in zip(start, step, strict=True)]
-    size, total = (abs(to_x - x), abs(to_y - y)), [abs(b // UNIT - a // UNIT) for a, b in zip(start, end, strict=True)]
-    done = [0, 0]
-    while True:
-        yield y // UNIT + step[1] * done[1], x // UNIT + step[0] * done[0]
-        if done == total:
-            return
-        next_x, next_y = ((first[k] + done[k] * UNIT) * size[1 - k] for k in (0, 1))
-        in_x = done[0] < total[0] and (done[1] == total[1] or next_x <= next_y)
-        done[0 if in_x else 1] += 1
 
 
 FAR = [  # start and end in cells; all but the last cross a map of 40 x 50 cells, or end in it

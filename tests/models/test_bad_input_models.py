@@ -72,8 +72,6 @@ def absent(selection: str) -> Callable[[], str]:
 NO_SELECTION = (
     "backend: must be 'auto', 'numpy', 'opencl', 'opencl:<name or P:D>', 'warp:cpu' or 'warp:cuda:<n>', got {!r}"
 ).format
-TOLERANCE = "tolerance: must be finite and >= 0.001 and <= 10, got {}".format
-BINS = "bins: must be >= 4 and <= 4096, got {}".format
 RULE = "rule: must be one of 'safe', 'centre', got {}".format
 
 V, T = ValueError, TypeError
@@ -97,19 +95,14 @@ CALL_CASES = [
 CASTER_CASES = [
     (caster(range_max=1e7), V, "range_max: must be at most 1048576 cells of the grid, got 10000000"),
     (lambda: CASTER.save_table("table"), V, "method: must be 'lookup' for a table to be saved, got 'exact'"),
-    (lambda: casters.March(0), V, TOLERANCE("0")),
     (lambda: casters.March(rule="fast"), V, RULE("'fast'")),
-    (lambda: casters.Cddt(3), V, BINS("3")),
     (lambda: casters.Lookup(file=7), T, "file: must be a path, got 7"),
     (distances(np.zeros((1, 40_000), bool)), V, "obstacles: must have at most 32767 rows and columns, got 1 x 40000"),
 ]  # fmt: skip
 
 BACKEND_CASES = [
-    (caster(backend="vulkan"), V, NO_SELECTION("vulkan")),
     (beam(backend="numpy:1"), V, NO_SELECTION("numpy:1")),
-    (beam(backend="auto:gpu"), V, NO_SELECTION("auto:gpu")),
     (beam(backend="opencl:nosuch"), V, absent("opencl:nosuch")),
-    (caster(backend="opencl:99:0"), V, absent("opencl:99:0")),
     (beam(backend="warp:cuda:7"), V, absent("warp:cuda:7")),
     (field(backend="warp:gpu"), V, absent("warp:gpu")),
     (lambda: gs.distance_transform([[0]], backend="cl"), V, NO_SELECTION("cl")),
@@ -176,14 +169,6 @@ def test_bad_input(action, kind, message):
         action()
     assert type(caught.value) is kind
     assert str(caught.value) == (message if isinstance(message, str) else message())
-
-
-def test_messages_are_one_line_that_names_the_argument():
-    for _, _, message in CASES:
-        text = message if isinstance(message, str) else message()
-        argument, rule = text.split(": ", 1)
-        assert (" must " in f" {rule}" or "is not installed" in rule) and ", got " in rule and "\n" not in text
-        assert argument.replace(" + ", "").isidentifier(), text
 
 
 def test_models_work_after_refusals():

@@ -1,4 +1,4 @@
-"""Copies and pickles of models keep the arguments and the current map, hold no device, and score alike."""
+"""Copies and pickles of models keep the arguments and the current map, hold no device, and score alike; ``repr``."""
 
 from __future__ import annotations
 
@@ -111,3 +111,12 @@ def test_a_pickle_has_the_map_as_it_is_now_and_the_device_as_it_was_asked_for(ne
     model = SCANS["field"](queue)
     assert pickle.loads(pickle.dumps(model)).device.selection == model.device.selection
     assert copy.deepcopy(model).backend is model.backend
+
+
+def test_repr_makes_no_table():
+    model = gs.BeamModel(GRID, SCANNER, backend="numpy")
+    assert repr(model) and model.table_bytes == 0
+
+
+def test_repr_follows_the_device(device):
+    assert repr(gs.RayCaster(GRID, 5.0, backend=device)).endswith(f"backend={device.info.selection!r})")

@@ -184,30 +184,3 @@ def test_save_refuses(name, error, message, tmp_path, monkeypatch):
     with pytest.raises(error, match=message):
         plots.save(figure, name)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(("converged", "verdict"), [(2, "tracking"), (None, "uncertain"), (0, "lost")])
-def test_a_track_is_titled_by_its_verdict_and_faint_before_convergence(converged, verdict):
-    from types import SimpleNamespace
-
-    from gpusense.plots.runs import track_figure
-
-    poses = np.column_stack([np.arange(4.0), np.ones(4), np.zeros(4)])
-    pf = SimpleNamespace(grid=gs.worlds.building(), host_particles=lambda: poses)
-    track = SimpleNamespace(
-        poses=poses, references=None, converged=converged, verdicts=[verdict] * 4, p_lost=[0.3] * 4,
-        explained=[0.9] * 4, covariances=[np.eye(3)] * 4,
-        steps=[SimpleNamespace(index=k) for k in range(4)], errors=lambda: None,
-    )  # fmt: skip
-    ax = track_figure(pf, track).axes[0]
-    assert ax.get_title(loc="left") == f"{verdict.upper()} (p_lost 0.3)"
-    lines = {line.get_label(): line for line in ax.get_lines()}
-    assert ("mean before convergence" in lines) == (converged != 0)
-    if converged != 0:
-        faint = lines["mean before convergence"]
-        assert faint.get_linestyle() == ":" and faint.get_alpha() < 1
-    assert len(lines["estimate"].get_xdata()) == {2: 2, None: 0, 0: 4}[converged]
-    # The legend hides no wall.
-    figure = ax.figure
-    figure.canvas.draw()
-    assert ax.get_legend().get_window_extent().y1 < ax.get_window_extent().y0

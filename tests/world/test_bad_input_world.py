@@ -53,8 +53,6 @@ SCANNER_CASES = [
 ]  # fmt: skip
 PARAMETER_CASES = [
     (lambda tmp: BeamParameters(z_hit=0.8), V, "z_hit + z_short + z_max + z_rand: must be 1 within 1e-06, got 1.1"),
-    (lambda tmp: BeamParameters(z_hit=1.1, z_short=-0.1, z_max=0, z_rand=0), V,
-     "z_short: must be finite and >= 0, got -0.1"),
     (lambda tmp: BeamParameters().replace(sigma=0.1), V,
      "BeamParameters: every field must be one of z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, "
      "range_bias, sigma_growth, hit, hit_dof, got 'sigma'"),
@@ -111,7 +109,6 @@ PGM = "{tmp}/input/map.pgm"
 MAP_CASES = [
     (lambda tmp: read_map(tmp / "absent.yaml"), FileNotFoundError, "{tmp}/absent.yaml: must exist, got no such file"),
     (lambda tmp: read_map(tmp), V, "{tmp}: must be a regular file, got another kind"),
-    (lambda tmp: read_map(3), T, "path: must be a path, got 3"),
     (map_with(image="absent.pgm"), FileNotFoundError,
      f"{YAML}: image: {{tmp}}/input/absent.pgm: must exist, got no such file"),
     (map_with(image="a" * 300), FileNotFoundError,
@@ -133,10 +130,7 @@ MAP_CASES = [
     *[
         (map_with(resolution=text), V, f"{YAML}: resolution: {message}")
         for text, message in [
-            ("5e-5", "must be finite and >= 0.0001 and <= 1000.0, got 5e-05"),
-            ("5000", "must be finite and >= 0.0001 and <= 1000.0, got 5000"),
             (".nan", "must be finite and >= 0.0001 and <= 1000.0, got nan"),
-            ("true", "must be a real number, got True"),
             ("'0.05 m'", "must be a real number, got '0.05 m'"),
         ]
     ],
@@ -200,23 +194,18 @@ LOG_CASES = [
     (lambda tmp: read_log(put(tmp, "readme.txt", "").parent), V,
      f"{{tmp}}/input: must be {KNOWN}, got a folder without metadata.yaml, .db3 or .mcap files"),
     (log_with(GOOD_LINE, topic="/scan"), V, "topic: must be left out for a CARMEN log, got '/scan'"),
-    (log_with(GOOD_LINE, topic=1), T, "topic: must be a string or None, got 1"),
     (log_with(GOOD_LINE, mount=(0, 0, 0)), V, "mount: must be left out for a CARMEN log, got (0, 0, 0)"),
     (log_with("data", name="run.bag", rear=True), V,
      "rear: must be False for a ROS bag, whose lasers have topics (topic=), got True"),
     bad_lines(":2: must begin with L or O, got 'X'", WEAN_LINE, "X 1 2"),
     bad_lines(":2: O: must have 5 fields, got 3", WEAN_LINE, "O 1 2"),
     bad_lines(":1: O: field 2 must be a finite number, got '1_0'", "O 0 1_0 0 1"),
-    bad_lines(":1: O: field 4 must be a finite number, got 'nan'", "O 0 0 0 nan"),
     bad_lines(":2: L: the laser must stay at (0.25, 0.0, 0.0) on the robot, got (0.5, 0.0, 0.0)", WEAN_LINE,
      WEAN_LINE.replace("25 0 0", "50 0 0")),
     (log_with("O 0 0 0 1", rear=True), V,
      "rear: must be False for a Wean Hall log, whose robot has one laser, got True"),
-    (log_with(GOOD_LINE, range_max=-1), V, "range_max: must be finite and > 0, got -1"),
-    (log_with(GOOD_LINE, odometry=1), T, "odometry: must be True or False, got 1"),
     bad_lines(": must hold laser or ODOM messages of CARMEN, got none in 2 lines", "hello", "world"),
     bad_lines(":3: FLASER: must have 14 fields, got 10", "# a log", GOOD_LINE, GOOD_LINE[:30]),
-    bad_lines(":1: FLASER: field 1 must be a count, got ''", "FLASER"),
     bad_lines(":1: FLASER: field 1 must be a count, got '-3'", GOOD_LINE.replace("FLASER 3", "FLASER -3")),
     bad_lines(f":1: FLASER: field 1 must be a count, got '{'7' * 40}'",
      GOOD_LINE.replace("FLASER 3", f"FLASER {'7' * 1000}")),
@@ -224,8 +213,6 @@ LOG_CASES = [
      GOOD_LINE.replace("FLASER 3", "FLASER 1000000000")),
     bad_lines(":1: FLASER: must have 13 fields, got 14", GOOD_LINE.replace("FLASER 3", "FLASER 2")),
     bad_lines(":2: FLASER: field 3 must be a number, got '2.O'", GOOD_LINE, GOOD_LINE.replace("2.0", "2.O")),
-    bad_lines(":1: FLASER: field 3 must be a number, got '2_0'", GOOD_LINE.replace("2.0", "2_0")),
-    bad_lines(":1: FLASER: field 11 must be a number, got 'noon'", GOOD_LINE.replace("12.5", "noon")),
     bad_lines(":1: a pose must be finite, got (1.0, 2.0, nan)", GOOD_LINE.replace("1 2 3 4", "1 2 nan 4")),
     bad_lines(":1: ODOM: must have 10 fields, got 9", "ODOM 1 2 3 0 0 0 1.0 robot"),
     bad_lines(": must have a reading > 0 unless range_max is given, got none",

@@ -314,24 +314,6 @@ def test_collisions(backend: str) -> None:
         worlds.collides([(math.nan, 0.0, 0.0)], 1.0, world=0)
 
 
-@pytest.mark.parametrize(
-    ("shapes", "error", "words"),
-    [
-        (dict(discs=np.zeros((2, 1, 4))), ValueError, r"^discs: shape must be \(M, N, 3\)"),
-        (dict(boxes=np.zeros((2, 5))), ValueError, r"^boxes: shape must be \(M, N, 5\)"),
-        (dict(segments="no"), TypeError, r"^segments: "),
-        (
-            dict(discs=np.zeros((2, 1, 3)), boxes=np.zeros((3, 1, 5))),
-            ValueError,
-            r"of the same number of worlds",
-        ),
-    ],
-)
-def test_bad_shapes_are_refused(shapes: dict[str, Any], error: type, words: str) -> None:
-    with pytest.raises(error, match=words):
-        gs.Shapes(**shapes)
-
-
 def test_shapes_must_be_of_these_worlds() -> None:
     worlds = wall_free("numpy")
     with pytest.raises(ValueError, match=r"^shapes: must be of 3 worlds, got 2"):

@@ -68,16 +68,6 @@ def test_bad_parameters_for_angles_of_incidence(edges, parameters, error, messag
     assert str(raised.value).startswith(message)
 
 
-@pytest.mark.parametrize(
-    "values", [3, {"edges": [0, 1]}, {**TWO.to_dict(), "more": 1}, {"edges": [0, 1], "no_surface": None}]
-)
-def test_bad_dictionaries_of_them(values):
-    with pytest.raises(
-        (TypeError, ValueError), match=r"must (be a mapping|have the fields edges and parameters.*), got"
-    ):
-        IncidenceParameters.from_dict(values)
-
-
 @pytest.mark.parametrize("kind", [BeamParameters, IncidenceParameters, LikelihoodFieldParameters])
 def test_every_parameter_is_documented(kind):
     body = ast.parse(inspect.getsource(kind)).body[0].body

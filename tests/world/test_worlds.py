@@ -113,26 +113,6 @@ def test_one_world_needs_no_index(backend: str) -> None:
 CELLS = np.zeros((2, 3, 4), np.int8)
 
 
-@pytest.mark.parametrize(
-    ("cells", "options", "error", "words"),
-    [
-        (CELLS.astype(bool), {}, TypeError, r"^cells: must hold integers.*bool; pass 100 \* cells"),
-        (CELLS.astype(float), {}, TypeError, r"^cells: must hold integers.*float64; pass \(100 \* cells\)"),
-        (CELLS[0], {}, ValueError, r"^cells: shape must be \(M, H, W\).*\(3, 4\)"),
-        (CELLS[:0], {}, ValueError, r"^cells: shape must be \(M, H, W\)"),
-        ([], {}, ValueError, r"^cells: shape must be"),
-        (CELLS + 101, {}, ValueError, r"^cells: every value must be from -1 to 100, got 101"),
-        (CELLS, {"resolution": 0.0}, ValueError, r"^resolution: "),
-        (CELLS, {"origin": (0.0, 0.0)}, ValueError, r"^origin: "),
-        (CELLS, {"origin": np.zeros((3, 3))}, ValueError, r"^origin: shape must be \(2, 3\)"),
-        (CELLS, {"occupied_threshold": 0}, ValueError, r"^occupied_threshold: "),
-    ],
-)
-def test_bad_cells_are_refused(cells: Any, options: dict[str, Any], error: type, words: str) -> None:
-    with pytest.raises(error, match=words):
-        gs.Worlds(cells, backend="numpy", **options)
-
-
 def test_grids_must_agree_in_resolution() -> None:
     grids = [gs.OccupancyGrid(CELLS[0], 0.1), gs.OccupancyGrid(CELLS[0], 0.2)]
     with pytest.raises(ValueError, match=r"^resolution: must be the same for all worlds, got \[0.1, 0.2\]"):

@@ -211,18 +211,15 @@ def test_named_worlds_can_be_driven_through(name):
 
 
 BAD = {
-    "no scan": (dict(scans=0), ValueError, "scans: must be >= 1"),
     "more scans than poses": (dict(scans=3, path=np.zeros((2, 3))), ValueError, "scans: must be >= 1 and <= 2"),
     "kidnapped along a path": (dict(path=np.zeros((5, 3)), kidnaps=1), ValueError, "kidnaps: must be 0 with a path"),
     "no pose": (dict(path=np.zeros((0, 3))), ValueError, "path: must hold at least one pose"),
     "all hidden": (dict(hidden=1.0), ValueError, "hidden: must be .* <= 0.9"),
     "more than all": (dict(moved=0.7, removed=0.7), ValueError, "moved [+] removed: must be at most 1"),
     "changes of a world": (dict(world=OFFICE, moved=0.1), ValueError, "moved: must be None with a world"),
-    "a step of 0": (dict(step=0.0), ValueError, "step: must be finite and > 0"),
     "no room": (dict(clearance=30.0), ValueError, "clearance: must be found somewhere in the map"),
     "a motion by velocities": (dict(motion=gs.VelocityMotion()), TypeError, "motion: must be OdometryMotion or Omni"),
     "parameters of a field": (dict(parameters=gs.LikelihoodFieldParameters()), TypeError, "parameters: must be Beam"),
-    "glass of 2": (dict(glass=2.0), ValueError, "glass: must be .* <= 1"),
 }
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import landmark_scenes as scenes
 from support.absolute_scenes import GRID, models, poses_around
-from support.array_libraries import Array, installed, to_device
+from support.array_libraries import Array, to_device
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing
@@ -110,17 +110,3 @@ def test_associations_of_poses_on_the_device(warp_as_gpu):
     for found, expected in zip(there, here, strict=True):
         assert isinstance(found, np.ndarray)
         np.testing.assert_array_equal(found, expected)
-
-
-@pytest.mark.parametrize("name", SENSORS)
-def test_arrays_of_another_library_in_host_memory(name, monkeypatch):
-    installed(monkeypatch)
-    call = calls("numpy")[name]
-    found = call(Array(POSES))
-    assert type(found) is Array and differing(found.held, call(POSES)) == 0
-    out = np.empty(len(POSES), np.float32)
-    assert call(POSES, out=out) is out and differing(out, found.held) == 0
-    with pytest.raises(ValueError, match="out: shape must be"):
-        call(POSES, out=np.empty(3, np.float32))
-    with pytest.raises(TypeError, match="out: must hold float32, got float64"):
-        call(POSES, out=np.empty(len(POSES)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +10,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 from support import landmark_scenes as scenes
+from support.feature_oracle import Densities, assert_within, joint, likelihoods
 from support.selection import on_every_backend
 
 import gpusense as gs
@@ -19,8 +19,6 @@ from gpusense.interface import feature_layout as at
 from gpusense.world.frames import place_poses
 
 mp.mp.dps = 36
-
-Table = tuple[list[Any], list[Any], Any]
 
 
 @dataclass(frozen=True)
@@ -119,10 +117,6 @@ def candidate(p: gs.LandmarkParameters, seen: Seen, landmark: Any, feature: Any,
     return True
 
 
-def log(p: Any) -> float:
-    return float(mp.log(p)) if p > 0 else -np.inf
-
-
 @dataclass(frozen=True)
 class World:
     """Sensors, landmarks, features and their turns as exact numbers."""
@@ -177,7 +171,7 @@ def prepared(model: gs.LandmarkModel, features: Any) -> np.ndarray:
     return found.numbers
 
 
-def table(model: gs.LandmarkModel, world: World) -> Table:
+def table(model: gs.LandmarkModel, world: World) -> tuple[Densities, list[Any]]:
     """Return (N, F, M) densities p(f | j), None where j is no candidate, and (F,) densities of false positives."""
     p = model.parameters
     span = span_of(p, model.landmarks.signatures) if p.sigma_signature is not None else (0, 1)
@@ -191,42 +185,7 @@ def table(model: gs.LandmarkModel, world: World) -> Table:
         ]
         for s in world.seen
     ]
-    return densities, [uniform(p, f, span) for f in world.features], span
-
-
-def likelihoods(model: gs.LandmarkModel, tabled: Table, correspondence: Any = None) -> np.ndarray:
-    """Return (N, F) float64 log p of each feature, without joint association."""
-    p, (densities, false, _) = model.parameters, tabled
-    detect, miss = mp.mpf(p.z_detect), mp.mpf(p.z_false)
-    found = np.empty((len(densities), len(false)))
-    for n, rows in enumerate(densities):
-        for k, row in enumerate(rows):
-            if correspondence is not None:
-                j = correspondence[k]
-                of_landmarks = row[j][0] if j >= 0 else mp.mpf(0)
-            else:
-                of = [d for d, may in row if may] or [mp.mpf(0)]
-                of_landmarks = mp.fsum(of) / len(row) if model.association == "sum" and row else max(of)
-            found[n, k] = log(detect * of_landmarks + miss * false[k])
-    return found
-
-
-def joint(model: gs.LandmarkModel, tabled: Table) -> np.ndarray:
-    """Return (N,) float64 log p of the likeliest joint association, by trying all."""
-    p, (densities, false, _) = model.parameters, tabled
-    detect, miss = mp.mpf(p.z_detect), mp.mpf(p.z_false)
-    found = np.full(len(densities), -np.inf)
-    for n, rows in enumerate(densities):
-        # Terms of each feature: as a false positive, and as each possible landmark.
-        options = [
-            [(-1, log(miss * none))] + [(j, log(detect * d + miss * none)) for j, (d, may) in enumerate(row) if may]
-            for row, none in zip(rows, false, strict=True)
-        ]
-        for chosen in itertools.product(*options):
-            landmarks = [j for j, _ in chosen if j >= 0]
-            if len(set(landmarks)) == len(landmarks):
-                found[n] = max(found[n], sum(value for _, value in chosen))
-    return found
+    return densities, [uniform(p, f, span) for f in world.features]
 
 
 PRECISIONS = ("float32", "float64")
@@ -234,7 +193,7 @@ KNOWN = (0, 2, -1, 5, 6)
 
 
 @functools.cache
-def tabled(name: str, precision: str) -> Table:
+def tabled(name: str, precision: str) -> tuple[Densities, list[Any]]:
     """Return the densities of a scene in mpmath, for the kernels' inputs."""
     model, poses, features = scenes.model(name, "numpy", precision=precision)
     return table(model, exact_inputs(model, poses, features))
@@ -244,21 +203,10 @@ def tabled(name: str, precision: str) -> Table:
 def truth(name: str, precision: str, how: str) -> np.ndarray:
     """Return (N, F) log p of a scene's features in mpmath, or (N,) of their joint association."""
     model, _, _ = scenes.model(name, "numpy", association="nearest" if how == "known" else how)
-    densities = tabled(name, precision)
+    densities, false = tabled(name, precision)
     if how == "joint":
-        return joint(model, densities)
-    return likelihoods(model, densities, KNOWN if how == "known" else None)
-
-
-def assert_within(found: np.ndarray, expected: np.ndarray, terms: int = 1) -> None:
-    """Check for equal infinities, no NaN, and the table's tolerance times the number of terms of a sum."""
-    eps = np.finfo(found.dtype).eps
-    assert not np.isnan(found).any()
-    np.testing.assert_array_equal(np.isneginf(found), np.isneginf(expected))
-    finite = np.isfinite(expected)
-    apart = np.abs(found[finite].astype(np.float64) - expected[finite])
-    worst = np.max(apart / (eps * (terms + np.abs(expected[finite]))), initial=0.0)
-    assert worst <= TOLERANCES["landmark"].value, f"{worst:.1f} eps (1 + |log p|)"
+        return joint(model, densities, false)
+    return likelihoods(model, densities, false, KNOWN if how == "known" else None)
 
 
 def scored(name: str, backend: str, precision: str, how: str) -> tuple[np.ndarray, np.ndarray]:
@@ -316,7 +264,7 @@ def test_joint_association_tries_all(backend, name, precision):
 def test_features_as_the_caller_gave_them(backend, precision):
     """The bound includes rounding of positions, directions and readings: float32 keeps them in two numbers."""
     model, poses, features = scenes.model("everything", backend, precision=precision)
-    expected = likelihoods(model, table(model, exact_inputs(model, poses, features, rounded=False)))
+    expected = likelihoods(model, *table(model, exact_inputs(model, poses, features, rounded=False)))
     found = model.associate(poses, features)[1]
     # float64 positions of up to 300 m, rounded by up to 16 eps; deviations are 0.2.
     allowed = (TOLERANCES["landmark"].value + (3e4 if precision == "float64" else 0)) * np.finfo(precision).eps

@@ -146,13 +146,6 @@ def test_coincident_landmarks_are_the_first_of_them(backend):
     assert which.tolist() == [list(scenes.SEEN)]
 
 
-@pytest.mark.long_on("warp")
-def test_temperature_multiplies_the_sum(backend):
-    model, poses, features = scenes.model("ordinary", backend)
-    cool, _, _ = scenes.model("ordinary", backend, temperature=0.25)
-    np.testing.assert_array_equal(cool.log_likelihood(poses, features), 0.25 * model.log_likelihood(poses, features))
-
-
 @pytest.mark.parametrize("xy", [[[0, 0]], [[1e7, -1e7]] * 5, np.arange(12).reshape(6, 2) * (1, 0), np.eye(2) * 1e6])
 def test_buckets_hold_every_landmark_once(xy):
     xy = np.array(xy, float)

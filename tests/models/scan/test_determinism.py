@@ -78,16 +78,6 @@ def make(kind: str, precision: str, backend: str) -> tuple[object, Call]:
 shared = functools.cache(make)
 
 
-@pytest.fixture(params=KINDS)
-def kind(request: pytest.FixtureRequest) -> str:
-    return request.param
-
-
-@pytest.fixture(params=PRECISIONS)
-def call(request: pytest.FixtureRequest, kind: str, backend: str) -> Call:
-    return shared(kind, request.param, backend)[1]
-
-
 def hashes(backend: str) -> str:
     """Return a line for each kind and precision."""
     results = {(kind, p): make(kind, p, backend)[1](cloud()) for kind in KINDS for p in PRECISIONS}

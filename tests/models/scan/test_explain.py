@@ -46,30 +46,6 @@ def test_explain_names_what_is_left_out(monkeypatch):
     assert not {"missing readings", "max readings"} & set(left_out(model))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_explain_of_a_model_that_leaves_nothing_out(kind):
-    grid = room()
-    model = make(kind, grid, "numpy", specialize=False)
-    model.log_likelihood(cloud(grid, 20), scan())
-    assert not left_out(model)
-    assert "nothing is left out" in model.explain() and "specialize=False" in model.explain()
-
-
-@pytest.mark.parametrize("kind", ["field", "bilinear"])
-def test_explain_of_a_field(kind):
-    grid = room()
-    model = make(kind, grid, "numpy", weights=(1.0, 0.0, 0.0), mount=(0.0, 0.0, 0.0))
-    z = scan()
-    z[:2] = [INF, NAN]
-    model.log_likelihood(cloud(grid, 10), z)
-    assert model.explain().startswith("likelihood field, float32, ")
-    found = left_out(model)
-    assert {"rand component", "max component", "missing readings"} <= set(found)
-    assert {"interpolation", "density per beam"} & set(found) == (
-        {"interpolation", "density per beam"} if kind == "field" else set()
-    )
-
-
 def marked(model: Any, mark: str) -> dict[str, str]:
     """Return the lines of ``explain`` with a mark, by name."""
     lines = [line[2:] for line in model.explain().splitlines() if line.startswith(f"{mark} ")]

@@ -144,18 +144,6 @@ def test_other_programs_have_neither(peer):
             gs.BeamModel(grid, scanner, p, backend="numpy", compat=peer)
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        (dict(range_bias=np.nan), "range_bias: must be"), (dict(range_bias="x"), "range_bias: must be"),
-        (dict(sigma_growth=-0.1), "sigma_growth: must be"), (dict(sigma_growth=np.inf), "sigma_growth: must be"),
-    ],
-)  # fmt: skip
-def test_bad_values_are_named(values, message):
-    with pytest.raises((TypeError, ValueError), match=message):
-        gs.BeamParameters(**values)
-
-
 def test_a_start_that_grows_with_range_is_refused():
     with pytest.raises(ValueError, match="initial: sigma_growth must be 0"):
         gs.fit_beam_parameters([1.0], [1.0], RANGE, initial=gs.BeamParameters(sigma_growth=0.1), backend="numpy")

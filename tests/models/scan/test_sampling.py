@@ -229,24 +229,6 @@ def test_a_device_without_float64_draws_the_same_bits(kind, monkeypatch):
     np.testing.assert_array_equal(model_of(kind, precision="float32").sample(poses, seed=3), expected)
 
 
-BAD = {
-    "a seed below 0": (dict(seed=-1), ValueError, "seed: must be >= 0"),
-    "a seed that is no integer": (dict(seed=1.0), TypeError, "seed: must be an integer"),
-    "a seed beyond 64 bits": (dict(seed=2**64), ValueError, "seed: must be >= 0 and <= "),
-    "a step beyond 31 bits": (dict(step=2**31), ValueError, "step: must be >= 0 and <= "),
-    "poses of a wrong shape": (dict(poses=np.zeros((2, 2))), ValueError, "poses: shape must be"),
-    "a pose that is not finite": (dict(poses=[(0, 0, np.nan)]), ValueError, "poses: every value must be finite"),
-    "four axes": (dict(poses=np.zeros((2, 2, 2, 3))), ValueError, "poses: shape must be"),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_bad_arguments_are_named(name):
-    arguments, kind, message = BAD[name]
-    with pytest.raises(kind, match=message):
-        model_of("beam").sample(**(dict(poses=[POSE]) | arguments))
-
-
 def test_weights_of_other_programs_and_fields_have_no_density():
     amcl = gs.BeamModel(ROOM, SCANNER, backend="numpy", compat="amcl")
     with pytest.raises(ValueError, match="compat: must be None where readings are drawn, got 'amcl'"):

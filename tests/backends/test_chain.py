@@ -290,24 +290,6 @@ def test_a_container_without_a_folder_for_code_has_a_slower_device(needs, kind, 
     assert chosen == "warp:cpu" or not any("warp" in row and row.endswith(" available") for row in rows)
 
 
-@pytest.mark.parametrize("variable", ["POCL_DEVICES", "OCL_ICD_VENDORS"])
-def test_a_variable_that_hides_devices_is_the_remedy(needs, tmp_path, variable):
-    """The remedy names no installation of packages that are installed."""
-    needs("opencl")
-    fake_driver.pocl_library()
-    code = "from gpusense.backends import listing\n"
-    code += "print(*[device.reason for device in listing.present(listing.BY_NAME['opencl'])[1]], sep='\\n')"
-    # The library is the only driver, so that no simulator is found.
-    vendors = {"OCL_ICD_VENDORS": fake_driver.pocl_library()} if variable == "POCL_DEVICES" else {}
-    value = "cuda" if variable == "POCL_DEVICES" else str(tmp_path / "nothing.icd")
-    (tmp_path / "nothing.icd").write_text("/nowhere/libnothing.so\n")
-    environment = fake_driver.environment(tmp_path, **vendors, **{variable: value})
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
-    assert done.returncode == 0, done.stderr
-    (reason,) = [line for line in done.stdout.splitlines() if line]
-    assert f"with {variable}={value}: unset this variable" in reason and "install" not in reason
-
-
 _FIRST = """
 import sys, pyopencl as cl
 platform = next(one for one in cl.get_platforms() if "Portable" in one.name)

@@ -12,7 +12,7 @@ from support.caster_world import lists_of
 
 import gpusense as gs
 from gpusense.evaluation.worlds import building, cloud_uniform
-from gpusense.tables.casters import Cddt, Exact
+from gpusense.tables.casters import Cddt
 from gpusense.tables.directional import directional_table
 
 
@@ -59,29 +59,6 @@ def test_directional_table_by_brute_force(bins):
         # The first is seen from afar, and nothing is added.
         assert pruned[key][0] == begins[0] and not set(pruned[key]) - set(begins)
     assert sum(map(len, pruned.values())) < sum(map(len, found.values()))
-
-
-@pytest.mark.parametrize("pruned", [True, False])
-def test_directional_ranges_on_the_middle_of_a_line_are_exact(pruned, backend):
-    """Rays to one obstacle have the directions of bins: along the axes, at 45 degrees, and between."""
-    bins, cells = 24, np.zeros((30, 30), int)
-    cells[14, 17] = 100
-    grid, checked = gs.OccupancyGrid(cells, 1.0), 0
-    for bin in range(bins):
-        turn = 2 * math.pi * bin / bins
-        along, across = np.meshgrid(np.arange(-12.0, 2.0, 0.7), np.arange(-2.0, 3.0))
-        middle = math.floor(14.5 * math.cos(turn) - 17.5 * math.sin(turn)) + 0.5 + across.ravel()
-        start = 17.5 * math.cos(turn) + 14.5 * math.sin(turn) + along.ravel()
-        x, y = start * math.cos(turn) - middle * math.sin(turn), start * math.sin(turn) + middle * math.cos(turn)
-        poses = np.column_stack([x, y, np.full(len(x), turn)])
-        exact, found = (
-            gs.RayCaster(grid, 20.0, method=kind, backend=backend, precision="float64").cast(poses, [0.0])[:, 0]
-            for kind in (Exact(), Cddt(bins, pruned))
-        )
-        hit = exact < 20
-        assert np.abs(found - exact)[hit].max() <= 2.0**-10
-        checked += np.count_nonzero(hit)
-    assert checked > 300
 
 
 @functools.cache

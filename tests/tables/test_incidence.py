@@ -27,27 +27,6 @@ def wall(angle: float, thick: float, shift: tuple[float, float]) -> gs.Occupancy
     return gs.OccupancyGrid(100 * (off <= 0 if thick == 0 else np.abs(off) <= thick / 2), 1.0)
 
 
-@pytest.mark.parametrize("thick", [1.0, 1.5, 3.0, 5.0, 0.0])
-def test_normals_of_straight_walls(thick, record_property):
-    rng = np.random.default_rng(4)
-    errors = []
-    for angle in (0.0, 0.02, RIGHT / 2, *rng.uniform(0, math.pi, 40)):
-        # A line's width in cells along an axis is at least one, so that it has no holes.
-        least = max(abs(math.cos(angle)), abs(math.sin(angle)))
-        normals = gs.surface_normals(wall(angle, thick * least, rng.uniform(-1, 1, 2)))[10:-10, 10:-10]
-        found = normals[~np.isnan(normals[..., 0])]
-        np.testing.assert_allclose(np.hypot(*found.T), 1, rtol=1e-12)
-        along = found @ (-math.sin(angle), math.cos(angle))
-        errors.append(np.degrees(np.arccos(np.minimum(np.abs(along), 1))))
-        if thick == 0:
-            assert (along > 0.9).all()
-    each = np.concatenate(errors)
-    record_property("mean error in degrees", float(each.mean()))
-    record_property("largest error in degrees", float(each.max()))
-    assert each.mean() <= TOLERANCES["normals of straight walls, mean"].value
-    assert each.max() <= TOLERANCES["normals of straight walls, largest"].value
-
-
 def test_cells_without_a_surface_have_no_normal():
     cells = np.zeros((60, 60), int)
     cells[5, 5] = cells[5, 40] = cells[5, 41] = 100

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from support import landmark_scenes as scenes
-from support.absolute_scenes import GRID, models, poses_around
-from support.array_libraries import Array, to_device
+from support.absolute_scenes import GRID, poses_around
+from support.array_libraries import to_device
 
 import gpusense as gs
-from gpusense.evaluation.tolerances import differing
-from gpusense.models import chunking
 
 INF = float("inf")
 IMPOSSIBLE = {
@@ -52,56 +48,6 @@ def test_limits_of_the_sensor_are_possible():
 
 POSES = poses_around(GRID, 60)
 FEATURES = np.array([[3.0, 0.1], [6.0, np.nan], [2.0, -2.0]])
-
-
-def calls(backend: Any) -> dict[str, Any]:
-    """Return the calls that take poses and ``out=``, by sensor, each also with a reading without information."""
-    xy = [(5e6, 0.0), (5e6 + 9, 3.0), (5e6 - 4, -2.0)]
-    found = {name: (model, measured) for name, (model, measured) in models(backend).items()}
-    landmarks = gs.LandmarkMap(xy)
-    found["nearest"] = gs.LandmarkModel(landmarks, backend=backend), (FEATURES,)
-    found["known"] = gs.LandmarkModel(landmarks, backend=backend), (FEATURES, [0, -1, 2])
-    found["joint"] = gs.LandmarkModel(landmarks, backend=backend, association="joint", negative=True), (FEATURES,)
-    walls = gs.LineMap([(5e6, -3, 5e6 + 8, 4), (5e6 - 4, 0, 5e6, 5)])
-    found["lines"] = gs.LineModel(walls, backend=backend), ([(0.5, 1.0), (-2.0, 3.0)],)
-    found["no feature"] = gs.LandmarkModel(landmarks, backend=backend), ([],)
-    found["missing"] = models(backend)["heading"][0], (np.nan,)
-    return {
-        name: lambda poses, model=model, measured=measured, **options: model.log_likelihood(poses, *measured, **options)
-        for name, (model, measured) in found.items()
-    }
-
-
-SENSORS = ("position", "heading", "beacons", "bumper", "nearest", "known", "joint", "lines", "no feature", "missing")
-
-
-@pytest.mark.sampled(0.5)
-@pytest.mark.parametrize("name", SENSORS)
-def test_poses_on_the_device_stay_there(name, warp_as_gpu, warp_copies, monkeypatch):
-    """Try float32 and float64 poses, results and ``out=`` of the same library, pieces, infinite poses, and none."""
-    call = calls(warp_as_gpu)[name]
-    expected = call(POSES)
-    for real in (np.float64, np.float32):
-        truth = call(POSES.astype(real))
-        for wrap in (lambda array: array, Array):
-            given, out = wrap(to_device(POSES.astype(real))), wrap(to_device(np.full(len(POSES), 7, np.float32)))
-            call(given)
-            warp_copies.clear()
-            found = call(given)
-            assert type(found) is type(given)
-            assert differing((found.held if wrap is Array else found).numpy(), truth) == 0
-            # Only measurements go to the device, and only the two numbers of the pose status come back.
-            assert [size for way, size in warp_copies if way == "down"] == [8]
-            assert all(size <= 400 for _, size in warp_copies)
-            assert call(given, out=out) is out
-            assert differing((out.held if wrap is Array else out).numpy(), truth) == 0
-    bad = POSES.copy()
-    bad[17, 1] = np.nan
-    with pytest.raises(ValueError, match=r"^poses: must be finite, got a pose on the device that is not$"):
-        call(to_device(bad))
-    assert call(to_device(np.empty((0, 3)))).shape == (0,)
-    monkeypatch.setattr(chunking, "CHUNK", 23)
-    assert differing(call(to_device(POSES)).numpy(), expected) == 0
 
 
 def test_associations_of_poses_on_the_device(warp_as_gpu):

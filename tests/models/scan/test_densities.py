@@ -111,23 +111,6 @@ def test_continuous_part_and_atom_sum_to_one(expected, sigma, rate):
     assert continuous + atom == pytest.approx(1 - lost, abs=1e-9)
 
 
-def test_supports_scalars_and_shapes():
-    assert log_hit([-1e-9, 8.1], 3.0, 0.1, 8.0).tolist() == [-np.inf, -np.inf]
-    assert np.isfinite(log_hit([0.0, 8.0], 3.0, 0.1, 8.0)).all()
-    assert log_short([3.1, -1.0, 0.0], 3.0, 0.5)[:2].tolist() == [-np.inf, -np.inf]
-    assert log_short(0.0, [0.0, -2.0], 0.5).tolist() == [-np.inf, -np.inf]
-    assert log_rand([-1.0, 0.0, 8.0], 8.0).tolist() == [-np.inf, -math.log(8.0), -np.inf]
-    assert np.isnan([log_hit(np.nan, 1.0, 1.0, 8.0), log_short(np.nan, 1.0, 1.0), log_rand(np.nan, 8.0)]).all()
-    assert isinstance(log_hit(1.0, 2.0, 0.1, 8.0), np.float64)
-    assert log_hit(np.float32(1), 2.0, 0.1, 8.0).dtype == np.float32
-    assert log_short(1, 2, 1).dtype == np.float64
-    z = np.zeros((3, 1), np.float32)
-    everything = dict(gs.BeamParameters().to_dict(), range_max=8.0)
-    assert log_mixture(z, np.ones(4, np.float32), **everything).shape == (3, 4)
-    assert log_mixture(z, np.ones(4, np.float32), **everything).dtype == np.float32
-    assert log_mixture(z, np.ones(4), **everything).dtype == np.float64
-
-
 def test_mixture_of_one_component_is_that_component_and_nothing_is_nan():
     z, expected = np.array([0.0, 1.0, 7.5]), np.array([3.0, -4.0, 11.0])
     shape = {"sigma_hit": 1e-3, "lambda_short": 0.0, "range_max": 8.0}

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-from support.model_world import INF, KINDS, NAN, REPEATED, cloud, make, room, scan
+from support.model_world import INF, NAN, REPEATED, cloud, make, room, scan
 
 import gpusense as gs
-from gpusense.backends import Backend, get_backend
-from gpusense.models.scan import tiles
+from gpusense.backends import get_backend
 from gpusense.world import windows
 
 
@@ -127,80 +124,3 @@ def test_measured_savings(backend):
 
 
 # ------------------------------------------------------------------------------------- what the last cloud left out
-
-
-@pytest.fixture
-def pretend(monkeypatch) -> Callable[[str], Backend]:
-    """Let the reference pass as a processor or a GPU, since the host makes the list."""
-
-    def as_kind(kind: str) -> Backend:
-        device = get_backend("numpy")
-        monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind=kind, lanes=1))
-        return device
-
-    return as_kind
-
-
-HUGE, GUARD, CLAMPS, ORDER = (
-    "reduction of huge headings", "guard of each end point", "clamps to the table", "order of particles"
-)  # fmt: skip
-
-
-def placed(grid: gs.OccupancyGrid, row: int, heading: float = 0.5) -> np.ndarray:
-    """Return eight poses in the middle of the columns."""
-    return np.column_stack([grid.cell_centers([row] * 8, range(36, 44)), np.full(8, heading)])
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_huge_headings_are_left_out_where_there_are_none(kind):
-    grid = room()
-    model = make(kind, grid, "numpy")
-    assert HUGE not in left_out(model)
-    model.log_likelihood(placed(grid, 30, 2.0**20), scan())
-    assert "no heading is beyond 2^20 rad" in left_out(model)[HUGE] and "HUGE_HEADINGS" not in model.explain()
-    model.log_likelihood(placed(grid, 30, 2.0**20 + 1), scan())
-    assert HUGE not in left_out(model) and "HUGE_HEADINGS" in model.explain()
-
-
-def test_a_gpu_looks_for_doubtful_end_points_by_blocks(pretend):
-    """Only float32 look-ups round to cells."""
-    grid, inside = room((200, 80)), placed(room((200, 80)), 100)
-    for kind, device, options, listed in (
-        ("field", "gpu", {}, True),
-        ("field", "cpu", {}, False),
-        ("field", "gpu", {"precision": "float64"}, False),
-        ("bilinear", "gpu", {}, False),
-    ):
-        model = make(kind, grid, pretend(device), **options)
-        model.log_likelihood(inside, scan() * 0.4)
-        assert (GUARD in left_out(model)) == listed, (kind, device, options)
-    model = make("field", grid, pretend("gpu"))
-    model.log_likelihood(inside, scan(), per_beam=True)
-    assert GUARD not in left_out(model)
-
-
-def test_a_gpu_clamps_only_where_some_end_point_leaves_the_table(pretend):
-    grid = room((200, 80))
-    model = make("field", grid, pretend("gpu"))
-    model.log_likelihood(placed(grid, 100), scan() * 0.4)
-    assert "no end point of the cloud leaves the table" in left_out(model)[CLAMPS]
-    model.log_likelihood(placed(grid, 2), scan() * 0.4)
-    assert CLAMPS not in left_out(model) and GUARD in left_out(model)
-
-
-def test_a_gpu_orders_particles_where_they_are_many(pretend, monkeypatch):
-    grid = room()
-    model = make("beam", grid, pretend("gpu"))
-    assert ORDER not in left_out(model)
-    model.log_likelihood(placed(grid, 30), scan())
-    rays, particles = tiles.LEAST_ORDERED
-    assert f"a launch has fewer than {rays} rays or {particles} particles" in left_out(model)[ORDER]
-    model.log_likelihood(placed(grid, 30), scan(), per_beam=True)
-    assert "parts are wanted" in left_out(model)[ORDER]
-    monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
-    model.log_likelihood(placed(grid, 30), scan())
-    assert ORDER not in left_out(model) and "ORDERED" in model.explain()
-    for kind, device in (("beam", "cpu"), ("field", "gpu")):
-        model = make(kind, grid, pretend(device))
-        model.log_likelihood(placed(grid, 30), scan())
-        assert ORDER not in left_out(model)

@@ -178,24 +178,6 @@ def test_casters(method, kind, ordered, as_gpu):
     assert differing(*found) == 0
 
 
-def test_each_cast_orders_its_own_cloud(as_gpu, monkeypatch):
-    """A repeated program bounds the headings of the last cloud alone, however wide clouds before it were."""
-    device, orders, order_of = as_gpu(), [], tiles.order_of
-    monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
-    monkeypatch.setattr(tiles, "order_of", lambda *a: orders.append(order_of(*a)) or orders[-1])
-    grid, scanner, _ = world()
-    wide = poses_of("inside")
-    narrow = wide * (1, 1, 0.01)
-
-    def bounds(*clouds: np.ndarray) -> list[int]:
-        caster = gs.RayCaster(grid, RANGE, backend=device)
-        for cloud in clouds:
-            caster.cast(cloud, scanner.bearings)
-        return device.download(orders[-1].bounds, np.empty(7, np.int32)).tolist()
-
-    assert bounds(wide) != bounds(narrow) == bounds(narrow, wide, narrow, wide, narrow)
-
-
 @pytest.mark.long_on("warp")
 @pytest.mark.parametrize("chunk", ["CHUNK", "CHUNK_BYTES"])
 def test_in_pieces(chunk, ordered, as_gpu, monkeypatch):

@@ -92,18 +92,26 @@ def distinct_poses(
     Poses (M, 3) of S scans, (M,) ascending in ``scan``, come by falling score; the best ones are in the rows ``best``
     (S,), None for the first row alone. Poses within ``radius`` [m] and ``angle`` [rad] of a better one are left out.
     """
-    left, columns = np.arange(len(poses)), np.ascontiguousarray(poses.T)
-    of = np.zeros(len(poses), np.intp) if scan is None else scan
-    chosen = [left[:1] if best is None else best]
-    firsts = np.append(True, of[1:] != of[:-1])[: len(of)].nonzero()[0]
-    while len(left) and len(chosen) < count:
-        # The last choice of each scan that has poses left.
-        x, y, heading = columns - np.repeat(poses[chosen[-1]].T, np.diff(np.append(firsts, len(of))), axis=1)
-        near = x * x + y * y <= radius * radius
-        far = ~near
-        far[near] = np.abs(wrapped(heading[near])) > angle
-        left, columns, of = left[far], columns[:, far], of[far]
-        firsts = np.append(True, of[1:] != of[:-1])[: len(of)].nonzero()[0]
-        chosen.append(left[firsts])
+    group = np.zeros(len(poses), np.intp) if scan is None else scan
+    firsts = np.append(True, group[1:] != group[:-1])[: len(group)].nonzero()[0]
+    last = firsts if best is None else best
+    chosen, sizes, x = [last], np.diff(np.append(firsts, len(group))), poses[:, 0].copy()
+    group = np.repeat(np.arange(len(firsts)), sizes)
+    for _ in range(count - 1 if len(group) else 0):
+        # Most poses are far along x alone; poses that are left out are infinitely far.
+        x[last] = np.inf
+        near = (np.abs(x - np.repeat(poses[last, 0], sizes)) <= radius).nonzero()[0]
+        off = poses[near] - poses[last[group[near]]]
+        same = off[:, 0] * off[:, 0] + off[:, 1] * off[:, 1] <= radius * radius
+        x[near[same & (np.abs(wrapped(off[:, 2])) <= angle)]] = np.inf
+        left = (x < np.inf).cumsum()
+        before = np.append(0, left)[firsts]
+        some = left[firsts + sizes - 1] > before
+        if not some.any():
+            break
+        # The first pose that is left of each scan.
+        last = last.copy()
+        last[some] = left.searchsorted(before[some] + 1)
+        chosen.append(last[some])
     rows = np.concatenate(chosen)
     return rows if scan is None else rows[np.argsort(scan[rows], kind="stable")]

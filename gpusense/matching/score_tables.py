@@ -9,6 +9,7 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.structs import ScoreTable
 
 _BYTE, _INT = np.dtype(np.uint8), np.dtype(np.int32)
@@ -46,7 +47,7 @@ def field_scores(distances: np.ndarray, sigma: float, max_distance: float) -> np
 class Folded(NamedTuple):
     """Tables of a level as images, one per first cell of blocks."""
 
-    table: Buffer  # the images
+    table: Buffer  # the images, as bytes for kernels in lanes, otherwise with four rows in a number
     shape: ScoreTable  # their sizes
     unit: int  # scores in a unit of a loss
     quarters: Buffer | None  # losses of the blocks' quarters, relative to the blocks, as images; None at level 0
@@ -153,7 +154,11 @@ class ScoreTables:
                     _launched(exact), self.level(level - 1), made, quarters, self.shape, shape, exact, period, step,
                     period // 2, self._beyond, unit,
                 )  # fmt: skip
-            # The pooled copy lives until the launches have ended.
+            table = made
+            if not with_lanes_flag(self.backend.info.lanes, "shift_scores", _NO_FLAGS):
+                table = self.backend.empty(self._cells(shape), _INT)
+                self.backend.compile("pack_rows", _NO_FLAGS)(_launched(shape), made, table, shape)
+            # Copies live until the launches have ended.
             self.backend.synchronize()
-            self._folded[level] = Folded(made, shape, unit, quarters, exact)
+            self._folded[level] = Folded(table, shape, unit, quarters, exact)
         return self._folded[level]

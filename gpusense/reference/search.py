@@ -109,6 +109,14 @@ def divided(
     return total
 
 
+def pack_rows(flags, table, packed, scores):
+    """Write the losses of each cell and the three below it as bytes of a number."""
+    lines, stride = padded_lines(scores), padded_stride(scores)
+    images = table[: scores.tables * lines * stride].reshape(scores.tables, lines, stride)
+    below = [images[:, np.minimum(np.arange(lines) + i, lines - 1)] for i in range(4)]
+    packed[: images.size] = np.stack(below, axis=-1).view("<i4").ravel()
+
+
 def shift_scores(flags, table, point, image, first, allowed, score, scores, items, height, width, unit):
     """Sum the losses of each item's points at all shifts by less than height rows and width columns, and write scores.
 
@@ -121,7 +129,7 @@ def shift_scores(flags, table, point, image, first, allowed, score, scores, item
         total[item] = TOP * (first[item + 1] - first[item])
         for k in range(first[item], first[item + 1]):
             cells = table[int(image[k]) * size + cell_index(scores, point[k, 1] + rows, point[k, 0] + cols)]
-            total[item] -= unit * cells.astype(np.int32)
+            total[item] -= unit * (cells & 255)
     total[:, allowed[: height * width].reshape(height, width) == 0] = -1
 
 

@@ -11,8 +11,9 @@
 // less the cell's, divided by a unit and rounded down, so that losses of several points fit a byte.
 // requires: score_cells
 
-// Points after which sums are compared.
+// Points after which sums are compared, and points whose losses fit 16 bits.
 #define STEP 48
+#define TOGETHER 256
 // Numbers that count the rows of a scan by their scores.
 #define BINS 512
 
@@ -109,6 +110,16 @@ int4 divided(global const int *quarters, global const int2 *point, global const 
     return total;
 }
 
+// Write the losses of each cell and the three below it as bytes of a number. One work-item takes a cell.
+kernel void pack_rows(ARGUMENTS) {
+    const int col = get_global_id(0), line = get_global_id(1), image = get_global_id(2);
+    const int lines = padded_lines(scores), stride = padded_stride(scores);
+    if (col >= stride || line >= lines || image >= scores.tables) return;
+    uint four = 0;
+    for (int i = 0; i < 4; ++i) four |= (uint)table[(image * lines + min(line + i, lines - 1)) * stride + col] << (8 * i);
+    packed[(image * lines + line) * stride + col] = (int)four;
+}
+
 // Sum the losses of each item's points at all shifts by less than height rows and width columns, and write the scores; a
 // shift that is not allowed has -1. One work-item takes SHIFT_ROWS rows of a column of an item.
 kernel void shift_scores(ARGUMENTS) {
@@ -119,10 +130,25 @@ kernel void shift_scores(ARGUMENTS) {
     const int stride = padded_stride(scores), size = padded_lines(scores) * stride;
     const int last = some ? first[item + 1] : first[item];
     int total[SHIFT_ROWS] = {0};
-    for (int k = first[item]; k < last; ++k) {
-        global const uchar *cells =
-            table + image[k] * size + block_index(scores, point[k].y + row, point[k].x + col, SHIFT_ROWS - 1, 0);
-        for (int i = 0; i < SHIFT_ROWS; ++i) total[i] += cells[i * stride];
+    for (int k = first[item]; k < last;) {
+        const int stop = last - k > TOGETHER ? k + TOGETHER : last;
+        // Two sums of 16 bits in a number.
+        uint even[SHIFT_ROWS / 4] = {0}, odd[SHIFT_ROWS / 4] = {0};
+        for (; k < stop; ++k) {
+            global const int *cells =
+                table + image[k] * size + block_index(scores, point[k].y + row, point[k].x + col, SHIFT_ROWS - 1, 0);
+            for (int i = 0; i < SHIFT_ROWS / 4; ++i) {
+                const uint four = cells[4 * i * stride];
+                even[i] += four & 0xff00ff;
+                odd[i] += four >> 8 & 0xff00ff;
+            }
+        }
+        for (int i = 0; i < SHIFT_ROWS / 4; ++i) {
+            total[4 * i] += even[i] & 0xffff;
+            total[4 * i + 1] += odd[i] & 0xffff;
+            total[4 * i + 2] += even[i] >> 16;
+            total[4 * i + 3] += odd[i] >> 16;
+        }
     }
     // A loop of SHIFT_ROWS steps keeps the sums in registers.
     for (int i = 0; i < SHIFT_ROWS; ++i) {

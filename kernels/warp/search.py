@@ -17,12 +17,13 @@ import warp as wp
 from .prelude import kernel, reader
 from .score_cells import SHIFT_ROWS, TOP, ScoreTable, block_index, padded_lines, padded_stride
 
-byte_at, number_at, cell_at = reader(wp.uint8), reader(wp.int32), reader(wp.vec2i)
+number_at, cell_at = reader(wp.int32), reader(wp.vec2i)
 # Sums of neighbouring rows.
 Rows = wp.types.vector(length=SHIFT_ROWS, dtype=wp.int32)
-# Points after which sums are compared, and points that are read together.
+# Points after which sums are compared, points that are read together, and points whose losses fit 16 bits.
 STEP = 48
 AT_ONCE = 8
+TOGETHER = 256
 # Numbers that count the rows of a scan by their scores.
 BINS = 512
 
@@ -159,6 +160,20 @@ def divided(
 
 
 @kernel
+def pack_rows(table, packed, scores):
+    """Write the losses of each cell and the three below it as bytes of a number."""
+    image, line, col = wp.tid()
+    lines = padded_lines(scores)
+    stride = padded_stride(scores)
+    if col >= stride or line >= lines or image >= scores.tables:
+        return
+    four = int(0)
+    for i in range(4):
+        four = four | (int(table[(image * lines + wp.min(line + i, lines - 1)) * stride + col]) << (8 * i))
+    packed[(image * lines + line) * stride + col] = four
+
+
+@kernel
 def shift_scores(table, point, image, first, allowed, score, scores, items, height, width, unit):
     """Sum the losses of each item's points at all shifts by less than height rows and width columns, and write the
     scores; a shift that is not allowed has -1.
@@ -176,11 +191,25 @@ def shift_scores(table, point, image, first, allowed, score, scores, items, heig
     if some > 0:
         last = first[item + 1]
     total = Rows()
-    for k in range(first[item], last):
-        cell = cell_at(point, k)
-        place = number_at(image, k) * size + block_index(scores, cell.y + row, cell.x + col, SHIFT_ROWS - 1, 0)
-        for i in range(SHIFT_ROWS):
-            total[i] = total[i] + int(byte_at(table, place + i * stride))
+    k = int(first[item])
+    while k < last:
+        stop = wp.min(k + TOGETHER, last)
+        # Two sums of 16 bits in a number.
+        even = wp.vec2i()
+        odd = wp.vec2i()
+        while k < stop:
+            cell = cell_at(point, k)
+            place = number_at(image, k) * size + block_index(scores, cell.y + row, cell.x + col, SHIFT_ROWS - 1, 0)
+            for i in range(2):
+                four = number_at(table, place + 4 * i * stride)
+                even[i] = even[i] + (four & 0xFF00FF)
+                odd[i] = odd[i] + ((four >> 8) & 0xFF00FF)
+            k = k + 1
+        for i in range(2):
+            total[4 * i] = total[4 * i] + (even[i] & 0xFFFF)
+            total[4 * i + 1] = total[4 * i + 1] + (odd[i] & 0xFFFF)
+            total[4 * i + 2] = total[4 * i + 2] + ((even[i] >> 16) & 0xFFFF)
+            total[4 * i + 3] = total[4 * i + 3] + ((odd[i] >> 16) & 0xFFFF)
     for i in range(SHIFT_ROWS):
         if row + i < height:
             n = (row + i) * width + col

@@ -7,7 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from gpusense._util.angles import wrapped
 from gpusense.backends import get_backend
+from gpusense.matching.pose_grid import distinct_poses
 from gpusense.matching.score_tables import ScoreTables, field_scores
 from gpusense.matching.search import PoseGrid, Search
 
@@ -149,3 +151,20 @@ def test_exact_bounds_as_on_gpus_divide_fewer_blocks(name, monkeypatch, needs):
     for field in ("scan", "row", "col", "heading", "score"):
         np.testing.assert_array_equal(getattr(exact, field), getattr(rounded, field))
     assert exact.evaluated < rounded.evaluated
+
+
+def test_distinct_poses_are_those_of_a_greedy_choice():
+    rng = np.random.default_rng(5)
+    for count in (1, 3, 12):
+        scan = np.repeat([0, 1, 3], [40, 1, 25])
+        poses = np.column_stack([rng.uniform(0, 2, (66, 2)), rng.uniform(-3.2, 3.2, 66)])
+        best, expected = np.array([7, 40, 41]), []
+        for first, rows in zip(best, (range(40), range(40, 41), range(41, 66)), strict=True):
+            chosen = [first]
+            for row in rows:
+                off = poses[row] - poses[chosen]
+                near = (np.hypot(*off[:, :2].T) <= 0.6) & (np.abs(wrapped(off[:, 2])) <= 1.0)
+                if len(chosen) < count and not near.any():
+                    chosen.append(row)
+            expected += chosen
+        np.testing.assert_array_equal(distinct_poses(poses, count, 0.6, 1.0, scan, best), expected)

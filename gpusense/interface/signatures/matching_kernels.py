@@ -93,8 +93,11 @@ KERNELS: dict[str, Kernel] = {
         "out int bound_image [points]", "out int quarter_image [points]", "int items", "int turns", "int stride",
         "int level", "int step_level", "int offset",
     ),
+    "pack_rows": kernel(
+        "search", "col line image", _CELLS, f"out int packed [{_size('scores')}]", "ScoreTable scores",
+    ),
     "shift_scores": kernel(
-        "search", "col rows item", _CELLS, *_ENDS, "uchar allowed [height * width]",
+        "search", "col rows item", f"int table [{_size('scores')}]", *_ENDS, "uchar allowed [height * width]",
         "out int score [items * height * width]", "ScoreTable scores", "int items", "int height", "int width",
         "int unit",
     ),

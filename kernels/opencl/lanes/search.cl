@@ -6,7 +6,7 @@ typedef uint8 unaligned __attribute__((aligned(1)));
 
 // Sum the losses of each item's points at all shifts by less than height rows and width columns, and write the scores; a
 // shift that is not allowed has -1. One work-item takes SHIFT_ROWS rows of RUN shifts of an item. The losses of together
-// points fit a byte, and those of 256 times as many points fit 16 bits.
+// points fit a byte, and those of 256 times as many points fit 16 bits. The table holds bytes.
 kernel void shift_scores(ARGUMENTS) {
     const int col = RUN * get_global_id(0), row = SHIFT_ROWS * get_global_id(1), item = get_global_id(2);
     if (col >= width || row >= height || item >= items) return;
@@ -27,7 +27,7 @@ kernel void shift_scores(ARGUMENTS) {
             for (int i = 0; i < SHIFT_ROWS; ++i) few[i] = (uint8)0;
             const int stop = last - k > together ? k + together : last;
             for (; k < stop; ++k) {
-                global const uchar *cells = table + image[k] * size +
+                global const uchar *cells = (global const uchar *)table + image[k] * size +
                                             block_index(scores, point[k].y + row, point[k].x + col, SHIFT_ROWS - 1, RUN - 1);
 #pragma unroll
                 for (int i = 0; i < SHIFT_ROWS; ++i) few[i] += *(global const unaligned *)(cells + i * stride);

@@ -65,9 +65,7 @@ def log_other_turns(residual: vec2, decay: real):
 
 @wp.func
 def log_waves(residual: vec2, waves: wp.array(dtype=real)):
-    """Return the log of the ratio of the Fourier series to its first term, by Clenshaw's recurrence. waves are 2 q^(n
-    n).
-    """
+    """Return the log of the ratio of the Fourier series to its first term, by Clenshaw's recurrence."""
     sine = half_sine(residual)
     cosine = ONE - TWO * sine.x * sine.x
     newer = real(0.0)

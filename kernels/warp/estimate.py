@@ -22,9 +22,7 @@ totals = wp.types.vector(length=13, dtype=wp.float64)
 
 @kernel
 def sum_poses(poses, weight, estimate, sums, particles, block, lanes, second_pass):
-    """Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings (far poses in the
-    second pass): one work-item takes a number of lanes of a block.
-    """
+    """Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings or far poses."""
     i = wp.tid()
     each = ESTIMATE_LANES / lanes
     begin = i / each * block
@@ -72,9 +70,7 @@ def sum_poses(poses, weight, estimate, sums, particles, block, lanes, second_pas
 
 @kernel
 def finish_estimate(poses, sums, estimate, groups, second_pass):
-    """Write the mean pose and the covariance about it from the sums of all groups, and whether headings require a
-    second pass; that pass writes the covariance, and the share of far poses.
-    """
+    """Write mean pose and covariance from the sums of all groups, and whether headings require a second pass."""
     i = wp.tid()
     if i > 0:
         return

@@ -31,9 +31,7 @@ def rounded_block(
     table: wp.array(dtype=real), origin: wp.vec2i, sensor_pose: vec4, sensor_low: vec4, point: wp.array(dtype=vec2),
     point_low: wp.array(dtype=vec2), begin: wp.int32, end: wp.int32, far: real, window: Window, guard: real,
 ):  # fmt: skip
-    """Return the sum of the readings from begin to end by rounded cells, again with more digits where an end point is
-    too near to an edge.
-    """
+    """Return the sum of the readings from begin to end by rounded cells, with more digits near edges of cells."""
     lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
     start_cell = table_origin(origin, window.cols)
     sure = rounding_margin(guard)

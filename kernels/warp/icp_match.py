@@ -58,9 +58,7 @@ def refine(
     point: wp.array(dtype=vec4), line: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, second: wp.int32,
     others: wp.int32, guess: vec4, rules: MatchRules, member: wp.int32,
 ):  # fmt: skip
-    """Refine a guess until steps are below the tolerance: pose, last step, sums of the last iteration over pairs and
-    blocks, iterations, and whether the last step was below ten tolerances.
-    """
+    """Refine a guess until steps are below the tolerance; return it with last step, sums and iterations."""
     pose = guess
     moved = vec4()
     sums = Sums()
@@ -108,9 +106,7 @@ def mutual_agreement(
     point: wp.array(dtype=vec4), line: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, second: wp.int32,
     others: wp.int32, pose: vec4, rules: MatchRules, member: wp.int32,
 ):  # fmt: skip
-    """Return how well two scans agree at a pose (x, y, theta), as the sum of both directions, or of one with
-    one_way.
-    """
+    """Return how well two scans agree at a pose (x, y, theta); one_way looks in one direction only."""
     both = vec4()
     if count > 0 and others > 0:
         c = wp.cos(pose.z)
@@ -137,9 +133,7 @@ def match_pair(
     pair: wp.array(dtype=wp.int32), which: wp.int32, guess: vec4, rules: wp.array(dtype=real),
     result: wp.array(dtype=real), out: wp.int32, member: wp.int32,
 ):  # fmt: skip
-    """Match pair number which (reference, second scan, level of its rules) from a guess, write the result from out on,
-    and return the pose.
-    """
+    """Match pair number which from a guess, write the result from out on, and return the pose."""
     first = start[pair[which]]
     count = start[pair[which] + 1] - first
     second = start[pair[which + 1]]
@@ -182,9 +176,7 @@ def match_in_turns(
     pair: wp.array(dtype=wp.int32), which: wp.int32, guess: vec4, rules: wp.array(dtype=real),
     result: wp.array(dtype=real), out: wp.int32, turns: wp.int32, far: real, far_turn: real, member: wp.int32,
 ):  # fmt: skip
-    """Match a pair from a guess, and with two turns again from its result if that is farther from the guess than a
-    distance along an axis or a turn; otherwise the second result has 0 iterations.
-    """
+    """Match a pair from a guess, and with two turns again from a result that is far from the guess."""
     start_pose = guess
     turn = int(0)
     if turns > 1 and member == 0:

@@ -35,9 +35,7 @@ def nearest_point(
     point: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, ahead: wp.int32, skip: wp.int32, place: vec2,
     squared: real,
 ):  # fmt: skip
-    """Return the nearest of every skip-th point of a scan that is nearer than the square root of squared, -1 without
-    one; ahead points have a smaller bearing than the place.
-    """
+    """Return the nearest of every skip-th point within the square root of squared, -1 without one."""
     kept = (count + skip - 1) // skip
     before = (ahead + skip - 1) // skip
     length = place.x * place.x + place.y * place.y
@@ -161,9 +159,7 @@ def sum_pairs(
     others: wp.int32, stride: wp.int32, skip: wp.int32, pose: vec4, capture: real, scale: real, last: wp.bool,
     full: wp.bool, member: wp.int32,
 ):  # fmt: skip
-    """Return the sums over the pairs of a scan's points at a pose (x, y, cos, sin), and the sums of blocks, 0 unless
-    full.
-    """
+    """Return the sums over the pairs of a scan's points at a pose (x, y, cos, sin), and over blocks if full."""
     used = (others + stride - 1) // stride
     log = log_share(used)
     begin = int(member << log)

@@ -137,9 +137,7 @@ def bucket_at(position: real, size: real, count: wp.int32):
 
 @wp.func
 def near(off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, most: real):
-    """Return whether a landmark is in a feature's disc, within the limits of the sensor that the feature does not
-    measure, and no farther from the end point than the square root of most.
-    """
+    """Return whether a landmark is in a feature's disc, and within limits that the feature does not measure."""
     reach = feature[base + REACH]
     radius = feature[base + RADIUS]
     hole = feature[base + HOLE]

@@ -11,10 +11,7 @@ WHOLE_TURN = real(6.283185307179586)
 
 @wp.func
 def line_through(centre: vec4, total: vec2, xx: real, xy: real, yy: real, weight: real):
-    """Return the line through a point and its neighbours, a unit normal, an offset, and 1 / (sum of squared distances
-    along the line), from sums of the neighbours' coordinates relative to the point and of their products; weight is the
-    number of points.
-    """
+    """Return the line through a point and its neighbours from sums of their coordinates relative to the point."""
     mean_x = total.x / weight
     mean_y = total.y / weight
     a = xx - weight * mean_x * mean_x
@@ -47,10 +44,7 @@ def line_at(
     point: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, k: wp.int32, reach: wp.int32, most: wp.int32,
     ratio: real, slack: real, width: real, gap: real,
 ):  # fmt: skip
-    """Return the line through the k-th point of a scan and reach neighbours on either side, up to most within a
-    distance of width, none of them farther from the last one than slack plus ratio times its range, nor than gap in
-    bearing.
-    """
+    """Return the line through the k-th point of a scan and at most reach neighbours on either side."""
     centre = point[first + k]
     sum_x = real(0.0)
     sum_y = real(0.0)
@@ -103,10 +97,7 @@ def fit_scan(
 
 @kernel
 def fit_lines(point, start, which, line, scans, points, chosen, reach, most, ratio, slack, width, gap):
-    """Fit a line to each point and reach neighbours on either side, up to most within a distance of width, none of them
-    farther from the last one than slack plus ratio times its range, nor than gap in bearing: unit normal, offset, and 1
-    / (sum of squared distances along the line).
-    """
+    """Fit a line to each point and at most reach neighbours on either side."""
     row, k = wp.tid()
     if row >= chosen:
         return

@@ -28,9 +28,7 @@ def last_range(z: real, terms: wp.array(dtype=MixtureTerms)):
 
 @wp.func
 def hit_mass(before: real, after: real, erf_scale: real):
-    """Return the mass of the untruncated normal from a distance before its mean to one after it, a sum of positive
-    terms.
-    """
+    """Return the mass of the untruncated normal from a distance before its mean to one after it."""
     below = before * erf_scale
     above = after * erf_scale
     nearer = wp.min(below, above)
@@ -191,9 +189,7 @@ if LINEAR:
 
     @wp.func
     def log_density(z: real, expected: real, terms: wp.array(dtype=MixtureTerms), masses: wp.array(dtype=real)):
-        """Return log p(z | z*). p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm
-        suffices.
-        """
+        """Return log p(z | z*); p_rand > 0 bounds the sum from below, so components may underflow."""
         p = real(0.0)
         if HIT:
             # 1: correct range.
@@ -255,9 +251,7 @@ else:
 
 @wp.func
 def compat_density(z: real, expected: real, terms: wp.array(dtype=MixtureTerms)):
-    """Return the density whose cube nav2_amcl and Beluga add for each beam of a scan. amcl's is without normalisers,
-    Beluga's with both (book table 6.1).
-    """
+    """Return the density whose cube nav2_amcl and Beluga add for each beam of a scan."""
     off = z - expected
     p = terms[0].hit_peak * wp.exp(-(off * (off * terms[0].square_scale)))
     if AMCL:

@@ -25,9 +25,7 @@ NEAREST = wp.constant(wp.float64(1e-6))
 
 @wp.func
 def deviation_of(before: wp.float64, here: wp.float64, after: wp.float64, left: wp.float64, right: wp.float64):
-    """Return the difference between a range and its prediction from neighbours on a straight wall, in standard
-    deviations; infinite where they are on different surfaces. left and right are the neighbours' weights.
-    """
+    """Return the difference between a range and its prediction from neighbours, in standard deviations."""
     expected = ONE / (left / before + right / after)
     limit = LARGEST_STEP * here
     deviation = wp.float64(FOREVER)
@@ -42,9 +40,7 @@ def deviation_of(before: wp.float64, here: wp.float64, after: wp.float64, left: 
 
 @wp.func
 def rounding_of(number: wp.array(dtype=wp.float64), first: wp.int32, count: wp.int32, deviation: wp.float64):
-    """Return the deviation of rounding to the steps in which some ascending ranges come, 0 without steps, or where it
-    is smaller than another deviation.
-    """
+    """Return the deviation of rounding to the steps of ascending ranges, 0 without steps or below another one."""
     step = wp.float64(FOREVER)
     gaps = int(0)
     for i in range(1, count):

@@ -154,9 +154,7 @@ def angle_bin(direction: vec2, bins: wp.int32):
 
 @wp.func
 def expected_range(t: real, scale: RangeScale):
-    """Convert a distance in cells to metres, exactly range_max where nothing is nearer, or with AMCL_LINES where
-    nothing is met.
-    """
+    """Convert a distance in cells to metres, exactly range_max where nothing is nearer or met."""
     if AMCL_LINES:
         return wp.where(t == scale.limit, scale.range_max, t * scale.resolution)
     return wp.where(t >= scale.limit, scale.range_max, wp.min(t * scale.resolution, scale.range_max))

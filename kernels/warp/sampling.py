@@ -242,9 +242,7 @@ def cell_reading_of(
 
 @kernel
 def draw_readings(incidence, mixture, edges, chances, settings, ranges, particles, rays, tables, scale):
-    """Replace expected ranges by readings; incidence holds cosines, and edges the cosines between bins. One work-item
-    takes a particle and ray; a launch has fewer than 2^31.
-    """
+    """Replace expected ranges by readings; one work-item takes a particle and ray."""
     i, k = wp.tid()
     if k >= rays or i >= particles:
         return

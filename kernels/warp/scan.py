@@ -89,9 +89,7 @@ def chosen_of(telling: wp.int32, rank: wp.int32, informative: wp.int32, chosen: 
 
 @wp.func
 def placed_of(used: wp.int32, hits: wp.int32, fars: wp.int32, left: wp.int32, rules: ReadingRules):
-    """Return the sets of a block's chosen readings that get a place, as ranges and as max readings, and of all readings
-    with a place; left readings remain from the first of the block on.
-    """
+    """Return the sets of a block's chosen readings that get a place, as ranges, as max readings, and all."""
     as_range = int(0)
     if rules.possible != 0:
         as_range = used & hits
@@ -140,9 +138,7 @@ def fill_rays(
     place: wp.int32, value: wp.float64, vector: wp.vec2d, vectors: wp.array(dtype=wp.float64), source: wp.int32,
     point: wp.array(dtype=vec2), reading: wp.array(dtype=real), each: wp.int32, top: wp.float64,
 ):  # fmt: skip
-    """Fill a place with a reading, at most top, and with the vectors of its beam, the first of which is read
-    already.
-    """
+    """Fill a place with a reading, at most top, and with the vectors of its beam."""
     point[place * each] = vec2(real(vector.x), real(vector.y))
     for j in range(1, each):
         point[place * each + j] = vec2(real(vectors[source + 2 * j]), real(vectors[source + 2 * j + 1]))
@@ -159,9 +155,7 @@ def fill_item(
     point_low: wp.array(dtype=vec2), reading: wp.array(dtype=real), guard: wp.array(dtype=real),
     resolution: wp.float64, rules: ReadingRules,
 ):  # fmt: skip
-    """Fill the place of an item's reading, if it has one, and with left_over the place of the item with a missing
-    reading.
-    """
+    """Fill the place of an item's reading, if it has one, or with left_over that of a missing reading."""
     if END_POINTS:
         scale = rules.guard_scale
         if item_place < rules.places:

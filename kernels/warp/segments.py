@@ -188,9 +188,7 @@ def fit_line(
     point: wp.array(dtype=vec4), begin: wp.int32, size: wp.int32, first: wp.int32, count: wp.int32, sigma: real,
     line: wp.array(dtype=real), place: wp.int32,
 ):  # fmt: skip
-    """Write a, b, the triangular root of the information about (a, b), and the cost of a line through a part of a scan:
-    -1 where no line fits, all 0 for two points.
-    """
+    """Write a, b, the triangular root of their information, and the cost of a line; -1 where no line fits."""
     a = real(0.0)
     b = real(0.0)
     rows = rows6()

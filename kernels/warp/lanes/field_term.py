@@ -105,9 +105,7 @@ else:
 
     @wp.func
     def square_lanes(four: vec4, rest_x: rest, rest_y: rest, factor: rest):
-        """Return the square of an interpolated distance over 2 sigma^2 in two parts, given 1 / (2 sigma^2) as
-        factor.
-        """
+        """Return the square of an interpolated distance over 2 sigma^2 in two parts; factor is 1 / (2 sigma^2)."""
         left = rest(four.x)
         above = rest(four.z)
         if EXACT_EXPONENT:

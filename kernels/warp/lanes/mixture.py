@@ -155,9 +155,7 @@ def short_density_lanes(z: real, expected: real, terms: wp.array(dtype=MixtureTe
 
 @wp.func
 def log_of_parts_lanes(hit: real, shorter: real, terms: wp.array(dtype=MixtureTerms)):
-    """Return log p(z | z*) from the densities of components, or from their logarithms; -inf only where the mixture is
-    0.
-    """
+    """Return log p(z | z*) from the densities of components, or from their logarithms."""
     random = term_of.rand_density(terms)
     if LINEAR:
         return log_lanes((random + hit) + shorter)

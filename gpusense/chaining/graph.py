@@ -157,11 +157,7 @@ def solve(
 
 
 def _raised(rise: Floats, links: Links, count: int, fails: int) -> Flags:
-    """Return the poses (N,) with rising damping after a failed step.
-
-    These are the poses of the links with the largest ``rise`` (L,) in cost and their neighbours, more after further
-    failures.
-    """
+    """Return the poses (N,) with rising damping after a failed step: near the largest ``rise`` (L,), later more."""
     near = np.full(count, fails >= _FAILS)
     some = rise > _RISE**fails * rise.max()
     for _ in range(2):

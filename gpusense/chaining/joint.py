@@ -121,11 +121,7 @@ _OPEN = 1e-6
 
 
 class Joint:
-    """The matched scans of several front ends.
-
-    ``rows`` are the indices in the log of each front end's scans, ``times`` (S,) the times of the poses at the scans of
-    the log [s], evenly if None. Only the first ``scans`` of the log count.
-    """
+    """The matched scans of front ends among the first ``scans`` of a log; ``times`` (S,) [s] are even if None."""
 
     def __init__(self, fronts: Sequence[Front], rows: Sequence[Integers], times: Floats | None, scans: int) -> None:
         self.fronts = fronts

@@ -39,10 +39,7 @@ class TransformError(LookupError):
 
 @dataclass
 class Link:
-    """Transform between a frame and its parent.
-
-    A single transform whose stamp goes back is stray: it is dropped unless the next stamp follows it.
-    """
+    """Transform between a frame and its parent; a stamp that goes back is stray unless the next one follows it."""
 
     parent: str
     child: str

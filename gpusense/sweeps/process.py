@@ -57,10 +57,7 @@ def receive(sent: Mapping[str, Any]) -> None:
 
 
 def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:
-    """Run a job in this process; errors are part of the result.
-
-    ``device`` is for a worker without a chosen device. Files that were read for another sweep are read again.
-    """
+    """Run a job in this process, on ``device`` unless the worker has one; errors are part of the result."""
     chosen = os.environ.get(DEVICE) or device
     with _LOCK:
         begin, begin_cpu = time.perf_counter(), time.process_time()
@@ -164,10 +161,7 @@ class _Spawn(SpawnContext):
 
 
 class Worker:
-    """A process that starts on first use and again after its end; each keeps the sent maps and paths of logs.
-
-    An empty ``device`` leaves the device of the environment.
-    """
+    """A process that starts on first use and after its end, with sent maps and logs; it may choose no ``device``."""
 
     def __init__(self, device: str, sent: Mapping[str, Any] | None = None) -> None:
         self._device, self._sent, self._closed = device, sent or {}, False

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,22 +33,13 @@ _CHUNK = 1 << 26
 _FLAGS = frozenset({"HIT", "SHORT", "RAND", "BIAS"})
 
 
-@dataclass(frozen=True)
-class _Chunk:
-    """Pairs in one buffer on the device: ``blocks`` blocks of ``readings`` pairs, the last one padded with NaN."""
+class _Chunk(NamedTuple):
+    """Pairs in one buffer on the device, in blocks; the last block is padded with NaN."""
 
     reading: Any  # readings [m]
     expected: Any  # expected ranges [m]
-    count: int
-    blocks: int  # number of blocks
-    readings: int  # pairs per block
-    across: int  # stride from one block to the next
-    along: int  # stride from one pair of a block to the next
-
-    @property
-    def layout(self) -> tuple[int, int, int, int]:
-        """Layout arguments of the kernels."""
-        return self.blocks, self.readings, self.across, self.along
+    pairs: int  # number of pairs
+    layout: tuple[int, int, int, int]  # blocks, pairs per block, strides of blocks and of pairs
 
 
 class DeviceSums:
@@ -67,7 +58,7 @@ class DeviceSums:
             self._upload(pairs.reading[first : first + most], pairs.expected[first : first + most], gpu)
             for first in range(0, pairs.hits, most)
         ]
-        self._most_blocks = max((chunk.blocks for chunk in self._chunks), default=0)
+        self._most_blocks = max((chunk.layout[0] for chunk in self._chunks), default=0)
         self._rows = backend.empty(self._most_blocks * _SUMS[True], real) if self._chunks else None
 
     def _upload(self, reading: NDArray[np.floating], expected: NDArray[np.floating], gpu: bool) -> _Chunk:
@@ -81,7 +72,7 @@ class DeviceSums:
         # On a GPU neighbouring work-items read neighbouring pairs; on a processor each reads a contiguous block.
         across, along = (1, blocks) if gpu else (length, 1)
         z, z_expected = (self._backend.upload(np.ascontiguousarray(row)) for row in padded)
-        return _Chunk(z, z_expected, count, blocks, length, across, along)
+        return _Chunk(z, z_expected, count, (blocks, length, across, along))
 
     def of(self, pairs: Pairs) -> DeviceSums:
         """Return the sums over ``pairs`` on the same device."""
@@ -109,8 +100,8 @@ class DeviceSums:
         launch = backend.compile("e_step", with_lanes_flag(backend.info.lanes, "e_step", flags))
         mixture = self._mixture(point)
         for chunk in self._chunks:
-            launch((chunk.blocks,), chunk.reading, chunk.expected, *mixture, self._rows, *chunk.layout, width)
-            rows = backend.download(self._rows, np.empty((chunk.blocks, width), self.real))
+            launch(chunk.layout[:1], chunk.reading, chunk.expected, *mixture, self._rows, *chunk.layout, width)
+            rows = backend.download(self._rows, np.empty((chunk.layout[0], width), self.real))
             total += np.ascontiguousarray(rows.T, np.float64).sum(axis=1)
         # Compensated sums convert the log p = -inf of an impossible pair to NaN.
         total[0] = -math.inf if math.isnan(total[0]) else total[0]
@@ -122,10 +113,10 @@ class DeviceSums:
         rows = [np.empty((0, 4))]
         mixture = self._mixture(point) if self._chunks else ()
         for chunk in self._chunks:
-            out = backend.empty(4 * chunk.blocks * chunk.readings, self.real)
+            out = backend.empty(4 * chunk.layout[0] * chunk.layout[1], self.real)
             launch = backend.compile("pair_causes", self._flags | point.shape.flags)
-            launch((chunk.blocks,), chunk.reading, chunk.expected, *mixture, out, *chunk.layout)
-            rows.append(backend.download(out, np.empty((chunk.count, 4), self.real)).astype(np.float64))
+            launch(chunk.layout[:1], chunk.reading, chunk.expected, *mixture, out, *chunk.layout)
+            rows.append(backend.download(out, np.empty((chunk.pairs, 4), self.real)).astype(np.float64))
         return np.concatenate(rows)
 
 

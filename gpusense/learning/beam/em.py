@@ -185,11 +185,7 @@ _TURNS = 5
 
 
 class _Coordinates:
-    """The free coordinates of a search as a vector.
-
-    They are the logarithms of the weights, log sigma_hit, log lambda_short and bias / range_max. The largest weight at
-    the start, the reference, follows from the normalisation. Causes of weight 0 at the start stay excluded.
-    """
+    """Free coordinates of a search as a vector: logs of weights but the largest, of shapes, and bias / range_max."""
 
     def __init__(self, problem: Problem, start: Point) -> None:
         self._problem, self._start = problem, start

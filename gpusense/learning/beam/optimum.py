@@ -210,11 +210,7 @@ def _assume(sample: Sample, bounds: Bounds, causes: NDArray[np.bool_], bias: flo
 def short_runs(
     sample: Sample, starts: list[Point], bounds: Bounds, fit_bias: bool
 ) -> tuple[list[Point], NDArray[np.float64]]:
-    """Run a few steps of EM from C starts on a sample; return the ends and their (C,) log-likelihoods.
-
-    Steps of sigma_hit and of the offset are the book's, without truncation; the long run corrects them. lambda_short
-    takes one fixed-point step of the exact M-step. Weights at the ends are at least half a reading.
-    """
+    """Run a few steps of EM without truncation from C starts on a sample; return ends and (C,) log-likelihoods."""
     z, expected = sample.reading[:, None], sample.expected[:, None]
     weights = np.array([point.weights for point in starts])
     sigma, rate, bias = (np.array([getattr(point, name) for point in starts]) for name in ("sigma", "rate", "bias"))

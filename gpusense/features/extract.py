@@ -16,7 +16,7 @@ from gpusense.backends import Selection, get_backend
 from gpusense.backends.base import Backend
 from gpusense.features.lines import find_hallways, find_lines, scores_of, straight
 from gpusense.features.objects import find_doors, find_poles
-from gpusense.features.result import KINDS, Features, Found, check_kinds, features_of, joined, nothing, turned_axes
+from gpusense.features.result import KINDS, Features, Found, check_kinds, features_of, joined, turned_axes
 from gpusense.features.segments import NEIGHBOURS, ScanDevice, Segments, beams_of, by_bearing, find_segments
 from gpusense.matching.match import readings
 from gpusense.matching.points import ASSUMED_NOISE, scan_points, whole_noise
@@ -203,7 +203,7 @@ def find_reflectors(ranges: np.ndarray, intensities: np.ndarray, scanner: Scanne
             found = _reflector(light[run], r[run], bearing[run], usual, step)
             if found is not None:
                 rows.append([scan, *found, noise[scan]])
-    return _found(np.array(rows), scanner.mount) if rows else nothing()
+    return _found(np.array(rows).reshape(-1, 7), scanner.mount)
 
 
 def _runs(bright: np.ndarray, r: np.ndarray, steps: np.ndarray, step: float) -> list[np.ndarray]:

@@ -204,12 +204,6 @@ def turned_axes(angle: np.ndarray) -> np.ndarray:
     return axes
 
 
-def nothing() -> Found:
-    """Return an empty set of features."""
-    empty = np.zeros(0)
-    return Found(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), empty, empty)
-
-
 def features_of(found: dict[str, Found]) -> Features:
     """Join features of several kinds, ordered by scan, then kind."""
     parts = list(found.values())

@@ -15,7 +15,7 @@ import re
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -69,7 +69,9 @@ def messages(path: Path, wanted: Mapping[str, set[str] | None]) -> Iterator[Mess
         return names is None or topic.name in names
 
     place = str(path)
-    decode = _decoder(path)
+    first = is_ros1(path)
+    library("rosbags.typesys", f"{path}: a ROS bag")
+    store = type_store(first)
     numbers: Counter[str] = Counter()
     with errors_at(place):
         files = storages(path)
@@ -84,7 +86,8 @@ def messages(path: Path, wanted: Mapping[str, set[str] | None]) -> Iterator[Mess
             numbers[name] += 1
             where = f"{path}: {name}, message {numbers[name]}"
             with errors_at(where):
-                fields = decode(raw.data, kind)
+                data = raw.data if first else unpacked(raw.data)
+                fields = (store.deserialize_ros1 if first else store.deserialize_cdr)(data, kind)
                 if kind == ECHOES:
                     kind, fields = SCAN, _first_echo(fields)
             yield Message(where, kind, name, raw.time / 1e9, fields)
@@ -124,15 +127,6 @@ def type_store(first: bool) -> Any:
     if TRANSFORMS not in store.types:
         store.register(types.get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
     return store
-
-
-def _decoder(path: Path) -> Callable[[bytes, str], Any]:
-    first = is_ros1(path)
-    library("rosbags.typesys", f"{path}: a ROS bag")
-    store = type_store(first)
-    if first:
-        return lambda data, kind: store.deserialize_ros1(data, kind)
-    return lambda data, kind: store.deserialize_cdr(unpacked(data), kind)
 
 
 # Suffixes of a database's write-ahead log and of its rollback journal, and first bytes of the latter in use.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
-from gpusense._util.typing import Floats, Integers, Precision
+from gpusense._util.typing import Floats, Precision
 from gpusense.backends import Selection, get_backend
 from gpusense.chaining.closing import Loops
 from gpusense.chaining.drift import pose_covariances
@@ -220,7 +220,10 @@ class Chainer:
         else:
             joint, links, loops = self._loops
             closures = loops.closures.renumbered(joint.keys)
-            poses = _carried(joint.poses, joint.keys, loops.solution.poses)
+            # All poses move with their preceding key scans.
+            key = np.searchsorted(joint.keys, np.arange(len(joint.poses)), "right") - 1
+            moved = pose_difference(joint.poses[joint.keys[key]], joint.poses)
+            poses = compose_poses(loops.solution.poses[key], moved)
         # The curvature of a long chain is barely observable without closures, and the chain of matches bends least.
         solution = solve(poses, Links.joined([links, closures]), settle=len(closures) > 0)
         spread = pose_covariances(solution)
@@ -294,9 +297,3 @@ class Chainer:
                 last = np.searchsorted(front.nodes[: front.done], np.arange(len(rows)), "right") - 1
                 motions[rows] = front.matcher.motion[front.nodes[last]]
         return motions[:count]
-
-
-def _carried(poses: Floats, keys: Integers, placed: Floats) -> Floats:
-    """Return (N, 3) poses moved with their preceding key scans to the (K, 3) placed ones."""
-    place = np.searchsorted(keys, np.arange(len(poses)), "right") - 1
-    return compose_poses(placed[place], pose_difference(poses[keys[place]], poses))

@@ -92,8 +92,12 @@ class Loops:
         """Match candidates of a level and of all lower levels, and return whether there were any."""
         _, cell, most = _LEVELS[level]
         first, second, share = self._overlaps(cell)
-        drift = _deviations(self._drift().relative(first, second))
-        needed = _level_of(drift)
+        drift = self._drift().relative(first, second)
+        # Largest deviation of the position, and deviation of the heading; then the smallest window around both.
+        place = np.linalg.eigvalsh(drift[:, :2, :2])[:, -1]
+        deviation = _DEVIATIONS * np.sqrt(np.maximum(np.stack([place, drift[:, 2, 2]], axis=1), 0.0))
+        windows = np.array([window for window, _, _ in _LEVELS[:-1]])
+        needed = (deviation[:, None, :] > windows).any(axis=2).sum(axis=1)
         # Repeat with the next window, since deviations are estimates; the last window is only for large drifts.
         again = (needed == level - 1) & (level < len(_LEVELS) - 1)
         needed = np.where(again, level, needed)
@@ -228,16 +232,3 @@ def joined_breaks(broken: Integers, closures: Links) -> Integers:
     np.minimum.at(least, part, np.arange(count))
     joined: Integers = least[part][broken]
     return joined
-
-
-def _level_of(drift: Floats) -> Integers:
-    """Return the smallest level (L,) with a window around the drift (L, 2), or the last one."""
-    windows = np.array([window for window, _, _ in _LEVELS[:-1]])
-    level: Integers = (_DEVIATIONS * drift[:, None, :] > windows).any(axis=2).sum(axis=1)
-    return level
-
-
-def _deviations(covariances: Floats) -> Floats:
-    """Return the largest deviation of the position, and the deviation of the heading, (L, 2)."""
-    place = np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1]
-    return np.sqrt(np.maximum(np.stack([place, covariances[:, 2, 2]], axis=1), 0.0))

@@ -274,7 +274,8 @@ def matched_again(matcher: Matcher, found: ScanMatch, first: Integers, second: I
                 continue
             place = np.searchsorted(near, rows) - (attempt == "before")
             others = found.pose[near[np.clip(place, 0, len(near) - 1)]]
-        found = _tried(matcher, found, rows, first, second, others, _WIDE if attempt == "wide" else None)
+        again = matcher.match(first[rows], second[rows], others, _WIDE if attempt == "wide" else None)
+        found = found.replaced(rows, again, _is_better(found, rows, again))
     return found
 
 
@@ -346,15 +347,6 @@ def motions_around(motion: Floats, good: Flags, last: Floats | None) -> tuple[Fl
         np.where(alone[:, None], 0.0, motion[near[np.minimum(side, len(near) - 1)]]) for side in (before, after)
     )
     return one, two, 0.5 * (one + two)
-
-
-def _tried(
-    matcher: Matcher, found: ScanMatch, rows: Integers, first: Integers, second: Integers, guess: Floats,
-    window: tuple[float, float] | None,
-) -> ScanMatch:  # fmt: skip
-    """Retry some matches from new guesses, and return all matches, replaced where p_right is higher."""
-    again = matcher.match(first[rows], second[rows], guess, window)
-    return found.replaced(rows, again, _is_better(found, rows, again))
 
 
 def _is_better(found: ScanMatch, rows: Integers, again: ScanMatch) -> Flags:

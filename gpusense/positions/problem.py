@@ -234,7 +234,11 @@ def make_problem(
     loss = checks.choice("loss", loss, tuple(LOSSES))
     loss_scale = checks.real("loss_scale", checks.real("loss_scale", loss_scale, above=0), low=_SMALL, high=_LARGE)
     used = factors > 0
-    _check_number(used, least, reason)
+    number, rule = int(np.count_nonzero(used)), f"at least {least} beacon{'s' * (least > 1)}{reason}"
+    if count < least:
+        raise ValueError(f"xy: must hold {rule}, got {count}")
+    if number < least:
+        raise ValueError(f"weights: must be > 0 for {rule}, got {number}")
     positions, factors = positions[used], factors[used]
     # The middle of the box has the same spacing of floats as the beacons, so that differences are exact.
     origin = positions.min(axis=0) / 2 + positions.max(axis=0) / 2
@@ -261,16 +265,6 @@ def _not_negative(name: str, values: ArrayLike, count: int, largest: float) -> F
     if checked.size and checked.min() < 0:
         raise ValueError(f"{name}: must be >= 0, got {checked.min()} at index {int(np.argmin(checked))}")
     return checked
-
-
-def _check_number(used: NDArray[np.bool], least: int, reason: str) -> None:
-    number = int(np.count_nonzero(used))
-    if number >= least:
-        return
-    rule = f"at least {least} beacon{'s' * (least > 1)}{reason}"
-    if len(used) >= least:
-        raise ValueError(f"weights: must be > 0 for {rule}, got {number}")
-    raise ValueError(f"xy: must hold {rule}, got {len(used)}")
 
 
 def subsets(count: int, size: int) -> NDArray[np.intp]:

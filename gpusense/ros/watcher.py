@@ -98,7 +98,11 @@ class Watcher:
         # A restarted recording turns the clock back.
         if self._verdict is None or abs(now - self._judged) > self.patience:
             return status_fields("localisation", STALE, "no pose with a scan of its time", {}, node)
-        found, likely = self._verdict, self._likely()
+        found, likely = self._verdict, None
+        if self._causes:
+            # The newest diagnosis of the last poses' most frequent cause.
+            ((cause, _),) = Counter(each.cause for each in self._causes).most_common(1)
+            likely = next(each for each in reversed(self._causes) if each.cause == cause)
         evidence = "" if likely is None else f": {likely.text}"
         values = {
             "p_lost": f"{found.p_lost:.4f}", "verdict": found.verdict, "explained": f"{found.explained:.3f}",
@@ -107,13 +111,6 @@ class Watcher:
         if likely is not None:
             values["cause"] = likely.cause
         return status_fields("localisation", LEVELS[found.verdict], f"{found.verdict}{evidence}", values, node)
-
-    def _likely(self) -> Diagnosis | None:
-        """Return the newest diagnosis of the last poses' most frequent cause."""
-        if not self._causes:
-            return None
-        ((cause, _),) = Counter(each.cause for each in self._causes).most_common(1)
-        return next(each for each in reversed(self._causes) if each.cause == cause)
 
     def _monitor_of(self, grid: OccupancyGrid, scanner: Scanner) -> PoseMonitor:
         """Return the monitor of a scanner; its memory survives a change of scanners."""

@@ -110,7 +110,11 @@ class Table:
         ordered += [row for key, row in self.rows.items() if key not in known]
         self._rewrite(ordered, self.columns)
         if self.parquet is not None:
-            _write_parquet(self.parquet, self.columns, ordered)
+            pyarrow = _pyarrow()
+            import pyarrow as arrow
+
+            table = arrow.table(columns_of(self.columns, ordered))
+            write_whole(self.parquet, lambda stream: pyarrow.write_table(table, stream))
 
 
 def row_of(job: Job, outcome: Outcome, attempts: int) -> Row:
@@ -232,14 +236,6 @@ def _opened(path: Path) -> BinaryIO:
             stream.close()
             raise OSError(f"table: must be written by one sweep at a time, got {path} of another one") from error
     return stream
-
-
-def _write_parquet(path: Path, names: Sequence[str], rows: Sequence[Row]) -> None:
-    pyarrow = _pyarrow()
-    import pyarrow as arrow
-
-    table = arrow.table(columns_of(names, rows))
-    write_whole(path, lambda stream: pyarrow.write_table(table, stream))
 
 
 def _pyarrow() -> Any:

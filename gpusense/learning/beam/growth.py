@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from gpusense._util.typing import Floats
 from gpusense.learning.beam.device_sums import DeviceSums, Options
-from gpusense.learning.beam.em import Climb, climb_em
+from gpusense.learning.beam.em import climb_em
 from gpusense.learning.beam.pairs import Bounds, Pairs, Point
 from gpusense.learning.beam.problem import NO_PRIOR, Problem, Value
 from gpusense.learning.beam.report import report
@@ -62,14 +62,17 @@ def fit_shape(
         starts.append(replace(first, shape=shape_of(initial)))
     problem = Problem(device, pairs, bounds, NO_PRIOR, options.range_bias)
     sample = _sampled(problem)
-    best = max((_climb(sample, start, options) for start in starts), key=lambda end: end.value.objective)
+    # A small gain suffices to rank the starts.
+    most, roughly = options.max_iterations, max(options.tolerance, _ROUGHLY)
+    ends = [climb_em(sample, start, max_iterations=most, tolerance=roughly, watch=lambda *_: None) for start in starts]
+    best = max(ends, key=lambda end: end.value.objective)
     start, known = best.value.point, best.trace[:-1] if sample is problem else []
 
     def watch(iteration: int, value: Value) -> None:
         if options.callback is not None:
             options.callback(fit.iterations + len(known) + iteration, value.log_likelihood, value.point.parameters())
 
-    end = climb_em(problem, start, max_iterations=options.max_iterations, tolerance=options.tolerance, watch=watch)
+    end = climb_em(problem, start, max_iterations=most, tolerance=options.tolerance, watch=watch)
     return report(problem, replace(end, trace=known + end.trace), options, start)
 
 
@@ -90,13 +93,6 @@ def _sampled(problem: Problem) -> Problem:
         return problem
     some = pairs.subset(np.arange(len(pairs.kinds)) % every == 0)
     return Problem(problem.device.of(some), some, problem.bounds, problem.prior, problem.fit_bias)
-
-
-def _climb(problem: Problem, start: Point, options: Options) -> Climb:
-    tolerance = max(options.tolerance, _ROUGHLY)
-    return climb_em(
-        problem, start, max_iterations=options.max_iterations, tolerance=tolerance, watch=lambda iteration, value: None
-    )
 
 
 # Shares of the deviation at the mean expected range that starts turn into growth; iterations of a search.

@@ -132,7 +132,10 @@ class MapBuilder:
         cell = check_resolution(resolution)
         limit = np.inf if range_limit is None else checks.real("range_limit", range_limit, above=0)
         checks.boolean("clear_max", clear_max)
-        self._occupancy = _occupancy(p_hit, p_miss, p_prior)
+        self._occupancy = (
+            checks.real("p_hit", p_hit, above=0.5, below=1), checks.real("p_miss", p_miss, above=0, below=0.5),
+            checks.real("p_prior", p_prior, above=0, below=1),
+        )  # fmt: skip
         self._threshold = checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
         moved = check_motion("motion", motion, len(placed))
         self._survey = Survey(data, placed, limit, clear_max, moved)
@@ -213,11 +216,6 @@ def _readings(name: str, value: Any, scanner: Scanner) -> np.ndarray:
     read = float64_readings(checks.array(name, value, ("S", scanner.count), finite=False, dtype=None), scanner)
     scanner._first_scans.look_at(name, read)
     return read
-
-
-def _occupancy(p_hit: float, p_miss: float, p_prior: float) -> tuple[float, float, float]:
-    hit, miss = checks.real("p_hit", p_hit, above=0.5, below=1), checks.real("p_miss", p_miss, above=0, below=0.5)
-    return hit, miss, checks.real("p_prior", p_prior, above=0, below=1)
 
 
 def _frame(

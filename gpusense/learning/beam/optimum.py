@@ -53,8 +53,11 @@ class Search:
         Other starts have the causes of ``start`` and come from the readings; ``known`` may lack some causes. Each of
         ``more`` is followed to its maximum. Notes report lower ends, and a likelier start than the chosen one.
         """
-        causes, others = start.weights > 0, self._others(start)
-        values = [self.problem.value(point) for point in (start, known) if point is not None]
+        problem, causes = self.problem, start.weights > 0
+        points = choose_starts(problem.pairs, problem.bounds, causes, problem.fit_bias)
+        others = [problem.value(replace(point, shape=start.shape)) for point in points]
+        others = [value for value in others if math.isfinite(value.objective)]
+        values = [problem.value(point) for point in (start, known) if point is not None]
         if not chosen:
             values = sorted(values + others, key=lambda value: -value.objective)
         climb = self._climb(values[0].point, causes)
@@ -63,17 +66,14 @@ class Search:
                 climb = max(climb, self._climb(value.point, causes), key=_objective)
         ends = [climb, *(self._climb(point, causes) for point in more)]
         best = max(ends, key=_objective)
-        best.notes += _lower([best.value.objective - end.value.objective for end in ends])
+        lower = [best.value.objective - end.value.objective for end in ends]
+        lower = [each for each in lower if each > _SAME]
+        if lower:
+            best.notes.append(f"{len(lower)} of {len(ends)} starts ended lower, by up to {max(lower):.3g} nats")
         higher = max((value.objective for value in others), default=-math.inf) - best.value.objective
         if chosen and higher > _SAME:
             best.notes.append(f"another start is at least {higher:.3g} nats higher: leave out 'initial'")
         return best
-
-    def _others(self, start: Point) -> list[Value]:
-        problem = self.problem
-        points = choose_starts(problem.pairs, problem.bounds, start.weights > 0, problem.fit_bias)
-        values = [problem.value(replace(point, shape=start.shape)) for point in points]
-        return [value for value in values if math.isfinite(value.objective)]
 
     def _climb(self, start: Point, causes: NDArray[np.bool_]) -> Climb:
         """Search from a start, and continue with causes that the search dropped too early."""
@@ -95,8 +95,9 @@ class Search:
         """Return a likelier point where a cause of weight 0 gets some weight, or None."""
         best = value
         for cause in np.flatnonzero(causes & (value.point.weights == 0)):
-            tried = [self._with(value.point, int(cause), shape, NOTHING / self.problem.total)
-                     for shape in _shapes(self.problem, int(cause))]  # fmt: skip
+            bounds = {HIT: self.problem.bounds.sigma, SHORT: self.problem.bounds.rate}.get(int(cause))
+            shapes = [None] if bounds is None else np.geomspace(*bounds, _SHAPES).tolist()
+            tried = [self._with(value.point, int(cause), shape, NOTHING / self.problem.total) for shape in shapes]
             values = [self.problem.value(point) for point in tried]
             likeliest = max(values, key=lambda each: each.totals[cause])
             if likeliest.totals[cause] <= NOTHING * (1 + 1e-6):
@@ -116,24 +117,8 @@ class Search:
         return replace(point, weights=weights)
 
 
-def _shapes(problem: Problem, cause: int) -> list[float | None]:
-    """Return a coarse list of shapes of a cause within their bounds; [None] for a cause without a shape."""
-    if cause not in (HIT, SHORT):
-        return [None]
-    low, high = problem.bounds.sigma if cause == HIT else problem.bounds.rate
-    return list(np.geomspace(low, high, _SHAPES))
-
-
 def _objective(climb: Climb) -> float:
     return climb.value.objective
-
-
-def _lower(differences: list[float]) -> list[str]:
-    """Return a note on searches that ended lower than the best."""
-    lower = [each for each in differences if each > _SAME]
-    if not lower:
-        return []
-    return [f"{len(lower)} of {len(differences)} starts ended lower, by up to {max(lower):.3g} nats"]
 
 
 # Readings in the sample, steps of each short run, and largest number of returned starts.

@@ -35,17 +35,14 @@ class Drift:
     widened by the covariance of the steps in between; the time is linear in the number of poses for any number of
     closures.
 
-    ``anchors`` (A,) are the kept poses, ascending from 0, by default at most ``most``; any other pose takes the
-    covariance of the last kept pose before it.
+    At most ``most`` poses are kept; any other pose takes the covariance of the last kept pose before it.
     """
 
-    def __init__(self, solution: Solution, most: int = _ANCHORS, anchors: Integers | None = None) -> None:
+    def __init__(self, solution: Solution, most: int = _ANCHORS) -> None:
         poses, links, count = solution.poses, solution.links, len(solution.poses)
         self._poses = poses
         spread = _spread_of_steps(solution) if count > 1 else np.zeros((0, 3, 3))
-        if anchors is None:
-            anchors = _anchors_of(spread, most) if count > most else np.arange(count)
-        self.anchors = anchors
+        self.anchors = anchors = _anchors_of(spread, most) if count > most else np.arange(count)
         self._joint = np.zeros((len(anchors), 3, len(anchors), 3))
         if count < 2:
             return

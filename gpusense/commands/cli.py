@@ -74,12 +74,11 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the message with a likely correction instead of the usage, and exit."""
         choice = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message)
-        option = re.match(r"unrecognized arguments: (-\S+)", message)
-        wrong = choice or option
-        known = re.findall(r"[\w-]+", choice[2]) if choice else [one for action in self._actions
-                                                                 for one in action.option_strings]  # fmt: skip
+        wrong = choice or re.match(r"unrecognized arguments: -+([^\s=-][^\s=]*)", message)
+        names = [name for action in self._actions for name in action.option_strings]
+        known = {name.lstrip("-"): name for name in (re.findall(r"[\w-]+", choice[2]) if choice else names)}
         close = difflib.get_close_matches(wrong[1], known, n=1) if wrong else []
-        self.exit(BAD_INPUT, _error_line(message + (f"; did you mean {close[0]!r}?" if close else "")))
+        self.exit(BAD_INPUT, _error_line(message + (f"; did you mean {known[close[0]]!r}?" if close else "")))
 
     def parse_known_args(  # type: ignore[override]
         self, args: Any = None, namespace: Any = None

@@ -23,6 +23,7 @@ from gpusense.evaluation.worlds import cloud_around, cloud_uniform
 from gpusense.localization.beam_consistency import BeamConsistency, MapJudge, beam_consistency
 from gpusense.localization.belief import Belief, evidence_of_scan
 from gpusense.localization.diagnosis import Diagnosis, evidence_of
+from gpusense.localization.pose_algebra import mean_pose
 from gpusense.localization.spread import LOST, TRACKING, Word
 from gpusense.localization.temperature import BeamCorrelation, learn_from_scan
 from gpusense.localization.weights import normalize_weights
@@ -123,12 +124,9 @@ def score_scan(index: int, poses: Floats, log_p: Array, beams: int, seconds: flo
     mean: Pose | None = None
     position = heading = effective = None
     if not normalized.degenerate:
-        weights, effective = normalized.weights, normalized.effective_sample_size
-        x, y = (weights @ poses[1:, :2]).tolist()
-        theta = math.atan2(float(weights @ np.sin(poses[1:, 2])), float(weights @ np.cos(poses[1:, 2])))
-        mean = (x, y, theta)
-        position = math.hypot(x - pose[0], y - pose[1])
-        heading = abs(math.remainder(theta - pose[2], math.tau))
+        effective, centre = normalized.effective_sample_size, mean_pose(poses[1:], normalized.weights)
+        mean, off = cast(Pose, tuple(centre.tolist())), centre - poses[0]
+        position, heading = math.hypot(off[0], off[1]), abs(math.remainder(off[2], math.tau))
     return ScanScore(
         index, pose, 1 + better + equal / 2, 100 * (others - better - equal / 2) / others, mean, position, heading,
         effective, normalized.degenerate, beams, seconds,

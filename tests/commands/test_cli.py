@@ -88,6 +88,7 @@ def test_version(capsys):
     [
         (["devices", "--jsn"], "unrecognized arguments: --jsn; did you mean '--json'?"),
         ([*SMALL, "--nothing-like-it"], "unrecognized arguments: --nothing-like-it"),
+        (["match", "--log", "run.log", "--kinds", "x"], "unrecognized arguments: --kinds x"),
         (["demo", "--particles", "1e3"], "argument --particles: must be an integer from 1 to 100000000, got '1e3'"),
         (["demo", "--output", "demo.gif"], "argument --output: must end in .png or .pdf or .svg, got 'demo.gif'"),
         (

@@ -30,13 +30,14 @@ from gpusense.backends import get_backend
 from gpusense.evaluation import stiff
 from gpusense.evaluation.benchmark.report import commit
 from gpusense.evaluation.tolerances import TOLERANCES, Check
-from gpusense.models.scan.densities import naive_log_hit, naive_log_short
 from gpusense.reference.mixture import log_density
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
 from accuracy.extreme_tables import write_tables
 from common import FIGURES, command_line, make_parser, parse, publish, table
+from support.textbook import textbook_log_hit, textbook_log_short, textbook_of
 
 mpl.use("Agg")
 mp.mp.dps = 60
@@ -87,7 +88,7 @@ def sweep(precision: str, shares: np.ndarray, weights: tuple[float, ...], places
         grid, scanner = gs.OccupancyGrid([[0]], 1.0), gs.Scanner([0.0], RANGE_MAX)
         model = gs.BeamModel(grid, scanner, p, backend="numpy", precision=precision)
         z, expected = (a.astype(real) for a in places(shape))
-        exact, naive = (exact_hit, naive_log_hit) if hit else (exact_short, naive_log_short)
+        exact, naive = (exact_hit, textbook_log_hit) if hit else (exact_short, textbook_log_short)
         truth = [exact(float(a), float(b), shape) for a, b in zip(z, expected, strict=True)]
         with np.errstate(all="ignore"):
             found = log_density(model._pipeline.mixture.flags, z, expected, model._pipeline.mixture.terms)
@@ -202,7 +203,7 @@ def grid_rows(backends: list[str], families: list[dict[str, Any]]) -> list[dict[
             checks, grid = stiff.run(backend, precision), stiff.density_grid(backend, precision)
             families += family_rows(precision, checks)
             densities = checks[0]
-            bound, naive = densities.tolerance.value, stiff.error_in_eps(grid.naive(), grid.truth(), precision)
+            bound, naive = densities.tolerance.value, stiff.error_in_eps(textbook_of(grid), grid.truth(), precision)
             found.append({
                 "backend": backend, "precision": precision, "worst": densities.difference,
                 "not_finite": int(np.isinf(stiff.error_in_eps(grid.log_p, grid.truth(), precision)).sum()),

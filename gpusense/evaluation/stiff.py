@@ -26,7 +26,7 @@ from gpusense.interface.launches import launch
 from gpusense.localization.weights import normalize_weights
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.caster import RayCaster
-from gpusense.models.scan.densities import log_mixture, naive_log_mixture
+from gpusense.models.scan.densities import log_mixture
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.tables.rectangles import Planes, empty_rectangles
 from gpusense.world.grid import OccupancyGrid
@@ -70,10 +70,6 @@ class Densities:
         """Compute log p by the float64 densities on the same rounded numbers."""
         z, expected = self.z.astype(np.float64), self.expected.astype(np.float64)
         return np.asarray(log_mixture(z, expected, range_max=RANGE_MAX, **self.parameters))
-
-    def naive(self) -> Reals:
-        """Compute log p by the textbook's formulas in the grid's precision."""
-        return np.asarray(naive_log_mixture(self.z, self.expected, range_max=RANGE_MAX, **self.parameters))
 
 
 def density_grid(backend: Selection, precision: Precision) -> Densities:

@@ -3,8 +3,6 @@
 Kernels see expected ranges in [0, range_max], as casters return them. Learning, and other predictions of ranges, may
 need values outside this interval, where the textbook's normaliser underflows to 0. These functions stay finite.
 They take scalars or arrays, float64 or float32; float32 throughout gives float32, computed in float32.
-
-The ``naive_`` functions are the textbook's formulas as printed, for comparisons only.
 """
 
 from __future__ import annotations
@@ -152,52 +150,6 @@ def log_mixture(
         shift = np.where(np.isneginf(largest), z.dtype.type(0), largest)
         continuous = shift + np.log(np.exp(parts - shift).sum(axis=0))
         return _scalar(np.where(z >= range_max, NoReturn(top).log_mass, np.where(np.isnan(z), z, continuous)))
-
-
-def naive_log_hit(z: ArrayLike, expected: ArrayLike, sigma: ArrayLike, range_max: ArrayLike) -> Any:
-    """Evaluate equations 6.4 to 6.6 as printed, the normaliser a difference of two cumulative normals."""
-    z, expected, sigma, range_max = _arrays(z, expected, sigma, range_max)
-    real = z.dtype.type
-    with np.errstate(all="ignore"):
-        normal = np.exp(-real(0.5) * (z - expected) ** 2 / sigma**2) / (real(_ROOT_2PI) * sigma)
-        scale = sigma * real(math.sqrt(2))
-        upper, lower = (real(0.5) * (real(1) + erf((x - expected) / scale)) for x in (range_max, real(0)))
-        return _scalar(np.log(normal / (upper - lower)))
-
-
-def naive_log_short(z: ArrayLike, expected: ArrayLike, rate: ArrayLike) -> Any:
-    """Evaluate equations 6.7 to 6.9 as printed, with ``1 - exp(-rate z*)``."""
-    z, expected, rate = _arrays(z, expected, rate)
-    real = z.dtype.type
-    with np.errstate(all="ignore"):
-        normaliser = real(1) / (real(1) - np.exp(-rate * expected))
-        density = np.where((z >= 0) & (z <= expected), normaliser * rate * np.exp(-rate * z), real(0))
-        return _scalar(np.log(density))
-
-
-def naive_log_mixture(
-    z: ArrayLike,
-    expected: ArrayLike,
-    *,
-    z_hit: ArrayLike,
-    z_short: ArrayLike,
-    z_max: ArrayLike,
-    z_rand: ArrayLike,
-    sigma_hit: ArrayLike,
-    lambda_short: ArrayLike,
-    range_max: ArrayLike,
-    range_bias: ArrayLike = 0.0,
-    sigma_growth: ArrayLike = 0.0,
-) -> Any:
-    """Evaluate equation 6.12 as printed, components of weight 0 left out, z_max at z >= Z."""
-    z, expected, hit, short, top, rand, sigma, rate, range_max, bias, growth = _arrays(
-        z, expected, z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, range_max, range_bias, sigma_growth
-    )
-    mean, sigma = _moments(expected, bias, sigma, growth, range_max)
-    with np.errstate(all="ignore"):
-        p = np.where(hit > 0, hit * np.exp(naive_log_hit(z, mean, sigma, range_max)), 0)
-        p = p + np.where(short > 0, short * np.exp(naive_log_short(z, expected, rate)), 0)
-        return _scalar(np.log(np.where(z >= range_max, top, p + rand / range_max)))
 
 
 def _moments(expected: Reals, bias: Reals, sigma: Reals, growth: Reals, range_max: Reals) -> tuple[Reals, Reals]:

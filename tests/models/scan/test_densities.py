@@ -9,9 +9,10 @@ import mpmath as mp
 import numpy as np
 import pytest
 from hypothesis import strategies as st
+from support.textbook import textbook_log_hit, textbook_log_short
 
 import gpusense as gs
-from gpusense.models.scan.densities import log_hit, log_mixture, log_rand, log_short, naive_log_hit, naive_log_short
+from gpusense.models.scan.densities import log_hit, log_mixture, log_rand, log_short
 
 PRECISIONS = ("float64", "float32")
 
@@ -68,7 +69,7 @@ def test_hit_for_any_expected_range(precision):
             (0.0, 1e-9, 0.3, 0.999, 1.0),
         )
     ]
-    worst, lost, wrong = worst_of(cases, log_hit, naive_log_hit, exact_hit, precision)
+    worst, lost, wrong = worst_of(cases, log_hit, textbook_log_hit, exact_hit, precision)
     assert worst[0] <= 4, worst
     assert lost > 0.3
     assert wrong > 0.4
@@ -82,7 +83,7 @@ def test_short_for_any_rate(precision):
             (1e-30, 1e-6, 0.1, 3.0, 80.0), (0.0, 1e-30, 1e-12, 1e-3, 0.2, 1.0, 30.0, 1e6), (0.0, 0.1, 0.5, 1.0)
         )
     ]
-    worst, lost, wrong = worst_of(cases, log_short, naive_log_short, exact_short, precision)
+    worst, lost, wrong = worst_of(cases, log_short, textbook_log_short, exact_short, precision)
     assert worst[0] <= 4, worst
     assert lost > 0.2
     assert wrong > 0.25

@@ -202,7 +202,7 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def peers(arguments: argparse.Namespace) -> list[tuple[str, ...]]:
-    """Measure a lidar of 64 beams in each world, among 12 discs, and compare the ranges."""
+    """Measure a lidar of 64 beams in each world, among 12 discs, and steps that also move all and find collisions."""
     rng, count, rays, longest = np.random.default_rng(0), int(arguments.worlds.split(",")[0]), 64, 10.0
     away, angle = rng.uniform(0.8, 9, (count, 12)), rng.uniform(-np.pi, np.pi, (count, 12))
     poses = np.column_stack([rng.uniform(-3, 3, (count, 2)), rng.uniform(-3, 3, count)])
@@ -213,26 +213,39 @@ def peers(arguments: argparse.Namespace) -> list[tuple[str, ...]]:
     worlds.shapes = gs.Shapes(discs=discs)
     caster, index = gs.RayCaster(worlds, longest, backend=backend), np.arange(count)
     turn = np.linspace(0, 2 * np.pi, rays, endpoint=False)
-    placed, where = there(backend, poses, index)
-    ours = least(caster.bind(placed, turn, world=where), backend, arguments.repeats, arguments.seconds)
-    lines = [(f"gpusense, {backend.info.selection}", str(count), f"{1e3 * ours:.3g}", f"{count / ours:.3g}", "")]
-    for name, lidars in (("vmas", vmas_lidars), ("irsim", ir_sim_lidars)):
+    placed, where, moved, ahead, beside = there(backend, poses.copy(), index, discs.copy(), 1e-6 * poses, 1e-6 * discs)
+    cast = caster.bind(placed, turn, world=where)
+
+    def step() -> None:
+        nonlocal placed, moved
+        placed += ahead
+        moved += beside
+        worlds.shapes = gs.Shapes(discs=moved)
+        cast()
+        worlds.collides(placed, 0.2, world=where)
+
+    def rates(measure: Callable[[], Any], step: Callable[[], Any], lidars: int) -> tuple[str, ...]:
+        each = (lidars / least(run, backend, arguments.repeats, arguments.seconds) for run in (measure, step))
+        return str(lidars), *(f"{rate:.3g}" for rate in each)
+
+    lines = []
+    for name, program in (("vmas", vmas_program), ("irsim", ir_sim_program)):
         if importlib.util.find_spec(name) is None:
             note(f"{name} is not installed")
             continue
-        measure, bearings = lidars(poses, discs, rays, longest)
+        measure, other_step, bearings = program(poses, discs, rays, longest)
         found = measure()
-        seconds = least(measure, backend, arguments.repeats, arguments.seconds)
         off = np.abs(found - caster.cast(poses, bearings, world=index)[: len(found)])
         wrong = f"{np.quantile(off, 0.99):.1g} m (99 % of rays), {off.max():.1g} m"
-        lines.append((name, str(len(found)), f"{1e3 * seconds:.3g}", f"{len(found) / seconds:.3g}", wrong))
-    return lines
+        lines.append((name, *rates(measure, other_step, len(found)), wrong))
+    return [(f"gpusense, {backend.info.selection}", *rates(cast, step, count), ""), *lines]
 
 
-def vmas_lidars(
-    poses: np.ndarray, discs: np.ndarray, rays: int, longest: float
-) -> tuple[Callable[[], np.ndarray], np.ndarray]:
-    """Return a function that measures VMAS's lidars, and their bearings [rad]."""
+Program = tuple[Callable[[], np.ndarray], Callable[[], Any], np.ndarray]
+
+
+def vmas_program(poses: np.ndarray, discs: np.ndarray, rays: int, longest: float) -> Program:
+    """Return functions that measure VMAS's lidars and step its world, and the bearings of the beams [rad]."""
     import torch
     from vmas.simulator.core import Agent, Landmark, Sphere, World
     from vmas.simulator.sensors import Lidar
@@ -242,21 +255,25 @@ def vmas_lidars(
     robot = Agent("robot", shape=Sphere(0.2), sensors=[lidar])
     world.add_agent(robot)
     for number in range(discs.shape[1]):
-        disc = Landmark(f"disc {number}", collide=True, shape=Sphere(discs[0, number, 2]))
+        disc = Landmark(f"disc {number}", collide=True, movable=True, shape=Sphere(discs[0, number, 2]))
         world.add_landmark(disc)
         disc.set_pos(torch.tensor(discs[:, number, :2], dtype=torch.float32), batch_index=None)
     robot.set_pos(torch.tensor(poses[:, :2], dtype=torch.float32), batch_index=None)
     robot.set_rot(torch.tensor(poses[:, 2:], dtype=torch.float32), batch_index=None)
-    return lambda: lidar.measure().numpy(), np.linspace(0, 2 * np.pi, rays, endpoint=False)
+
+    def step() -> Any:
+        world.step()
+        lidar.measure()
+        return [world.is_overlapping(robot, disc) for disc in world.landmarks]
+
+    return lambda: lidar.measure().numpy(), step, np.linspace(0, 2 * np.pi, rays, endpoint=False)
 
 
-def ir_sim_lidars(
-    poses: np.ndarray, discs: np.ndarray, rays: int, longest: float
-) -> tuple[Callable[[], np.ndarray], np.ndarray]:
-    """Return a function that measures the lidars of ir-sim in the first 16 worlds, and their bearings [rad]."""
+def ir_sim_program(poses: np.ndarray, discs: np.ndarray, rays: int, longest: float) -> Program:
+    """Return functions that measure the lidars of ir-sim in 16 worlds and step these, and the bearings [rad]."""
     import irsim
 
-    robots = []
+    worlds = []
     for (x, y, theta), each in zip(poses[:16].tolist(), discs.tolist(), strict=False):
         circles = "\n".join(f"  - {{shape: {{name: circle, radius: {r}}}, state: [{u}, {v}, 0]}}" for u, v, r in each)
         with tempfile.TemporaryDirectory() as folder:
@@ -269,14 +286,15 @@ robot:
 obstacle:
 {circles}
 """)
-            robots.append(irsim.make(str(path), display=False, save_ani=False).robot_list[0])
+            worlds.append(irsim.make(str(path), display=False, save_ani=False))
+    robots = [world.robot_list[0] for world in worlds]
 
     def measure() -> np.ndarray:
         for robot in robots:
             robot.lidar.step(robot.state)
         return np.array([robot.lidar.range_data for robot in robots])
 
-    return measure, robots[0].lidar.angle_list
+    return measure, lambda: [world.step(np.zeros((2, 1))) for world in worlds], robots[0].lidar.angle_list
 
 
 def line_of(row: dict[str, Any]) -> list[str]:
@@ -300,7 +318,7 @@ def main(argv: list[str] | None = None) -> None:
     arguments = parse(parser, argv)
     if arguments.peers:
         lines = peers(arguments)
-        columns = ("program", "lidars of 64 beams", "ms", "lidars/s", "differs from gpusense by at most")
+        columns = ("program", "lidars of 64 beams", "lidars/s", "steps/s", "differs from gpusense by at most")
         publish(__file__, arguments, table(columns, lines), {"rows": lines})
         return
     rows = measure(arguments)

@@ -171,7 +171,6 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         worlds = gs.Worlds(cells, RESOLUTION, backend=recorder)
         caster = gs.RayCaster(worlds, RANGE_MAX, backend=recorder)
         index = np.arange(count, dtype=np.int32).repeat(ROBOTS)
-        index = rng.permutation(index) if arguments.shuffled else index
         poses, where = there(backend, poses_in(count, rng), index)
         (new,), changed = there(backend, kinds), np.arange(len(kinds))
 
@@ -192,8 +191,9 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
             call()
             bound = rays / least(call, backend, repeats, seconds)
             rows.append(dict(
-                worlds=count, shapes=shapes, rate=rate, bound=bound, of_room=bound / room, of_map=bound / one,
-                made=made, replaced=replaced, bytes=worlds.nbytes / (count * SIDE * SIDE),
+                worlds=count, shapes=shapes, rate=rate / 1e6, bound=bound / 1e6, of_room=bound / room,
+                of_map=bound / one, made=1e3 * made, replaced=1e3 * replaced,
+                bytes=worlds.nbytes / (count * SIDE * SIDE),
                 launches="; ".join(timed(recorder, run) for run in (cast, replace)),
             ))  # fmt: skip
             note(" | ".join(line_of(rows[-1])))
@@ -299,11 +299,10 @@ obstacle:
 
 def line_of(row: dict[str, Any]) -> list[str]:
     """Return the cells of a row."""
-    return [
-        str(row["worlds"]), str(row["shapes"]), f"{row['rate'] / 1e6:.0f} / {row['bound'] / 1e6:.0f}",
-        f"{row['of_room']:.2f}", f"{row['of_map']:.2f}", f"{1e3 * row['made']:.2f}", f"{1e3 * row['replaced']:.2f}",
-        f"{row['bytes']:.1f}", row["launches"],
-    ]  # fmt: skip
+    text = (
+        "{worlds}|{shapes}|{rate:.0f} / {bound:.0f}|{of_room:.2f}|{of_map:.2f}|{made:.2f}|{replaced:.2f}|{bytes:.1f}|"
+    )
+    return [*text.format(**row).split("|")[:-1], row["launches"]]
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -312,7 +311,6 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--worlds", default="64,1024", help="numbers of worlds, with commas (default: 64,1024)")
     parser.add_argument("--shapes", type=int, default=0, help="moving shapes of each world (default: 0)")
     parser.add_argument("--kernels", action="store_true", help="measure each launch by the device's clock")
-    parser.add_argument("--shuffled", action="store_true", help="robots of a world do not follow each other")
     parser.add_argument("--peers", action="store_true", help="compare a lidar among discs with those of peers")
     add_repeats(parser, 20, 5.0)
     arguments = parse(parser, argv)

@@ -18,7 +18,7 @@ from gpusense.reference.ray import TINY, ray_direction
 
 DISC, BOX, SEGMENT = 4, 8, 4
 # Ranges of directions of a particle's sights, and of a table of beams.
-SIGHTS, DIRECTIONS = 64, 1024
+SIGHTS, DIRECTIONS = 64, 4096
 # Widening of a shape's range, in quarters of a turn.
 APART = 1.25e-4
 

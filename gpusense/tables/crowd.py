@@ -83,7 +83,7 @@ def turns_of(vectors: np.ndarray) -> np.ndarray:
     """Return the order of (K, 2) ray vectors by direction; see the kernel file ``shapes``.
 
     Returns:
-        (1025 + K,) first place of each range of directions among the rays in order, K, and the rays in order.
+        (4097 + K,) first place of each range of directions among the rays in order, K, and the rays in order.
     """
     x, y = vectors.T
     places = np.floor(turned(x, y) * (DIRECTIONS / 4)).astype(int) % DIRECTIONS

@@ -23,7 +23,7 @@ long world_begin(global const int2 *world, const int n, const int each) { return
 #define SEGMENT 4
 // Ranges of directions of a particle's sights, and of a table of beams.
 #define SIGHTS 64
-#define DIRECTIONS 1024
+#define DIRECTIONS 4096
 // Widening of a shape's range of directions, which covers rounding, as a sine and in quarters of a turn.
 #define WIDER (real)1e-5
 #define APART (real)1.25e-4
@@ -128,15 +128,24 @@ real2 meet_segment(const real dx, const real dy, const real x, const real y, con
     return (real2)((aside <= 0) & (end_aside >= 0) | (aside >= 0) & (end_aside <= 0) ? met : (real)INFINITY, straight);
 }
 
-// Return the same of shape i of a world, whose numbers begin at one.
-real2 meet_shape(global const real *one, const int i, const Crowd crowd, const int2 cell, const real4 pose,
-                 const real2 direction) {
-    const real4 four = *(global const real4 *)one;
-    const real x = (four.x - cell.x) - pose.x, y = (four.y - cell.y) - pose.y;
-    if (i < crowd.discs) return meet_disc(direction.x, direction.y, x, y, four.z);
+// Return a shape's numbers relative to a pose, from the first four in its world.
+real4 relative_shape(const real4 one, const int i, const Crowd crowd, const int2 cell, const real4 pose) {
+    const real x = (one.x - cell.x) - pose.x, y = (one.y - cell.y) - pose.y;
+    if (i < crowd.discs + crowd.boxes) return (real4)(x, y, one.z, one.w);
+    return (real4)(x, y, (one.z - cell.x) - pose.x, (one.w - cell.y) - pose.y);
+}
+
+// Return half the length and width of a box, 0 of other shapes.
+real2 box_size(global const real4 *one, const int i, const Crowd crowd) {
+    return i >= crowd.discs && i < crowd.discs + crowd.boxes ? one[1].xy : (real2)0;
+}
+
+// Return the same of shape i of a world by its numbers relative to a pose.
+real2 meet_shape(const real4 one, const real2 size, const int i, const Crowd crowd, const real2 direction) {
+    if (i < crowd.discs) return meet_disc(direction.x, direction.y, one.x, one.y, one.z);
     if (i < crowd.discs + crowd.boxes)
-        return meet_box(direction.x, direction.y, x, y, four.z, four.w, one[4], one[5]);
-    return meet_segment(direction.x, direction.y, x, y, (four.z - cell.x) - pose.x, (four.w - cell.y) - pose.y);
+        return meet_box(direction.x, direction.y, one.x, one.y, one.z, one.w, size.x, size.y);
+    return meet_segment(direction.x, direction.y, one.x, one.y, one.z, one.w);
 }
 
 // Return the nearest of the shapes that a particle sees along a ray and of an obstacle at a distance t: the distance in
@@ -151,7 +160,9 @@ real2 nearest_shape(global const real *shapes, global const int2 *world, const C
     for (int k = 0; k < 2 * crowd.pairs; ++k) {
         for (uint left = (uint)sights[k]; left != 0; left &= left - 1) {
             const int i = 32 * k + lowest_bit(left);
-            const real2 met = meet_shape(first + shape_at(crowd, i), i, crowd, cell, pose, direction);
+            global const real4 *one = (global const real4 *)(first + shape_at(crowd, i));
+            const real4 near = relative_shape(one[0], i, crowd, cell, pose);
+            const real2 met = meet_shape(near, box_size(one, i, crowd), i, crowd, direction);
             if (met.x < nearest.x) nearest = met;
         }
     }

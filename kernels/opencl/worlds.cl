@@ -103,6 +103,10 @@ kernel void find_sights(ARGUMENTS) {
 #if IN_TEAMS
 #define TEAM 64
 #define MOST_RAYS 2048
+// Places of a table of the members that have every so many pairs, and the least number of pairs between them, as powers
+// of two.
+#define COARSE 256
+#define APART_LOG 3
 #else
 #define TEAM 1
 #endif
@@ -114,6 +118,9 @@ kernel void find_sights(ARGUMENTS) {
 kernel void meet_shapes(ARGUMENTS) {
 #if IN_TEAMS
     local int end[TEAM], base[TEAM];
+    local uchar owner_at[COARSE];
+    local real4 ones[TEAM];
+    local real2 sizes[TEAM];
     local real nearest[MOST_RAYS];
     const int n = get_group_id(0), member = get_local_id(0);
 #else
@@ -130,8 +137,14 @@ kernel void meet_shapes(ARGUMENTS) {
     for (int k = member; k < rays; k += TEAM) nearest[k] = limit;
     for (int before = 0; before < count; before += TEAM) {
         int begin = 0, pairs = 0;
-        if (before + member < count) {
-            const real2 seen = directions_of(shapes, world, crowd, n, before + member, cell, sensor, sensor.zw);
+        real4 one = 0;
+        real2 size = 0;
+        const int own = before + member;
+        if (own < count) {
+            global const real4 *numbers = (global const real4 *)(first + shape_at(crowd, own));
+            one = relative_shape(numbers[0], own, crowd, cell, sensor);
+            size = box_size(numbers, own, crowd);
+            const real2 seen = directions_of(shapes, world, crowd, n, own, cell, sensor, sensor.zw);
             const int low = (int)floor(seen.x * (DIRECTIONS / 4)), high = (int)floor(seen.y * (DIRECTIONS / 4));
             const int from = low & (DIRECTIONS - 1), to = from + high - low;
             begin = turns[from];
@@ -148,20 +161,28 @@ kernel void meet_shapes(ARGUMENTS) {
             end[member] = all;
         }
         base[member] = begin - (all - pairs);
+        ones[member] = one;
+        sizes[member] = size;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        int apart_log = APART_LOG;
+        while (end[TEAM - 1] >> apart_log >= COARSE) ++apart_log;
+        for (int i = (all - pairs + (1 << apart_log) - 1) >> apart_log; i << apart_log < all; ++i)
+            owner_at[i] = (uchar)member;
         barrier(CLK_LOCAL_MEM_FENCE);
         pairs = end[TEAM - 1];
 #endif
         for (int pair = member; pair < pairs; pair += TEAM) {
             int shape = before, place = begin + pair;
 #if IN_TEAMS
-            int owner = 0;
-            for (int step = TEAM / 2; step > 0; step /= 2) owner += end[owner + step - 1] <= pair ? step : 0;
+            int owner = owner_at[pair >> apart_log];
+            while (end[owner] <= pair) ++owner;
+            one = ones[owner], size = sizes[owner];
             shape += owner;
             place = base[owner] + pair;
 #endif
             const int k = turns[DIRECTIONS + 1 + (place >= rays ? place - rays : place)];
             const real2 direction = ray_direction(sensor, ray[k]);
-            const real t = meet_shape(first + shape_at(crowd, shape), shape, crowd, cell, sensor, direction).x;
+            const real t = meet_shape(one, size, shape, crowd, direction).x;
 #if IN_TEAMS
             // The bits of numbers from 0 on grow with them.
             if (t < limit) atomic_min((volatile local int *)(nearest + k), as_int(t));

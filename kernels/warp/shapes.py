@@ -20,7 +20,7 @@ from .types import Crowd, Window, real, vec2, vec4
 
 DISC, BOX, SEGMENT = wp.constant(4), wp.constant(8), wp.constant(4)
 # Ranges of directions of a particle's sights, and of a table of beams.
-SIGHTS, DIRECTIONS = wp.constant(64), wp.constant(1024)
+SIGHTS, DIRECTIONS = wp.constant(64), wp.constant(4096)
 cell_at = reader(wp.vec2i)
 
 
@@ -198,22 +198,33 @@ def meet_segment(dx: real, dy: real, x: real, y: real, end_x: real, end_y: real)
 
 
 @wp.func
-def meet_shape(
-    shapes: wp.array(dtype=real), one: wp.int32, i: wp.int32, crowd: Crowd, cell: wp.vec2i, pose: vec4,
-    direction: vec2,
-):  # fmt: skip
-    """Return the same of shape i of a world, whose numbers begin at one."""
+def relative_shape(shapes: wp.array(dtype=real), one: wp.int32, i: wp.int32, crowd: Crowd, cell: wp.vec2i, pose: vec4):
+    """Return a shape's numbers relative to a pose, from the first four in its world."""
     four = four_at(shapes, one)
     x = (four[0] - real(cell.x)) - pose.x
     y = (four[1] - real(cell.y)) - pose.y
-    if i < crowd.discs:
-        return meet_disc(direction.x, direction.y, x, y, four[2])
     if i < crowd.discs + crowd.boxes:
+        return vec4(x, y, four[2], four[3])
+    return vec4(x, y, (four[2] - real(cell.x)) - pose.x, (four[3] - real(cell.y)) - pose.y)
+
+
+@wp.func
+def box_size(shapes: wp.array(dtype=real), one: wp.int32, i: wp.int32, crowd: Crowd):
+    """Return half the length and width of a box, 0 of other shapes."""
+    if i >= crowd.discs and i < crowd.discs + crowd.boxes:
         rest = four_at(shapes, one + 4)
-        return meet_box(direction.x, direction.y, x, y, four[2], four[3], rest[0], rest[1])
-    end_x = (four[2] - real(cell.x)) - pose.x
-    end_y = (four[3] - real(cell.y)) - pose.y
-    return meet_segment(direction.x, direction.y, x, y, end_x, end_y)
+        return vec2(rest[0], rest[1])
+    return vec2(ZERO, ZERO)
+
+
+@wp.func
+def meet_shape(one: vec4, size: vec2, i: wp.int32, crowd: Crowd, direction: vec2):
+    """Return the same of shape i of a world by its numbers relative to a pose."""
+    if i < crowd.discs:
+        return meet_disc(direction.x, direction.y, one.x, one.y, one.z)
+    if i < crowd.discs + crowd.boxes:
+        return meet_box(direction.x, direction.y, one.x, one.y, one.z, one.w, size.x, size.y)
+    return meet_segment(direction.x, direction.y, one.x, one.y, one.z, one.w)
 
 
 @wp.func
@@ -234,7 +245,9 @@ def nearest_shape(
         while left != wp.uint32(0):
             i = 32 * k + lowest_bit(left)
             left = left & (left - wp.uint32(1))
-            met = meet_shape(shapes, first + shape_at(crowd, i), i, crowd, cell, pose, direction)
+            one = first + shape_at(crowd, i)
+            size = box_size(shapes, one, i, crowd)
+            met = meet_shape(relative_shape(shapes, one, i, crowd, cell, pose), size, i, crowd, direction)
             if met.x < nearest.x:
                 nearest = met
     return nearest

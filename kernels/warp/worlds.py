@@ -20,8 +20,10 @@ from .shapes import (
     DISC,
     QUARTER,
     SIGHTS,
+    box_size,
     directions_of,
     meet_shape,
+    relative_shape,
     shape_at,
     shape_distance,
     sight_at,
@@ -49,11 +51,13 @@ _BY_TEAM = """
 {alone}
 #endif
 """
-_MEMORY = "__shared__ int memory[2 * {team} + {most}]; return (unsigned long long)(size_t)memory;"
+# A team's memory: ends and places of the members' pairs, their shapes, the least distance of each ray, the members that
+# have every so many pairs, and the logarithm of this number.
+_MEMORY = "__shared__ __align__(16) int memory[8 * {team} + {most} + 65]; return (unsigned long long)(size_t)memory;"
 _SHARE_PAIRS = """
 int *end = (int *)(size_t)memory;
 const int member = threadIdx.x;
-int all = pairs;
+int all = pairs, apart_log = 3;
 __syncthreads();
 end[member] = all;
 for (int apart = 1; apart < {team}; apart *= 2) {{
@@ -63,18 +67,34 @@ for (int apart = 1; apart < {team}; apart *= 2) {{
     end[member] = all;
 }}
 end[{team} + member] = begin - (all - pairs);
+*((float4 *)(end + 2 * {team}) + member) = make_float4(one.c[0], one.c[1], one.c[2], one.c[3]);
+*((float2 *)(end + 6 * {team}) + member) = make_float2(size.c[0], size.c[1]);
+__syncthreads();
+while (end[{team} - 1] >> apart_log >= 256) ++apart_log;
+unsigned char *owner_at = (unsigned char *)(end + 8 * {team} + {most});
+for (int i = (all - pairs + (1 << apart_log) - 1) >> apart_log; i << apart_log < all; ++i) owner_at[i] = member;
+if (member == 0) end[8 * {team} + {most} + 64] = apart_log;
 __syncthreads();
 return end[{team} - 1];
 """
-_PLACE_OF = """
+_OWNER_OF = """
 const int *end = (const int *)(size_t)memory;
-int owner = 0;
-for (int step = {team} / 2; step > 0; step /= 2) owner += end[owner + step - 1] <= pair ? step : 0;
-return wp::vec_t<2, int>(owner, end[{team} + owner] + pair);
+int owner = ((const unsigned char *)(end + 8 * {team} + {most}))[pair >> end[8 * {team} + {most} + 64]];
+while (end[owner] <= pair) ++owner;
+return owner;
 """
-_BEGIN_AT = "((float *)(size_t)memory)[2 * {team} + k] = t;"
-_KEEP_LEAST = "atomicMin((int *)(size_t)memory + 2 * {team} + k, __float_as_int(t));"
-_LEAST_AT = "return ((const float *)(size_t)memory)[2 * {team} + k];"
+_PLACE_OF = "return ((const int *)(size_t)memory)[{team} + owner] + pair;"
+_ONE_OF = """
+const float4 one = *((const float4 *)((const int *)(size_t)memory + 2 * {team}) + owner);
+return wp::vec_t<4, float>(one.x, one.y, one.z, one.w);
+"""
+_REST_OF = """
+const float2 rest = *((const float2 *)((const int *)(size_t)memory + 6 * {team}) + owner);
+return wp::vec_t<2, float>(rest.x, rest.y);
+"""
+_BEGIN_AT = "((float *)(size_t)memory)[8 * {team} + k] = t;"
+_KEEP_LEAST = "atomicMin((int *)(size_t)memory + 8 * {team} + k, __float_as_int(t));"
+_LEAST_AT = "return ((const float *)(size_t)memory)[8 * {team} + k];"
 
 
 @kernel
@@ -218,19 +238,34 @@ def by_team(shared, alone):
 def members() -> wp.int32: ...
 
 
-# Return the address of the memory: ends and places of the members' pairs, and the least distance of each ray.
+# Return the address of the memory.
 @wp.func_native(by_team(_MEMORY, "return 0;"))
 def team_memory() -> wp.uint64: ...
 
 
-# Share each member's pairs and the place of its first ray, and return the number of pairs of all.
+# Share each member's pairs, the place of its first ray and its shape, and return the number of pairs of all.
 @wp.func_native(by_team(_SHARE_PAIRS, "return pairs;"))
-def share_pairs(memory: wp.uint64, begin: wp.int32, pairs: wp.int32) -> wp.int32: ...
+def share_pairs(memory: wp.uint64, begin: wp.int32, pairs: wp.int32, one: vec4, size: vec2) -> wp.int32: ...
 
 
-# Return the member whose shape a pair has, and the place of its ray.
-@wp.func_native(by_team(_PLACE_OF, "return wp::vec_t<2, int>(0, begin + pair);"))
-def place_of(memory: wp.uint64, begin: wp.int32, pair: wp.int32) -> wp.vec2i: ...
+# Return the member whose shape a pair has.
+@wp.func_native(by_team(_OWNER_OF, "return 0;"))
+def owner_of(memory: wp.uint64, pair: wp.int32) -> wp.int32: ...
+
+
+# Return the place of a pair's ray.
+@wp.func_native(by_team(_PLACE_OF, "return begin + pair;"))
+def place_of(memory: wp.uint64, owner: wp.int32, begin: wp.int32, pair: wp.int32) -> wp.int32: ...
+
+
+# Return the first numbers of a member's shape.
+@wp.func_native(by_team(_ONE_OF, "return own;"))
+def one_of(memory: wp.uint64, owner: wp.int32, own: vec4) -> vec4: ...
+
+
+# Return the size of a member's box.
+@wp.func_native(by_team(_REST_OF, "return own;"))
+def size_of(memory: wp.uint64, owner: wp.int32, own: vec2) -> vec2: ...
 
 
 # Begin with a distance of a ray, whose place among all is i.
@@ -279,7 +314,12 @@ def meet_shapes(shapes, world, pose_cell, pose, ray, turns, ranges, particles, r
     while before < count:
         begin = int(0)
         pairs = int(0)
+        one = vec4()
+        size = vec2()
         if before + member < count:
+            at = first + shape_at(crowd, before + member)
+            one = relative_shape(shapes, at, before + member, crowd, cell, sensor)
+            size = box_size(shapes, at, before + member, crowd)
             heading = vec2(sensor.z, sensor.w)
             seen = directions_of(shapes, world, crowd, n, before + member, cell, sensor, heading)
             low = int(wp.floor(seen.x * EACH))
@@ -289,13 +329,15 @@ def meet_shapes(shapes, world, pose_cell, pose, ray, turns, ranges, particles, r
             begin = turn_at(turns, since)
             if high >= low:
                 pairs = turn_at(turns, (to & (DIRECTIONS - 1)) + 1) - begin + wp.where(to >= DIRECTIONS, rays, 0)
-        for pair in range(member, share_pairs(memory, begin, pairs), members()):
-            found = place_of(memory, begin, pair)
-            shape = before + found[0]
-            place = found[1]
+        for pair in range(member, share_pairs(memory, begin, pairs, one, size), members()):
+            owner = owner_of(memory, pair)
+            place = place_of(memory, owner, begin, pair)
             k = turn_at(turns, DIRECTIONS + 1 + wp.where(place >= rays, place - rays, place))
             direction = ray_direction(sensor, ray_at(ray, k))
-            t = meet_shape(shapes, first + shape_at(crowd, shape), shape, crowd, cell, sensor, direction).x
+            met = meet_shape(
+                one_of(memory, owner, one), size_of(memory, owner, size), before + owner, crowd, direction
+            )  # fmt: skip
+            t = met.x
             if t < limit:
                 keep_least(memory, ranges, n * rays + k, k, t)
         before += members()

@@ -83,11 +83,15 @@ ON_PURPOSE = [
     Purpose("raycast", "sectors_of", REFERENCE_ONLY, "SECTORS is a constant of the kernels"),
     Purpose("shapes", "particles_of_worlds", REFERENCE_ONLY, WORLD_BY_WORLD),
     Purpose(
-        "shapes", "seen_between directions_of_disc directions_of_segment sight_at shape_at meet_shape", KERNELS_ONLY,
+        "shapes",
+        "seen_between directions_of_disc directions_of_segment sight_at shape_at relative_shape box_size meet_shape",
+        KERNELS_ONLY,
         "a ray tests the shapes near its direction; in the reference it tests every shape",
     ),
     Purpose(
-        "worlds", "by_team members team_memory share_pairs place_of begin_at keep_least wait least_at", (WARP,),
+        "worlds",
+        "by_team members team_memory share_pairs owner_of place_of one_of size_of begin_at keep_least wait least_at",
+        (WARP,),
         "a kernel in OpenCL has its team's memory",
     ),
     Purpose("icp_step", "add_to_blocks close_blocks", KERNELS_ONLY, "points come one after another"),

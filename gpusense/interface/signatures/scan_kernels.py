@@ -204,7 +204,7 @@ KERNELS: dict[str, Kernel] = {
     ),
     "meet_shapes": kernel(
         "worlds", "item", "real shapes [crowd.stride]", "int2 world [2 * particles]", *POSES, "real2 ray [rays]",
-        "int turns [1025 + rays]", "out real ranges [particles * rays]", "int particles", "int rays", "real limit",
+        "int turns [4097 + rays]", "out real ranges [particles * rays]", "int particles", "int rays", "real limit",
         "Crowd crowd", team=64,
     ),
     "place_shapes": kernel(

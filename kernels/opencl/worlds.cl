@@ -99,12 +99,11 @@ kernel void find_sights(ARGUMENTS) {
         atomic_or(&sights[2 * sight_at(crowd, n, k) + i / 32], (int)(1u << (i % 32)));
 }
 
-// Work-items of a team, and most rays of which it finds the nearest shapes.
+// Work-items of a team, most rays of which it finds the nearest shapes, and most places of a table of the members to
+// which pairs belong, at least 2^APART_LOG pairs apart.
 #if IN_TEAMS
 #define TEAM 64
 #define MOST_RAYS 2048
-// Places of a table of the members that have every so many pairs, and the least number of pairs between them, as powers
-// of two.
 #define COARSE 256
 #define APART_LOG 3
 #else

@@ -51,8 +51,8 @@ _BY_TEAM = """
 {alone}
 #endif
 """
-# A team's memory: ends and places of the members' pairs, their shapes, the least distance of each ray, the members that
-# have every so many pairs, and the logarithm of this number.
+# A team's memory: ends and places of the members' pairs, their shapes, the least distance of each ray, a table of the
+# members to which pairs belong, 2^3 pairs or more apart, and the logarithm of their distance.
 _MEMORY = "__shared__ __align__(16) int memory[8 * {team} + {most} + 65]; return (unsigned long long)(size_t)memory;"
 _SHARE_PAIRS = """
 int *end = (int *)(size_t)memory;

@@ -147,7 +147,8 @@ def fail_in_every_call(name: str, backend: str, monkeypatch: pytest.MonkeyPatch)
     pf.correct(readings(pf, 3))
     after, count = everything(pf), [0]
     owners = [(one, call) for one in pf.models for call in ("start_scoring", "log_likelihood") if hasattr(one, call)]
-    for owner, call in (*owners, (Exchange, "start")):
+    exchanges = [(kind, "start") for kind in (Exchange, *Exchange.__subclasses__()) if "start" in vars(kind)]
+    for owner, call in (*owners, *exchanges):
         inner = getattr(owner, call)
 
         def failing(*arguments, inner=inner, **options):

@@ -155,6 +155,7 @@ def test_scans_with_readings_share_one_set_of_launches(kind, gpu, as_gpu, monkey
     launches(1)
     # Launches of at most 150 particles, three scans each.
     monkeypatch.setattr(chunking, "CHUNK", 150)
+    model = kind(GRID, SCANNER, backend=device)
     assert_as_one_by_one(model, poses, z)
     device.launches.clear()
     model.log_likelihood(poses[5:], z[5:])

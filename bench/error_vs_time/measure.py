@@ -41,12 +41,11 @@ SIZE = ["--particles", "10000", "--beams", "360", "--repeats", "15"]
 QUICK = ["--particles", "512", "--beams", "60", "--repeats", "3", "--checked", "64"]
 # Arguments that all points of a report share.
 ALIKE = ("particles", "checked", "beams", "repeats", "seconds", "seed", "build_limit")
-# Scenes to measure first.
-FIRST = ("building", "basement", "intel", "clutter", "willow", "spielberg")
-# Recorded maps by the names of their scenes: files below the folder in the variable GPUSENSE_DATA.
-MAPS = {
-    "basement": "ros_maps/basement_hallways_5cm.yaml", "spielberg": "ros_maps/Spielberg_map.yaml",
-    "willow": "ros_maps/willow-full.yaml", "intel": "carmen_logs/derived_maps/intel_even_05cm.yaml",
+# Scenes in their order, with the files of recorded maps below the folder in the variable GPUSENSE_DATA.
+SCENES = {
+    "building": "", "basement": "ros_maps/basement_hallways_5cm.yaml",
+    "intel": "carmen_logs/derived_maps/intel_even_05cm.yaml", "clutter": "", "willow": "ros_maps/willow-full.yaml",
+    "spielberg": "ros_maps/Spielberg_map.yaml",
 }  # fmt: skip
 
 
@@ -62,13 +61,9 @@ def plans_of(arguments: argparse.Namespace) -> tuple[list[Plan], dict[str, Any],
     if not arguments.no_peers:
         whole = replace(whole, candidates=[*whole.candidates, *(one for one in outside() if not one.missing)])
         absent += dict.fromkeys(f"{one.outside}: {one.missing}" for one in outside() if one.missing)
-    folder = Path(os.environ.get("GPUSENSE_DATA", ""))
-    known = {source.name: source for source in whole.sources}
-    known |= {name: MapSource(name, file, folder / file) for name, file in MAPS.items() if (folder / file).is_file()}
-    if unknown := set(arguments.scene or ()) - set(known):
-        raise ValueError(f"--scene: must be one of {', '.join(known)}, got {', '.join(unknown)}")
-    chosen = [known[name] for name in arguments.scene or known]
-    sources = sorted(chosen, key=lambda one: FIRST.index(one.name) if one.name in FIRST else len(FIRST))
+    folder, known = Path(os.environ.get("GPUSENSE_DATA", "")), {source.name: source for source in whole.sources}
+    known |= {name: MapSource(name, file, folder / file) for name, file in SCENES.items() if (folder / file).is_file()}
+    sources = [known[name] for name in SCENES if name in known and name in (arguments.scene or SCENES)]
     exact = [one for one in whole.candidates if one.exact and not one.outside]
     plans = [
         replace(whole, sources=[source], candidates=chosen, precisions=[precision])
@@ -155,7 +150,7 @@ def main() -> None:
     """Measure the needs and scenes, and write the reports."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--backend", action="append", required=True, help="selection string, repeatable")
-    parser.add_argument("--scene", action="append", help="scene of gpusense bench or of MAPS, repeatable; default: all")
+    parser.add_argument("--scene", action="append", choices=tuple(SCENES), help="repeatable; default: all")
     parser.add_argument("--no-tasks", action="store_true", help="without the report of needs.py")
     parser.add_argument("--no-models", action="store_true", help="without the report of gpusense bench")
     parser.add_argument("--quick", action="store_true", help="512 particles, 60 beams, to see whether all runs")

@@ -62,10 +62,7 @@ def chart(rows: Sequence[Row], need: str, devices: Sequence[str]) -> str:
         if not chosen:
             continue
         kept = best([row for row in chosen if not row.outside], measure)
-        marks = [
-            Mark(row.errors[measure], row.seconds, row.text, row.method, any(row is one for one in kept))
-            for row in chosen
-        ]
+        marks = [Mark(row.errors[measure], row.seconds, row.text, row.method, row in kept) for row in chosen]
         charts.append(Chart(device, f"{measure} [{chosen[0].units[measure]}]", marks))
     return drawing(charts)
 
@@ -109,11 +106,9 @@ def peers(rows: Sequence[Row]) -> list[str]:
         measure = SHOWN[need][0]
         for device in dict.fromkeys(row.device for row in outside if row.need == need):
             rivals = [row for row in outside if (row.need, row.device) == (need, device)]
-            reference = [
-                row for row in own(rows, need, device)
-                if row.precision == "float32" and (not row.setting or row.method in TABLES)
-            ]  # fmt: skip
-            for row in sorted([*rivals, *reference], key=lambda one: one.seconds):
+            single = [row for row in own(rows, need, device) if row.precision == "float32"]
+            rivals += [row for row in single if not row.setting or row.method in TABLES]
+            for row in sorted(rivals, key=lambda one: one.seconds):
                 rate = row.work / row.seconds / 1e6
                 error = value(row.errors[measure], row.units[measure]) + " nats" * (need != "rays")
                 lines.append((need, row.text, row.outside or "gpusense", f"{rate:.3g}", error, device))
@@ -130,10 +125,8 @@ def rivals(rows: Sequence[Row], need: str, of: str) -> list[str]:
         listed = [row for row in [*outside, *reference] if row.device == device and row.setting in settings]
         for row in sorted(listed, key=lambda one: (int(one.setting.split()[0]), one.seconds)):
             errors = [value(row.errors[name], "m") for name in SHOWN[need]]
-            whole = time_text(row.quartiles[1])
-            lines.append(
-                (row.method, row.setting, row.outside or "gpusense", time_text(row.seconds), whole, *errors, device)
-            )
+            times = time_text(row.seconds), time_text(row.quartiles[1])
+            lines.append((row.method, row.setting, row.outside or "gpusense", *times, *errors, device))
     columns = ("method", "setting", "version, threads", f"{of}, one core", "elapsed", *SHOWN[need], "processor")
     missing = "None in these reports; an [earlier run](../bench/results/other_programs.md) has some."
     return table(columns, lines, 3) if lines else [missing]

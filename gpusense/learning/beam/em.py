@@ -11,9 +11,6 @@ it is the expected inverse variance of a reading, the weight of its EM (Lange, L
 of both sides are nearly linear in log sigma and log lambda, so one Newton step of their difference is a good solution;
 without truncation it is exact and equals the book's. The step is halved until the log-likelihood does not fall: a
 generalised EM (Dempster, Laird and Rubin 1977, theorem 1).
-
-EM is slow if causes are hard to distinguish. The same pass over the pairs yields the observed information; once EM
-gains little, a Newton step of the log-likelihood is tried, and accepted if the log-likelihood rises.
 """
 
 from __future__ import annotations

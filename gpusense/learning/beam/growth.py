@@ -1,13 +1,8 @@
 """Fit the shape of hits, and the growth of their deviation with range, jointly with all other parameters.
 
-The shape alone is fitted on the device. Student's t is a normal with a random inverse variance. EM with its expected
-value, the weight of the shape, has the M-steps of a normal with weighted readings; as in ECME, the degrees of freedom
-move by Newton steps of the likelihood (Lange, Little and Taylor 1989; Liu and Rubin 1994, "The ECME algorithm").
-
-A correct range has the scale ``sigma_hit + sigma_growth z*``, but the device's sums have a single deviation. This
-search therefore computes the log p and gradient of every pair on the host in float64. Newton steps within bounds start
-from the normal fit without growth, with shares of its deviation turned into growth, and from the starts of the shape.
-No step lowers the likelihood.
+The shape alone is fitted on the device: EM has the M-steps of a normal with weighted readings, and the degrees of
+freedom move by Newton steps, as in ECME (Liu and Rubin 1994). Growth gives each reading a deviation, so its search
+computes log p and gradient of every pair on the host, in Newton steps within bounds. No step lowers the likelihood.
 """
 
 from __future__ import annotations

@@ -1,13 +1,8 @@
 """Search for the highest maximum: try several starts, and causes that a search dropped too early.
 
-A search may end at a lower maximum, or drive the weight of a cause to 0, from where no small step leads back. Three
-checks follow each search from an automatic start:
-
-- An unused start whose likelihood exceeds the end of the search begins another search.
-- A cause of weight 0 gets the weight of a hundredth of a reading, with each shape of a coarse list. If it then accounts
-  for more than this, the likelihood rises with its weight (it is concave in the weight), and the search continues with
-  this cause: Lindsay's condition of optimality (1983) for the components of a mixture.
-- The status counts searches that end lower.
+A cause of weight 0 gets the weight of a hundredth of a reading, with each shape of a coarse list. If it then accounts
+for more than this, the likelihood rises with its weight (Lindsay 1983), and the search continues with this cause. See
+docs/learning.md, "Several maxima".
 """
 
 from __future__ import annotations

@@ -1,14 +1,7 @@
 """Build the user's result from the end of a search: parameters, standard errors and status.
 
-Errors within a scan and between neighbouring scans are correlated. The inverse of the observed information H then is
-not the covariance of the parameters. For independent blocks with gradients G_b of the log-likelihood, the covariance is
-
-    H^-1 (sum_b G_b G_b') H^-1,
-
-even if the mixture is not the true distribution. The sum is centred and multiplied by B / (B - 1).
-
-Source: White (1982), "Maximum likelihood estimation of misspecified models"; Liang and Zeger (1986), "Longitudinal data
-analysis using generalized linear models".
+Standard errors over B blocks with gradients G_b follow from ``H^-1 (sum_b G_b G_b') H^-1`` with the observed
+information H. The sum is centred and multiplied by B / (B - 1). Sources and reasons: docs/learning.md.
 """
 
 from __future__ import annotations

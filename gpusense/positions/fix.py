@@ -134,10 +134,8 @@ def two_circles(
 ) -> tuple[Complexes, Words]:
     """Intersect pairs of circles ("Distances Only, No Uncertainty").
 
-    With the beacons at 0 and a on the x axis, x = (a^2 + d1^2 - d2^2) / 2a and y = +-sqrt(d1^2 - x^2). These formulas
-    lose digits for flat triangles of beacons and robot. Here x counts from the beacon with the smaller range, as ((a -
-    d2)(a + d2) + d1^2) / 2a, and y is the height of the triangle, 2 area / a, with Kahan's area ("Miscalculating Area
-    and Angles of a Needle-like Triangle", 2014), which subtracts only the sides.
+    x counts from the beacon with the smaller range, and y is the height of the triangle by Kahan's area
+    ("Miscalculating Area and Angles of a Needle-like Triangle", 2014): both keep digits in flat triangles.
 
     ``share`` of a gap between circles belongs to the first one; ``noise`` is the rounding error of coordinates, a
     length.

@@ -1,6 +1,6 @@
 """Fit the shape of hits, and the growth of their deviation with range, jointly with all other parameters.
 
-The shape alone is fitted on the device: EM has the M-steps of a normal with weighted readings, and the degrees of
+The shape alone is fitted on the device: EM takes the M-steps of a normal with weighted readings, and the degrees of
 freedom move by Newton steps, as in ECME (Liu and Rubin 1994). Growth gives each reading a deviation, so its search
 computes log p and gradient of every pair on the host, in Newton steps within bounds. No step lowers the likelihood.
 """

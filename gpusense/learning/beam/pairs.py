@@ -104,7 +104,7 @@ def make_pairs(
 
 
 def range_resolution(reading: NDArray[np.floating]) -> float:
-    """Estimate the rounding step of readings, whose gaps are its multiples but for a few ulp; 0 without one."""
+    """Estimate the rounding step of readings, 0 without one: their gaps are its multiples, but for a few ulp."""
     sample = reading[:: max(1, len(reading) // _SAMPLE)]
     distinct = np.unique(sample).astype(np.float64)
     if len(distinct) < 2 or len(distinct) == len(sample):

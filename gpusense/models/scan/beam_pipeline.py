@@ -134,8 +134,9 @@ class BeamPipeline(ScanPipeline):
     def score_launches(self, scoring: ScanLaunch) -> Program:
         placed, readings, parts, caster = scoring.placed, scoring.readings, self.parts(scoring), self.caster
         window, count = placed.frame.window, placed.count
+        normals = caster.normals(window) if "INCIDENCE" in self.cones.flags else None
         common = dict(
-            map_table=scoring.table, normals=caster.normals(window, self.cones.flags), pose_cell=placed.cell,
+            map_table=scoring.table, normals=normals, pose_cell=placed.cell,
             pose=placed.pose, window=window, particles=count, rays=readings.rays, readings=readings.readings,
             parts=parts.buffer, caster=caster.method.struct(), scale=caster.scale, batch=scoring.batch,
             **placed.places(), **self._constants, **readings.arguments,

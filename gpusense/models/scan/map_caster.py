@@ -154,10 +154,8 @@ class MapCaster:
         """Bytes of the map's tables on the device."""
         return self._table_bytes + (0 if self._normals is None else self._normals[2])
 
-    def normals(self, window: Window, flags: frozenset[str]) -> Buffer | None:
-        """Return the normals of the walls in a window, where flags need them, else None; made once for a window."""
-        if "INCIDENCE" not in flags:
-            return None
+    def normals(self, window: Window) -> Buffer:
+        """Return the normals of the walls in a window, made once for a window."""
         if self._worlds is not None:
             from gpusense.tables.normals import normals_of_worlds
 
@@ -325,7 +323,7 @@ class MapCaster:
         ranges: Buffer, incidence: Buffer,
     ) -> None:  # fmt: skip
         """Cast the rays of placed poses to ranges and, with INCIDENCE, angles of incidence; repeat kept programs."""
-        normals = self.normals(state.window, cones.flags)
+        normals = self.normals(state.window) if "INCIDENCE" in cones.flags else None
         changing = dict(poses=placed.source, ranges=ranges, incidence=incidence, normals=normals)
         if placed.inside is not None:
             changing |= placed.changing()

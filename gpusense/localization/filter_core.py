@@ -109,12 +109,12 @@ class FilterCore:
             particles = tracker.moved_particles()
             if is_together(tracker.mean_and_covariance()[1]):
                 used = skipped(self.sensors, used, particles, verdict.anywhere(), share)
-        for learner in self._learners:
-            if learner.lessons:
-                learner.receive()
         judged = verdict.expected(used, tracker.progress.motion)
         tracker.weigh(used, judged=judged, meanwhile=functools.partial(self._use_wait, everything))
         tracker.learn(used, self.recovery.is_doubted)
+        for learner in self._learners:
+            if learner.lessons:
+                learner.exchange()
         self.recovery.corrected(used, self.last)
 
     def _use_wait(self, readings: dict[int, tuple[Any, ...]]) -> None:

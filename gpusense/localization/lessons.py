@@ -1,10 +1,10 @@
 """Learn the temperature of a scan sensor from lessons: scans at the estimated pose, spread over several corrections.
 
-A correction that begins a lesson only keeps its scan and estimate. In later corrections, while the device works on the
-step, the host first starts the terms of the readings at poses around the estimate, behind the launches of the step,
-then computes their scores in three parts, and then adds them to the correlation. A correction does one part of the
-oldest lesson. The first scans are all lessons; then a correction ends one and starts the next. A lesson therefore ends
-a fixed number of corrections later on every device.
+A correction that begins a lesson only keeps its scan and estimate. The next one, or the same one among the first scans,
+starts the terms of the readings at poses around the estimate, once the device has ended the step. Another one reads
+them. In later corrections, while the device works on the step, the host places the terms, chooses beams, adds up their
+scores, fits, and learns: one part of the oldest lesson per correction, or all parts among the first scans, which are
+all lessons. A lesson ends a fixed number of corrections later on every device.
 """
 
 from __future__ import annotations
@@ -15,15 +15,16 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from gpusense.backends.base import Exchange
 from gpusense.backends.workspace import Packed
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around, scores_of
+from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around, scores_of, sums_of
 from gpusense.models.scan.model import ScanModel
 
 _DOUBLE = np.dtype(np.float64)
 # Number of poses of a lesson; its stages.
 _POSES = 7
-_KEPT, _STARTED, _PLACED, _SUMMED, _SCORED, _LEARNED = range(6)
+_KEPT, _STARTED, _RECEIVED, _PLACED, _CHOSEN, _SUMMED, _SCORED, _LEARNED = range(8)
 
 
 class Lesson(NamedTuple):
@@ -32,9 +33,10 @@ class Lesson(NamedTuple):
     pose: np.ndarray  # (3,) estimate
     axes: np.ndarray  # (3, 3) steps to the poses around it
     ranges: np.ndarray | None  # (K,) readings; None if the host has computed the terms
+    scan: int  # number of the scan
     follows: bool  # whether the scan directly follows the previous lesson
     stage: int = _KEPT
-    # Terms of the readings as the device writes them, then (7, K) terms, then their sums and scores.
+    # Terms of the readings as the device writes them, then (7, K) terms, then chosen beams, their sums and scores.
     result: Any = None
 
 
@@ -51,9 +53,8 @@ class Learner:
         # Number of scans, and the number of the last lesson's scan.
         self.seen, self.learned = 0, -1
         self.lessons: tuple[Lesson, ...] = ()
-        # The recording that scores readings, and its exchange, once a lesson needs them; the last started lesson that
-        # was received, and its terms.
-        self._ready: Any = None
+        # The exchange of the last started lesson; the last lesson that was received, and its terms.
+        self._exchange: Exchange | None = None
         self._received: tuple[Lesson | None, Any] = None, None
 
     @property
@@ -70,7 +71,7 @@ class Learner:
     def count(self) -> bool:
         """Count a scan; return whether it is due as a lesson: each of the first, then two in 25."""
         self.seen += 1
-        return self.seen <= DEFAULTS.calibrations or self.seen % 25 <= 1
+        return self._is_early or self.seen % 25 <= 1
 
     def begin(
         self, pose: np.ndarray, covariance: np.ndarray, reading: tuple[Any, ...], ranges: np.ndarray | None
@@ -84,55 +85,76 @@ class Learner:
             around = poses_around(pose, axes)
             terms = np.asarray(self._model.log_likelihood(around, *reading, per_beam=True)[1], np.float64)
         stage = _KEPT if terms is None else _PLACED
-        lesson = Lesson(pose, axes, ranges, self.learned == self.seen - 1, stage, terms)
+        lesson = Lesson(pose, axes, ranges, self.seen, self.learned == self.seen - 1, stage, terms)
         self.lessons = *self.lessons, lesson
         self.learned = self.seen
 
     def receive(self) -> None:
-        """Complete the terms of a started lesson, and let the program of the next one follow changes of the map."""
-        may_start = 2 if self.seen <= DEFAULTS.calibrations else 1
-        for number, lesson in enumerate(self.lessons[:may_start]):
-            if lesson.stage == _KEPT:
-                self._ready = self._bound[1].exchange(self._bound[0])
-                return
-            if lesson.stage == _STARTED and lesson.result is None:
-                # A repeated correction needs them again, after another lesson has used the exchange.
-                if self._received[0] is not lesson:
-                    self._received = lesson, self._ready[1].finish()
-                received = lesson._replace(result=self._received[1])
-                self.lessons = *self.lessons[:number], received, *self.lessons[number + 1 :]
+        """Wait for the terms of a started lesson."""
+        self.lessons = tuple([self._with_terms(one) if one.stage == _STARTED else one for one in self.lessons])
+
+    def _with_terms(self, lesson: Lesson) -> Lesson:
+        """Return a started lesson with its terms."""
+        if lesson.result is not None:
+            return lesson
+        # A repeated correction needs them again, after another lesson has used the exchange.
+        if self._received[0] is not lesson and self._exchange is not None:
+            self._received = lesson, self._exchange.finish()
+        return lesson._replace(result=self._received[1])
+
+    def exchange(self) -> None:
+        """Read the terms of a started lesson, and start those of the next; the device has ended the step.
+
+        A lesson that has just begun waits for the next correction, except among the first scans.
+        """
+        lessons = list(self.lessons)
+        for place, lesson in enumerate(lessons):
+            if lesson.stage == _STARTED:
+                lessons[place] = self._with_terms(lesson)._replace(stage=_RECEIVED)
+            elif lesson.stage == _KEPT and (self._is_early or lesson.scan < self.seen):
+                lessons[place] = self._started(lesson)
+                break
+        self.lessons = tuple(lessons)
+
+    @property
+    def _is_early(self) -> bool:
+        """Return whether the last scan is among the first, which are all lessons."""
+        return self.seen <= DEFAULTS.calibrations
+
+    def _started(self, lesson: Lesson) -> Lesson:
+        """Start the terms of a lesson."""
+        inputs, call = self._bound
+        recording, self._exchange = call.exchange(inputs)
+        given, (poses, ranges) = self._exchange.begin(), inputs.spans
+        given[poses], given[ranges] = poses_around(lesson.pose, lesson.axes).reshape(-1), lesson.ranges
+        self._exchange.start(recording)
+        return lesson._replace(stage=_STARTED)
 
     def work(self, *, doubted: bool) -> None:
-        """Continue the oldest lesson, or end and start lessons of the first scans; drop all if scans are doubted."""
+        """Do the next part of the oldest lesson, or all parts among the first scans; drop all if scans are doubted."""
         if doubted:
             self.lessons, self.learned = (), -1
             return
         first, *rest = self.lessons
-        if first.stage == _KEPT or self.seen > DEFAULTS.calibrations:
-            first = self._advanced(first)
-        else:
-            while first.stage < _LEARNED:
-                first = self._advanced(first)
-            rest[:1] = [self._advanced(one) for one in rest[:1] if one.stage == _KEPT] or rest[:1]
+        parts = _LEARNED if self._is_early else 1
+        while parts and _RECEIVED <= first.stage < _LEARNED:
+            first, parts = self._advanced(first), parts - 1
         self.lessons = tuple(rest if first.stage == _LEARNED else [first, *rest])
 
     def _advanced(self, lesson: Lesson) -> Lesson:
-        """Return a lesson after its next stage; the device completes started terms before it is idle."""
+        """Return a received lesson after its next part."""
         result, stage = lesson.result, lesson.stage
-        if stage == _KEPT:
-            (recording, exchange), (poses, ranges) = self._ready, self._bound[0].spans
-            given = exchange.begin()
-            given[poses], given[ranges] = poses_around(lesson.pose, lesson.axes).reshape(-1), lesson.ranges
-            exchange.start(recording)
-        elif stage == _STARTED:
+        if stage == _RECEIVED:
             result = self._bound[1].terms(result, lesson.ranges)
         elif stage == _SUMMED:
             result = None if result is None else scores_of(result)
+        elif stage == _CHOSEN:
+            result = None if result is None else sums_of(*result)
         else:
             # A new object, since the correlation is part of the state.
             self.correlation = copy.copy(self.correlation)
             if stage == _PLACED:
-                result = self.correlation.summed(result, self._model.scanner.bearings + lesson.pose[2])
+                result = self.correlation.chosen(result, self._model.scanner.bearings + lesson.pose[2])
             else:
                 self.correlation.learn(result, lesson.axes, follows=lesson.follows)
         return lesson._replace(stage=stage + 1, result=result)

@@ -105,7 +105,7 @@ class Scores(NamedTuple):
     seen: np.ndarray  # (A,) whether a sector has beams
 
 
-def _summed(parts: np.ndarray, sector: np.ndarray, sectors: int) -> ScoreSums:
+def sums_of(parts: np.ndarray, sector: np.ndarray, sectors: int) -> ScoreSums:
     """Return the sums of scores of (7, K) log-likelihoods of used beams, by the sector (K,) of each beam."""
     beams = parts.shape[1]
     at, *around = parts.sum(axis=1).tolist()
@@ -186,12 +186,12 @@ class BeamCorrelation:
         Beams with 0 or a non-finite value are ignored. Directions (K,) in the world [rad] serve to compare a scan with
         the previous one if it ``follows`` directly.
         """
-        sums = self.summed(parts, directions)
+        chosen = self.chosen(parts, directions)
         steps = checks.array("axes", axes, (3, 3))
-        self.learn(None if sums is None else scores_of(sums), steps, follows=follows)
+        self.learn(None if chosen is None else scores_of(sums_of(*chosen)), steps, follows=follows)
 
-    def summed(self, parts: AnyArray, directions: AnyArray | None = None) -> ScoreSums | None:
-        """Return the sums of a scan's scores, as for :meth:`add`; None of too few beams."""
+    def chosen(self, parts: AnyArray, directions: AnyArray | None = None) -> tuple[np.ndarray, np.ndarray, int] | None:
+        """Return what ``sums_of`` needs of a scan, as for :meth:`add`; None of too few beams."""
         values = checks.array("parts", parts, (7, "K"), finite=False)
         used = np.isfinite(values).all(axis=0) & values.any(axis=0)
         count, around, sector = int(np.count_nonzero(used)), 0, used
@@ -202,7 +202,7 @@ class BeamCorrelation:
             around = self._around
         if count < len(used):
             values, sector = values[:, used], sector[used]
-        return _summed(values, sector, around)
+        return values, sector, around
 
     def learn(self, scores: Scores | None, axes: np.ndarray, *, follows: bool = True) -> None:
         """Add the scores of a scan with (3, 3) axes."""

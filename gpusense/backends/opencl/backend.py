@@ -8,6 +8,7 @@ import os
 import struct
 import threading
 import time
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -30,7 +31,7 @@ from gpusense.backends.opencl.memory import (
 from gpusense.backends.opencl.programs import BoundLaunch, OpenCLRecording, Programs, new_kernel, without_caches
 from gpusense.backends.processor import Staging
 from gpusense.backends.recycled import ResultMemory
-from gpusense.interface import structs
+from gpusense.interface import launches, structs
 from gpusense.interface.launches import Program
 from gpusense.interface.signatures import KERNELS, Argument, Kernel, lanes_of, team_of
 from gpusense.interface.sources import assemble, relevant, uses_double
@@ -68,6 +69,8 @@ class OpenCLBackend(ProcessBound, Backend):
         self._queued = self._ended = 0
         self.alignment = memory.alignment_of(device)
         self._launchers: dict[tuple[str, frozenset[str]], Launch] = {}
+        # Launches of recordings that are alive; each keeps its arguments alive, so their identities stay unique.
+        self._launches = weakref.WeakValueDictionary[tuple[object, ...], BoundLaunch]()
         self.programs = Programs(info, device, self._context)
         self._pocl = self.programs.pocl
         # The last launch, if its groups leave a processor to the calling thread.
@@ -183,8 +186,16 @@ class OpenCLBackend(ProcessBound, Backend):
         return self.info.kind == "gpu"
 
     def record(self, program: Program) -> OpenCLRecording:
-        launches = [self.compile(one.kernel, one.flags).bind(one.size, one.arguments) for one in program]
-        return OpenCLRecording(self._queue, launches, self._counted)
+        return OpenCLRecording(self._queue, [self._bound(one) for one in program], self._counted)
+
+    def _bound(self, one: launches.Launch) -> BoundLaunch:
+        """Return a launch with its arguments set; recordings share equal ones, since a driver takes up to 1 ms each."""
+        arguments = [value if isinstance(value, (int, float, tuple)) else id(value) for value in one.arguments]
+        key = one.kernel, one.flags, one.size, *arguments
+        bound = self._launches.get(key)
+        if bound is None:
+            bound = self._launches[key] = self.compile(one.kernel, one.flags).bind(one.size, one.arguments)
+        return bound
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launch:
         if os.getpid() != self._process:

@@ -93,7 +93,8 @@ class FilterCore:
     def follow(self, motion: SampledMotion) -> None:
         """Move the particles and their rival."""
         self.tracker.follow(motion)
-        self.recovery.follow(motion)
+        if (rival := self.recovery.active) is not None:
+            rival.follow(motion)
 
     def correct(self, readings: Any) -> None:
         """Weigh the particles by readings; see ``ParticleFilter.correct``."""
@@ -181,12 +182,13 @@ class FilterCore:
         tracker = self.tracker
         for learner in self._learners:
             learner.receive()
+        contents, mine = tracker.state()
         memory = {
-            "tracker": plain_state(tracker), "verdict": plain_state(self.verdict), "recovery": self.recovery.state(),
+            "tracker": mine, "verdict": plain_state(self.verdict), "recovery": self.recovery.state(),
             "learners": [plain_state(learner) for learner in self._learners],
             "readings": {index: tuple(map(self._on_host, reading)) for index, reading in self.last.items()},
         }  # fmt: skip
-        return tracker.cloud.contents(tracker.shown), memory
+        return contents, memory
 
     def _on_host(self, part: Any) -> Any:
         """Return a part of a reading in host memory."""
@@ -195,8 +197,7 @@ class FilterCore:
 
     def restore(self, contents: Contents, memory: Mapping[str, Any]) -> None:
         """Take over particles and memory."""
-        self.tracker.cloud.restore(contents)
-        set_state(self.tracker, memory["tracker"])
+        self.tracker.restore(contents, memory["tracker"])
         set_state(self.verdict, memory["verdict"])
         for learner, values in zip(self._learners, memory["learners"], strict=True):
             set_state(learner, values)

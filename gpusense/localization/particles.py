@@ -153,21 +153,19 @@ class Particles:
         return self.sums.launch("move_particles", self.count, source=self.poses[origin], settings=self.settings,
                                 target=self.poses[target], particles=self.count, kind=kind)  # fmt: skip
 
-    def sizes(self) -> dict[str, int]:
-        """Return the numbers of particles by the names of arguments."""
-        return dict(particles=self.count, block=self.block)
-
     def numbers(self, stage: Stage) -> dict[str, Any]:
         """Return the arguments of launches for weights, by name."""
-        return dict(score=self.score, before=self.weights[stage.before], settings=self.settings,
-                    state=self.states[stage.state], blocks=self.blocks, **self.sizes())  # fmt: skip
+        return dict(
+            score=self.score, before=self.weights[stage.before], settings=self.settings, block=self.block,
+            state=self.states[stage.state], blocks=self.blocks, particles=self.count,
+        )  # fmt: skip
 
     def scoring(self, sensors: int) -> Program:
         """Return the launches that add up the log-likelihoods of sensors."""
         flags = flags_if(FLOAT64=self.precision == np.float64)
         return tuple(
             launch("add_scores", flags, (self.blocks,), log_p=log_p, settings=self.settings, score=self.score,
-                   largest=self.sums.largest, sensor=sensor, **self.sizes())
+                   largest=self.sums.largest, sensor=sensor, particles=self.count, block=self.block)
             for sensor, log_p in enumerate(self.log_p[:sensors])
         )  # fmt: skip
 

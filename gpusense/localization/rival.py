@@ -119,10 +119,9 @@ class Rival:
         self._ratios, self._place, self._last = np.zeros(3), np.zeros(3), {}
         return ratio
 
-    def predict(self, motion: SampledMotion) -> None:
+    def follow(self, motion: SampledMotion) -> None:
         """Move the rival."""
-        if self.active:
-            self._tracker.follow(motion)
+        self._tracker.follow(motion)
 
     def correct(self, readings: list[SensorReadings], evidence: float, pose: np.ndarray) -> None:
         """Correct the rival, and compare it with particles at a (3,) pose by the log evidence of both."""
@@ -230,11 +229,6 @@ class Recovery:
     def expect_anywhere(self) -> None:
         """Compare the pose with other places after convergence."""
         self.everywhere = COMPARISONS
-
-    def follow(self, motion: SampledMotion) -> None:
-        """Move the rival."""
-        if self.rival is not None:
-            self.rival.predict(motion)
 
     def is_doubted(self) -> bool:
         """Return whether the last judged scans contradict the pose, or a rival competes with it."""

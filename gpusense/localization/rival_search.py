@@ -85,7 +85,7 @@ class RivalSearch:
         for index, reading in readings:
             sensor = self._sensors[index]
             share = float(sensor.temperature(temperature))
-            score += share * np.asarray(sensor.log_likelihood(judged, reading), np.float64)
+            score += share * np.asarray(sensor.model.log_likelihood(judged, *reading), np.float64)
             beams += share * sensor.beams
         score, reached = score[:-1], float(score[-1])
         if not on_map:

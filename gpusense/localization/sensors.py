@@ -84,10 +84,6 @@ class Sensor:
         """Return (N, K) log-likelihoods of the beams of a scan, in float64."""
         return np.asarray(self.model.log_likelihood(poses, *reading, per_beam=True)[1], np.float64)
 
-    def log_likelihood(self, poses: Any, reading: tuple[Any, ...]) -> Any:
-        """Return the log-likelihoods of poses."""
-        return self.model.log_likelihood(poses, *reading)
-
     def score(
         self,
         poses: Any,

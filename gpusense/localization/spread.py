@@ -200,7 +200,7 @@ def distances_by_scan(sensors: Sequence[Sensor], readings: Mapping[int, tuple[An
                 every = max(sensor.beams // _BEAMS, 1)
                 reading = (np.where(np.arange(sensor.beams) % every == 0, reading[0], np.nan), *reading[1:])
             temperature = min(every * sensor.temperature("auto"), 1.0)
-            log_p += temperature * np.asarray(sensor.log_likelihood(poses, reading), np.float64)
+            log_p += temperature * np.asarray(sensor.model.log_likelihood(poses, *reading), np.float64)
         best = log_p.max()
         likelihood = np.exp(log_p - best) if math.isfinite(best) else np.ones(_AROUND)
         return poses, np.asarray(likelihood * far**1.5 * np.abs(turn))

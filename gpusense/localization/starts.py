@@ -150,7 +150,7 @@ def likeliest(
     score = np.zeros(len(tries))
     for index, reading in readings.items():
         sensor = sensors[index]
-        score += sensor.temperature(temperature) * sensor.log_likelihood(tries, reading)
+        score += sensor.temperature(temperature) * sensor.model.log_likelihood(tries, *reading)
     with np.errstate(invalid="ignore"):
         return np.asarray(tries[np.argsort(-score, kind="stable")[: max(_replaced(particles) // _SHARE, 1)]])
 

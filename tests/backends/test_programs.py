@@ -167,3 +167,18 @@ def test_a_held_array_is_copied_once_for_each_key_and_again_after_an_error():
     assert held(2) == 2 and copied == [2, 3, 2, 2]
     space.release()
     assert held(2) == 2 and len(copied) == 5
+
+
+def test_recordings_of_opencl_share_equal_launches_while_one_is_alive(needs):
+    """A kernel object with its arguments set takes a driver up to 1 ms."""
+    device = get_backend(needs("opencl"))
+    source, target = device.upload(np.arange(4.0)), device.empty(4, REAL)
+    both = program(device, source, target, 4) + program(device, source, target, 2)
+    first, second = device.record(both), device.record(both[:1])
+    assert second._launches[0] is first._launches[0] is not first._launches[1]
+    second()
+    np.testing.assert_array_equal(device.download(target, np.empty(4)), np.arange(4.0))
+    kept = weakref.ref(first._launches[1])
+    del first
+    gc.collect()
+    assert kept() is None and device.record(both[1:])._launches[0] is not None

@@ -181,6 +181,21 @@ def test_corrections_judge_the_pose_that_each_step_asks_for(backend, monkeypatch
         assert many == 10 and few <= 5
 
 
+def test_a_robot_that_crosses_a_long_map_repeats_its_recordings(warp_as_gpu):
+    grid = gs.OccupancyGrid(np.pad(np.zeros((20, 400), int), 2, constant_values=100), resolution=0.1)
+    scanner = gs.Scanner(SCANNER.bearings, range_max=2.0)
+    caster, pose = gs.RayCaster(grid, range_max=2.0, backend="numpy"), np.array([1.0, 1.2, 0.0])
+    pf = gs.ParticleFilter(gs.LikelihoodFieldModel(grid, scanner, backend="warp:cpu"), particles=100, temperature=0.2)
+    pf.initialize(mean=pose, covariance=np.diag([0.01, 0.01, 0.003]))
+    for _ in range(30):
+        pose[0] += 0.6
+        pf.predict((0, 0, 0), (0.6, 0, 0))
+        pf.correct(caster.cast(pose[None], scanner.bearings)[0])
+        assert abs(pf.estimate().pose[1] - 1.2) < 0.2
+    # The last part of a key is the map on the device; the first corrections have none.
+    assert len({key[-1] for key, _ in pf._cloud._recordings.items()}) == 2
+
+
 @pytest.mark.long
 def test_a_gpu_has_the_particles_of_a_processor(needs, monkeypatch):
     def run():

@@ -9,7 +9,9 @@ import pytest
 from scipy.signal import lfilter
 
 import gpusense as gs
+from gpusense.localization import lessons
 from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around
+from gpusense.models.scan.bound import RecordedCall
 
 HALF = np.array([3.0, 2.0])
 # For 40 scans with four blocks, F_4 has a standard deviation of 0.15, and F_4 / F_16 of 0.2, weighted up to three
@@ -162,6 +164,31 @@ def test_a_filter_learns_from_each_scanner_while_its_particles_lie_together():
         assert all(sensor.learner.correlation.repeat > 0.5 for sensor in one._sensors)
     assert pf.temperatures == copied.temperatures
     assert np.array_equal(*(one._sensors[1].learner.correlation._means for one in (pf, copied)))
+
+
+def test_a_correction_after_the_first_scans_does_one_part_of_a_lesson(monkeypatch):
+    grid = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
+    scanner = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.1, count=60, range_max=10.0)
+    pose, parts = np.array([3.0, 2.5, 0.4]), []
+    ranges = gs.RayCaster(grid, range_max=10.0, backend="numpy").cast(pose[None], scanner.bearings)[0]
+    for owner, name in (
+        (RecordedCall, "terms"), (BeamCorrelation, "chosen"), (lessons, "sums_of"), (lessons, "scores_of"),
+        (BeamCorrelation, "learn"),
+    ):  # fmt: skip
+        inner = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda *a, _i=inner, _n=name, **k: (parts.append(_n), _i(*a, **k))[1])
+    pf = gs.ParticleFilter(gs.LikelihoodFieldModel(grid, scanner, backend="numpy"), particles=100, seed=1)
+    pf.initialize(mean=pose, covariance=np.diag([1e-3, 1e-3, 1e-4]))
+    done = []
+    for _ in range(100):
+        parts.clear()
+        pf.correct(ranges)
+        pf.predict((0, 0, 0), (0, 0, 0))
+        done.append([*parts])
+    order = ["terms", "chosen", "sums_of", "scores_of", "learn"]
+    assert done[40] == order and max(map(len, done[62:])) == 1
+    # Scans 75, 76 and 100 are lessons.
+    assert [name for step in done[74:] for name in step] == 2 * order
 
 
 @pytest.mark.parametrize("scans", [5, 20])

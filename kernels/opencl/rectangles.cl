@@ -132,61 +132,59 @@ kernel void rectangles_scan(ARGUMENTS) {
     const int sector = get_global_id(1) % sectors, tile = get_global_id(1) / sectors;
     const int col = reach_begin(dx, left) + get_global_id(0), begin = reach_begin(dy, top) + tall * tile;
     const int end = min(begin + tall, reach_end(dy, bottom, rows));
-    if (col >= reach_end(dx, right, cols) || w >= worlds) return;
-    global const uchar *column = runs + ((long)(quadrant & 1) * band * worlds + w) * cols + col;
+    if (col >= reach_end(dx, right, cols) || w >= worlds || begin >= end) return;
     global ushort *out = rectangles + (long)place[w] * 4 * sectors;
     out += (long)(quadrant * sectors + sector) * lines * (cols + 2);
     const int2 middle = slope(sectors, sector);
-    const long line = (long)worlds * cols, step = dy * line;
+    const long step = dy * (long)worlds * cols;
     // x * inverse >> 16 is x / middle.y for x up to 4000.
     const int inverse = 65536 / middle.y + 1;
     int height = 0, width = LONGEST, narrower = 0, bound = 0, wider = LONGEST, nearer = 0, filled = 0;
+    int row = dy > 0 ? end - 1 : begin, room = min(dy > 0 ? rows - row : row + 1, LONGEST);
+    global const uchar *run = runs + (((long)(quadrant & 1) * band + row - first) * worlds + w) * cols + col;
     ulong four = 0;
-    for (int i = 0; i < end - begin; ++i) {
-        const int row = dy > 0 ? end - 1 - i : begin + i, room = min(dy > 0 ? rows - row : row + 1, LONGEST);
-        global const uchar *run = column + (row - first) * line;
-        if (i == 0) {
-            for (;;) {
-                narrower = height < room ? min(width, (int)run[height * step]) : 0;
-                if (narrower * middle.x < (height + 1) * middle.y) break;
-                if (narrower < width) wider = width, nearer = bound, bound = height;
-                width = narrower;
-                ++height;
-            }
-        } else {
-            const int here = run[0], least = min(here, width);
-            const int higher = height < room && least * middle.x >= (height + 1) * middle.y;
-            bound = here <= width ? 0 : bound + 1;
-            nearer = here <= wider ? 0 : nearer + 1;
-            wider = here <= width ? LONGEST : min(here, wider);
-            height = higher ? height + 1 : min(height, here * middle.x * inverse >> 16);
-            narrower = height == room ? 0 : higher ? min(here, narrower) : least;
-            width = height > 0 ? least : LONGEST;
-            if (height > 0 && bound >= height) {
-                width = wider, bound = nearer, wider = -1;
-                if (width < 0 || bound >= height) {
-                    width = LONGEST, bound = 0, wider = LONGEST;
-                    for (int j = 0; j < height; ++j) {
-                        const int other = run[j * step];
-                        if (other < width) wider = width, nearer = bound, width = other, bound = j;
-                    }
-                }
-            }
-        }
+    for (;;) {
+        narrower = height < room ? min(width, (int)run[height * step]) : 0;
+        if (narrower * middle.x < (height + 1) * middle.y) break;
+        if (narrower < width) wider = width, nearer = bound, bound = height;
+        width = narrower;
+        ++height;
+    }
+    for (int remaining = end - begin - 1; remaining >= 0; --remaining) {
         const int best = narrower * middle.x > height * middle.y;
         const int sides = best ? narrower + 256 * (height + 1) : height > 0 ? width + 256 * height : OCCUPIED;
-        const int at = padded_in_groups(row, col, cols, group), part = (row + 1) & 3, first = at - part;
+        const int part = (row + 1) & 3;
         if (group == 1) {
-            out[at] = (ushort)sides;
-            continue;
+            out[padded(row, col, cols)] = (ushort)sides;
+        } else {
+            // A write of four rows takes no longer than a write of one.
+            four |= (ulong)sides << 16 * part;
+            ++filled;
+            if (part == (dy > 0 ? 0 : 3) || remaining == 0) {
+                global ushort *to = out + padded_in_groups(row, col, cols, group) - part;
+                if (filled == 4) *(global ulong *)to = four;
+                for (int k = part; filled < 4 && filled > 0; --filled, k += dy) to[k] = (ushort)(four >> 16 * k);
+                four = 0;
+                filled = 0;
+            }
         }
-        // A write of four rows takes no longer than a write of one.
-        four |= (ulong)sides << 16 * part;
-        ++filled;
-        if (part != (dy > 0 ? 0 : 3) && i < end - begin - 1) continue;
-        if (filled == 4) *(global ulong *)(out + first) = four;
-        for (int k = part; filled < 4 && filled > 0; --filled, k += dy) out[first + k] = (ushort)(four >> 16 * k);
-        four = 0;
-        filled = 0;
+        if (remaining == 0) return;
+        row -= dy, run -= step, room = min(room + 1, LONGEST);
+        const int here = run[0], least = min(here, width);
+        const int higher = height < room && least * middle.x >= (height + 1) * middle.y;
+        bound = here <= width ? 0 : bound + 1;
+        nearer = here <= wider ? 0 : nearer + 1;
+        wider = here <= width ? LONGEST : min(here, wider);
+        height = higher ? height + 1 : min(height, here * middle.x * inverse >> 16);
+        narrower = height == room ? 0 : higher ? min(here, narrower) : least;
+        width = height > 0 ? least : LONGEST;
+        if (height == 0 || bound < height) continue;
+        width = wider, bound = nearer, wider = -1;
+        if (width >= 0 && bound < height) continue;
+        width = LONGEST, bound = 0, wider = LONGEST;
+        for (int j = 0; j < height; ++j) {
+            const int other = run[j * step];
+            if (other < width) wider = width, nearer = bound, width = other, bound = j;
+        }
     }
 }

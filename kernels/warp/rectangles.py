@@ -194,10 +194,9 @@ def rectangles_scan(
     col = reach_begin(dx, left) + col_item
     begin = reach_begin(dy, top) + tall * (tile_item // sectors)
     end = wp.min(begin + tall, reach_end(dy, bottom, rows))
-    if col >= reach_end(dx, right, cols) or w >= worlds:
+    if col >= reach_end(dx, right, cols) or w >= worlds or begin >= end:
         return
     planes = behind_of(rectangles, wp.int64(place[w]) * wp.int64(4 * sectors))
-    column = ((quadrant & 1) * band * worlds + w) * cols + col
     out = (quadrant * sectors + sector) * lines * (cols + 2)
     middle = slope(sectors, sector)
     step = dy * worlds * cols
@@ -211,73 +210,77 @@ def rectangles_scan(
     nearer = int(0)
     four = wp.uint64(0)
     filled = int(0)
-    for i in range(end - begin):
-        row = wp.where(dy > 0, end - 1 - i, begin + i)
-        room = wp.min(wp.where(dy > 0, rows - row, row + 1), LONGEST)
-        run = column + (row - first) * worlds * cols
-        if i == 0:
-            fits = bool(True)
-            while fits:
-                narrower = int(0)
-                if height < room:
-                    narrower = wp.min(width, int(run_at(runs, run + height * step)))
-                fits = narrower * middle[0] >= (height + 1) * middle[1]
-                if fits:
-                    if narrower < width:
-                        wider = width
-                        nearer = bound
-                        bound = height
-                    width = narrower
-                    height += 1
-        else:
-            here = int(run_at(runs, run))
-            least = wp.min(here, width)
-            higher = height < room and least * middle[0] >= (height + 1) * middle[1]
-            bound = wp.where(here <= width, 0, bound + 1)
-            nearer = wp.where(here <= wider, 0, nearer + 1)
-            wider = wp.where(here <= width, LONGEST, wp.min(here, wider))
-            if higher:
-                height += 1
-                narrower = wp.min(here, narrower)
-            else:
-                height = wp.min(height, (here * middle[0] * inverse) >> 16)
-                narrower = least
-            if height == room:
-                narrower = int(0)
-            width = wp.where(height > 0, least, LONGEST)
-            if height > 0 and bound >= height:
-                width = wider
-                bound = nearer
-                wider = int(-1)
-                if width < 0 or bound >= height:
-                    width = int(LONGEST)
-                    bound = int(0)
-                    wider = int(LONGEST)
-                    for j in range(height):
-                        other = int(run_at(runs, run + j * step))
-                        if other < width:
-                            wider = width
-                            nearer = bound
-                            width = other
-                            bound = j
+    row = int(begin)
+    room = wp.min(begin + 1, LONGEST)
+    if dy > 0:
+        row = end - 1
+        room = wp.min(rows - row, LONGEST)
+    run = (((quadrant & 1) * band + row - first) * worlds + w) * cols + col
+    fits = bool(True)
+    while fits:
+        narrower = int(0)
+        if height < room:
+            narrower = wp.min(width, int(run_at(runs, run + height * step)))
+        fits = narrower * middle[0] >= (height + 1) * middle[1]
+        if fits:
+            if narrower < width:
+                wider = width
+                nearer = bound
+                bound = height
+            width = narrower
+            height += 1
+    remaining = end - begin
+    while remaining > 0:
+        remaining -= 1
         sides = wp.where(height > 0, width + 256 * height, OCCUPIED)
         if narrower * middle[0] > height * middle[1]:
             sides = narrower + 256 * (height + 1)
-        at = out + padded_in_groups(row, col, cols, group)
         if group == 1:
-            put(planes, at, wp.uint16(sides))
+            put(planes, out + padded(row, col, cols), wp.uint16(sides))
         else:
             # A write of four rows takes no longer than a write of one.
             part = (row + 1) & 3
             four = four | (wp.uint64(sides) << wp.uint64(16 * part))
             filled += 1
-            if part == wp.where(dy > 0, 0, 3) or i == end - begin - 1:
+            if part == wp.where(dy > 0, 0, 3) or remaining == 0:
+                to = out + padded_in_groups(row, col, cols, group) - part
                 if filled == 4:
-                    put_four(planes, at - part, four)
+                    put_four(planes, to, four)
                 else:
                     for k in range(filled):
                         place_in_four = part + dy * k
                         one = (four >> wp.uint64(16 * place_in_four)) & wp.uint64(65535)
-                        put(planes, at - part + place_in_four, wp.uint16(one))
+                        put(planes, to + place_in_four, wp.uint16(one))
                 four = wp.uint64(0)
                 filled = int(0)
+        if remaining == 0:
+            return
+        row -= dy
+        run -= step
+        room = wp.min(room + 1, LONGEST)
+        here = int(run_at(runs, run))
+        least = wp.min(here, width)
+        higher = height < room and least * middle[0] >= (height + 1) * middle[1]
+        bound = wp.where(here <= width, 0, bound + 1)
+        nearer = wp.where(here <= wider, 0, nearer + 1)
+        wider = wp.where(here <= width, LONGEST, wp.min(here, wider))
+        narrower = wp.where(higher, wp.min(here, narrower), least)
+        height = wp.where(higher, height + 1, wp.min(height, (here * middle[0] * inverse) >> 16))
+        if height == room:
+            narrower = int(0)
+        width = wp.where(height > 0, least, LONGEST)
+        if height > 0 and bound >= height:
+            width = wider
+            bound = nearer
+            wider = int(-1)
+            if width < 0 or bound >= height:
+                width = int(LONGEST)
+                bound = int(0)
+                wider = int(LONGEST)
+                for j in range(height):
+                    other = int(run_at(runs, run + j * step))
+                    if other < width:
+                        wider = width
+                        nearer = bound
+                        width = other
+                        bound = j

@@ -113,8 +113,8 @@ def rectangles_of_worlds(worlds: Worlds, unknown: str) -> tuple[Table, frozenset
     backend = worlds.backend
     rows, cols = worlds.shape
     chosen = planes_of(backend, rows, cols, worlds.cells)
-    # On a processor each world is read into its caches anew, so smaller tables are faster.
-    sectors = 1 if backend.info.kind == "cpu" and len(worlds) > 1 else chosen.sectors
+    # Each of several worlds is read into the caches anew, so smaller tables are faster.
+    sectors = chosen.sectors if len(worlds) == 1 else min(chosen.sectors, 1 if backend.info.kind == "cpu" else 2)
     while sectors > 1 and 8 * sectors * worlds.cells > worlds.largest_table:
         sectors //= 2
     planes = Planes(sectors, chosen.group)

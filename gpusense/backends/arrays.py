@@ -210,7 +210,7 @@ def check_out(out: object, shape: tuple[int, ...], real: np.dtype, backend: Back
         return None
     if on_device(out) != device_poses:
         raise TypeError("out: must be in the memory where the poses are, got one that is not")
-    if on_device(out):
+    if device_poses:
         adopted = _adopt(out, backend, "out", in_place=True)
         _check_result(adopted.dtype, adopted.shape, adopted.contiguous, real, shape)
         return adopted.buffer

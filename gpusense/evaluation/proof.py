@@ -28,7 +28,7 @@ _BEAMS = 24
 _POSES = 70
 # Number of poses and seconds of the timed calls.
 _TIMED_POSES = 4000
-_TIMED_SECONDS = 0.05
+_TIMED_SECONDS = 0.02
 
 
 class Scene:

@@ -173,6 +173,7 @@ def test_a_pose_that_is_not_finite_is_reported_after_memory_ran_out(warp_as_gpu,
     poses = np.tile(POSES, (6, 1))
     poses[3, 0] = np.nan
     monkeypatch.setattr(chunking, "CHUNK", 600)
+    model._pipeline._most.clear()
     before, calls = Workspace.empty, []
 
     def empty(self, name, count, dtype, *, zero=False):

@@ -156,15 +156,15 @@ class WarpBackend(ProcessBound, Backend):
         if not size:
             # Warp takes a count of 0 as the whole array.
             return
-        from_size, to_size = (wp.types.type_size_in_bytes(array.dtype) for array in (source, target))
         queue = self.batch()
         if queue is not None:
             if begin == to == 0 and source.dtype is target.dtype and self._repeats(target.ptr, source.ptr):
                 # One graph of the whole call.
-                queue.steps.append(Copy(target, source, size // to_size))
+                queue.steps.append(Copy(target, source, size // wp.types.type_size_in_bytes(target.dtype)))
                 return
             # The copy follows all deferred work.
             self._flush(queue)
+        from_size, to_size = (wp.types.type_size_in_bytes(array.dtype) for array in (source, target))
         wp.copy(target, source, dest_offset=to // to_size, src_offset=begin // from_size, count=size // from_size)
 
     def _repeats(self, *addresses: int) -> bool:

@@ -38,12 +38,10 @@ def walk_ray(
     start: np.ndarray, slope: np.ndarray, steps: np.ndarray, cells: np.ndarray, rows: int,
     cols: int, occupied: int,
 ) -> np.ndarray:  # fmt: skip
-    """Return the distances (2, R) along rays to the first wall, and to the first unknown cell before it [cells].
+    """Return the distances (2, R) along rays to the first wall, and to an earlier unknown cell [cells]; else infinite.
 
-    They are infinite for none. A pair of walls that share a corner stops a ray.
-
-    ``start``: (2, R) columns and rows where rays begin [cells]; ``slope``: (2, R) directions; ``steps``: (R,) numbers
-    of steps; ``cells``: values of the cells of the map; ``occupied``: least value of a wall.
+    A pair of walls that share a corner stops a ray. ``start``: (2, R) columns and rows where rays begin; ``slope``:
+    (2, R) directions; ``steps``: (R,) numbers of steps; ``occupied``: least value of a wall.
     """
     # All steps of all rays in sequence.
     ray = np.arange(len(steps)).repeat(steps)
@@ -89,10 +87,8 @@ def walk_beside(
 ) -> np.ndarray:  # fmt: skip
     """Return the distances (2, 3, B) [m] along beams and their companions on both sides.
 
-    ``direction``: (B,) directions of the beams in the map's frame [rad]; ``origin``: where the beams begin [m];
-    ``companion``: companions' offset from a beam at its start [m], and angle of divergence [rad]; ``steps``: (B,)
-    numbers of steps; ``cells``: values of the cells of the map; ``cell``: side of a cell [m]; ``occupied``: least value
-    of a wall.
+    ``direction``: (B,) directions in the map's frame; ``origin``: where the beams begin [m]; ``companion``: companions'
+    offset at the start [m], and angle of divergence; ``steps``: (B,) numbers of steps; ``cell``: side of a cell [m].
     """
     slope = np.empty((2, len(SIDES), len(direction)))
     slope[0], slope[1] = cos_sin(direction + SIDES * companion[1])

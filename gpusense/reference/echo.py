@@ -56,18 +56,11 @@ def incidence_terms(
 
 
 def nearest_echo(flags, map_table, normals, window, cell, pose, ray, critical, limit, caster, shapes, world, crowd):
-    """Return the nearest returns of M cones.
+    """Return the nearest returns of M cones: distances in cells, and cosines and sines of angles of incidence.
 
-    A ray whose angle of incidence has a cosine below critical has no return: the surface reflects it like a mirror.
-
-    ``flags``: flags of the signature table; ``map_table``: the caster's table of the map; ``cell``: (M, 2) integer
-    column and row of each origin; ``pose``: (M, 4) fraction of the cell in x and y, cosine and sine of the heading;
-    ``ray``: (M, C, 2) cosine and sine of each cone's rays; ``caster``: the knobs of the caster; ``shapes``: the shapes
-    of all worlds; ``world``: (2 M, 2) numbers of the worlds of the cones; not read without SHAPES.
-
-    Returns:
-        (M,) distances in cells, limit where nothing returns, and cosines and sines of angles of incidence. A beam
-        without a return gets 2 and 0: 2 exceeds every cosine, so that the first bin can hold such beams alone.
+    Arguments are as for ``dda.cast_ray``; ``ray``: (M, C, 2) rays of each cone; ``world``: (2 M, 2) numbers of the
+    cones' worlds, not read without SHAPES. Beyond the critical angle a surface reflects a ray like a mirror. A beam
+    without a return gets limit, 2 and 0: 2 exceeds every cosine, so that the first bin can hold such beams alone.
     """
     real = pose.dtype.type
     nearest = np.full(len(cell), limit, pose.dtype)

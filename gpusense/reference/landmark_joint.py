@@ -27,9 +27,8 @@ def add_landmark(
 ) -> None:
     """Let landmark j be seen by one more feature of each set, at most one feature per group.
 
-    ``log_each``: (F, N) log p of the features; ``numbers``: (F, FEATURE) numbers of the features; ``best``: (N, 2^F)
-    largest sums of the sets; ``choice``: (N, 2^F, F) landmarks of the features of the sets; ``value``: (N, 2^F, F)
-    their log p.
+    ``log_each``: (F, N) log p of the features; ``best``: (N, 2^F) largest sums of the sets; ``choice``, ``value``:
+    (N, 2^F, F) landmarks of their features, and log p.
     """
     sets, groups = best.shape[1], int(numbers[:, GROUP].max(initial=0)) + 1
     # From the full set down, since smaller sets must not yet contain this landmark for the group.

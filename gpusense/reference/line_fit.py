@@ -8,12 +8,9 @@ WHOLE_TURN = 6.283185307179586
 
 
 def line_through(point: np.ndarray, sums: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Return the lines through points and their neighbours: unit normals, offsets, 1 / (sums of squares along them).
+    """Return the lines (N, 4) through points (N, 4) and their neighbours; see ``fit_lines``.
 
-    A point without neighbours gets the line perpendicular to its beam, and -1 instead of the sum.
-
-    ``point``: (N, 4) points; ``sums``: (5, N) sums of the neighbours' x, y, x x, x y and y y relative to the points;
-    ``size``: (N,) numbers of points.
+    ``sums``: (5, N) sums of the neighbours' x, y, x x, x y and y y relative to the points; ``size``: (N,) their number.
     """
     mean_x, mean_y = sums[0] / size, sums[1] / size
     a, b = sums[2] - size * mean_x * mean_x, sums[3] - size * mean_x * mean_y
@@ -33,13 +30,7 @@ def line_through(point: np.ndarray, sums: np.ndarray, size: np.ndarray) -> np.nd
 def fit_scan(
     point: np.ndarray, reach: int, most: int, ratio: float, slack: float, width: float, gap: float
 ) -> np.ndarray:
-    """Return the lines (N, 4) through the points of a scan and their neighbours.
-
-    ``point``: (N, 4) points; ``most``: most neighbours on either side, those beyond ``reach`` within a distance of
-    ``width``; ``ratio``: farthest distance of a neighbour from the one before, by the range of that one; ``slack``: the
-    distance that is added to it [m]; ``width``: half the least length of a line [m]; ``gap``: largest step of bearing
-    between neighbours [rad].
-    """
+    """Return the lines (N, 4) through the points (N, 4) of a scan and their neighbours; see ``fit_lines``."""
     count = len(point)
     sums, size = np.zeros((5, count), point.dtype), np.ones(count, point.dtype)
     for direction in (-1, 1):

@@ -23,17 +23,11 @@ NEAREST = 1e-6
 def deviation_of(
     before: np.ndarray, here: np.ndarray, after: np.ndarray, left: np.ndarray, right: np.ndarray
 ) -> np.ndarray:
-    """Return how far ranges are from those that their neighbours predict on a straight wall.
+    """Return how far (S, P) ranges are from their neighbours' predictions on a straight wall, in deviations.
 
-    The unit is the standard deviation of this difference, with the errors of both neighbours times their derivatives.
-    Call it where invalid operations are ignored.
-
-    ``before``: (S, P) ranges of the beams before [m]; NaN is unknown; ``here``: (S, P) ranges; ``after``: (S, P) ranges
-    of the beams after; ``left``: (P,) weights of the neighbours before; ``right``: (P,) weights of the neighbours
-    after.
-
-    Returns:
-        (S, P), infinite where the three are on different surfaces.
+    The deviation is of this difference, with the errors of both neighbours times their derivatives; it is infinite
+    where the three are on different surfaces. ``left``, ``right``: (P,) weights of the ranges before and after. Call
+    it where invalid operations are ignored.
     """
     expected = 1 / (left / before + right / after)
     share = np.sqrt(1 + np.square(np.square(expected / before) * left) + np.square(np.square(expected / after) * right))
@@ -48,10 +42,7 @@ def deviation_of(
 def rounding_of(ranges: np.ndarray, deviation: np.ndarray) -> np.ndarray:
     """Return the deviation (S,) of rounding to the steps in which ascending ranges (S, K) come [m], 0 without.
 
-    Infinite ranges do not count. Call it where invalid operations are ignored.
-
-    ``ranges``: the ranges [m]; ``deviation``: (S,) deviations; where the rounding to a step is smaller, the result may
-    be 0.
+    Where it is below ``deviation`` (S,), it may be 0. Call it where invalid operations are ignored.
     """
     gap = ranges[:, 1:] - ranges[:, :-1]
     # Differences of infinite ranges are NaN.
@@ -69,10 +60,9 @@ def rounding_of(ranges: np.ndarray, deviation: np.ndarray) -> np.ndarray:
 
 
 def noise_of(known: np.ndarray, places: tuple[slice, ...], left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (S,) of the ranges of scans [m], NaN where too few beams measure it.
+    """Return the standard deviations (S,) of scans' ranges (S, K) [m], NaN where too few beams measure it.
 
-    ``known``: (S, K) ranges [m], NaN where a reading is none; ``places``: the beams before, at and after (P,) places;
-    ``left``: (P,) weights of the neighbours before; ``right``: (P,) weights of the neighbours after.
+    ``places``: the beams before, at and after (P,) places; ``left``, ``right``: (P,) weights of both neighbours.
     """
     before, here, after = (known[:, part] for part in places)
     with np.errstate(all="ignore"):
@@ -88,21 +78,17 @@ def noise_of(known: np.ndarray, places: tuple[slice, ...], left: np.ndarray, rig
 
 
 def level_of(noise: float, largest: np.ndarray, assumed: int) -> int:
-    """Return the level of noise of a pair: the first one whose largest noise is not exceeded, or the last one.
-
-    ``noise``: larger noise of both scans [m], NaN where neither measures it; ``largest``: (L,) largest noise of each
-    level; ``assumed``: the level of unknown noise.
-    """
+    """Return the first level of ``largest`` noise (L,) not below a pair's, or the last; ``assumed`` for NaN."""
     return assumed if np.isnan(noise) else min(int(np.searchsorted(largest, noise)), len(largest) - 1)
 
 
 def place_points(
     readings: np.ndarray, beam: np.ndarray, nearest: float, farthest: float, real: np.dtype
 ) -> tuple[np.ndarray, float]:
-    """Return the points (N, 4) of a scan's hits, and the sum of squared ranges.
+    """Return the points (N, 4) of the hits of (K,) readings, and the sum of squared ranges.
 
-    ``readings``: (K,) readings [m]; ``beam``: (K, 4) cosines, sines, bearings in [0, 2 pi), and places of the readings;
-    beams come by bearing; ``nearest``: least range [m]; ``farthest``: least larger reading that is no range [m].
+    ``beam``: (K, 4) cosines, sines, bearings in [0, 2 pi), ascending, and places of the readings; ``nearest``: least
+    range; ``farthest``: least larger reading that is no range [m].
     """
     z = readings[beam[:, 3].astype(int)]
     kept = is_hit(z, nearest, farthest) & (z > NEAREST)

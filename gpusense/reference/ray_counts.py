@@ -31,11 +31,9 @@ def crossed_before(
 ) -> np.ndarray:
     """Return the number of boundaries of an axis that a ray crosses before a boundary of the other axis.
 
-    Products of lengths fit in 64 bits, since rays span at most 2^19 cells.
-
-    ``first``: distance to the first boundary of the axis; ``size``: length of the ray along the axis; ``reached``:
-    distance to the boundary of the other axis; ``other``: length of the ray along the other axis; ``ties``: whether
-    boundaries that the ray crosses at the same time count.
+    ``first``, ``size``: distance to the first boundary, and length of the ray, along the axis; ``reached``, ``other``:
+    the same for the other axis; ``ties``: whether simultaneous boundaries count. Products of lengths fit in 64 bits,
+    since rays span at most 2^19 cells.
     """
     room = reached * size - first * other - (not ties)
     return np.where(room < 0, 0, room // (UNIT * np.maximum(other, 1)) + 1)

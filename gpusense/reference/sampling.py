@@ -156,11 +156,9 @@ def short_of(u: np.ndarray, expected: np.ndarray, decay: np.ndarray) -> np.ndarr
 
 
 def reading_of(flags, u, v, expected, mixture, bins, range_max):
-    """Return readings drawn from the mixture; infinity without return, NaN where no reading is possible.
+    """Return readings of the mixture for expected ranges; infinity without return, NaN where none is possible.
 
-    ``flags``: flags of the shape of hits; ``u``: numbers in (0, 1) that choose the component; ``v``: numbers in (0, 1)
-    that choose the reading; ``expected``: expected ranges in [0, range_max]; ``mixture``: numbers of the mixtures; see
-    above.
+    ``u``, ``v``: numbers in (0, 1) that choose the component and the reading; ``mixture``: see above.
     """
     terms = (mixture[c.DRAW_TERMS * bins + i] for i in range(c.DRAW_TERMS))
     hit, short, none, rand, sigma, growth, bias, decay, place = terms

@@ -46,10 +46,7 @@ _UNKNOWN, _UNKNOWN_TURN = 30.0, 3.0
 
 
 def weighed(front: Front) -> Links:
-    """Return the matches so far with their information multiplied by the temperature.
-
-    Scans between two key scans are matched to both and share their errors, so both matches count as one.
-    """
+    """Return the matches so far, weighted by the temperature; two of a scan between key scans count as one."""
     links, keys = front.links, np.array(front.keys)
     is_key = np.zeros(front.done, bool)
     is_key[keys] = True

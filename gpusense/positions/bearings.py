@@ -152,10 +152,7 @@ def _line_or_circle(problem: Problem) -> str:
 
 
 def _on_circle(problem: Problem, triples: NDArray[np.intp], clarity: Floats, fix: PositionFix) -> PositionFix:
-    """Return ``fix``, or an empty result with status "circle" if beacons and robot share a circle.
-
-    Only there is the Jacobian of bearings of unknown heading singular.
-    """
+    """Return ``fix``, empty where beacons and robot share a circle, whose bearings have a singular Jacobian."""
     if problem.heading is not None or fix.status not in ("singular", "unique"):
         return fix
     if fix.status == "unique" and (clarity > _triple_blur(problem, triples, fix.best[:2] - problem.origin)).any():

@@ -156,10 +156,7 @@ class Problem:
         return gain @ gain.T, condition
 
     def fix(self, states: Sequence[Floats] | Floats, status: str, *, flat: bool = False) -> PositionFix:
-        """Make the result for (S, d) solutions, the best first.
-
-        A status of a definite solution becomes "singular" if the information matrix is, or is known to be (``flat``).
-        """
+        """Make the result for (S, d) solutions, the best first; ``flat``: their information is known to be singular."""
         solutions = np.asarray(states, np.float64).reshape(-1, self.dimension)
         assert status in STATUSES
         pairs = [self.information(state) for state in solutions]

@@ -168,10 +168,7 @@ def defaults() -> dict[str, Any]:
 
 
 def options_of(values: Mapping[str, Any]) -> tuple[Nav2Options, tuple[str, ...]]:
-    """Return the options of parameters by dotted names, and the names of parameters that have no effect.
-
-    A file named by ``parameters`` replaces nav2_amcl's parameters, except a first pose.
-    """
+    """Return options by dotted names, of the file ``parameters`` if set, and names without effect."""
     _check_own(values)
     first = {name: value for name, value in values.items() if name.startswith("initial_pose.")}
     first["set_initial_pose"] = values["set_initial_pose"]

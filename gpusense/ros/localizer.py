@@ -271,11 +271,7 @@ class ScanQueue:
         return len(self._waiting)
 
     def add(self, scan: Any, stamp: float) -> None:
-        """Add a scan, and deliver ready scans.
-
-        Waiting scans that are later by more than 2 s are dropped: a recording has restarted, or their stamps were
-        wrong.
-        """
+        """Add a scan, drop waiting ones over 2 s later (a recording restarted), and deliver ready scans."""
         later = [each for each in self._waiting if each[1] > stamp + BACK]
         for each in later:
             self._waiting.remove(each)

@@ -22,10 +22,7 @@ _MOST, _ITERATIONS, _SMALL = 20_000, 20, 1e-4
 
 
 def smoothed(occupied: np.ndarray, known: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the shares of occupied cells among the known ones around each cell, 0 where none is, and of known cells.
-
-    Images are (H, W) bool, ``sigma`` is the deviation of the weights [cells].
-    """
+    """Return shares of occupied among known cells near each cell (H, W), 0 where none is known, and of known cells."""
     offsets = np.arange(-math.ceil(_REACH * sigma), math.ceil(_REACH * sigma) + 1)
     weights = np.exp(-0.5 * (offsets / sigma) ** 2)
     weights /= weights.sum()

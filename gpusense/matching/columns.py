@@ -171,10 +171,7 @@ def squared_length(triangle: Triangle, x: Column, y: Column, turn: Column) -> Co
 
 
 def axes_of_one(triangle: Triangle) -> list[tuple[float, Vector]]:
-    """Return the three eigenvalues of a single matrix in ascending order, with unit vectors.
-
-    Jacobi's rotations (Golub and Van Loan, Matrix Computations, section 8.5) make the off-diagonal numbers 0.
-    """
+    """Return ascending eigenvalues of a single matrix, with unit vectors, by Jacobi's rotations."""
     xx, xy, xt, yy, yt, tt = triangle
     least = _ROUNDING * (abs(xx) + abs(yy) + abs(tt))
     a, b, c = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
@@ -196,10 +193,7 @@ def axes_of_one(triangle: Triangle) -> list[tuple[float, Vector]]:
 def _rotated(
     one: float, other: float, both: float, beside: float, across: float, first: Vector, second: Vector
 ) -> tuple[float, float, float, float, Vector, Vector]:
-    """Rotate two axes so that the nonzero number ``both`` of their row and column becomes 0.
-
-    Return their two numbers on the diagonal, their two numbers in the third row, and the vectors of both axes.
-    """
+    """Rotate two axes so that ``both`` becomes 0; return their diagonal, their third row, and their vectors."""
     half = (other - one) / (2 * both)
     tangent = math.copysign(1.0, half) / (abs(half) + math.sqrt(half * half + 1))
     cosine = 1 / math.sqrt(tangent * tangent + 1)

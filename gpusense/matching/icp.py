@@ -58,10 +58,7 @@ def space_of(backend: Backend) -> tuple[threading.RLock, Workspace]:
 
 
 def line_rules(width: float, gap: float) -> dict[str, float]:
-    """Return the rules of lines of half a length ``width`` [m] by the names of the kernel's arguments.
-
-    ``gap`` is the largest step between the bearings of two neighbours that hides nothing [rad].
-    """
+    """Return the rules of lines of half a length ``width`` [m] by the names of the kernel's arguments."""
     most = _MOST if width > WIDTH else _FEWER
     reach = 1 if gap > GAP * _SPARSE else REACH
     return {"reach": reach, "most": most, "ratio": max(_RATIO, _STEPS * gap / GAP), "width": width, "gap": gap}
@@ -118,10 +115,7 @@ class PlacedPairs:
         return most
 
     def fit_lines(self, width: Callable[[float], float], pairs: np.ndarray | None = None) -> None:
-        """Fit lines to the points of all scans, or of the scans of some pairs, from the next match on.
-
-        ``width`` is half their length by the noise of ranges [m]; they are shorter where points are missing.
-        """
+        """Fit lines of half a length ``width`` [m], by the noise of ranges, to all scans or to those of some pairs."""
         if not self._most:
             return
         if pairs is not None and len(pairs) == len(self._pairs):
@@ -174,10 +168,7 @@ class PlacedPairs:
     def run_in_turns(
         self, guess: np.ndarray, rules: Sequence[MatchRules], far: float, far_turn: float
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Match a single pair, and again from its result if it is farther from the guess (1, 3) than a limit [m, rad].
-
-        Return both results (1, 35); the second one is None where the match was not repeated.
-        """
+        """Match a single pair, and again if the result is far from the guess; return both results (1, 35) or None."""
         first, again = self._run(_FIRST_PAIR, guess[:, None], rules, (2, far, far_turn))[0, 0, :, None]
         # A second turn that did not run writes its number of iterations, 0, alone.
         return first.astype(np.float64), again.astype(np.float64) if again[0, 4] > 0 else None

@@ -106,10 +106,7 @@ def _is_moved(result: np.ndarray, guess: np.ndarray, distance: float, turn: floa
 def _repeat(
     device: PlacedPairs, guess: np.ndarray, best: Best, options: MatchOptions, levels: Levels, known: np.ndarray | None
 ) -> None:
-    """Match pairs again from their results where the guess was poor: ICP may have stopped short of it.
-
-    Results (S, 35) that are known already are not computed.
-    """
+    """Match pairs again from their results where the guess was poor, unless the second results (S, 35) are known."""
     moved = _is_moved(best.result, guess, POOR * options.capture, POOR_TURN)
     if any_of(moved):
         rows = np.flatnonzero(moved)
@@ -177,10 +174,7 @@ def is_held(
     first: np.ndarray, second: np.ndarray, scanner: Scanner, match: ScanMatch, backend: Backend, precision: Precision,
     motions: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
 ) -> np.ndarray:  # fmt: skip
-    """Return (S,) whether starts along the lost directions of matches of (S, K) readings lead back to their poses.
-
-    Starts are matched with the matches' noise. ``motions`` are (S, 3) motions during both scans, or None.
-    """
+    """Return (S,) whether starts along the lost directions of matches of (S, K) readings lead back to their poses."""
     count, real = len(second), np.dtype(precision)
     before, during = motions
     moved = None if before is None or during is None else np.concatenate([before, during])

@@ -178,10 +178,7 @@ def _nothing(options: dict[str, Any]) -> Location:
 
 
 def end_points_of(model: LikelihoodFieldModel, ranges: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return which of (S, K) readings are hits that the model uses, and their (M, 2) end points on the robot, by scan.
-
-    Points are in metres.
-    """
+    """Return which of (S, K) readings are hits in use, and their end points (M, 2) on the robot by scan [m]."""
     scanner, rules = model.scanner, model._context.rules
     scanner._first_scans.look_at("ranges", ranges, math.hypot(model.grid.width, model.grid.height))
     is_hit = classify(ranges, scanner) == Reading.HIT
@@ -236,10 +233,7 @@ def _mode_numbers(
 def _locations(
     best: _Modes, numbers: np.ndarray, refined: np.ndarray | None, least: float, options: dict[str, Any]
 ) -> list[Location]:
-    """Return the results of scans from their modes and the modes' numbers (R, 5).
-
-    ``refined`` (S, 3) are the poses of the results; None: the poses of the first modes.
-    """
+    """Return the results of scans from their modes, the modes' numbers (R, 5) and refined poses (S, 3) or None."""
     evidence = location_evidence(numbers, best.scan, best.first, _DEPTH)
     p_right, alone = (part.tolist() for part in probabilities_right(evidence))
     modes = [PoseMode(pose, *values) for pose, values in zip(best.poses, numbers.tolist(), strict=True)]

@@ -120,10 +120,7 @@ def _matches(
     reference: AnyArray | OccupancyGrid, ranges: AnyArray, scanner: Scanner, guess: ArrayLike, method: Method,
     device: Backend, precision: Precision, options: MatchOptions, motions: tuple[object, object], given: bool,
 ) -> tuple[ScanMatch, bool]:  # fmt: skip
-    """Check the scans, the guess and the motions; return S matches, and whether a single match is requested.
-
-    ``given`` states whether the caller chose the noise; otherwise it is estimated from the scans.
-    """
+    """Return checked scans' S matches, and whether one is requested; ``given``: the caller chose the noise."""
     second = readings("ranges", ranges, scanner, device)
     motion = check_motion("motion", motions[0], 1 if second.ndim == 1 else len(second))
     if isinstance(reference, OccupancyGrid):
@@ -255,10 +252,7 @@ def readings(name: str, ranges: object, scanner: Scanner, backend: Backend) -> n
 
 
 def scan_map(ranges: np.ndarray, scanner: Scanner, margin: float, cell: float) -> OccupancyGrid:
-    """Return the map of a scan (K,) in the robot's frame: cells of hits are occupied, the rest is unknown.
-
-    ``margin`` is the width of the space around the hits, ``cell`` the least side of a cell [m].
-    """
+    """Return a scan's map in the robot's frame: hits are occupied; ``margin`` and least side ``cell`` [m]."""
     hits = classify_ranges(ranges, scanner.range_min, scanner.range_max)[0]
     vectors, middle = ray_vectors(scanner.bearings, scanner.mount)[hits], np.array(scanner.mount[:2])
     # Axes along the fourfold moment of the points, and space around the sensor on both sides: the cells turn and mirror

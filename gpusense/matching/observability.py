@@ -118,11 +118,7 @@ def _with_diagonal(triangle: Triangle, place: Column, heading: Column) -> Triang
 def _partly_observed(
     total: np.ndarray, made_up: np.ndarray, critical: np.ndarray, least: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the observed part (L, 3, 3) of an information, and the number of lost directions (L,).
-
-    ``total`` (L, 3, 3) is of x, y and ``lever`` times the heading, ``made_up`` its part that is due to noise.
-    ``critical`` (L,) is the least generalised eigenvalue of an observed direction, ``least`` (L,) its least pairs.
-    """
+    """Return the observed part (L, 3, 3) of information with noise ``made_up``, and the lost directions (L,)."""
     values, vectors = _generalised(total, made_up)
     lost = _is_lost(values, vectors, critical, least)
     count = lost.sum(axis=1)
@@ -150,11 +146,7 @@ def balance_of(lever: Column) -> np.ndarray:
 
 
 def without(information: np.ndarray, lost: np.ndarray, made_up: np.ndarray) -> np.ndarray:
-    """Return information (S, 3, 3) with the positions along lost directions (S, 3, L) unknown; columns may be 0.
-
-    The directions have no information at all in the result, up to rounding. ``made_up`` (S, 3, 3) is the information
-    that comes from rounding and noise.
-    """
+    """Return information (S, 3, 3) with the positions along lost directions (S, 3, L) unknown; columns may be 0."""
     side = information @ lost
     inner = lost.transpose(0, 2, 1) @ (side + made_up @ lost)
     left = information - side @ np.linalg.pinv(inner, rcond=1e-12, hermitian=True) @ side.transpose(0, 2, 1)
@@ -217,10 +209,7 @@ def orthonormal(vectors: np.ndarray) -> np.ndarray:
 
 
 def axes_of(information: np.ndarray, lever: Column) -> tuple[np.ndarray, np.ndarray]:
-    """Return ascending eigenvalues (S, 3) of information, exactly 0 where lost, and directions (S, 3, 3) in columns.
-
-    Directions are those of x, y and ``lever`` times the heading; their signs are arbitrary.
-    """
+    """Return ascending eigenvalues (S, 3) of information, 0 where lost, and directions (S, 3, 3) in columns."""
     if not isinstance(lever, np.ndarray):
         # Where nothing is lost, the axes do not depend on rounding.
         axes = axes_of_one(balanced(triangle_of(information), lever))

@@ -253,10 +253,7 @@ def nearby(options: MatchOptions) -> MatchOptions:
 
 
 def distinct(poses: np.ndarray, score: np.ndarray, known: np.ndarray, capture: float) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the best of poses (S, M, 3) with scores (S, M) that differ from each other and from a known pose (S, 3).
-
-    Return (C,) numbers of rows, ascending, and (C, 3) poses.
-    """
+    """Return rows (C,) and poses (C, 3), the best of (S, M, 3) that differ from each other and from known ones."""
     # Only starts that may be refined, after the known poses.
     row, start = np.nonzero(score > score.max(axis=1, keepdims=True) - _PROMISING)
     falling = np.argsort(-score[row, start], kind="stable")

@@ -177,10 +177,7 @@ def _order_of(scanner: Scanner) -> np.ndarray:
 
 
 def whole_noise(ranges: np.ndarray, scanner: Scanner) -> np.ndarray:
-    """Return the standard deviations (S,) of ranges from all beams and their neighbours by bearing [m].
-
-    :func:`scan_noise` takes at most 120 beams, which depend on the order of beams.
-    """
+    """Return the standard deviations (S,) of ranges [m] from all beams; ``scan_noise`` takes at most 120 of them."""
     if scanner.count < 3 or not len(ranges):
         return np.full(len(ranges), np.nan)
     known = np.where(classify_ranges(ranges, scanner.range_min, scanner.range_max)[0], ranges, np.nan)

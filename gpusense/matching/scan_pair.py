@@ -58,11 +58,7 @@ def match_pair(
     backend: Backend, real: np.dtype, first: np.ndarray, second: np.ndarray, scanner: Scanner, guess: np.ndarray,
     method: str, options: MatchOptions, *, given: bool,
 ) -> ScanMatch:  # fmt: skip
-    """Match two scans (K,) of a robot at rest; ``judged`` adds the probability that the match is right.
-
-    ``guess`` (1, 3) is the pose of the second robot frame in the first one. ``given`` is True if the options set the
-    noise; otherwise it is estimated from the scans.
-    """
+    """Match two scans (K,) from a guess (1, 3); ``given``: the options set the noise. ``judged`` adds ``p_right``."""
     mount = scanner.mount[:2]
     sensor = to_sensor(guess, mount)
     kind = first.dtype if first.dtype == second.dtype else np.result_type(first, second)

@@ -29,10 +29,7 @@ _MOST_CELLS = (1 << 31) - 1
 
 
 def quantized(values: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Round values from ``low`` to ``high`` to scores from 0 to 255; a score differs by at most half a step.
-
-    A step is ``(high - low) / 255``. All scores are 0 without a difference.
-    """
+    """Round values from ``low`` to ``high`` to scores from 0 to 255; all are 0 without a difference."""
     if not high > low:
         return np.zeros(np.shape(values), _BYTE)
     return np.rint((np.clip(values, low, high) - low) * (TOP / (high - low))).astype(_BYTE)
@@ -116,10 +113,7 @@ class ScoreTables:
         return made
 
     def quarters(self, level: int) -> Buffer:
-        """Return the losses of four blocks of a level, relative to the block of the next one that they make, as bytes.
-
-        A number holds four losses.
-        """
+        """Return the losses of four blocks of a level, relative to the block that they make, as bytes of numbers."""
         if level not in self._quarters:
             table, made = self.level(level), self.backend.empty(self._cells(self.shape), _INT)
             self.backend.compile("pack_quarters", _NO_FLAGS)(

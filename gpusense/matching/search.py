@@ -224,10 +224,7 @@ class _Run:
         )  # fmt: skip
 
     def _quarters(self, level: int) -> tuple[tuple[Any, ...], ScoreTable, tuple[int, int]]:
-        """Return tables of quarters and end points to divide blocks into blocks of a level, and the tables' sizes.
-
-        The last two numbers are the cells of the tables between 2^n positions, and n.
-        """
+        """Return quarters and end points of a level, the tables' sizes, and the cells between 2^n positions with n."""
         if level < self._level - 1:
             return (self._tables.quarters(level), *self._ends), self._tables.shape, (self._tables.stride, 0)
         folded = self._tables.folded(self._level)

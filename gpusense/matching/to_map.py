@@ -136,10 +136,7 @@ class MapMatcher:
         return self._unslid(ranges, pose, local).moved(pose, self._options.window)
 
     def _unslid(self, ranges: np.ndarray, pose: np.ndarray, found: ScanMatch) -> ScanMatch:
-        """Return matches to expected scans, at their start along lost directions unless starts on both sides return.
-
-        Along a corridor ICP slides on what noise leaves. Scans of few beams are not tested.
-        """
+        """Return matches to expected scans, at their start along lost directions unless starts on both sides return."""
         rows = np.flatnonzero(found.usable & (found.eigenvalues == 0).any(axis=1))
         if not len(rows) or self._dense is not self._scanner:
             return found
@@ -294,10 +291,7 @@ def _turned(heading: np.ndarray, mount: tuple[float, float]) -> np.ndarray:
 
 
 def _joint(field: np.ndarray, own: np.ndarray, bias: float, lever: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the information (S, 3, 3) whose covariance is the sum of both and of a bias [m], and its lost directions.
-
-    A direction is lost if either information does not observe it.
-    """
+    """Return information (S, 3, 3) with the sum of both covariances and of a bias [m], and its lost directions."""
     scale = balance_of(lever)
     both = scale[:, :, None] * scale[:, None, :]
     gone = []

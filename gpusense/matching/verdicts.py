@@ -198,11 +198,7 @@ def pair_sums(
 
 
 def pair_evidence(result: np.ndarray, lost: Column, other: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Return the evidence (S, 9) of results (S, 35) of ``match_scans``, see :data:`NAMES`; the distance is 0.
-
-    ``other`` (S, 3) are offsets to poses that agree about as well, NaN without one; ``noise`` (S,) are
-    deviations of ranges [m].
-    """
+    """Return the evidence (S, 9) of results (S, 35), see :data:`NAMES`; ``other`` (S, 3) is NaN without a rival."""
     numbers = columns_of(result)
     weights, squared, seen, through, unseen = numbers[19:24]
     pairs, common = larger(numbers[18], 1.0), larger(seen + through, 1.0)
@@ -330,20 +326,13 @@ def observed_pairs(
     information: Triangle, doubt: Triangle, variance: Column, lever: Column, lines: Column | None,
     unneeded: Column = False,
 ) -> Observed:  # fmt: skip
-    """Return the information that pairs of points and lines observe, of sums of w J J'.
-
-    ``doubt`` is the part due to a unit variance of the points, ``variance`` their variance [m^2]; see
-    ``observability.observed_information`` for the rest.
-    """
+    """Return the information that pairs observe, of sums of w J J'; ``doubt`` is noise's part for a unit variance."""
     spurious = [part * variance for part in doubt]
     return observed_information(information, spurious, lever, lines, LEAST_PAIRS, unneeded)
 
 
 def statuses(result: np.ndarray, lost: Column, step: Column) -> np.ndarray:
-    """Return the status of (S, 35) results of the kernel ``match_scans``.
-
-    ``step`` is the length of the last step in deviations of the pose, along observed directions.
-    """
+    """Return the status of (S, 35) results; ``step`` is the last step along observed directions [deviations]."""
     numbers = columns_of(result)
     seen, through, unseen = numbers[21:24]
     code = chosen(lost > 0, 1, 0)

@@ -94,7 +94,8 @@ def check_scanners(steps: Sequence[Step], path: str | os.PathLike[str]) -> None:
 
 
 def with_poses(steps: Sequence[Step], path: str | os.PathLike[str]) -> list[tuple[int, Scan]]:
-    """Return the numbered scans of steps of a log, which must have poses."""
+    """Return the numbered scans of steps of a log, which must have poses, and one scanner for each laser."""
+    check_scanners(steps, path)
     for step in steps:
         if step.scan.pose is None:
             raise ValueError(

@@ -171,19 +171,20 @@ class Store:
         sent = self._sent.get(name)
         return sent if isinstance(sent, OccupancyGrid) else self.keep("maps", name, lambda: read_map(self.path(name)))
 
-    def steps(self, job: Job, group: str = "") -> list[Step]:
-        """Return the scans of a job with their odometry; ``group`` names the options that choose them."""
+    def steps(self, job: Job, group: str = "", *, odometry: bool = True) -> list[Step]:
+        """Return the scans of a job, with their odometry or not; ``group`` names the options that choose them."""
         from gpusense.evaluation.steps import read_steps
 
         chosen, topic = _chosen(job, group), _topic(job)
-        key, sensors = (job.log, topic, *chosen.items()), () if topic is None else (topic,)
-        return self.keep("logs", key, lambda: read_steps(self.path(job.log), sensors=sensors, **chosen))
+        key, options = (job.log, topic, odometry, *chosen.items()), chosen | {"odometry": odometry}
+        sensors = () if topic is None else (topic,)
+        return self.keep("logs", key, lambda: read_steps(self.path(job.log), sensors=sensors, **options))
 
     def scans(self, job: Job, group: str = "") -> list[tuple[int, Scan]]:
         """Return the scans of a job with logged poses; see :meth:`steps`."""
         from gpusense.evaluation.steps import with_poses
 
-        return with_poses(self.steps(job, group), self.path(job.log))
+        return with_poses(self.steps(job, group, odometry=False), self.path(job.log))
 
     def keep(self, kind: str, key: Hashable, make: Callable[[], Any]) -> Any:
         """Return a cached object of a kind, or make it."""

@@ -26,8 +26,7 @@ RESULTS = {
 # Methods for the package's own use, of exceptions, or that draw a picture; and those that calls() gives otherwise.
 LEFT_OUT = {
     "ParticleFilter.correct", "ParticleFilter.predict",
-    "BeamModel.bind_terms", "LikelihoodFieldModel.bind_terms",
-    "BeamModel.start_scoring", "LikelihoodFieldModel.start_scoring", "LikelihoodFieldModel.sample",
+    "bind_terms", "start_scoring", "LikelihoodFieldModel.sample",
     "PoseLikelihood.plot", "RayCaster.save_table", "OdometryMotion.sampled", "OdometryMotion.sampled_turns",
     "OmniMotion.sampled", "VelocityMotion.sampled", "ScanMatch.changed", "ScanMatch.joined", "ScanMatch.moved",
     "ScanMatch.ordered", "ScanMatch.replaced", "PoseMonitor.restore", "Shapes.counts", "Worlds.allocate",
@@ -284,7 +283,7 @@ def calls() -> dict[str, Call]:
                 objects.setdefault(name, lambda value=value, name=name: value(**found[name].arguments))
             for each in dir(value):
                 key, method = f"{name}.{each}", getattr(value, each)
-                if each.startswith("_") or not callable(method) or key in LEFT_OUT:
+                if each.startswith("_") or not callable(method) or {key, each} & LEFT_OUT:
                     continue
                 if each == "from_dict" and key not in given:
                     given[key] = dict(values=objects[name]().to_dict())

@@ -154,7 +154,7 @@ class ScanPipeline(ABC):
     end_points: bool = False
     careful: bool = False
     orders: bool = False
-    # The kernels that score in one launch, and in tiles.
+    # The kernels that score in one launch, and in tiles; without the latter GPUs score in one launch.
     kernel_names: tuple[tuple[str, ...], tuple[str, ...]]
     map: ReachableMap
 
@@ -287,7 +287,7 @@ class ScanPipeline(ABC):
     ) -> ScanLaunch:  # fmt: skip
         """Describe a piece on the device."""
         tiles = None
-        if self.backend.info.kind == "gpu" and not per_beam:
+        if self.backend.info.kind == "gpu" and self.kernel_names[1] and not per_beam:
             order = order_of(space, placed, readings.rays, self.real) if ordered and self.orders else None
             tiles = Tiles(self.spread(placed.count, readings), order)
         conditions = self.conditions(readings, placed, tiles)

@@ -103,14 +103,14 @@ class FilterCore:
         used = readings_of(readings, self.sensors)
         if not used:
             return
-        everything = dict(used)
+        scans, everything = used, dict(used)
         if verdict.watches(everything):
             verdict.predicted(*tracker.moved_particles(), everything)
         if share is not None:
             particles = tracker.moved_particles()
             if is_together(tracker.mean_and_covariance()[1]):
                 used = skipped(self.sensors, used, particles, verdict.anywhere(), share)
-        judged = verdict.expected(used, tracker.progress.motion)
+        judged = verdict.expected(scans, tracker.progress.motion)
         tracker.weigh(used, judged=judged, meanwhile=functools.partial(self._use_wait, everything))
         tracker.learn(used, self.recovery.is_doubted)
         for learner in self._learners:
@@ -119,7 +119,7 @@ class FilterCore:
         self.recovery.corrected(used, self.last)
 
     def _use_wait(self, readings: dict[int, tuple[Any, ...]]) -> None:
-        """Count a correction, and advance the lessons of earlier ones unless scans contradict the pose."""
+        """Count a correction, and continue lessons of earlier ones unless scans contradict the pose."""
         self.last = readings
         for learner in self._learners:
             if learner.lessons:

@@ -137,9 +137,7 @@ def locate_scan(
     search = field_search(model, stride)
     if positions == "free" and not search.free.any():
         raise ValueError("positions: 'free' needs a position in a free cell, got none; use positions='all'")
-    rows, cols = (-(-size // stride) for size in model.grid.shape)
-    headings = 2 * math.pi / turns * np.arange(turns)[None]
-    searched = PoseGrid(np.array([[0.5, 0.5]]), headings, rows, cols)
+    searched = PoseGrid.whole(model.grid.shape, turns, stride)
     is_hit, points = end_points_of(model, values)
     options: dict[str, Any] = dict(
         resolution=stride * cell, angle=2 * math.pi / turns, poses=searched.count, evaluated=0
@@ -263,8 +261,7 @@ def likely_poses(model: LikelihoodFieldModel, ranges: NDArray[np.float64], count
     if not len(points) or not search.free.any() or grid.resolution > np.hypot(*points.T).max():
         return np.empty((0, 3))
     turns = 4 * math.ceil(math.pi / 2 / _COARSE_ANGLE)
-    rows, columns = (-(-size // stride) for size in grid.shape)
-    searched = PoseGrid(np.array([[0.5, 0.5]]), 2 * math.pi / turns * np.arange(turns)[None], rows, columns)
+    searched = PoseGrid.whole(grid.shape, turns, stride)
     with search.lock:
         poses = search.find(ranges[None], [points], searched, search.free, _LIKELY_DEPTH).poses
     return poses[distinct_poses(poses, count, _MODE_RADIUS, _MODE_ANGLE)]

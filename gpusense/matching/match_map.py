@@ -141,7 +141,12 @@ def match_map(
         raise ValueError("local_grid: must have an occupied cell, got none")
     device = get_backend(backend)
     local = _Local(local_grid, grid.resolution)
-    searched = _whole(grid, turn, local_grid.origin[2]) if guess is None else _around(grid, local, guess, window, turn)
+    if guess is None:
+        # The yaw turns the local map's cells.
+        turns = 4 * math.ceil(math.pi / 2 / turn - 1e-9)
+        searched = PoseGrid.whole(grid.shape, turns, yaw=local_grid.origin[2])
+    else:
+        searched = _around(grid, local, guess, window, turn)
     slack = math.ceil(_DEPTH * TOP * len(local.points))
     with _LOCK:
         search = _search_of(grid, device)
@@ -197,12 +202,6 @@ def _scores(grid: OccupancyGrid, *, backend: Backend) -> np.ndarray:
     field = field_scores(distance_transform(grid.occupied, backend=backend), _SIGMA, _CAP)
     free = np.where(grid.free, TOP, np.where(grid.occupied, 0, TOP // 2)).astype(np.uint8)
     return np.stack([field, free])
-
-
-def _whole(grid: OccupancyGrid, angle: float, yaw: float) -> PoseGrid:
-    """Return positions in all cells of a map, and headings all around; ``yaw`` turns the local map's cells."""
-    turns = 4 * math.ceil(math.pi / 2 / angle - 1e-9)
-    return PoseGrid(np.array([[0.5, 0.5]]), 2 * math.pi / turns * np.arange(turns)[None] - yaw, *grid.shape)
 
 
 def _around(grid: OccupancyGrid, local: _Local, guess: ArrayLike, window: ArrayLike | None, angle: float) -> PoseGrid:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -30,6 +31,12 @@ class PoseGrid:
         start = poses[:, :2] - stride * np.array([cols, rows])
         headings = poses[:, 2:] + angle * np.arange(-turns, turns + 1)
         return cls(start, headings, 2 * rows + 1, 2 * cols + 1)
+
+    @classmethod
+    def whole(cls, shape: tuple[int, int], turns: int, stride: int = 1, yaw: float = 0.0) -> PoseGrid:
+        """Return the centres of every ``stride``-th cell of a map, with headings all around, less ``yaw`` [rad]."""
+        headings = 2 * math.pi / turns * np.arange(turns)[None] - yaw
+        return cls(np.array([[0.5, 0.5]]), headings, *(-(-size // stride) for size in shape))
 
     @property
     def count(self) -> int:

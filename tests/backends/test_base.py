@@ -139,15 +139,6 @@ def test_a_proxy_forwards_methods(name, monkeypatch):
     assert seen == [(tuple(positional), options)] and result in ("result", None)
 
 
-def test_a_proxy_forwards_properties():
-    class Able(Plain):
-        alignment = 256
-        in_batch = replays = True
-
-    proxy = Proxy(Able())
-    assert (proxy.info, proxy.alignment, proxy.in_batch, proxy.replays) == (Plain.info, 256, True, True)
-
-
 def test_a_proxy_sees_each_launch_of_programs_and_recordings(backend):
     """On real devices, results are equal, and every launch goes through ``compile``."""
     device = Watching(get_backend(backend))

@@ -88,23 +88,6 @@ def test_one_line_says_what_failed_and_why(machine, caplog, kind):
     assert caplog.records[0].levelname == "WARNING"
 
 
-@pytest.mark.parametrize("kind", [BROKEN, PASSING, KEPT])
-def test_numpy_is_taken_with_one_line_whatever_else_is_said(machine, monkeypatch, caplog, kind):
-    """NumPy needs no folder of kernels. Each process prints the line, even for stored verdicts."""
-    machine([GPU, WARP], {"opencl:0:0": kind, "warp:cpu": kind})
-    real = selection._open
-
-    def open_one(name):
-        notices.warn("the cache folder cannot be written")
-        return real(name)
-
-    monkeypatch.setattr(selection, "_open", open_one)
-    assert get_backend("auto").info.selection == "numpy"
-    (line,) = caplog.messages
-    assert line.startswith("gpusense: 'auto' is numpy, as nothing faster works: opencl:0:0 (A GPU, Driver 1)")
-    assert "; warp:cpu (CPU, Warp 1)" in line
-
-
 def test_a_verdict_is_reported_by_the_process_that_makes_it(machine, caplog):
     """Later processes with another compiled device are silent."""
     machine([GPU, WARP], {"opencl:0:0": KEPT})

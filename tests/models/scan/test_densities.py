@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support.textbook import textbook_log_hit, textbook_log_short
 
 import gpusense as gs
-from gpusense.models.scan.densities import log_hit, log_mixture, log_rand, log_short
+from gpusense.models.scan.densities import log_hit, log_mixture, log_short
 
 PRECISIONS = ("float64", "float32")
 
@@ -110,16 +110,3 @@ def test_continuous_part_and_atom_sum_to_one(expected, sigma, rate):
     atom = np.exp(log_mixture(top, expected, range_max=top, **p.to_dict()))
     lost = p.z_short if expected <= 0 else 0.0
     assert continuous + atom == pytest.approx(1 - lost, abs=1e-9)
-
-
-def test_mixture_of_one_component_is_that_component_and_nothing_is_nan():
-    z, expected = np.array([0.0, 1.0, 7.5]), np.array([3.0, -4.0, 11.0])
-    shape = {"sigma_hit": 1e-3, "lambda_short": 0.0, "range_max": 8.0}
-    names = ("z_hit", "z_short", "z_max", "z_rand")
-    alone = [dict(zip(names, np.eye(4)[i], strict=True), **shape) for i in range(4)]
-    np.testing.assert_array_equal(log_mixture(z, expected, **alone[0]), log_hit(z, expected, 1e-3, 8.0))
-    np.testing.assert_array_equal(log_mixture(z, expected, **alone[1]), log_short(z, np.minimum(expected, 8.0), 0.0))
-    np.testing.assert_array_equal(log_mixture(z, expected, **alone[2]), np.full(3, -np.inf))
-    np.testing.assert_array_equal(log_mixture(z, expected, **alone[3]), log_rand(z, 8.0))
-    assert log_mixture(np.inf, 3.0, **alone[2]) == 0.0
-    assert log_mixture([8.0, np.inf], 3.0, **alone[0]).tolist() == [-np.inf, -np.inf]

@@ -80,9 +80,7 @@ def models(
     plans, given, absent = plans_of(arguments)
     outcome, command = Outcome([], []), command_line("bench/error_vs_time/measure.py")
     if old is not None:
-        same(
-            {name: old["arguments"].get(name) for name in ALIKE}, {name: given.get(name) for name in ALIKE}, "arguments"
-        )
+        same(*({name: one.get(name) for name in ALIKE} for one in (old["arguments"], given)), "arguments")
         same([one["selection"] for one in old["devices"]], [one.info.selection for one in plans[0].backends], "devices")
         outcome.scenes, outcome.points = list(old["scenes"]), list(old["points"])
         command = f"{old['command']}; {command}"

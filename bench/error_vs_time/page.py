@@ -100,8 +100,7 @@ def _time(row: Row | None) -> str:
 
 def peers(rows: Sequence[Row]) -> list[str]:
     """Return the table of other implementations and of comparable rows of gpusense."""
-    outside = [row for row in rows if row.outside and row.scene == ALL]
-    lines = []
+    lines, outside = [], [row for row in rows if row.outside and row.scene == ALL]
     for need in ("rays", "beam model", "likelihood field"):
         measure = SHOWN[need][0]
         for device in dict.fromkeys(row.device for row in outside if row.need == need):
@@ -118,10 +117,9 @@ def peers(rows: Sequence[Row]) -> list[str]:
 def rivals(rows: Sequence[Row], need: str, of: str) -> list[str]:
     """Return the table of other programs for a task and of gpusense's rows of the same settings."""
     outside = [row for row in rows if row.outside and row.need == need]
-    lines = []
+    lines, settings = [], {row.setting for row in outside}
     for device in dict.fromkeys(row.device for row in outside):
         reference = [row for row in own(rows, need, device) if row.precision == "float32"]
-        settings = {row.setting for row in outside}
         listed = [row for row in [*outside, *reference] if row.device == device and row.setting in settings]
         for row in sorted(listed, key=lambda one: (int(one.setting.split()[0]), one.seconds)):
             errors = [value(row.errors[name], "m") for name in SHOWN[need]]

@@ -11,9 +11,9 @@
 // less the cell's, divided by a unit and rounded down, so that losses of several points fit a byte.
 // requires: score_cells
 
-// Points after which sums are compared, and points whose losses fit 16 bits.
+// Points after which sums are compared, and points whose losses fit 15 bits.
 #define STEP 48
-#define TOGETHER 256
+#define TOGETHER 128
 // Numbers that count the rows of a scan by their scores.
 #define BINS 512
 

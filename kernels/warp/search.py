@@ -20,10 +20,10 @@ from .score_cells import SHIFT_ROWS, TOP, ScoreTable, block_index, padded_lines,
 number_at, cell_at = reader(wp.int32), reader(wp.vec2i)
 # Sums of neighbouring rows.
 Rows = wp.types.vector(length=SHIFT_ROWS, dtype=wp.int32)
-# Points after which sums are compared, points that are read together, and points whose losses fit 16 bits.
+# Points after which sums are compared, points that are read together, and points whose losses fit 15 bits.
 STEP = 48
 AT_ONCE = 8
-TOGETHER = 256
+TOGETHER = 128
 # Numbers that count the rows of a scan by their scores.
 BINS = 512
 

@@ -106,7 +106,7 @@ def locate_scan(
     Raises:
         TypeError: the model is not a LikelihoodFieldModel, or an argument is of the wrong kind.
         ValueError: an argument breaks its rule, the model has ``compat``, or no cell of the map is free.
-        MemoryError: the device cannot hold the tables of the search, up to 22 bytes for each cell of the map.
+        MemoryError: the device cannot hold the tables of the search, up to 26 bytes for each cell of the map.
 
     Example:
         >>> import gpusense as gs, numpy as np

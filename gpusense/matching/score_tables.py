@@ -75,8 +75,8 @@ class ScoreTables:
         cells, info, self._size = self._cells(self.shape), backend.info, _launched(self.shape)
         if cells > _MOST_CELLS:
             raise ValueError(f"scores: must have at most {_MOST_CELLS} cells with margins, got {stack.shape}")
-        # Scores, one table of larger blocks, and the losses of four blocks at each level.
-        if (needed := (2 + 4 * levels) * cells) > info.memory:
+        # Scores, one table of larger blocks, bounds, and the losses of four blocks at each level.
+        if (needed := (6 + 4 * levels) * cells) > info.memory:
             raise MemoryError(
                 f"grid: a search of {tables * rows * cols} cells takes {needed / 1e9:.2g} GB of tables, "
                 f"but {info.name} has {info.memory / 1e9:.2g} GB; use a map with larger cells, or a part of it"
@@ -133,7 +133,9 @@ class ScoreTables:
             period, step, unit = self.stride << level, self.step(level), _UNIT[self.backend.info.kind] if level else 1
             cols, lines, tables = self._size
             size = -(-lines // period), -(-cols // period)
-            shape = ScoreTable(tables * (period // step) ** 2, *size, RUN)
+            in_lanes = with_lanes_flag(self.backend.info.lanes, "shift_scores", _NO_FLAGS)
+            # A kernel reads no more neighbours of a cell.
+            shape = ScoreTable(tables * (period // step) ** 2, *size, RUN if in_lanes else SHIFT_ROWS)
             exact = ScoreTable(tables * period**2, *size, 1)
             if (most := max(map(self._cells, (shape, exact)))) > _MOST_CELLS:
                 raise ValueError(f"scores: a search must fold at most {_MOST_CELLS} cells, got {most}")
@@ -149,7 +151,7 @@ class ScoreTables:
                     period // 2, self._beyond, unit,
                 )  # fmt: skip
             table = made
-            if not with_lanes_flag(self.backend.info.lanes, "shift_scores", _NO_FLAGS):
+            if not in_lanes:
                 table = self.backend.empty(self._cells(shape), _INT)
                 self.backend.compile("pack_rows", _NO_FLAGS)(_launched(shape), made, table, shape)
             # Copies live until the launches have ended.

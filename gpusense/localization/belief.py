@@ -1,87 +1,30 @@
 """Estimate the belief that a localiser follows a wrong pose, by a hidden Markov model.
 
-The states are "right" (the robot is inside the localiser's distribution) and "wrong" (it is elsewhere). The prior
-probability of "wrong" is ``START``. Over n scans and d metres a right pose becomes wrong, by a silent divergence or a
-carried robot, with probability ``1 - exp(-(PER_SCAN n + PER_METRE d))``; a wrong pose becomes right with probability
-``FOUND`` per scan. While the distribution is wide enough to cover several places, both happen with probability ``WIDE``
-per scan.
-
-A scan yields a log-likelihood ratio r of "wrong" against "right". Consecutive ratios are dependent: moved furniture is
-wrong in all scans of a room. The ratios are modelled as a first-order autoregressive process; the correlation ``rho =
-STAYS exp(-d / LENGTH - turn / TURN)`` falls with the motion between two scans. For normal ratios of equal variance the
-exact increment of the log odds is then
+The states are "right" (the robot is inside the localiser's distribution) and "wrong" (it is elsewhere). A scan yields a
+log-likelihood ratio r of "wrong" against "right". Consecutive ratios are a first-order autoregressive process of
+correlation ``rho = STAYS exp(-d / LENGTH - turn / TURN)`` (Hamilton, "A new approach to the economic analysis of
+nonstationary time series", *Econometrica* 57 (1989), treats such regimes), so the log odds change by
 
     (r_t - rho r_{t-1}) / (1 + rho),
 
-so a standing robot gains almost nothing from its hundredth scan, and a change is detected at once (Hamilton, "A new
-approach to the economic analysis of nonstationary time series", *Econometrica* 57 (1989), treats such regimes). A pose
-that became wrong since the last scan has another place, and the last ratio says nothing about it. Its share of "wrong"
-gets the whole ratio instead, and a rise by D counts as further evidence, since the ratio of a right pose would have
-stayed:
+and for a pose that became wrong since by r_t + max(r_t - r_{t-1}, 0) rho / (1 + rho).
 
-    r_t + max(r_t - r_{t-1}, 0) rho / (1 + rho).
+If a share a of the wrong places still looks like the right one, an increment i of the log odds becomes
 
-Such a place looks like the right one (see below) with probability ``ALIKE (1 - rho)``, since near the last pose its
-scan must also repeat the last scan.
+    log(a + (1 - a) e^i),   a <- a / (a + (1 - a) e^i).
 
-Some wrong places look like the right one: scans agree there equally, and are no evidence. ``ALIKE`` is the prior share
-of such places among wrong ones, and ``ALIKE_CHOSEN`` among places from a search, which prefers them. Places stop
-looking alike at the rates of ``ALIKE_LENGTH`` and ``ALIKE_TURN``. If a share a still looks alike, an increment i of the
-log odds becomes
-
-    log(a + (1 - a) e^i),   a <- a / (a + (1 - a) e^i),
-
-and even perfect scans of a short log leave "wrong" at least a share ``ALIKE`` of its prior odds.
-
-A search, for example after a start anywhere, chooses a place because the scans agree with it. This agreement is no new
-evidence and counts as repeated from the previous scan. A contradiction counts in full.
-
-Comparisons of the pose with other places of the map (:func:`ratio_of_places`) form a second series of ratios. Given
-right or wrong, they count as independent of the scans' ratios, the offset of their fit. Their autocorrelation is the
-same.
-
-**Evidence of a scan.** The log-likelihood ratio of "wrong" against "right" comes from the beams of one scan.
-A short beam is hardly evidence: people and furniture shorten beams at right poses as often as walls at wrong poses.
-Among the beams that meet a mapped wall, T pass through and A agree, C of them within a few centimetres. At a wrong pose
-that a filter fitted to a scan beams also agree, but less closely. On a wrong map many beams, N, end in unknown cells or
-off the map and are no evidence. Let n = A + S + T be the informative beams, S of them short, and f(a, b) = log((a +
-1/2) / (b + 1/2)). The ratio is
+T beams of a scan pass through walls, A agree, C of them within a few centimetres, and S are short; N end in unknown
+cells or off the map. With n = A + S + T and f(a, b) = log((a + 1/2) / (b + 1/2)) the ratio is
 
     r = n / (n + FEW) (BIAS + SLOPE f(T, A) + BLUNT f(A - C, C) + NOTHING f(N, n)),
 
-within LIMITS, since another place may always look alike. A pose inside solid cells adds SOLID, a pose in unknown cells
-UNKNOWN. The coefficients come from a logistic regression on about 450 simulated runs with people, moved and new
-furniture, glass, wrong maps, 16 to 360 beams and kidnapping; right and wrong poses have equal weight. 200 other runs
-(``bench/results/verdict.md``) yield 2.83, 1.40, 0.62 and 0.40. BIAS is lower by CAUTION, since false alarms cost
-more; only CAUTION was chosen on the tuning half of the recorded logs.
-
-**Other places.** On a coarse or old map many beams contradict even the right pose, and a single scan cannot
-distinguish a wrong pose from a wrong map. A search of the whole map can. At a wrong pose the scan fits another place
-far better: the true place, or on another building's map the best of many. At a right pose it seldom does. The best
-place beyond 1 m or 0.5 rad of the pose maximises T log p(z | place) - rho, with the temperature T and the ratio rho of
-the place's beams that meet walls. Its lead is
-
-    L = T log p(z | place) - T log p(z | pose),
-
-A scan of K beams has m = T K independent beams. I is 1 if the search found the pose, else 0. If the place were
-certainly possible, the ratio of the comparison would be
+within LIMITS. A pose inside solid cells adds SOLID, a pose in unknown cells UNKNOWN. The best other place, of lead L
+and ratio rho of its beams, of which m are independent, adds log(pi e^q + 1 - pi), pi = 1 / (1 + e^rho), if
 
     q = OF_LEAD min(max(L, NEAREST), FARTHEST) - m / (m + HALF) (BY_CHANCE + IS_FOUND I)
 
-The likelihood of end points prefers places with many walls, even walls that beams pass through: after walls have
-moved, one of many rooms fits the scan better than the right pose, although its beams contradict it. Then the map is
-wrong, and the lead is meaningless. By rho the place is possible with probability pi = 1 / (1 + e^rho), so for q > 0 the
-likelihood ratio is the mean of both cases,
-
-    log(pi e^q + 1 - pi).
-
-For q < 0 it is q: even on a wrong map a wrong pose is seldom among the best. BY_CHANCE is the chance gain of the best
-of many places, 0 for a scan without information. OF_LEAD comes from a logistic regression with the scan's ratio as an
-offset, on 71 further simulated runs and on the log robotdata4 of Wean Hall, with a fifth of the weight of right poses.
-BY_CHANCE and IS_FOUND were chosen on 246 more simulated runs, half of them with 30 % of the walls moved, and on the
-tuning half of the recorded logs. The 200 runs, with few doubtful right poses, yield 0.29, 1.6 and 0.0 for the three.
-
-Among landmarks the ratio comes from the prediction of features (:class:`gpusense.localization.verdict.Evidence`).
+is positive, else q; I is 1 if the search found the pose. ``docs/localization.md`` gives the reasons, and the runs that
+the numbers come from. Landmarks: :class:`gpusense.localization.verdict.Evidence`.
 """
 
 from __future__ import annotations

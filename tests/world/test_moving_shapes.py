@@ -200,6 +200,19 @@ def test_gpus_have_the_same_ranges(as_gpu: Any, backend: str, monkeypatch: pytes
     assert "ROW_GROUPS" in caster._caster.flags
 
 
+def test_teams_of_gpus_find_the_shapes_of_few_and_many_rays(as_gpu: Any, backend: str) -> None:
+    rng = np.random.default_rng(4)
+    shapes, poses = crowd_of(rng)
+    device = as_gpu()
+    for rays in (1, 45, 2100):
+        bearings, found = rng.permutation(np.linspace(-math.pi, math.pi, rays)), []
+        for name in ("numpy", device):
+            worlds = gs.Worlds(np.zeros((1, 120, 120), np.int8), 0.1, ORIGINS[1], backend=name)
+            worlds.shapes = shapes
+            found.append(gs.RayCaster(worlds, RANGE, backend=name).cast(poses[:: max(rays // 30, 1)], bearings))
+        np.testing.assert_allclose(found[1], found[0], rtol=0, atol=2e-6, err_msg=f"{rays} rays")
+
+
 CASES = [
     (dict(discs=[[[3.0, 1.0, 1.0]]]), 3.0, "a disc that the ray grazes"),
     (dict(discs=[[[1.0, 0.0, 2.0]]]), 0.0, "inside a disc"),

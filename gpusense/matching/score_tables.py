@@ -44,7 +44,8 @@ def field_scores(distances: np.ndarray, sigma: float, max_distance: float) -> np
 class Folded(NamedTuple):
     """Tables of a level as images, one per first cell of blocks."""
 
-    table: Buffer  # the images, as bytes for kernels in lanes, otherwise with four rows in a number
+    table: Buffer  # the images, as bytes for a kernel in lanes, otherwise with four rows in a number
+    flags: frozenset[str]  # flags of the kernel that reads them
     shape: ScoreTable  # their sizes
     unit: int  # scores in a unit of a loss
     quarters: Buffer | None  # losses of the blocks' quarters, relative to the blocks, as images; None at level 0
@@ -133,9 +134,9 @@ class ScoreTables:
             period, step, unit = self.stride << level, self.step(level), _UNIT[self.backend.info.kind] if level else 1
             cols, lines, tables = self._size
             size = -(-lines // period), -(-cols // period)
-            in_lanes = with_lanes_flag(self.backend.info.lanes, "shift_scores", _NO_FLAGS)
+            flags = with_lanes_flag(self.backend.info.lanes, "shift_scores", _NO_FLAGS)
             # A kernel reads no more neighbours of a cell.
-            shape = ScoreTable(tables * (period // step) ** 2, *size, RUN if in_lanes else SHIFT_ROWS)
+            shape = ScoreTable(tables * (period // step) ** 2, *size, RUN if flags else SHIFT_ROWS)
             exact = ScoreTable(tables * period**2, *size, 1)
             if (most := max(map(self._cells, (shape, exact)))) > _MOST_CELLS:
                 raise ValueError(f"scores: a search must fold at most {_MOST_CELLS} cells, got {most}")
@@ -151,10 +152,10 @@ class ScoreTables:
                     period // 2, self._beyond, unit,
                 )  # fmt: skip
             table = made
-            if not in_lanes:
+            if not flags:
                 table = self.backend.empty(self._cells(shape), _INT)
                 self.backend.compile("pack_rows", _NO_FLAGS)(_launched(shape), made, table, shape)
             # Copies live until the launches have ended.
             self.backend.synchronize()
-            self._folded[level] = Folded(table, shape, unit, quarters, exact)
+            self._folded[level] = Folded(table, flags, shape, unit, quarters, exact)
         return self._folded[level]

@@ -17,7 +17,6 @@ from gpusense.backends import get_backend
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.structs import ScoreTable
 from gpusense.matching.pose_grid import Found, PoseGrid
 from gpusense.matching.score_tables import RUN, SHIFT_ROWS, TOP, ScoreTables
@@ -208,12 +207,11 @@ class _Run:
         """Bound all blocks: scores (S * A, rows, cols), -1 where none is allowed, and the best of each row."""
         folded, rows = self._tables.folded(self._level), self._items * self._height
         self._score = self._space.empty("bounds", rows * self._width, _INT)
-        flags = with_lanes_flag(self._backend.info.lanes, "shift_scores", _NO_FLAGS)
-        columns = -(-self._width // RUN) if flags else self._width
+        columns = -(-self._width // RUN) if folded.flags else self._width
         self._launch(
             "shift_scores", (columns, -(-self._height // SHIFT_ROWS), self._items), folded.table, *self._bound_ends,
             self._allowed[self._level], self._score, folded.shape, self._items, self._height, self._width, folded.unit,
-            flags=flags,
+            flags=folded.flags,
         )  # fmt: skip
         self._evaluated += rows * self._width
         self._maxima = self._space.empty("row maxima", 2 * rows, _INT)

@@ -105,3 +105,25 @@ def test_models_and_kernels_class_readings_alike(backend, model, on_device):
     expected = scored.log_likelihood(poses, with_equal_classes())
     found = scored.bind(to_device(poses), to_device(scan()))() if on_device else scored.log_likelihood(poses, scan())
     np.testing.assert_allclose(np.asarray(found), expected, rtol=1e-4)
+
+
+def expected_and_scored(model, backend):
+    """Return log-likelihoods by classes of the host, and a model of a backend with poses."""
+    parameters, poses = BEAM if model is gs.BeamModel else FIELD, np.tile(POSE, (4, 1))
+    expected = model(GRID, SCANNER, parameters, backend="numpy").log_likelihood(poses, with_equal_classes())
+    return expected, model(GRID, SCANNER, parameters, backend=backend), poses
+
+
+@pytest.mark.parametrize("model", [gs.BeamModel, gs.LikelihoodFieldModel])
+def test_kernels_class_readings_of_numpy_as_the_host_does(as_gpu, model):
+    """Repeated calls of GPUs class readings on the device."""
+    expected, scored, poses = expected_and_scored(model, as_gpu(True))
+    for _ in range(3):
+        np.testing.assert_allclose(scored.log_likelihood(poses, scan()), expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("model", [gs.BeamModel, gs.LikelihoodFieldModel])
+def test_kernels_class_readings_on_the_device_as_the_host_does(warp_as_gpu, model):
+    expected, scored, poses = expected_and_scored(model, warp_as_gpu)
+    call = scored.bind(to_device(poses), to_device(scan()))
+    np.testing.assert_allclose(call().numpy(), expected, rtol=1e-4)

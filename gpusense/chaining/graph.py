@@ -37,7 +37,7 @@ class Equations:
         if ordered:
             ends = [np.append(one, self.place) for one in ((first, second), (second, first))]
             self.place = np.argsort(order_of(*ends))
-        # Each link has blocks of both poses, and damping one of each pose.
+        # Links contribute blocks of both poses; damping adds one block per pose.
         self._columns = np.append(self.place[np.stack([first, second], axis=1)], self.place)
         self._starts = np.append(2 * np.arange(len(first)), 2 * len(first) + np.arange(count + 1))
 

@@ -249,7 +249,7 @@ def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
 
 
 def _follows(line: str, number: int, flags: frozenset[str], branches: list[tuple[int, bool, bool | None]]) -> bool:
-    """Open, change or close a branch, and return whether a line is a condition that may stand there."""
+    """Open, change or close a branch, and return whether a line is a valid condition."""
     match = _CONDITION.match(line)
     if match is None or not (match[4] or match[3] in FLAGS):
         return False

@@ -3,8 +3,8 @@
 A correction that begins a lesson only keeps its scan and estimate. The next one, or the same one among the first scans,
 starts the terms of the readings at poses around the estimate, once the device has ended the step. Another one reads
 them. In later corrections, while the device works on the step, the host places the terms, chooses beams, adds up their
-scores, fits, and learns: one part of the oldest lesson per correction, or all parts among the first scans, which are
-all lessons. A lesson ends a fixed number of corrections later on every device.
+scores, fits, and learns: one part of the oldest lesson per correction. Each of the first scans is a lesson, whose parts
+all run at once. A lesson ends a fixed number of corrections later on every device.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Learner:
         return lesson._replace(result=self._received[1])
 
     def exchange(self) -> None:
-        """Read the terms of a started lesson, and start those of the next; the device has ended the step.
+        """Read the terms of a started lesson, and start the next lesson; the device has ended the step.
 
         A lesson that has just begun waits for the next correction, except among the first scans.
         """
@@ -118,7 +118,7 @@ class Learner:
 
     @property
     def _is_early(self) -> bool:
-        """Return whether the last scan is among the first, which are all lessons."""
+        """Return whether every scan is still a lesson."""
         return self.seen <= DEFAULTS.calibrations
 
     def _started(self, lesson: Lesson) -> Lesson:

@@ -1,21 +1,26 @@
-"""Make maps of landmarks and lines from features of scans at known poses, or from an occupancy grid."""
+"""Make maps of landmarks and lines from features of scans at known poses, or from an occupancy grid.
+
+The state of a landmark is its position, of a line its offset to the left and its direction, in the frame of its first
+feature. States grow by information, the most certain features first.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
-from gpusense._util.typing import Floats
+from gpusense._util.angles import wrapped
+from gpusense._util.typing import Floats, Integers
 from gpusense.backends import Selection
 from gpusense.features.extract import extract_features
-from gpusense.features.feature_map import LANDMARK_KINDS, MAP_KINDS, FeatureMap, joined_maps
-from gpusense.features.lines import lines_of
-from gpusense.features.result import KIND_TYPE, Features, check_kinds
+from gpusense.features.feature_map import MAP_KINDS, FeatureMap, joined_maps
+from gpusense.features.result import KIND_TYPE, Features, across_lines, check_kinds
 from gpusense.models.scan.caster import RayCaster
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
@@ -24,9 +29,6 @@ from gpusense.world.scanner import Scanner
 _BEAMS, _RANGE, _SPACING, _CLEARANCE = 720, 12.0, 1.0, 0.3
 # Most scans to cast in a map, and least number of scans that show a landmark.
 _MOST_SCANS, _VIEWS = 4000, 3
-_SIZES = {"corner": 0.5, "door": 0.4, "pole": 0.1, "reflector": 0.1}
-# Kinds without a direction.
-ROUND = ("pole", "reflector")
 
 
 def map_features(
@@ -73,10 +75,7 @@ def map_features(
     if (spread < 0).any():
         raise ValueError(f"pose_deviation: must be at least 0, got {checks.show(spread)}")
     enough = checks.integer("least", least, low=1)
-    parts = [clustered(features[name], placed, spread, name, enough) for name in LANDMARK_KINDS if name in wanted]
-    if "line" in wanted:
-        parts.insert(0, lines_of(features["line"], placed, spread, enough))
-    return joined_maps(parts)
+    return joined_maps([_merged(features[name], placed, spread, name, enough) for name in MAP_KINDS if name in wanted])
 
 
 def landmarks_of_map(
@@ -141,109 +140,177 @@ def _free_places(grid: OccupancyGrid) -> Floats:
     return np.column_stack([ox + c * x - s * y, oy + s * x + c * y, np.zeros(len(x))])
 
 
-# Features form one landmark if they are within this many deviations plus this distance [m], and differ at most by this
-# direction [rad] and these sizes [m or rad].
-_DEVIATIONS, _FLOOR, _TURN = 4.0, 0.03, 0.4
+# Features form one landmark within this many deviations plus this distance [m], lines plus this direction [rad].
+_DEVIATIONS, _FLOOR, _LINE_TURN = 4.0, 0.03, 0.02
+# Largest differences between a landmark and its features: direction [rad], position [m], and sizes [m or rad].
+_TURN, _NEAR, _SIZES = 0.4, 2.0, {"corner": 0.5, "door": 0.4, "pole": 0.1, "reflector": 0.1}
+# Kinds without a direction.
+_ROUND = ("pole", "reflector")
+# Largest difference in direction between compared lines [rad], and largest gap between pieces of a line [m].
+_ALIKE, _GAP = 0.15, 0.3
+# Most passes that join lines after they have grown.
+_PASSES = 4
 
 
 @dataclass
-class InWorld:
-    """Features of one kind in the world."""
+class _Pieces:
+    """Features of one kind in the world, or landmarks made from them."""
 
-    scan: np.ndarray
-    pose: np.ndarray
-    covariance: np.ndarray
-    size: np.ndarray
+    pose: Floats  # (P, 3) as in ``FeatureMap``
+    size: Floats  # (P,)
+    covariance: Floats  # (P, 2, 2) of x and y; for lines of the offset to the left at the middle, and of the direction
+
+    def only(self, rows: NDArray[Any]) -> _Pieces:
+        """Return some of the pieces."""
+        return _Pieces(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
+    def by_certainty(self, kind: str) -> Integers:
+        """Return the pieces in order, the most certain one first."""
+        of = self.covariance[:, 1, 1] if kind == "line" else np.trace(self.covariance, axis1=1, axis2=2)
+        return np.argsort(of, kind="stable")
 
 
-def in_world(features: Features, poses: Floats, spread: Floats) -> InWorld:
+def _in_world(features: Features, poses: Floats, spread: Floats, kind: str) -> _Pieces:
     """Return features in the world; covariances include the errors of poses."""
     at = poses[features.scan]
     c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
     turn = np.stack([c, -s, s, c], axis=1).reshape(-1, 2, 2)
     off = (turn @ features.pose[:, :2, None])[..., 0]
-    covariance = turn @ features.covariance[:, :2, :2] @ turn.transpose(0, 2, 1)
-    across = np.stack([-off[:, 1], off[:, 0]], axis=1) * spread[1]
-    covariance = covariance + np.eye(2) * spread[0] ** 2 + across[:, :, None] * across[:, None, :]
-    pose = np.column_stack([at[:, :2] + off, at[:, 2] + features.pose[:, 2]])
-    return InWorld(features.scan, pose, covariance, features.size)
+    theta = at[:, 2] + features.pose[:, 2]
+    if kind == "line":
+        # Positive to the left, towards the scanner.
+        covariance = across_lines(features) * ((1, -1), (-1, 1))
+        # A heading error moves the middle across by the error times its distance along the line.
+        lever = np.cos(theta) * off[:, 0] + np.sin(theta) * off[:, 1]
+        turned = np.stack([lever, np.ones_like(lever)], axis=1)
+    else:
+        covariance = turn @ features.covariance[:, :2, :2] @ turn.transpose(0, 2, 1)
+        covariance[:, 1, 1] += spread[0] ** 2
+        turned = np.stack([-off[:, 1], off[:, 0]], axis=1)
+    covariance[:, 0, 0] += spread[0] ** 2
+    turned = turned * spread[1]
+    covariance = covariance + turned[:, :, None] * turned[:, None, :]
+    return _Pieces(np.column_stack([at[:, :2] + off, theta]), features.size, covariance)
 
 
-def clustered(features: Features, poses: Floats, spread: Floats, kind: str, least: int) -> FeatureMap:
-    """Return the landmarks of features of one kind."""
-    world = in_world(features, poses, spread)
-    clusters = _Clusters(kind)
-    order = np.argsort(np.einsum("fii->f", world.covariance) if len(world.scan) else np.zeros(0), kind="stable")
-    for i in order.tolist():
-        clusters.add(world, i)
-    label = np.array([clusters.nearest(world, i) for i in range(len(world.scan))], np.int64)
-    return _fused(world, label, kind, least)
+def _seen(frame: Floats, pose: Floats, kind: str) -> tuple[Floats, Floats]:
+    """Return the states (P, 2) of pieces in frames (P, 3), and the matrices (P, 2, 2) from landmarks to pieces."""
+    off, row = pose[..., :2] - frame[:, :2], np.tile(np.eye(2), (len(frame), 1, 1))
+    if kind != "line":
+        return off, row
+    c, s = np.cos(frame[:, 2]), np.sin(frame[:, 2])
+    row[:, 0, 1] = c * off[:, 0] + s * off[:, 1]
+    return np.stack([c * off[:, 1] - s * off[:, 0], wrapped(pose[..., 2] - frame[:, 2])], axis=1), row
 
 
-class _Clusters:
-    """Growing landmarks, the most certain features first."""
+class _Growing:
+    """Growing landmarks of one kind, each with a state in the frame of its first piece."""
 
-    def __init__(self, kind: str) -> None:
-        self._kind = kind
-        self._information = np.zeros((0, 2, 2))
-        self._sum = np.zeros((0, 2))
-        self._pose = np.zeros((0, 3))
-        self._covariance = np.zeros((0, 2, 2))
-        self._size = np.zeros(0)
+    def __init__(self, pieces: _Pieces, kind: str) -> None:
+        most = len(pieces.size)
+        self._pieces, self._kind, self._count = pieces, kind, 0
+        self._frame, self._size, self._ends = np.zeros((most, 3)), np.zeros(most), np.zeros((most, 2))
+        self._information, self._sum = np.zeros((most, 2, 2)), np.zeros((most, 2))
+        self._state, self._covariance = np.zeros((most, 2)), np.zeros((most, 2, 2))
 
-    def nearest(self, world: InWorld, i: int) -> int:
-        """Return the nearest landmark that a feature may belong to, or -1."""
-        off = self._pose[:, :2] - world.pose[i, :2]
-        near = np.flatnonzero(np.abs(off).max(axis=1, initial=0) < 2.0)
+    def nearest(self, i: int) -> int:
+        """Return the nearest landmark that a piece may belong to, or -1."""
+        pose, size = self._pieces.pose[i], self._pieces.size[i]
+        period = math.pi if self._kind == "door" else 2 * math.pi
+        turn = np.abs(np.mod(pose[2] - self._frame[: self._count, 2] + period / 2, period) - period / 2)
+        limit = {"line": _ALIKE} | dict.fromkeys(_ROUND, math.inf)
+        near = np.flatnonzero(turn < limit.get(self._kind, _TURN))
+        offset, row = _seen(self._frame[near], pose, self._kind)
+        if self._kind == "line":
+            along, half = row[:, 0, 1], 0.5 * size
+            fits = (along - half < self._ends[near, 1] + _GAP) & (along + half > self._ends[near, 0] - _GAP)
+        else:
+            fits = np.abs(offset - self._state[near]).max(axis=1, initial=0) < _NEAR
+            fits &= np.abs(self._size[near] - size) < _SIZES[self._kind]
+        near, offset, row = near[fits], offset[fits], row[fits]
         if not len(near):
             return -1
-        both = self._covariance[near] + world.covariance[i] + np.eye(2) * _FLOOR**2
-        distance = np.einsum("mi,mij,mj->m", off[near], np.linalg.inv(both), off[near])
-        fits = np.abs(self._size[near] - world.size[i]) < _SIZES[self._kind]
-        if self._kind not in ROUND:
-            period = math.pi if self._kind == "door" else 2 * math.pi
-            turn = np.mod(self._pose[near, 2] - world.pose[i, 2] + period / 2, period) - period / 2
-            fits &= np.abs(turn) < _TURN
-        distance = np.where(fits, distance, np.inf)
+        residual = offset - np.einsum("mij,mj->mi", row, self._state[near])
+        both = row @ self._covariance[near] @ row.transpose(0, 2, 1) + self._pieces.covariance[i]
+        both = both + np.diag(np.square([_FLOOR, _LINE_TURN if self._kind == "line" else _FLOOR]))
+        distance = np.einsum("mi,mij,mj->m", residual, np.linalg.inv(both), residual)
         best = int(distance.argmin())
         return int(near[best]) if distance[best] < _DEVIATIONS**2 else -1
 
-    def add(self, world: InWorld, i: int) -> None:
-        """Add a feature to the nearest landmark, or begin one."""
-        j = self.nearest(world, i)
-        information = np.linalg.inv(world.covariance[i])
+    def add(self, i: int) -> int:
+        """Add a piece to the nearest landmark, or begin one; return the landmark."""
+        pieces, j = self._pieces, self.nearest(i)
         if j < 0:
-            self._information = np.concatenate([self._information, information[None]])
-            self._sum = np.concatenate([self._sum, (information @ world.pose[i, :2])[None]])
-            self._pose = np.concatenate([self._pose, world.pose[i][None]])
-            self._covariance = np.concatenate([self._covariance, world.covariance[i][None]])
-            self._size = np.append(self._size, world.size[i])
-            return
-        self._information[j] += information
-        self._sum[j] += information @ world.pose[i, :2]
+            j = self._count
+            self._count += 1
+            self._frame[j], self._size[j], self._ends[j] = pieces.pose[i], pieces.size[i], (np.inf, -np.inf)
+        (offset,), (row,) = _seen(self._frame[[j]], pieces.pose[i], self._kind)
+        information = np.linalg.inv(pieces.covariance[i])
+        self._information[j] += row.T @ information @ row
+        self._sum[j] += row.T @ information @ offset
         self._covariance[j] = np.linalg.inv(self._information[j])
-        self._pose[j, :2] = self._covariance[j] @ self._sum[j]
+        self._state[j] = self._covariance[j] @ self._sum[j]
+        ends = row[0, 1] + 0.5 * pieces.size[i] * np.array([-1, 1])
+        self._ends[j] = min(self._ends[j, 0], ends[0]), max(self._ends[j, 1], ends[1])
+        return j
 
 
-def _fused(world: InWorld, label: np.ndarray, kind: str, least: int) -> FeatureMap:
-    """Return each landmark as the weighted mean of its features."""
-    poses, covariances, sizes, counts = [], [], [], []
-    for j in range(int(label.max(initial=-1)) + 1):
-        rows = np.flatnonzero(label == j)
-        if len(np.unique(world.scan[rows])) < least:
-            continue
-        information = np.linalg.inv(world.covariance[rows])
-        covariance = np.linalg.inv(information.sum(axis=0))
-        xy = covariance @ np.einsum("fij,fj->i", information, world.pose[rows, :2])
-        off = world.pose[rows, :2] - xy
-        scatter = np.einsum("fi,fij,fj->", off, information, off) / max(2 * len(rows) - 2, 1)
-        factor = 2 if kind == "door" else 1
-        theta = np.angle(np.exp(1j * factor * world.pose[rows, 2]).sum()) / factor if kind not in ROUND else 0.0
-        poses.append([*xy, theta])
-        covariances.append(covariance * max(scatter, 1.0))
-        sizes.append(np.median(world.size[rows]))
-        counts.append(len(rows))
-    return FeatureMap(
-        np.full(len(counts), kind, KIND_TYPE), np.array(poses).reshape(-1, 3), np.array(covariances).reshape(-1, 2, 2),
-        np.array(sizes, float), np.array(counts, np.int64),
-    )  # fmt: skip
+def _labels(pieces: _Pieces, kind: str) -> Integers:
+    """Return the landmark (P,) of each piece, or -1."""
+    growing, label = _Growing(pieces, kind), np.zeros(len(pieces.size), np.int64)
+    for i in pieces.by_certainty(kind).tolist():
+        label[i] = growing.add(i)
+    # A landmark may have moved away from its first pieces; lines join in further passes.
+    return label if kind == "line" else np.array([growing.nearest(i) for i in range(len(label))], np.int64)
+
+
+def _merged(features: Features, poses: Floats, spread: Floats, kind: str, least: int) -> FeatureMap:
+    """Merge features of one kind into the landmarks or lines that at least ``least`` scans show."""
+    own, scan = _in_world(features, poses, spread, kind), features.scan
+    label, made = np.arange(len(scan)), own
+    for _ in range(_PASSES if kind == "line" else 1):
+        before, label = len(made.size), _labels(made, kind)[label]
+        own, scan = own.only(label >= 0), scan[label >= 0]
+        label = np.unique(label[label >= 0], return_inverse=True)[1].ravel()
+        made = _fused(own, label, kind)
+        if len(made.size) == before:
+            break
+    rows = [j for j in range(len(made.size)) if len(np.unique(scan[label == j])) >= least]
+    count, made = np.bincount(label, minlength=len(made.size))[rows], made.only(np.array(rows, np.int64))
+    if kind == "line":
+        normal = np.column_stack([-np.sin(made.pose[:, 2]), np.cos(made.pose[:, 2])])
+        made.covariance = made.covariance[:, :1, :1] * normal[:, :, None] * normal[:, None, :]
+        made.pose[:, 2] = wrapped(made.pose[:, 2])
+    return FeatureMap(np.full(len(rows), kind, KIND_TYPE), made.pose, made.covariance, made.size, count)
+
+
+def _fused(own: _Pieces, label: Integers, kind: str) -> _Pieces:
+    """Return each landmark as the mean of its pieces, weighted by information; a line from end to end."""
+    count = int(label.max(initial=-1)) + 1
+    fused = _Pieces(np.zeros((count, 3)), np.zeros(count), np.zeros((count, 2, 2)))
+    order = own.by_certainty(kind)
+    for j in range(count):
+        rows = order[label[order] == j]
+        frame, information = own.pose[rows[:1]].copy(), np.linalg.inv(own.covariance[rows])
+        if kind == "line":
+            direction = np.array([math.cos(frame[0, 2]), math.sin(frame[0, 2])])
+            along = _seen(np.repeat(frame, len(rows), axis=0), own.pose[rows], kind)[1][:, 0, 1]
+            ends = (along - 0.5 * own.size[rows]).min(), (along + 0.5 * own.size[rows]).max()
+            # At its middle the offset of a line is nearly independent of its direction.
+            frame[0, :2] += 0.5 * (ends[0] + ends[1]) * direction
+        observed, row = _seen(np.repeat(frame, len(rows), axis=0), own.pose[rows], kind)
+        weighted = row.transpose(0, 2, 1) @ information
+        covariance = np.linalg.inv((weighted @ row).sum(axis=0))
+        state = covariance @ (weighted @ observed[..., None]).sum(axis=0)[:, 0]
+        rest = observed - row @ state
+        scatter = np.einsum("pi,pij,pj->", rest, information, rest) / max(2 * len(rows) - 2, 1)
+        fused.covariance[j] = covariance * max(scatter, 1.0)
+        if kind == "line":
+            fused.pose[j] = *(frame[0, :2] + state[0] * direction[::-1] * (-1, 1)), frame[0, 2] + state[1]
+            fused.size[j] = ends[1] - ends[0]
+        else:
+            factor = 0 if kind in _ROUND else 2 if kind == "door" else 1
+            turned = np.angle(np.exp(1j * factor * own.pose[rows, 2]).sum()) / max(factor, 1)
+            fused.pose[j] = *(frame[0, :2] + state), turned
+            fused.size[j] = np.median(own.size[rows])
+    return fused

@@ -211,3 +211,21 @@ def test_features_seen_too_seldom_are_no_landmarks(surveyed):
     assert len(gs.map_features(features, poses, least=1)) > 0
     assert len(gs.map_features(features[:0], np.zeros((0, 3)))) == 0
     assert repr(gs.map_features(features[:0], np.zeros((0, 3)))) == "FeatureMap(none)"
+
+
+def test_a_line_counts_its_own_features():
+    """Three pieces of the second wall are together more certain than the only piece of the first one."""
+    deviation = np.array([0.010, 0.015, 0.015, 0.015])
+    information = np.zeros((4, 3, 3))
+    information[:, 1, 1] = information[:, 2, 2] = deviation**-2
+    covariance = np.where(information > 0, deviation[:, None, None] ** 2, 0.0)
+    covariance[:, 0, 0] = np.inf
+    pose = np.column_stack([np.full(4, 2.0), [5.0, 0.0, 0.0, 0.0], np.zeros(4)])
+    features = gs.Features(
+        np.full(4, "line"), np.arange(4), pose, covariance, information, np.full(4, 4.0), np.ones(4)
+    )  # fmt: skip
+    found = gs.map_features(features, np.zeros((4, 3)), pose_deviation=(0.0, 0.0))
+    assert found.count.tolist() == [3]
+    np.testing.assert_allclose(found.pose, [[2.0, 0.0, 0.0]], atol=1e-12)
+    both = gs.map_features(features, np.zeros((4, 3)), pose_deviation=(0.0, 0.0), least=1)
+    assert sorted(zip(both.pose[:, 1].round(6).tolist(), both.count.tolist(), strict=True)) == [(0.0, 3), (5.0, 1)]

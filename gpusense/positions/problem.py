@@ -16,17 +16,13 @@ from gpusense._util.typing import Floats
 from gpusense.positions.fix import EPS, STATUSES, Complexes, PositionFix, wrap
 from gpusense.world.plausible import look_at_bearings
 
-# rho(z), rho'(z) and rho''(z) of the squared residual z, by the names of scipy.optimize.least_squares.
-LOSSES: dict[str, Callable[[Floats], tuple[Floats, Floats, Floats]]] = {
-    "linear": lambda z: (z, np.ones_like(z), np.zeros_like(z)),
-    "soft_l1": lambda z: (2 * z / (np.sqrt(1 + z) + 1), (1 + z) ** -0.5, -0.5 * (1 + z) ** -1.5),
-    "huber": lambda z: (
-        np.where(z <= 1, z, 2 * np.sqrt(z) - 1),
-        np.maximum(z, 1.0) ** -0.5,
-        np.where(z <= 1, 0.0, -0.5 * np.maximum(z, 1.0) ** -1.5),
-    ),
-    "cauchy": lambda z: (np.log1p(z), 1 / (1 + z), -1 / (1 + z) ** 2),
-    "arctan": lambda z: (np.arctan(z), 1 / (1 + z * z), -2 * z / (1 + z * z) ** 2),
+# rho(z) and rho'(z) of the squared residual z, by the names of scipy.optimize.least_squares.
+LOSSES: dict[str, Callable[[Floats], tuple[Floats, Floats]]] = {
+    "linear": lambda z: (z, np.ones_like(z)),
+    "soft_l1": lambda z: (2 * z / (np.sqrt(1 + z) + 1), (1 + z) ** -0.5),
+    "huber": lambda z: (np.where(z <= 1, z, 2 * np.sqrt(z) - 1), np.maximum(z, 1.0) ** -0.5),
+    "cauchy": lambda z: (np.log1p(z), 1 / (1 + z)),
+    "arctan": lambda z: (np.arctan(z), 1 / (1 + z * z)),
 }
 # Least condition number of a singular Jacobian, given rounding errors of about 1e-16.
 SINGULAR = 1e12
@@ -125,7 +121,7 @@ class Problem:
 
     def rho(self, scaled: Floats) -> tuple[Floats, Floats]:
         """Return the losses of scaled residuals, and their weights under a robust loss."""
-        value, slope, _ = LOSSES[self.loss]((scaled / self.loss_scale) ** 2)
+        value, slope = LOSSES[self.loss]((scaled / self.loss_scale) ** 2)
         return value * self.loss_scale**2, slope
 
     def costs(self, states: Floats) -> Floats:
@@ -221,11 +217,9 @@ def make_problem(
     distances = None if ranges is None else _not_negative("ranges", ranges, count, checks.FARTHEST)
     angles = None if bearings is None else checks.array("bearings", bearings, (count,), largest=checks.FARTHEST)
     look_at_bearings("bearings", angles)
-    theta = (
-        None
-        if heading is None
-        else float(checks.array("heading", checks.real("heading", heading), largest=checks.FARTHEST))
-    )
+    theta = None if heading is None else checks.real("heading", heading)
+    if theta is not None:
+        checks.array("heading", theta, largest=checks.FARTHEST)
     sigma_r, sigma_b = deviations(names[0], sigma_range, count), deviations(names[1], sigma_bearing, count)
     factors = np.ones(count) if weights is None else _not_negative("weights", weights, count, _LARGE)
     loss = checks.choice("loss", loss, tuple(LOSSES))
@@ -242,18 +236,9 @@ def make_problem(
     relative = positions - origin
     relative[np.abs(relative) < _SAME_PLACE] = 0.0
     return Problem(
-        relative,
-        origin,
-        None if distances is None else distances[used],
-        None if angles is None else angles[used],
-        theta,
-        sigma_r[used],
-        sigma_b[used],
-        factors,
-        loss,
-        loss_scale,
-        used,
-    )
+        relative, origin, None if distances is None else distances[used], None if angles is None else angles[used],
+        theta, sigma_r[used], sigma_b[used], factors, loss, loss_scale, used,
+    )  # fmt: skip
 
 
 def _not_negative(name: str, values: ArrayLike, count: int, largest: float) -> Floats:

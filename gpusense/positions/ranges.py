@@ -12,7 +12,7 @@ from gpusense._util.angles import wrapped
 from gpusense._util.typing import Floats, Loss
 from gpusense.positions.fix import PositionFix, two_circles, wrap
 from gpusense.positions.problem import Problem, make_problem, subsets
-from gpusense.positions.solver import distinct, in_line, minima, pick, reflect, solve
+from gpusense.positions.solver import distinct, in_line, minima, pick, solve
 
 
 def trilaterate(
@@ -107,23 +107,21 @@ def _beside_line(problem: Problem, starts: Floats, line: tuple[Floats, Floats], 
     """Solve for beacons in line: return a solution and its mirror image, or a solution on the line."""
     point, direction = line
     normal = np.array([-direction[1], direction[0]])
-    assert problem.ranges is not None
-    along = ((problem.xy - point) @ direction)[:, None] + problem.ranges[:, None] * (-1, 1)
-    on, on_cost = minima(problem, point + along.reshape(-1, 1) * direction, line)
     # Mirror images cost the same: search the left side only.
-    left = starts + (np.abs(aside := (starts - point) @ normal) - aside)[:, None] * normal
-    states, costs = minima(problem, left)
+    aside = (starts - point) @ normal
+    states, costs = minima(problem, starts + (np.abs(aside) - aside)[:, None] * normal)
     aside = (states - point) @ normal
-    # A solution nearer to the line than the root of the rounding error coincides with its image.
-    off = np.abs(aside) > 1e-7 * problem.spread
-    states, costs = distinct(problem, states[off] + (np.abs(aside) - aside)[off, None] * normal)
+    on_line = states - aside[:, None] * normal
+    # Rounding hides whether a solution near the line differs from its image.
     rounding = (1e-14 * problem.spread * problem.scales.max()) ** 2 * len(problem.xy)
-    if not len(states) or on_cost[0] <= costs[0] + rounding:
-        status = "at a beacon" if problem.at_beacon(on[0]) else "in line"
-        return problem.fix(on[:1], status, flat=True)
-    best, _ = pick(states, costs, known_sigma=known_sigma)
-    both = np.stack([best, reflect(best, line)], axis=1).reshape(-1, 2)
-    return problem.fix(both, "mirror" if len(best) == 1 else "ambiguous")
+    off = (np.abs(aside) > 1e-7 * problem.spread) & (problem.costs(on_line) > costs + rounding)
+    if not off[0]:
+        status = "at a beacon" if problem.at_beacon(on_line[0]) else "in line"
+        return problem.fix(on_line[:1], status, flat=True)
+    away = np.abs(aside)[:, None] * normal
+    best, _ = pick(*distinct(problem, (on_line + away)[off]), known_sigma=known_sigma)
+    image = best - 2 * ((best - point) @ normal)[:, None] * normal
+    return problem.fix(np.stack([best, image], axis=1).reshape(-1, 2), "mirror" if len(best) == 1 else "ambiguous")
 
 
 # Standard deviation of a bearing without information [rad].

@@ -8,7 +8,7 @@ import numpy as np
 
 from gpusense._util.typing import Floats
 from gpusense.positions.fix import wrap
-from gpusense.positions.problem import LOSSES, Problem
+from gpusense.positions.problem import Problem
 
 # Largest number of starts to follow, and the least distance between them, in spreads of the scene (or radians).
 FOLLOWED = 8
@@ -27,44 +27,26 @@ def distance(problem: Problem, states: Floats, state: Floats) -> Floats:
     return away if problem.dimension == 2 else np.maximum(away, np.abs(wrap(states[:, 2] - state[2])))
 
 
-def descend(problem: Problem, start: Floats, line: tuple[Floats, Floats] | None, step: float) -> Floats:
+def descend(problem: Problem, start: Floats, step: float) -> Floats:
     """Return the minimum that least squares (trust-region Gauss-Newton of SciPy) reaches from a (d,) state.
 
-    ``line`` (point, direction) constrains the position; ``step`` is the relative change at which the search stops.
+    ``step`` is the relative change at which the search stops.
     """
     from scipy.optimize import least_squares
 
-    unit = np.ones(problem.dimension)
+    # Positions in spreads of the scene, comparable to headings.
+    unit, scales = np.ones(problem.dimension), problem.scales
     unit[:2] = problem.spread or 1.0
-    # Columns are the free directions of the state, in comparable units.
-    base, moves = np.zeros(problem.dimension), np.diag(unit)
-    if line is not None:
-        base[:2] = line[0]
-        moves = np.delete(moves, 1, axis=1)
-        moves[:2, 0] = line[1] * unit[0]
-    scales = problem.scales
-
-    def residuals(x: Floats) -> Floats:
-        return problem.residuals((base + moves @ x)[None])[0] * scales
-
-    def jacobian(x: Floats) -> Floats:
-        # A residual is the measured less the expected value.
-        return -(problem.jacobian(base + moves @ x) * scales[:, None]) @ moves
-
-    def rho(z: Floats) -> Floats:
-        return np.stack(LOSSES[problem.loss](z))
-
-    x0 = np.linalg.lstsq(moves, start - base, rcond=None)[0]
     result = least_squares(
-        residuals, x0, jacobian, loss="linear" if problem.loss == "linear" else rho, f_scale=problem.loss_scale,
-        ftol=step, xtol=step, gtol=FINE, x_scale="jac", max_nfev=200,
+        lambda x: problem.residuals((x * unit)[None])[0] * scales, start / unit,
+        # A residual is the measured less the expected value.
+        lambda x: -problem.jacobian(x * unit) * scales[:, None] * unit,
+        loss=problem.loss, f_scale=problem.loss_scale, ftol=step, xtol=step, gtol=FINE, x_scale="jac", max_nfev=200,
     )  # fmt: skip
-    return base + moves @ result.x
+    return np.asarray(result.x * unit)
 
 
-def minima(
-    problem: Problem, starts: Sequence[Floats] | Floats, line: tuple[Floats, Floats] | None = None
-) -> tuple[Floats, Floats]:
+def minima(problem: Problem, starts: Sequence[Floats] | Floats) -> tuple[Floats, Floats]:
     """Return (S, d) different minima near the lowest, sorted, and their (S,) costs, from finite (N, d) starts."""
     pending = np.asarray(starts, np.float64).reshape(-1, problem.dimension)
     pending = pending[np.isfinite(pending).all(axis=1)]
@@ -74,7 +56,7 @@ def minima(
         if not len(pending):
             break
         start, pending = pending[0], pending[1:]
-        state = descend(problem, start, line, COARSE)
+        state = descend(problem, start, COARSE)
         for near in (start, state):
             pending = pending[distance(problem, pending, near) > APART]
         if not coarse or distance(problem, np.array(coarse), state).min() > APART / 10:
@@ -82,7 +64,7 @@ def minima(
     states = np.array(coarse).reshape(-1, problem.dimension)
     costs = problem.costs(states)
     near = states[costs <= 1.1 * costs.min(initial=np.inf) + 2 * AMBIGUOUS]
-    fine = [descend(problem, state, line, FINE) for state in near]
+    fine = [descend(problem, state, FINE) for state in near]
     return distinct(problem, np.array(fine).reshape(-1, problem.dimension))
 
 
@@ -119,10 +101,3 @@ def in_line(points: Floats, noise: float) -> tuple[Floats, Floats] | None:
     aside = np.abs(offset[:, 1] * direction[0] - offset[:, 0] * direction[1])
     # Rounding affects both ends of an offset, and the farthest point's rounding turns the line.
     return (points[0], direction) if aside.max() <= 8 * noise else None
-
-
-def reflect(states: Floats, line: tuple[Floats, Floats]) -> Floats:
-    """Return the mirror images of (S, 2) positions in a line."""
-    point, direction = line
-    offset = states - point
-    return point + 2 * (offset @ direction)[:, None] * direction - offset

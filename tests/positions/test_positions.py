@@ -131,7 +131,7 @@ def test_robust_losses_forget_an_outlier(name, loss):
 def test_losses_are_those_of_scipy(loss):
     """The cost is twice SciPy's for the loss of the same name, and its slope is the cost's derivative."""
     z = np.array([0.0, 1e-9, 0.3, 0.999, 1.001, 7.0, 1e6])
-    value, slope, curve = LOSSES[loss](z)
+    value, slope = LOSSES[loss](z)
     for residual, mine in zip(np.sqrt(z), value, strict=True):
         theirs = least_squares(lambda x, r=residual: r + 0 * x, [0.0], loss=loss, max_nfev=1)
         assert 2 * theirs.cost == pytest.approx(mine, rel=1e-12, abs=1e-15)
@@ -139,7 +139,6 @@ def test_losses_are_those_of_scipy(loss):
     ahead, behind = LOSSES[loss](z + step), LOSSES[loss](z - np.minimum(step, z))
     width = step + np.minimum(step, z)
     np.testing.assert_allclose((ahead[0] - behind[0]) / width, slope, rtol=2e-3)
-    np.testing.assert_allclose((ahead[1] - behind[1]) / width, curve, rtol=2e-3, atol=1e-6)
 
 
 def test_many_beacons():

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -15,6 +17,10 @@ from gpusense._util.typing import Floats, Integers
 from gpusense.world.parameters import BeamParameters, LandmarkParameters
 
 P = TypeVar("P")
+_UNITS = {
+    "sigma_hit": "m", "lambda_short": "1/m", "range_bias": "m", "sigma_range": "m", "sigma_bearing": "rad",
+    "bearing_bias": "rad",
+}  # fmt: skip
 
 
 class FitRow(NamedTuple):
@@ -27,7 +33,7 @@ class FitRow(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted(Generic[P]):
+class Fitted(ABC, Generic[P]):
     """Result of a fit; ``print(fit)`` shows a table of parameters and standard errors."""
 
     parameters: P
@@ -76,19 +82,28 @@ class Fitted(Generic[P]):
         rows = [(row.name, row.value, _error_text(row.error), row.note) for row in self._rows()]
         return card(f"{type(self).__name__}: {self.status}", rows, head=FIT_HEAD, detail=str(self))
 
-    def _table(self, units: dict[str, str], independent: dict[str, float]) -> list[str]:
-        """Return the lines of the table, including a column of errors for independent readings, if any."""
+    def __str__(self) -> str:
+        blocks = getattr(self, "blocks", 0)
+        independent = getattr(self, "independent_errors", {}) if blocks else {}
         lines = [
             f"{'parameter':16}{'value':>13}{'std. error':>13}{'if independent' if independent else '':>16}".rstrip()
         ]
         for name, value, error, note in self._rows():
             number = f"{value:13.6g}" if math.isfinite(value) else f"{'-':>13}"
             second = f"{_error_text(independent[name]):>16}" if independent else ""
-            lines.append(f"{name:16}{number}{_error_text(error):>13}{second} {units.get(name, ''):4}  {note}".rstrip())
-        return lines
+            lines.append(f"{name:16}{number}{_error_text(error):>13}{second} {_UNITS.get(name, ''):4}  {note}".rstrip())
+        if blocks:
+            lines.append(f"standard errors over {blocks} blocks of readings")
+        lines.append(f"log-likelihood {self.log_likelihood:.6f} of {self._counted()}")
+        return "\n".join([*lines, f"{self._search()}: {self.status}"])
 
+    @abstractmethod
+    def _counted(self) -> str:
+        """Return the numbers of readings in words."""
 
-_BEAM_UNITS = {"sigma_hit": "m", "lambda_short": "1/m", "range_bias": "m"}
+    def _search(self) -> str:
+        """Return the search in words."""
+        return f"{self.iterations} iterations"
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,19 +160,12 @@ class BeamFit(Fitted[BeamParameters]):
     def _rows(self) -> list[FitRow]:
         return [*super()._rows(), _offset("range_bias", self.range_bias, self.range_bias_error, self.bias_fitted)]
 
-    def __str__(self) -> str:
-        lines = self._table(_BEAM_UNITS, self.independent_errors if self.blocks else {})
-        if self.blocks:
-            lines.append(f"standard errors over {self.blocks} blocks of readings")
-        lines.append(
-            f"log-likelihood {self.log_likelihood:.6f} of {self.hits} hits and {self.max_readings} max readings; "
-            f"{self.missing} missing, {self.outliers} unexplained"
-        )
-        lines.append(f"{self.method}, {self.iterations} iterations, {self.precision} on {self.device}: {self.status}")
-        return "\n".join(lines)
+    def _counted(self) -> str:
+        counts = f"{self.hits} hits and {self.max_readings} max readings"
+        return f"{counts}; {self.missing} missing, {self.outliers} unexplained"
 
-
-_LANDMARK_UNITS = {"sigma_range": "m", "sigma_bearing": "rad", "range_bias": "m", "bearing_bias": "rad"}
+    def _search(self) -> str:
+        return f"{self.method}, {self.iterations} iterations, {self.precision} on {self.device}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -208,16 +216,10 @@ class LandmarkFit(Fitted[LandmarkParameters]):
         ]
         return [*super()._rows(), *(_offset(*bias, self.bias_fitted) for bias in biases if math.isfinite(bias[1]))]
 
-    def __str__(self) -> str:
-        lines = self._table(_LANDMARK_UNITS, {})
-        lines.append(
-            f"log-likelihood {self.log_likelihood:.6f} of {self.features} features; {self.missing} missing, "
-            f"{self.false_positives:.1f} false positives"
-        )
-        if self.expected:
-            lines.append(f"{self.detected:.1f} of {self.expected} landmarks in view were seen")
-        lines.append(f"{self.iterations} iterations: {self.status}")
-        return "\n".join(lines)
+    def _counted(self) -> str:
+        counts = f"{self.features} features; {self.missing} missing, {self.false_positives:.1f} false positives"
+        seen = f"\n{self.detected:.1f} of {self.expected} landmarks in view were seen"
+        return counts + (seen if self.expected else "")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -246,14 +248,8 @@ class PointFit(Fitted[P]):
     def _value(self, name: str) -> float:
         return self.values[name]
 
-    def __str__(self) -> str:
-        lines = self._table({}, self.independent_errors if self.blocks else {})
-        blocks = f"; errors over {self.blocks} blocks" if self.blocks else ""
-        lines.append(
-            f"log-likelihood {self.log_likelihood:.6f} of {self.readings} readings, {self.missing} missing{blocks}"
-        )
-        lines.append(f"{self.iterations} iterations: {self.status}")
-        return "\n".join(lines)
+    def _counted(self) -> str:
+        return f"{self.readings} readings, {self.missing} missing"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -306,6 +302,29 @@ def _error_text(error: float) -> str:
 _FLAT = 1e-10
 # Standard errors over fewer blocks are rough.
 FEW_BLOCKS = 10
+
+
+def common_fields(
+    log_likelihood: float, trace: Sequence[float], converged: bool, errors: dict[str, float], held: dict[str, str],
+    notes: list[str], missing: int,
+) -> dict[str, Any]:  # fmt: skip
+    """Return the attributes that all results have, from the end of a search; ``notes`` come before ``held``."""
+    unknown = [name for name, error in errors.items() if error == math.inf]
+    held = held | dict.fromkeys(unknown, "the readings do not determine it")
+    reasons = [
+        f"{shortened([name for name in held if held[name] == reason])}: {reason}"
+        for reason in dict.fromkeys(held.values())
+    ]
+    return dict(
+        log_likelihood=log_likelihood, trace=np.array(trace), converged=converged, standard_errors=errors, held=held,
+        iterations=len(trace) - 1, missing=missing,
+        status="; ".join(["converged" if converged else "stopped", *notes, *reasons]),
+    )  # fmt: skip
+
+
+def shortened(names: list[str]) -> str:
+    """Return the first names, and the number of further ones."""
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 def number_blocks(blocks: object, shape: tuple[int, ...], of: NDArray[Any]) -> Integers | None:

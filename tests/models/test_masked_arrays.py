@@ -66,7 +66,7 @@ def learned(readings):
 
 
 def counted(readings):
-    counts = count_pairs(readings, np.full(len(readings), 2.5), RANGE, 5)
+    counts, _ = count_pairs(readings, np.full(len(readings), 2.5), RANGE, 5)
     return np.array([counts.missing, *counts.counts])
 
 

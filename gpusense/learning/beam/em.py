@@ -175,84 +175,60 @@ def without_needless(problem: Problem, value: Value) -> Value:
     return value
 
 
-# Bound on a log weight relative to the reference: weights are between e^-25 and e^25 times the reference weight.
+# Bound on the change of a log weight relative to the largest weight.
 _WIDEST = 25.0
 # Largest number of rotations of the directions of a stuck hill climb.
 _TURNS = 5
 
 
-class _Coordinates:
-    """Free coordinates of a search as a vector: logs of weights but the largest, of shapes, and bias / range_max."""
-
-    def __init__(self, problem: Problem, start: Point) -> None:
-        self._problem, self._start = problem, start
-        self._origin = start.coordinates()
-        weights = start.weights
-        reference = int(np.argmax(weights))
-        free = np.append(weights > 0, [weights[0] > 0, weights[1] > 0, problem.fit_bias and weights[0] > 0])
-        free[reference] = False
-        self.places = np.flatnonzero(free)
-        self.reference = reference
-        bounds = problem.bounds
-        shift = self._origin[reference]
-        limits = [(shift - _WIDEST, shift + _WIDEST)] * 4
-        limits += [(math.log(low), math.log(high)) for low, high in (bounds.sigma, bounds.rate)]
-        limits.append((-bounds.bias, bounds.bias))
-        self.unit = np.where(np.arange(7) == BIAS, problem.pairs.range_max, 1.0)[self.places]
-        self.limits = np.array([limits[place] for place in self.places]).reshape(-1, 2) / self.unit[:, None]
-
-    def vector(self, point: Point) -> Floats:
-        """Return the free coordinates of a point, clamped to their limits."""
-        logs = point.coordinates()
-        logs[:4] += self._origin[self.reference] - logs[self.reference]
-        return np.clip(logs[self.places] / self.unit, self.limits[:, 0], self.limits[:, 1])
-
-    def point(self, vector: Floats) -> Point:
-        """Return the point of free coordinates."""
-        step = np.zeros(7)
-        step[self.places] = vector * self.unit - self._origin[self.places]
-        return self._start.moved(step, self._problem.bounds)
-
-
 class _Search:
-    """The objective as a function of a vector, with the best value so far and the trace."""
+    """The objective as a function of a step from a point, with the best value so far and the trace."""
 
     def __init__(self, problem: Problem, start: Point, watch: Watch) -> None:
         self.problem, self.watch = problem, watch
-        self.coordinates = _Coordinates(problem, start)
         self.best = problem.value(start)
         self.trace = [self.best.objective]
+        self.restart()
 
-    def value(self, vector: Floats) -> Value:
-        """Evaluate a vector, and remember the best value."""
-        value = self.problem.value(self.coordinates.point(vector))
+    def restart(self) -> None:
+        """Count steps from the best point: in logs of weights but the largest, of shapes, and in bias / range_max."""
+        problem, self._start = self.problem, self.best.point
+        used, bounds, at = self._start.weights > 0, problem.bounds, self._start.coordinates()
+        free = np.append(used, [used[HIT], used[SHORT], problem.fit_bias and used[HIT]])
+        free[int(np.argmax(self._start.weights))] = False
+        ends = np.log([bounds.sigma, bounds.rate]), [(-bounds.bias, bounds.bias)]
+        limits = np.concatenate([np.tile([-_WIDEST, _WIDEST], (4, 1)), np.concatenate(ends) - at[SIGMA:, None]])
+        self.places = np.flatnonzero(free)
+        self.unit = np.where(np.arange(FORM) == BIAS, problem.pairs.range_max, 1.0)[self.places]
+        self.limits = limits[self.places] / self.unit[:, None]
+
+    def value(self, step: Floats) -> Value:
+        """Evaluate a step along the free coordinates, and remember the best value."""
+        whole = np.zeros(FORM)
+        whole[self.places] = step * self.unit
+        value = self.problem.value(self._start.moved(whole, self.problem.bounds))
         if value.objective > self.best.objective:
             self.best = value
         return value
 
-    def cost(self, vector: Floats) -> float:
+    def cost(self, step: Floats) -> float:
         """Return minus the objective per reading."""
-        return -self.value(vector).objective / self.problem.total
+        return -self.value(step).objective / self.problem.total
 
-    def cost_and_gradient(self, vector: Floats) -> tuple[float, Floats]:
+    def cost_and_gradient(self, step: Floats) -> tuple[float, Floats]:
         """Return minus the objective per reading and its gradient."""
-        value = self.value(vector)
-        slope = value.gradient[self.coordinates.places] * self.coordinates.unit
-        return -value.objective / self.problem.total, -slope / self.problem.total
+        value = self.value(step)
+        return -value.objective / self.problem.total, -value.gradient[self.places] * self.unit / self.problem.total
 
     def end_iteration(self, *_: Any) -> None:
         """Append the best objective to the trace, and call the watch."""
         self.trace.append(self.best.objective)
         self.watch(len(self.trace) - 1, self.best)
 
-    def left(self) -> float:
-        """Return the remaining gain that the quadratic model predicts at the best point [nats]."""
-        self.best = without_needless(self.problem, self.problem.value(self.best.point, second=True))
-        return free_direction(self.problem, self.best)[1]
-
     def stopped(self, tolerance: float) -> Climb:
         """Return the end of a search that gains nothing: an optimum if the quadratic model predicts no gain either."""
-        left = self.left()
+        self.best = without_needless(self.problem, self.problem.value(self.best.point, second=True))
+        left = free_direction(self.problem, self.best)[1]
         if left <= max(1e3 * tolerance, self.problem.noise(self.best)):
             return Climb(self.best, self.trace, True)
         return Climb(self.best, self.trace, False, [f"no progress, with {left:.2g} nats left to gain"])
@@ -273,60 +249,55 @@ def climb_by_scipy(
     """
     search = _Search(problem, start, watch)
     if method == "hill_climb":
-        options = {"xtol": 1e-4, "ftol": 1e-13}
-        return _restarted(search, "Powell", options, max_iterations, tolerance, 10 * tolerance, _TURNS)
-    if method == "genetic":
-        _evolve(search, start, seed, max_iterations)
+        return _restarted(search, {"xtol": 1e-4, "ftol": 1e-13}, max_iterations, tolerance, _TURNS)
+    if method == "genetic" and len(search.places):
+        _evolve(search, seed, max_iterations)
         max_iterations += len(search.trace)
     options = {"maxfun": 20 * max_iterations, "maxcor": 20, "ftol": 1e-15, "gtol": 1e-12}
-    climb = _restarted(search, "L-BFGS-B", options, max_iterations, tolerance, tolerance)
+    climb = _restarted(search, options, max_iterations, tolerance, None)
     if method == "genetic":
         climb.notes.append("the last steps are of method 'gradient'")
     return climb
 
 
 def _restarted(
-    search: _Search, method: str, options: dict[str, Any], max_iterations: int, tolerance: float, least: float,
-    turns: int = 0,
-) -> Climb:  # fmt: skip
-    """Run a method of SciPy as long as it gains more than ``least``; Powell's turns its directions ``turns`` times."""
+    search: _Search, options: dict[str, Any], max_iterations: int, tolerance: float, turns: int | None
+) -> Climb:
+    """Run L-BFGS-B, or Powell's method with up to ``turns`` rotations of its directions, as long as it gains."""
     from scipy.optimize import minimize
 
-    coordinates, powell = search.coordinates, method == "Powell"
-    if not len(coordinates.places):
-        return Climb(search.best, search.trace, True)
-    rng, directions = np.random.default_rng(0), np.eye(len(coordinates.places))
+    rng, turned, powell = np.random.default_rng(0), False, turns is not None
     while len(search.trace) <= max_iterations:
         before = search.best.objective
+        search.restart()
+        size = len(search.places)
+        if not size:
+            return Climb(search.best, search.trace, True)
         # SciPy changes the directions in place.
-        more = {"direc": directions.copy()} if powell else {}
+        directions = np.linalg.qr(rng.normal(size=(size, size)))[0] if turned else np.eye(size)
+        more = {"direc": directions} if powell else {}
         result = minimize(
-            search.cost if powell else search.cost_and_gradient, coordinates.vector(search.best.point), method=method,
-            jac=not powell, bounds=coordinates.limits, callback=search.end_iteration,
-            options={**options, **more, "maxiter": max_iterations + 1 - len(search.trace)},
+            search.cost if powell else search.cost_and_gradient, np.zeros(size), jac=not powell,
+            method="Powell" if powell else "L-BFGS-B", bounds=search.limits, callback=search.end_iteration,
+            options=options | {"maxiter": max_iterations + 1 - len(search.trace)} | more,
         )  # fmt: skip
         if result.nit == 0:
             search.end_iteration()
+        least = 10 * tolerance if powell else tolerance
         if search.best.objective - before <= max(least, search.problem.noise(search.best)):
             end = search.stopped(tolerance)
             if end.converged or not turns:
                 return end
-            turns -= 1
-            directions = np.linalg.qr(rng.normal(size=directions.shape))[0]
+            turns, turned = turns - 1, True
     return Climb(search.best, search.trace, False, [f"no convergence within {max_iterations} iterations"])
 
 
-def _evolve(search: _Search, start: Point, seed: int, max_iterations: int) -> None:
+def _evolve(search: _Search, seed: int, max_iterations: int) -> None:
     from scipy.optimize import differential_evolution
 
-    coordinates, total = search.coordinates, search.problem.total
-    if not len(coordinates.places):
-        return
     # Weights far below one reading are left to L-BFGS-B.
-    narrow, middle, limits = np.log(10 * total), coordinates.vector(start), coordinates.limits.copy()
-    some = coordinates.places <= RAND
-    limits[some] = np.clip((middle + np.array([[-narrow], [narrow]])).T, limits[:, :1], limits[:, 1:])[some]
+    narrow = np.where(search.places <= RAND, math.log(10 * search.problem.total), math.inf)[:, None]
     differential_evolution(
-        search.cost, limits, x0=middle, rng=seed, maxiter=max_iterations, popsize=10, tol=1e-6, atol=1e-9,
-        polish=False, callback=search.end_iteration,
+        search.cost, np.clip(search.limits, -narrow, narrow), x0=np.zeros(len(narrow)), rng=seed,
+        maxiter=max_iterations, popsize=10, tol=1e-6, atol=1e-9, polish=False, callback=search.end_iteration,
     )  # fmt: skip

@@ -110,18 +110,16 @@ class _Growing(hosted.Problem):
     expected: Floats
     none: NDArray[np.bool_]
     range_max: float
-    limits: Bounds
+    within: Bounds
     start: BeamParameters
     fit_bias: bool
     reach: float
     kind: type[HitShape]
 
-    def bounds(self) -> tuple[Floats, Floats]:
-        sigma, rate = (tuple(np.log(pair)) for pair in (self.limits.sigma, self.limits.rate))
-        pairs = [(0.0, 1.0)] * 3 + [sigma, (0.0, 1.0), rate] + [(-self.limits.bias, self.limits.bias)] * self.fit_bias
-        pairs += self.kind.limits
-        low, high = np.array(pairs).T
-        return low, high
+    def bounds(self) -> list[tuple[float, float]]:
+        sigma, rate = (tuple(np.log(pair).tolist()) for pair in (self.within.sigma, self.within.rate))
+        bias = [(-self.within.bias, self.within.bias)] * self.fit_bias
+        return [*[(0.0, 1.0)] * 3, sigma, (0.0, 1.0), rate, *bias, *self.kind.limits]
 
     def scales(self, theta: Floats) -> Floats:
         sigma = math.exp(theta[_SIGMA]) + theta[_GROWTH] * self.reach
@@ -137,7 +135,7 @@ class _Growing(hosted.Problem):
         rand = min(max(p.z_rand / rest, 1e-3), 0.999)
         short = min(max(p.z_short / max(p.z_hit + p.z_short, 1e-300), 1e-3), 0.999)
         bias = [p.range_bias] if self.fit_bias else []
-        rate = math.log(max(p.lambda_short, self.limits.rate[0]))
+        rate = math.log(max(p.lambda_short, self.within.rate[0]))
         return [
             np.array([
                 p.z_max, rand, short, math.log((1 - f) * factor * p.sigma_hit), f * factor * p.sigma_hit / self.reach,
@@ -150,46 +148,38 @@ class _Growing(hosted.Problem):
     def _shape_at(self, theta: Floats) -> Floats:
         return theta[_BIAS + self.fit_bias :]
 
-    def parts(self, theta: Floats) -> tuple[list[tuple[float, Floats]], tuple[Floats, Floats, Floats], Floats, Floats]:
-        """Return weights and densities of hit, short and rand, and the derivatives by the shapes."""
-        z, expected = self.reading, self.expected
-        sigma = math.exp(theta[_SIGMA]) + theta[_GROWTH] * expected
-        obstacle = ShortDensity(math.exp(theta[_RATE]))
+    def parts(self, theta: Floats) -> tuple[list[tuple[float, Floats]], list[Floats], Floats]:
+        """Return weights and densities of hit, short and rand, and the derivatives of both by their coordinates."""
+        z, expected, least = self.reading, self.expected, math.exp(theta[_SIGMA])
+        sigma = least + theta[_GROWTH] * expected
         moved = expected + (theta[_BIAS] if self.fit_bias else 0.0)
-        mean = np.clip(moved, 0, self.range_max)
-        hit = truncated(z - mean, mean, self.range_max, sigma, self._shape_of(self._shape_at(theta)))
-        log_short, by_rate = obstacle.log_pdf(z, expected), obstacle.by_log_rate(z, expected)
-        rand, short = theta[_RAND], theta[_SHORT]
-        weights = ((1 - rand) * (1 - short), (1 - rand) * short, rand)
-        densities = hit[0], log_short, np.full(len(z), RandomDensity(self.range_max).log_peak(1.0))
-        return list(zip(weights, densities, strict=True)), hit, by_rate, np.where(mean == moved, 1.0, 0.0)
+        mean, at = np.clip(moved, 0, self.range_max), self._shape_at(theta)
+        log_hit, by_sigma, by_mean = truncated(z - mean, mean, self.range_max, sigma, self._shape_of(at))
+        ends = (z - mean) / sigma, mean / sigma, (self.range_max - mean) / sigma
+        by_hit = [by_sigma * least / sigma, by_sigma * expected / sigma]
+        by_hit += [by_mean * (mean == moved)] if self.fit_bias else []
+        by_hit += by_shape(*ends, at, self._shape_of, self.kind.limits)
+        obstacle, rand, short = ShortDensity(math.exp(theta[_RATE])), theta[_RAND], theta[_SHORT]
+        weights = (1 - rand) * (1 - short), (1 - rand) * short, rand
+        log_rand = np.full(len(z), RandomDensity(self.range_max).log_peak(1.0))
+        densities = log_hit, obstacle.log_pdf(z, expected), log_rand
+        return list(zip(weights, densities, strict=True)), by_hit, obstacle.by_log_rate(z, expected)
 
     def log_p(self, theta: Floats) -> tuple[Floats, Floats]:
-        parts, (_, by_sigma, by_mean), by_rate, free = self.parts(theta)
+        parts, by_hit, by_rate = self.parts(theta)
         log_p, (of_hit, of_short, _), (hit, short, rand) = mix(parts)
-        sigma, top = math.exp(theta[_SIGMA]) + theta[_GROWTH] * self.expected, theta[_TOP]
-        share = theta[_SHORT]
+        top, share = theta[_TOP], theta[_SHORT]
+        by_sigma, by_growth, *others = (of_hit * each for each in by_hit)
         columns = [
             np.full(len(log_p), -1 / max(1 - top, 1e-300)),
             rand - (1 - share) * hit - share * short,
             (1 - theta[_RAND]) * (short - hit),
-            of_hit * by_sigma * math.exp(theta[_SIGMA]) / sigma,
-            of_hit * by_sigma * self.expected / sigma,
-            of_short * by_rate,
-            *([of_hit * by_mean * free] if self.fit_bias else []),
-            *(of_hit * each for each in self._by_shape(theta)),
+            *(by_sigma, by_growth, of_short * by_rate, *others),
         ]
         gradient = np.where(self.none[:, None], 0.0, np.stack(columns, axis=1))
         gradient[self.none, _TOP] = 1 / max(top, 1e-300)
         with np.errstate(divide="ignore"):
             return np.where(self.none, NoReturn(top).log_mass, log_p + np.log1p(-top)), gradient
-
-    def _by_shape(self, theta: Floats) -> list[Floats]:
-        """Return the derivatives of the log density of hits by the coordinates of the shape, by differences."""
-        sigma = math.exp(theta[_SIGMA]) + theta[_GROWTH] * self.expected
-        mean = np.clip(self.expected + (theta[_BIAS] if self.fit_bias else 0.0), 0, self.range_max)
-        ends = mean / sigma, (self.range_max - mean) / sigma
-        return by_shape((self.reading - mean) / sigma, *ends, self._shape_at(theta), self._shape_of, self.kind.limits)
 
     def _shape_of(self, coordinates: Floats) -> HitShape:
         """Return the shape at coordinates; many readings look up masses in a table."""

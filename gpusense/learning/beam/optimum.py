@@ -20,6 +20,8 @@ from gpusense._util.typing import Floats
 from gpusense.learning.beam.em import Climb, Watch
 from gpusense.learning.beam.pairs import HIT, MAX, RAND, SHORT, Bounds, Pairs, Point, possible_causes
 from gpusense.learning.beam.problem import NOTHING, Problem, Value
+from gpusense.learning.point.densities import half_sample_mode
+from gpusense.world.hit_shapes import NORMAL
 from gpusense.world.range_causes import RandomDensity, ShortDensity
 
 # Gain [nats] below which two ends count as the same maximum.
@@ -146,9 +148,11 @@ def choose_starts(pairs: Pairs, bounds: Bounds, causes: NDArray[np.bool_], fit_b
     if not pairs.hits or not causes[[HIT, SHORT, RAND]].any():
         return []
     sample = Sample.of(pairs)
+    off = sample.reading - sample.expected
+    biases = [0.0, float(np.median(off)), half_sample_mode(off)] if fit_bias else [0.0]
     starts = [
         point
-        for bias, share in itertools.product(_biases(sample) if fit_bias else [0.0], _SHARES)
+        for bias, share in itertools.product(biases, _SHARES)
         for point in _assume(sample, bounds, causes, bias, share)
     ]
     ends, log_p = short_runs(sample, starts, bounds, fit_bias)
@@ -157,17 +161,6 @@ def choose_starts(pairs: Pairs, bounds: Bounds, causes: NDArray[np.bool_], fit_b
         if math.isfinite(log_p[i]) and all(_different(ends[i], other) for other in chosen):
             chosen.append(ends[i])
     return chosen[:_MOST]
-
-
-def _biases(sample: Sample) -> list[float]:
-    """Return initial offsets: 0, the median deviation, and the middle of the narrowest half, by repeated halving."""
-    off = np.sort(sample.reading - sample.expected)
-    middle = float(np.median(off))
-    while len(off) > 2:
-        half = (len(off) + 1) // 2
-        first = int(np.argmin(off[half:] - off[:-half])) if len(off) > half else 0
-        off = off[first : first + half]
-    return [0.0, middle, float(off.mean())]
 
 
 def _assume(sample: Sample, bounds: Bounds, causes: NDArray[np.bool_], bias: float, share: float) -> list[Point]:
@@ -229,11 +222,9 @@ def _next_rate(parts: Floats, z: Floats, expected: Floats, rate: Floats, bounds:
 
 def _log_components(sample: Sample, z: Floats, expected: Floats, sigma: Floats, rate: Floats, bias: Floats) -> Floats:
     """Return (3, m, C) log densities of hit, short and rand; -inf where a cause is impossible."""
-    from scipy.special import ndtr
-
     mean = np.clip(expected + bias, 0, sample.range_max)
-    mass = ndtr((sample.range_max - mean) / sigma) - ndtr(-mean / sigma)
-    hit = -0.5 * ((z - mean) / sigma) ** 2 - np.log(math.sqrt(2 * math.pi) * sigma * np.maximum(mass, 1e-300))
+    mass = NORMAL.half_mass(mean / sigma) + NORMAL.half_mass((sample.range_max - mean) / sigma)
+    hit = NORMAL.log_pdf((z - mean) / sigma) - np.log(sigma * np.maximum(mass, 1e-300))
     rand = np.full_like(hit, RandomDensity(sample.range_max).log_peak(1.0))
     return np.stack([hit, ShortDensity(rate).log_pdf(z, expected), rand])
 

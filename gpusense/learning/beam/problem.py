@@ -233,27 +233,26 @@ class Problem:
         hessian[:, BIAS] /= point.sigma
         return hessian
 
+    def shapes(self, point: Point) -> list[tuple[int, float, float, float]]:
+        """Return the cause, the value and its bounds of each coordinate after the weights."""
+        bounds = self.bounds
+        form = zip(point.shape.coordinates.tolist(), point.shape.limits, strict=True)
+        return [
+            (HIT, point.sigma, *bounds.sigma), (SHORT, point.rate, *bounds.rate),
+            (HIT, point.bias, -bounds.bias, bounds.bias), *((HIT, at, *limits) for at, limits in form),
+        ]  # fmt: skip
+
     def free(self, value: Value) -> NDArray[np.bool_]:
         """Return the mask of coordinates that may move: no weight of 0, not the largest one, no shape at a bound."""
-        point, bounds = value.point, self.bounds
-        free = np.append(point.weights > 0, [True, True, self.fit_bias])
-        free[int(np.argmax(point.weights))] = False
-        free[[SIGMA, BIAS]] &= value.totals[HIT] > NOTHING
-        free[RATE] &= value.totals[SHORT] > NOTHING
-        for place, shape, (low, high) in ((SIGMA, point.sigma, bounds.sigma), (RATE, point.rate, bounds.rate)):
-            slope = value.gradient[place]
-            near = _AT * shape
-            free[place] &= not ((shape <= low + near and slope < 0) or (shape >= high - near and slope > 0))
-        free[BIAS] &= abs(point.bias) < bounds.bias
-        form = [self._form_is_free(value, place) for place in range(len(point.shape.limits))]
-        return np.append(free, np.array(form, bool))
-
-    def _form_is_free(self, value: Value, place: int) -> bool:
-        at, slope = value.point.shape.coordinates[place], value.gradient[FORM + place]
-        low, high = value.point.shape.limits[place]
-        near = _AT * max(abs(at), low)
-        held = (at <= low + near and slope < 0) or (at >= high - near and slope > 0)
-        return bool(value.totals[HIT] > NOTHING and not held)
+        weights = value.point.weights
+        free = weights > 0
+        free[int(np.argmax(weights))] = False
+        for place, (cause, at, low, high) in enumerate(self.shapes(value.point), SIGMA):
+            slope, near = value.gradient[place], _AT * max(abs(at), low)
+            held = (at <= low + near and slope < 0) or (at >= high - near and slope > 0)
+            moves = place != BIAS or self.fit_bias
+            free = np.append(free, moves and not held and value.totals[cause] > NOTHING)
+        return free
 
 
 # Lower limit of a coordinate of the shape of hits for steps of differences, and these steps as shares of the

@@ -18,7 +18,7 @@ from gpusense.learning.beam.em import Climb, Watch, climb_em
 from gpusense.learning.beam.optimum import Search
 from gpusense.learning.beam.pairs import BIAS, FORM, HIT, MAX, NAMES, RAND, RATE, SHORT, SIGMA, Pairs, Point
 from gpusense.learning.beam.problem import NOTHING, Problem, Value
-from gpusense.learning.fitted import BeamFit, errors_of, notes_on_blocks, scatter_of
+from gpusense.learning.fitted import BeamFit, common_fields, errors_of, notes_on_blocks, scatter_of
 from gpusense.learning.point.densities import by_shape, truncated
 from gpusense.world.range_causes import ShortDensity
 from gpusense.world.scanner import Reading
@@ -33,25 +33,21 @@ def report(problem: Problem, climb: Climb, options: Options, start: Point) -> Be
     """Build the fit from the end of a search that began with the causes of ``start``."""
     device, pairs = problem.device, problem.pairs
     value = problem.value(climb.value.point, second=True)
-    held = _held(problem, value)
     errors, independent = _errors(problem, value)
-    bias, errors[NAMES[BIAS]], independent[NAMES[BIAS]] = _bias(problem, value, climb, options, start)
+    bias, error, independent[NAMES[BIAS]] = _bias(problem, value, climb, options, start)
+    errors = {name: errors[name] for name in value.point.names if name != NAMES[BIAS]}
     return BeamFit(
         parameters=value.point.parameters(),
-        log_likelihood=value.log_likelihood,
-        trace=np.array(climb.trace),
-        converged=climb.converged,
-        status=_status(problem, climb, value, errors, held),
-        standard_errors={name: errors[name] for name in value.point.names if name != NAMES[BIAS]},
-        held=held,
+        **common_fields(
+            value.log_likelihood, climb.trace, climb.converged, errors, _held(problem, value),
+            _notes(problem, climb, value), pairs.missing,
+        ),
         range_bias=bias,
-        range_bias_error=errors[NAMES[BIAS]],
+        range_bias_error=error,
         bias_fitted=options.range_bias,
-        iterations=len(climb.trace) - 1,
         passes=device.passes,
         hits=pairs.hits,
         max_readings=pairs.max_readings,
-        missing=pairs.missing,
         outliers=round(float(value.sums[13])),
         method=options.method,
         precision=device.real.name,
@@ -59,26 +55,18 @@ def report(problem: Problem, climb: Climb, options: Options, start: Point) -> Be
         independent_errors=independent,
         blocks=pairs.blocks,
         responsibilities=_responsibilities(device, pairs, value.point) if options.responsibilities else None,
-    )
+    )  # fmt: skip
 
 
-def _status(problem: Problem, climb: Climb, value: Value, errors: dict[str, float], held: dict[str, str]) -> str:
-    """Return the status in words, and add the parameters that the readings do not determine to ``held``."""
-    notes = list(climb.notes)
-    if not climb.converged and not notes:
-        notes.append("did not converge")
+def _notes(problem: Problem, climb: Climb, value: Value) -> list[str]:
+    """Return the notes of a search, and warnings of few readings and blocks."""
+    notes = climb.notes or ([] if climb.converged else ["did not converge"])
     weights = value.point.weights
     count = int((weights > 0).sum()) - 1 + int(weights[HIT] > 0) * (1 + len(value.point.shape.limits))
     if problem.readings < count:
         readings = "1 reading" if problem.readings == 1 else f"{problem.readings} readings"
-        notes.append(f"{readings} cannot determine {count} parameters")
-    if problem.pairs.block is not None:
-        notes += notes_on_blocks(problem.pairs.blocks)
-    for name in errors.keys() - {NAMES[BIAS]}:
-        if errors[name] == math.inf:
-            held[name] = "the readings do not determine it"
-    notes += [f"{name}: {reason}" for name, reason in held.items()]
-    return "; ".join(["converged" if climb.converged else "stopped", *notes])
+        notes = [*notes, f"{readings} cannot determine {count} parameters"]
+    return notes if problem.pairs.block is None else notes + notes_on_blocks(problem.pairs.blocks)
 
 
 def _errors(problem: Problem, value: Value) -> tuple[dict[str, float], dict[str, float]]:
@@ -122,26 +110,21 @@ def _jacobian(point: Point) -> Floats:
 
 def _held(problem: Problem, value: Value) -> dict[str, str]:
     """Return the reasons why parameters were not free, by name."""
-    point, bounds = value.point, problem.bounds
-    held = {}
+    point, held = value.point, {}
     for cause in range(4):
-        if point.weights[cause] == 0:
-            held[NAMES[cause]] = "no reading needs this cause"
-        elif point.weights[cause] == 1:
-            held[NAMES[cause]] = "every reading has this cause"
+        if point.weights[cause] in (0, 1):
+            reason = "no reading needs this cause" if point.weights[cause] == 0 else "every reading has this cause"
+            held[NAMES[cause]] = reason
     free = problem.free(value)
-    shapes = ((SIGMA, HIT, point.sigma, bounds.sigma), (RATE, SHORT, point.rate, bounds.rate))
-    for place, cause, shape, (low, high) in shapes:
+    for place, (cause, at, low, high) in enumerate(problem.shapes(point), SIGMA):
+        name, side = point.names[place], "lower bound" if at - low < high - at else "upper bound"
+        if place == BIAS:
+            continue
         if value.totals[cause] <= NOTHING:
-            held[NAMES[place]] = f"kept, since {NAMES[cause]} accounts for no reading"
+            held[name] = f"kept, since {NAMES[cause]} accounts for no reading"
         elif not free[place]:
-            side, bound = ("lower", low) if shape <= low else ("upper", high)
-            held[NAMES[place]] = f"at its {side} bound {bound:.3g}"
-    for place, name in enumerate(point.shape.fitted, FORM):
-        if value.totals[HIT] <= NOTHING:
-            held[name] = f"kept, since {NAMES[HIT]} accounts for no reading"
-        elif not free[place]:
-            held[name] = f"at its bound {point.shape.values()[name]:.3g}"
+            at = point.shape.values()[name] if place >= FORM else at
+            held[name] = f"at its {'bound' if place >= FORM else side} {at:.3g}"
     return held
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Self
 
@@ -217,22 +217,17 @@ _FIRST, _SECOND = 1e-5, 1e-2
 _ITERATIONS, _TOLERANCE = 300, 1e-10
 # Number of beam steps of the coarse problem in front of a search with many.
 _FEW = 100
-# Number of readings per pass.
-_READINGS = 1 << 20
 
 
 def learn_causes(
     ranges: object, expected: object, range_max: float, bins: int, blocks: object = None
 ) -> tuple[DiscreteCauses, DiscreteFit]:
     """Learn the most likely causes by Newton steps within bounds; see ``DiscreteBeamModel.learn``."""
-    data = count_pairs(ranges, expected, range_max, bins)
-    problem, labels = _Causes(data), None
-    end = maximize(problem, _ITERATIONS, _TOLERANCE)
+    data, _ = count_pairs(ranges, expected, range_max, bins)
+    end = maximize(_Causes(data), _ITERATIONS, _TOLERANCE)
     causes = _causes(end.theta)
-    if blocks is not None:
-        labels, data_of_blocks = _counts_of_blocks(data, ranges, expected, float(range_max), blocks)
-        problem = _Causes(data_of_blocks)
-    fit = report(problem, end, causes, labels, data.missing)
+    cells, labels = (data, None) if blocks is None else count_pairs(ranges, expected, range_max, bins, blocks)
+    fit = report(_Causes(cells), end, causes, labels, data.missing)
     errors = {
         each: {name: error if math.isfinite(error) else math.nan for name, error in getattr(fit, each).items()}
         for each in ("standard_errors", "independent_errors")
@@ -257,12 +252,11 @@ class _Causes(Problem):
     def part(self, every: int) -> _Causes:
         return _Causes(self.data.coarser(_FEW)) if self.data.bins > 2 * _FEW else self
 
-    def bounds(self) -> tuple[Floats, Floats]:
+    def bounds(self) -> list[tuple[float, float]]:
         """Return bounds beyond which a table changes by less than a part in a million."""
         reach, width = self.data.bins * self.data.width, self.data.width
         rates = math.log(1e-9 / reach), math.log(30 / width)
-        low, high = np.array([rates, rates, (-25.0, 25.0), (math.log(1e-6 * width), math.log(10 * reach))]).T
-        return low, high
+        return [rates, rates, (-25.0, 25.0), (math.log(1e-6 * width), math.log(10 * reach))]
 
     def scales(self, theta: Floats) -> Floats:
         return np.ones(len(NAMES))
@@ -311,22 +305,6 @@ def _causes(theta: Floats) -> DiscreteCauses:
     return DiscreteCauses(math.exp(short), math.exp(rand), 1 / (1 + math.exp(-odds)), math.exp(sigma))
 
 
-def _counts_of_blocks(
-    data: Counts, ranges: object, expected: object, range_max: float, blocks: object
-) -> tuple[Integers, Counts]:
-    """Return the block (E,) and the counts of all cells that each block occupies."""
-    z, z_exp = (
-        checks.as_array(name, value, masked=True) for name, value in (("ranges", ranges), ("expected", expected))
-    )
-    readings, expected_ranges = check_pairs(z.ravel(), z_exp.ravel(), range_max)
-    i, j = (bins_of(each, range_max, data.bins) for each in (readings, expected_ranges))
-    known = i >= 0
-    numbers = number_blocks(blocks, z.shape, known)
-    assert numbers is not None
-    both, times = np.unique(np.stack([numbers, j[known], i[known]]), axis=1, return_counts=True)
-    return both[0], replace(data, rows=both[1], steps=both[2], counts=times.astype(np.float64))
-
-
 @dataclass(frozen=True)
 class Counts:
     """Counts of readings: ``counts[k]`` readings in step ``steps[k]`` with an obstacle expected in ``rows[k]``."""
@@ -356,8 +334,10 @@ class Counts:
         return Counts(cells[0], cells[1], counts, self.missing, bins, self.bins * self.width / bins)
 
 
-def count_pairs(ranges: object, expected: object, range_max: float, bins: int) -> Counts:
-    """Count readings; see ``DiscreteBeamModel.learn`` for arguments and errors."""
+def count_pairs(
+    ranges: object, expected: object, range_max: float, bins: int, blocks: object = None
+) -> tuple[Counts, Integers | None]:
+    """Count readings, of each block separately, and return the (K,) blocks; see ``DiscreteBeamModel.learn``."""
     range_max = checks.real("range_max", range_max, low=checks.SMALLEST, high=checks.FARTHEST)
     bins = checks.integer("bins", bins, low=1, high=MOST_BINS)
     z, z_exp = (
@@ -366,17 +346,16 @@ def count_pairs(ranges: object, expected: object, range_max: float, bins: int) -
     if z.shape != z_exp.shape:
         shapes = checks.shape_text(z.shape), checks.shape_text(z_exp.shape)
         raise ValueError(f"expected: shape must be {shapes[0]}, got {shapes[1]}")
-    z, z_exp = z.reshape(-1), z_exp.reshape(-1)
-    table, missing = np.zeros((bins + 1) ** 2, np.int64), 0
-    for first in range(0, max(len(z), 1), _READINGS):
-        block = slice(first, first + _READINGS)
-        readings, expected_ranges = check_pairs(z[block], z_exp[block], range_max)
-        i, j = bins_of(readings, range_max, bins), bins_of(expected_ranges, range_max, bins)
-        missing += int(np.count_nonzero(i < 0))
-        # bincount returns bins up to the last occupied one.
-        counts = np.bincount((j * (bins + 1) + i)[i >= 0])
-        table[: len(counts)] += counts
-    cells = np.flatnonzero(table)
-    if cells.size == 0:
-        raise ValueError(f"ranges: must have a reading that is not missing, got {missing} missing ones")
-    return Counts(cells // (bins + 1), cells % (bins + 1), table[cells].astype(float), missing, bins, range_max / bins)
+    i, j = (bins_of(each, range_max, bins) for each in check_pairs(z.reshape(-1), z_exp.reshape(-1), range_max))
+    known = i >= 0
+    if not known.any():
+        raise ValueError(f"ranges: must have a reading that is not missing, got {len(i)} missing ones")
+    labels = number_blocks(blocks, z.shape, known)
+    cells = j[known] * (bins + 1) + i[known] + (0 if labels is None else labels * (bins + 1) ** 2)
+    cells, times = np.unique(cells, return_counts=True)
+    block, cell = np.divmod(cells, (bins + 1) ** 2)
+    counts = Counts(
+        cell // (bins + 1), cell % (bins + 1), times.astype(float), int(np.count_nonzero(~known)), bins,
+        range_max / bins,
+    )  # fmt: skip
+    return counts, None if labels is None else block

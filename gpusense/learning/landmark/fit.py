@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers
-from gpusense.learning.fitted import LandmarkFit
+from gpusense.learning.fitted import LandmarkFit, common_fields
 from gpusense.learning.landmark.pairs import (
     FALSE,
     RANGE,
@@ -56,12 +56,10 @@ class _Features(Problem):
     def part(self, every: int) -> _Features:
         return replace(self, pairs=self.pairs.every(every))
 
-    def bounds(self) -> tuple[Floats, Floats]:
-        low, high = np.full(6, -math.inf), np.full(6, math.inf)
-        (low[:FALSE], high[:FALSE]), (low[FALSE], high[FALSE]) = np.log(_limits(self.pairs)), (0.0, 1.0)
-        fixed = np.append(~np.array(self.pairs.measured), [not len(self.pairs.feature), not self.fit_bias])
-        fixed = np.append(fixed, not self.fit_bias)
-        return np.where(fixed, self.start, low), np.where(fixed, self.start, high)
+    def bounds(self) -> Floats:
+        limits = np.concatenate([np.log(_limits(self.pairs)).T, [(0.0, 1.0)], [(-math.inf, math.inf)] * 2])
+        free = [*self.pairs.measured, len(self.pairs.feature) > 0, self.fit_bias, self.fit_bias]
+        return np.where(np.array(free)[:, None], limits, self.start[:, None])
 
     def scales(self, theta: Floats) -> Floats:
         return np.array([1.0, 1.0, 1.0, of_weight(theta[FALSE]), *np.exp(theta[:2])])
@@ -239,12 +237,11 @@ def _report(
     pairs, values, value = problem.pairs, problem.values(end.theta), evaluate(problem.pairs, end.theta)
     held = _held(pairs, values, value)
     errors = standard_errors(problem, end.theta, end.free)
-    held |= {name: "the features do not determine it" for name in errors if errors[name] == math.inf}
     p_detect, errors["p_detect"] = _p_detect(counts, base.p_detect, held)
     # Offsets have errors even if they are not fitted.
     joint = replace(problem, fit_bias=True)
     offset_errors = standard_errors(joint, end.theta, free_coordinates(joint, end.theta))
-    offsets: dict[str, float] = {}
+    offsets: dict[str, Any] = {}
     for part, name in enumerate(_BIASES):
         known = pairs.measured[part] and value.responsibility.sum() > _NOTHING
         offset = values[name] if problem.fit_bias else _mean(pairs, value, part)
@@ -258,11 +255,12 @@ def _report(
     weights = {name: values[name] for name in ("z_detect", "z_false")}
     return LandmarkFit(
         parameters=replace(base, **sigmas, **weights, p_detect=p_detect, signature_span=span),
-        log_likelihood=end.value, trace=np.array(end.trace), converged=end.converged,
-        status=_status(pairs, value, end.converged, held), standard_errors=errors, held=held, **offsets,
-        bias_fitted=problem.fit_bias, iterations=len(end.trace) - 1, features=len(value.false),
-        missing=sightings.total - len(value.false), false_positives=float(value.false.sum()), expected=expected,
-        detected=detected, false=false,
+        **common_fields(
+            end.value, end.trace, end.converged, errors, held, _notes(pairs, value, end.converged),
+            sightings.total - len(value.false),
+        ),
+        **offsets, bias_fitted=problem.fit_bias, features=len(value.false),
+        false_positives=float(value.false.sum()), expected=expected, detected=detected, false=false,
     )  # fmt: skip
 
 
@@ -306,13 +304,13 @@ def _held(pairs: Pairs, values: dict[str, float], value: Value) -> dict[str, str
     return held
 
 
-def _status(pairs: Pairs, value: Value, converged: bool, held: dict[str, str]) -> str:
-    notes = ["converged" if converged else "stopped: more iterations are needed"]
+def _notes(pairs: Pairs, value: Value, converged: bool) -> list[str]:
+    """Return the warnings of a fit."""
+    notes = [] if converged else ["more iterations are needed"]
     used = np.unique(pairs.landmark[value.responsibility > 0.5])
     if len(used) == 1:
         notes.append(f"landmark {used[0]} alone was seen: an error of its position counts as an offset or as noise")
     count = sum(pairs.present) + 1
     if len(value.false) < count:
         notes.append(f"{len(value.false)} features cannot determine {count} parameters")
-    notes += [f"{name}: {reason}" for name, reason in held.items() if reason != "no feature has this part"]
-    return "; ".join(notes)
+    return notes

@@ -41,12 +41,10 @@ class _Fixes(Problem):
     fit_mount: bool
     spread: float
 
-    def bounds(self) -> tuple[Floats, Floats]:
-        centre = -math.log(self.spread)
-        shape = [(centre - 14, centre + 7)] + ([(-math.inf, math.inf), (centre - 14, centre + 7)] * self.correlated)
-        mount = [(-math.inf, math.inf)] * 2 if self.fit_mount else []
-        low, high = np.array([(0.0, 0.0 if self.area is None else 1.0), *shape, *mount]).T
-        return low, high
+    def bounds(self) -> list[tuple[float, float]]:
+        scale, free = (-math.log(self.spread) - 14, -math.log(self.spread) + 7), (-math.inf, math.inf)
+        rand = 0.0, 0.0 if self.area is None else 1.0
+        return [rand, scale, *[free, scale] * self.correlated, *[free] * 2 * self.fit_mount]
 
     def scales(self, theta: Floats) -> Floats:
         sigma = math.exp(-theta[1])
@@ -194,9 +192,9 @@ class _Headings(Problem):
     turned: Floats
     kind: str
 
-    def bounds(self) -> tuple[Floats, Floats]:
+    def bounds(self) -> list[tuple[float, float]]:
         low, high = _SIGMAS if self.kind == "wrapped_normal" else _KAPPAS
-        return np.array([math.log(low), 0.0, -math.inf]), np.array([math.log(high), 1.0, math.inf])
+        return [(math.log(low), math.log(high)), (0.0, 1.0), (-math.inf, math.inf)]
 
     def scales(self, theta: Floats) -> Floats:
         sigma = math.exp(theta[0]) if self.kind == "wrapped_normal" else math.exp(-0.5 * theta[0])

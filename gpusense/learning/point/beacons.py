@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers
 from gpusense.learning.fitted import PointFit, number_blocks
-from gpusense.learning.point.densities import truncated
+from gpusense.learning.point.densities import half_sample_mode, truncated
 from gpusense.learning.point.problem import Problem, maximize, mix, of_weight, places_of, report
 from gpusense.world.hit_shapes import NORMAL, StudentHit
 from gpusense.world.range_causes import RandomDensity
@@ -39,22 +39,17 @@ class _Beacons(Problem):
     def _first(self) -> int:
         return 4 if self.kind == "mixture" else 2
 
-    def bounds(self) -> tuple[Floats, Floats]:
-        low_sigma, high_sigma = math.log(max(1e-3 * self.spread, 1e-9 * self.range_max)), math.log(self.range_max)
-        heavy = [(low_sigma, high_sigma), (0.0, 1.0)] if self.kind == "mixture" else []
-        pairs = [(low_sigma, high_sigma), (0.0, 1.0), *heavy, *[(-self.range_max, self.range_max)] * self.biases]
-        low, high = np.array(pairs).T
-        return low, high
+    def bounds(self) -> list[tuple[float, float]]:
+        sigma = math.log(max(1e-3 * self.spread, 1e-9 * self.range_max)), math.log(self.range_max)
+        return [sigma, (0.0, 1.0)] * (self._first // 2) + [(-self.range_max, self.range_max)] * self.biases
 
     def scales(self, theta: Floats) -> Floats:
-        scale = math.exp(theta[0])
-        weight = [of_weight(theta[1])]
         heavy = [1.0, of_weight(theta[3])] if self.kind == "mixture" else []
-        return np.array([1.0, *weight, *heavy, *[scale] * self.biases])
+        return np.array([1.0, of_weight(theta[1]), *heavy, *[math.exp(theta[0])] * self.biases])
 
     def starts(self) -> list[Floats]:
         residual = self.ranges - self.distances
-        mode = _half_sample_mode(residual)
+        mode = half_sample_mode(residual)
         centre = float(np.median(residual))
         starts = []
         for bias in sorted({centre, mode}) if self.biases else [0.0]:
@@ -221,17 +216,3 @@ def _readings(poses: ArrayLike, ranges: ArrayLike, beacons: int, ids: object) ->
         raise ValueError(f"ids: indices must be in [0, {beacons}), got {columns[at]} at index {at}")
     z = checks.array("ranges", ranges, (len(columns),), finite=False)
     return pose, z, [np.arange(len(columns)), columns]
-
-
-def _half_sample_mode(values: Floats) -> float:
-    """Return the centre of the densest part by repeated halving; robust even to more than half outliers.
-
-    Source: Bickel and Fruehwirth (2006), "On a fast, robust estimator of the mode".
-    """
-    ordered = np.sort(values)
-    while len(ordered) > 2:
-        half = (len(ordered) + 1) // 2
-        widths = ordered[half - 1 :] - ordered[: len(ordered) - half + 1]
-        at = int(np.argmin(widths))
-        ordered = ordered[at : at + half]
-    return float(ordered.mean())

@@ -31,9 +31,8 @@ class _Bumps(Problem):
     pressed: Floats
     side: float
 
-    def bounds(self) -> tuple[Floats, Floats]:
-        low, high = math.log(1e-3 * self.side), math.log(1e3 * self.side)
-        return np.array([0.0, 0.0, low]), np.array([1.0, 1.0, high])
+    def bounds(self) -> list[tuple[float, float]]:
+        return [(0.0, 1.0), (0.0, 1.0), (math.log(1e-3 * self.side), math.log(1e3 * self.side))]
 
     def scales(self, theta: Floats) -> Floats:
         return np.array([of_weight(theta[0]), of_weight(theta[1]), 1.0])

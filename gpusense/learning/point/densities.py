@@ -83,3 +83,16 @@ def von_mises(residual: Floats, kappa: float) -> tuple[Floats, Floats, Floats]:
     ratio = float(i1e(kappa) / i0e(kappa))
     rest = 1 - ratio if kappa < 1e4 else 1 / (2 * kappa) + 1 / (8 * kappa**2) + 1 / (8 * kappa**3)
     return log_p, kappa * (rest - drop), kappa * np.sin(residual)
+
+
+def half_sample_mode(values: Floats) -> float:
+    """Return the centre of the densest part by repeated halving; robust even to more than half outliers.
+
+    Source: Bickel and Fruehwirth (2006), "On a fast, robust estimator of the mode".
+    """
+    ordered = np.sort(values)
+    while len(ordered) > 2:
+        half = (len(ordered) + 1) // 2
+        at = int(np.argmin(ordered[half - 1 :] - ordered[: len(ordered) - half + 1]))
+        ordered = ordered[at : at + half]
+    return float(ordered.mean())

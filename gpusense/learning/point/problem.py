@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,7 +19,16 @@ from numpy.typing import NDArray
 
 from gpusense._util import checks
 from gpusense._util.typing import Floats, Integers
-from gpusense.learning.fitted import FEW_BLOCKS, P, PointFit, errors_of, notes_on_blocks, scatter_of
+from gpusense.learning.fitted import (
+    FEW_BLOCKS,
+    P,
+    PointFit,
+    common_fields,
+    errors_of,
+    notes_on_blocks,
+    scatter_of,
+    shortened,
+)
 
 
 def places_of(poses: Floats, mount: object) -> Floats:
@@ -49,8 +59,14 @@ class Problem(ABC):
         return len(getattr(self, self.per_reading[0]))
 
     @abstractmethod
-    def bounds(self) -> tuple[Floats, Floats]:
-        """Return the smallest and largest values (k,) of the coordinates."""
+    def bounds(self) -> Sequence[tuple[float, float]] | Floats:
+        """Return the smallest and largest value (k, 2) of each coordinate."""
+
+    @cached_property
+    def limits(self) -> tuple[Floats, Floats]:
+        """The smallest and the largest values (k,) of the coordinates."""
+        low, high = np.array(self.bounds(), np.float64).T
+        return low, high
 
     @abstractmethod
     def starts(self) -> list[Floats]:
@@ -96,7 +112,7 @@ class Problem(ABC):
 
     def _slope(self, function: Callable[[Floats], Floats], theta: Floats, place: int) -> Floats:
         """Return the derivative of a function by a coordinate, as a difference within the bounds."""
-        low, high = self.bounds()
+        low, high = self.limits
         step = _STEP * self.scales(theta)[place]
         room = max(theta[place] - low[place], 0.0), max(high[place] - theta[place], 0.0)
         # One-sided at a bound.
@@ -160,7 +176,7 @@ def maximize(problem: Problem, max_iterations: int, tolerance: float) -> Climb:
     checks.real("tolerance", tolerance, above=0)
     every = max(1, problem.readings // _SAMPLE)
     sample = problem.part(every) if every > 1 else problem
-    low, high = problem.bounds()
+    low, high = problem.limits
     starts = [np.clip(each, low, high) for each in problem.starts()]
     starts = sorted(starts, key=lambda each: -sample.total(each)[0])[:_CLIMBED]
     ends = [climb(sample, each, max_iterations, tolerance) for each in starts]
@@ -176,7 +192,7 @@ def maximize(problem: Problem, max_iterations: int, tolerance: float) -> Climb:
 
 def climb(problem: Problem, start: Floats, max_iterations: int, tolerance: float) -> Climb:
     """Search for a maximum from one start."""
-    low, high = problem.bounds()
+    low, high = problem.limits
     theta: Floats = np.clip(start, low, high)
     value, gradient = problem.total(theta)
     trace, converged = [value], False
@@ -197,7 +213,7 @@ def climb(problem: Problem, start: Floats, max_iterations: int, tolerance: float
 
 def free_coordinates(problem: Problem, theta: Floats) -> NDArray[np.bool_]:
     """Return the mask (k,) of the coordinates that are not held at a bound."""
-    return _free(theta, problem.total(theta)[1], *problem.bounds())
+    return _free(theta, problem.total(theta)[1], *problem.limits)
 
 
 def _free(theta: Floats, gradient: Floats, low: Floats, high: Floats) -> NDArray[np.bool_]:
@@ -230,7 +246,7 @@ def _line_search(
     problem: Problem, theta: Floats, value: float, gradient: Floats, step: Floats
 ) -> tuple[Floats, float, Floats] | None:
     """Return the first point along the step that is likely enough, its log-likelihood and gradient; or None."""
-    low, high = problem.bounds()
+    low, high = problem.limits
     for halvings in range(_HALVINGS):
         moved: Floats = np.clip(theta + step * 0.5**halvings, low, high)
         if np.array_equal(moved, theta):
@@ -245,46 +261,29 @@ def _line_search(
 def report(problem: Problem, end: Climb, parameters: P, blocks: Integers | None, missing: int) -> PointFit[P]:
     """Build the fit from the end of a search."""
     values = problem.values(end.theta)
-    count = 0 if blocks is None else int(blocks.max()) + 1
     independent = standard_errors(problem, end.theta, end.free)
-    errors = dict(independent) if blocks is None else standard_errors(problem, end.theta, end.free, blocks)
-    touched = _blocks_of(problem, end, blocks)
-    held = {}
+    errors, held, touched = dict(independent), {}, dict.fromkeys(values, FEW_BLOCKS)
+    notes, count = [] if end.converged else ["did not converge"], 0
+    if blocks is not None:
+        count, touched = int(blocks.max()) + 1, _blocks_of(problem, end, blocks)
+        errors = standard_errors(problem, end.theta, end.free, blocks)
+        notes += notes_on_blocks(count)
     for name, error in independent.items():
-        if error == math.inf:
-            held[name] = "the readings do not determine it"
-        elif math.isnan(error):
+        if math.isnan(error):
             held[name] = "at a bound"
-        elif blocks is not None and touched[name] < 2:
+        elif error < math.inf and touched[name] < 2:
             held[name], errors[name] = "the readings that determine it are in one block", math.nan
-    notes: list[str] = [] if end.converged else ["did not converge"]
-    rough = [name for name in values if name not in held and touched[name] < FEW_BLOCKS] if blocks is not None else []
-    few = [] if blocks is None else notes_on_blocks(count)
-    notes += few
-    if rough and not few:
-        notes.append(f"standard errors from fewer than {FEW_BLOCKS} blocks are rough: {_list(rough)}")
-    for reason in dict.fromkeys(held.values()):
-        notes.append(f"{_list([name for name in held if held[name] == reason])}: {reason}")
+    rough = [name for name, error in errors.items() if math.isfinite(error) and touched[name] < FEW_BLOCKS]
+    if rough and count >= FEW_BLOCKS:
+        notes.append(f"standard errors from fewer than {FEW_BLOCKS} blocks are rough: {shortened(rough)}")
     return PointFit(
         parameters=parameters,
-        log_likelihood=end.value,
-        trace=np.array(end.trace),
-        converged=end.converged,
-        status="; ".join(["converged" if end.converged else "stopped", *notes]),
-        standard_errors=errors,
+        **common_fields(end.value, end.trace, end.converged, errors, held, notes, missing),
         independent_errors=independent,
-        held=held,
         values=values,
-        iterations=len(end.trace) - 1,
         readings=problem.readings,
-        missing=missing,
         blocks=count,
     )
-
-
-def _list(names: list[str]) -> str:
-    """Return the first names, and the number of further ones."""
-    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 def standard_errors(
@@ -305,13 +304,10 @@ def standard_errors(
     return dict(zip(problem.values(theta), errors.tolist(), strict=True))
 
 
-def _blocks_of(problem: Problem, end: Climb, blocks: Integers | None) -> dict[str, int]:
+def _blocks_of(problem: Problem, end: Climb, blocks: Integers) -> dict[str, int]:
     """Return the least number of blocks that depend on a coordinate, for each parameter that it determines."""
-    names = list(problem.values(end.theta))
-    if blocks is None:
-        return dict.fromkeys(names, 0)
     gradients, jacobian = problem.log_p(end.theta)[1], problem.jacobian(end.theta)
     counts = np.array([len(np.unique(blocks[column != 0])) for column in gradients.T])
     used = (jacobian != 0) & end.free
     least = np.where(used, counts, np.iinfo(np.int64).max).min(axis=1)
-    return dict(zip(names, least.tolist(), strict=True))
+    return dict(zip(problem.values(end.theta), least.tolist(), strict=True))

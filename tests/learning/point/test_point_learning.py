@@ -62,7 +62,7 @@ def test_gradients_are_those_of_differences(name: str, problem: Problem, at: lis
 
 def no_better(problem: Problem, theta: np.ndarray, value: float) -> None:
     """Check an optimum with another optimiser, from the optimum and from disturbed points."""
-    low, high = problem.bounds()
+    low, high = problem.limits
     scales = problem.scales(theta)
     for seed in range(3):
         start = np.clip(theta + 0.5 * seed * np.random.default_rng(seed).normal(size=len(theta)) * scales, low, high)

@@ -1,7 +1,6 @@
 """Time one step of the particle filter: predict, score, normalise, resample and estimate.
 
-A step that is one recorded program is also replayed many times in a row, with and without the estimate. This gives its
-time on the device.
+A step that is one recorded program is also replayed many times in a row, which gives its time on the device.
 
 The scene is a generated building, in which the particles track a robot. A filter with one stage is the plain filter.
 The default filter has up to four stages, and on a processor a step runs only as many as its particles need. Three
@@ -60,7 +59,8 @@ def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -
         pf = gs.ParticleFilter(model, particles=particles, temperature=0.2, stages=stages, recovery=recovery)
         pf.initialize(mean=pose, covariance=np.diag([0.01, 0.01, 0.002]))
         filters.append(pf)
-    filters[0]._parts.verdict.is_informed_by = lambda _: False
+    verdict_of_first = filters[0]._parts.verdict
+    verdict_of_first.is_informed_by, verdict_of_first.expected = lambda _: False, lambda *_: []
     times: list[list[float]] = [[], [], []]
     for _ in range(steps + 5):
         for which, (pf, kept) in enumerate(zip(filters, times, strict=True)):
@@ -76,16 +76,11 @@ def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -
     # A mean without outliers of the machine, since only some steps compute the verdict.
     means = [float(np.minimum(kept, 4 * np.median(kept)).mean()) for kept in (late, verdict, default)]
     pf = filters[0]
-    in_a_row = with_estimate = None
-    # First stages, without and with the estimate (the fourth part of a key), which the first steps launch by
-    # themselves.
-    recorded = {key[3]: kept.recording for key, kept in pf._cloud._recordings.items() if key[1].number == 0}
-    if recorded:
-        in_a_row, with_estimate = (_in_a_row(pf, steps, recorded[estimates]) for estimates in (False, True))
+    recorded = [kept.recording for key, kept in pf._cloud._recordings.items() if key[1].number == 0]
     return dict(
         backend=backend, particles=particles, beams=beams, stages=stages, median_ms=float(np.median(late)),
-        least_ms=min(late), verdict_ms=means[1] - means[0], recovery_ms=means[2] - means[0], in_a_row_ms=in_a_row,
-        with_estimate_ms=with_estimate, start=pf.explain(),
+        least_ms=min(late), verdict_ms=means[1] - means[0], recovery_ms=means[2] - means[0],
+        in_a_row_ms=_in_a_row(pf, steps, recorded[-1]) if recorded else None, start=pf.explain(),
     )  # fmt: skip
 
 
@@ -114,10 +109,11 @@ QUANTILES = (0.1, 0.5, 0.9, 0.99, 1.0)
 WORK = {
     "begin": ("sensors.Sensor", ("begin_lesson",)),
     "learn": ("lessons.Learner", ("_advanced",)),
-    "search": ("rival.Rival", ("start",)),
+    "search": ("rival.Recovery", ("_start",)),
     "rival": ("rival.Rival", ("correct",)),
     "stage": ("cloud.Cloud", ("_draw",)),
     "record": ("cloud.RecordedProgram", ("__init__",)),
+    "judge": ("beam_consistency.MapJudge", ("consistency",)),
 }
 
 
@@ -142,13 +138,6 @@ def watch_work() -> list[str]:
             if hasattr(found, name):
                 watch(found, name, word)
     watch(importlib.import_module("gpusense.localization.cloud").Cloud, "_read", "copy")
-    judge = importlib.import_module("gpusense.localization.verdict").beam_consistency
-
-    def judged(*arguments: Any) -> Any:
-        done.append("judge")
-        return judge(*arguments)
-
-    importlib.import_module("gpusense.localization.verdict").beam_consistency = judged
     return done
 
 
@@ -272,8 +261,8 @@ def main() -> None:
         return _write(args, rows)
     print(
         "| particles x beams | stages | median ms | least ms | verdict, more ms | and recovery, more ms | "
-        "recorded ones in a row ms | with estimate | start |\n"
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+        "recorded ones in a row ms | start |\n"
+        "| --- | --- | --- | --- | --- | --- | --- | --- |"
     )
     for particles, beams in args.size or SIZES:
         for stages in (1, 4):
@@ -282,7 +271,7 @@ def main() -> None:
             print(
                 f"| {particles} x {beams} | {stages} | {one['median_ms']:.2f} | {one['least_ms']:.2f} | "
                 f"{one['verdict_ms']:.3f} | {one['recovery_ms']:.3f} | "
-                f"{_text(one['in_a_row_ms'])} | {_text(one['with_estimate_ms'])} | "
+                f"{_text(one['in_a_row_ms'])} | "
                 f"{one['start']} |",
                 flush=True,
             )

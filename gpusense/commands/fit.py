@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -353,7 +353,7 @@ def parameters_yaml(result: FitResult) -> str:
         lines += [
             "# For 'gpusense localize --parameters': OdometryMotion. nav2_amcl lacks least, sideways and systematic:",
             "# alpha alone is too little noise there.",
-            block("odometry_motion", asdict(result.motion.motion)),
+            block("odometry_motion", result.motion.motion.to_dict()),
         ]
     own = ("range_bias", "sigma_growth", *SHAPE_PARAMETERS)
     shared = {name: value for name, value in values.items() if name not in own}

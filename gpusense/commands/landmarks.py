@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -83,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     with working(track.steps, len(recorded.time)) as step:
         for one in landmark_runs.follow(pf, recorded, track, known=args.known):
             step(f"scan {one.index}" + (", lost" if track.verdicts[-1] == "lost" else ""))
-    figures = summary(track) | {"gain": pf.gain}
+    figures = summary(track)
     if args.json:
         output.report(_document(recorded, fit, doubts) | {
             "association": agreement, "motion": asdict(motion), "filter": figures, "device": model.device.selection,
@@ -134,15 +133,10 @@ def _print(
 
 
 def _verdict(figures: dict[str, Any]) -> str:
-    if math.isnan(figures["gain"]):
-        return "NO VERDICT: too few scans with readings"
     verdict = figures["verdict"]
     since = f"; lost in {figures['scans_lost']} scans" if figures["scans_lost"] else ""
     cure = "; is this the map of the run, and --drift large enough?" if verdict == "lost" else ""
-    return (
-        f"{verdict.upper()}: the particles predict a reading {figures['gain']:.1f} nats better than chance; p_lost "
-        f"{figures['p_lost']:.2g}{since}{cure}"
-    )
+    return f"{verdict.upper()}: p_lost {figures['p_lost']:.2g}{since}{cure}"
 
 
 def _print_suspicions(run: LandmarkRun, suspicions: Suspicions) -> None:

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from gpusense._util import checks
 from gpusense._util.typing import Floats
-from gpusense.backends import BackendInfo
+from gpusense.backends import BackendInfo, get_backend
 from gpusense.evaluation.worlds import cloud_around, cloud_uniform
-from gpusense.localization.beam_consistency import BeamConsistency, MapJudge, beam_consistency
+from gpusense.localization.beam_consistency import BeamConsistency, MapJudge
 from gpusense.localization.belief import Belief, evidence_of_scan
 from gpusense.localization.diagnosis import Diagnosis, evidence_of
 from gpusense.localization.pose_algebra import mean_pose
@@ -248,10 +248,9 @@ class FitnessOfLog:
     """
 
     def __init__(self, model: Model) -> None:
-        self._grid = model.grid
         # The host judges beams for devices without float64.
-        device = model.backend if model.backend.info.float64 else None
-        self._belief, self._judge = Belief(), None if device is None else MapJudge(device, model.grid)
+        device = model.backend if model.backend.info.float64 else get_backend("numpy")
+        self._belief, self._judge = Belief(), MapJudge(device, model.grid)
         self._scans: list[BeamConsistency] = []
         self._shares: list[float] = []
         self._better: list[float] = []
@@ -260,7 +259,7 @@ class FitnessOfLog:
     def add(self, scan: Scan, better: float | None) -> None:
         """Add a scan with its :attr:`ScanScore.better`."""
         pose, ranges = np.array(scan.pose, np.float64), np.asarray(scan.ranges, np.float64)
-        found = beam_consistency(self._grid, scan.scanner, pose, ranges, judge=self._judge)
+        found = self._judge.consistency(scan.scanner, pose, ranges)
         ratio, share = evidence_of_scan([found])
         ratio += 0.0 if better is None else _ratio_of_rank(better)
         x, y, theta = (float(value) for value in pose)

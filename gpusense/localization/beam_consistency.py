@@ -33,7 +33,7 @@ from gpusense.interface.constants import AGREES, MOMENTS, NOTHING, SHORT, THROUG
 from gpusense.interface.lanes import with_teams_flags
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import BeamRules, Frame
-from gpusense.reference.beam_consistency import STEP, judge_beams
+from gpusense.reference.beam_consistency import STEP
 from gpusense.world.frames import frame_of
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner, float64_readings, range_limits
@@ -101,31 +101,10 @@ def counts_of(scans: Sequence[BeamConsistency]) -> Counts:
     """Return the counts of several scans."""
     kinds, close = list[float](), 0
     for one in scans:
-        # Python's numbers are faster than short arrays.
-        these = one.kind.tolist()
-        kinds += these
-        for kind, reading, distance in zip(these, one.reading.tolist(), one.distance.tolist(), strict=True):
-            if kind == _AGREES and -one.near < reading - distance < one.near:
-                close += 1
+        kinds += one.kind.tolist()
+        is_close = (one.distance < one.reading + one.near) & (one.distance > one.reading - one.near)
+        close += int(np.count_nonzero(is_close & (one.kind == _AGREES)))
     return Counts(kinds.count(_AGREES), close, *[kinds.count(kind) for kind in _OTHERS])
-
-
-def beam_consistency(
-    grid: OccupancyGrid,
-    scanner: Scanner,
-    pose: Floats,
-    ranges: Floats,
-    covariance: Floats = _STILL,
-    judge: MapJudge | None = None,
-) -> BeamConsistency:
-    """Judge the beams of a scan (K,) at a (3,) pose with a (3, 3) covariance, by the map on a device or on the host."""
-    if judge is None:
-        beams, _ = _chosen_beams(scanner, ranges)
-        kind, distance = _judged_on_host(grid, scanner, pose, covariance, beams)
-    else:
-        beams, kind, distance = judge(scanner, pose, covariance, ranges)
-    near = max(_CLOSE, grid.resolution)
-    return BeamConsistency(kind, distance, *beams, pose, scanner.mount, near, *_place_of(grid, pose))
 
 
 def _place_of(grid: OccupancyGrid, pose: Floats) -> tuple[bool, bool]:
@@ -144,13 +123,12 @@ def _place_of(grid: OccupancyGrid, pose: Floats) -> tuple[bool, bool]:
     return solid, not solid and bool((around < 0).all())
 
 
-def _chosen_beams(scanner: Scanner, ranges: Floats) -> tuple[Beams, np.ndarray]:
+def _chosen_beams(setting: _Setting, ranges: Floats) -> tuple[Beams, np.ndarray]:
     """Return the judged beams of a scan (K,), hits and max readings, evenly; and their indices."""
-    nearest, _ = range_limits(ranges.dtype, scanner.range_min, scanner.range_max)
-    chosen = (ranges >= nearest).nonzero()[0]
+    chosen = (ranges >= setting.nearest).nonzero()[0]
     if len(chosen) > BEAMS:
         chosen = chosen[_evenly(len(chosen))]
-    return Beams(scanner.bearings[chosen], ranges[chosen]), chosen
+    return Beams(setting.scanner.bearings[chosen], ranges[chosen]), chosen
 
 
 @functools.lru_cache(maxsize=256)
@@ -159,23 +137,11 @@ def _evenly(count: int) -> np.ndarray:
     return (np.arange(BEAMS) * 2 + 1) * count // JUDGED
 
 
-def _judged_on_host(
-    grid: OccupancyGrid, scanner: Scanner, pose: Floats, covariance: Floats, beams: Beams
-) -> tuple[Floats, Floats]:
-    """Compute the results of the kernel ``judge_beams`` on the host: classes and distances."""
-    setting, count = _setting_of(grid, scanner), len(beams.bearing)
-    scan = np.concatenate([beams.bearing + setting.turn, beams.reading])
-    estimate, judged = np.array(_numbers_of(pose, covariance)), np.empty(2 * count)
-    cells = grid.cells.reshape(-1).view(np.uint8)
-    if count:
-        judge_beams(_PLAIN, cells, estimate, scan, judged, setting.frame, setting.rules, *grid.shape, count)
-    return judged[:count], judged[count:]
-
-
 class _Setting(NamedTuple):
     """A scanner in a map."""
 
     scanner: Scanner
+    nearest: float  # shortest judged reading [m]
     turn: float  # direction of bearing 0 relative to the robot's heading [rad]
     directions: Floats  # (K,) directions of the beams relative to the robot's heading [rad]
     frame: Frame
@@ -198,16 +164,24 @@ class MapJudge:
         self._known: tuple[Floats, Beams, list[float], Floats, Floats] | None = None
         self._uploaded: Floats | None = None
 
-    def __call__(
+    def consistency(
+        self, scanner: Scanner, pose: Floats, ranges: Floats, covariance: Floats = _STILL
+    ) -> BeamConsistency:
+        """Judge the beams of a scan (K,), on host or device, at a (3,) pose with a (3, 3) covariance."""
+        beams, kind, distance = self._judged(scanner, pose, covariance, ranges)
+        near = max(_CLOSE, self.grid.resolution)
+        return BeamConsistency(kind, distance, *beams, pose, scanner.mount, near, *_place_of(self.grid, pose))
+
+    def _judged(
         self, scanner: Scanner, pose: Floats, covariance: Floats, ranges: Floats
     ) -> tuple[Beams, Floats, Floats]:
-        """Return the judged beams of a scan (K,) on host or device, their classes, and distances of walls."""
+        """Return the judged beams of a scan, their classes, and distances of walls."""
         numbers, setting = _numbers_of(pose, covariance), self._set(scanner)
         # Readings that a correction has judged are the same object.
         if self._known is not None and self._known[0] is ranges and self._known[2] == numbers:
             return self._known[1], *self._known[3:]
         on_host = np.asarray(arrays.copied_to_host(ranges, self._backend, "ranges"))
-        beams, space = _chosen_beams(scanner, float64_readings(on_host, scanner))[0], self._space
+        beams, space = _chosen_beams(setting, float64_readings(on_host, scanner))[0], self._space
         count = len(beams.bearing)
         result = np.empty(2 * count)
         if count:
@@ -231,7 +205,7 @@ class MapJudge:
         be filled with its beams.
         """
         setting, self._known = self._set(scanner), None
-        beams, chosen = _chosen_beams(scanner, values)
+        beams, chosen = _chosen_beams(setting, values)
         count = len(chosen)
         self._expected = (ranges, beams) if count else None
         if count < BEAMS:
@@ -250,7 +224,7 @@ class MapJudge:
     def receive(self, estimate: Floats, judged: Floats) -> None:
         """Keep the judgement of the expected scan: the results of ``finish_estimate`` and of ``judge_beams``."""
         if self._expected is not None:
-            (ranges, beams), self._expected = self._expected, None
+            ranges, beams = self._expected
             count, numbers = len(beams.bearing), _finished(estimate[:MOMENTS].tolist())
             self._known = ranges, beams, numbers, judged[:count], judged[BEAMS : BEAMS + count]
 
@@ -296,4 +270,5 @@ def _setting_of(grid: OccupancyGrid, scanner: Scanner) -> _Setting:
         max(_LEAST, _LEAST_CELLS * side), _PART, min(_FARTHEST, scanner.range_max), scanner.range_max,
         grid.occupied_threshold,
     )  # fmt: skip
-    return _Setting(scanner, turn, scanner.bearings + turn, frame_of(grid, scanner.mount), rules)
+    nearest, _ = range_limits(_DOUBLE, scanner.range_min, scanner.range_max)
+    return _Setting(scanner, nearest, turn, scanner.bearings + turn, frame_of(grid, scanner.mount), rules)

@@ -1,30 +1,13 @@
 """Estimate the belief that a localiser follows a wrong pose, by a hidden Markov model.
 
 The states are "right" (the robot is inside the localiser's distribution) and "wrong" (it is elsewhere). A scan yields a
-log-likelihood ratio r of "wrong" against "right". Consecutive ratios are a first-order autoregressive process of
-correlation ``rho = STAYS exp(-d / LENGTH - turn / TURN)`` (Hamilton, "A new approach to the economic analysis of
-nonstationary time series", *Econometrica* 57 (1989), treats such regimes), so the log odds change by
-
-    (r_t - rho r_{t-1}) / (1 + rho),
-
-and for a pose that became wrong since by r_t + max(r_t - r_{t-1}, 0) rho / (1 + rho).
-
-If a share a of the wrong places still looks like the right one, an increment i of the log odds becomes
+log-likelihood ratio r of "wrong" against "right". Consecutive ratios are a first-order autoregressive process
+(Hamilton, "A new approach to the economic analysis of nonstationary time series", *Econometrica* 57 (1989), treats such
+regimes). If a share a of the wrong places still looks like the right one, an increment i of the log odds becomes
 
     log(a + (1 - a) e^i),   a <- a / (a + (1 - a) e^i).
 
-T beams of a scan pass through walls, A agree, C of them within a few centimetres, and S are short; N end in unknown
-cells or off the map. With n = A + S + T and f(a, b) = log((a + 1/2) / (b + 1/2)) the ratio is
-
-    r = n / (n + FEW) (BIAS + SLOPE f(T, A) + BLUNT f(A - C, C) + NOTHING f(N, n)),
-
-within LIMITS. A pose inside solid cells adds SOLID, a pose in unknown cells UNKNOWN. The best other place, of lead L
-and ratio rho of its beams, of which m are independent, adds log(pi e^q + 1 - pi), pi = 1 / (1 + e^rho), if
-
-    q = OF_LEAD min(max(L, NEAREST), FARTHEST) - m / (m + HALF) (BY_CHANCE + IS_FOUND I)
-
-is positive, else q; I is 1 if the search found the pose. ``docs/localization.md`` gives the reasons, and the runs that
-the numbers come from. Landmarks: :class:`gpusense.localization.verdict.Evidence`.
+``docs/localization.md`` has all formulas, their reasons, and the runs that the numbers come from.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 A correction runs stages until the temperature is used up. On a GPU motion, scores, weights, the estimate and the beams
 to judge are one recorded program of a stage: one copy writes all of its inputs, and one reads all of its results. In
-CUDA the copies are part of its graph. The estimate is part of it if the estimates of the last corrections were read,
-its second pass if the last one needed that, and a judgement if the pose will probably be judged. While the device
-works, the host learns from the last lesson (:mod:`gpusense.localization.temperature`).
+CUDA the copies are part of its graph. The second pass of the estimate is part of it if the last correction needed that,
+and a judgement if the pose will probably be judged. While the device works, the host learns from the last lesson
+(:mod:`gpusense.localization.lessons`).
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from gpusense.localization.particles import BufferSlots, Particles, Stage
 from gpusense.localization.sensors import Sensor, SensorReadings
 
 _DOUBLE = np.dtype(np.float64)
+# Passes of the estimate before any has run.
+_NO_PASSES: dict[bool, Hashable] = {False: None, True: None}
 # Most recorded steps, other programs, and programs of sensors.
 _MOST_RECORDED, _MOST_STAGES, _MOST_PROGRAMS = 64, 48, 8
-# Consecutive corrections with a read estimate after which corrections compute the estimate.
-_ASKED = 3
 
 
 class Cloud(Particles):
@@ -46,19 +46,16 @@ class Cloud(Particles):
         self._recordings = ProgramCache[RecordedProgram](_MOST_RECORDED)
         self._programs = ProgramCache[tuple[Program, object]](_MOST_PROGRAMS)
         self._estimates, self._stages = RepeatedPrograms(self.backend, 8), RepeatedPrograms(self.backend, _MOST_STAGES)
-        # Results on the host while they are valid; buffers and number of particles behind the estimate and its second
-        # pass on the device, and behind the final estimate on the host.
+        # Results on the host while they are valid; buffers and number of particles behind both passes of the estimate
+        # on the device, and behind the final estimate on the host.
         self._results: np.ndarray | None = None
         self._summary: tuple[np.ndarray, int, Summary] | None = None
-        self._estimated_of: Hashable = None
-        self._refined_of: Hashable = None
+        self._passes = dict[bool, Hashable](_NO_PASSES)
         self._known: tuple[Hashable, np.ndarray] | None = None
         self._snapshots: list[weakref.ref[Snapshot]] = []
-        # Consecutive corrections with a read estimate; whether the last one's was read; whether the stages of the
-        # present one compute the estimate; the same for the second pass, of one correction.
-        self._asked, self._was_asked, self._estimates_too = 0, False, False
+        # Whether the last correction's estimate needed its second pass; whether stages of the present one compute it.
         self._was_refined, self._refines_too = False, False
-        # Number of sensors of the present correction; judges until they receive the result.
+        # Number of sensors of the present correction; judges of its scans.
         self._used = 0
         self._judges: list[MapJudge] = []
         # Inputs of a recorded correction, and readings of other arrays of the device; whether results are on their way.
@@ -86,7 +83,7 @@ class Cloud(Particles):
     def _begin_change(self) -> None:
         """Invalidate the results on the host, and save the particles that the change may overwrite."""
         self._change_results()
-        self._known = self._estimated_of = self._refined_of = None
+        self._known, self._passes = None, _NO_PASSES
         self._judges, self._given, self._adopted = [], None, ()
         for one in self._snapshots:
             snapshot = one()
@@ -113,15 +110,13 @@ class Cloud(Particles):
     ) -> None:  # fmt: skip
         """Run a correction by readings after a kind of motion: stages until the temperature is used up.
 
-        It draws a number of particles, judges scans at the new pose if it estimates that, and calls ``meanwhile`` while
-        the device works on the first stage.
+        It draws a number of particles, estimates the pose, judges scans there, and calls ``meanwhile`` while the device
+        works on the first stage.
         """
         indices = [index for index, _ in readings]
         self._begin_change()
         self._used = len(indices)
-        self._asked, self._was_asked = self._asked + 1 if self._was_asked else 0, False
-        self._estimates_too = self._asked >= _ASKED
-        self._refines_too, self._was_refined = self._estimates_too and self._was_refined, False
+        self._refines_too, self._was_refined = self._was_refined, False
         recorded = self.backend.info.kind == "gpu"
         for index, reading in readings:
             recorded = recorded and self._scored[index].records(reading)
@@ -153,8 +148,7 @@ class Cloud(Particles):
             if last:
                 break
         places = stage.places
-        self._estimated_of = (places, self.count) if self._estimates_too else None
-        self._refined_of = (places, self.count) if self._refines_too else None
+        self._passes = {False: (places, self.count), True: (places, self.count) if self._refines_too else None}
         self.set_particles(places, drawn)
 
     def _give(self, settings: np.ndarray, readings: list[SensorReadings]) -> None:
@@ -175,7 +169,7 @@ class Cloud(Particles):
         for place, (index, reading) in enumerate(readings):
             self._scored[index].score(poses, reading, self.log_p_of(place), before=before)
             before = None
-        key = (stage.key, self.count, len(readings), self._estimates_too, self._refines_too)
+        key = (stage.key, self.count, len(readings), self._refines_too)
         self._stages.run(key, lambda: self._weighing(stage))
         # Prepare scans while the device works.
         versions = self._prepare_judges(judged)
@@ -185,7 +179,7 @@ class Cloud(Particles):
     def _replay(self, indices: list[int], stage: Stage, judged: Sequence[SensorReadings]) -> None:
         """Run a stage of a correction by sensors ``indices`` as one recorded program."""
         sensors = tuple([(index, self._scored[index].version) for index in indices])
-        key = (sensors, stage, self.count, self._estimates_too, self._refines_too, self._prepare_judges(judged))
+        key = (sensors, stage, self.count, self._refines_too, self._prepare_judges(judged))
         recorded = self._recordings.get(key)
         if recorded is None:
             move = () if stage.kind is None else self.motion(stage.origin, stage.source, stage.kind)
@@ -229,13 +223,9 @@ class Cloud(Particles):
         return numbers, settings
 
     def _weighing(self, stage: Stage) -> Program:
-        """Return the launches of a stage after its scores, including the estimate if it is expected."""
-        program = self.weighing(stage, self._used)
-        if self._estimates_too:
-            program += self._estimating(stage.places, self.count)
-        if self._refines_too:
-            program += self._estimating(stage.places, self.count, self.refined)
-        return program
+        """Return the launches of a stage after its scores."""
+        program = self.weighing(stage, self._used) + self._estimating(stage.places, self.count)
+        return program + self._estimating(stage.places, self.count, self.refined) if self._refines_too else program
 
     def _judging(self) -> Program:
         """Return the launches for judging scans at the estimate."""
@@ -243,12 +233,10 @@ class Cloud(Particles):
         return tuple(one for judge, *buffers in triples for one in judge.launches(self.estimated, *buffers))
 
     def _prepare_judges(self, scans: Sequence[SensorReadings]) -> Hashable:
-        """Let judges expect the scans of a correction that estimates the pose; return the key of their launches.
+        """Let judges expect the scans of a correction; return the key of their launches.
 
         The beams are inputs of a recorded correction, or are copied to the device.
         """
-        if not self._estimates_too:
-            return ()
         given = self._given
         for index, reading in scans:
             sensor, place = self._scored[index], len(self._judges)
@@ -318,18 +306,19 @@ class Cloud(Particles):
 
     def estimate(self, count: int) -> np.ndarray:
         """Return mean, covariance and sum of weights of the shown particles from the kernels; not to be changed."""
-        self._was_asked, key = True, (self.places, count)
+        key = self.places, count
         if self._known is None or self._known[0] != key:
-            numbers = self._estimate(count)
+            numbers = self._passed(count)
             if numbers[WIDE_HEADINGS]:
-                numbers = np.concatenate([numbers[:3], self._refined(count)[3:MOMENTS], numbers[MOMENTS:]])
+                second = self._passed(count, second=True)
+                numbers = np.concatenate([numbers[:3], second[3:MOMENTS], numbers[MOMENTS:]])
             self._known = key, numbers
         return self._known[1]
 
     def far_share(self, count: int) -> float:
         """Return the share of the shown particles beyond 1 m or 0.5 rad of the mean."""
         self.estimate(count)
-        return float(self._refined(count)[FAR_SHARE])
+        return float(self._passed(count, second=True)[FAR_SHARE])
 
     def snapshot(self, count: int) -> Snapshot:
         """Return the function that copies the shown particles of now to the host, at any later time."""
@@ -337,40 +326,28 @@ class Cloud(Particles):
         self._snapshots.append(weakref.ref(made))
         return made
 
-    def _estimate(self, count: int) -> np.ndarray:
-        """Return the estimate; compute it unless the last correction did."""
-        places = self.places
-        if self._estimated_of != (places, count):
-            self._judges = []
+    def _passed(self, count: int, *, second: bool = False) -> np.ndarray:
+        """Return a pass of the present estimate; compute it unless the last correction did."""
+        places, refined = self.places, self.refined if second else None
+        self._was_refined = self._was_refined or second
+        if self._passes[second] != (places, count):
             self._change_results()
             # Clouds of varying size rarely repeat a size.
-            self._estimates.run((places.shown, places.weight, count), lambda: self._estimating(places, count))
-            self._estimated_of = places, count
-        numbers, (first, _, *spans) = self._read_results(), self.results.spans[2:]
-        estimate = numbers[first]
-        for judge, span in zip(self._judges, spans, strict=False):
-            judge.receive(estimate, numbers[span])
-        self._judges = []
-        return estimate
-
-    def _refined(self, count: int) -> np.ndarray:
-        """Return the second pass of the present estimate; compute it unless the last correction did."""
-        places, self._was_refined = self.places, True
-        if self._refined_of != (places, count):
-            self._change_results()
-            self._estimates.run(
-                (places.shown, places.weight, count, "refined"), lambda: self._estimating(places, count, self.refined)
-            )
-            self._refined_of = places, count
-        return self._read_results()[self.results.spans[3]]
+            key = places.shown, places.weight, count, second
+            self._estimates.run(key, lambda: self._estimating(places, count, refined))
+            self._passes = {**self._passes, second: (places, count)}
+        return self._read_results()[self.results.spans[3 if second else 2]]
 
     def _read_results(self) -> np.ndarray:
-        """Return states and estimate, copied once after each change."""
+        """Return states, estimate and judged beams, copied once after each change."""
         if self._results is None:
             if self._is_running:
                 self._results, self._is_running = self._exchange.finish(), False
             else:
                 self._results = self._read(self.results.buffer, self.results.size)
+            estimate, _, *spans = self.results.spans[2:]
+            for judge, span in zip(self._judges, spans, strict=False):
+                judge.receive(self._results[estimate], self._results[span])
         return self._results
 
     def _change_results(self) -> None:

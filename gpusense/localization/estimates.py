@@ -9,14 +9,14 @@ import numpy as np
 
 from gpusense._util.html import card, pose_rows
 from gpusense.localization.pose_algebra import mean_pose, wrap_angle
-from gpusense.localization.spread import LEAST_SAMPLE, LOST, Distances, Word, protection_level
+from gpusense.localization.spread import LEAST_SAMPLE, Distances, JudgedPose, Word
 
 # Bins of positions and headings [m, rad]; neighbouring bins belong to one cluster.
 _BIN, _BIN_TURN = 0.5, 0.35
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Estimate(JudgedPose):
     """Pose of the robot according to the particles.
 
     Attributes:
@@ -74,37 +74,10 @@ class Estimate:
                 ("effective sample size", self.effective_sample_size, f"of {self.particles}")]  # fmt: skip
         return card(f"Estimate: {self.verdict}", rows, head=("", "value", "deviation"))
 
-    @property
-    def lost(self) -> bool:
-        """True if p_lost is above 0.5: the pose is unusable, because scans contradict it or the spread is wide."""
-        return self.p_lost > LOST
-
-    def protection_level(self, risk: float) -> float:
-        """Return the radius that the error of the position exceeds with at most a stated probability [m].
-
-        It is the smallest r with ``p_lost + (1 - p_lost) P(|error| > r | not lost) <= risk``. P comes from the
-        particles, with the spread times ``widening`` and plus ``margin``; see ``docs/localization.md``.
-
-        Args:
-            risk: The probability, from 0.01 to 1, the range supported by logs.
-
-        Returns:
-            The radius; infinite if p_lost exceeds the risk or the effective sample size is below 10.
-
-        Raises:
-            TypeError, ValueError: ``risk`` breaks its rule.
-
-        Example:
-            >>> import gpusense as gs, numpy as np
-            >>> e = gs.Estimate(np.zeros(3), np.eye(3) * 0.01, 250.0, 0.0, "tracking", 0.9, 0.1, 1.0, False, 500)
-            >>> round(e.protection_level(risk=0.01), 3)
-            0.303
-        """
-        moments = self.covariance if self.moments is None else self.moments
+    def _moments(self) -> np.ndarray:
         if not self.effective_sample_size >= LEAST_SAMPLE:
-            moments = np.full((3, 3), math.inf)
-        margins = dict(widening=self.widening, margin=self.margin)
-        return protection_level(risk, self.p_lost, moments, self.distances, **margins)
+            return np.full((3, 3), math.inf)
+        return self.covariance if self.moments is None else self.moments
 
 
 def covariance_of(numbers: np.ndarray) -> np.ndarray:

@@ -190,7 +190,7 @@ class ParticleFilter(Transactional):
         tracker, rival = self._parts.tracker, self._parts.recovery.rival
         tracker.check_started()
         sampled = self.motion.sampled(*motion)
-        if tracker.progress.motion is None and (rival is None or not rival.active):
+        if tracker.progress.motion is None and rival is None:
             # A single assignment, indivisible by interrupts.
             tracker.follow(sampled)
         else:
@@ -304,15 +304,6 @@ class ParticleFilter(Transactional):
     def temperatures(self) -> tuple[float, ...]:
         """Present temperature of each model."""
         return tuple(sensor.temperature(self.options.temperature) for sensor in self._sensors)
-
-    @property
-    @consistent
-    def gain(self) -> float:
-        """Mean gain of predicting recent features over chance [nats]; below 1 the filter is lost.
-
-        It is NaN without a landmark model, and before 20 scans with features.
-        """
-        return self._parts.verdict.gain
 
     @property
     def grid(self) -> OccupancyGrid:

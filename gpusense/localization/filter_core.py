@@ -93,7 +93,7 @@ class FilterCore:
     def follow(self, motion: SampledMotion) -> None:
         """Move the particles and their rival."""
         self.tracker.follow(motion)
-        if (rival := self.recovery.active) is not None:
+        if (rival := self.recovery.rival) is not None:
             rival.follow(motion)
 
     def correct(self, readings: Any) -> None:

@@ -5,8 +5,8 @@ journal, and at its end drops the journal by one assignment. After an interrupt 
 once or, if a second interrupt prevents that, before the next call. Buffers on a device need no copy, since a step
 writes only buffers that no attribute names yet.
 
-A class lists its state in ``MEMORY``; without it all attributes are state. Values of attributes are replaced, never
-changed: arrays, dictionaries and objects too.
+A class lists its state in ``MEMORY``. Values of attributes are replaced, never changed: arrays, dictionaries and
+objects too.
 """
 
 from __future__ import annotations
@@ -15,13 +15,9 @@ import copy
 import functools
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import FrameType
-from typing import Any, Concatenate, NamedTuple, ParamSpec, TypeVar
-
-import numpy as np
-
-_PLAIN = (type(None), bool, int, float, str, np.generic)
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -48,8 +44,7 @@ class Journal:
     def restore(self) -> None:
         """Restore everything; an interrupted restoration is repeated."""
         for one, values in self._objects:
-            names = getattr(one, "MEMORY", values)
-            one.__dict__.update({name: values[name] for name in names if name in values})
+            one.__dict__.update({name: values[name] for name in one.MEMORY})
 
 
 class Transactional:
@@ -117,41 +112,12 @@ def consistent(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W
 # ---- plain data
 
 
-class Held(NamedTuple):
-    """Attributes of an object within a state, to set on a copy of the present object."""
-
-    values: dict[str, Any]
-
-
-def plain_state(owner: Any, *, without: Collection[str] = ()) -> dict[str, Any]:
-    """Return the state of an object, without some attributes, as plain data that pickles and holds no device."""
-    names = getattr(owner, "MEMORY", vars(owner))
-    return {name: _plain(getattr(owner, name)) for name in names if name not in without}
-
-
-def _plain(value: Any) -> Any:
-    """Return a copy of a value as plain data."""
-    kind = type(value)
-    if isinstance(value, np.ndarray):
-        return value.copy()
-    if isinstance(value, _PLAIN):
-        return value
-    if kind is dict:
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, tuple):
-        items = [_plain(item) for item in value]
-        return tuple(items) if kind is tuple else kind(*items)
-    if kind.__module__.startswith("gpusense.localization.") and hasattr(value, "__dict__"):
-        return Held(plain_state(value))
-    raise TypeError(f"state: must be plain data, got {kind}")
+def plain_state(owner: Any) -> dict[str, Any]:
+    """Return a copy of the state of an object, plain data that pickles and holds no device."""
+    return copy.deepcopy({name: getattr(owner, name) for name in owner.MEMORY})
 
 
 def set_state(owner: Any, values: Mapping[str, Any]) -> None:
-    """Set the state of an object from the result of ``plain_state``."""
+    """Set the state of an object from a copy of the result of ``plain_state``."""
     for name, value in values.items():
-        if isinstance(value, Held):
-            changed = copy.copy(getattr(owner, name))
-            set_state(changed, value.values)
-            setattr(owner, name, changed)
-        else:
-            setattr(owner, name, copy.copy(value) if isinstance(value, (np.ndarray, dict)) else value)
+        setattr(owner, name, copy.deepcopy(value))

@@ -14,12 +14,11 @@ from gpusense.localization import starts
 from gpusense.localization.diagnosis import Diagnosis, diagnose
 from gpusense.localization.sensors import readings_of, sensors_of
 from gpusense.localization.spread import (
-    LOST,
     Distances,
+    JudgedPose,
     Word,
     distances_by_scan,
     margins_of,
-    protection_level,
     share_off,
     spread_of,
     verdict_label,
@@ -32,7 +31,7 @@ _DRAWN = 64
 
 
 @dataclass(frozen=True)
-class PoseVerdict:
+class PoseVerdict(JudgedPose):
     """Verdict on a pose.
 
     Attributes:
@@ -58,36 +57,6 @@ class PoseVerdict:
     widening: float = field(default=1.0, repr=False)
     margin: float = field(default=0.0, repr=False)
     distances: Distances | None = field(default=None, repr=False, compare=False)
-
-    @property
-    def lost(self) -> bool:
-        """Return whether p_lost is above 0.5."""
-        return self.p_lost > LOST
-
-    def protection_level(self, risk: float) -> float:
-        """Return the radius that the error of the position exceeds with at most a stated probability [m].
-
-        It is the smallest r with ``p_lost + (1 - p_lost) P(|error| > r | not lost) <= risk``. P comes from a normal
-        density with the pose's covariance, widened as this package's filter does. If the localiser states no
-        covariance, P comes from the likelihood of the scan at poses around the pose, and the radius is at most 1 m,
-        the largest error of a pose that is not lost.
-
-        Args:
-            risk: The probability, from 0.01 to 1, the range supported by logs.
-
-        Returns:
-            The radius; infinite where p_lost exceeds the risk.
-
-        Raises:
-            TypeError, ValueError: ``risk`` breaks its rule.
-
-        Example:
-            >>> import gpusense as gs
-            >>> gs.PoseVerdict(0.002, "tracking", 0.9).protection_level(risk=0.01)
-            1.0
-        """
-        margins = dict(widening=self.widening, margin=self.margin)
-        return protection_level(risk, self.p_lost, self.covariance, self.distances, **margins)
 
 
 class PoseMonitor:

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, Self
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from gpusense._util import checks
 from gpusense.interface.constants import STRAIGHT, VELOCITY_MODEL
 from gpusense.localization.defaults import DEFAULTS
+from gpusense.world.parameters import _Parameters
 
 # Least translation that has a direction [m].
 SHORTEST = 0.01
@@ -122,7 +123,7 @@ def _least(least: object) -> tuple[float, float]:
 
 
 @dataclasses.dataclass(frozen=True)
-class OdometryMotion:
+class OdometryMotion(_Parameters):
     """Odometry motion model, *Probabilistic Robotics* table 5.6.
 
     Attributes:
@@ -154,29 +155,11 @@ class OdometryMotion:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "alpha", _alphas(self.alpha, 4))
-        object.__setattr__(self, "reverse", checks.real("reverse", self.reverse, low=0, high=1))
         object.__setattr__(self, "least", _least(self.least))
-        object.__setattr__(self, "sideways", checks.real("sideways", self.sideways, low=0))
+        self._check("reverse", low=0, high=1)
+        self._check("sideways", low=0)
         missed = checks.array("systematic", self.systematic, (3,))
         object.__setattr__(self, "systematic", tuple(float(value) for value in missed))
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Make the model from a mapping of its attributes, such as ``gpusense fit`` writes.
-
-        Missing attributes take their defaults.
-
-        Raises:
-            TypeError: ``values`` is not a mapping, or a value has the wrong type.
-            ValueError: A key names no attribute, or a value breaks its rule.
-        """
-        if not isinstance(values, Mapping):
-            raise TypeError(f"values: must be a mapping, got {checks.show(values)}")
-        names = [one.name for one in dataclasses.fields(cls)]
-        for key in values:
-            if key not in names:
-                raise ValueError(f"values: every key must be one of {', '.join(names)}, got {checks.show(key)}")
-        return cls(**values)
 
     def sampled(self, *arguments: Any) -> SampledMotion:
         """Return the numbers of a step from the odometer's poses before and after it."""

@@ -10,15 +10,12 @@ predicted particles. The logarithm of the Bayes factor
 
 is evidence for the rival (Kass and Raftery, "Bayes factors" (1995)); the scan that chose the rival is none. Terms of
 nearby scans repeat one another, since the same furniture is wrong in all of them; against a tracked pose only the new
-part of each counts (:mod:`gpusense.localization.belief`). The rival replaces the particles once B exceeds ``WIN``,
-after ``SCANS`` scans if it is concentrated, and after ``APART`` scans if several places are equally likely, provided
-that the beams that meet walls support it. Until then the particles yield the estimate, and the rival's probability adds
-to the probability of being lost. A rival ends if it reaches the pose of the particles, falls behind, or has not won
-after ``LONGEST`` scans.
+part of each counts (:mod:`gpusense.localization.belief`). ``docs/localization.md`` describes when a rival wins or ends.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
@@ -61,16 +58,18 @@ _MOST = 50.0
 class Rival:
     """Rival of a filter: a second set of particles with the filter's sensors, and its log odds against the first."""
 
-    def __init__(self, tracker: Tracker) -> None:
-        self._tracker = tracker
-        self.active, self.log_odds = False, PRIOR
-        self._scans, self._place = 0, np.zeros(3)
+    MEMORY: ClassVar[tuple[str, ...]] = (
+        "active", "log_odds", "_scans", "_place", "_last", "_prior", "_settled", "_ratios",
+    )  # fmt: skip
+
+    def __init__(self, tracker: Tracker, prior: float = PRIOR) -> None:
+        self._tracker, self._prior, self.log_odds = tracker, prior, prior
+        # Whether it may still win.
+        self.active, self._scans, self._settled, self._place = True, 0, False, np.zeros(3)
         # Log ratio of the last scan of each set of sensors, and the particles' pose then.
         self._last: dict[tuple[int, ...], tuple[float, np.ndarray]] = {}
-        self._prior, self._settled = PRIOR, False
         # Weighted sums of the log-likelihood ratios of the rival and of the particles, and the sum of the weights.
         self._ratios = np.zeros(3)
-        self._search = RivalSearch(tracker.sensors)
 
     def changing(self) -> tuple[Any, ...]:
         """Return the objects whose state a call may change, and keep their present buffers."""
@@ -79,45 +78,12 @@ class Rival:
 
     def state(self) -> tuple[dict[str, Any], Contents, dict[str, Any]]:
         """Return the rival as plain data: its state, its particles and their memory."""
-        return plain_state(self, without=("_tracker", "_search")), *self._tracker.state()
+        return plain_state(self), *self._tracker.state()
 
     def restore(self, state: tuple[dict[str, Any], Contents, dict[str, Any]]) -> None:
         """Take over a rival."""
         set_state(self, state[0])
         self._tracker.restore(*state[1:])
-
-    def stop(self) -> None:
-        """End the rival."""
-        self.active = False
-
-    def start(
-        self,
-        pose: np.ndarray,
-        covariance: np.ndarray,
-        readings: Sequence[SensorReadings],
-        *,
-        step: int,
-        prior: float = PRIOR,
-    ) -> float:
-        """Search for a rival by the last readings; return the log-likelihood ratio of other places, NaN without a map.
-
-        The ratio is against the estimate. Equal steps give equal rivals. Prior log odds of 0 exclude places near it.
-        """
-        self._tracker.progress = Progress(step)
-        key, options = self._tracker.key(), self._tracker.options
-        found = self._search.found(pose, covariance, readings, key, options.temperature)
-        tries, score, ratio = found.poses, found.score, found.ratio
-        if prior == 0.0:
-            far = are_apart(tries, pose, 2 * FAR_TURN)
-            tries, score = tries[far], score[far]
-        chosen = drawn(score, options.most, found.effective)
-        if chosen is None:
-            return ratio
-        self._tracker.place(starts.spread(tries[chosen], _SPREAD, options.most, key, each=True))
-        self.active, self.log_odds, self._prior, self._scans, self._settled = True, prior, prior, 0, False
-        # Clear all state of an earlier rival.
-        self._ratios, self._place, self._last = np.zeros(3), np.zeros(3), {}
-        return ratio
 
     def follow(self, motion: SampledMotion) -> None:
         """Move the rival."""
@@ -154,12 +120,12 @@ class Rival:
             # The particles were once spread out as well: two concentrated clouds start with even odds.
             self.log_odds, gain = (0.0, 0.0) if self._prior == 0.0 else (self.log_odds, gain)
         if together and self.is_at(pose, _SAME, _SAME_TURN):
-            self.stop()
+            self.active = False
         elif gain > WIN and self._scans >= (SCANS if together else APART) and self._is_plausible(better=True):
-            self.stop()
+            self.active = False
             return self._tracker.host_particles(), self._tracker.host_weights()
         elif self._is_late(gain):
-            self.stop()
+            self.active = False
         return None
 
     def _compare(
@@ -198,7 +164,7 @@ class Rival:
 
     def probability(self, pose: np.ndarray) -> float:
         """Return the probability that the rival is right and a pose is wrong."""
-        if not self.active or not self._scans or self.is_at(pose) or not self._is_plausible():
+        if not self._scans or self.is_at(pose) or not self._is_plausible():
             return 0.0
         return 1 / (1 + math.exp(-min(max(self.log_odds, -_MOST), _MOST)))
 
@@ -211,20 +177,14 @@ class Recovery:
     def __init__(self, tracker: Tracker, verdict: Verdict) -> None:
         self._tracker, self._verdict = tracker, verdict
         self._searches = tracker.options.recovery == "sensor" and can_search(tracker.sensors)
+        self._search = RivalSearch(tracker.sensors)
         self.rival: Rival | None = None
         # Number of places still to be compared with the pose.
         self.everywhere = 0
 
-    @property
-    def active(self) -> Rival | None:
-        """The competing rival, or None."""
-        return self.rival if self.rival is not None and self.rival.active else None
-
     def restart(self) -> None:
         """Forget the rival for new particles."""
-        self.everywhere = 0
-        if self.rival is not None:
-            self.rival.stop()
+        self.everywhere, self.rival = 0, None
 
     def expect_anywhere(self) -> None:
         """Compare the pose with other places after convergence."""
@@ -232,7 +192,7 @@ class Recovery:
 
     def is_doubted(self) -> bool:
         """Return whether the last judged scans contradict the pose, or a rival competes with it."""
-        return self.active is not None or not self._tracker.together or self._verdict.doubts(self._verdict.state)
+        return self.rival is not None or not self._tracker.together or self._verdict.doubts(self._verdict.state)
 
     def corrected(self, readings: list[SensorReadings], last: Mapping[int, tuple[Any, ...]]) -> None:
         """Compare the particles with their rival, judge their pose, and search for a rival if scans contradict it.
@@ -240,7 +200,7 @@ class Recovery:
         A search needs two consecutive judgements that contradict the pose, or one at every fifth to tenth correction.
         ``last`` holds all beams of the readings.
         """
-        tracker, verdict, rival = self._tracker, self._verdict, self.active
+        tracker, verdict, rival = self._tracker, self._verdict, self.rival
         before = verdict.state
         if rival is not None:
             self._compare(rival, readings)
@@ -251,9 +211,7 @@ class Recovery:
         if self._searches and rival is None and self._is_wanted(before):
             prior = 0.0 if self.everywhere else PRIOR
             self.everywhere = max(self.everywhere - 1, 0)
-            step = tracker.progress.step
-            ratio = self._made().start(pose, covariance, list(last.items()), step=step, prior=prior)
-            verdict.compared(pose, covariance, ratio)
+            verdict.compared(pose, covariance, self._start(pose, covariance, list(last.items()), prior))
 
     def _is_wanted(self, before: VerdictState) -> bool:
         """Return whether to search, by the verdict of ``before`` and the present one."""
@@ -270,6 +228,8 @@ class Recovery:
         pose, covariance = tracker.mean_and_covariance()
         rival.correct(readings, tracker.cloud.summary().evidence, pose)
         won = rival.judge(pose, covariance, readings)
+        if not rival.active:
+            self.rival = None
         if won is not None:
             poses, weights = won
             # The next scans must confirm the new particles.
@@ -277,27 +237,47 @@ class Recovery:
             self._verdict.doubt()
             self.expect_anywhere()
 
-    def _made(self) -> Rival:
-        """Return the rival, made on first use with the sensors of the filter."""
-        if self.rival is None:
-            tracker = self._tracker
-            options = tracker.options._replace(
-                least=PARTICLES, most=PARTICLES, seed=tracker.options.seed ^ _RIVAL, recovery=None, beam_skip=None
-            )
-            cloud = Cloud(tracker.sensors, PARTICLES, residual=options.resampling == "residual")
-            self.rival = Rival(Tracker(tracker.sensors, options, cloud))
-        return self.rival
+    def _start(
+        self, pose: np.ndarray, covariance: np.ndarray, readings: Sequence[SensorReadings], prior: float
+    ) -> float:
+        """Search for a rival by the last readings; return the log-likelihood ratio of other places, NaN without a map.
+
+        The ratio is against the estimate. Equal steps give equal rivals. Prior log odds of 0 exclude places near it.
+        """
+        tracker = self._particles
+        tracker.progress = Progress(self._tracker.progress.step)
+        key, options = tracker.key(), tracker.options
+        found = self._search.found(pose, covariance, readings, key, options.temperature)
+        tries, score = found.poses, found.score
+        if prior == 0.0:
+            far = are_apart(tries, pose, 2 * FAR_TURN)
+            tries, score = tries[far], score[far]
+        chosen = drawn(score, options.most, found.effective)
+        if chosen is not None:
+            tracker.place(starts.spread(tries[chosen], _SPREAD, options.most, key, each=True))
+            self.rival = Rival(tracker, prior)
+        return found.ratio
+
+    @functools.cached_property
+    def _particles(self) -> Tracker:
+        """Particles of rivals, of one at a time."""
+        tracker = self._tracker
+        options = tracker.options._replace(
+            least=PARTICLES, most=PARTICLES, seed=tracker.options.seed ^ _RIVAL, recovery=None, beam_skip=None
+        )
+        cloud = Cloud(tracker.sensors, PARTICLES, residual=options.resampling == "residual")
+        return Tracker(tracker.sensors, options, cloud)
 
     # ---- state
 
     def state(self) -> dict[str, Any]:
         """Return the state as plain data."""
-        return {"everywhere": self.everywhere, "rival": None if self.active is None else self.active.state()}
+        return {"everywhere": self.everywhere, "rival": None if self.rival is None else self.rival.state()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Take over a state."""
-        self.everywhere = state["everywhere"]
+        self.everywhere, self.rival = state["everywhere"], None
         if state["rival"] is not None:
-            self._made().restore(state["rival"])
-        elif self.rival is not None:
-            self.rival.stop()
+            rival = Rival(self._particles)
+            rival.restore(state["rival"])
+            self.rival = rival

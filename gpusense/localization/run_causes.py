@@ -146,7 +146,7 @@ class _Places:
 
     def __init__(self, sensor: Sensor, moments: Sequence[Moment]) -> None:
         self._sensor, self._moments = sensor, moments
-        self._search, self._field = RivalSearch([sensor]), None
+        self._search = RivalSearch([sensor])
 
     def evidence(self, motion: ScanMotion) -> RunEvidence:
         """Return the evidence of a run with the motion between its scans."""

@@ -1,13 +1,8 @@
 """Judge a filter or any localiser: the probability of being lost, and a word for it.
 
-``p_lost`` is the probability that the pose is off by more than 1 m or 0.5 rad. Let W be the belief that another place
-is right (:mod:`gpusense.localization.belief`), and s the share of the particles, or of a covariance, beyond these
-limits:
-
-    p_lost = W + (1 - W) s.
-
-W comes from the scans (:mod:`gpusense.localization.belief`), s from the spread. Models of positions or headings
-have no map and no evidence; W would only follow its prior and rates, and is omitted.
+``p_lost`` is W + (1 - W) s. W is the belief that another place is right (:mod:`gpusense.localization.belief`), s the
+share of the particles, or of a covariance, beyond 1 m or 0.5 rad. Models of positions or headings have no map and no
+evidence, and W is omitted.
 """
 
 from __future__ import annotations
@@ -19,7 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.localization.beam_consistency import BeamConsistency, beam_consistency
+from gpusense.localization.beam_consistency import BeamConsistency
 from gpusense.localization.belief import Belief, evidence_of_scan, motion_between, ratio_of_features
 from gpusense.localization.motion import STILL, SampledMotion
 from gpusense.localization.sensors import Sensor, SensorReadings
@@ -31,31 +26,16 @@ _RANDOM = 64
 # Largest belief of a sure pose; distance [m], turn [rad], number of corrections, and drop of the readings'
 # log-likelihood [nats] before its next judgement.
 _SURE, _WAY, _TURNED, _SELDOM, _DROP = 0.05, 0.25, 0.25, 10, 3.0
+# Share of these limits at which a correction prepares a judgement, since the estimate differs from the odometry.
+_PREDICTED = 0.9
 # Corrections before a single judgement of an unsure pose may begin a search.
 _INTERVAL = 5
 # Least share of explained beams that makes a search elsewhere unnecessary, and the probability of another place that
 # starts one; above the prior before the first scan.
 _FEW, _DOUBT = 0.4, 0.2
-# Gain at which right and wrong are equally likely [nats per feature]; scans in the average; number of poses anywhere,
-# and their margin around the landmarks [m].
-LEAST_GAIN, _RECENT, _ANYWHERE, _MARGIN = 1.0, 20, 1000, 1.0
-
-
-class Gains(NamedTuple):
-    """Gains [nats] and numbers of features of the last 20 scans; immutable."""
-
-    recent: tuple[tuple[float, int], ...] = ()
-
-    def added(self, gain: float, count: int) -> Gains:
-        """Return the gains after adding a scan."""
-        return Gains((*self.recent, (gain, count))[-_RECENT:])
-
-    @property
-    def mean(self) -> float:
-        """Mean gain per feature [nats]; NaN without enough scans."""
-        if len(self.recent) < _RECENT:
-            return math.nan
-        return sum(gain for gain, _ in self.recent) / sum(count for _, count in self.recent)
+# Gain at which right and wrong are equally likely [nats per feature]; number of poses anywhere, and their margin around
+# the landmarks [m].
+_LEAST_GAIN, _ANYWHERE, _MARGIN = 1.0, 1000, 1.0
 
 
 class VerdictState(NamedTuple):
@@ -65,7 +45,6 @@ class VerdictState(NamedTuple):
     corrections: int = 0  # corrections since the filter began
     judged: int = -1  # corrections at the last judgement; -1 before
     explained: float = math.nan  # share of explained beams then; NaN without beams
-    gains: tuple[tuple[int, Gains], ...] = ()  # gains of recent features by index of the sensor
     ratios: tuple[float, ...] = ()  # ratios of features since the last judgement
     places: int = 0  # number of places searched since the last confirmed place
     evidence: float = -math.inf  # evidence of the last judged readings, by the particles
@@ -84,7 +63,7 @@ class Verdict:
             for index, sensor in enumerate(sensors)
             if isinstance(sensor.model, FeatureModel)
         }
-        # Pose of the last call of ``judge``; no state, since it affects only the speed.
+        # Pose of the last call of ``judge``, None if it was not sure; no state, since it affects only the speed.
         self._pose: np.ndarray | None = None
         # True if a sensor has a map that can contradict a pose.
         self.informed = bool(self._evidence) or any(sensor.calibrates for sensor in sensors)
@@ -110,22 +89,15 @@ class Verdict:
 
     def predicted(self, poses: np.ndarray, weights: np.ndarray, readings: Mapping[int, tuple[Any, ...]]) -> None:
         """Add the features of a scan before they correct the filter."""
-        gains, ratios = dict(self.state.gains), list(self.state.ratios)
+        ratios = self.state.ratios
         for index, evidence in self._evidence.items():
             if index not in readings or not _count(readings[index]):
                 continue
             features = np.asarray(checks.filled(readings[index][0]), np.float64)
             gain = evidence.gain(poses, weights, features)
             if not math.isnan(gain):
-                gains[index] = gains.get(index, Gains()).added(gain, len(features))
-                ratios.append(ratio_of_features(gain, len(features), LEAST_GAIN))
-        self.state = self.state._replace(gains=tuple(gains.items()), ratios=tuple(ratios))
-
-    @property
-    def gain(self) -> float:
-        """Least mean gain of the predictions of features [nats]; NaN without enough features."""
-        means = [gains.mean for _, gains in self.state.gains]
-        return min((mean for mean in means if not math.isnan(mean)), default=math.nan)
+                ratios = *ratios, ratio_of_features(gain, len(features), _LEAST_GAIN)
+        self.state = self.state._replace(ratios=ratios)
 
     def anywhere(self) -> np.ndarray:
         """Return poses anywhere in the free space, for comparison."""
@@ -170,7 +142,7 @@ class Verdict:
         Return the share of explained beams, or NaN. The evidence is log p(last | earlier readings) of the particles.
         """
         state, spread = self.state, spread_of(covariance) if spread is None else spread
-        self._pose = pose
+        self._pose = None if spread.wide else pose
         if not spread.wide and evidence >= state.evidence - _DROP and self._is_near(pose):
             return state.explained
         scans = sightings(self._sensors, readings, pose, covariance)
@@ -187,13 +159,13 @@ class Verdict:
                 ratio = of_features if math.isnan(ratio) else ratio + of_features
             belief = belief.judged((x, y, theta), ratio)
         places, count = 0 if belief.wrong < TRACKING else state.places, state.corrections
-        self.state = VerdictState(belief, count, count, explained, state.gains, (), places, evidence)
+        self.state = VerdictState(belief, count, count, explained, (), places, evidence)
         return explained
 
     def expected(self, readings: Sequence[SensorReadings], motion: SampledMotion | None) -> list[SensorReadings]:
         """Return the scans that will probably be judged after the next correction, for judging them within it."""
         # A sure pose will probably stay near the last judged pose.
-        if self._pose is None or self._is_near((motion or STILL).after(self._pose.tolist()), 1):
+        if self._pose is not None and self._is_near((motion or STILL).after(self._pose.tolist()), 1, _PREDICTED):
             return []
         scans = []
         for index, reading in readings:
@@ -204,14 +176,14 @@ class Verdict:
                 scans.append((index, reading))
         return scans
 
-    def _is_near(self, pose: np.ndarray | Sequence[float], later: int = 0) -> bool:
-        """Return whether a pose is sure, and near the last judged pose but few corrections ago."""
+    def _is_near(self, pose: np.ndarray | Sequence[float], later: int = 0, share: float = 1.0) -> bool:
+        """Return whether a pose is sure, and within a share of the limits of the last judged pose."""
         state = self.state
         before = state.belief.pose
         if before is None or state.judged < 0 or state.belief.wrong > _SURE or state.ratios:
             return False
         way, turn = motion_between(pose, before)
-        return way < _WAY and turn < _TURNED and state.corrections + later - state.judged < _SELDOM
+        return way < share * _WAY and turn < share * _TURNED and state.corrections + later - state.judged < _SELDOM
 
     def compared(self, pose: np.ndarray, covariance: np.ndarray, ratio: float) -> None:
         """Add the ratio of other places against the last judged pose (3,), or NaN, unless its covariance is wide."""
@@ -265,8 +237,7 @@ def sightings(
     for index, reading in readings.items():
         sensor = sensors[index]
         if sensor.calibrates:
-            judge = sensor.judge()
-            result.append(beam_consistency(judge.grid, sensor.model.scanner, pose, reading[0], covariance, judge))
+            result.append(sensor.judge().consistency(sensor.model.scanner, pose, reading[0], covariance))
     return result
 
 

@@ -35,7 +35,7 @@ LOOKS: dict[str, Callable[[gs.ParticleFilter], Any]] = {
     "diagnose": lambda pf: pf.diagnose(), "evidence": lambda pf: pf.diagnose(search=False),
     "state": lambda pf: pf.state(), "copy": copy.copy, "deepcopy": copy.deepcopy,
     "pickle": lambda pf: pickle.loads(pickle.dumps(pf)), "temperatures": lambda pf: pf.temperatures,
-    "gain": lambda pf: pf.gain, "count": lambda pf: pf.count, "explain": lambda pf: pf.explain(),
+    "count": lambda pf: pf.count, "explain": lambda pf: pf.explain(),
 }  # fmt: skip
 
 

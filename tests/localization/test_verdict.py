@@ -12,7 +12,7 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.interface.constants import AGREES, NOTHING, SHORT, THROUGH, VANISHED
 from gpusense.localization import belief as constants
-from gpusense.localization.beam_consistency import MapJudge, beam_consistency
+from gpusense.localization.beam_consistency import MapJudge
 from gpusense.localization.belief import (
     ALIKE,
     ALIKE_CHOSEN,
@@ -48,12 +48,16 @@ def scan_at(pose, grid=GRID):
     return gs.RayCaster(grid, range_max=12.0, backend="numpy").cast(pose[None], SCANNER.bearings)[0].astype(float)
 
 
+def consistency(grid, scanner, pose, ranges, *covariance):
+    return MapJudge(get_backend("numpy"), grid).consistency(scanner, pose, ranges, *covariance)
+
+
 def number_of(found, kind):
     return np.count_nonzero(found.kind == kind)
 
 
-def kinds(pose, ranges, grid=GRID, **options):
-    found = beam_consistency(grid, SCANNER, np.asarray(pose, float), np.asarray(ranges, float), **options)
+def kinds(pose, ranges, grid=GRID):
+    found = consistency(grid, SCANNER, np.asarray(pose, float), np.asarray(ranges, float))
     return [number_of(found, kind) for kind in (AGREES, SHORT, THROUGH, VANISHED, NOTHING)]
 
 
@@ -84,12 +88,12 @@ def test_unknown_cells_and_what_is_off_the_map_tell_nothing():
     # The beams through the door and over the wall end in unknown cells.
     agree, short, through, _, nothing = kinds(POSE, ranges, open_world)
     assert short == through == 0 and nothing >= 2 and agree >= 20
-    off = beam_consistency(GRID, SCANNER, np.array([50.0, 0.0, 0.0]), ranges)
+    off = consistency(GRID, SCANNER, np.array([50.0, 0.0, 0.0]), ranges)
     assert off.off and not off.inside and number_of(off, NOTHING) == len(off.kind)
-    inside = beam_consistency(house(), SCANNER, np.array([-0.3, 2.0, 0.0]), ranges)
+    inside = consistency(house(), SCANNER, np.array([-0.3, 2.0, 0.0]), ranges)
     assert inside.off
     solid = gs.OccupancyGrid(np.full((40, 40), 100), 0.1)
-    assert beam_consistency(solid, SCANNER, np.array([2.0, 2.0, 0.0]), ranges).inside
+    assert consistency(solid, SCANNER, np.array([2.0, 2.0, 0.0]), ranges).inside
 
 
 def test_a_diagonal_pair_of_walls_stops_a_beam():
@@ -100,7 +104,7 @@ def test_a_diagonal_pair_of_walls_stops_a_beam():
     for _ in range(20):
         pose = np.array([*rng.uniform(1.0, 2.0, 2), 0.0])
         scanner = gs.Scanner(rng.uniform(0.3, 1.2, 16), range_max=12.0)
-        found = beam_consistency(grid, scanner, pose, np.full(16, 6.0))
+        found = consistency(grid, scanner, pose, np.full(16, 6.0))
         # A ray that leaves the map first meets no wall.
         assert number_of(found, THROUGH) == 16
 
@@ -130,8 +134,8 @@ def test_every_device_judges_beams_alike(backend, as_gpu, gpu):
             ranges = rng.choice([np.nan, np.inf, 0.0, *rng.uniform(0.0, 11.0, 9)], 64)
             spread = np.diag(np.square([0.1 * (k % 4), 0.07 * (k % 3), 0.05 * (k % 3)]))
             spread[0, 1] = spread[1, 0] = -0.5 * spread[0, 0] ** 0.5 * spread[1, 1] ** 0.5
-            host = beam_consistency(grid, scanner, pose, ranges * farthest / 12, spread)
-            device = beam_consistency(grid, scanner, pose, ranges * farthest / 12, spread, judge)
+            host = consistency(grid, scanner, pose, ranges * farthest / 12, spread)
+            device = judge.consistency(scanner, pose, ranges * farthest / 12, spread)
             assert all(np.array_equal(*pair) for pair in zip(host, device, strict=True))
 
 
@@ -139,20 +143,20 @@ def test_a_scanner_has_its_mount():
     mount = (0.3, -0.1, 1.0)
     turned = gs.Scanner(SCANNER.bearings, range_max=12.0, mount=mount)
     base = gs.compose_poses(POSE, gs.invert_poses(np.array(mount)))
-    found = beam_consistency(GRID, turned, base, scan_at(POSE))
+    found = consistency(GRID, turned, base, scan_at(POSE))
     assert number_of(found, AGREES) >= 29
 
 
 def test_the_ratio_ignores_short_beams_and_has_limits():
     right, hidden = scan_at(POSE), scan_at(POSE)
     hidden[20:40] = 0.6
-    one = ratio_of_scan([beam_consistency(GRID, SCANNER, POSE, right)])
-    two = ratio_of_scan([beam_consistency(GRID, SCANNER, POSE, hidden)])
+    one = ratio_of_scan([consistency(GRID, SCANNER, POSE, right)])
+    two = ratio_of_scan([consistency(GRID, SCANNER, POSE, hidden)])
     assert one == two == LIMITS[0]
-    elsewhere = ratio_of_scan([beam_consistency(GRID, SCANNER, POSE + np.array([3.5, 0.0, 0.0]), right)])
+    elsewhere = ratio_of_scan([consistency(GRID, SCANNER, POSE + np.array([3.5, 0.0, 0.0]), right)])
     assert one + 3 < elsewhere <= LIMITS[1]
     assert math.isnan(ratio_of_scan([])) and math.isnan(evidence_of_scan([])[1])
-    nothing = beam_consistency(GRID, SCANNER, POSE, np.full(64, np.nan))
+    nothing = consistency(GRID, SCANNER, POSE, np.full(64, np.nan))
     assert math.isnan(ratio_of_scan([nothing])) and math.isnan(evidence_of_scan([nothing])[1])
 
 

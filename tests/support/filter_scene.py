@@ -11,6 +11,7 @@ import numpy as np
 from support.tracking_scene import GRID, SCANNER, TRUTH, field, field_and_compass, scans
 
 import gpusense as gs
+from gpusense.localization.temperature import BeamCorrelation
 
 XY = np.random.default_rng(3).uniform(0, 6, (8, 2))
 START = TRUTH + np.array([0.2, -0.2, 0.1])
@@ -84,9 +85,11 @@ def everything(pf: Filter) -> Any:
 
 
 def frozen(value: Any) -> Any:
-    """Return nested containers as nested tuples, arrays as bytes."""
+    """Return nested containers and objects as nested tuples, arrays as bytes."""
     if isinstance(value, np.ndarray):
         return value.shape, value.tobytes()
+    if isinstance(value, BeamCorrelation):
+        return frozen(vars(value))
     if isinstance(value, dict):
         return tuple((key, frozen(item)) for key, item in sorted(value.items()))
     if isinstance(value, (str, bytes)) or not hasattr(value, "__iter__"):

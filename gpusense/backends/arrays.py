@@ -26,6 +26,8 @@ _WIDTH, _FEW = 256, 1 << 14
 # Least number of poses whose bounds are worth a thread, and largest number of threads: more wait for each other.
 _SHARE, _MOST_SHARES = 1 << 16, 4
 
+FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
+
 Bounds = tuple[tuple[float, ...], tuple[float, ...]]
 """The least and the largest x, y and theta of poses."""
 
@@ -61,10 +63,10 @@ def copied_to_host(array: object, backend: Backend, name: str) -> object:
     array = checks.filled(array)
     if not on_device(array):
         return to_host(array, name)
-    return _adopt(array, backend, name).to_host()
+    return adopt(array, backend, name).to_host()
 
 
-def _adopt(array: Any, backend: Backend, name: str, *, in_place: bool = False) -> Adopted:
+def adopt(array: Any, backend: Backend, name: str, *, in_place: bool = False) -> Adopted:
     """Return an array on the device as a buffer of the backend."""
     if isinstance(array, Adopted):
         return array
@@ -134,7 +136,7 @@ def adopt_poses(
     array: object, backend: Backend, name: str, scans: int | None = None, *, in_place: bool = False
 ) -> tuple[Buffer, int, bool, object]:
     """Return device poses as a flat buffer, their number, whether they are float32, and the owner of the memory."""
-    adopted = _adopt(array, backend, name, in_place=in_place)
+    adopted = adopt(array, backend, name, in_place=in_place)
     if not backend.info.float64:
         raise TypeError(f"{name}: must be in host memory on {backend.info.name}, which has no float64 to place them")
     wanted = ("N", 3) if scans is None else (scans, "N", 3)
@@ -146,7 +148,7 @@ def adopt_poses(
 
 def adopt_readings(array: object, backend: Backend, shape: tuple[int, ...], *, in_place: bool) -> Adopted:
     """Return ranges of a shape on the device."""
-    adopted = _adopt(array, backend, "ranges", in_place=in_place)
+    adopted = adopt(array, backend, "ranges", in_place=in_place)
     if adopted.shape != shape:
         raise ValueError(f"ranges: shape must be {shape_text(shape)}, got {shape_text(adopted.shape)}")
     _check_numbers(adopted, "ranges")
@@ -155,27 +157,30 @@ def adopt_readings(array: object, backend: Backend, shape: tuple[int, ...], *, i
 
 def adopt_numbers(array: object, backend: Backend, name: str) -> Adopted:
     """Return a C-contiguous array of float32 or float64 numbers on the device."""
-    adopted = _adopt(array, backend, name)
+    adopted = adopt(array, backend, name)
     _check_numbers(adopted, name)
     return adopted
 
 
 def adopt_integers(array: object, backend: Backend, name: str, kinds: tuple[str, ...]) -> Adopted:
     """Return a C-contiguous array of integers on the device."""
-    adopted = _adopt(array, backend, name)
+    adopted = adopt(array, backend, name)
     if adopted.dtype.name not in kinds:
         raise TypeError(f"{name}: must hold {' or '.join(kinds)} on the device, got {adopted.dtype.name}")
-    if not adopted.contiguous:
-        raise ValueError(f"{name}: must be C-contiguous on the device, got strides {adopted.strides}")
+    _check_contiguous(adopted, name)
     return adopted
 
 
 def _check_numbers(adopted: Adopted, name: str) -> None:
     """Refuse numbers of another type than float32 or float64, and arrays that are not C-contiguous."""
-    if adopted.dtype not in (np.float32, np.float64):
+    if adopted.dtype not in FLOATS:
         dtype = adopted.dtype.name if adopted.dtype.isnative else adopted.dtype.str
         raise TypeError(f"{name}: must hold float32 or float64, got {dtype}")
-    if not adopted.contiguous:
+    _check_contiguous(adopted, name)
+
+
+def _check_contiguous(adopted: Adopted, name: str) -> None:
+    if adopted.strides is not None:
         raise ValueError(f"{name}: must be C-contiguous on the device, got strides {adopted.strides}")
 
 
@@ -211,7 +216,7 @@ def check_out(out: object, shape: tuple[int, ...], real: np.dtype, backend: Back
     if on_device(out) != device_poses:
         raise TypeError("out: must be in the memory where the poses are, got one that is not")
     if device_poses:
-        adopted = _adopt(out, backend, "out", in_place=True)
+        adopted = adopt(out, backend, "out", in_place=True)
         _check_result(adopted.dtype, adopted.shape, adopted.contiguous, real, shape)
         return adopted.buffer
     view = to_host(out, "out")
@@ -251,7 +256,11 @@ class Result:
         if out is not None:
             self.flat = check_out(out, shape, real, backend, device_poses=on_device)
         elif on_device:
-            self.flat = backend.empty_external(math.prod(shape), real)
+            made = backend.empty_like(poses, shape, real)
+            if made is None:
+                self.flat = backend.empty_external(math.prod(shape), real)
+            else:
+                self._out, self.flat = made
         else:
             self.flat = np.empty(shape, real) if backend.results is None else backend.results.empty(shape, real)
         if not on_device:

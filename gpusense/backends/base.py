@@ -6,8 +6,6 @@ without the ability that a method needs, the method does nothing if that is corr
 
 from __future__ import annotations
 
-import itertools
-import operator
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -56,17 +54,22 @@ class Launcher(Protocol):
         """Start one launch with buffers and scalars in the order of the signature table."""
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True, eq=False)
 class Adopted:
     """An array in a device's memory: one of another library without a copy, or the head of a buffer."""
 
     buffer: Buffer  # its numbers; only of a C-contiguous array
     shape: tuple[int, ...]
     dtype: np.dtype  # type of its numbers
-    strides: tuple[int, ...]  # bytes from one number to the next along each axis
-    contiguous: bool  # true if it is C-contiguous
     to_host: Callable[[], np.ndarray]  # function that copies it to the host, after all earlier work
     owner: object  # the object that keeps the memory alive
+    # Bytes from one number to the next along each axis; None if the array is C-contiguous.
+    strides: tuple[int, ...] | None = None
+
+    @property
+    def contiguous(self) -> bool:
+        """True if it is C-contiguous."""
+        return self.strides is None
 
 
 class Backend(ABC):
@@ -186,12 +189,11 @@ class Backend(ABC):
 
     def view(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> Adopted:
         """Return the head of a buffer of this device as an array that models take."""
-        strides = [*itertools.accumulate(shape[:0:-1], operator.mul, initial=dtype.itemsize)][::-1]
 
         def to_host() -> np.ndarray:
             return self.download(buffer, np.empty(shape, dtype))
 
-        return Adopted(buffer, shape, dtype, tuple(strides), True, to_host, buffer)
+        return Adopted(buffer, shape, dtype, to_host, buffer)
 
     def empty_external(self, count: int, dtype: np.dtype) -> Buffer:
         """Allocate a buffer of ``count`` numbers, 0 included, for an external array, in memory of the device alone."""
@@ -204,6 +206,10 @@ class Backend(ABC):
     def wrap_external(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
         """Return a buffer as an array of the backend's library."""
         raise TypeError(f"{self.info.selection} does not wrap buffers")
+
+    def empty_like(self, array: object, shape: tuple[int, ...], dtype: np.dtype) -> tuple[Any, Buffer] | None:
+        """Return a new array of the library of a device array, with its memory as a buffer; None if it makes none."""
+        return None
 
 
 class _ProgramRecording(Recording):
@@ -246,7 +252,8 @@ class Exchange:
     def start(self, recording: Recording, *, between: Callable[[], None] | None = None) -> None:
         """Copy the inputs, run ``between``, and start a recording; each has only one exchange."""
         self._busy = True
-        self._backend.refill(self.given, self._inputs)
+        if self.given.size:
+            self._backend.refill(self.given, self._inputs)
         if between is not None:
             between()
         recording()

@@ -8,6 +8,7 @@ from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any, Generic, TypeVar
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from gpusense.backends.base import Backend, Buffer, Recording
 from gpusense.interface.launches import Program, flags_of
@@ -70,17 +71,17 @@ class PartialResult:
 
 
 class Packed:
-    """Arrays of float64 numbers (``parts``) in one ``buffer``, at ``spans`` of its numbers, for single copies."""
+    """Arrays of numbers (``parts``) in one ``buffer``, at ``spans`` of its numbers, for single copies."""
 
-    def __init__(self, backend: Backend, sizes: Sequence[int]) -> None:
-        kind = np.dtype(np.float64)
+    def __init__(self, backend: Backend, sizes: Sequence[int], dtype: DTypeLike = np.float64) -> None:
+        kind = np.dtype(dtype)
         align = max(backend.alignment // kind.itemsize, 1)
         begins = (0, *itertools.accumulate(-(-max(size, 1) // align) * align for size in sizes))
         self.spans = [slice(begin, begin + size) for begin, size in zip(begins, sizes, strict=False)]
         self.size = begins[-1]
         # Other libraries get no memory that a processor shares with the host.
         make = backend.empty_external if backend.info.kind == "gpu" else backend.empty
-        self.buffer = backend.upload(np.zeros(self.size), make(self.size, kind))
+        self.buffer = backend.upload(np.zeros(self.size, kind), make(self.size, kind))
         self.parts = [backend.part(self.buffer, one.start, max(one.stop - one.start, 1), kind) for one in self.spans]
 
 

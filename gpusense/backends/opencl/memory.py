@@ -204,7 +204,8 @@ def adopted(array: Any, queue: cl.CommandQueue, selection: str, name: str, *, in
     contiguous = bool(array.flags.c_contiguous)
     buffer: Buffer = None
     if contiguous:
-        alignment = alignment_of(queue.device)
+        # An array of its own buffer, as most are, needs no query of the device.
+        alignment = alignment_of(queue.device) if array.offset else 1
         if array.offset % alignment and in_place:
             raise ValueError(
                 f"{name}: must begin at a multiple of {alignment} bytes of its buffer on {selection}, got "
@@ -225,7 +226,8 @@ def adopted(array: Any, queue: cl.CommandQueue, selection: str, name: str, *, in
             cl.enqueue_copy(queue, numbers, whole)
         return np.ndarray(source.shape, source.dtype, numbers, source.offset, source.strides).copy()
 
-    return Adopted(buffer, tuple(map(int, array.shape)), array.dtype, tuple(array.strides), contiguous, to_host, array)
+    strides = None if contiguous else tuple(array.strides)
+    return Adopted(buffer, tuple(map(int, array.shape)), array.dtype, to_host, array, strides)
 
 
 def wrapped(buffer: cl.Buffer, queue: cl.CommandQueue, shape: tuple[int, ...], dtype: np.dtype) -> pyopencl.array.Array:

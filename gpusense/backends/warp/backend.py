@@ -17,11 +17,11 @@ from gpusense._util.memory import prefer_large_pages
 from gpusense.backends.base import Adopted, Backend, BackendInfo, Exchange, ProcessBound, Recording
 from gpusense.backends.processor import Staging
 from gpusense.backends.recycled import ResultMemory
-from gpusense.backends.warp.arrays import adopted, has_protocol, slots_of
+from gpusense.backends.warp.arrays import Results, adopted, has_protocol, slots_of
 from gpusense.backends.warp.graphs import GraphCache, GraphExchange, WarpRecording
 from gpusense.backends.warp.launch import SCALARS, Launch, host_view
 from gpusense.backends.warp.pieces import SharedLaunch, shared
-from gpusense.backends.warp.queue import CallQueue, Copy
+from gpusense.backends.warp.queue import CallQueue
 from gpusense.backends.warp.settings import LOCK, initialize, load, settings
 from gpusense.interface.kernel_files import warp_files, warp_source
 from gpusense.interface.launches import Program
@@ -31,9 +31,6 @@ from gpusense.interface.sources import relevant
 _MOST_NUMBERS = (1 << 31) - 1
 # Largest copy that a thread reads through its cached memory of each type [bytes].
 _FEW_BYTES = 1 << 10
-# Number of arrays of the device whose last copies are known. Graphs contain only copies that repeat: arrays at changing
-# addresses would each need another graph.
-_MOST_PARTNERS = 128
 
 
 class WarpBackend(ProcessBound, Backend):
@@ -48,13 +45,12 @@ class WarpBackend(ProcessBound, Backend):
         self._device = wp.get_device(device)
         self._graphs = GraphCache(self._device)
         self.results = ResultMemory() if info.kind == "gpu" else None
+        self._results_there = Results(self._device)
         # Large copies; None on the processor, which uses the host's memory.
         self._staging = Staging(functools.partial(slots_of, self._device)) if self._device.is_cuda else None
         # The queue of each thread that has a batch, and the queues that no call uses.
         self._thread = threading.local()
         self._queues: list[CallQueue] = []
-        # By the address of an array, the array of the device that it was last copied to or from; the newest last.
-        self._partners: dict[int, int] = {}
         # By the flags that change code, and by all flags of a launch.
         self._launchers: dict[tuple[str, frozenset[str]], Launch | SharedLaunch] = {}
         self._asked: dict[tuple[str, frozenset[str]], Launch | SharedLaunch] = {}
@@ -149,6 +145,9 @@ class WarpBackend(ProcessBound, Backend):
         """See Backend.adopt; every array on the device can be used in place."""
         return adopted(array, self._device, name)
 
+    def empty_like(self, array: Any, shape: tuple[int, ...], dtype: np.dtype) -> tuple[Any, wp.array] | None:
+        return self._results_there.empty_like(array, shape, dtype)
+
     def empty_external(self, count: int, dtype: np.dtype) -> wp.array:
         return self.part(self.empty(count, dtype), 0, count, dtype)
 
@@ -156,26 +155,10 @@ class WarpBackend(ProcessBound, Backend):
         if not size:
             # Warp takes a count of 0 as the whole array.
             return
-        queue = self.batch()
-        if queue is not None:
-            if begin == to == 0 and source.dtype is target.dtype and self._repeats(target.ptr, source.ptr):
-                # One graph of the whole call.
-                queue.steps.append(Copy(target, source, size // wp.types.type_size_in_bytes(target.dtype)))
-                return
-            # The copy follows all deferred work.
-            self._flush(queue)
+        # The copy follows all deferred work.
+        self.submit()
         from_size, to_size = (wp.types.type_size_in_bytes(array.dtype) for array in (source, target))
         wp.copy(target, source, dest_offset=to // to_size, src_offset=begin // from_size, count=size // from_size)
-
-    def _repeats(self, *addresses: int) -> bool:
-        """Return whether the last copy of either of two arrays was to or from the other, and note this one."""
-        partners, repeated = self._partners, True
-        for one, other in (addresses, addresses[::-1]):
-            repeated &= partners.pop(one, None) == other
-            partners[one] = other
-        while len(partners) > _MOST_PARTNERS:
-            del partners[next(iter(partners))]
-        return repeated
 
     def wrap_external(self, buffer: wp.array, shape: tuple[int, ...], dtype: np.dtype) -> wp.array:
         return buffer if buffer.shape == shape else buffer.reshape(shape)

@@ -16,6 +16,7 @@ import warp as wp
 
 from gpusense.backends.base import Backend, Exchange, Recording
 from gpusense.backends.processor import HELPERS
+from gpusense.backends.warp.arrays import stream_of
 from gpusense.backends.warp.queue import Copy, Step, as_graph, one_by_one, start_each
 
 _LOG = logging.getLogger("gpusense")
@@ -192,7 +193,6 @@ class WarpRecording(Recording, Step):
         self._started = one_by_one(steps, FIRST)
         # True once they were started singly: this loads modules, for which a capture must not wait.
         self._loaded = False
-        self._streams: dict[int, wp.Stream] = {}
         # The recording with copies of its exchange.
         self.exchanged: WarpRecording | None = None
         # The streams on which they were started since the last wait; the processor has none.
@@ -248,9 +248,7 @@ class WarpRecording(Recording, Step):
             address = getattr(stream, name, address)
         if not isinstance(address, int) or not self._device.is_cuda:
             raise TypeError(f"stream: must be a stream of {self._device}, got {stream!r}")
-        if address not in self._streams:
-            self._streams[address] = wp.Stream(self._device, cuda_stream=address)
-        return self._streams[address]
+        return stream_of(self._device.alias, address)
 
 
 class GraphExchange(Exchange):
@@ -261,10 +259,11 @@ class GraphExchange(Exchange):
         results: tuple[wp.array, int],
     ) -> None:  # fmt: skip
         here = dict(device="cpu", pinned=device.is_cuda)
-        given, taken = (wp.zeros(count, dtype=array.dtype, **here) for array, count in (inputs, results))
-        super().__init__(backend, inputs[0], given.numpy(), results[0], taken.numpy())
+        given, taken = (wp.zeros(max(count, 1), dtype=array.dtype, **here) for array, count in (inputs, results))
+        super().__init__(backend, inputs[0], given.numpy()[: inputs[1]], results[0], taken.numpy())
         self._device, self._graphs = device, graphs
-        self._copies = Copy(inputs[0], given, inputs[1]), Copy(taken, results[0], results[1])
+        self._to_device = [Copy(inputs[0], given, inputs[1])] if inputs[1] else []
+        self._to_host = Copy(taken, results[0], results[1])
         # True if the last start copies the results.
         self._takes = False
 
@@ -275,8 +274,8 @@ class GraphExchange(Exchange):
             return
         self._busy = self._takes = True
         if recording.exchanged is None:
-            to_device, to_host = self._copies
-            recording.exchanged = WarpRecording(self._device, self._graphs, [to_device, recording, to_host])
+            steps = [*self._to_device, recording, self._to_host]
+            recording.exchanged = WarpRecording(self._device, self._graphs, steps)
         recording.exchanged()
 
     def explain(self, recording: Recording) -> str:

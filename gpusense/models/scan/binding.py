@@ -11,11 +11,11 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.backends import arrays
-from gpusense.backends.arrays import Result
+from gpusense.backends.arrays import FLOATS, Result
 from gpusense.models.scan.bound import BoundCall, RecordedCall, RecordedCast
 from gpusense.models.scan.map_caster import MapCaster
 from gpusense.models.scan.packed_call import LARGEST, MOST_CELLS, PackedCall, fits, host_task, is_short
-from gpusense.models.scan.pipeline import FLOATS, ScanPipeline
+from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.tables.world_index import WorldIndex
 from gpusense.tables.world_map import index_of
 from gpusense.tables.worlds import Worlds

@@ -109,9 +109,9 @@ class ReplayedCall(BoundCall):
         self._current().recording(stream)
         return self.out
 
-    def explain(self) -> str:
+    def explain(self, words: Callable[[Recording], str] = lambda one: one.explain()) -> str:
         for _, program in self._programs.items():
-            return program.recording.explain()
+            return words(program.recording)
         return "nothing is recorded: the map has changed, and its new table did not fit the device"
 
     def check(self) -> None:
@@ -230,12 +230,12 @@ class RecordedCall(ReplayedCall):
         owners = (poses, ranges, adopted, array)
         super().__init__(backend, pipeline.map, lock, placed, owners, array, self._space, chunk)
 
-    def begin(self, corners: Corners | None = None) -> None:
-        """Start the recording as part of this thread's batch; ``corners`` are those of the box of the poses."""
+    def recording(self, corners: Corners | None = None) -> Recording:
+        """Return the recording for the present map; ``corners`` are those of the box of the poses."""
         if corners is not None:
             self._poses.hull = corners
             self._pipeline.map.ensure(corners)
-        self._pipeline.backend.replay(self._current().recording)
+        return self._current().recording
 
     @property
     def program(self) -> Program:

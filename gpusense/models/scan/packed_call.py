@@ -2,24 +2,27 @@
 
 Arrays of the host go to the device as one array, and results come back as one: a copy of few numbers takes as long as a
 launch, and the device classes a scan faster than the host. On CUDA, copies and launches form one graph. Arrays on the
-device are used in place by bound calls, and copied to the slots of the program by ordinary calls that repeat a size, as
-each of these has other arrays.
+device are used in place by bound calls, and by ordinary calls that repeat their addresses; other arrays are copied to
+the slots of a program of their size.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
+from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from gpusense.backends import Backend, arrays
-from gpusense.backends.arrays import Result
-from gpusense.backends.workspace import ProgramCache, Workspace
+from gpusense.backends import arrays
+from gpusense.backends.arrays import FLOATS, Result
+from gpusense.backends.base import Adopted
+from gpusense.backends.workspace import Packed, ProgramCache
 from gpusense.models.poses import corners_of
 from gpusense.models.scan.bound import RecordedCall
-from gpusense.models.scan.pipeline import FLOATS, ScanPipeline
+from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.tiles import LEAST_ORDERED
 from gpusense.world.scanner import classify_ranges
 from gpusense.world.windows import Corners
@@ -29,10 +32,9 @@ LARGEST = 256 << 10
 # Largest map of which a short call makes the whole table [cells].
 MOST_CELLS = 1 << 22
 _DOUBLE, _INT = np.dtype(np.float64), np.dtype(np.int32)
-# Alignment of arrays that are copied as one [bytes], enough for every device.
-_ALIGNED = 1024
-# Number of sizes of short calls that are kept; ordinary calls of a size before the first short one.
-_MOST_SIZES, _BEFORE = 8, 2
+# Numbers of sizes and of places of short calls that are kept; ordinary calls before the first short one; and calls
+# after which places make room for others.
+_MOST_SIZES, _MOST_PLACES, _BEFORE, _PATIENCE = 8, 24, 2, 4096
 
 
 def fits(count: int, readings: int) -> bool:
@@ -54,24 +56,6 @@ def host_task(pipeline: ScanPipeline) -> str:
     return ""
 
 
-class _Pack:
-    """Arrays that are copied as one: the packed array and its parts on the host (``views``) and on the device."""
-
-    def __init__(self, backend: Backend, dtype: np.dtype, *arrays: tuple[int, np.dtype]) -> None:
-        begins, size = [], 0
-        for count, dtype_of in arrays:
-            begins.append(size)
-            size += -(-count * dtype_of.itemsize // _ALIGNED) * _ALIGNED
-        self.host = np.zeros(size // dtype.itemsize, dtype)
-        self.on_device = backend.upload(self.host, backend.empty_external(self.host.size, dtype))
-        numbers = self.host.view(np.uint8)
-        self.views, self.parts = [], []
-        for begin, (count, dtype_of) in zip(begins, arrays, strict=True):
-            self.views.append(numbers[begin : begin + count * dtype_of.itemsize].view(dtype_of))
-            part = backend.part(self.on_device, begin // dtype_of.itemsize, count, dtype_of) if count else None
-            self.parts.append(part)
-
-
 class PackedCall:
     """The recorded program of a number of poses, with the copies of its inputs and of its result.
 
@@ -85,101 +69,133 @@ class PackedCall:
         self, pipeline: ScanPipeline, lock: threading.Lock, count: int, inputs: tuple[Any, Any], out: Any,
         limits: np.dtype | None, corners: Corners | None = None,
     ) -> None:  # fmt: skip
-        self._backend = backend = pipeline.backend
-        real, sizes = pipeline.real, (3 * count, pipeline.scanner.count)
-        shapes = (count, 3), (pipeline.scanner.count,)
-        in_host = [(size if kind is None else 0, _DOUBLE) for kind, size in zip(inputs, sizes, strict=True)]
-        self._inputs = _Pack(backend, _DOUBLE, *in_host)
-        self._outputs = _Pack(backend, real, (count if out is None else 0, real), (2, _INT))
-        # The places of the inputs: host arrays, buffers with their bytes, or None for arrays that are used in place.
+        backend = self._backend = pipeline.backend
+        self._limits = limits
+        real, shapes = pipeline.real, ((count, 3), (pipeline.scanner.count,))
+        sizes = [0 if kind is not None else math.prod(one) for kind, one in zip(inputs, shapes, strict=True)]
+        packed = Packed(backend, sizes)
+        results = Packed(backend, [count if out is None else 0, _INT.itemsize * 2 // real.itemsize], real)
+        given = packed.size if None in inputs else 0
+        self._exchange = backend.exchange(packed.buffer, given, results.buffer, results.size, real)
+        # The places of the inputs: arrays of the host, buffers with their bytes, or None for arrays in place.
         self._slots: list[Any] = []
         there: list[Any] = []
-        shown: list[Any] = []
-        for kind, shape, view, part in zip(inputs, shapes, self._inputs.views, self._inputs.parts, strict=True):
+        for kind, shape, span, part in zip(inputs, shapes, packed.spans, packed.parts, strict=True):
             if kind is None:
-                self._slots.append(view.reshape(shape))
-                there.append(backend.wrap_external(part, shape, _DOUBLE))
+                self._slots.append(self._exchange.given[span].reshape(shape))
+                kind = backend.view(part, shape, _DOUBLE)
             elif isinstance(kind, np.dtype):
                 size = math.prod(shape)
                 self._slots.append((backend.empty_external(size, kind), size * kind.itemsize))
-                there.append(backend.wrap_external(self._slots[-1][0], shape, kind))
+                kind = backend.view(self._slots[-1][0], shape, kind)
             else:
                 self._slots.append(None)
-                there.append(kind)
-            shown.append(self._slots[-1] if kind is None else there[-1])
-        self._shown, self._limits = shown, limits
-        log_p, status = self._outputs.parts
+            there.append(kind)
+        self._there = there
+        self._log_p, self._flag = results.spans
+        self._status = backend.part(results.parts[1], 0, 2, _INT)
         self._result, self._in_host = None, out is None
         if isinstance(out, np.dtype):
-            log_p = backend.empty_external(count, real)
-            self._result = log_p, count * real.itemsize
-        if out is None or self._result is not None:
-            out = backend.wrap_external(log_p, (count,), real)
-        self._recorded = RecordedCall(pipeline, lock, there[0], there[1], out, status, limits, corners)
-        self._space = Workspace(backend)
+            self._result = backend.empty_external(count, real), count * real.itemsize
+            out = backend.view(self._result[0], (count,), real)
+        elif out is None:
+            out = backend.view(results.parts[0], (count,), real)
+        self._recorded = RecordedCall(pipeline, lock, there[0], there[1], out, self._status, limits, corners)
 
     def score(self, poses: Any, ranges: Any, out: Any, corners: Corners | None = None) -> bool:
-        """Score poses that are not used in place; return False, and write nothing, if one is not finite."""
-        backend, inputs, outputs = self._backend, self._inputs, self._outputs
-        log_p, status = outputs.views
-        with self._space:
-            for slot, numbers in zip(self._slots, (poses, ranges), strict=True):
-                if type(slot) is tuple:
-                    backend.copy(numbers, *slot)
-                elif slot is not None:
-                    slot[...] = numbers
-            if inputs.host.size:
-                backend.upload(inputs.host, inputs.on_device, wait=False)
-            self._recorded.begin(corners)
-            backend.download(outputs.on_device, outputs.host, wait=not backend.in_batch)
-            if self._result is not None:
-                backend.copy(self._result[0], out, self._result[1])
-            if backend.in_batch:
-                backend.synchronize()
-        if not status[0]:
-            if self._in_host:
-                out[...] = log_p
-            return True
-        status[...] = 0
-        backend.upload(status, outputs.parts[1])
-        return False
+        """Score poses; return False, and write no array of the host, if one is not finite."""
+        exchange = self._exchange
+        exchange.begin()
+        recording = self._recorded.recording(corners)
+        for slot, numbers in zip(self._slots, (poses, ranges), strict=True):
+            if type(slot) is tuple:
+                self._backend.copy(numbers.buffer, *slot)
+            elif slot is not None:
+                slot[...] = numbers
+        exchange.start(recording)
+        if self._result is not None:
+            self._backend.copy(self._result[0], out, self._result[1])
+        results = exchange.finish()
+        status = results[self._flag].view(_INT)
+        if status[0]:
+            self._backend.upload(np.zeros(2, _INT), self._status)
+            return False
+        if self._in_host:
+            out[...] = results[self._log_p]
+        return True
 
-    @property
-    def arrays(self) -> tuple[Any, Any]:
-        """The poses and the readings of the last call; arrays of the host are copies, readings in their type."""
-        poses, ranges = self._shown
-        poses = poses.copy() if type(poses) is np.ndarray else poses
-        return poses, ranges.astype(self._limits) if type(ranges) is np.ndarray else ranges
+    def shown(self, poses: Any, ranges: Any) -> tuple[Any, Any]:
+        """Return the operands of the last call; arrays of the host are copies, readings in their type."""
+        at, readings = (
+            given if slot is None else there if type(slot) is tuple else slot.copy()
+            for slot, there, given in zip(self._slots, self._there, (poses, ranges), strict=True)
+        )
+        return at, readings.astype(self._limits) if type(self._slots[1]) is np.ndarray else readings
 
     def explain(self) -> str:
         """Return in one line how the launches are started."""
-        return self._recorded.explain()
+        return self._recorded.explain(self._exchange.explain)
 
 
 # ---- ordinary calls
 
 
-class _Inputs(NamedTuple):
-    """Poses and readings: types on the device (None on the host), arrays or buffers, owners, and type of limits."""
+class _Last(NamedTuple):
+    """The last call, with its operands."""
 
-    kinds: tuple[np.dtype | None, np.dtype | None]
-    arrays: tuple[Any, Any]
-    owners: tuple[Any, ...]
-    limits: np.dtype
+    call: PackedCall
+    poses: Any
+    ranges: Any
+
+    @property
+    def arrays(self) -> tuple[Any, Any]:
+        """The poses and the readings."""
+        return self.call.shown(self.poses, self.ranges)
+
+
+class _Recordings(ProgramCache[PackedCall]):
+    """Calls by their keys, each recorded once its key repeats.
+
+    If ``patience`` is not 0, a full cache makes room only after this number of calls without a recording: a recording
+    takes as long as many calls, so that keys must not evict each other in turn.
+    """
+
+    def __init__(self, most: int, patience: int) -> None:
+        super().__init__(most)
+        self._patience, self._since, self._seen = patience, 0, ProgramCache[int](most)
+
+    def found(self, key: Hashable, record: Callable[[], PackedCall]) -> PackedCall | None:
+        """Return the call of a key, or record it; None if it has not repeated, or there is no room."""
+        self._since += 1
+        call = self.get(key)
+        if call is not None:
+            return call
+        seen = self._seen.get(key) or 0
+        if seen < _BEFORE:
+            self._seen.keep(key, seen + 1)
+            return None
+        if self._patience and len(self) >= self._most:
+            if self._since < self._patience:
+                return None
+            self.clear()
+        self._since = 0
+        return self.keep(key, record())
 
 
 class PackedCallCache:
     """Ordinary calls of a model that repeat a size of few particles, with the same bits as others.
 
-    ``last``: the last call; None if it was not a short one.
+    Arrays of the device at addresses that repeat are used in place, others are copied.
+
+    Attributes:
+        last: The last call; None if it was not a short one.
     """
 
     def __init__(self, pipeline: ScanPipeline) -> None:
         self._pipeline = pipeline
-        self.last: PackedCall | None = None
-        self._calls = ProgramCache[PackedCall](_MOST_SIZES)
-        # Number of calls by size so far.
-        self._seen = ProgramCache[int](_MOST_SIZES)
+        self.last: _Last | None = None
+        # Keyed by size and types; and by size, types and addresses of arrays in place.
+        self._sizes, self._places = _Recordings(_MOST_SIZES, 0), _Recordings(_MOST_PLACES, _PATIENCE)
         # A private lock, since the scoring thread holds the model's lock.
         self._lock = threading.Lock()
 
@@ -199,21 +215,23 @@ class PackedCallCache:
         if shape[1:] != (3,) or getattr(ranges, "shape", None) != (size,):
             return None
         count = shape[0]
-        inputs = self._inputs(poses, ranges) if is_short(count, size) and fits(count, size) else None
-        if inputs is None:
+        if not (is_short(count, size) and fits(count, size)):
             return None
-        there, in_host = inputs.kinds[0], inputs.kinds[0] is None
-        key = (count, *inputs.kinds, inputs.limits)
-        if not (out is None or not in_host or self._writes(count, out)) or not self._repeats(key):
+        at, readings = self._operand(poses, "poses"), self._operand(ranges, "ranges")
+        if at is None or readings is None:
+            return None
+        in_host, there = type(at) is np.ndarray, type(readings) is not np.ndarray
+        if there and (pipeline.rules.first_scans.left or pipeline.context.temperature < 1):
+            # The host inspects the first scans, and whether a range depends on the pose; see below.
+            return None
+        if in_host and not (out is None or self._writes(count, out)):
             return None
         corners = self._corners(poses) if in_host else None
         if in_host and corners is None:
             return None
-        if pipeline.context.temperature < 1:
+        if pipeline.context.temperature < 1 and not classify_ranges(ranges, *pipeline.rules.limits)[0].any():
             # Without a range that depends on the pose, the constant term is rounded differently.
-            hit = None if inputs.kinds[1] is not None else classify_ranges(ranges, *pipeline.rules.limits)[0]
-            if hit is None or not hit.any():
-                return None
+            return None
         try:
             result = None
             if in_host:
@@ -221,60 +239,70 @@ class PackedCallCache:
             else:
                 result = Result(poses, out, (count,), pipeline.real, pipeline.backend, on_device=True)
                 target = result.flat
-            call = self._calls.get(key)
-            if call is None:
-                result_type = None if there is None else pipeline.real
-                call = PackedCall(pipeline, self._lock, count, inputs.kinds, result_type, inputs.limits, corners)
-                self._calls.keep(key, call)
-            if not call.score(*inputs.arrays, target, corners):
+            # Libraries of CUDA reuse the memory of earlier results.
+            in_place = not in_host and (out is not None or pipeline.backend.info.graphs)
+            call = self._call((at, readings), target, corners, in_place=in_place)
+            if call is None or not call.score(at, readings, target, corners):
                 return None
         except MemoryError:
             # The buffers of both kinds of calls may not fit the device at once.
-            self._calls.clear()
+            self._sizes.clear()
+            self._places.clear()
             return None
-        self.last, rules = call, pipeline.rules
+        self.last, rules = _Last(call, poses, ranges), pipeline.rules
         if rules.first_scans.left:
             rules.first_scans.look_at("ranges", ranges[None], rules.map_size)
         return target if result is None else result.user_array()
 
-    def _inputs(self, poses: Any, ranges: Any) -> _Inputs | None:
-        """Return the inputs of a call; None for arrays that the ordinary call must read or refuse."""
-        if type(poses) is np.ndarray and type(ranges) is np.ndarray:
-            usable = poses.dtype in FLOATS and ranges.dtype in FLOATS
-            return _Inputs((None, None), (poses, ranges), (), ranges.dtype) if usable else None
+    def _operand(self, array: Any, name: str) -> np.ndarray | Adopted | None:
+        """Return an array of the host or of the device; None if the ordinary call must read or refuse it."""
+        if type(array) is np.ndarray:
+            return array if array.dtype in FLOATS else None
         backend = self._pipeline.backend
-        for array in (poses, ranges):
-            if type(array) is np.ndarray:
-                if array.dtype not in FLOATS:
-                    return None
-            elif not (backend.reads(array) and arrays.on_device(array)):
-                return None
-        kind, taken, owner = None, poses, None
+        if not (backend.reads(array) and arrays.on_device(array)):
+            return None
         try:
-            if type(poses) is not np.ndarray:
-                taken, _, single, owner = arrays.adopt_poses(poses, backend, "poses")
-                kind = FLOATS[0] if single else _DOUBLE
-            if type(ranges) is np.ndarray:
-                return _Inputs((kind, None), (taken, ranges), (owner,), ranges.dtype)
-            # The first scans are inspected on the host.
-            if self._pipeline.rules.first_scans.left:
-                return None
-            adopted = arrays.adopt_readings(ranges, backend, (self._pipeline.scanner.count,), in_place=False)
+            adopted = backend.adopt(array, name)
         except (TypeError, ValueError):
             return None
-        return _Inputs((kind, adopted.dtype), (taken, adopted.buffer), (owner, adopted), adopted.dtype)
+        return adopted if adopted.dtype in FLOATS and adopted.strides is None else None
+
+    def _call(
+        self, operands: tuple[np.ndarray | Adopted, np.ndarray | Adopted], target: Any, corners: Corners | None, *,
+        in_place: bool,
+    ) -> PackedCall | None:  # fmt: skip
+        """Return the call of poses and ranges, recorded once it repeats; ``in_place``: whether results may be."""
+        there = [None if isinstance(one, np.ndarray) else one for one in operands]
+        kinds = [None if one is None else one.dtype for one in there]
+        size = (operands[0].shape[0], *kinds, operands[1].dtype)
+        if there != [None, None]:
+            address = self._pipeline.backend.address
+            places = [None if one is None else address(one.buffer) for one in there]
+            for result in (address(target), None) if in_place else (None,):
+                key = (*size, *places, result)
+                call = self._places.found(key, functools.partial(self._recorded, key, there, target, corners))
+                if call is not None:
+                    return call
+        key = (*size, None, None, None)
+        return self._sizes.found(key, functools.partial(self._recorded, key, there, target, corners))
+
+    def _recorded(
+        self, key: tuple[Any, ...], there: list[Adopted | None], target: Any, corners: Corners | None
+    ) -> PackedCall:
+        """Return a new call, which uses the arrays of the device in place that its key names."""
+        count, *kinds, limits, at, readings, result = key
+        view, real = self._pipeline.backend.view, self._pipeline.real
+        inputs = [
+            kind if place is None or one is None else view(one.buffer, one.shape, one.dtype)
+            for one, kind, place in zip(there, kinds, (at, readings), strict=True)
+        ]
+        out = None if there[0] is None else real if result is None else view(target, (count,), real)
+        return PackedCall(self._pipeline, self._lock, count, (inputs[0], inputs[1]), out, limits, corners)
 
     def _writes(self, count: int, out: Any) -> bool:
         """Return whether results can be written to an array of the host."""
         usable = type(out) is np.ndarray and out.dtype == self._pipeline.real and out.shape == (count,)
         return usable and out.flags.c_contiguous and out.flags.writeable
-
-    def _repeats(self, key: tuple[Any, ...]) -> bool:
-        """Count a call of a size, and return whether the size has occurred often."""
-        seen = self._seen.get(key) or 0
-        if seen < _BEFORE:
-            self._seen.keep(key, seen + 1)
-        return seen >= _BEFORE
 
     def _corners(self, poses: np.ndarray) -> Corners | None:
         """Return corners of the box of poses; None where one is not finite."""

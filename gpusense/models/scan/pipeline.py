@@ -15,7 +15,7 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.backends import arrays
-from gpusense.backends.arrays import Result
+from gpusense.backends.arrays import FLOATS, Result
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.launches import Program
@@ -31,7 +31,6 @@ from gpusense.tables.worlds import Worlds
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.plausible import look_at_poses
 
-FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
 # Poses that several models share, checked once, by the number of scans.
 Known = MutableMapping[int | None, Poses]
 # Rays times particles of one scan up to which several scans share their launches, by kind of device. Above, the

@@ -8,11 +8,12 @@ from typing import Any, cast
 
 import numpy as np
 
+from gpusense.backends.arrays import FLOATS
 from gpusense.backends.workspace import ChangingProgram, PartialResult, RecordedProgram, Workspace
 from gpusense.models.chunking import Piece, chunk_of, run_pieces
 from gpusense.models.poses import Part, place
 from gpusense.models.scan.classed import ClassedScans
-from gpusense.models.scan.pipeline import FLOATS, Request, ScanPipeline
+from gpusense.models.scan.pipeline import Request, ScanPipeline
 from gpusense.models.scan.readings import Readings
 from gpusense.world.range_causes import NoReturn
 from gpusense.world.windows import Frame, whole

@@ -168,6 +168,8 @@ def test_arrays_on_the_device_repeat_a_recording(case, batching):
     model, plain = (CASES[case](backend=device) for _ in range(2))
     plain._short = None
     beams, short = model.scanner.count, model._short is not None
+    # No two of them have the same address.
+    held: list[Any] = []
     for real, there in ((np.float32, (True, False)), (np.float64, (True, True)), (np.float64, (False, True))):
         for seed, scan in enumerate((*SCANS, *SCANS[:2], *SCANS[:2])):
             host = cloud(seed).astype(real), scan[:beams].astype(real)
@@ -175,6 +177,7 @@ def test_arrays_on_the_device_repeat_a_recording(case, batching):
             out = to_device(np.zeros(COUNT, model.precision)) if seed % 2 and there[0] else None
             before = len(started)
             found = model.log_likelihood(poses, ranges, out=out)
+            held += [poses, ranges, found]
             graphs = len(started) - before
             expected = plain.log_likelihood(poses, ranges)
             assert type(found) is type(expected) and (out is None or found is out)
@@ -199,19 +202,76 @@ def test_arrays_on_the_device_repeat_a_recording(case, batching):
 
 @pytest.mark.parametrize("there", [(True, True), (True, False)])
 @pytest.mark.parametrize("kind", MODELS)
-def test_arrays_that_stay_in_place_are_copied_by_the_graph(kind, there, batching):
+def test_arrays_whose_addresses_repeat_are_used_in_place(kind, there, batching, monkeypatch):
     device, started = batching
     model, plain = (kind(GRID, NEAR, backend=device) for _ in range(2))
     poses, ranges = (to_device(one) if on else one for one, on in zip((cloud(0), mixed(0)), there, strict=True))
     plain.log_likelihood(cloud(0), mixed(0))
     out = to_device(np.zeros(COUNT, np.float32))
+    copied, copy = [], device.copy
+    monkeypatch.setattr(device, "copy", lambda *given, **how: (copied.append(given), copy(*given, **how)))
     for seed in range(6):
         poses.assign(cloud(seed))
         before = len(started)
         model.log_likelihood(poses, ranges, out=out)
         assert seed < 4 or len(started) == before + 1
         assert differing(out.numpy(), plain.log_likelihood(cloud(seed), mixed(0))) == 0
-    assert model._short.last.explain().endswith(" launches and 4 copies")
+    # The pose status goes to the host, and readings of the host to the device.
+    copies = "1 copy" if there[1] else "2 copies"
+    assert not copied and model._short.last.call.explain().endswith(f" launches and {copies}")
+    plain.log_likelihood(poses, ranges)
+    assert model.explain() == plain.explain()
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_results_that_are_kept_stay(kind, batching):
+    """Poses and readings are used in place, while every result has other memory."""
+    model, plain = (kind(GRID, NEAR, backend=batching[0]) for _ in range(2))
+    poses, ranges = to_device(cloud(0)), to_device(mixed(0))
+    expected, found = [], []
+    for seed in range(9):
+        poses.assign(cloud(seed))
+        ranges.assign(mixed(seed))
+        found.append(model.log_likelihood(poses, ranges))
+        expected.append(plain.log_likelihood(cloud(seed), mixed(seed)))
+        if seed > 5:
+            # The last result is freed: its memory may come back.
+            found[-2], expected[-2] = found[-1], expected[-1]
+    assert all(differing(one.numpy(), other) == 0 for one, other in zip(found, expected, strict=True))
+
+
+def test_memory_that_comes_back_with_other_arrays(batching):
+    """An address alone does not name an array: its size and its type may have changed."""
+    import warp as wp
+
+    model, plain = (FIELD(GRID, NEAR, backend=batching[0]) for _ in range(2))
+    memory, readings = wp.zeros(3 * COUNT, dtype=wp.float64, device="cpu"), to_device(mixed(0))
+    for turn in range(5):
+        for count, real in ((COUNT, wp.float64), (COUNT, wp.float32), (40, wp.float64)):
+            poses = wp.array(ptr=memory.ptr, shape=(count, 3), dtype=real, device="cpu")
+            poses.assign(cloud(turn, count))
+            expected = plain.log_likelihood(poses.numpy(), mixed(0))
+            assert differing(model.log_likelihood(poses, readings).numpy(), expected) == 0
+            assert (model._short.last is not None) == (turn > 1)
+
+
+def test_addresses_that_change_too_often_are_not_recorded(batching, monkeypatch):
+    """A recording takes as long as many calls; those of the past make room after a while."""
+    monkeypatch.setattr(packed_call, "_MOST_PLACES", 3)
+    monkeypatch.setattr(packed_call, "_PATIENCE", 20)
+    made, record = [], packed_call.RecordedCall
+    monkeypatch.setattr(packed_call, "RecordedCall", lambda *given: (made.append(1), record(*given))[1])
+    model, plain = (FIELD(GRID, NEAR, backend=batching[0]) for _ in range(2))
+    ranges, clouds = to_device(mixed(0)), [to_device(cloud(seed)) for seed in range(6)]
+    outs = [to_device(np.zeros(COUNT, np.float32)) for _ in range(2)]
+    expected = [plain.log_likelihood(cloud(seed), mixed(0)) for seed in range(6)]
+    rng = np.random.default_rng(0)
+    for number in range(60):
+        at = int(rng.integers(6))
+        out = model.log_likelihood(clouds[at], ranges, out=outs[number % 2])
+        assert differing(out.numpy(), expected[at]) == 0
+        assert len(model._short._places) <= 3
+    assert 3 < len(made) <= 9
 
 
 @pytest.mark.parametrize("kind", MODELS)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
+import io
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -56,18 +55,11 @@ def pose_rows(pose: NDArray[np.floating], covariance: NDArray[np.floating]) -> l
 
 def grey_png(pixels: NDArray[np.uint8]) -> bytes:
     """Return (H, W) grey values as a PNG."""
-    rows, cols = pixels.shape
-    lines = np.zeros((rows, cols + 1), np.uint8)  # each begins with its filter byte, 0
-    lines[:, 1:] = pixels
-    chunks = (
-        (b"IHDR", struct.pack(">IIBBBBB", cols, rows, 8, 0, 0, 0, 0)),
-        (b"IDAT", zlib.compress(lines.tobytes(), 9)),
-        (b"IEND", b""),
-    )
-    packed = [
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
-    ]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "PNG")
+    return stream.getvalue()
 
 
 def _text(value: object) -> str:

@@ -16,7 +16,7 @@ from gpusense.commands.arguments import Options, finite_number
 from gpusense.evaluation.steps import Step, check_scanners, read_steps, with_poses
 from gpusense.evaluation.trajectory_files import poses_at, read_tum, write_tum
 from gpusense.logs import Scan
-from gpusense.logs.reader import LogOptions, read_laser
+from gpusense.logs.reader import LogOptions, read_lasers
 
 FORMATS = "CARMEN or Wean Hall, plain or .gz; a bag of ROS 1 (.bag) or of ROS 2 (folder, .db3, .mcap)"
 OPTIONS = {
@@ -71,8 +71,9 @@ def read_scan(args: argparse.Namespace) -> Scan:
     """Read the scan ``--scan`` of ``--log``, the first one by default."""
     wanted, index = args.scan or 0, 0
     with options_named():
-        for scan in read_laser(args.log, args.topic, **log_options(args)):
-            if index == wanted:
+        sensors = () if args.topic is None else (args.topic,)
+        for _, scan in read_lasers(args.log, sensors, odometry=False, **log_options(args)):
+            if index == wanted and isinstance(scan, Scan):
                 return scan
             index += 1
     raise ValueError(f"--scan: must be below the log's number of scans, {index}, got {wanted}")

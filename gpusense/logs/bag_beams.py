@@ -52,8 +52,8 @@ class Beams:
     count: int  # number of beams
     range_min: float  # lower limit of ranges [m]
     range_max: float  # upper limit of ranges [m]
-    overridden: tuple[bool, bool]  # whether options replace the messages' range_min and range_max
-    varied: bool  # whether beams vary from scan to scan, so that the common beams cover a full turn
+    overridden: tuple[bool, bool] = (False, False)  # whether options replace the messages' range_min and range_max
+    varied: bool = False  # whether beams vary from scan to scan, so that the common beams cover a full turn
 
     def scanner(self, mount: Pose, upside_down: bool) -> Scanner:
         """Return the scanner at a mount; bearings of an upside-down laser run clockwise."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -190,7 +188,7 @@ class Bag:
     transforms: TransformBuffer = field(default_factory=TransformBuffer)
 
 
-class _Skipped:
+class Skipped:
     """Skipped messages and transforms with invalid numbers."""
 
     def __init__(self) -> None:
@@ -198,15 +196,18 @@ class _Skipped:
         self._reason = ""
 
     def add(self, message: Message, error: Exception) -> None:
+        """Count a message."""
         self._reason = self._reason or f"{message.where.rpartition(': ')[2]}: {error}"
         self._counts[message.topic] += 1
 
     def warn(self, path: Path) -> None:
+        """Warn with the counts by topic."""
         if total := self._counts.total():
             each = ", ".join(f"{number} on {topic}" for topic, number in sorted(self._counts.items()))
             warn_user(f"{path}: skipped messages: {total} ({each}); the first is {self._reason}")
 
     def reason(self, topic: str) -> str:
+        """Return the count of a topic and the first error; empty for a topic without skipped messages."""
         return f" but {self._counts[topic]} that are skipped ({self._reason})" if self._counts[topic] else ""
 
 
@@ -216,7 +217,7 @@ def survey(path: Path, topic: str | None, frame: str | None, odometry_from: str 
     chosen = _scan_topic(path, topics, topic)
     odometers = topics.get(ODOMETRY, [])
     odometer = odometry_topic(odometers, chosen, odometry_from)
-    bag, skipped = Bag(path, chosen), _Skipped()
+    bag, skipped = Bag(path, chosen), Skipped()
     bag.track.source = odometer
     # Counts of moving transforms, by whether they have a stamp; a single stamped one suffices.
     stamped: Counter[bool] = Counter()
@@ -224,13 +225,13 @@ def survey(path: Path, topic: str | None, frame: str | None, odometry_from: str 
         for each in message.fields.transforms if message.kind == TRANSFORMS else (message.fields,):
             try:
                 _take(bag, message, each)
-                if message.kind == TRANSFORMS and not stamped[True] and not _is_static(message):
+                if message.kind == TRANSFORMS and not stamped[True] and not is_static(message):
                     stamped[stamp_of("message", each) != 0] += 1
             except ValueError as error:
                 skipped.add(message, error)
     skipped.warn(path)
     if stamped[False] > 1 and not stamped[True]:
-        bag.transforms = _by_the_clock(path)
+        bag.transforms = transforms_of(path, Skipped(), by_the_clock=True)
     if not bag.lasers:
         raise ValueError(f"{path}: must hold scans on {chosen}, got none{skipped.reason(chosen)}")
     _name_frames(bag, frame)
@@ -272,7 +273,7 @@ def _scan_topic(path: Path, topics: dict[str, list[str]], topic: str | None) -> 
 def _take(bag: Bag, message: Message, part: object) -> None:
     """Record a message, or a transform of it."""
     if message.kind == TRANSFORMS:
-        bag.transforms.add(part, static=_is_static(message))
+        bag.transforms.add(part, is_static(message))
     elif message.kind == SCAN:
         geometry = geometry_of(part)
         bag.lasers.setdefault(frame_of(part), Counter())[geometry] += 1
@@ -284,20 +285,20 @@ def _take(bag: Bag, message: Message, part: object) -> None:
         bag.track.frame = bag.track.frame or frame_of(part)
 
 
-def _is_static(message: Message) -> bool:
+def is_static(message: Message) -> bool:
+    """Return whether a message has static transforms."""
     return message.topic.endswith("tf_static")
 
 
-def _by_the_clock(path: Path) -> TransformBuffer:
-    """Read the transforms of a bag without stamps at the log's times."""
+def transforms_of(path: Path, skipped: Skipped, *, by_the_clock: bool = False) -> TransformBuffer:
+    """Read the transforms of a bag, at the log's times if they have no stamps (``by_the_clock``)."""
     buffer = TransformBuffer()
     for message in messages(path, {TRANSFORMS: None}):
-        seconds, rest = divmod(round(message.time * 1e9), 10**9)
         for each in message.fields.transforms:
-            stamp = dataclasses.replace(each.header.stamp, sec=seconds, nanosec=rest)
-            stamped = dataclasses.replace(each, header=dataclasses.replace(each.header, stamp=stamp))
-            with contextlib.suppress(ValueError):
-                buffer.add(stamped, static=_is_static(message))
+            try:
+                buffer.add(each, is_static(message), message.time if by_the_clock else None)
+            except ValueError as error:
+                skipped.add(message, error)
     return buffer
 
 

@@ -45,18 +45,20 @@ _KNOWN = (*_FRONT, *_REAR, b"ODOM")
 _TAIL = 3  # time of measurement, host, logger's time
 
 
-def read(path: Path, *, range_max: float | None, odometry: bool, rear: bool) -> Iterator[Scan | Odometry]:
+def read(
+    path: Path, *, range_max: float | None, range_min: float | None, odometry: bool, rear: bool
+) -> Iterator[Scan | Odometry]:
     """Read the records of a CARMEN log; see :func:`gpusense.read_log` for arguments and errors."""
     names = _REAR if rear else _FRONT
-    return until_cut(path, lambda lines: _records(path, lines, names, range_max, odometry=odometry))
+    return until_cut(path, lambda lines: _records(path, lines, names, (range_max, range_min or 0.0), odometry))
 
 
 def _records(
-    path: Path, lines: Iterator[tuple[int, bytes]], names: tuple[bytes, bytes], range_max: float | None, *,
+    path: Path, lines: Iterator[tuple[int, bytes]], names: tuple[bytes, bytes], limits: tuple[float | None, float],
     odometry: bool,
 ) -> Iterator[Scan | Odometry]:  # fmt: skip
     scanners: dict[tuple[float, ...], Scanner] = {}
-    old_range_max = range_max
+    range_max = old_range_max = limits[0]
     for where, fields in _messages(path, lines):
         name = fields[0].decode()
         if fields[0] == b"ODOM":
@@ -80,7 +82,14 @@ def _records(
             geometry = -math.pi / 2, _old_step(ranges.size), ranges.size, old_range_max
         scanner = scanners.get(geometry)
         if scanner is None:
-            scanner = scanners[geometry] = _scanner(where, *geometry)
+            start, step, count, farthest = geometry
+            try:
+                scanner = Scanner.uniform(
+                    angle_min=start, angle_increment=step, count=int(count), range_max=farthest, range_min=limits[1]
+                )
+            except ValueError as error:
+                raise ValueError(f"{where}: {error}") from None
+            scanners[geometry] = scanner
         ranges.setflags(write=False)
         yield Scan(_time(where, fields), ranges, scanner, _pose(where, poses[3:]), _pose(where, poses[:3]))
 
@@ -161,13 +170,6 @@ def _old_step(count: int) -> float:
         if abs(degrees - common) <= 0.01 * common:
             degrees = common
     return math.radians(degrees)
-
-
-def _scanner(where: str, start: float, step: float, count: float, range_max: float) -> Scanner:
-    try:
-        return Scanner.uniform(angle_min=start, angle_increment=step, count=int(count), range_max=range_max)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
 
 
 def _range_max_of(path: Path, name: bytes) -> float:

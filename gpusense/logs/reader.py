@@ -7,7 +7,7 @@ import importlib
 import itertools
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypedDict, Unpack, overload
 
@@ -18,7 +18,6 @@ from gpusense._util.lines import numbered_lines
 from gpusense.logs.bag_storage import MCAP, SQLITE, ZSTD
 from gpusense.logs.bags import is_bag_folder
 from gpusense.logs.records import Odometry, Scan
-from gpusense.world.scanner import Scanner
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class Format:
     """A format of logs."""
 
     name: str  # name of the format in messages, with an article
-    module: str  # the module whose function ``read(file, *, range_max, odometry, rear)`` yields its records
+    module: str  # the module whose function ``read(file, *, range_max, range_min, odometry, rear)`` yields its records
     magic: tuple[bytes, ...] = ()  # first bytes of its binary files; they take precedence over suffixes
     suffixes: tuple[str, ...] = ()  # suffixes of its files without these bytes
     begins: tuple[bytes, ...] = ()  # first bytes of its text files
@@ -138,24 +137,10 @@ def read_log(
     for name, flag in (("odometry", odometry), ("rear", rear)):
         checks.boolean(name, flag)
     form = format_of(file)
-    options: dict[str, object] = dict(range_max=range_max, odometry=odometry, rear=rear)
+    options: dict[str, object] = dict(range_max=range_max, range_min=range_min, odometry=odometry, rear=rear)
     options |= _ros_options(form, mount, topic=topic, frame=frame, odometry_from=odometry_from)
-    if form.topics:
-        options["range_min"] = range_min
     records: Iterator[Scan | Odometry] = importlib.import_module(form.module).read(file, **options)
-    return records if form.topics or range_min is None else _with_range_min(records, range_min)
-
-
-def _with_range_min(records: Iterator[Scan | Odometry], range_min: float) -> Iterator[Scan | Odometry]:
-    """Yield the records of a format without a lower limit of ranges, with scanners that have one."""
-    scanners: dict[Scanner, Scanner] = {}
-    for record in records:
-        if isinstance(record, Scan):
-            one = record.scanner
-            if one not in scanners:
-                scanners[one] = Scanner(one.bearings, one.range_max, range_min, one.mount)
-            record = replace(record, scanner=scanners[one])
-        yield record
+    return records
 
 
 def format_of(file: Path) -> Format:
@@ -190,21 +175,6 @@ def _ros_options(form: Format, mount: ArrayLike | None, **others: object) -> dic
 
 
 FRONT, REAR = "front", "rear"
-
-
-def read_laser(
-    path: str | os.PathLike[str],
-    topic: str | None = None,
-    **options: Unpack[LogOptions],
-) -> Iterator[Scan]:
-    """Read the scans of one laser of a log.
-
-    ``topic`` names it in a ROS bag, or is ``"front"`` or ``"rear"`` for a CARMEN log; None for the laser that
-    ``read_log`` takes.
-    """
-    form = format_of(checks.path("path", path))
-    records = _records(form, path, topic, False, options)
-    return (record for record in records if isinstance(record, Scan))
 
 
 def read_lasers(

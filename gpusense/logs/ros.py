@@ -47,18 +47,20 @@ from gpusense.logs.bag_beams import Beams, shared_beams
 from gpusense.logs.bag_survey import (
     BASES,
     Bag,
+    Skipped,
     Track,
     bases_of,
     frame_of,
     odometry_pose,
     scans_on,
     survey,
+    transforms_of,
     warn_of_tilt,
 )
 from gpusense.logs.bags import ODOMETRY, TRANSFORMS, Message, messages, topics_of
 from gpusense.logs.records import Odometry, Pose, Scan, planar, planar_mount
-from gpusense.logs.transform_buffer import TransformBuffer, TransformError
-from gpusense.world.messages import LEVEL, planar_part, stamp_of, tilt_of
+from gpusense.logs.transform_buffer import TransformError
+from gpusense.world.messages import LEVEL, planar_covariance, planar_part, stamp_of, tilt_of
 from gpusense.world.messages import field as field_of
 from gpusense.world.scanner import Scanner
 
@@ -276,20 +278,20 @@ def _names(known: dict[str, str], has_transforms: bool) -> str:
 
 
 def _of_topic(path: Path, kind: str, topic: str, map_frame: str) -> PoseTrack:
-    track, covariances, frames = Track(topic), [], set()
-    skipped, reason = 0, ""
+    track, covariances, frames, skipped = Track(topic), [], set(), Skipped()
     for message in messages(path, {kind: {topic}}):
         try:
             pose, tilt = planar_part("message.pose", field_of("message", message.fields, _KINDS[kind]))
-            covariance = None if kind == POSE else _covariance(message.fields)
+            stated = None if kind == POSE else field_of("message", message.fields, "pose.covariance")
+            covariance = None if stated is None else planar_covariance(stated)
             track.add(stamp_of("message", message.fields), message.time, pose, tilt)
         except ValueError as error:
-            skipped, reason = skipped + 1, reason or f"{message.where.rpartition(': ')[2]}: {error}"
+            skipped.add(message, error)
             continue
-        covariances.append(covariance)
+        # Zeros mean "unknown".
+        covariances.append(covariance if covariance is not None and covariance.any() else None)
         frames.add(frame_of(message.fields))
-    if skipped:
-        warn_user(f"{path}: skipped messages: {skipped} on {topic}; the first is {reason}")
+    skipped.warn(path)
     if not track.poses:
         raise ValueError(f"poses: must have messages on {topic} in {path}, got none that is finite")
     others = ", ".join(sorted(repr(frame) for frame in frames - {map_frame, ""}))
@@ -300,32 +302,17 @@ def _of_topic(path: Path, kind: str, topic: str, map_frame: str) -> PoseTrack:
     order = np.argsort(np.array(list(track.times)), kind="stable")
     # The last of several messages with the same time counts.
     last = np.append(np.diff(times) > 0, True)
-    stated: Floats | None = None
+    known: Floats | None = None
     if any(one is not None for one in covariances):
         none = np.full((3, 3), math.nan)
-        stated = np.array([none if one is None else one for one in covariances])[order][last]
-    return PoseTrack(topic, times[last], poses[last], stated)
-
-
-def _covariance(message: object) -> Floats | None:
-    """Return the (3, 3) covariance of x, y and yaw; None for zeros, which mean "unknown"."""
-    full = np.asarray(field_of("message", message, "pose.covariance"), np.float64).reshape(6, 6)
-    part = full[np.ix_((0, 1, 5), (0, 1, 5))]
-    if not np.isfinite(part).all() or (part.diagonal() < 0).any():
-        raise ValueError(f"message.pose.covariance: must be finite, with variances >= 0, got {part.tolist()}")
-    return (part + part.T) / 2 if part.any() else None
+        known = np.array([none if one is None else one for one in covariances])[order][last]
+    return PoseTrack(topic, times[last], poses[last], known)
 
 
 def _of_transforms(path: Path, times: Floats, map_frame: str) -> PoseTrack:
-    buffer, skipped = TransformBuffer(), 0
-    for message in messages(path, {TRANSFORMS: None}):
-        for each in message.fields.transforms:
-            try:
-                buffer.add(each, static=message.topic.endswith("tf_static"))
-            except ValueError:
-                skipped += 1
-    if skipped:
-        warn_user(f"{path}: skipped transforms: {skipped}")
+    skipped = Skipped()
+    buffer = transforms_of(path, skipped)
+    skipped.warn(path)
     frame = map_frame.strip("/")
     problem = f"no transforms from {frame} to the robot's base"
     for base in bases_of(buffer):

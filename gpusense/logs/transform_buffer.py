@@ -106,8 +106,11 @@ class TransformBuffer:
         self.cache = cache
         self._links: dict[tuple[str, str], Link] = {}
 
-    def add(self, message: object, static: bool = False) -> bool:
-        """Add a ``geometry_msgs/TransformStamped``; return whether its stamp went back and dropped later transforms."""
+    def add(self, message: object, static: bool = False, time: float | None = None) -> bool:
+        """Add a ``geometry_msgs/TransformStamped``; return whether its stamp went back and dropped later transforms.
+
+        ``time`` [s] replaces the message's stamp.
+        """
         parent, child = (
             str(field_of("message", message, name)).strip("/") for name in ("header.frame_id", "child_frame_id")
         )
@@ -115,7 +118,7 @@ class TransformBuffer:
             raise ValueError(f"message.child_frame_id: must differ from header.frame_id {parent!r}, got {child!r}")
         place = [real_field("message", message, f"transform.translation.{axis}") for axis in "xyz"]
         turn = unit_quaternion("message.rotation", field_of("message", message, "transform.rotation"))
-        time = stamp_of("message", message)
+        time = stamp_of("message", message) if time is None else time
         link = self._links.setdefault((parent, child), Link(parent, child))
         back = not static and not link.static and len(link.times) > 0 and time < link.times[-1] - BACK
         stray, link.stray = link.stray, None

@@ -18,6 +18,8 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from gpusense._util.lines import numbers_in, until_cut
 from gpusense._util.typing import Floats
 from gpusense.logs.records import Odometry, Pose, Scan
@@ -29,15 +31,18 @@ _NAMES = {b"L": 6 + _BEAMS + 1, b"O": 4}
 _MOVED = 0.02
 
 
-def read(path: Path, *, range_max: float | None, odometry: bool, rear: bool) -> Iterator[Scan | Odometry]:
+def read(
+    path: Path, *, range_max: float | None, range_min: float | None, odometry: bool, rear: bool
+) -> Iterator[Scan | Odometry]:
     """Read the records of a log; see :func:`gpusense.read_log` for arguments and errors."""
     if rear:
         raise ValueError("rear: must be False for a Wean Hall log, whose robot has one laser, got True")
-    return until_cut(path, lambda lines: _records(path, lines, range_max or _RANGE_MAX, odometry))
+    limits = range_max or _RANGE_MAX, range_min or 0.0
+    return until_cut(path, lambda lines: _records(path, lines, limits, odometry))
 
 
 def _records(
-    path: Path, lines: Iterator[tuple[int, bytes]], range_max: float, odometry: bool
+    path: Path, lines: Iterator[tuple[int, bytes]], limits: tuple[float, float], odometry: bool
 ) -> Iterator[Scan | Odometry]:
     scanner: Scanner | None = None
     for number, line in lines:
@@ -53,9 +58,8 @@ def _records(
             continue
         mount = _mount(pose, (float(values[3]) / 100, float(values[4]) / 100, float(values[5])))
         if scanner is None:
-            scanner = Scanner.uniform(
-                angle_min=-math.pi / 2, angle_increment=math.pi / _BEAMS, count=_BEAMS, range_max=range_max, mount=mount
-            )
+            bearings = -math.pi / 2 + math.pi / _BEAMS * np.arange(_BEAMS)
+            scanner = Scanner(bearings, *limits, mount)
         apart = max(math.dist(mount[:2], scanner.mount[:2]), abs(math.remainder(mount[2] - scanner.mount[2], math.tau)))
         if apart > _MOVED:
             raise ValueError(f"{where}: L: the laser must stay at {scanner.mount} on the robot, got {mount}")

@@ -19,11 +19,8 @@ from gpusense.localization.nav2 import DEFAULTS, Nav2Options, from_nav2
 from gpusense.localization.pose_algebra import compose_poses, invert_poses
 from gpusense.localization.spread import check_risk
 from gpusense.logs.records import Pose, planar_mount, pose_fields
-from gpusense.world.messages import field, planar_pose
+from gpusense.world.messages import field, planar_covariance, planar_pose
 from gpusense.world.scanner import Scanner
-
-# Largest negative eigenvalue of a covariance that rounding may cause, relative to its largest variance.
-_ROUNDING = 1e-6
 
 
 def pose_matrix(pose: Pose) -> np.ndarray:
@@ -51,28 +48,13 @@ def covariance_fields(covariance: np.ndarray) -> list[float]:
     return [float(value) for value in full.ravel()]
 
 
-def covariance_of(numbers: Any) -> np.ndarray:
-    """Return the (3, 3) covariance of x, y and yaw out of the 36 numbers of geometry_msgs/PoseWithCovariance."""
-    full = np.asarray(numbers, np.float64).reshape(6, 6)
-    part = full[np.ix_((0, 1, 5), (0, 1, 5))]
-    if not np.isfinite(part).all():
-        raise ValueError(f"message.pose.covariance: must be finite, got {part.tolist()}")
-    part = 0.5 * (part + part.T)
-    least = float(np.linalg.eigvalsh(part).min())
-    if least < -_ROUNDING * max(float(part.diagonal().max()), 0.0):
-        raise ValueError(
-            f"message.pose.covariance: must be positive semidefinite, got an eigenvalue of {least:.3g} for x, y and yaw"
-        )
-    return part
-
-
 def start_of(message: Any, frame: str) -> tuple[Pose, np.ndarray]:
     """Return the pose and the (3, 3) covariance of a PoseWithCovarianceStamped, which must be in ``frame``."""
     named = str(field("message", message, "header.frame_id")).strip("/")
     if named != frame.strip("/"):
         raise ValueError(f"message.header.frame_id: must be {frame!r}, got {named!r}")
     pose = planar_pose("message.pose", field("message", message, "pose.pose"))
-    return pose, covariance_of(field("message", message, "pose.covariance"))
+    return pose, planar_covariance(field("message", message, "pose.covariance"))
 
 
 def odometry_fields(message: Any, frames: tuple[str, str]) -> dict[str, Any]:
@@ -102,7 +84,8 @@ def laser_scan(
         farthest = far
     if near is not None and not near <= nearest < farthest:
         nearest = near
-    return Scanner.from_laser_scan(fields, mount, range_max=farthest, range_min=nearest), fields
+    scanner = Scanner.from_laser_scan(fields, mount, range_max=farthest, range_min=nearest)
+    return scanner, fields | {"range_min": scanner.range_min, "range_max": scanner.range_max}
 
 
 def cloud_fields(particles: np.ndarray, weights: np.ndarray, most: int = 2000) -> list[dict[str, Any]]:

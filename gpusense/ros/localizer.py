@@ -14,6 +14,7 @@ from gpusense.evaluation.tracking import RISK
 from gpusense.localization.nav2 import Nav2Options
 from gpusense.localization.run_causes import CAUSES_OF_RUNS, diagnose_run
 from gpusense.localization.scan_motion import Moment
+from gpusense.logs.bag_beams import Beams
 from gpusense.logs.records import Pose
 from gpusense.logs.transform_buffer import BACK, TransformError
 from gpusense.ros.conversions import (
@@ -29,7 +30,7 @@ from gpusense.ros.conversions import (
     status_fields,
 )
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.messages import spread_readings, stamp_of
+from gpusense.world.messages import stamp_of
 from gpusense.world.scanner import Scanner
 
 PLACES = 1440
@@ -65,7 +66,7 @@ class Localizer:
         self.grid: OccupancyGrid | None = None
         self.filter: Any = None
         self._scanner: Scanner | None = None
-        self._spread = False
+        self._beams: Beams | None = None
         self.estimate: Any = None
         self.counted = 0
         # Text of the likely cause of the last estimate; None before the search.
@@ -199,20 +200,14 @@ class Localizer:
         The first scan's geometry is the scanner. After a scan of another geometry, all scans move to common bearings,
         so that varying beams need only a second model. Readings of 0 are missing, and each scan keeps its limits.
         """
-        if self._scanner is None or self.filter is None:
-            self._spread = False
+        limits = scanner.range_min, scanner.range_max
+        if self._scanner is None or self._beams is None or self.filter is None:
+            self._beams = Beams(fields["angle_min"], fields["angle_increment"], scanner.count, *limits)
             self._make(scanner)
-        elif not self._spread and not alike(scanner, self._scanner):
-            self._spread = True
-            self._make(Scanner.uniform(
-                angle_min=-math.pi, angle_increment=2 * math.pi / PLACES, count=PLACES, range_max=scanner.range_max,
-                range_min=scanner.range_min, mount=scanner.mount,
-            ))  # fmt: skip
-        ranges = spread_readings(fields, PLACES) if self._spread else np.array(fields["ranges"], np.float64)
-        ranges[ranges == 0] = math.nan
-        ranges[ranges < scanner.range_min] = math.nan
-        ranges[ranges >= scanner.range_max] = math.inf
-        return ranges
+        elif not self._beams.varied and not alike(scanner, self._scanner):
+            self._beams = Beams(-math.pi, 2 * math.pi / PLACES, PLACES, *limits, varied=True)
+            self._make(self._beams.scanner(scanner.mount, upside_down=False))
+        return self._beams.take(fields)[0]
 
     def _make(self, scanner: Scanner | None) -> None:
         assert self.grid is not None and scanner is not None

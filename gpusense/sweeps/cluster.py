@@ -14,28 +14,30 @@ import itertools
 import logging
 import pickle
 import secrets
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent import futures
-from concurrent.futures import CancelledError, Future, InvalidStateError
+from concurrent.futures import BrokenExecutor, CancelledError
 from pathlib import Path
 from typing import Any
 
 from gpusense._util import checks
 from gpusense._util.extras import library
-from gpusense.sweeps.executors import DEVICES, Terminable, answer, device_names, one_start, processes
-from gpusense.sweeps.process import WorkerDied, error_text, result_of
+from gpusense.sweeps.executors import SupervisedExecutor, device_names
+from gpusense.sweeps.process import Worker, WorkerDied, error_text
 
 _LOG = logging.getLogger("gpusense")
 _LOOPBACK = "127.0.0.1"
 # Resource of a Dask worker that represents its device; a job takes one.
 _RESOURCE = "gpusense"
-# Seconds between two checks of the cluster, for the scheduler to answer, and for workers to end their jobs.
-_LOOK, _ANSWER, _GOODBYE = 1.0, 5.0, 10.0
+# Most calls at once.
+_MOST_CALLS = 4096
+# Seconds between two checks of the cluster, and of a call, for the scheduler to answer, and for workers to end.
+_LOOK, _LOOK_CALL, _ANSWER, _GOODBYE = 1.0, 0.25, 5.0, 10.0
 
 
-class DaskExecutor(Terminable):
+class DaskExecutor(SupervisedExecutor):
     """Jobs on a Dask cluster, one at a time on each worker, in a process that the worker supervises.
 
     Workers of a cluster at an address are started by ``GPUSENSE_SWEEP_DEVICE=warp:cuda:0 dask worker ADDRESS
@@ -73,13 +75,13 @@ class DaskExecutor(Terminable):
     ) -> None:
         library("distributed", "a sweep on Dask")
         self._patience = checks.real("timeout", timeout, above=0)
-        self._seconds = None if job_timeout is None else checks.real("job_timeout", job_timeout, above=0)
         names = device_names(devices) if address is None else []
-        self._name, self._numbers, self._lost = secrets.token_hex(8), itertools.count(), ""
-        self._lock, self._end, self._open = threading.Lock(), threading.Event(), set[Future[Any]]()
-        self._client: Any
-        self._cluster: Any
-        self._client = self._cluster = None
+        super().__init__(_MOST_CALLS, job_timeout)
+        self._name, self._numbers = f"gpusense-{secrets.token_hex(8)}", itertools.count()
+        # Why the cluster is lost; empty before.
+        self._lost, self._end = "", threading.Event()
+        self._client: Any = None
+        self._cluster: Any = None
         try:
             self._connect(address, names, security)
             self.address = str(self._client.scheduler.address)
@@ -90,7 +92,7 @@ class DaskExecutor(Terminable):
             self.slots = self._usable(workers)
             threading.Thread(target=self._watch, name="gpusense-sweep-watch", daemon=True).start()
         except BaseException:
-            self._leave()
+            self.end()
             raise
 
     def _connect(self, address: str | None, names: list[str], security: Any) -> None:
@@ -107,7 +109,7 @@ class DaskExecutor(Terminable):
             target = address if self._cluster is None else self._cluster
             self._client = distributed.Client(target, timeout=self._patience, security=security, set_as_default=False)
             self._client.wait_for_workers(1, timeout=self._patience)
-            self._client.register_plugin(one_start(self._name), name=f"gpusense-{self._name}")
+            self._client.register_plugin(_one_start(self._name), name=self._name)
             self.send({})
         except (ImportError, AttributeError, pickle.PickleError) as error:
             raise ImportError(f"dask: every worker must have this version of gpusense, got {error}") from error
@@ -154,107 +156,68 @@ class DaskExecutor(Terminable):
 
     def _watch(self) -> None:
         """Follow the workers of the cluster until it is lost; no call may wait for a watch that has failed."""
+        try:
+            self._lost = self._lost or self._followed()
+        except Exception as error:
+            _LOG.error("sweep: the workers could not be followed", exc_info=True)
+            self._lost = f"the workers could not be followed: {error_text(error)}"
+
+    def _followed(self) -> str:
+        """Follow the workers of the cluster until it is lost, and return the reason."""
         answered = present = time.monotonic()
         while not self._end.wait(_LOOK):
-            try:
-                workers, now = self._workers() if self.alive else None, time.monotonic()
-                if not self.alive:
-                    self._lose("the scheduler has ended")
-                elif workers is None:
-                    if now - answered > self._patience:
-                        self._lose(f"the scheduler has not answered for {self._patience:g} s")
-                else:
-                    before, self.slots, answered = self.slots, self._usable(workers), now
-                    if self.slots:
-                        present = now
-                    elif before:
-                        _LOG.warning("sweep: no worker is left, waiting %g s for one", self._patience)
-                    elif now - present > self._patience:
-                        self._lose(f"no worker has been there for {self._patience:g} s")
-            except Exception as error:
-                _LOG.error("sweep: the workers could not be followed", exc_info=True)
-                self._lose(f"the workers could not be followed: {error_text(error)}")
-
-    def _lose(self, reason: str) -> None:
-        """End all calls, and accept no further ones."""
-        self._end.set()
-        with self._lock:
-            self._lost = self._lost or reason
-            running = list(self._open)
-        for future in running:
-            with contextlib.suppress(InvalidStateError):
-                future.set_exception(OSError(self._lost))
+            if not self.alive:
+                return "the scheduler has ended"
+            workers, now = self._workers(), time.monotonic()
+            if workers is None:
+                if now - answered > self._patience and self.alive:
+                    return f"the scheduler has not answered for {self._patience:g} s"
+                continue
+            before, self.slots, answered = self.slots, self._usable(workers), now
+            if self.slots:
+                present = now
+            elif before:
+                _LOG.warning("sweep: no worker is left, waiting %g s for one", self._patience)
+            elif now - present > self._patience:
+                return f"no worker has been there for {self._patience:g} s"
+        return "the executor has been shut down"
 
     # ---- calls
 
     def send(self, contents: Mapping[str, Any]) -> None:
         """Send maps and the bytes of logs once to each worker, including workers that join later."""
-        self._client.register_plugin(processes(self._name, dict(contents)), name=f"gpusense-{self._name}")
+        self._client.register_plugin(_process(dict(contents)), name=self._name)
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Queue a function for the next free worker; if the worker ends, the future raises :class:`WorkerDied`."""
+    def call(self, function: Callable[..., Any], args: Any, kwargs: Any) -> bytes:
+        """Run a function in the process of the next free worker."""
         import cloudpickle
-
-        # Another machine may lack the function's module.
-        payload, future = bytes(cloudpickle.dumps((fn, args, kwargs))), Future[Any]()
-        with self._lock:
-            if self._lost:
-                raise RuntimeError(self._lost)
-            self._open.add(future)
-        number = next(self._numbers)
-        remote = self._client.submit(
-            answer, self._name, payload, self._seconds, key=f"gpusense-{self._name}-{number}", priority=-number,
-            retries=0, **({"resources": {_RESOURCE: 1}} if self._pinned else {}),
-        )  # fmt: skip
-        remote.add_done_callback(lambda done: self._settle(future, done))
-        future.add_done_callback(lambda done: self._closed(done, remote))
-        return future
-
-    def _settle(self, future: Future[Any], remote: Any) -> None:
-        """Hand the end of a Dask task to the future of its call."""
         import distributed
 
-        value: Any = None
-        error: BaseException | None = None
+        # Another machine may lack the function's module.
+        payload, done = bytes(cloudpickle.dumps((function, args, kwargs))), threading.Event()
+        number = next(self._numbers)
+        remote = self._client.submit(
+            _answer, self._name, payload, self._seconds, key=f"{self._name}-{number}", priority=-number, retries=0,
+            **({"resources": {_RESOURCE: 1}} if self._pinned else {}),
+        )  # fmt: skip
+        remote.add_done_callback(lambda _: done.set())
+        while not done.wait(_LOOK_CALL) and not self._lost:
+            pass
         try:
-            value = result_of(remote.result(timeout=self._patience))
+            return remote.result(timeout=self._patience if done.is_set() else 0)
         except distributed.KilledWorker:
-            error = WorkerDied("with its Dask worker", outside=True)
-        except TimeoutError:
-            error = WorkerDied("before its result was fetched", outside=True)
-        except (CancelledError, distributed.CancelledError):
-            error = CancelledError("the scheduler has lost the job")
-        except BaseException as problem:
-            error = problem
-        with contextlib.suppress(InvalidStateError):
-            future.set_result(value) if error is None else future.set_exception(error)
-
-    def _closed(self, future: Future[Any], remote: Any) -> None:
-        """Forget a call, and end it if it was cancelled."""
-        with self._lock:
-            self._open.discard(future)
-        if future.cancelled() and self.alive:
-            with contextlib.suppress(Exception):
-                remote.cancel()
+            raise WorkerDied("with its Dask worker", outside=True) from None
+        except (TimeoutError, CancelledError, distributed.CancelledError):
+            if done.is_set() and not remote.cancelled():
+                raise WorkerDied("before its result was fetched", outside=True) from None
+            raise OSError(self._lost or "the scheduler has lost the job") from None
 
     # ---- the end
 
-    def terminate(self) -> None:
+    def end(self) -> None:
         """End the running jobs, and leave the cluster."""
-        self._lose("the executor has been shut down")
-        self._leave()
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Leave the cluster after the running jobs, and end it if it was started here."""
-        with self._lock:
-            running = list(self._open)
-        for future in running if cancel_futures else ():
-            future.cancel()
-        if wait:
-            futures.wait(running)
-        self.terminate()
-
-    def _leave(self) -> None:
+        self._lost = self._lost or "the executor has been shut down"
+        self._end.set()
         # A client without a scheduler would log its failed reconnection.
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         if self._client is not None and self.alive:
@@ -269,8 +232,8 @@ class DaskExecutor(Terminable):
 
     def _say_goodbye(self) -> None:
         with contextlib.suppress(Exception):
-            self._client.unregister_worker_plugin(f"gpusense-{self._name}")
-            self._client.unregister_scheduler_plugin(f"gpusense-{self._name}")
+            self._client.unregister_worker_plugin(self._name)
+            self._client.unregister_scheduler_plugin(self._name)
 
 
 def _check_address(address: str) -> None:
@@ -301,8 +264,73 @@ def _local_cluster(names: list[str], security: Any) -> Any:
         cluster = distributed.SpecCluster(
             scheduler=scheduler, workers=specification, silence_logs=50, asynchronous=False, security=security
         )
-    DEVICES.update({worker.id: names[index] for index, worker in cluster.workers.items()})
+    for index, worker in cluster.workers.items():
+        worker.gpusense_device = names[index]
     return cluster
+
+
+def _answer(name: str, payload: bytes, seconds: float) -> bytes:
+    """Run a call of at most ``seconds`` in the process of the present Dask worker; return the pickle of its answer."""
+    import distributed
+
+    dask_worker = distributed.get_worker()
+    task = dask_worker.get_current_task()
+
+    def wanted() -> bool:
+        """Return whether the task is still wanted; Dask forgets the tasks of a killed client."""
+        state = dask_worker.state.tasks.get(task)
+        return state is not None and state.state == "executing"
+
+    try:
+        answer: bytes = dask_worker.plugins[name].process.call(payload, seconds, wanted)
+        return answer
+    except BrokenExecutor as error:
+        return pickle.dumps((False, error))
+
+
+def _process(contents: dict[str, Any]) -> Any:
+    """Return the plugin of Dask workers that keeps an executor's process, with maps and the bytes of logs."""
+    import distributed
+
+    class Process(distributed.WorkerPlugin):  # type: ignore[misc]
+        """The process of an executor's jobs on a worker."""
+
+        def setup(self, worker: Any) -> None:
+            """Make the process, and write the logs as files, which outlive it."""
+            self.folder = tempfile.TemporaryDirectory(prefix="gpusense-sweep-")
+            sent = dict(contents)
+            for index, (path, content) in enumerate(contents.items()):
+                if isinstance(content, bytes):
+                    # Only the suffixes are taken from the sender, since they select the format.
+                    sent[path] = Path(self.folder.name) / f"{index}{''.join(Path(path).suffixes[-2:])}"
+                    sent[path].write_bytes(content)
+            self.process = Worker(getattr(worker, "gpusense_device", ""), sent)
+
+        def teardown(self, worker: Any) -> None:
+            """End the process, also during a job, and remove the files."""
+            self.process.close()
+            self.folder.cleanup()
+
+    return Process()
+
+
+def _one_start(name: str) -> Any:
+    """Return the plugin of the scheduler that lets an executor's tasks fail with their Dask worker."""
+    import distributed
+
+    class OneStart(distributed.SchedulerPlugin):  # type: ignore[misc]
+        """Let Dask repeat no job whose worker has ended: the sweep counts its starts."""
+
+        async def start(self, scheduler: Any) -> None:
+            """Keep the scheduler."""
+            self.scheduler = scheduler
+
+        def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:
+            """Allow a job that goes to a worker no further failure."""
+            if finish == "processing" and str(key).startswith(f"{name}-"):
+                self.scheduler.tasks[key].suspicious = self.scheduler.allowed_failures
+
+    return OneStart()
 
 
 def security_of(authority: Path, certificate: Path, key: Path) -> Any:

@@ -1,4 +1,4 @@
-"""Executors with the standard library's interface: in this process, in processes, or within Dask's workers.
+"""Executors with the standard library's interface: in this process, or with workers that a thread each supervises.
 
 ``submit(function, *arguments)`` returns a ``concurrent.futures.Future``. Each has ``slots``, the number of jobs that it
 runs at once. The death of a worker raises :class:`WorkerDied` in the future of its job, and the executor replaces the
@@ -7,18 +7,17 @@ worker.
 
 from __future__ import annotations
 
+import math
 import pickle
 import queue
-import tempfile
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from types import TracebackType
 from typing import Any
 
 from gpusense._util import checks
-from gpusense.sweeps.process import Worker, deafen, result_of
+from gpusense.sweeps.process import Worker
 
 
 class SerialExecutor(Executor):
@@ -45,12 +44,43 @@ class SerialExecutor(Executor):
         return future
 
 
-class Terminable(Executor):
-    """Executor that ends its jobs at once if its ``with`` block ends by an exception."""
+class SupervisedExecutor(Executor):
+    """Executor with a thread for each running call; it ends calls if its ``with`` block ends by an exception."""
+
+    def __init__(self, threads: int, job_timeout: float | None) -> None:
+        self._seconds = math.inf if job_timeout is None else checks.real("job_timeout", job_timeout, above=0)
+        self._threads = ThreadPoolExecutor(threads, "gpusense-sweep")
+
+    def call(self, function: Callable[..., Any], args: Any, kwargs: Any) -> bytes:
+        """Run a function in a worker, and return the pickle of its success and of its result or error."""
+        raise NotImplementedError
+
+    def end(self) -> None:
+        """End the workers at once, together with their jobs."""
+        raise NotImplementedError
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Queue a function for the next free worker; if that ends, the future raises :class:`WorkerDied`."""
+        return self._threads.submit(self._run, fn, args, kwargs)
+
+    def _run(self, *call: Any) -> Any:
+        succeeded, value = pickle.loads(self.call(*call))
+        if succeeded:
+            return value
+        raise value
 
     def terminate(self) -> None:
-        """End the running jobs."""
-        raise NotImplementedError
+        """End the workers at once, together with their jobs."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        self.end()
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the workers after their running jobs."""
+        self._threads.shutdown(wait=wait, cancel_futures=cancel_futures)
+        if wait:
+            self.end()
+        else:
+            threading.Thread(target=self.shutdown, name="gpusense-sweep-end").start()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -60,7 +90,7 @@ class Terminable(Executor):
         return super().__exit__(kind, error, trace)
 
 
-class ProcessExecutor(Terminable):
+class ProcessExecutor(SupervisedExecutor):
     """Run jobs in a spawned process for each device.
 
     A process runs one job at a time. If it ends during its job, it raises :class:`WorkerDied` in the job's future and
@@ -84,48 +114,34 @@ class ProcessExecutor(Terminable):
     """
 
     def __init__(self, devices: int | Sequence[str] = 1, *, job_timeout: float | None = None) -> None:
-        self._seconds = None if job_timeout is None else checks.real("job_timeout", job_timeout, above=0)
         self._names = device_names(devices)
         self.slots = len(self._names)
-        # A thread for each process hands it one job after another.
-        self._threads = ThreadPoolExecutor(self.slots, "gpusense-sweep", deafen)
-        self._free: queue.SimpleQueue[Worker] = queue.SimpleQueue()
+        super().__init__(self.slots, job_timeout)
         self._all = [Worker(name) for name in self._names]
+        self._free: queue.SimpleQueue[Worker] = queue.SimpleQueue()
         for one in self._all:
             self._free.put(one)
 
     def __repr__(self) -> str:
         return f"ProcessExecutor({self._names if any(self._names) else self.slots})"
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Queue a function of a module for the next free process."""
-        return self._threads.submit(self._run, fn, args, kwargs)
-
-    def _run(self, fn: Callable[..., Any], args: Any, kwargs: Any) -> Any:
-        payload, worker = pickle.dumps((fn, args, kwargs)), self._free.get()
-        try:
-            return result_of(worker.call(payload, self._seconds))
-        finally:
-            self._free.put(worker)
-
     @property
     def processes(self) -> tuple[int, ...]:
         """Identifiers of the running processes."""
         return tuple(number for one in self._all for number in one.processes)
 
-    def terminate(self) -> None:
+    def call(self, function: Callable[..., Any], args: Any, kwargs: Any) -> bytes:
+        """Run a function of a module in a free process."""
+        payload, worker = pickle.dumps((function, args, kwargs)), self._free.get()
+        try:
+            return worker.call(payload, self._seconds)
+        finally:
+            self._free.put(worker)
+
+    def end(self) -> None:
         """End the processes at once, together with their jobs."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
         for one in self._all:
             one.close()
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes after their running jobs."""
-        self._threads.shutdown(wait=wait, cancel_futures=cancel_futures)
-        if wait:
-            self.terminate()
-        else:
-            threading.Thread(target=self.shutdown, name="gpusense-sweep-end").start()
 
 
 def device_names(devices: int | Sequence[str]) -> list[str]:
@@ -136,83 +152,3 @@ def device_names(devices: int | Sequence[str]) -> list[str]:
     if not names or not all(isinstance(name, str) for name in names):
         raise ValueError(f"devices: must be at least one worker, got {checks.show(devices)}")
     return names
-
-
-# Processes by Dask worker and executor, since a cluster on one machine has several workers in a process.
-_WORKERS: dict[tuple[str, str], tuple[Worker, tempfile.TemporaryDirectory[str]]] = {}
-# Devices of the Dask workers of this process; other workers use the device of their environment.
-DEVICES: dict[str, str] = {}
-
-
-def take(worker: str, executor: str, contents: Mapping[str, Any]) -> None:
-    """Keep maps and logs for an executor's process; logs are stored as files, which outlive a process."""
-    folder = tempfile.TemporaryDirectory(prefix="gpusense-sweep-")
-    sent = dict(contents)
-    for index, (path, content) in enumerate(contents.items()):
-        if isinstance(content, bytes):
-            # Only the suffixes are taken from the sender, since they select the format.
-            sent[path] = Path(folder.name) / f"{index}{''.join(Path(path).suffixes[-2:])}"
-            sent[path].write_bytes(content)
-    _WORKERS[worker, executor] = Worker(DEVICES.get(worker, ""), sent), folder
-
-
-def leave(worker: str, executor: str) -> None:
-    """End an executor's process, also during a job, and remove its files."""
-    process, folder = _WORKERS.pop((worker, executor))
-    process.close()
-    folder.cleanup()
-
-
-def answer(executor: str, payload: bytes, seconds: float | None) -> bytes:
-    """Run a call of at most ``seconds`` in a process of the present Dask worker; return the pickle of its answer."""
-    import distributed
-
-    dask_worker = distributed.get_worker()
-    task = dask_worker.get_current_task()
-
-    def wanted() -> bool:
-        """Return whether the task is still wanted; Dask forgets the tasks of a killed client."""
-        state = dask_worker.state.tasks.get(task)
-        return state is not None and state.state == "executing"
-
-    try:
-        return _WORKERS[dask_worker.id, executor][0].call(payload, seconds, wanted)
-    except BrokenExecutor as error:
-        return pickle.dumps((False, error))
-
-
-def processes(name: str, contents: dict[str, Any]) -> Any:
-    """Return the plugin of Dask workers that keeps an executor's process, with maps and the bytes of logs."""
-    import distributed
-
-    class Processes(distributed.WorkerPlugin):  # type: ignore[misc]
-        """The process of an executor's jobs on a worker."""
-
-        def setup(self, worker: Any) -> None:
-            """Take the contents."""
-            take(worker.id, name, contents)
-
-        def teardown(self, worker: Any) -> None:
-            """End the process, also during a job."""
-            leave(worker.id, name)
-
-    return Processes()
-
-
-def one_start(name: str) -> Any:
-    """Return the plugin of the scheduler that lets an executor's tasks fail with their Dask worker."""
-    import distributed
-
-    class OneStart(distributed.SchedulerPlugin):  # type: ignore[misc]
-        """Let Dask repeat no job whose worker has ended: the sweep counts its starts."""
-
-        async def start(self, scheduler: Any) -> None:
-            """Keep the scheduler."""
-            self.scheduler = scheduler
-
-        def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:
-            """Allow a job that goes to a worker no further failure."""
-            if finish == "processing" and str(key).startswith(f"gpusense-{name}-"):
-                self.scheduler.tasks[key].suspicious = self.scheduler.allowed_failures
-
-    return OneStart()

@@ -143,18 +143,15 @@ class Store:
         reads: Number of maps and logs read, and of models made.
     """
 
-    def __init__(self, root: str | Path, device: str = "auto") -> None:
+    def __init__(self, root: str | Path, device: str = "auto", sent: Mapping[str, Any] | None = None) -> None:
         self._root, self.device, self.reads = Path(root), device, 0
         self._kept: dict[str, OrderedDict[Hashable, Any]] = {}
-        self._sent: dict[str, Any] = {}
+        # Maps, and files of logs, in place of the files under the root.
+        self._sent = dict(sent or {})
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{len(kept)} {kind}" for kind, kept in self._kept.items())
         return f"Store({str(self._root)!r}, device={self.device!r}, {counts or 'empty'})"
-
-    def receive(self, sent: Mapping[str, Any]) -> None:
-        """Use sent maps, and files of logs, instead of the files under the root."""
-        self._sent.update(sent)
 
     def path(self, name: str) -> Path:
         """Return the path of a log or another file."""

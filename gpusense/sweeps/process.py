@@ -1,12 +1,13 @@
 """Run one call at a time in a process; watch, end and replace it.
 
-Each process has a separate ``concurrent.futures.ProcessPoolExecutor``, so that its end fails only its call. All
-executors run their jobs in such processes; with Dask they are children of the Dask workers.
+All executors run their jobs in such processes; with Dask they are children of the Dask workers.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import math
 import multiprocessing
 import os
 import pickle
@@ -17,8 +18,9 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, wait
-from multiprocessing.context import SpawnContext, SpawnProcess
+from concurrent.futures import BrokenExecutor
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from typing import Any, NamedTuple
 
 from gpusense.sweeps.job import Job, Store
@@ -35,25 +37,23 @@ class Outcome(NamedTuple):
 
     values: dict[str, Any]  # columns of its row by name; empty after a failure
     error: str  # the error in one line; empty after success
-    trace: str  # traceback of the error, for a log
-    seconds: float  # time of the job [s]
-    cpu_seconds: float  # processor time of the worker's process during the job [s]
-    worker: str  # host and process of the worker
-    device: str  # selection string of the device
+    trace: str = ""  # traceback of the error, for a log
+    seconds: float = 0.0  # time of the job [s]
+    cpu_seconds: float = 0.0  # processor time of the worker's process during the job [s]
+    worker: str = ""  # host and process of the worker
+    device: str = ""  # selection string of the device
 
 
 # A worker runs one job at a time, since device and store serve only one.
 _LOCK = threading.Lock()
-# Stores by root, device and sweep, since files may change between sweeps.
-_STORES: dict[tuple[str, str, str], Store] = {}
-_SENT: dict[str, Any] = {}
+# Maps, and files of logs, that this process was sent.
+SENT: dict[str, Any] = {}
 
 
-def receive(sent: Mapping[str, Any]) -> None:
-    """Keep the sent maps and logs for all jobs of this process."""
-    with _LOCK:
-        _SENT.update(sent)
-        _STORES.clear()
+@functools.lru_cache(maxsize=1)
+def _store(root: str, device: str, sweep: str) -> Store:
+    """Return the store of a sweep; another sweep reads its files again, since they may have changed."""
+    return Store(root, device, SENT)
 
 
 def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:
@@ -61,15 +61,10 @@ def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:
     chosen = os.environ.get(DEVICE) or device
     with _LOCK:
         begin, begin_cpu = time.perf_counter(), time.process_time()
-        key = (root, chosen, sweep)
-        if key not in _STORES:
-            _STORES.clear()
-            _STORES[key] = Store(root, chosen)
-            _STORES[key].receive(_SENT)
         values: dict[str, Any] = {}
         error = trace = ""
         try:
-            found = task_of(job)(job, _STORES[key])
+            found = task_of(job)(job, _store(root, chosen, sweep))
             # Python's numbers in place of NumPy's.
             values = {name: value.item() if hasattr(value, "item") else value for name, value in found.items()}
         except KeyboardInterrupt:
@@ -89,18 +84,6 @@ def error_text(error: BaseException) -> str:
     except Exception:
         text = f"{type(error).__name__} without a text"
     return " ".join(text.split())[:_LONGEST]
-
-
-# Most consecutive processes that end before taking a call.
-_STARTS = 3
-# Interval between checks of a process, and time for it to end after a kill [s].
-_LOOK, _GRACE = 0.25, 10.0
-# Threads of the libraries of linear algebra: jobs run side by side, and threads that wait for small matrices take turns
-# at the processors of other jobs. Dask starts its workers so.
-_SINGLE = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-_STARTING = threading.Lock()
-# If memory is short, the system ends workers before their parent.
-_EXPENDABLE = "500"
 
 
 class WorkerDied(BrokenExecutor):
@@ -150,143 +133,135 @@ def death(code: int | None) -> WorkerDied:
     return WorkerDied(f"by {name}", outside=name == "SIGKILL")
 
 
-class _Spawn(SpawnContext):
-    """Start processes anew, since drivers do not survive a fork, and keep the last one, which knows its exit code."""
-
-    last: SpawnProcess | None = None
-
-    def Process(self, *args: Any, **kwargs: Any) -> SpawnProcess:  # type: ignore[override]
-        self.last = SpawnProcess(*args, **kwargs)
-        return self.last
+# Processes start anew, since drivers do not survive a fork.
+_SPAWN = multiprocessing.get_context("spawn")
+# Most consecutive processes that end before taking a call.
+_STARTS = 3
+# Interval between checks of a process, and time for it to end after a kill [s].
+_LOOK, _GRACE = 0.25, 10.0
+# Threads of the libraries of linear algebra: jobs run side by side, and threads that wait for small matrices take turns
+# at the processors of other jobs. Dask starts its workers so.
+_SINGLE = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+_STARTING = threading.Lock()
+# If memory is short, the system ends workers before their parent.
+_EXPENDABLE = "500"
 
 
 class Worker:
     """A process that starts on first use and after its end, with sent maps and logs; it may choose no ``device``."""
 
     def __init__(self, device: str, sent: Mapping[str, Any] | None = None) -> None:
-        self._device, self._sent, self._closed = device, sent or {}, False
-        self._pool: ProcessPoolExecutor | None = None
-        self._context = _Spawn()
-        self._calls = threading.Lock()
+        self._options = device, dict(sent or {})
+        self._process: SpawnProcess | None = None
+        self._pipe: Connection | None = None
+        self._closed, self._calls = False, threading.Lock()
 
     @property
     def processes(self) -> tuple[int, ...]:
         """Identifier of the process, if it runs."""
-        process = self._context.last
+        process = self._process
         return () if process is None or process.pid is None or process.exitcode is not None else (process.pid,)
 
-    def call(self, payload: bytes, seconds: float | None = None, wanted: Callable[[], bool] = lambda: True) -> bytes:
+    def call(self, payload: bytes, seconds: float = math.inf, wanted: Callable[[], bool] = lambda: True) -> bytes:
         """Run a pickled call of at most ``seconds`` in the process, and return the pickle of its answer.
 
         The process is ended once ``wanted()`` is false. Raises BrokenExecutor if processes end before they take a call,
         JobTimeout, and WorkerDied.
         """
         with self._calls:
-            pool, process = self._started()
-            end = None if seconds is None else time.monotonic() + seconds
-            try:
-                answer = pool.submit(_answer, payload)
-            except BrokenExecutor:
-                raise death(self._ended()) from None
-            while not answer.done():
-                wait([answer], _LOOK if end is None else min(_LOOK, max(end - time.monotonic(), 0)))
-                if process.exitcode is not None:
-                    # Child processes of the call may hold its pipes open and hide its end from the pool.
-                    self._ended()
-                    wait([answer], _GRACE)
+            for start in range(1, _STARTS + 1):
+                try:
+                    # The end of a process between two calls costs no start of a job.
+                    self._exchange(b"", math.inf, wanted)
                     break
-                if not answer.done() and (self._closed or not wanted()):
-                    self._ended()
+                except WorkerDied as error:
+                    if start == _STARTS:
+                        rule = "worker: must start (a script needs the guard if __name__ == '__main__')"
+                        raise BrokenExecutor(f"{rule}, got {start} that ended {error.how}") from None
+            return self._exchange(payload, seconds, wanted)
+
+    def _exchange(self, payload: bytes, seconds: float, wanted: Callable[[], bool]) -> bytes:
+        """Send a call to the process, which is started if necessary, and wait for its answer or its end."""
+        process, pipe = self._started()
+        end = time.monotonic() + seconds
+        try:
+            pipe.send_bytes(payload)
+            while not pipe.poll(min(_LOOK, max(end - time.monotonic(), 0))):
+                # Child processes of the call may hold its end of the pipe open.
+                if process.exitcode is not None:
+                    raise EOFError
+                if self._closed or not wanted():
+                    self._end(process)
                     raise WorkerDied("as nothing waits for its job any more")
-                if not answer.done() and end is not None and time.monotonic() >= end:
-                    self._ended()
+                if time.monotonic() >= end:
+                    self._end(process)
                     raise JobTimeout(f"after the limit of {seconds:g} s")
-            if answer.done() and answer.exception() is None:
-                return answer.result()
-            raise death(self._ended())
+            return pipe.recv_bytes()
+        except (EOFError, OSError):
+            raise death(self._end(process)) from None
 
-    def _started(self) -> tuple[ProcessPoolExecutor, SpawnProcess]:
-        """Start the process if necessary, wait for its answer, and return its pool and it."""
-        for _ in range(_STARTS):
-            if self._closed:
-                raise BrokenExecutor("worker: must not be used after its executor has ended")
-            try:
-                if self._pool is None:
-                    self._pool = ProcessPoolExecutor(1, self._context, _begin, (self._device, self._sent))
-                with _single_threads():
-                    answer = self._pool.submit(os.getpid)
-                answer.result()
-            except BrokenExecutor:
-                ended = death(self._ended())
-            except OSError as error:
-                raise BrokenExecutor(f"worker: must start, got {error}") from error
-            else:
-                assert self._context.last is not None
-                return self._pool, self._context.last
-        rule = "worker: must start (a script needs the guard if __name__ == '__main__')"
-        raise BrokenExecutor(f"{rule}, got {_STARTS} that ended {ended.how}")
-
-    def _ended(self) -> int | None:
-        """End the process and everything that it has started, and return its exit code."""
-        process, pool, self._pool = self._context.last, self._pool, None
-        self.kill()
-        if pool is not None:
-            pool.shutdown(wait=False, cancel_futures=True)
-        end = time.monotonic() + _GRACE
-        # The pool's thread may fetch the exit code first and store it later.
-        while process is not None and process.exitcode is None and time.monotonic() < end:
-            time.sleep(0.002)
+    def _started(self) -> tuple[SpawnProcess, Connection]:
         if self._closed:
             raise BrokenExecutor("worker: must not be used after its executor has ended")
-        return None if process is None else process.exitcode
+        if self._process is None or self._pipe is None:
+            try:
+                self._pipe, other = _SPAWN.Pipe()
+                self._process = _SPAWN.Process(target=_serve, args=(other, *self._options), daemon=True)
+                with other, _starting():
+                    self._process.start()
+            except OSError as error:
+                self._process = None
+                raise BrokenExecutor(f"worker: must start, got {error}") from error
+        return self._process, self._pipe
+
+    def _end(self, process: SpawnProcess) -> int | None:
+        """End the process and everything that it has started, and return its exit code."""
+        self.kill()
+        end = time.monotonic() + _GRACE
+        while process.exitcode is None and time.monotonic() < end:
+            time.sleep(0.002)
+        self._process = None
+        if self._closed:
+            raise BrokenExecutor("worker: must not be used after its executor has ended")
+        return process.exitcode
 
     def kill(self) -> None:
         """End the process at once, with everything that it has started."""
-        process = self._context.last
-        if process is None or process.pid is None:
-            return
-        with contextlib.suppress(OSError, ValueError):
-            if sys.platform != "win32":
+        process = self._process
+        if process is not None and process.pid is not None:
+            with contextlib.suppress(OSError, AttributeError):
                 os.killpg(process.pid, signal.SIGKILL)
-            process.kill()
+            with contextlib.suppress(OSError, ValueError):
+                process.kill()
 
     def close(self) -> None:
         """End the process, also during a call, and start no other one."""
-        self._closed, pool = True, self._pool
+        self._closed, process = True, self._process
         self.kill()
-        if pool is not None:
-            pool.shutdown(cancel_futures=True)
-
-
-def result_of(answer: bytes) -> Any:
-    """Return the result of a call, or raise its error."""
-    succeeded, value = pickle.loads(answer)
-    if succeeded:
-        return value
-    raise value
-
-
-def deafen() -> None:
-    """Block Ctrl-C in this thread, and so in the processes that it starts, until they ignore it."""
-    if sys.platform != "win32":
-        from multiprocessing import resource_tracker
-
-        # A later start would unblock the signal.
-        resource_tracker.ensure_running()
-        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        if process is not None and process.pid is not None:
+            process.join(_GRACE)
 
 
 @contextlib.contextmanager
-def _single_threads() -> Iterator[None]:
-    """Give processes that start one thread for linear algebra, unless the environment says otherwise."""
+def _starting() -> Iterator[None]:
+    """Let processes start with one thread for linear algebra, unless the environment says otherwise, deaf to Ctrl-C."""
     with _STARTING:
         # Workers of Dask are daemons, which may not start processes by default.
         multiprocessing.current_process().daemon = False
         added = {name: value for name, value in _SINGLE.items() if name not in os.environ}
         os.environ.update(added)
+        mask = None
+        if sys.platform != "win32":
+            from multiprocessing import resource_tracker
+
+            # Its later start would unblock the signal.
+            resource_tracker.ensure_running()
+            mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         try:
             yield
         finally:
+            if mask is not None:
+                signal.pthread_sigmask(signal.SIG_SETMASK, mask)
             for name in added:
                 os.environ.pop(name, None)
 
@@ -294,9 +269,12 @@ def _single_threads() -> Iterator[None]:
 # ---- in the worker's process
 
 
-def _begin(device: str, sent: Mapping[str, Any]) -> None:
-    """Make the process end with its parent, but not by the parent's Ctrl-C."""
+def _serve(pipe: Connection, device: str, sent: Mapping[str, Any]) -> None:
+    """Answer calls until the parent ends, by any cause but its Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    process = multiprocessing.current_process()
+    # Jobs may start processes.
+    process.daemon = False
     if sys.platform != "win32":
         # A new process group: processes that a job has started end with the worker.
         with contextlib.suppress(OSError):
@@ -304,9 +282,9 @@ def _begin(device: str, sent: Mapping[str, Any]) -> None:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w") as file:
             file.write(_EXPENDABLE)
-    parent = multiprocessing.parent_process()
+    parent: Any = multiprocessing.parent_process()
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    if sys.platform == "linux" and parent is not None:
+    if sys.platform == "linux":
         import fcntl
 
         # The kernel ends the process even in a job that never lets another thread run.
@@ -316,7 +294,11 @@ def _begin(device: str, sent: Mapping[str, Any]) -> None:
             fcntl.fcntl(parent.sentinel, fcntl.F_SETFL, fcntl.fcntl(parent.sentinel, fcntl.F_GETFL) | os.O_ASYNC)
     if device:
         os.environ[DEVICE] = device
-    receive(sent)
+    SENT.update(sent)
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            payload = pipe.recv_bytes()
+            pipe.send_bytes(_answer(payload) if payload else b"")
 
 
 def _end_with(parent: Any) -> None:

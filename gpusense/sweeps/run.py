@@ -113,7 +113,7 @@ def run(
         pending = [job for job in unique.values() if job.key not in kept]
         counts: Counter[str] = Counter()
         setting = str(Path(root).resolve()), backend, secrets.token_hex(8)
-        starts = Starts(pending, lambda job: _submitted(chosen, job, setting), most)
+        starts = Starts(pending, lambda job: chosen.submit(work, job, *setting), most)
 
         def record(ended: Ended) -> None:
             row = rows.add(ended.job, ended.outcome, ended.starts)
@@ -122,7 +122,7 @@ def run(
             on_row(row)
 
         try:
-            for ended in starts.ended(lambda: size or _window(chosen)):
+            for ended in starts.ended(lambda: size or getattr(chosen, "window", _QUEUED * _slots(chosen))):
                 record(ended)
         except (KeyboardInterrupt, SweepLost):
             # Keep the results of finished jobs.
@@ -136,15 +136,8 @@ def run(
         return Sweep(str(rows.path), len(unique), counts[DONE], counts[FAILED], skipped, counts["repeated"])
 
 
-def _window(executor: Executor) -> int:
-    return int(getattr(executor, "window", _QUEUED * getattr(executor, "slots", os.cpu_count() or 1)))
-
-
-def _submitted(executor: Executor, job: Job, setting: tuple[str, ...]) -> Future[Any]:
-    try:
-        return executor.submit(work, job, *setting)
-    except (RuntimeError, OSError, CancelledError) as error:
-        raise SweepLost(f"executor: must take jobs, got {type(error).__name__}: {error}") from error
+def _slots(executor: Executor) -> int:
+    return int(getattr(executor, "slots", os.cpu_count() or 1))
 
 
 class Ended(NamedTuple):
@@ -195,7 +188,10 @@ class Starts:
 
     def _start(self, jobs: deque[tuple[Job, int]]) -> None:
         job, starts = jobs[0]
-        self._running[self._submit(job)] = (job, starts + 1)
+        try:
+            self._running[self._submit(job)] = (job, starts + 1)
+        except (RuntimeError, OSError, CancelledError) as error:
+            raise SweepLost(f"executor: must take jobs, got {error_text(error)}") from error
         jobs.popleft()
 
     def _ended(self, future: Future[Any]) -> Ended | None:
@@ -207,15 +203,11 @@ class Starts:
         if isinstance(error, WorkerDied):
             if isinstance(error, JobTimeout) or starts >= self._most:
                 times = f", {starts} times" if starts > 1 else ""
-                return Ended(job, _failed(f"{type(error).__name__}: {error}{times}"), starts)
+                return Ended(job, Outcome({}, f"{type(error).__name__}: {error}{times}"), starts)
             last = error.outside and starts + 1 == self._most
             (self._suspects if last else self._waiting).appendleft((job, starts))
             return None
         if isinstance(error, (BrokenExecutor, CancelledError, OSError)):
             raise SweepLost(f"executor: has ended before the sweep: {error_text(error)}") from error
         # The job's result cannot be sent, or its worker cannot run it.
-        return Ended(job, _failed(error_text(error)), starts)
-
-
-def _failed(error: str) -> Outcome:
-    return Outcome({}, error, "", 0.0, 0.0, "", "")
+        return Ended(job, Outcome({}, error_text(error)), starts)

@@ -52,41 +52,32 @@ class Table:
         try:
             self._load()
         except BaseException:
-            self.close()
+            self._stream.close()
             raise
-
-    def __repr__(self) -> str:
-        return f"Table({str(self.path)!r}, {len(self.rows)} rows, {len(self.columns)} columns)"
 
     def __enter__(self) -> Table:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the file."""
         self._stream.close()
 
     def _load(self) -> None:
         """Read the rows, and cut off a torn last line."""
         self._stream.seek(0)
         data = self._stream.read()
-        whole = data.rfind(b"\n") + 1
-        if whole < len(data):
-            self._stream.truncate(whole)
-        self._stream.seek(0, os.SEEK_END)
-        self.columns, rows = _parsed(data[:whole], self.path)
-        self.rows = {row["key"]: row for row in rows}
+        self.columns, self.rows = _parsed(data, self.path)
+        if data and not self.columns:
+            raise ValueError(f"{self.path}: must be the table of a sweep, got {checks.show(data[:40])}")
+        self._stream.truncate(data.rfind(b"\n") + 1)
 
     def add(self, job: Job, outcome: Outcome, attempts: int) -> Row:
         """Append the row of a job, and return it once the line is on the disk."""
         row = row_of(job, outcome, attempts)
-        more = [name for name in row if name not in self.columns]
         self.rows[row["key"]] = row
-        if more or not self.columns:
+        if not row.keys() <= set(self.columns):
             middle = [name for name in (*self.columns, *row) if name not in (*FIRST, *LAST)]
-            self._rewrite(self.rows.values(), (*FIRST, *dict.fromkeys(middle), *LAST))
+            self.columns = (*FIRST, *dict.fromkeys(middle), *LAST)
+            self._rewrite()
         else:
             with naming(self.path):
                 self._stream.write(_lines(self.columns, [row]))
@@ -94,26 +85,21 @@ class Table:
                 os.fsync(self._stream.fileno())
         return row
 
-    def _rewrite(self, rows: Iterable[Row], columns: tuple[str, ...]) -> None:
-        text = _lines(columns, [dict(zip(columns, columns, strict=True)), *rows])
+    def _rewrite(self) -> None:
+        text = _lines(self.columns, [dict(zip(self.columns, self.columns, strict=True)), *self.rows.values()])
         write_whole(self.path, lambda stream: stream.write(text))
         self._stream.close()
-        self.columns, self._stream = columns, _opened(self.path)
-        self._stream.seek(0, os.SEEK_END)
+        self._stream = _opened(self.path)
 
     def finish(self, keys: Sequence[str]) -> None:
         """Write the rows in plan order, then rows of unknown jobs, then the Parquet file."""
         if not self.columns:
             return
-        ordered = [self.rows[key] for key in keys if key in self.rows]
-        known = set(keys)
-        ordered += [row for key, row in self.rows.items() if key not in known]
-        self._rewrite(ordered, self.columns)
+        self.rows = {key: self.rows[key] for key in dict.fromkeys((*keys, *self.rows)) if key in self.rows}
+        self._rewrite()
         if self.parquet is not None:
             pyarrow = _pyarrow()
-            import pyarrow as arrow
-
-            table = arrow.table(columns_of(self.columns, ordered))
+            table = library("pyarrow", "a Parquet table").table(_values(self.columns, self.rows))
             write_whole(self.parquet, lambda stream: pyarrow.write_table(table, stream))
 
 
@@ -154,16 +140,14 @@ def read_table(path: str | os.PathLike[str]) -> dict[str, list[Any]]:
     if file.suffix == ".parquet":
         columns: dict[str, list[Any]] = _pyarrow().read_table(file).to_pydict()
         return columns
-    data = file.read_bytes()
-    names, rows = _parsed(data[: data.rfind(b"\n") + 1], file)
-    return columns_of(names, list({row["key"]: row for row in rows}.values()))
+    return _values(*_parsed(file.read_bytes(), file))
 
 
-def columns_of(names: Sequence[str], rows: Sequence[Mapping[str, str]]) -> dict[str, list[Any]]:
+def _values(names: Sequence[str], rows: Mapping[str, Row]) -> dict[str, list[Any]]:
     """Return the columns of rows as values: each column has one type, strings if the types of its cells differ."""
     columns: dict[str, list[Any]] = {}
     for name in names:
-        cells = [row.get(name, "") for row in rows]
+        cells = [row.get(name, "") for row in rows.values()]
         values = [_value(cell) if name != "key" else cell for cell in cells]
         kinds = {type(value) for value in values if value is not None}
         if kinds == {int, float}:
@@ -191,11 +175,8 @@ def _text(value: Any) -> str:
     """Format a cell on one line; numbers can be read back with all bits."""
     if value is None:
         return ""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, (tuple, list)):
-        return json.dumps(value)
-    return " ".join(str(value).split()) if isinstance(value, str) else repr(value)
+    text = value if isinstance(value, str) else json.dumps(value, default=repr)
+    return " ".join(text.split())
 
 
 def _lines(columns: Sequence[str], rows: Iterable[Mapping[str, str]]) -> bytes:
@@ -205,21 +186,21 @@ def _lines(columns: Sequence[str], rows: Iterable[Mapping[str, str]]) -> bytes:
     return text.getvalue().encode()
 
 
-def _parsed(data: bytes, path: Path) -> tuple[tuple[str, ...], list[Row]]:
-    """Return columns and rows of whole lines."""
+def _parsed(data: bytes, path: Path) -> tuple[tuple[str, ...], dict[str, Row]]:
+    """Return the columns, and the last row of each key; a torn last line is left out."""
     try:
-        lines = list(csv.reader(io.StringIO(data.decode(), newline=""), strict=True))
+        lines = list(csv.reader(io.StringIO(data[: data.rfind(b"\n") + 1].decode(), newline=""), strict=True))
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path}: must be a CSV file, got {error}") from None
     if not lines:
-        return (), []
+        return (), {}
     columns = tuple(lines[0])
     if columns[: len(FIRST)] != FIRST or columns[-len(LAST) :] != LAST or len(set(columns)) < len(columns):
         raise ValueError(f"{path}: must be the table of a sweep, got the columns {checks.show(lines[0])}")
     for number, cells in enumerate(lines[1:], 2):
         if len(cells) != len(columns):
             raise ValueError(f"{path}: every line must have {len(columns)} cells, got {len(cells)} in line {number}")
-    return columns, [dict(zip(columns, cells, strict=True)) for cells in lines[1:]]
+    return columns, {cells[0]: dict(zip(columns, cells, strict=True)) for cells in lines[1:]}
 
 
 def _opened(path: Path) -> BinaryIO:

@@ -41,6 +41,11 @@ class Task(NamedTuple):
     error: str  # column that a plot shows against run time
 
 
+def _options(job: Job, *names: str) -> dict[str, Any]:
+    """Return the options of these names that are set."""
+    return {name: value for name in names if (value := job.option(name)) is not None}
+
+
 def model_of(job: Job, store: Store, scanner: Scanner, *, temperature: float = 1.0) -> Any:
     """Return the model of a job; the worker keeps it.
 
@@ -54,9 +59,7 @@ def model_of(job: Job, store: Store, scanner: Scanner, *, temperature: float = 1
     key = (job.map, job.log, job.model, scanner, temperature, *names.values(), *groups)
 
     def make() -> Any:
-        options: dict[str, Any] = dict(backend=store.device, beams=job.option("beams"), temperature=temperature)
-        if job.option("precision") is not None:
-            options["precision"] = job.option("precision")
+        options = dict(backend=store.device, temperature=temperature) | _options(job, "beams", "precision")
         grid, parameters = store.grid(job.map), _parameters(job, store)
         kind = LikelihoodFieldModel if job.model == "field" else BeamModel
         return kind(grid, scanner, parameters, **options)
@@ -90,8 +93,7 @@ def localize(job: Job, store: Store) -> Values:
     from gpusense.localization.motion import OdometryMotion
 
     steps = store.steps(job)
-    names = ("particles", "temperature", "resampling", "threshold", "stages", "recovery")
-    options = {name: job.option(name) for name in names if job.option(name) is not None}
+    options = _options(job, "particles", "temperature", "resampling", "threshold", "stages", "recovery")
     plain = OdometryMotion()
     motion = OdometryMotion(job.option("motion_noise", plain.alpha), job.option("reverse", plain.reverse))
     if isinstance(options.get("particles"), list):
@@ -111,8 +113,7 @@ def score(job: Job, store: Store) -> Values:
 
     scans = store.scans(job)
     model = model_of(job, store, scans[0][1].scanner, temperature=job.option("temperature", 1.0))
-    names = ("particles", "sigma_position", "sigma_heading")
-    options = {name: job.option(name) for name in names if job.option(name) is not None}
+    options = _options(job, "particles", "sigma_position", "sigma_heading")
     scoring = LogScoring(model, ParticleSampler(seed=job.seed, **options))
     for index, scan in scans:
         scoring.add(index, scan)

@@ -12,7 +12,6 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, NamedTuple
 
@@ -40,8 +39,7 @@ _LUMA = (299, 587, 114)
 _Strip = tuple[NDArray[np.uint8], NDArray[np.bool] | None]
 
 
-@dataclass(frozen=True)
-class Raster:
+class Raster(NamedTuple):
     """Image, read strip by strip."""
 
     rows: int  # rows of pixels
@@ -114,10 +112,19 @@ def _open_pnm(stream: BinaryIO, file: Path, size: int) -> Raster:
     steps = _steps(maxval)
 
     def strips() -> Iterator[_Strip]:
-        values = _PlainValues(stream, file, count) if plain else None
+        pieces = _plain_values(stream, file)
+        ready: NDArray[Any] = np.empty(0, np.uint32)
         for top, end in _strip_rows(rows, cols):
             number = (end - top) * cols * channels
-            block = values.take(number) if values else np.frombuffer(stream.read(width * number), f">u{width}")
+            if plain:
+                while len(ready) < number:
+                    if (piece := next(pieces, None)) is None:
+                        found = top * cols * channels + len(ready)
+                        raise ValueError(f"{file}: must have {count} values, got {found}")
+                    ready = np.concatenate([ready, piece])
+                block, ready = ready[:number], ready[number:]
+            else:
+                block = np.frombuffer(stream.read(width * number), f">u{width}")
             if block.max() > maxval:
                 raise ValueError(f"{file}: every value must be at most {maxval}, got {block.max()}")
             yield _greys(block.reshape(end - top, cols, channels), steps), None
@@ -147,35 +154,20 @@ def _pnm_header(stream: BinaryIO, file: Path) -> list[int]:
     raise ValueError(f"{file}: must have a header of width, height and maximum value, got {numbers}")
 
 
-class _PlainValues:
-    """Decimal numbers of a stream, read strip by strip."""
+def _plain_values(stream: BinaryIO, file: Path) -> Iterator[NDArray[np.uint32]]:
+    """Yield the decimal numbers of a stream in pieces."""
+    rest = b""
+    while chunk := stream.read(1 << 18):
+        head, _, rest = (rest + chunk).translate(_BLANKS_TO_SPACES).rpartition(b" ")
+        yield _decimals(head, rest, file)
+    yield _decimals(rest, b"", file)
 
-    def __init__(self, stream: BinaryIO, file: Path, count: int) -> None:
-        self._stream, self._file, self._count = stream, file, count
-        self._ready, self._taken, self._rest, self._ended = np.empty(0, np.uint32), 0, b"", False
 
-    def take(self, number: int) -> NDArray[np.uint32]:
-        """Return the next numbers."""
-        blocks, have = [self._ready], len(self._ready)
-        while have < number:
-            if self._ended:
-                raise ValueError(f"{self._file}: must have {self._count} values, got {self._taken + have}")
-            blocks.append(self._read())
-            have += len(blocks[-1])
-        every = np.concatenate(blocks)
-        self._ready, self._taken = every[number:], self._taken + number
-        return every[:number]
-
-    def _read(self) -> NDArray[np.uint32]:
-        """Read some more numbers."""
-        chunk = self._stream.read(1 << 18)
-        head, _, self._rest = (self._rest + chunk).translate(_BLANKS_TO_SPACES).rpartition(b" ")
-        if not chunk:
-            head, self._rest, self._ended = self._rest, b"", True
-        tokens = head.split()
-        if head.translate(None, _DIGITS) or len(self._rest) > 10 or any(len(token) > 9 for token in tokens):
-            raise ValueError(f"{self._file}: must have a raster of decimal numbers, got something else")
-        return np.array([int(token) for token in tokens], np.uint32)
+def _decimals(text: bytes, rest: bytes, file: Path) -> NDArray[np.uint32]:
+    tokens = text.split()
+    if text.translate(None, _DIGITS) or len(rest) > 10 or any(len(token) > 9 for token in tokens):
+        raise ValueError(f"{file}: must have a raster of decimal numbers, got something else")
+    return np.array([int(token) for token in tokens], np.uint32)
 
 
 @contextlib.contextmanager

@@ -5,10 +5,9 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import BinaryIO, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,18 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util import checks
 from gpusense._util.documents import read_mapping
 from gpusense._util.files import write_several
-from gpusense._util.lines import numbered_lines
+from gpusense._util.lines import number_in, numbered_lines, numbers_in
 from gpusense._util.memory import check_room
 from gpusense.world.grid import FARTHEST_ORIGIN, LARGEST_RESOLUTION, SMALLEST_RESOLUTION, OccupancyGrid, grid_of_checked
 from gpusense.world.images import MODES, UNKNOWN_GREY, MapMode, mapped, open_raster, paint, write_image
 
 _ENDINGS = (".pgm", ".ppm", ".pnm", ".png", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff")
-# Most YAML files of a folder that are searched for the name of an image.
-_MOST = 50
 
 
-@dataclass(frozen=True)
-class _MapYaml:
+class _MapYaml(NamedTuple):
     image: Path
     resolution: float
     origin: ArrayLike
@@ -86,7 +82,7 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
     """
     file = checks.existing_file(checks.path("path", path))
     if file.name.lower().endswith((".dat", ".dat.gz")):
-        return read_probabilities(file, occupied_threshold=occupied_threshold)
+        return _read_probabilities(file, occupied_threshold=occupied_threshold)
     _check_no_image(file)
     meta = _read_yaml(file)
     checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
@@ -201,7 +197,6 @@ def _read_yaml(file: Path) -> _MapYaml:
     for key in ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh"):
         if key not in data:
             raise ValueError(f"{file}: must have the key {key!r}, got {checks.show(list(data))}")
-
     image, origin, negate, mode = data["image"], data["origin"], data["negate"], data.get("mode", "trinary")
     if not isinstance(image, str) or not image or "\0" in image:
         raise ValueError(f"{file}: image: must be a file name, got {checks.show(image)}")
@@ -216,29 +211,15 @@ def _read_yaml(file: Path) -> _MapYaml:
     occupied = _number(file, "occupied_thresh", data["occupied_thresh"], low=0, high=1)
     if free >= occupied:
         raise ValueError(f"{file}: occupied_thresh: must be > free_thresh = {free}, got {occupied}")
-    return _MapYaml(
-        image=_image(file, image),
-        resolution=_number(file, "resolution", data["resolution"], low=SMALLEST_RESOLUTION, high=LARGEST_RESOLUTION),
-        origin=[
-            *(
-                _number(file, f"origin[{i}]", value, low=-FARTHEST_ORIGIN, high=FARTHEST_ORIGIN)
-                for i, value in enumerate(origin[:2])
-            ),
-            _number(file, "origin[2]", origin[2]),
-        ],
-        negate=bool(negate),
-        occupied_thresh=occupied,
-        free_thresh=free,
-        mode=mode.lower(),
-    )
-
-
-def _image(file: Path, name: str) -> Path:
-    """Return the image that a YAML file names."""
     try:
-        return checks.existing_file(file.parent / name)
+        picture = checks.existing_file(file.parent / image)
     except (FileNotFoundError, ValueError) as error:
         raise type(error)(f"{file}: image: {error}") from None
+    resolution = _number(file, "resolution", data["resolution"], low=SMALLEST_RESOLUTION, high=LARGEST_RESOLUTION)
+    far = dict(low=-FARTHEST_ORIGIN, high=FARTHEST_ORIGIN)
+    limits: tuple[dict[str, float], ...] = (far, far, {})
+    pose = [_number(file, f"origin[{i}]", value, **limits[i]) for i, value in enumerate(origin)]
+    return _MapYaml(picture, resolution, pose, bool(negate), occupied, free, mode.lower())
 
 
 def _number(file: Path, key: str, value: object, **limits: float) -> float:
@@ -275,99 +256,43 @@ def _check_no_image(file: Path) -> None:
     """Refuse an image in place of the YAML file of a map."""
     if file.suffix.lower() not in _ENDINGS:
         return
-    found = next(_yaml_files(file), None)
-    if found is not None:
-        raise ValueError(f"{file}: must be the YAML file of a map, got its image: the YAML file is {found}")
+    beside = [file.with_suffix(suffix) for suffix in (".yaml", ".yml")]
     keys = "image, resolution, origin, negate, occupied_thresh and free_thresh"
-    raise ValueError(
-        f"{file}: must be the YAML file of a map, got an image, and no YAML file beside it names it: write "
-        f"{file.with_suffix('.yaml').name} with {keys}"
-    )
+    remedies = [f"the YAML file is {one}" for one in beside if one.is_file()]
+    remedies.append(f"write {beside[0].name} with {keys}")
+    raise ValueError(f"{file}: must be the YAML file of a map, got an image: {remedies[0]}")
 
 
-def _yaml_files(image: Path) -> Iterator[Path]:
-    """Yield the YAML files in an image's folder that name the image, starting with files of the same stem."""
-    named = [image.with_suffix(suffix) for suffix in (".yaml", ".yml")]
-    others = sorted(path for path in image.parent.glob("*.y*ml") if path not in named)[:_MOST]
-    for path in (*named, *others):
-        try:
-            name = read_mapping(path).get("image") if path.is_file() else None
-        except (ValueError, OSError):
-            continue
-        if isinstance(name, str) and (path.parent / name).name == image.name and _same(path.parent / name, image):
-            yield path
-
-
-def _same(one: Path, other: Path) -> bool:
-    try:
-        return one.samefile(other)
-    except OSError:
-        return False
-
-
-_RESOLUTION, _MOST_CELLS, _LONGEST_FIELD = 0.1, 1 << 28, 64
+_MOST_CELLS = 1 << 28
 _SPECIFICATION, _SIZE = b"robot_specifications->", b"global_map[0]:"
 
 
-def read_probabilities(file: Path, *, occupied_threshold: int) -> OccupancyGrid:
-    """Read such a map; cells are ``round(100 (1 - p))``, p the probability of being free. The file may be gzipped."""
-    resolution, columns = _RESOLUTION, []
+def _read_probabilities(file: Path, *, occupied_threshold: int) -> OccupancyGrid:
+    """Read a map of BeeSoft; cells are ``round(100 (1 - p))``, p the probability of being free."""
+    resolution, columns = 0.1, list[NDArray[np.int8]]()
     for number, line in numbered_lines(file):
-        where = f"{file}:{number}"
-        if not line.strip() or line.lstrip().startswith(_SIZE):
+        where, fields = f"{file}:{number}", line.split()
+        if not fields or line.lstrip().startswith(_SIZE):
             continue
-        fields = _fields(where, line)
         if fields[0].startswith(_SPECIFICATION):
             if fields[0] == _SPECIFICATION + b"resolution":
-                resolution = _resolution(where, fields)
+                resolution = number_in(fields[1]) / 100 if len(fields) == 2 else 0.0
+                if not SMALLEST_RESOLUTION <= resolution <= LARGEST_RESOLUTION:
+                    rule = f"a number of centimetres, {100 * SMALLEST_RESOLUTION:g} to {100 * LARGEST_RESOLUTION:g}"
+                    raise ValueError(f"{where}: resolution: must be {rule}, got {fields[1:3]}")
             continue
-        columns.append(_cells(where, fields))
-        if len(columns[-1]) != len(columns[0]):
-            raise ValueError(f"{where}: must have {len(columns[0])} numbers, as line 1, got {len(columns[-1])}")
-        if len(columns) * len(columns[0]) > _MOST_CELLS:
+        free = numbers_in(where, fields, lambda index: f"number {index + 1} in a line of probabilities")
+        wrong = ~((free >= 0) & (free <= 1) | (free == -1))
+        if wrong.any():
+            got = checks.show(free[wrong][0])
+            raise ValueError(f"{where}: must be probabilities, 0 to 1, or -1 for unknown, got {got}")
+        columns.append(np.where(free < 0, -1, np.round(100 * (1 - free))).astype(np.int8))
+        if len(free) != len(columns[0]):
+            raise ValueError(f"{where}: must have {len(columns[0])} numbers, as line 1, got {len(free)}")
+        if len(columns) * len(free) > _MOST_CELLS:
             raise ValueError(f"{where}: must have at most {_MOST_CELLS} cells in all, got more")
     if not columns:
         raise ValueError(f"{file}: must have a line of numbers for each x, got none")
     check_room(str(file), len(columns) * len(columns[0]), f"{len(columns[0])} x {len(columns)} cells")
     cells = np.stack(columns, axis=1)
     return grid_of_checked(cells, resolution, (0.0, 0.0, 0.0), occupied_threshold=occupied_threshold)
-
-
-def _fields(where: str, line: bytes) -> list[bytes]:
-    """Return the fields of a line; long fields are refused, because an array pads all to the longest."""
-    fields = line.split()
-    longest = max(fields, key=len)
-    if len(longest) > _LONGEST_FIELD:
-        text = longest[:40].decode(errors="replace")
-        raise ValueError(f"{where}: must have fields of at most {_LONGEST_FIELD} bytes, got {text!r}...")
-    return fields
-
-
-def _cells(where: str, fields: list[bytes]) -> np.ndarray:
-    """Return the cells of a line."""
-    try:
-        free = np.array([b"nan" if b"_" in field else field for field in fields]).astype(np.float64)
-    except ValueError:
-        free = np.array([np.nan])
-    wrong = ~((free >= 0) & (free <= 1) | (free == -1))
-    if wrong.any():
-        raise ValueError(f"{where}: must be probabilities, 0 to 1, or -1 for unknown, got {_first(fields, wrong)!r}")
-    return np.where(free < 0, -1, np.round(100 * (1 - free))).astype(np.int8)
-
-
-def _first(fields: list[bytes], wrong: np.ndarray) -> str:
-    """Return the first wrong field, or the whole line if it does not consist of numbers, shortened."""
-    text = fields[int(np.argmax(wrong))] if len(wrong) == len(fields) else b" ".join(fields[:4])
-    return text.decode(errors="replace")[:40]
-
-
-def _resolution(where: str, fields: list[bytes]) -> float:
-    """Return the side of a cell in metres."""
-    try:
-        value = float(fields[1]) / 100 if len(fields) == 2 and b"_" not in fields[1] else 0.0
-    except ValueError:
-        value = 0.0
-    if not SMALLEST_RESOLUTION <= value <= LARGEST_RESOLUTION:
-        rule = f"must be a number of centimetres, {100 * SMALLEST_RESOLUTION:g} to {100 * LARGEST_RESOLUTION:g}"
-        raise ValueError(f"{where}: resolution: {rule}, got {fields[1:3]}")
-    return value

@@ -14,6 +14,8 @@ from gpusense._util import checks
 _ABSENT = object()
 LEVEL = math.acos(1 - 1e-3)
 """Largest tilt of a level pose [rad]."""
+# Largest negative eigenvalue of a covariance that rounding may cause, relative to its largest variance.
+_ROUNDING = 1e-6
 
 
 def field(name: str, message: object, path: str) -> Any:
@@ -90,6 +92,19 @@ def planar_pose(name: str, pose: object) -> tuple[float, float, float]:
     return planar
 
 
+def planar_covariance(numbers: Any) -> np.ndarray:
+    """Return the (3, 3) covariance of x, y and yaw out of the 36 numbers of geometry_msgs/PoseWithCovariance."""
+    part = np.asarray(numbers, np.float64).reshape(6, 6)[np.ix_((0, 1, 5), (0, 1, 5))]
+    if not np.isfinite(part).all():
+        raise ValueError(f"message.pose.covariance: must be finite, got {part.tolist()}")
+    part = 0.5 * (part + part.T)
+    least = float(np.linalg.eigvalsh(part).min())
+    if least < -_ROUNDING * max(float(part.diagonal().max()), 0.0):
+        rule = "must be positive semidefinite"
+        raise ValueError(f"message.pose.covariance: {rule}, got an eigenvalue of {least:.3g} for x, y and yaw")
+    return part
+
+
 def distinct_beams(step: float, count: int) -> int:
     """Return the number of beams with distinct directions: one less if the last beam repeats the first."""
     return count - 1 if count > 2 and abs(abs(step) * (count - 1) - 2 * math.pi) < 0.5 * abs(step) else count
@@ -105,22 +120,6 @@ def nearest_beams(bearings: NDArray[np.float64], first: float, step: float, coun
     width = abs(step)
     index = np.rint((np.mod(turned + width / 2, 2 * math.pi) - width / 2) / width).astype(np.int64)
     return np.where(index < count, index, -1)
-
-
-def spread_readings(message: object, places: int, upside_down: bool = False) -> NDArray[np.float64]:
-    """Map the readings of a ``sensor_msgs/LaserScan`` to evenly spaced bearings of a full turn; NaN in gaps.
-
-    ``places``: number of bearings, from -pi on; each reading goes to the nearest one; ``upside_down``: whether the
-    beams run clockwise.
-    """
-    raw = checks.array("message.ranges", field("message", message, "ranges"), ("K",), finite=False)
-    first, step, count = laser_beams(message)
-    bearings = np.asarray(
-        (first + step * np.arange(distinct_beams(step, count))) * (-1 if upside_down else 1), np.float64
-    )
-    ranges: NDArray[np.float64] = np.full(places, math.nan)
-    ranges[nearest_beams(bearings, -math.pi, 2 * math.pi / places, places)] = raw[: len(bearings)]
-    return ranges
 
 
 def laser_beams(message: object) -> tuple[float, float, int]:

@@ -15,7 +15,7 @@ from gpusense.logs.records import planar
 from gpusense.logs.transform_buffer import TransformError
 from gpusense.ros import conversions, localizer, watcher
 from gpusense.ros.localizer import ScanQueue
-from gpusense.world.messages import planar_pose
+from gpusense.world.messages import planar_covariance, planar_pose
 
 from_nav2 = gs.compat.from_nav2
 AHEAD = conversions.pose_matrix((0.1, 0.0, 0.0))
@@ -28,7 +28,7 @@ def test_conversions() -> None:
     covariance = np.array([[1.0, 0.1, 0.2], [0.1, 2.0, 0.3], [0.2, 0.3, 3.0]])
     numbers = conversions.covariance_fields(covariance)
     assert len(numbers) == 36 and numbers[5] == 0.2 and numbers[35] == 3.0
-    np.testing.assert_array_equal(conversions.covariance_of(numbers), covariance)
+    np.testing.assert_array_equal(planar_covariance(numbers), covariance)
     message = SimpleNamespace(position=SimpleNamespace(x=0.0, y=0.0, z=9.0), orientation=SimpleNamespace(w=0.0))
     assert planar_pose("pose", conversions.fill(message, conversions.pose_fields(pose))) == pytest.approx(pose)
     np.testing.assert_allclose(planar(conversions.pose_matrix(pose)), pose)

@@ -108,6 +108,6 @@ def start_and_end(folder):
 
 def sent_text(name):
     """Return the text of a sent file."""
-    from gpusense.sweeps.process import _SENT
+    from gpusense.sweeps.process import SENT
 
-    return Path(_SENT[name]).read_text()
+    return Path(SENT[name]).read_text()

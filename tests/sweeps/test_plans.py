@@ -105,7 +105,12 @@ def test_a_table_keeps_all_bits_and_survives_a_torn_line(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"), [("a,b\n1,2\n", "must be the table of a sweep"), ("\x00\xff\n", "must be")]
+    ("text", "message"),
+    [
+        ("a,b\n1,2\n", "must be the table of a sweep"),
+        ("\x00\xff\n", "must be"),
+        ("notes", "must be the table of a sweep, got b'notes'"),
+    ],
 )
 def test_another_file_is_no_table(tmp_path, text, message):
     path = tmp_path / "t.csv"

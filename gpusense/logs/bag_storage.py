@@ -172,19 +172,17 @@ class _Chunked(Storage):
 
     def messages(self, wanted: Callable[[Topic], bool]) -> Iterator[Raw]:
         chosen = {number: topic for number, topic in self._topics.items() if wanted(topic)}
-        parts = [self._sorted(at, chunk, chosen) for at, chunk in enumerate(self._chunks)] if chosen else []
-        for time, _, place, topic, data in heapq.merge(*parts, key=lambda each: each[:3]):
-            if place >= 0:
-                yield Raw(time, topic, data)
-
-    def _sorted(self, at: int, chunk: _Chunk, chosen: dict[int, Topic]) -> Iterator[tuple[int, int, int, Topic, bytes]]:
-        """Yield the messages of a chunk by time, after an entry that delays the chunk until its time."""
-        yield chunk.start, at, -1, Topic("", ""), b""
-        found = [
-            (time, at, place, chosen[number], data)
-            for place, (number, time, data) in enumerate(self._within(chunk)) if number in chosen
-        ]  # fmt: skip
-        yield from sorted(found, key=lambda each: each[:3])
+        chunks = sorted(enumerate(self._chunks), key=lambda each: each[1].start) if chosen else []
+        # Messages of the chunks so far by time, chunk and place.
+        waiting: list[tuple[int, int, int, Raw]] = []
+        for at, chunk in chunks:
+            while waiting and waiting[0][0] < chunk.start:
+                yield heapq.heappop(waiting)[-1]
+            for place, (number, time, data) in enumerate(self._within(chunk)):
+                if number in chosen:
+                    heapq.heappush(waiting, (time, at, place, Raw(time, chosen[number], data)))
+        while waiting:
+            yield heapq.heappop(waiting)[-1]
 
     def _within(self, chunk: _Chunk) -> Iterator[tuple[int, int, bytes]]:
         """Yield topic, time [ns] and bytes of the messages in a chunk, and record the topics that it describes."""

@@ -80,8 +80,9 @@ class DaskExecutor(SupervisedExecutor):
         self._name, self._numbers = f"gpusense-{secrets.token_hex(8)}", itertools.count()
         # Why the cluster is lost; empty before.
         self._lost, self._end = "", threading.Event()
-        self._client: Any = None
-        self._cluster: Any = None
+        self._client: Any
+        self._cluster: Any
+        self._client = self._cluster = None
         try:
             self._connect(address, names, security)
             self.address = str(self._client.scheduler.address)

@@ -181,7 +181,7 @@ class Worker:
             return self._exchange(payload, seconds, wanted)
 
     def _exchange(self, payload: bytes, seconds: float, wanted: Callable[[], bool]) -> bytes:
-        """Send a call to the process, which is started if necessary, and wait for its answer or its end."""
+        """Start the process if necessary, send a call, and wait for its answer or its end."""
         process, pipe = self._started()
         end = time.monotonic() + seconds
         try:

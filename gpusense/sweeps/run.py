@@ -122,7 +122,7 @@ def run(
             on_row(row)
 
         try:
-            for ended in starts.ended(lambda: size or getattr(chosen, "window", _QUEUED * _slots(chosen))):
+            for ended in starts.ended(lambda: size or _window(chosen)):
                 record(ended)
         except (KeyboardInterrupt, SweepLost):
             # Keep the results of finished jobs.
@@ -136,8 +136,8 @@ def run(
         return Sweep(str(rows.path), len(unique), counts[DONE], counts[FAILED], skipped, counts["repeated"])
 
 
-def _slots(executor: Executor) -> int:
-    return int(getattr(executor, "slots", os.cpu_count() or 1))
+def _window(executor: Executor) -> int:
+    return int(getattr(executor, "window", _QUEUED * getattr(executor, "slots", os.cpu_count() or 1)))
 
 
 class Ended(NamedTuple):

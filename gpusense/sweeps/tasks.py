@@ -59,7 +59,7 @@ def model_of(job: Job, store: Store, scanner: Scanner, *, temperature: float = 1
     key = (job.map, job.log, job.model, scanner, temperature, *names.values(), *groups)
 
     def make() -> Any:
-        options = dict(backend=store.device, temperature=temperature) | _options(job, "beams", "precision")
+        options = _options(job, "beams", "precision") | {"backend": store.device, "temperature": temperature}
         grid, parameters = store.grid(job.map), _parameters(job, store)
         kind = LikelihoodFieldModel if job.model == "field" else BeamModel
         return kind(grid, scanner, parameters, **options)

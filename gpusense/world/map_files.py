@@ -92,7 +92,7 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
         table = _cell_table(meta)
         cells = np.empty((raster.rows, raster.cols), np.int8)
         end, freed = raster.rows, 0
-        # Whether the grey that map_saver writes for unknown cells is free.
+        # True if the grey of map_saver's unknown cells is free.
         frees = meta.mode == "trinary" and not meta.negate and table[UNKNOWN_GREY] == 0
         for greys, opaque in raster.strips:
             block = cells[end - len(greys) : end][::-1]

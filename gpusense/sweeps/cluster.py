@@ -32,9 +32,9 @@ _LOOPBACK = "127.0.0.1"
 # Resource of a Dask worker that represents its device; a job takes one.
 _RESOURCE = "gpusense"
 # Most calls at once.
-_MOST_CALLS = 4096
-# Seconds between two checks of the cluster, and of a call, for the scheduler to answer, and for workers to end.
-_LOOK, _LOOK_CALL, _ANSWER, _GOODBYE = 1.0, 0.25, 5.0, 10.0
+_MOST_CALLS = 1024
+# Seconds between two checks of the cluster, for the scheduler to answer, and for workers to end their jobs.
+_LOOK, _ANSWER, _GOODBYE = 1.0, 5.0, 10.0
 
 
 class DaskExecutor(SupervisedExecutor):
@@ -78,8 +78,8 @@ class DaskExecutor(SupervisedExecutor):
         names = device_names(devices) if address is None else []
         super().__init__(_MOST_CALLS, job_timeout)
         self._name, self._numbers = f"gpusense-{secrets.token_hex(8)}", itertools.count()
-        # Why the cluster is lost; empty before.
-        self._lost, self._end = "", threading.Event()
+        # Why the cluster is lost (empty before), and the events for which calls and the watch wait.
+        self._lost, self._end, self._calls = "", threading.Event(), set[threading.Event]()
         self._client: Any
         self._cluster: Any
         self._client = self._cluster = None
@@ -158,10 +158,17 @@ class DaskExecutor(SupervisedExecutor):
     def _watch(self) -> None:
         """Follow the workers of the cluster until it is lost; no call may wait for a watch that has failed."""
         try:
-            self._lost = self._lost or self._followed()
+            self._lose(self._followed())
         except Exception as error:
             _LOG.error("sweep: the workers could not be followed", exc_info=True)
-            self._lost = f"the workers could not be followed: {error_text(error)}"
+            self._lose(f"the workers could not be followed: {error_text(error)}")
+
+    def _lose(self, reason: str) -> None:
+        """End all calls, and accept no further ones."""
+        self._lost = self._lost or reason
+        self._end.set()
+        for done in list(self._calls):
+            done.set()
 
     def _followed(self) -> str:
         """Follow the workers of the cluster until it is lost, and return the reason."""
@@ -201,24 +208,27 @@ class DaskExecutor(SupervisedExecutor):
             _answer, self._name, payload, self._seconds, key=f"{self._name}-{number}", priority=-number, retries=0,
             **({"resources": {_RESOURCE: 1}} if self._pinned else {}),
         )  # fmt: skip
+        self._calls.add(done)
         remote.add_done_callback(lambda _: done.set())
-        while not done.wait(_LOOK_CALL) and not self._lost:
-            pass
+        if not self._lost:
+            done.wait()
+        self._calls.discard(done)
+        if self._lost and not remote.done():
+            raise OSError(self._lost)
         try:
-            return remote.result(timeout=self._patience if done.is_set() else 0)
+            return remote.result(timeout=self._patience)
         except distributed.KilledWorker:
             raise WorkerDied("with its Dask worker", outside=True) from None
-        except (TimeoutError, CancelledError, distributed.CancelledError):
-            if done.is_set() and not remote.cancelled():
-                raise WorkerDied("before its result was fetched", outside=True) from None
+        except TimeoutError:
+            raise WorkerDied("before its result was fetched", outside=True) from None
+        except (CancelledError, distributed.CancelledError):
             raise OSError(self._lost or "the scheduler has lost the job") from None
 
     # ---- the end
 
     def end(self) -> None:
         """End the running jobs, and leave the cluster."""
-        self._lost = self._lost or "the executor has been shut down"
-        self._end.set()
+        self._lose("the executor has been shut down")
         # A client without a scheduler would log its failed reconnection.
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         if self._client is not None and self.alive:

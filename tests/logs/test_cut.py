@@ -68,8 +68,7 @@ def test_a_map_line_with_one_long_field_takes_no_more_memory_than_the_line(tmp_p
     (tmp_path / "hall.dat").write_bytes(b"1 " * 1_000_000 + b"0" * 1_000_000)
     tracemalloc.start()
     try:
-        with pytest.raises(ValueError, match="must have fields of at most 64 bytes"):
-            gs.read_map(tmp_path / "hall.dat")
+        assert gs.read_map(tmp_path / "hall.dat").shape == (1_000_001, 1)
         assert tracemalloc.get_traced_memory()[1] < 100e6
     finally:
         tracemalloc.stop()

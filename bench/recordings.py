@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import gpusense as gs
-from gpusense.evaluation.steps import read_steps
+from gpusense.evaluation.log_steps import read_steps
 from gpusense.evaluation.tracking import START, coverage_report, rank_of
 
 CARMEN = {name: name for name in ("intel", "csail", "aces", "belgioioso", "fhw", "seattle")} | {"fr079": "freiburg-079"}

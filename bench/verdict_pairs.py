@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 import gpusense as gs
+from gpusense.evaluation.log_steps import read_steps
 from gpusense.evaluation.matching import WRONG, WRONG_TURN, relative_poses
-from gpusense.evaluation.steps import read_steps
 from gpusense.evaluation.worlds import free_pose
 from gpusense.matching.result import ScanMatch
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
 import platform
+import sys
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -45,14 +47,27 @@ def host_memory() -> int:
 
 @functools.cache
 def _fields() -> dict[str, str]:
-    """Return the fields of the first processor in Linux's list."""
+    """Return the fields of Linux's list, those of the first processor where several have one."""
     try:
         with open(_CPUINFO, encoding="utf-8", errors="replace") as file:
             text = file.read(1 << 16)
     except OSError:
         return {}
-    lines = (line.partition(":") for line in text.split("\n\n")[0].splitlines())
+    lines = (line.partition(":") for line in reversed(text.splitlines()))
     return {name.strip(): value.strip() for name, _, value in lines}
+
+
+def name() -> str:
+    """Return the processor's name as the operating system reports it."""
+    fields = _fields()
+    named = next((fields[key] for key in ("model name", "Model", "Hardware") if fields.get(key)), "")
+    if sys.platform == "darwin":
+        import subprocess
+
+        with contextlib.suppress(OSError, subprocess.SubprocessError):
+            command = ["/usr/sbin/sysctl", "-n", "machdep.cpu.brand_string"]
+            named = subprocess.run(command, capture_output=True, text=True, check=True, timeout=5).stdout.strip()
+    return named or platform.processor() or platform.machine() or "unknown processor"
 
 
 # ---- threads that share the host's part of large work: launches on the processor, copies, and bounds of poses

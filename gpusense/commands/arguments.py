@@ -6,21 +6,18 @@ import argparse
 import contextlib
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import gpusense as gs
 from gpusense._util.extras import check_library
 from gpusense._util.files import check_writable
 from gpusense._util.typing import PRECISIONS
 
 if TYPE_CHECKING:
     from gpusense.backends import Backend
-    from gpusense.models.scan.beam import BeamModel
-    from gpusense.models.scan.field import LikelihoodFieldModel
-    from gpusense.world.grid import OccupancyGrid
-    from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
-    from gpusense.world.scanner import Scanner
 
 BACKEND_HELP = (
     "device: auto (the fastest one present), gpu, cpu, cuda, numpy, opencl, opencl:<part of a name>, warp:cpu or "
@@ -141,12 +138,12 @@ SHARED: dict[str, Callable[[Options], None]] = {
 
 def open_backends(selections: Sequence[str] | None) -> tuple[list[Backend], list[str]]:
     """Open the distinct backends of selections, or all devices but simulators; also return the errors of the latter."""
-    from gpusense.backends import devices, get_backend
+    from gpusense.backends import get_backend
 
     if selections is not None:
         return list({backend.info.selection: backend for backend in map(get_backend, selections)}.values()), []
     opened, failures = [], []
-    for device in devices():
+    for device in gs.devices():
         if device.available and device.kind != "simulator":
             try:
                 opened.append(get_backend(device.selection))
@@ -193,6 +190,19 @@ not_negative_number = real_number("a finite number >= 0", lambda number: 0 <= nu
 range_number = real_number(
     f"a number > 0 and <= {_LONGEST_RANGE:g} (metres)", lambda number: 0 < number <= _LONGEST_RANGE
 )
+
+
+def quantity(units: Mapping[str, tuple[str, float]]) -> Callable[[str], tuple[str, float]]:
+    """Make a type for ``add_argument``: a number > 0 with a unit, converted to another one by a factor."""
+
+    def convert(text: str) -> tuple[str, float]:
+        found = re.fullmatch(r"\s*((?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-z%]+)\s*", text)
+        if found is None or found[2] not in units or not 0 < float(found[1]) < math.inf:
+            raise argparse.ArgumentTypeError(f"must be a number > 0 with a unit of {', '.join(units)}, got {text!r}")
+        unit, factor = units[found[2]]
+        return unit, factor * float(found[1])
+
+    return convert
 
 
 class Output:
@@ -247,13 +257,21 @@ def temperature(text: str) -> float | str:
     return text if text == "auto" else positive_number(text)
 
 
-def parameters_of(args: argparse.Namespace) -> BeamParameters | LikelihoodFieldParameters:
+def refuse(args: argparse.Namespace, names: Iterable[str], rule: str) -> None:
+    """Refuse options that were given; ``names`` are those of the namespace."""
+    for name in names:
+        value = getattr(args, name)
+        if value is not None and value is not False:
+            option = {"odometry_from": "odometry", "anywhere": "global"}.get(name, name.replace("_", "-"))
+            raise ValueError(f"--{option}: {rule}, got {'it' if value is True else value}")
+
+
+def parameters_of(args: argparse.Namespace) -> gs.BeamParameters | gs.LikelihoodFieldParameters:
     """Return the parameters of the model that the options choose."""
     from gpusense.commands.parameter_files import read_parameters
-    from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 
-    values: BeamParameters | LikelihoodFieldParameters
-    values = BeamParameters() if args.model == "beam" else LikelihoodFieldParameters.tracking()
+    values: gs.BeamParameters | gs.LikelihoodFieldParameters
+    values = gs.BeamParameters() if args.model == "beam" else gs.LikelihoodFieldParameters.tracking()
     if args.parameters is not None:
         values = read_parameters(args.parameters, "beam_model" if args.model == "beam" else "likelihood_field")
     changes: dict[str, float | str] = {}
@@ -268,15 +286,11 @@ def parameters_of(args: argparse.Namespace) -> BeamParameters | LikelihoodFieldP
 
 
 def scan_model(
-    args: argparse.Namespace, grid: OccupancyGrid, scanner: Scanner, **options: Any
-) -> BeamModel | LikelihoodFieldModel:
+    args: argparse.Namespace, grid: gs.OccupancyGrid, scanner: gs.Scanner, **options: Any
+) -> gs.BeamModel | gs.LikelihoodFieldModel:
     """Make the model that ``--model``, its parameters, ``--precision``, ``--beams`` and ``--backend`` choose."""
-    from gpusense.models.scan.beam import BeamModel
-    from gpusense.models.scan.field import LikelihoodFieldModel
-    from gpusense.world.parameters import BeamParameters
-
     parameters = parameters_of(args)
     options |= {"backend": args.backend, "precision": args.precision, "beams": args.beams}
-    if isinstance(parameters, BeamParameters):
-        return BeamModel(grid, scanner, parameters, **options)
-    return LikelihoodFieldModel(grid, scanner, parameters, **options)
+    if isinstance(parameters, gs.BeamParameters):
+        return gs.BeamModel(grid, scanner, parameters, **options)
+    return gs.LikelihoodFieldModel(grid, scanner, parameters, **options)

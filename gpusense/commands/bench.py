@@ -6,13 +6,13 @@ import argparse
 import json
 import shlex
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import gpusense as gs
 from gpusense._util.files import write_whole
 from gpusense._util.typing import PRECISIONS
-from gpusense.backends import devices
 from gpusense.commands import output
 from gpusense.commands.arguments import (
     BACKEND_HELP,
@@ -21,26 +21,25 @@ from gpusense.commands.arguments import (
     open_backends,
     output_folder,
     positive_number,
+    quantity,
     whole_number,
 )
 from gpusense.commands.signals import working
-from gpusense.evaluation.benchmark.candidates import candidates
-from gpusense.evaluation.benchmark.choice import choices, parse_error, parse_time
-from gpusense.evaluation.benchmark.report import document, model_rows
-from gpusense.evaluation.benchmark.runner import Outcome, Plan, steps
-from gpusense.evaluation.benchmark.runner import run as run_plan
-from gpusense.evaluation.benchmark.scenes import GENERATED, sources
+from gpusense.evaluation.benchmark import candidates, choice, report, runner, scenes
 from gpusense.evaluation.machine import machine, machine_line
-from gpusense.plots.error_page import error_page
 
 FIRST = ("quick", "html", "map", "max_error", "max_time")
 SHARED = ("json",)
 
-PROBLEMS = ("ranges", "beam", "field")
+PROBLEMS, SCENES = ("ranges", "beam", "field"), ("building", "clutter")
 # Fields of the plan of a quick run that differ: 40 s of measuring, 20 ms of calls a point.
 QUICK: dict[str, Any] = {
     "particles": 128, "checked": 128, "beams": 60, "repeats": 10, "build_limit": 3.0, "seconds": 0.02, "deadline": 40.0,
 }  # fmt: skip
+# Units of limits, with the unit and the factor that the measures have.
+_ERRORS = {"nats": ("nats", 1.0), "cells": ("cells", 1.0), "%": ("%", 0.01), "m": ("m", 1.0), "cm": ("m", 0.01),
+           "mm": ("m", 0.001)}  # fmt: skip
+_TIMES = {"s": ("s", 1.0), "ms": ("s", 1e-3), "us": ("s", 1e-6)}
 # Options that are fields of the plan.
 _FIELDS = ("particles", "checked", "beams", "repeats", "seconds", "build_limit", "seed")
 
@@ -72,7 +71,7 @@ def add_options(add: Options) -> None:
     add("--output DIR", "folder for the report, created if absent", output_folder())
     add("--html FILE", "interactive page of the measurement, one file that works offline", Output(".html"))
     add("--quick", "small maps, few values of the knobs, float32: half a minute plus compiling")
-    add("--scene *", "a generated scene; may be repeated (default: both, without --map)", GENERATED)
+    add("--scene *", "a generated scene; may be repeated (default: both, without --map)", SCENES)
     add("--map YAML*", "a map_server map as a further scene; may be repeated", Path, [])
     add("--backend DEVICE*", f"{BACKEND_HELP}; may be repeated (default: all present except simulators)")
     add("--problem *", "a problem; may be repeated (default: all)", PROBLEMS)
@@ -88,48 +87,38 @@ def add_options(add: Options) -> None:
     add("--build-limit S", "leave out tables that take longer to build [s] (default: 60)", positive_number)
     add("--max-error E*", "choose the fastest method with at most this error, such as '0.01 nats', '2 cm', '1 %%' "
         "or '0.5 cells' (default: 0.01 nats, 1 %%); may be repeated with other units",
-        _limit(parse_error), [])  # fmt: skip
+        quantity(_ERRORS), [])  # fmt: skip
     add("--max-time T", "recommend the most exact method whose call takes at most this time, such as '1 ms'",
-        _limit(parse_time))  # fmt: skip
+        lambda text: quantity(_TIMES)(text)[1])  # fmt: skip
     add("--seed N", "seed of maps, scans and particles (default: 0)", whole_number(low=0))
-
-
-def _limit(parse: Callable[[str], Any]) -> Callable[[str], Any]:
-    """Make a type for ``add_argument`` from a function that raises ``ValueError`` with the option's name."""
-
-    def convert(text: str) -> Any:
-        try:
-            return parse(text)
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(str(error).partition(": ")[2]) from None
-
-    return convert
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure and write the report; after Ctrl-C write and print the points so far."""
     plan, absent = make_plan(args)
-    outcome = Outcome([], [])
-    with working(outcome.points, steps(plan)) as step:
-        run_plan(plan, step, outcome)
+    outcome = runner.Outcome([], [])
+    with working(outcome.points, runner.steps(plan)) as step:
+        runner.run(plan, step, outcome)
     words = ["gpusense", *(Path(word).name if Path(word).is_absolute() else word for word in sys.argv[1:])]
-    report = document(plan, outcome, arguments_of(args, plan), machine(), absent, shlex.join(words))
+    made = report.document(plan, outcome, arguments_of(args, plan), machine(), absent, shlex.join(words))
     if args.output is not None:
         args.output.mkdir(parents=True, exist_ok=True)
-        write_whole(args.output / "report.json", lambda stream: stream.write(json.dumps(report, indent=1).encode()))
+        write_whole(args.output / "report.json", lambda stream: stream.write(json.dumps(made, indent=1).encode()))
     if args.html is not None:
-        page = error_page(model_rows(report), text=f"{report['date']}. {machine_line()}")
+        from gpusense.plots.error_page import error_page
+
+        page = error_page(report.model_rows(made), text=f"{made['date']}. {machine_line()}")
         write_whole(args.html, lambda stream: stream.write(page.encode()))
     if args.json:
-        output.document(report)
+        output.document(made)
     else:
-        _print(report, args)
+        _print(made, args)
     return 0
 
 
-def _print(report: Mapping[str, Any], args: argparse.Namespace) -> None:
+def _print(made: Mapping[str, Any], args: argparse.Namespace) -> None:
     """Print the answers, the best methods of each device, and failures."""
-    found, points = list(choices(report, dict(args.max_error), args.max_time)), report["points"]
+    found, points = list(choice.choices(made, dict(args.max_error), args.max_time)), made["points"]
     for _, answer, _ in found:
         output.result(answer)
     for backend in dict.fromkeys(backend for backend, _, _ in found):
@@ -142,14 +131,14 @@ def _print(report: Mapping[str, Any], args: argparse.Namespace) -> None:
             place = ", ".join(point[name] for name in ("scene", "cloud", "backend", "method"))
             output.fact(point["status"], f"{place}: {point['reason']}")
     left = sum(point["status"] == "left out" for point in points)
-    output.fact("points", f"{len(points)}, {left} left out; errors against {report['truth']['device']}, float64")
+    output.fact("points", f"{len(points)}, {left} left out; errors against {made['truth']['device']}, float64")
     output.files(args.html, args.output and args.output / "report.json")
 
 
-def make_plan(args: argparse.Namespace) -> tuple[Plan, list[str]]:
+def make_plan(args: argparse.Namespace) -> tuple[runner.Plan, list[str]]:
     """Make the plan of a run, and list absent devices with their reasons."""
     numbers = {name: getattr(args, name) for name in _FIELDS if getattr(args, name) is not None}
-    chosen = candidates(args.problem or PROBLEMS, quick=args.quick)
+    chosen = candidates.candidates(args.problem or PROBLEMS, quick=args.quick)
     if args.method:
         names = list(dict.fromkeys(candidate.method for candidate in chosen))
         for method in args.method:
@@ -159,16 +148,16 @@ def make_plan(args: argparse.Namespace) -> tuple[Plan, list[str]]:
     backends, failures = open_backends(args.backend)
     if args.quick and args.backend is None and len(backends) > 1:
         backends = [backend for backend in backends if backend.info.backend != "numpy"]
-    plan = Plan(
-        sources(args.scene, args.map, quick=args.quick), backends, chosen,
+    plan = runner.Plan(
+        scenes.sources(args.scene, args.map, quick=args.quick), backends, chosen,
         args.precision or (PRECISIONS[:1] if args.quick else PRECISIONS),
         **({"seconds": 5.0} | (QUICK if args.quick else {}) | numbers),
     )  # fmt: skip
-    absent = [] if args.backend else [f"{one.name}: {one.reason}" for one in devices() if not one.available]
+    absent = [] if args.backend else [f"{one.name}: {one.reason}" for one in gs.devices() if not one.available]
     return plan, [*absent, *failures]
 
 
-def arguments_of(args: argparse.Namespace, plan: Plan) -> dict[str, Any]:
+def arguments_of(args: argparse.Namespace, plan: runner.Plan) -> dict[str, Any]:
     """Return the arguments that affect the measurements; files are reduced to names."""
     return {name: getattr(plan, name) for name in _FIELDS} | {
         "quick": plan.deadline < float("inf"), "scenes": [source.name for source in plan.sources],

@@ -6,6 +6,9 @@ import argparse
 import contextlib
 import difflib
 import importlib
+import importlib.abc
+import importlib.machinery
+import importlib.util
 import io
 import itertools
 import os
@@ -95,6 +98,26 @@ class Parser(argparse.ArgumentParser):
                     rule = f"must be another file than that of {other.option_strings[0]}, got both"
                     self.error(f"argument {action.option_strings[0]}: {rule}")
         return found, rest
+
+
+class _Postponed(importlib.abc.MetaPathFinder):
+    """Finder that executes a module of the library when one of its names is first used: help needs few of them."""
+
+    def find_spec(self, fullname: str, path: Any, target: Any = None) -> importlib.machinery.ModuleSpec | None:
+        """Return the specification of a module outside the commands."""
+        if not fullname.startswith("gpusense.") or fullname.startswith("gpusense.commands."):
+            return None
+        spec = importlib.machinery.PathFinder.find_spec(fullname, path, target)
+        if spec is None or spec.loader is None or spec.submodule_search_locations is not None:
+            return None
+        spec.loader = importlib.util.LazyLoader(spec.loader)
+        return spec
+
+    def __enter__(self) -> None:
+        sys.meta_path.insert(0, self)
+
+    def __exit__(self, *_: object) -> None:
+        sys.meta_path.remove(self)
 
 
 class Layout(argparse.RawDescriptionHelpFormatter):
@@ -233,7 +256,8 @@ def _build(loaded: Iterable[str]) -> Parser:
             name, help=text, description=text, formatter_class=Layout, allow_abbrev=False, add_help=False
         )
         if name in loaded:
-            module = importlib.import_module(f"gpusense.commands.{name.replace('-', '_')}")
+            with _Postponed():
+                module = importlib.import_module(f"gpusense.commands.{name.replace('-', '_')}")
             command.description, command.epilog = getattr(module, "DESCRIPTION", text), _epilog(module)
             add = arguments.Options(command, module.FIRST)
             module.add_options(add)

@@ -8,28 +8,25 @@ import math
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+import gpusense as gs
 from gpusense._util.extras import check_library
 from gpusense._util.files import check_writable
 from gpusense._util.typing import Precision
-from gpusense.backends import Backend, Selection
 from gpusense.commands import output
 from gpusense.commands.arguments import BACKEND_HELP, Options, open_backends, picture, whole_number
 from gpusense.commands.output import grouped
 from gpusense.commands.signals import working
-from gpusense.evaluation import worlds
 from gpusense.evaluation.machine import machine
-from gpusense.evaluation.scoring import evaluated_beams
-from gpusense.models.scan.beam import BeamModel
-from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.world.grid import OccupancyGrid
-from gpusense.world.parameters import BeamParameters
-from gpusense.world.scanner import Scanner
+
+if TYPE_CHECKING:
+    from gpusense.backends import Backend, Selection
+
+    Model = gs.BeamModel | gs.LikelihoodFieldModel
 
 FIRST = ("particles", "backend", "output")
 SHARED = ("seed", "verbose")
@@ -88,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
 
         _score_all(scene, references, backends, scores, failures, selected=args.backend is not None, step=step)
         step("picture")
-        if not args.no_plot and {score.name for score in scores} == {BEAM, FIELD}:
+        if not args.no_plot and {score.facts["model"] for score in scores} == {BEAM, FIELD}:
             draw(scene, scores, args.output)
             written = args.output
     marks.append(("report", time.perf_counter()))
@@ -136,7 +133,7 @@ def draw(scene: Scene, scores: list[Score], path: Path) -> None:
     from gpusense.plots import drawing, pose_densities
 
     beam = _fastest(scores, BEAM)
-    best = beam.best
+    best = beam.facts["best_pose"]
     poses, free, extent = pose_densities.pose_lattice(scene.grid, LATTICE, float(best[2]))
     densities = {}
     for name in (BEAM, FIELD):
@@ -155,25 +152,25 @@ def draw(scene: Scene, scores: list[Score], path: Path) -> None:
 
 
 def _fastest(scores: list[Score], name: str) -> Score:
-    return max((score for score in scores if score.name == name), key=lambda score: score.rate)
+    rated = (score for score in scores if score.facts["model"] == name)
+    return max(rated, key=lambda score: float(score.facts["particle_beams_per_s"]))
 
 
 def _report(scene: Scene, scores: list[Score], failures: list[str], written: Path | None) -> None:
     """Print the likeliest pose, the table of devices, and the file of the picture."""
-    for name in dict.fromkeys(score.name for score in scores):
-        metres, degrees = _fastest(scores, name).off
-        off, count = f"{metres:.2f} m and {degrees:.1f} degrees off the true pose", grouped(len(scene.poses) - 1)
+    rows = [score.facts for score in scores]
+    count = grouped(len(scene.poses) - 1)
+    for name in dict.fromkeys(row["model"] for row in rows):
+        best = _fastest(scores, name).facts
+        off = f"{best['best_pose_off_m']:.2f} m and {best['best_pose_off_degrees']:.1f} degrees off the true pose"
         output.result(f"{name.capitalize()}: the likeliest of {count} poses is {off}.")
     columns = ["backend", "model", "first call [s]", "next call [s]", "rate [M/s]", "error"]
-    rows = [
-        [
-            score.model.device.selection, score.name, f"{score.first_s:.2f}", f"{score.steady_s:.3f}",
-            f"{score.rate / 1e6:.0f}" if score.rate > 1e7 else f"{score.rate / 1e6:.1f}", f"{score.errors.max():.0e}",
-        ]
-        for score in scores
-    ]  # fmt: skip
     print()
-    output.table(columns, rows, right=columns[2:])
+    output.table(columns, [
+        [row["backend"], row["model"], f"{row['first_call_s']:.2f}", f"{row['steady_s']:.3f}",
+         f"{rate:.{int(rate <= 10)}f}", f"{row['largest_error']:.0e}"]
+        for row, rate in ((row, row["particle_beams_per_s"] / 1e6) for row in rows)
+    ], right=columns[2:])  # fmt: skip
     print()
     output.fact("rate", "particle-beams a second of whole calls, NumPy arrays in and out")
     output.fact("error", "of log p [nats], the largest at the poses that the NumPy reference scores in float64, one in "
@@ -187,39 +184,23 @@ def _document(
     scene: Scene, seed: int, scores: list[Score], failures: list[str], written: Path | None
 ) -> dict[str, Any]:
     """Build the report for ``--json``; times in seconds, errors in nats."""
-    results = []
-    for score in scores:
-        device, (metres, degrees) = score.model.device, score.off
-        results.append({
-            "backend": device.selection, "device": device.name, "kind": device.kind, "driver": device.driver,
-            "model": score.name, "precision": score.model.precision, "first_call_s": score.first_s,
-            "steady_s": score.steady_s, "repetitions": score.repetitions, "beams_evaluated": score.evaluated,
-            "particle_beams_per_s": score.rate, "largest_error": score.errors.max(), "error_poses": len(score.errors),
-            "rank_of_true_pose": score.rank, "log_p_of_true_pose": score.log_p[-1], "poses": len(score.poses) - 1,
-            "best_log_p": score.log_p[:-1].max(), "best_pose": score.best, "best_pose_off_m": metres,
-            "best_pose_off_degrees": degrees, "explain": score.model.explain(),
-        })  # fmt: skip
     return {
         "machine": machine(), "seed": seed,
         "world": {"size_m": SIZE, "shape": scene.grid.shape, "resolution_m": scene.grid.resolution},
         "scan": {"beams": BEAMS, "beams_used": scene.beams, "range_max_m": RANGE_MAX, "ranges_m": scene.ranges},
-        "particles": len(scene.poses) - 1, "true_pose": scene.truth, "results": results, "failures": failures,
-        "picture": written,
+        "particles": len(scene.poses) - 1, "true_pose": scene.truth, "results": [score.facts for score in scores],
+        "failures": failures, "picture": written,
     }  # fmt: skip
 
 
 # ---- the scene, its models, and their scores
 
 
-Model = BeamModel | LikelihoodFieldModel
-
-
-@dataclass(frozen=True)
-class Scene:
+class Scene(NamedTuple):
     """A map, a scan, the poses to score with the true pose last, and the number of beams for models."""
 
-    grid: OccupancyGrid
-    scanner: Scanner
+    grid: gs.OccupancyGrid
+    scanner: gs.Scanner
     ranges: np.ndarray
     poses: np.ndarray
     beams: int
@@ -235,63 +216,36 @@ class Scene:
         return slice(None, None, -(-len(self.poses) // REFERENCE_PARTICLES))
 
 
-@dataclass(frozen=True)
-class Score:
-    """Scores and times of a model on a device; the true pose is last."""
+class Score(NamedTuple):
+    """A model on a device with the scores of poses, the true pose last, and the facts of the report."""
 
-    name: str
     model: Model
     poses: np.ndarray
     log_p: np.ndarray
-    first_s: float
-    steady_s: float
-    repetitions: int
-    evaluated: int
-    errors: np.ndarray
-
-    @property
-    def rate(self) -> float:
-        """Return the particle-beams per second of the steady call."""
-        return len(self.log_p) * self.evaluated / self.steady_s
-
-    @property
-    def rank(self) -> int:
-        """Return the rank of the true pose: 1 if no particle scores better."""
-        return 1 + int((self.log_p[:-1] > self.log_p[-1]).sum())
-
-    @property
-    def best(self) -> np.ndarray:
-        """Return the likeliest particle (3,)."""
-        return self.poses[self.log_p[:-1].argmax()]
-
-    @property
-    def off(self) -> tuple[float, float]:
-        """Return the distance of the likeliest particle from the true pose [m, degrees]."""
-        dx, dy, turn = (self.best - self.poses[-1]).tolist()
-        return math.hypot(dx, dy), abs(math.degrees(math.remainder(turn, math.tau)))
+    facts: dict[str, Any]
 
 
-def make_world(seed: int) -> tuple[OccupancyGrid, Scanner]:
+def make_world(seed: int) -> tuple[gs.OccupancyGrid, gs.Scanner]:
     """Make a building and a scanner."""
     first, step = -math.radians(FIELD_OF_VIEW) / 2, math.radians(FIELD_OF_VIEW) / (BEAMS - 1)
-    scanner = Scanner.uniform(angle_min=first, angle_increment=step, count=BEAMS, range_max=RANGE_MAX)
-    return worlds.building(seed, SIZE), scanner
+    scanner = gs.Scanner.uniform(angle_min=first, angle_increment=step, count=BEAMS, range_max=RANGE_MAX)
+    return gs.worlds.building(seed, SIZE), scanner
 
 
 def make_scene(seed: int, particles: int, beams: int) -> Scene:
     """Make a building, a scan drawn from the beam model at a free pose, and a cloud of particles."""
     rng = np.random.default_rng(seed)
     grid, scanner = make_world(seed)
-    truth = worlds.free_pose(grid, rng)
-    ranges = worlds.simulate_scan(grid, scanner, truth, BeamParameters(), rng)
-    around = worlds.cloud_around(truth, particles // 2, SIGMA_XY, SIGMA_THETA, rng)
-    anywhere = worlds.cloud_uniform(grid, particles - particles // 2, rng)
+    truth = gs.worlds.free_pose(grid, rng)
+    ranges = gs.worlds.simulate_scan(grid, scanner, truth, gs.BeamParameters(), rng)
+    around = gs.worlds.cloud_around(truth, particles // 2, SIGMA_XY, SIGMA_THETA, rng)
+    anywhere = gs.worlds.cloud_uniform(grid, particles - particles // 2, rng)
     return Scene(grid, scanner, ranges, np.concatenate([around, anywhere, truth[None]]), beams)
 
 
 def make_model(scene: Scene, name: str, backend: Selection, precision: Precision = PRECISION) -> Model:
     """Make a model with its default parameters; ``name`` is ``BEAM`` or ``FIELD``."""
-    kind: Any = BeamModel if name == BEAM else LikelihoodFieldModel
+    kind: Any = gs.BeamModel if name == BEAM else gs.LikelihoodFieldModel
     return kind(scene.grid, scene.scanner, backend=backend, precision=precision, beams=scene.beams)
 
 
@@ -300,6 +254,8 @@ def score_scene(scene: Scene, name: str, backend: Backend, reference: np.ndarray
 
     NumPy scores the poses ``scene.checked`` and the true pose.
     """
+    from gpusense.evaluation.scoring import evaluated_beams
+
     on_numpy = backend.info.backend == "numpy"
     poses = np.concatenate([scene.poses[:-1][scene.checked], scene.poses[-1:]]) if on_numpy else scene.poses
     begin = time.perf_counter()
@@ -312,7 +268,17 @@ def score_scene(scene: Scene, name: str, backend: Backend, reference: np.ndarray
         log_p = np.asarray(model.log_likelihood(poses, scene.ranges))
         calls.append(time.perf_counter() - begin)
     # Readings without return have the same probability at every pose, and are not evaluated.
-    evaluated = evaluated_beams(model, scene.ranges)
-    scored = log_p[:-1] if on_numpy else log_p[:-1][scene.checked]
-    errors = np.abs(scored - reference)
-    return Score(name, model, poses, log_p, first, min(calls), len(calls), evaluated, errors)
+    evaluated, device, others = evaluated_beams(model, scene.ranges), model.device, log_p[:-1]
+    errors = np.abs((others if on_numpy else others[scene.checked]) - reference)
+    best = poses[others.argmax()]
+    dx, dy, turn = (best - scene.truth).tolist()
+    return Score(model, poses, log_p, {
+        "backend": device.selection, "device": device.name, "kind": device.kind, "driver": device.driver,
+        "model": name, "precision": model.precision, "first_call_s": first, "steady_s": min(calls),
+        "repetitions": len(calls), "beams_evaluated": evaluated,
+        "particle_beams_per_s": len(log_p) * evaluated / min(calls), "largest_error": errors.max(),
+        "error_poses": len(errors), "rank_of_true_pose": 1 + int((others > log_p[-1]).sum()),
+        "log_p_of_true_pose": log_p[-1], "poses": len(others), "best_log_p": others.max(), "best_pose": best,
+        "best_pose_off_m": math.hypot(dx, dy),
+        "best_pose_off_degrees": abs(math.degrees(math.remainder(turn, math.tau))), "explain": model.explain(),
+    })  # fmt: skip

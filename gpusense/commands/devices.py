@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict, replace
 
+import gpusense as gs
 from gpusense._util import notices
-from gpusense.backends import Device, default_failures, devices, get_backend
 from gpusense.commands import output
 from gpusense.commands.arguments import Options
 from gpusense.commands.output import driver_text
@@ -37,7 +37,7 @@ def add_options(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the devices; for absent devices, also the reason and the remedy."""
-    listed: list[Device] = devices(anew=args.prove)
+    listed: list[gs.Device] = gs.devices(anew=args.prove)
     auto, auto_error = _auto()
     listed = _with_failures(listed)
     if args.json:
@@ -60,8 +60,10 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _with_failures(listed: list[Device]) -> list[Device]:
+def _with_failures(listed: list[gs.Device]) -> list[gs.Device]:
     """Return the devices; a device that ``"auto"`` failed to open counts as unusable, with the reason."""
+    from gpusense.backends import default_failures
+
     reasons = {selection: reason for selection, reason in default_failures() if selection}
     return [
         replace(device, available=False, reason=reasons[device.selection])
@@ -71,7 +73,7 @@ def _with_failures(listed: list[Device]) -> list[Device]:
     ]
 
 
-def _status(device: Device) -> str:
+def _status(device: gs.Device) -> str:
     if device.available:
         return "limited" if device.reason else "available"
     return "unusable" if device.selection else "absent"
@@ -79,6 +81,8 @@ def _status(device: Device) -> str:
 
 def _auto() -> tuple[str | None, str | None]:
     """Return the selection of 'auto', or the error of opening it, which this command only reports."""
+    from gpusense.backends import get_backend
+
     try:
         with notices.held() as lines:
             backend = get_backend("auto")

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
+import gpusense as gs
 from gpusense._util.typing import CasterName
 from gpusense.commands import output
-from gpusense.commands.arguments import Options, scan_model, whole_number
+from gpusense.commands.arguments import Options, refuse, scan_model, whole_number
 from gpusense.commands.demo import make_world
 from gpusense.commands.output import counted
-from gpusense.commands.scans import OPTIONS, add_log, read_scan
-from gpusense.evaluation import worlds
-from gpusense.interface.plan import Plan
-from gpusense.models.scan.savings import poses_on
-from gpusense.world.grid import OccupancyGrid
-from gpusense.world.map_files import read_map
-from gpusense.world.parameters import BeamParameters
-from gpusense.world.scanner import Scanner
+from gpusense.commands.scans import add_log, read_scan
+from gpusense.models.scan import savings
+
+if TYPE_CHECKING:
+    from gpusense.interface.plan import Plan
 
 FIRST = ("map", "log", "model", "parameters", "measure")
 SHARED = ("range", "model", "backend", "seed", "verbose")
@@ -56,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     if args.caster is not None and args.model == "field":
         raise ValueError(f"--caster: must be left out with the field, got {args.caster}")
     model = scan_model(args, grid, scanner, **({} if args.caster is None else {"caster": args.caster}))
-    model.log_likelihood(poses_on(grid), ranges)
+    model.log_likelihood(savings.poses_on(grid), ranges)
     plan = model.plan(measure=args.measure)
     texts = model.sources() if args.sources else {}
     if args.json:
@@ -73,23 +71,22 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _scene(args: argparse.Namespace) -> tuple[OccupancyGrid, Scanner, np.ndarray]:
+def _scene(args: argparse.Namespace) -> tuple[gs.OccupancyGrid, gs.Scanner, np.ndarray]:
     """Return the map, the scanner and the readings."""
     if args.log is not None and args.map is None:
         raise ValueError(f"--map: must come with --log, got --log {args.log} alone")
     if args.log is None:
-        for name in ("scan", "topic", "mount", "range_max", "range_min", "frame", "odometry_from"):
-            if getattr(args, name) is not None:
-                raise ValueError(f"--{OPTIONS.get(name, name)}: must come with --log, got it alone")
+        of_log = ("scan", "topic", "mount", "range_max", "range_min", "frame", "odometry_from")
+        refuse(args, of_log, "must come with --log")
     grid, scanner = make_world(args.seed)
     if args.map is not None:
-        grid = read_map(args.map)
+        grid = gs.read_map(args.map)
     if args.log is not None:
         scan = read_scan(args)
         return grid, scan.scanner, scan.ranges
     rng = np.random.default_rng(args.seed)
-    truth = worlds.free_pose(grid, rng)
-    return grid, scanner, worlds.simulate_scan(grid, scanner, truth, BeamParameters(), rng)
+    truth = gs.worlds.free_pose(grid, rng)
+    return grid, scanner, gs.worlds.simulate_scan(grid, scanner, truth, gs.BeamParameters(), rng)
 
 
 def _document(plan: Plan) -> dict[str, Any]:

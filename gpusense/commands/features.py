@@ -10,19 +10,15 @@ from typing import Any
 
 import numpy as np
 
+import gpusense as gs
 from gpusense.commands import output
-from gpusense.commands.arguments import Options, csv_file, picture, positive_number, whole_number
+from gpusense.commands.arguments import Options, csv_file, picture, positive_number, refuse, whole_number
 from gpusense.commands.output import counted, draw, write_table
 from gpusense.commands.scans import add_log, read_posed_steps
 from gpusense.commands.signals import working
-from gpusense.evaluation.steps import with_poses
-from gpusense.features.extract import extract_features
-from gpusense.features.feature_map import MAP_KINDS, FeatureMap
-from gpusense.features.landmarks import landmarks_of_map, map_features
-from gpusense.features.result import KINDS, Features, joined
-from gpusense.logs import Scan
-from gpusense.plots.features import features_figure, landmarks_figure
-from gpusense.world.map_files import read_map
+from gpusense.evaluation import log_steps
+from gpusense.features import feature_map
+from gpusense.features import result as feature_result
 
 FIRST = ("log", "reference", "kinds", "map_out", "plot")
 SHARED = ("reference", "choice", "backend", "verbose")
@@ -67,8 +63,8 @@ def run(args: argparse.Namespace) -> int:
         return _of_map(args)
     posed = args.map_out is not None or args.map_plot is not None
     steps = read_posed_steps(args)
-    scans = with_poses(steps, args.log) if posed else [(step.index, step.scan) for step in steps]
-    parts: list[Features] = []
+    scans = log_steps.with_poses(steps, args.log) if posed else [(step.index, step.scan) for step in steps]
+    parts: list[gs.Features] = []
     begun = time.perf_counter()
     with working(parts, len(scans)) as step:
         for first in range(0, len(scans), _CALL):
@@ -79,21 +75,19 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _extract(args: argparse.Namespace, scans: list[tuple[int, Scan]]) -> Features:
+def _extract(args: argparse.Namespace, scans: list[tuple[int, gs.Scan]]) -> gs.Features:
     ranges = np.array([scan.ranges for _, scan in scans])
-    kinds, scanner = args.kinds or KINDS, scans[0][1].scanner
+    kinds, scanner = args.kinds or feature_result.KINDS, scans[0][1].scanner
     light = [np.full(ranges.shape[1], np.nan) if scan.intensities is None else scan.intensities for _, scan in scans]
     noise: Any = "auto" if args.noise is None else args.noise
-    return extract_features(ranges, scanner, kinds, args.backend, noise=noise, intensities=np.array(light))
+    return gs.extract_features(ranges, scanner, kinds, args.backend, noise=noise, intensities=np.array(light))
 
 
 def _of_map(args: argparse.Namespace) -> int:
     """Make landmarks from a map."""
-    for option in ("out", "plot", "reference"):
-        if getattr(args, option) is not None:
-            raise ValueError(f"--{option}: must not be given with --map-in, which has no scans")
-    grid = read_map(args.map_in)
-    landmarks = landmarks_of_map(grid, kinds=_kinds(args, MAP_KINDS), backend=args.backend)
+    refuse(args, ("out", "plot", "reference"), "must not be given with --map-in, which has no scans")
+    grid = gs.read_map(args.map_in)
+    landmarks = gs.landmarks_of_map(grid, kinds=_kinds(args, feature_map.MAP_KINDS), backend=args.backend)
     rows = _write_landmarks(args, landmarks, grid)
     if args.json:
         output.report({"landmarks": rows}, args)
@@ -104,13 +98,15 @@ def _of_map(args: argparse.Namespace) -> int:
 
 
 def _report(
-    args: argparse.Namespace, scans: list[tuple[int, Scan]], parts: list[Features], posed: bool, seconds: float
+    args: argparse.Namespace, scans: list[tuple[int, gs.Scan]], parts: list[gs.Features], posed: bool, seconds: float
 ) -> None:
     """Print and write the features of all scans, or of the scans before an interrupt."""
-    features, done, rows = joined(parts, _CALL), min(_CALL * len(parts), len(scans)), None
+    from gpusense.plots.features import features_figure
+
+    features, done, rows = feature_result.joined(parts, _CALL), min(_CALL * len(parts), len(scans)), None
     if posed:
         poses = np.array([scan.pose for _, scan in scans[:done]])
-        landmarks = map_features(features, poses, kinds=_kinds(args, MAP_KINDS), least=args.least)
+        landmarks = gs.map_features(features, poses, kinds=_kinds(args, feature_map.MAP_KINDS), least=args.least)
         rows = _write_landmarks(args, landmarks, None)
     deviations = np.sqrt(np.einsum("fii->fi", features.covariance))
     index = np.array([index for index, _ in scans])[features.scan]
@@ -147,8 +143,10 @@ def _counts_text(kinds: np.ndarray) -> str:
     return ", ".join(counted(count, kind) for kind, count in _counts(kinds).items()) or "none"
 
 
-def _write_landmarks(args: argparse.Namespace, landmarks: FeatureMap, grid: Any) -> list[dict[str, Any]]:
+def _write_landmarks(args: argparse.Namespace, landmarks: gs.FeatureMap, grid: Any) -> list[dict[str, Any]]:
     """Write and draw landmarks, if requested, and return their rows for ``--json``."""
+    from gpusense.plots.features import landmarks_figure
+
     if args.map_out is not None:
         landmarks.save(args.map_out)
     draw(args.map_plot, lambda: landmarks_figure(landmarks, grid))

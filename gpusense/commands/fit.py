@@ -7,28 +7,20 @@ import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import gpusense as gs
 from gpusense._util.files import write_whole
 from gpusense._util.progress import progress
 from gpusense.commands import output
-from gpusense.commands.arguments import Options, output_folder, whole_number
+from gpusense.commands.arguments import Options, output_folder, refuse, whole_number
 from gpusense.commands.output import length, rounded
-from gpusense.commands.scans import OPTIONS, add_log, read_chosen_steps, read_scans
-from gpusense.evaluation import range_data
-from gpusense.evaluation.range_data import HeldOut, RangeData, compare_held_out
-from gpusense.evaluation.steps import references_to_learn_from, with_references
-from gpusense.evaluation.trajectory_files import read_tum
-from gpusense.learning.beam.fit import fit_beam_parameters
-from gpusense.learning.beam.incidence import IncidenceFit, fit_incidence_parameters
-from gpusense.learning.fitted import BeamFit
-from gpusense.localization.motion_fit import MotionFit, fit_odometry_motion
-from gpusense.plots import fits
-from gpusense.plots.drawing import save
-from gpusense.world.hit_shapes import SHAPE_PARAMETERS, SHAPES
-from gpusense.world.map_files import read_map
-from gpusense.world.parameters import BeamParameters
-from gpusense.world.scanner import Reading
+from gpusense.commands.scans import add_log, read_chosen_steps, read_scans
+from gpusense.evaluation import log_steps, range_data, trajectory_files
+from gpusense.world import hit_shapes
+
+if TYPE_CHECKING:
+    from gpusense.evaluation.range_data import HeldOut, RangeData
 
 FIRST = ("map", "log", "reference", "holdout", "out")
 SHARED = ("reference", "pairs", "backend", "seed", "verbose")
@@ -75,7 +67,7 @@ def add_options(add: Options) -> None:
         ("em", "em-book", "gradient", "hill_climb", "genetic"), "em")  # fmt: skip
     add("--range-bias", "also fit an offset of all correct ranges")
     add("--sigma-growth", "also fit a deviation of correct ranges that grows with range")
-    add("--hit", "shape of correct ranges; student fits a Student t", tuple(SHAPES), "normal")
+    add("--hit", "shape of correct ranges; student fits a Student t", tuple(hit_shapes.SHAPES), "normal")
     add("--fit-motion", "also learn the noise of the log's odometry from its poses")
     add("--incidence BINS", "also fit parameters for BINS bins of the angle of incidence", whole_number(low=1, high=90))
     add("--restarts N", "further random starts", whole_number(low=0, high=10_000), 0)
@@ -106,11 +98,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_sources(args: argparse.Namespace) -> None:
     if args.pairs is not None:
-        for name in ("map", "log", "reference", "topic", "mount", "frame", "odometry_from"):
-            if getattr(args, name) is not None:
-                raise ValueError(
-                    f"--{OPTIONS.get(name, name)}: must be left out with --pairs, got {getattr(args, name)}"
-                )
+        of_log = ("map", "log", "reference", "topic", "mount", "frame", "odometry_from")
+        refuse(args, of_log, "must be left out with --pairs")
         if args.fit_motion:
             raise ValueError("--fit-motion: must have a --log with odometry, got --pairs")
         if args.range_max is None:
@@ -132,7 +121,7 @@ def _read(args: argparse.Namespace) -> RangeData:
         if args.incidence and data.incidence is None:
             raise ValueError(f"--incidence: must have pairs with a third column, the angle, got two in {args.pairs}")
         return data
-    grid = read_map(args.map)
+    grid = gs.read_map(args.map)
     scans = read_scans(args)
     with progress(-(-len(scans) // range_data.SCANS)) as step:
         return range_data.data_of_log(
@@ -141,12 +130,12 @@ def _read(args: argparse.Namespace) -> RangeData:
         )  # fmt: skip
 
 
-def _fit(args: argparse.Namespace, data: RangeData, motion: MotionFit | None, partial: PartialFit) -> FitResult:
+def _fit(args: argparse.Namespace, data: RangeData, motion: gs.MotionFit | None, partial: PartialFit) -> FitResult:
     data, rest = data.halves() if args.holdout else (data, None)
     sensor = {"range_max": data.range_max, "range_min": data.range_min, "backend": args.backend}
-    known = data.block[data.kinds != Reading.MISSING]
+    known = data.block[data.kinds != gs.Reading.MISSING]
     blocks = data.block if len(set(known.tolist())) > 1 else None
-    fit = fit_beam_parameters(
+    fit = gs.fit_beam_parameters(
         data.ranges, data.expected, **sensor, method=args.method, seed=args.seed, restarts=args.restarts,
         range_bias=args.range_bias, sigma_growth=args.sigma_growth, hit=args.hit, progress=True, callback=partial.see,
         blocks=blocks,
@@ -154,24 +143,26 @@ def _fit(args: argparse.Namespace, data: RangeData, motion: MotionFit | None, pa
     partial.fit = fit
     incidence = None
     if data.incidence is not None and args.incidence:
-        incidence = fit_incidence_parameters(
+        incidence = gs.fit_incidence_parameters(
             data.ranges, data.expected, data.incidence, **sensor, bins=args.incidence, range_bias=args.range_bias,
             hit=args.hit, blocks=blocks,
         )  # fmt: skip
     compared = []
     if rest is not None:
-        compared = compare_held_out(fit.parameters, rest, readings=fit.hits + fit.max_readings, incidence=incidence)
+        compared = range_data.compare_held_out(
+            fit.parameters, rest, readings=fit.hits + fit.max_readings, incidence=incidence
+        )
     return FitResult(data, fit, incidence, compared, 0 if rest is None else len(rest.ranges), motion)
 
 
-def _motion(args: argparse.Namespace) -> MotionFit | None:
+def _motion(args: argparse.Namespace) -> gs.MotionFit | None:
     """Learn the noise of the odometry from the chosen scans; None if it is not requested."""
     if not args.fit_motion:
         return None
     steps = read_chosen_steps(args)
     if args.reference is not None:
-        steps = with_references(steps, *read_tum(args.reference))
-    return fit_odometry_motion(*references_to_learn_from(steps))
+        steps = log_steps.with_references(steps, *trajectory_files.read_tum(args.reference))
+    return gs.fit_odometry_motion(*log_steps.references_to_learn_from(steps))
 
 
 def _document(result: FitResult, files: list[Path]) -> dict[str, Any]:
@@ -185,6 +176,9 @@ def _document(result: FitResult, files: list[Path]) -> dict[str, Any]:
 
 def _write(folder: Path, result: FitResult) -> list[Path]:
     """Write the files of a fit, each atomically, and return their paths."""
+    from gpusense.plots import fits
+    from gpusense.plots.drawing import save
+
     folder.mkdir(parents=True, exist_ok=True)
     text, file = parameters_yaml(result).encode(), folder / "parameters.yaml"
     write_whole(file, lambda stream: stream.write(text))
@@ -221,11 +215,11 @@ class FitResult:
     """
 
     data: RangeData
-    fit: BeamFit
-    incidence: IncidenceFit | None
+    fit: gs.BeamFit
+    incidence: gs.IncidenceFit | None
     held_out: list[HeldOut]
     held_out_readings: int
-    motion: MotionFit | None = None
+    motion: gs.MotionFit | None = None
 
 
 @dataclass
@@ -238,10 +232,10 @@ class PartialFit:
     """
 
     log_likelihood: float = -math.inf
-    parameters: BeamParameters | None = None
-    fit: BeamFit | None = None
+    parameters: gs.BeamParameters | None = None
+    fit: gs.BeamFit | None = None
 
-    def see(self, iteration: int, log_likelihood: float, parameters: BeamParameters) -> None:
+    def see(self, iteration: int, log_likelihood: float, parameters: gs.BeamParameters) -> None:
         """Record an iteration of the search."""
         if log_likelihood > self.log_likelihood:
             self.log_likelihood, self.parameters = log_likelihood, parameters
@@ -294,13 +288,13 @@ def print_fit(args: argparse.Namespace, result: FitResult, files: list[Path]) ->
     output.details(args, f"{fit}\nrange_max {result.data.range_max:.6g} m, {len(result.data.ranges)} readings")
 
 
-def is_doubtful(fit: BeamFit) -> bool:
+def is_doubtful(fit: gs.BeamFit) -> bool:
     """Return whether readings are far from their expected ranges."""
     p, unexplained = fit.parameters, fit.outliers > _MOST_UNEXPLAINED * (fit.hits + fit.max_readings)
     return p.z_hit < _LEAST_HIT or p.sigma_hit > _MOST_DEVIATION or unexplained
 
 
-def _print_bias(fit: BeamFit) -> None:
+def _print_bias(fit: gs.BeamFit) -> None:
     """Print the offset of correct ranges, and the option that takes it into the parameters if it matters."""
     bias, error, sigma = fit.range_bias, fit.range_bias_error, fit.parameters.sigma_hit
     if fit.bias_fitted or not math.isfinite(bias) or not math.isfinite(error):
@@ -322,7 +316,7 @@ def _print_held_out(result: FitResult) -> None:
                         "added to each cause, with which the other rows are compared")  # fmt: skip
 
 
-def _print_motion(fit: MotionFit) -> None:
+def _print_motion(fit: gs.MotionFit) -> None:
     path = f"{fit.travelled:.1f} m and {fit.turned:.1f} rad"
     print()
     output.fact("odometry", f"{fit.motion}, from {fit.steps} steps ({path}) with {fit.references} reference poses")
@@ -355,7 +349,7 @@ def parameters_yaml(result: FitResult) -> str:
             "# alpha alone is too little noise there.",
             block("odometry_motion", result.motion.motion.to_dict()),
         ]
-    own = ("range_bias", "sigma_growth", *SHAPE_PARAMETERS)
+    own = ("range_bias", "sigma_growth", *hit_shapes.SHAPE_PARAMETERS)
     shared = {name: value for name, value in values.items() if name not in own}
     nav2 = {"laser_model_type": "beam", **shared, "laser_max_range": float(result.data.range_max)}
     lines += [

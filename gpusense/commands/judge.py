@@ -7,26 +7,21 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import gpusense as gs
 from gpusense.commands import output
 from gpusense.commands.arguments import Options, Output, csv_file, picture, positive_number
 from gpusense.commands.output import counted, draw, length, write_table
 from gpusense.commands.scans import add_log, options_named, read_chosen_steps
 from gpusense.commands.signals import working
-from gpusense.evaluation.integrity import Integrity, integrity
-from gpusense.evaluation.judging import Judgement, Stretch, TrajectoryJudge, errors_of
-from gpusense.evaluation.steps import Step, posed_scans
-from gpusense.evaluation.trajectory_files import read_tum
-from gpusense.logs import Scan
-from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.models.scan.model import ScanModel
-from gpusense.plots.runs import judgement_figure
-from gpusense.plots.viewer import Recording
-from gpusense.world.grid import OccupancyGrid
-from gpusense.world.map_files import read_map
+from gpusense.evaluation import judging, log_steps, trajectory_files
+
+if TYPE_CHECKING:
+    from gpusense.evaluation.log_steps import Step
+    from gpusense.models.scan.model import ScanModel
 
 FIRST = ("map", "log", "poses", "plot", "truth")
 SHARED = ("choice", "backend", "json")
@@ -80,12 +75,12 @@ def add_options(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Judge the poses, and print the results; after Ctrl-C, the results so far."""
-    grid = read_map(args.map)
-    truth = None if args.truth is None else read_tum(args.truth)
+    grid = gs.read_map(args.map)
+    truth = None if args.truth is None else trajectory_files.read_tum(args.truth)
     steps = read_chosen_steps(args)
     with options_named():
-        source, posed = posed_scans(args.log, steps, args.poses, map_frame=args.map_frame)
-        judge = TrajectoryJudge(_models(args, grid, steps), risk=args.risk)
+        source, posed = log_steps.posed_scans(args.log, steps, args.poses, map_frame=args.map_frame)
+        judge = judging.TrajectoryJudge(_models(args, grid, steps), risk=args.risk)
     with working(judge, len(posed)) as step:
         for one in posed:
             step(f"scan {one.index}")
@@ -101,23 +96,26 @@ def _source(text: str) -> str | Path:
     return path if path.suffix.lower() in _TRAJECTORIES or path.is_file() else text
 
 
-def _models(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step]) -> list[ScanModel]:
+def _models(args: argparse.Namespace, grid: gs.OccupancyGrid, steps: list[Step]) -> list[ScanModel]:
     """Return the likelihood field of each scanner."""
     scanners = dict.fromkeys(step.scan.scanner for step in steps)
-    return [LikelihoodFieldModel(grid, one, backend=args.backend) for one in scanners]
+    return [gs.LikelihoodFieldModel(grid, one, backend=args.backend) for one in scanners]
 
 
 def _report(
-    args: argparse.Namespace, grid: OccupancyGrid, found: Judgement, source: str, scans: Sequence[Scan],
+    args: argparse.Namespace, grid: gs.OccupancyGrid, found: gs.Judgement, source: str, scans: Sequence[gs.Scan],
     truth: tuple[np.ndarray, np.ndarray] | None,
 ) -> None:  # fmt: skip
     """Write the files, and print the results."""
+    from gpusense.plots.runs import judgement_figure
+    from gpusense.plots.viewer import Recording
+
     errors, rated = np.full(len(found.times), math.nan), None
     if truth is not None:
-        errors = errors_of(found, *truth)
+        errors = judging.errors_of(found, *truth)
         known = np.isfinite(errors)
         times = found.times[known] if (np.diff(found.times[known]) > 0).all() else None
-        rated = integrity(errors[known], found.radii[known], alert_limit=args.alert_limit, times=times)
+        rated = gs.integrity(errors[known], found.radii[known], alert_limit=args.alert_limit, times=times)
     x, y, theta = found.poses.T
     write_table(
         args.csv, scan=found.index, time=[f"{time:.6f}" for time in found.times], x=x, y=y, theta=theta,
@@ -137,7 +135,7 @@ def _report(
     output.files(args.plot, args.csv, args.record)
 
 
-def headline(found: Judgement) -> str:
+def headline(found: gs.Judgement) -> str:
     """Return the verdict in one line, the worst stretches first."""
     total, unsure, begin = _seconds(found.duration()), found.duration("uncertain"), float(found.times[0])
     if not found.informed:
@@ -154,7 +152,7 @@ def headline(found: Judgement) -> str:
     return f"{word.upper()}{space}{rest}"
 
 
-def _lost(lost: Sequence[Stretch], begin: float) -> str:
+def _lost(lost: Sequence[gs.Stretch], begin: float) -> str:
     """Return when the poses were lost, and how far off."""
     off = max((one.off for one in lost if not math.isnan(one.off)), default=math.nan)
     away = "" if math.isnan(off) else f", {'up to ' if len(lost) > 1 else ''}{off:.1f} m off the likeliest place"
@@ -168,7 +166,7 @@ def _seconds(time: float, *, unit: bool = True) -> str:
     return (f"{time:.0f}" if time >= 9.95 else f"{time:.1f}") + (" s" if unit else "")
 
 
-def _print_integrity(rated: Integrity, risk: float) -> None:
+def _print_integrity(rated: gs.Integrity, risk: float) -> None:
     output.fact(
         "integrity",
         f"hazardously misleading {100 * rated.hazardous:.3g} %, misleading {100 * rated.misleading:.3g} %, available "
@@ -184,7 +182,7 @@ def _print_integrity(rated: Integrity, risk: float) -> None:
         output.fact("alerts", f"{len(alerted)} of {counted(len(delays), 'error')} above the alert limit{longest}")
 
 
-def _document(found: Judgement, source: str, rated: Integrity | None, errors: np.ndarray) -> dict[str, Any]:
+def _document(found: gs.Judgement, source: str, rated: gs.Integrity | None, errors: np.ndarray) -> dict[str, Any]:
     names = ("lost", "informed", "scans", "risk", "index", "times", "poses", "p_lost", "verdicts", "explained", "radii")
     result = {name: getattr(found, name) for name in names} | {
         "verdict": headline(found), "source": source, "stretches": stretch_rows(found.stretches), "integrity": None,
@@ -192,8 +190,8 @@ def _document(found: Judgement, source: str, rated: Integrity | None, errors: np
     }  # fmt: skip
     if rated is not None:
         figures = ("alert_limit", "hazardous", "misleading", "available", "exceeded", "times_to_alert")
-        integrity = {"poses": len(rated.errors)} | {name: getattr(rated, name) for name in figures}
-        result |= {"errors": errors, "integrity": integrity}
+        rates = {"poses": len(rated.errors)} | {name: getattr(rated, name) for name in figures}
+        result |= {"errors": errors, "integrity": rates}
     return result
 
 
@@ -201,7 +199,7 @@ def _document(found: Judgement, source: str, rated: Integrity | None, errors: np
 _MOST = 12
 
 
-def print_stretches(stretches: Sequence[Stretch], begin: float, risk: float) -> None:
+def print_stretches(stretches: Sequence[gs.Stretch], begin: float, risk: float) -> None:
     """Print the stretches, the worst ones of many, by time since ``begin`` [s]."""
     order = {"lost": 0, "uncertain": 1, "tracking": 2}
     chosen = sorted(stretches, key=lambda one: (order[one.verdict], -one.duration))[:_MOST]
@@ -215,7 +213,7 @@ def print_stretches(stretches: Sequence[Stretch], begin: float, risk: float) -> 
         output.fact("", f"and {len(stretches) - len(chosen)} shorter ones; --json lists all")
 
 
-def _summary(one: Stretch, begin: float, risk: float) -> str:
+def _summary(one: gs.Stretch, begin: float, risk: float) -> str:
     share, radius = "no beam to judge by", "no radius"
     if math.isfinite(one.explained):
         share = f"{100 * one.explained:.0f} % of the beams explained"
@@ -225,7 +223,7 @@ def _summary(one: Stretch, begin: float, risk: float) -> str:
     return f"{one.start - begin:.1f} s to {one.end - begin:.1f} s: p_lost at most {one.p_lost:.2g}, {share}, {radius}"
 
 
-def _place(one: Stretch) -> str:
+def _place(one: gs.Stretch) -> str:
     assert one.place is not None
     if one.place.status == "no match":
         return "no place of the map explains the scans"
@@ -236,7 +234,7 @@ def _place(one: Stretch) -> str:
     )
 
 
-def stretch_rows(stretches: Sequence[Stretch]) -> list[dict[str, Any]]:
+def stretch_rows(stretches: Sequence[gs.Stretch]) -> list[dict[str, Any]]:
     """Return the stretches as JSON documents."""
     rows = []
     for one in stretches:

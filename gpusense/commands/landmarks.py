@@ -5,20 +5,19 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import gpusense as gs
 from gpusense.commands import output
 from gpusense.commands.arguments import Options, not_negative_number, range_number, whole_number
 from gpusense.commands.output import counted, degrees, length
 from gpusense.commands.signals import working
-from gpusense.evaluation import landmark_runs
-from gpusense.evaluation.tracking import Track, summary
-from gpusense.learning.fitted import LandmarkFit
-from gpusense.learning.landmark.pairs import Suspicions, suspicious_landmarks
+from gpusense.evaluation import landmark_runs, tracking
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.logs.mrclam import read_mrclam
-from gpusense.logs.records import LandmarkRun
-from gpusense.models.landmark.model import LandmarkModel
+
+if TYPE_CHECKING:
+    from gpusense.learning.landmark.pairs import Suspicions
+    from gpusense.logs.records import LandmarkRun
 
 FIRST = ("folder", "robot", "known", "particles", "drift")
 SHARED = ("backend", "seed", "verbose")
@@ -69,20 +68,27 @@ def add_options(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fit the noise, check the map, associate, localise, and print the results; after Ctrl-C, of the scans so far."""
+    from gpusense.logs.mrclam import read_mrclam
+
     recorded = landmark_runs.first_scans(read_mrclam(args.folder, args.robot, range_max=args.range_max), args.scans)
     # Suspicions need the recorded landmarks even with --unknown.
     fit = landmark_runs.fit_run(recorded)
-    doubts = suspicious_landmarks(recorded.poses, recorded.features, recorded.landmarks, recorded.ids, fit.parameters)
+    doubts = gs.suspicious_landmarks(
+        recorded.poses, recorded.features, recorded.landmarks, recorded.ids, fit.parameters
+    )
     fit = fit if args.known else landmark_runs.fit_run(recorded, known=False)
-    model = LandmarkModel(recorded.landmarks, landmark_runs.usable(fit.parameters), backend=args.backend)
+    model = gs.LandmarkModel(recorded.landmarks, landmark_runs.usable(fit.parameters), backend=args.backend)
     agreement = landmark_runs.association(recorded, model)
     drift = None if args.drift is None else tuple(args.drift)
     motion = landmark_runs.run_motion(recorded, drift=drift, fit=args.fit_motion)
-    pf, track = landmark_runs.make_filter(recorded, model, motion, particles=args.particles, seed=args.seed), Track()
+    pf, track = (
+        landmark_runs.make_filter(recorded, model, motion, particles=args.particles, seed=args.seed),
+        tracking.Track(),
+    )
     with working(track.steps, len(recorded.time)) as step:
         for one in landmark_runs.follow(pf, recorded, track, known=args.known):
             step(f"scan {one.index}" + (", lost" if track.verdicts[-1] == "lost" else ""))
-    figures = summary(track)
+    figures = tracking.summary(track)
     if args.json:
         output.report(_document(recorded, fit, doubts) | {
             "association": agreement, "motion": asdict(motion), "filter": figures, "device": model.device.selection,
@@ -102,7 +108,7 @@ def _left_out(run: LandmarkRun) -> str:
     return ", ".join(f"{count} {reason}" for reason, count in run.left_out.items())
 
 
-def _document(run: LandmarkRun, fit: LandmarkFit, doubts: Suspicions) -> dict[str, Any]:
+def _document(run: LandmarkRun, fit: gs.LandmarkFit, doubts: Suspicions) -> dict[str, Any]:
     label = run.labels.tolist()
     return {
         "scans": len(run.time), "features": len(run.ids), "left_out": run.left_out, "fit": fit.to_dict(),
@@ -114,7 +120,7 @@ def _document(run: LandmarkRun, fit: LandmarkFit, doubts: Suspicions) -> dict[st
 
 
 def _print(
-    args: argparse.Namespace, run: LandmarkRun, fit: LandmarkFit, doubts: Suspicions, agreement: dict[str, float],
+    args: argparse.Namespace, run: LandmarkRun, fit: gs.LandmarkFit, doubts: Suspicions, agreement: dict[str, float],
     figures: dict[str, Any],
 ) -> None:  # fmt: skip
     kind = "known" if args.known else "unknown"

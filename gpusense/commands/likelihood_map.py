@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+import gpusense as gs
 from gpusense.commands import output
 from gpusense.commands.arguments import Options, picture, positive_number, scan_model, whole_number
 from gpusense.commands.output import grouped
 from gpusense.commands.scans import add_log, read_scan
 from gpusense.commands.signals import working
-from gpusense.matching.pose_likelihood import prepare_tiles, refine_modes
-from gpusense.world.map_files import read_map
+from gpusense.matching import pose_likelihood
 
 FIRST = ("map", "log", "scan", "out", "model")
 SHARED = ("range", "field", "backend", "verbose")
@@ -52,10 +52,10 @@ def add_options(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compute and draw the likelihoods; after Ctrl-C, the tiles so far."""
-    grid = read_map(args.map)
+    grid = gs.read_map(args.map)
     scan = read_scan(args)
     model = scan_model(args, grid, scan.scanner, temperature=args.temperature)
-    result, tiles = prepare_tiles(
+    result, tiles = pose_likelihood.prepare_tiles(
         model, scan.ranges, resolution=args.resolution, headings=args.headings, positions="free"
     )
     done = 0.0
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         for done in tiles:
             step(f"{100 * done:.0f}%")
     result.plot(args.out)
-    poses, log_p, gain = refine_modes(model, scan.ranges, result, _MODES)
+    poses, log_p, gain = pose_likelihood.refine_modes(model, scan.ranges, result, _MODES)
     if args.json:
         output.report({
             "picture": str(args.out), "done": done, "rows": result.log_p.shape[0], "cols": result.log_p.shape[1],

@@ -7,10 +7,11 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import gpusense as gs
 from gpusense.commands.arguments import (
     Options,
     Output,
@@ -22,25 +23,18 @@ from gpusense.commands.arguments import (
     tum_file,
     whole_number,
 )
-from gpusense.commands.localize_report import Recorder, report
+from gpusense.commands.localize_report import report
 from gpusense.commands.parameter_files import Localization, read_localization
 from gpusense.commands.scans import add_log, options_named, read_chosen_steps
 from gpusense.commands.signals import working
-from gpusense.evaluation.steps import Step, references_to_learn_from, with_references
-from gpusense.evaluation.tracking import Track, follow, start
-from gpusense.evaluation.trajectory_files import read_tum
+from gpusense.evaluation import log_steps, tracking, trajectory_files
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.filter import ParticleFilter
-from gpusense.localization.motion import MotionModel, OdometryMotion
-from gpusense.localization.motion_fit import fit_odometry_motion
-from gpusense.localization.nav2 import Nav2Options
-from gpusense.models.scan.beam import BeamModel
-from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.plots.viewer import Animation, Recording
-from gpusense.world.grid import OccupancyGrid
-from gpusense.world.map_files import read_map
-from gpusense.world.parameters import BeamParameters
-from gpusense.world.scanner import Scanner
+
+if TYPE_CHECKING:
+    from gpusense.commands.localize_report import Recorder
+    from gpusense.evaluation.log_steps import Step
+    from gpusense.localization.motion import MotionModel
+    from gpusense.localization.nav2 import Nav2Options
 
 FIRST = ("map", "log", "everywhere", "start", "plot")
 SHARED = ("beams", "choice", "backend", "seed", "verbose")
@@ -117,20 +111,22 @@ def add_options(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Localise, and print the results; after Ctrl-C, the results so far."""
+    from gpusense.plots import viewer
+
     read = read_parameters(args)
-    grid = read_map(args.map)
+    grid = gs.read_map(args.map)
     steps = read_chosen(args, read)
     pf = make_filter(args, grid, steps, read)
     pose, covariance = start_of(args, read.nav2) or (None, None)
-    start(pf, steps, everywhere=args.everywhere, pose=pose, covariance=covariance)
-    track, recorders = Track(), dict[Path, Recorder]()
+    tracking.start(pf, steps, everywhere=args.everywhere, pose=pose, covariance=covariance)
+    track, recorders = tracking.Track(), dict[Path, "Recorder"]()
     if args.record is not None:
-        recorders[args.record] = Recording(pf.grid)
+        recorders[args.record] = viewer.Recording(pf.grid)
     if args.animate is not None:
-        recorders[args.animate] = Animation(pf.grid, len(steps))
+        recorders[args.animate] = viewer.Animation(pf.grid, len(steps))
     with working(track.steps, len(steps)) as step:
         step("starting")
-        for one in follow(pf, steps, track):
+        for one in tracking.follow(pf, steps, track):
             step(_text(track, one))
             for recorder in recorders.values():
                 recorder.add(pf, track, one)
@@ -138,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
     return int(found["verdict"] != "tracking" or found["explained_at_end"] is None)
 
 
-def _text(track: Track, step: Step) -> str:
+def _text(track: tracking.Track, step: Step) -> str:
     errors = track.errors()
     error = "" if errors is None or math.isnan(errors[0][-1]) else f", error {errors[0][-1]:.2f} m"
     rate = 1 / max(sum(track.seconds[-1]), 1e-9)
@@ -166,7 +162,7 @@ def read_chosen(args: argparse.Namespace, read: Localization) -> list[Step]:
         steps = _limited(steps, near, None if args.range_max is not None else far)
     if args.reference is None:
         return steps
-    steps = with_references(steps, *read_tum(args.reference))
+    steps = log_steps.with_references(steps, *trajectory_files.read_tum(args.reference))
     if args.everywhere or start_of(args, read.nav2) is not None:
         return steps
     # The run begins at the first reference pose.
@@ -175,12 +171,12 @@ def read_chosen(args: argparse.Namespace, read: Localization) -> list[Step]:
 
 def _limited(steps: list[Step], near: float | None, far: float | None) -> list[Step]:
     """Return steps with scanners limited to a range_min and a range_max, like nav2_amcl's."""
-    scanners: dict[Scanner, Scanner] = {}
+    scanners: dict[gs.Scanner, gs.Scanner] = {}
     for step in steps:
         if (one := step.scan.scanner) not in scanners:
             least = one.range_min if near is None else max(near, one.range_min)
             most = one.range_max if far is None else min(far, one.range_max)
-            scanners[one] = Scanner(one.bearings, most, least, one.mount)
+            scanners[one] = gs.Scanner(one.bearings, most, least, one.mount)
     return [replace(step, scan=replace(step.scan, scanner=scanners[step.scan.scanner])) for step in steps]
 
 
@@ -194,12 +190,14 @@ def start_of(args: argparse.Namespace, nav2: Nav2Options | None) -> tuple[Any, A
     return nav2.initial_pose, usual if nav2.initial_covariance is None else np.array(nav2.initial_covariance)
 
 
-def make_filter(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step], read: Localization) -> ParticleFilter:
+def make_filter(
+    args: argparse.Namespace, grid: gs.OccupancyGrid, steps: list[Step], read: Localization
+) -> gs.ParticleFilter:
     """Make the filter, with a model for each laser; options of the command line override the file."""
     scanners = {step.sensor: step.scan.scanner for step in steps}
     parameters, nav2 = read.sensor, read.nav2
     beams = args.beams or (DEFAULTS.beams if nav2 is None else nav2.max_beams)
-    kind: Any = BeamModel if isinstance(parameters, BeamParameters) else LikelihoodFieldModel
+    kind: Any = gs.BeamModel if isinstance(parameters, gs.BeamParameters) else gs.LikelihoodFieldModel
     models = [kind(grid, scanners[one], parameters, beams=beams, backend=args.backend) for one in sorted(scanners)]
     chosen: dict[str, Any] = dict(
         particles=DEFAULTS.particles_everywhere if args.everywhere else DEFAULTS.particles,
@@ -215,7 +213,7 @@ def make_filter(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step]
     given = {name: getattr(args, name) for name in chosen if getattr(args, name) is not None}
     if args.recovery == "none":
         given["recovery"] = None
-    return ParticleFilter(
+    return gs.ParticleFilter(
         models, motion=_motion(args, steps, read), seed=args.seed, temperature=args.temperature, **(chosen | given)
     )
 
@@ -229,13 +227,13 @@ def _motion(args: argparse.Namespace, steps: list[Step], read: Localization) -> 
             if getattr(args, name) is not None:
                 option = "--" + name.replace("_", "-")
                 raise ValueError(f"--fit-motion: must be given without {option}, which it learns, got both")
-        fit = fit_odometry_motion(*references_to_learn_from(steps))
+        fit = gs.fit_odometry_motion(*log_steps.references_to_learn_from(steps))
         if fit.undetermined:
             names = ", ".join(fit.undetermined)
             print(f"gpusense: --fit-motion: the log does not determine {names}: at most the default", file=sys.stderr)
         return fit.motion
     if read.nav2 is None:
-        return OdometryMotion(**read.noise | given)
+        return gs.OdometryMotion(**read.noise | given)
     if read.nav2.motion == "omni" and not given:
         return read.nav2.make_motion()
-    return OdometryMotion(**dict(alpha=read.nav2.alpha[:4]) | given)
+    return gs.OdometryMotion(**dict(alpha=read.nav2.alpha[:4]) | given)

@@ -7,24 +7,21 @@ import math
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import gpusense as gs
 from gpusense.commands import output
 from gpusense.commands.judge import print_stretches, stretch_rows
 from gpusense.commands.output import degrees, draw, length
 from gpusense.commands.scans import write_trajectory
-from gpusense.evaluation.judging import stretches_of_track
-from gpusense.evaluation.tracking import RISK, Track, summary
-from gpusense.localization.diagnosis import Diagnosis
-from gpusense.localization.filter import ParticleFilter
-from gpusense.localization.run_causes import CAUSES_OF_RUNS, diagnose_run
-from gpusense.localization.scan_motion import Moment
-from gpusense.localization.spread import WIDE, WIDE_TURN
-from gpusense.plots.runs import track_figure
-from gpusense.plots.viewer import Animation, Recording
+from gpusense.evaluation import judging, tracking
+from gpusense.localization import run_causes, scan_motion, spread
 
-Recorder = Recording | Animation
+if TYPE_CHECKING:
+    from gpusense.evaluation.tracking import Track
+    from gpusense.plots.viewer import Animation, Recording
 
+    Recorder = Recording | Animation
 
 # Results other than a single number.
 _NO_NUMBER = ("rank_histogram", "verdict", "evidence")
@@ -32,11 +29,13 @@ _PARTS = ("predict", "correct", "estimate")
 
 
 def report(
-    args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: int, recorders: dict[Path, Recorder]
+    args: argparse.Namespace, pf: gs.ParticleFilter, track: Track, chosen: int, recorders: dict[Path, Recorder]
 ) -> dict[str, Any]:
     """Write the files, print the results of the scans (before an interrupt), and return their summary."""
-    result, stretches = summary(track), stretches_of_track(track)
-    found = _diagnosis(pf, track, tracking=result["verdict"] == "tracking")
+    from gpusense.plots.runs import track_figure
+
+    result, stretches = tracking.summary(track), judging.stretches_of_track(track)
+    found = _diagnosis(pf, track, tracks=result["verdict"] == "tracking")
     result["evidence"] = None if found is None else asdict(found) | {"text": found.text}
     first = 0 if args.tum_from == "start" else len(track.poses) if track.converged is None else track.converged
     times = [step.scan.time for step in track.steps]
@@ -47,12 +46,12 @@ def report(
     if args.json:
         poses = [[step.index, *pose.tolist()] for step, pose in zip(track.steps, track.poses, strict=True)]
         document = {"filter": repr(pf), "summary": result, "scans_chosen": chosen}
-        document |= {"poses": poses, "times": times, "stretches": stretch_rows(stretches), "risk": RISK}
+        document |= {"poses": poses, "times": times, "stretches": stretch_rows(stretches), "risk": tracking.RISK}
         output.report(document, args)
         return result
     _print(pf, result, chosen, track)
     if len(stretches) > 1:
-        print_stretches(stretches, track.steps[0].scan.time, RISK)
+        print_stretches(stretches, track.steps[0].scan.time, tracking.RISK)
     output.files(args.plot, *recorders, args.tum)
     if args.tum is not None and first:
         output.fact("", f"without the first {first} of {len(track.poses)} scans, before the verdict is 'tracking'; "
@@ -61,20 +60,20 @@ def report(
     return result
 
 
-def _diagnosis(pf: ParticleFilter, track: Track, *, tracking: bool) -> Diagnosis | None:
+def _diagnosis(pf: gs.ParticleFilter, track: Track, *, tracks: bool) -> gs.Diagnosis | None:
     """Return the evidence of a run; for a run that tracks, only if its odometry, mount or times are wrong."""
     moments = [
-        Moment(step.scan.ranges, pose, step.odometry, step.scan.time, step.sensor)
+        scan_motion.Moment(step.scan.ranges, pose, step.odometry, step.scan.time, step.sensor)
         for step, pose in zip(track.steps, track.poses, strict=True)
     ]
-    found = diagnose_run(pf.models, moments, search=not tracking)
-    if tracking:
-        return found if found.cause in CAUSES_OF_RUNS else None
+    found = run_causes.diagnose_run(pf.models, moments, search=not tracks)
+    if tracks:
+        return found if found.cause in run_causes.CAUSES_OF_RUNS else None
     # The last scan alone may show more: people, a far turned mount.
     return pf.diagnose() if found.cause in ("none", "unknown") else found
 
 
-def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track) -> None:
+def _print(pf: gs.ParticleFilter, result: dict[str, Any], chosen: int, track: Track) -> None:
     """Print the verdict with the error in one line, and then the last pose and the errors."""
     deviations = [math.sqrt(max(value, 0.0)) for value in track.covariances[-1].diagonal()]
     known = result["error_median"] is not None and not result["references_repeat_odometry"]
@@ -114,7 +113,7 @@ def _print_errors(result: dict[str, Any]) -> None:
         output.fact("", f"before: median {length(result['early_median'])}")
 
 
-def _details(pf: ParticleFilter, result: dict[str, Any]) -> str:
+def _details(pf: gs.ParticleFilter, result: dict[str, Any]) -> str:
     """Return calibration, times and options of the filter."""
     s = {name: "-" if value is None else f"{value:.3g}" for name, value in result.items() if name not in _NO_NUMBER}
     lines = []
@@ -152,6 +151,6 @@ def _verdict(result: dict[str, Any], deviations: list[float]) -> str:
 def _doubt(deviations: list[float], agrees: bool) -> str:
     """Return why a pose is uncertain despite its evidence: wide particles, or places that look alike."""
     position, heading = max(deviations[:2]), deviations[2]
-    if position > WIDE or heading > WIDE_TURN:
+    if position > spread.WIDE or heading > spread.WIDE_TURN:
         return f"the particles lie {position:.1f} m and {math.degrees(heading):.0f} degrees apart"
     return "the scans so far fit other places as well: drive on" if agrees else ""

@@ -7,23 +7,24 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from gpusense.chaining.chain import Chainer
-from gpusense.chaining.result import REASONS, ScanChain
+import gpusense as gs
+from gpusense.chaining import chain as chaining
+from gpusense.chaining import result as chain_result
 from gpusense.commands import output
-from gpusense.commands.arguments import Options, Output, csv_file, number, picture, positive_number, tum_file
+from gpusense.commands.arguments import Options, Output, csv_file, number, picture, positive_number, refuse, tum_file
 from gpusense.commands.output import counted, draw, grouped, write_table
 from gpusense.commands.scans import add_log, read_posed_steps, scanners_of, write_trajectory
 from gpusense.commands.signals import working
-from gpusense.evaluation.steps import Step, with_poses
-from gpusense.mapping.build import MapBuilder
-from gpusense.plots.runs import chain_figure
-from gpusense.world.grid import OccupancyGrid
-from gpusense.world.images import MODES
-from gpusense.world.map_files import write_map
+from gpusense.evaluation import log_steps
+from gpusense.mapping import build
+from gpusense.world import images
+
+if TYPE_CHECKING:
+    from gpusense.evaluation.log_steps import Step
 
 FIRST = ("log", "out", "plot", "chain", "resolution")
 SHARED = ("reference", "choice", "backend", "verbose")
@@ -68,7 +69,7 @@ def add_options(add: Options) -> None:
     add("--plot FILE", "draw the map with trajectory, closures and doubtful stretches of a chain", picture)
     add("--out YAML", "the map, next to its image", Output(".yaml"), required=True)
     add("--mode", "trinary: white, black and grey; scale: shades, a PNG; raw: per cent as greys, almost black",
-        MODES, "trinary")  # fmt: skip
+        images.MODES, "trinary")  # fmt: skip
     add("--resolution M", "side of a cell [m]", positive_number, 0.05)
     add("--range-limit M", "longer ranges clear cells up to it and mark no obstacle [m] (default: none)",
         positive_number)  # fmt: skip
@@ -86,8 +87,8 @@ def run(args: argparse.Namespace) -> int:
     if _is_chained(args, steps):
         chained = _chain_log(args, steps)
         steps = chained.steps
-    scans = with_poses(steps, args.log)
-    builder = MapBuilder(
+    scans = log_steps.with_poses(steps, args.log)
+    builder = build.MapBuilder(
         [scan.ranges for _, scan in scans], [scan.pose or (0.0, 0.0, 0.0) for _, scan in scans],
         resolution=args.resolution, origin=None, shape=None, range_limit=args.range_limit, clear_max=args.clear_max,
         p_hit=args.p_hit, p_miss=args.p_miss, p_prior=0.5, occupied_threshold=65, backend=args.backend, each=_SCANS,
@@ -105,17 +106,17 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _write(args: argparse.Namespace, grid: OccupancyGrid) -> Path:
+def _write(args: argparse.Namespace, grid: gs.OccupancyGrid) -> Path:
     """Write the map, and return the path of its image."""
     transparent = args.mode == "scale" and bool(grid.unknown.any())
     form: Literal["pgm", "png"] = "png" if transparent else "pgm"
-    write_map(grid, args.out, mode=args.mode, image_format=form)
+    gs.write_map(grid, args.out, mode=args.mode, image_format=form)
     image: Path = args.out.with_suffix(f".{form}")
     return image
 
 
 def _report(
-    args: argparse.Namespace, builder: MapBuilder, grid: OccupancyGrid, image: Path, scans: tuple[int, int],
+    args: argparse.Namespace, builder: build.MapBuilder, grid: gs.OccupancyGrid, image: Path, scans: tuple[int, int],
     chained: ChainedScans | None,
 ) -> None:  # fmt: skip
     """Print a summary of the map."""
@@ -154,17 +155,16 @@ class ChainedScans:
     """Scans with poses from a chain."""
 
     steps: list[Step]
-    chain: ScanChain
+    chain: gs.ScanChain
     seconds: float
 
 
 def _is_chained(args: argparse.Namespace, steps: list[Step]) -> bool:
     """Return whether a chain finds the poses, and check the options that need a chain."""
     chained = args.chain or (args.reference is None and any(step.scan.pose is None for step in steps))
-    for name in ("tum", "poses", "plot", "no_odometry", "no_loops"):
-        if not chained and getattr(args, name):
-            option = name.replace("_", "-")
-            raise ValueError(f"--{option}: must be used with --chain where the scans have poses, got it without")
+    if not chained:
+        of_chain = ("tum", "poses", "plot", "no_odometry", "no_loops")
+        refuse(args, of_chain, "must be used with --chain where the scans have poses")
     return chained
 
 
@@ -176,7 +176,7 @@ def _chain_log(args: argparse.Namespace, steps: list[Step]) -> ChainedScans:
     known = bool((np.diff(times) >= 0).all())
     spans, lasers = np.array([(step.scan.duration, step.sensor) for step in steps]).T
     durations = [float(np.median(spans[lasers == one])) if known else 0.0 for one in np.unique(lasers)]
-    chainer = Chainer(
+    chainer = chaining.Chainer(
         readings, odometry=odometry, times=times if known else None, close_loops=not args.no_loops,
         duration=durations if len(durations) > 1 else durations[0], backend=args.backend, **scanners_of(steps),
     )  # fmt: skip
@@ -203,8 +203,10 @@ def _odometry(steps: list[Step]) -> np.ndarray | None:
     return poses
 
 
-def _write_chain(args: argparse.Namespace, chained: ChainedScans, grid: OccupancyGrid) -> None:
+def _write_chain(args: argparse.Namespace, chained: ChainedScans, grid: gs.OccupancyGrid) -> None:
     """Write the requested files: trajectory, poses with covariances, picture."""
+    from gpusense.plots.runs import chain_figure
+
     chain = chained.chain
     # If beams are in reverse order, poses belong to the end of scans.
     at = np.array([step.scan.time for step in chained.steps]) + chain.later
@@ -248,7 +250,7 @@ def _print_chain(chained: ChainedScans) -> None:
     else:
         output.fact("loops", "none closed, since no place was seen again with certainty: the map bends by the drift of "
                     "the whole way")  # fmt: skip
-    for reason, meaning in REASONS.items():
+    for reason, meaning in chain_result.REASONS.items():
         some = [doubt for doubt in chain.doubts if doubt.reason == reason]
         if some:
             spans = ", ".join(f"{doubt.first} to {doubt.last}" for doubt in some[:5])

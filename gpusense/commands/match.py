@@ -10,20 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import gpusense as gs
 from gpusense.commands import output
 from gpusense.commands.arguments import Options, csv_file, not_negative_number, picture, positive_number, tum_file
 from gpusense.commands.output import counted, degrees, draw, length, write_table
 from gpusense.commands.scans import add_log, read_posed_steps, write_trajectory
 from gpusense.commands.signals import working
-from gpusense.evaluation.matching import LogMatches, differences, joined, match_log, summary, trajectory
-from gpusense.logs import Scan
-from gpusense.matching.result import STATUSES
-from gpusense.plots.runs import match_figure
-from gpusense.world.grid import OccupancyGrid
-from gpusense.world.map_files import read_map
+from gpusense.evaluation import matching
+from gpusense.matching import result as match_result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from gpusense.evaluation.matching import LogMatches
 
 FIRST = ("log", "map", "reference", "tum", "plot")
 SHARED = ("reference", "choice", "backend", "seed", "verbose")
@@ -60,11 +59,11 @@ def add_options(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Match the scans and print the results; after Ctrl-C, the results so far."""
-    grid = None if args.map is None else read_map(args.map)
+    grid = None if args.map is None else gs.read_map(args.map)
     scans = [(step.index, step.scan) for step in read_posed_steps(args)]
     parts: list[LogMatches] = []
     begun = time.perf_counter()
-    calls = match_log(
+    calls = matching.match_log(
         scans, grid, guess=args.guess or ("odometry" if grid is None else "logged"), method=args.method,
         backend=args.backend, spread=(args.shift, math.radians(args.turn)), seed=args.seed, noise=args.noise,
     )  # fmt: skip
@@ -79,19 +78,19 @@ def run(args: argparse.Namespace) -> int:
 
 def _report(
     args: argparse.Namespace,
-    grid: OccupancyGrid | None,
-    scans: list[tuple[int, Scan]],
+    grid: gs.OccupancyGrid | None,
+    scans: list[tuple[int, gs.Scan]],
     parts: list[LogMatches],
     seconds: float,
 ) -> None:
     """Print and write the results of all matches, or of the matches before an interrupt."""
-    matches = joined(parts)
-    total = summary(matches) | {"milliseconds_each": 1e3 * seconds / len(matches.match)}
+    matches = matching.joined(parts)
+    total = matching.summary(matches) | {"milliseconds_each": 1e3 * seconds / len(matches.match)}
     match, first = matches.match, scans[0][1]
     deviations = np.sqrt(np.einsum("sii->si", match.covariance))
     columns = (*matches.indices.T, *match.pose.T, *deviations.T, match.score, match.status)
     write_table(args.out, **dict(zip(_COLUMNS, columns, strict=True)))
-    poses = trajectory(matches, np.array(first.odometry if first.pose is None else first.pose))
+    poses = matching.trajectory(matches, np.array(first.odometry if first.pose is None else first.pose))
     write_trajectory(args.tum, [scan.time for _, scan in scans[: len(poses)]], poses)
     draw(args.plot, lambda: _worst(grid, dict(scans), matches))
     if args.json:
@@ -125,12 +124,14 @@ def _print(total: dict[str, Any]) -> None:
                     f"{degrees(total['guess_heading_median'])} degrees")  # fmt: skip
     for status, number in statuses.items():
         if status != "converged":
-            output.fact("status", f"{number} {status}: {STATUSES[status]}")
+            output.fact("status", f"{number} {status}: {match_result.STATUSES[status]}")
 
 
-def _worst(grid: OccupancyGrid | None, scans: dict[int, Scan], matches: LogMatches) -> Figure:
+def _worst(grid: gs.OccupancyGrid | None, scans: dict[int, gs.Scan], matches: LogMatches) -> Figure:
     """Draw the match with the largest correction."""
-    distance, turn = differences(matches.match.pose, matches.guess)
+    from gpusense.plots.runs import match_figure
+
+    distance, turn = matching.differences(matches.match.pose, matches.guess)
     worst = int(np.argmax(distance + turn * matches.match.lever / 10))
     first, second = matches.indices[worst]
     scan = scans[int(second)]

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import gpusense as gs
 from gpusense._util import checks
 from gpusense._util.documents import read_mapping
-from gpusense.localization.motion import OdometryMotion
-from gpusense.localization.nav2 import Nav2Options, from_nav2, has_parameters
-from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
+from gpusense.localization import nav2 as nav2_options
+
+if TYPE_CHECKING:
+    from gpusense.localization.nav2 import Nav2Options
 
 
-def read_parameters(path: Path, name: str) -> BeamParameters | LikelihoodFieldParameters:
+def read_parameters(path: Path, name: str) -> gs.BeamParameters | gs.LikelihoodFieldParameters:
     """Read the mapping ``beam_model`` or ``likelihood_field`` of a YAML file."""
-    make = BeamParameters.from_dict if name == "beam_model" else LikelihoodFieldParameters.from_dict
+    make = gs.BeamParameters.from_dict if name == "beam_model" else gs.LikelihoodFieldParameters.from_dict
     values = read_mapping(checks.existing_file(path)).get(name)
-    made: BeamParameters | LikelihoodFieldParameters = _made(path, name, values, make)
+    made: gs.BeamParameters | gs.LikelihoodFieldParameters = _made(path, name, values, make)
     return made
 
 
@@ -30,7 +32,7 @@ class Localization:
         nav2: Options of nav2_amcl's node from a file of nav2, or None.
     """
 
-    sensor: BeamParameters | LikelihoodFieldParameters | None
+    sensor: gs.BeamParameters | gs.LikelihoodFieldParameters | None
     noise: dict[str, Any]
     nav2: Nav2Options | None = None
 
@@ -39,9 +41,9 @@ def read_localization(path: Path, node: str | None = None) -> Localization:
     """Read ``beam_model`` and ``odometry_motion`` of a YAML file, or the parameters of nav2_amcl's ``node``."""
     content = read_mapping(checks.existing_file(path))
     models = [name for name in ("beam_model", "likelihood_field") if name in content]
-    if has_parameters(content) and not models and "odometry_motion" not in content:
+    if nav2_options.has_parameters(content) and not models and "odometry_motion" not in content:
         try:
-            options = from_nav2(path, node=node)
+            options = nav2_options.from_nav2(path, node=node)
         except (TypeError, ValueError) as error:
             text = str(error)
             raise ValueError(text if text.startswith((str(path), "node: ")) else f"{path}: {text}") from None
@@ -55,7 +57,7 @@ def read_localization(path: Path, node: str | None = None) -> Localization:
         raise ValueError(f"{path}: {rule}, got {checks.show(list(content))}")
     sensor = read_parameters(path, models[0]) if models else None
     values = content.get("odometry_motion", {})
-    _made(path, "odometry_motion", values, OdometryMotion.from_dict)
+    _made(path, "odometry_motion", values, gs.OdometryMotion.from_dict)
     return Localization(sensor, values)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from gpusense._util import checks
 from gpusense._util.documents import read_mapping
-from gpusense.commands.arguments import Options, finite_number
+from gpusense.commands.arguments import Options, finite_number, refuse
 from gpusense.localization.nav2_file import FITTED
 
 FIRST = ("map", "params_file", "start", "anywhere", "odom_topic")
@@ -93,11 +93,7 @@ def _localize(args: argparse.Namespace) -> dict[str, Any]:
 
 def _watch(args: argparse.Namespace) -> dict[str, Any]:
     """Return the parameters of the watching node."""
-    options = {"--start": args.start, "--global": args.anywhere, "--odom-topic": args.odom_topic,
-               "--no-autostart": args.no_autostart}  # fmt: skip
-    for name, value in options.items():
-        if value:
-            raise ValueError(f"{name}: must not come with watch")
+    refuse(args, ("start", "anywhere", "odom_topic", "no_autostart"), "must not come with watch")
     return _common(args) | ({} if args.base_frame is None else {"base_frame": args.base_frame})
 
 

@@ -10,13 +10,15 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import gpusense as gs
 from gpusense.commands.arguments import Options, finite_number
-from gpusense.evaluation.steps import Step, check_scanners, read_steps, with_poses
-from gpusense.evaluation.trajectory_files import poses_at, read_tum, write_tum
-from gpusense.logs import Scan
-from gpusense.logs.reader import LogOptions, read_lasers
+from gpusense.evaluation import log_steps, trajectory_files
+
+if TYPE_CHECKING:
+    from gpusense.evaluation.log_steps import Step
+    from gpusense.logs.reader import LogOptions
 
 FORMATS = "CARMEN or Wean Hall, plain or .gz; a bag of ROS 1 (.bag) or of ROS 2 (folder, .db3, .mcap)"
 OPTIONS = {
@@ -62,18 +64,20 @@ def options_named() -> Iterator[None]:
         raise ValueError(f"--{OPTIONS[found[1]]}: {str(error)[found.end() :]}") from None
 
 
-def read_scans(args: argparse.Namespace) -> list[tuple[int, Scan]]:
+def read_scans(args: argparse.Namespace) -> list[tuple[int, gs.Scan]]:
     """Read the chosen scans of ``--log`` with their indices; each must have a pose."""
-    return with_poses(read_posed_steps(args), args.log)
+    return log_steps.with_poses(read_posed_steps(args), args.log)
 
 
-def read_scan(args: argparse.Namespace) -> Scan:
+def read_scan(args: argparse.Namespace) -> gs.Scan:
     """Read the scan ``--scan`` of ``--log``, the first one by default."""
+    from gpusense.logs.reader import read_lasers
+
     wanted, index = args.scan or 0, 0
     with options_named():
         sensors = () if args.topic is None else (args.topic,)
         for _, scan in read_lasers(args.log, sensors, odometry=False, **log_options(args)):
-            if index == wanted and isinstance(scan, Scan):
+            if index == wanted and isinstance(scan, gs.Scan):
                 return scan
             index += 1
     raise ValueError(f"--scan: must be below the log's number of scans, {index}, got {wanted}")
@@ -83,7 +87,7 @@ def read_chosen_steps(args: argparse.Namespace, *, odometry: bool = True) -> lis
     """Read the chosen scans of ``--log`` with raw odometry, of one laser or of several by time."""
     sensors = [args.topic] if isinstance(args.topic, str) else args.topic or ()
     with options_named():
-        steps = read_steps(
+        steps = log_steps.read_steps(
             args.log, every=args.every, offset=args.offset, limit=args.limit, sensors=sensors, odometry=odometry,
             **log_options(args),
         )  # fmt: skip
@@ -97,13 +101,13 @@ def read_posed_steps(args: argparse.Namespace) -> list[Step]:
     """Read the chosen scans of ``--log``, with the poses of ``--reference`` if set; scans without one are skipped."""
     steps = read_chosen_steps(args, odometry=False)
     if args.reference is None:
-        check_scanners(steps, args.log)
+        log_steps.check_scanners(steps, args.log)
         return steps
-    poses = poses_at([step.scan.time for step in steps], *read_tum(args.reference))
+    poses = trajectory_files.poses_at([step.scan.time for step in steps], *trajectory_files.read_tum(args.reference))
     known = [replace(step, scan=replace(step.scan, pose=pose)) for step, pose in zip(steps, poses, strict=True) if pose]
     if len(known) < len(steps):
         sys.stderr.write(f"gpusense: --reference: has poses of {len(known)} of {len(steps)} chosen scans\n")
-    check_scanners(known, args.log)
+    log_steps.check_scanners(known, args.log)
     return known
 
 
@@ -125,4 +129,4 @@ def write_trajectory(path: Path | None, times: Sequence[float], poses: Any, firs
         rule = "the times of the log do not increase: the trajectory has the indices of the scans instead"
         sys.stderr.write(f"gpusense: --tum: {rule}\n")
     at = range(len(times)) if indices else times
-    write_tum(path, at[first:], poses[first:], indices=indices)
+    trajectory_files.write_tum(path, at[first:], poses[first:], indices=indices)

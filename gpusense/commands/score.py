@@ -5,25 +5,19 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import gpusense as gs
 from gpusense.commands import output
 from gpusense.commands.arguments import Options, picture, scan_model, temperature, whole_number
 from gpusense.commands.output import counted, degrees, draw, grouped, length
 from gpusense.commands.scans import add_log, read_scans
 from gpusense.commands.signals import working
-from gpusense.evaluation.scoring import (
-    Fitness,
-    FitnessOfLog,
-    LogScore,
-    LogScoring,
-    Model,
-    ParticleSampler,
-    summary,
-    temperature_of_log,
-)
+from gpusense.evaluation import scoring
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.plots.runs import scores_figure
-from gpusense.world.map_files import read_map
+
+if TYPE_CHECKING:
+    from gpusense.evaluation.scoring import Fitness, LogScore, Model
 
 FIRST = ("map", "log", "reference", "parameters", "plot")
 SHARED = ("reference", "choice", "model", "backend", "seed", "verbose")
@@ -59,19 +53,21 @@ def add_options(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Score the scans and print the results; after Ctrl-C, the results so far."""
-    sampler = ParticleSampler(args.particles, seed=args.seed)
-    grid = read_map(args.map)
+    from gpusense.plots.runs import scores_figure
+
+    sampler = scoring.ParticleSampler(args.particles, seed=args.seed)
+    grid = gs.read_map(args.map)
     scans = read_scans(args)
     scanner, factor = scans[0][1].scanner, args.temperature
     if factor == "auto":
-        factor = temperature_of_log(scan_model(args, grid, scanner), scans)
+        factor = scoring.temperature_of_log(scan_model(args, grid, scanner), scans)
     model = scan_model(args, grid, scanner, temperature=factor)
-    scoring, fitness = LogScoring(model, sampler), FitnessOfLog(model)
-    with working(scoring, len(scans)) as step:
+    scores, fitness = scoring.LogScoring(model, sampler), scoring.FitnessOfLog(model)
+    with working(scores, len(scans)) as step:
         for index, scan in scans:
             step(f"scan {index}")
-            fitness.add(scan, scoring.add(index, scan).better)
-    score, fit = scoring.result(), fitness.result()
+            fitness.add(scan, scores.add(index, scan).better)
+    score, fit = scores.result(), fitness.result()
     _report(args, model, score, fit, len(scans))
     draw(args.plot, lambda: scores_figure(grid, score, pose_name(args)))
     if not args.json:
@@ -84,8 +80,8 @@ def _report(args: argparse.Namespace, model: Model, score: LogScore, fitness: Fi
     if args.json:
         facts = {
             "parameters": model.parameters.to_dict(), "temperature": model.temperature,
-            "range_max": model.scanner.range_max, **asdict(score), "summary": summary(score), "scans_chosen": chosen,
-            "fitness": asdict(fitness) | {"fits": fitness.fits, "verdict": fitness.verdict},
+            "range_max": model.scanner.range_max, **asdict(score), "summary": scoring.summary(score),
+            "scans_chosen": chosen, "fitness": asdict(fitness) | {"fits": fitness.fits, "verdict": fitness.verdict},
         }  # fmt: skip
         output.report(facts, args)
         return
@@ -94,7 +90,7 @@ def _report(args: argparse.Namespace, model: Model, score: LogScore, fitness: Fi
     output.interrupted(len(score.scans), chosen)
     values = ", ".join(f"{name} {value}" for name, value in model.parameters.to_dict().items())
     how = "calibrated from the scans" if args.temperature == "auto" else "given"
-    s = {name: number_text(value) for name, value in summary(score).items()}
+    s = {name: number_text(value) for name, value in scoring.summary(score).items()}
     output.details(
         args,
         f"{args.model} model, {args.precision}: {values}, range_max {model.scanner.range_max:.6g} m\n"
@@ -111,7 +107,7 @@ def pose_name(args: argparse.Namespace) -> str:
 
 def _print(score: LogScore, pose: str) -> None:
     """Print the rank of the true pose, and the error of the weighted mean."""
-    s = summary(score)
+    s = scoring.summary(score)
     output.fact("device", f"{score.device.selection} ({score.device.name}): {counted(len(score.scans), 'scan')}, "
                 f"{grouped(score.particles)} particles each")  # fmt: skip
     output.fact("rank", f"of the {pose} among them: median {number_text(s['rank_median'])}, better than "

@@ -7,16 +7,19 @@ import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import asdict
+from typing import TYPE_CHECKING
 
+import gpusense as gs
 from gpusense._util.typing import PRECISIONS
-from gpusense.backends import Backend, devices
 from gpusense.commands import output
 from gpusense.commands.arguments import BACKEND_HELP, Options
 from gpusense.commands.output import driver_text
 from gpusense.commands.signals import HELD, working
 from gpusense.evaluation import selftest, stiff
-from gpusense.evaluation.tolerances import Check
-from gpusense.world.plausible import PlausibilityWarning
+
+if TYPE_CHECKING:
+    from gpusense.backends import Backend
+    from gpusense.evaluation.tolerances import Check
 
 FIRST = ("backend", "stiff")
 SHARED = ("verbose",)
@@ -55,14 +58,14 @@ def run(args: argparse.Namespace) -> int:
     checks: list[Check] = []
     with warnings.catch_warnings():
         # The scenes have implausible readings on purpose.
-        warnings.simplefilter("ignore", PlausibilityWarning)
+        warnings.simplefilter("ignore", gs.PlausibilityWarning)
         if args.stiff:
             _run_stiff(backends, checks)
         else:
             with working(checks, len(backends)) as step:
                 selftest.run(backends, step=step, checks=checks)
     seconds, breaches = time.perf_counter() - begin, [check for check in checks if not check.passed]
-    absent = [device for device in devices() if not device.available]
+    absent = [device for device in gs.devices() if not device.available]
     if args.json:
         output.report({
             "passed": not breaches and not HELD, "backends": [asdict(backend.info) for backend in backends],
@@ -96,7 +99,7 @@ def _print_result(count: int, breaches: int, backends: Sequence[Backend], interr
     else:
         verdict = interrupted or f"PASSED: all {count}"
         output.result(f"{verdict} comparisons within tolerance, in {seconds:.0f} s")
-    reasons = {device.selection: device.reason for device in devices()}
+    reasons = {device.selection: device.reason for device in gs.devices()}
     for info in (backend.info for backend in backends):
         reason = reasons.get(info.selection)
         output.fact(info.selection, f"{info.name} ({driver_text(info)}){f': {reason}' if reason else ''}")

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+import gpusense as gs
 from gpusense._util.files import check_writable
 from gpusense.commands import output
 from gpusense.commands.arguments import (
@@ -25,15 +26,8 @@ from gpusense.commands.arguments import (
 )
 from gpusense.commands.output import counted
 from gpusense.commands.parameter_files import Localization, read_localization
-from gpusense.evaluation.buildings import WORLDS
-from gpusense.evaluation.simulation.run import MOTION, READINGS, SimulatedRun, kind_of, simulate_run, write_run
-from gpusense.evaluation.trajectory_files import read_tum, write_tum
-from gpusense.localization.motion import OdometryMotion
-from gpusense.logs.bag_writer import check_bag
-from gpusense.world.grid import OccupancyGrid
-from gpusense.world.map_files import read_map, write_map
-from gpusense.world.parameters import BeamParameters
-from gpusense.world.scanner import Scanner
+from gpusense.evaluation import buildings, trajectory_files
+from gpusense.evaluation.simulation import run as simulation
 
 FIRST = ("world", "map", "log_out", "map_out", "scans")
 SHARED = ("seed", "json")
@@ -109,11 +103,11 @@ def _add_sensors(add: Options) -> None:
 def run(args: argparse.Namespace) -> int:
     """Simulate, and write the files."""
     args.format = _check_output(args)
-    grid = read_map(args.map) if args.map else _generated(args.world, args.seed)
-    world = None if args.true_map is None else read_map(args.true_map)
-    path = None if args.path is None else read_tum(args.path)[1]
+    grid = gs.read_map(args.map) if args.map else _generated(args.world, args.seed)
+    world = None if args.true_map is None else gs.read_map(args.true_map)
+    path = None if args.path is None else trajectory_files.read_tum(args.path)[1]
     parameters, motion = _noise(args)
-    made = simulate_run(
+    made = gs.worlds.simulate_run(
         grid, _scanner(args), scans=args.scans, world=world, path=path, parameters=parameters, motion=motion,
         people=args.people, hidden=args.hidden, moved=args.moved, removed=args.removed, added=args.added,
         glass=args.glass, kidnaps=args.kidnaps, step=args.step, turn=args.turn, period=args.period,
@@ -121,17 +115,19 @@ def run(args: argparse.Namespace) -> int:
     )  # fmt: skip
     for file, content in ((args.map_out, made.grid), (args.world_out, made.world)):
         if file is not None:
-            write_map(content, file)
+            gs.write_map(content, file)
     if args.tum is not None:
-        write_tum(args.tum, made.times.tolist(), made.poses)
-    write_run(made, args.log_out, args.format)
+        trajectory_files.write_tum(args.tum, made.times.tolist(), made.poses)
+    gs.worlds.write_run(made, args.log_out, args.format)
     _report(args, made)
     return 0
 
 
 def _check_output(args: argparse.Namespace) -> str:
     """Return the format of the log, after checking that it can be written."""
-    kind = kind_of(args.log_out) if args.format is None else str(args.format)
+    from gpusense.logs.bag_writer import check_bag
+
+    kind = simulation.kind_of(args.log_out) if args.format is None else str(args.format)
     if kind == "carmen":
         check_writable(args.log_out)
         return kind
@@ -142,12 +138,14 @@ def _check_output(args: argparse.Namespace) -> str:
     return kind
 
 
-def _generated(name: str, seed: int) -> OccupancyGrid:
+def _generated(name: str, seed: int) -> gs.OccupancyGrid:
     """Return a generated world by a name such as ``office`` or ``office:3``."""
     kind, colon, number = name.partition(":")
-    if kind not in WORLDS or (colon and not (number.isascii() and number.isdigit() and len(number) < 10)):
-        raise ValueError(f"--world: must be one of {', '.join(WORLDS)}, or with a seed as in office:3, got {name!r}")
-    return WORLDS[kind](int(number) if colon else seed)
+    if kind not in buildings.WORLDS or (colon and not (number.isascii() and number.isdigit() and len(number) < 10)):
+        raise ValueError(
+            f"--world: must be one of {', '.join(buildings.WORLDS)}, or with a seed as in office:3, got {name!r}"
+        )
+    return buildings.WORLDS[kind](int(number) if colon else seed)
 
 
 def _scanner(args: argparse.Namespace) -> Any:
@@ -155,25 +153,25 @@ def _scanner(args: argparse.Namespace) -> Any:
         raise ValueError(f"--view: must be below 360, got {args.view:g}")
     view = math.radians(args.view)
     step = view / max(args.beams - 1, 1)
-    return Scanner.uniform(
+    return gs.Scanner.uniform(
         angle_min=-view / 2 if args.beams > 1 else 0.0, angle_increment=step, count=args.beams,
         range_max=args.range_max, mount=args.mount,
     )  # fmt: skip
 
 
-def _noise(args: argparse.Namespace) -> tuple[BeamParameters, OdometryMotion]:
+def _noise(args: argparse.Namespace) -> tuple[gs.BeamParameters, gs.OdometryMotion]:
     """Return the mixture of the readings and the noise of the odometry."""
     given = Localization(None, {}) if args.parameters is None else read_localization(args.parameters)
-    parameters = given.sensor if isinstance(given.sensor, BeamParameters) else READINGS
+    parameters = given.sensor if isinstance(given.sensor, gs.BeamParameters) else simulation.READINGS
     if args.noise is not None:
         parameters = parameters.replace(sigma_hit=args.noise)
-    motion = OdometryMotion(**given.noise) if given.noise else MOTION
+    motion = gs.OdometryMotion(**given.noise) if given.noise else simulation.MOTION
     if args.motion_noise is not None:
         motion = dataclasses.replace(motion, alpha=tuple(args.motion_noise))
     return parameters, motion
 
 
-def _report(args: argparse.Namespace, made: SimulatedRun) -> None:
+def _report(args: argparse.Namespace, made: gs.worlds.SimulatedRun) -> None:
     steps = np.hypot(*np.diff(made.poses[:, :2], axis=0).T)
     length = float(steps[~made.kidnapped[1:]].sum())
     changed = int(np.count_nonzero(made.world.occupied != made.grid.occupied)) if args.true_map is None else None

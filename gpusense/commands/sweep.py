@@ -9,21 +9,18 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gpusense._util import checks
 from gpusense._util.progress import progress
 from gpusense.commands import output
 from gpusense.commands.arguments import BACKEND_HELP, Options, picture, positive_number, whole_number
 from gpusense.commands.output import counted
-from gpusense.plots.drawing import save
-from gpusense.plots.runs import sweep_figure
-from gpusense.sweeps.cluster import DaskExecutor, security_of
-from gpusense.sweeps.executors import ProcessExecutor
-from gpusense.sweeps.job import Job, contents_of
-from gpusense.sweeps.run import Sweep
-from gpusense.sweeps.run import run as run_jobs
-from gpusense.sweeps.table import read_table
-from gpusense.sweeps.tasks import read_plan
+
+if TYPE_CHECKING:
+    from gpusense.sweeps.cluster import DaskExecutor
+    from gpusense.sweeps.job import Job
+    from gpusense.sweeps.run import Sweep
 
 FIRST = ("table", "processes", "device", "resume", "plot")
 SHARED = ("verbose",)
@@ -79,6 +76,8 @@ def add_options(add: Options) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the jobs, and print a summary; after Ctrl-C, of the jobs so far."""
+    from gpusense.sweeps.tasks import read_plan
+
     jobs = read_plan(args.plan)
     if args.list:
         return _list(jobs, as_json=args.json)
@@ -109,6 +108,8 @@ def _list(jobs: tuple[Job, ...], *, as_json: bool) -> int:
 
 def _swept(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Sweep:
     """Run the jobs on the executor of the options."""
+    from gpusense.sweeps.run import run as run_jobs
+
     failures = 0
     with _executor(args, jobs) as executor, progress(len(jobs)) as step:
         step("starting")
@@ -138,6 +139,9 @@ def _swept(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Sweep:
 @contextlib.contextmanager
 def _executor(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Iterator[Executor]:
     """Make the executor from the options, and end it afterwards."""
+    from gpusense.sweeps.executors import ProcessExecutor
+    from gpusense.sweeps.job import contents_of
+
     devices: list[str] = args.device or []
     count = args.processes or max(len(devices), 1)
     if args.processes and len(devices) > 1 and len(devices) != count:
@@ -159,6 +163,8 @@ def _executor(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Iterator[Execu
 
 @contextlib.contextmanager
 def _dask(args: argparse.Namespace, names: list[str] | int) -> Iterator[DaskExecutor]:
+    from gpusense.sweeps.cluster import DaskExecutor, security_of
+
     local = args.dask == LOCAL
     try:
         files = [checks.existing_file(one) for one in (args.tls_ca, args.tls_cert, args.tls_key) if one is not None]
@@ -194,6 +200,10 @@ def _report(args: argparse.Namespace, ended: Sweep, seconds: float) -> None:
 
 def _drawn(table: str, path: Path) -> bool:
     """Draw the picture; return whether any job could be drawn."""
+    from gpusense.plots.drawing import save
+    from gpusense.plots.runs import sweep_figure
+    from gpusense.sweeps.table import read_table
+
     try:
         figure = sweep_figure(read_table(table))
     except ValueError as error:

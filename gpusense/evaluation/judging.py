@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Floats
-from gpusense.evaluation.steps import NEAR
+from gpusense.evaluation.log_steps import NEAR
 from gpusense.evaluation.tracking import RISK, Track
 from gpusense.evaluation.trajectory_files import nearest_index, poses_at
 from gpusense.localization.diagnosis import Diagnosis

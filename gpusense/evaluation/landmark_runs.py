@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.evaluation.steps import Step
+from gpusense.evaluation.log_steps import Step
 from gpusense.evaluation.tracking import Track
 from gpusense.learning.fitted import LandmarkFit
 from gpusense.learning.landmark.fit import fit_landmark_parameters

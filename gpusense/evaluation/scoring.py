@@ -7,7 +7,6 @@ logged pose is ranked among them. The weighted mean excludes it, since it would 
 from __future__ import annotations
 
 import math
-import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -133,31 +132,25 @@ def score_scan(index: int, poses: Floats, log_p: Array, beams: int, seconds: flo
     )  # fmt: skip
 
 
+# Figures over scans: an attribute of their scores, and how it is summarised.
+_FIGURES = (
+    "rank_median", "percentile_median", "percentile_min", "error_position_median", "error_position_90",
+    "error_position_max", "error_heading_median", "error_heading_90", "effective_median",
+)  # fmt: skip
+_TAKE: dict[str, Callable[[list[float]], Any]] = {
+    "median": np.median, "90": lambda values: np.quantile(values, 0.9, method="inverted_cdf"), "min": min, "max": max,
+}  # fmt: skip
+
+
 def summary(score: LogScore) -> dict[str, Any]:
     """Return medians, 90 % quantiles and extremes over the scans; None if no scan has a value."""
-
-    def over_scans(pick: Callable[[ScanScore], float | None], take: Callable[[Sequence[float]], float]) -> float | None:
-        values = [value for value in map(pick, score.scans) if value is not None]
-        return take(values) if values else None
-
-    def quantile_90(values: Sequence[float]) -> float:
-        return sorted(values)[min(math.ceil(0.9 * len(values)), len(values)) - 1]
-
-    middle = statistics.median
-    return {
-        "scans": len(score.scans),
-        "rank_median": over_scans(lambda s: s.rank, middle),
-        "percentile_median": over_scans(lambda s: s.percentile, middle),
-        "percentile_min": over_scans(lambda s: s.percentile, min),
-        "error_position_median": over_scans(lambda s: s.error_position, middle),
-        "error_position_90": over_scans(lambda s: s.error_position, quantile_90),
-        "error_position_max": over_scans(lambda s: s.error_position, max),
-        "error_heading_median": over_scans(lambda s: s.error_heading, middle),
-        "error_heading_90": over_scans(lambda s: s.error_heading, quantile_90),
-        "effective_median": over_scans(lambda s: s.effective, middle),
-        "degenerate": sum(s.degenerate for s in score.scans),
-        "particle_beams_per_second": score.particle_beams_per_second,
-    }
+    figures: dict[str, Any] = {"scans": len(score.scans)}
+    for figure in _FIGURES:
+        name, _, kind = figure.rpartition("_")
+        values = [value for scan in score.scans if (value := getattr(scan, name)) is not None]
+        figures[figure] = float(_TAKE[kind](values)) if values else None
+    figures["degenerate"] = sum(scan.degenerate for scan in score.scans)
+    return figures | {"particle_beams_per_second": score.particle_beams_per_second}
 
 
 class LogScoring:

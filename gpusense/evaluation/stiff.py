@@ -1,9 +1,8 @@
 """Evaluate a catalogue of stiff and extreme cases on a backend.
 
-:func:`density_grid` evaluates the mixture in the device's scoring kernel on a grid of densities for which the
-textbook's formulas fail; the truth is ``gpusense.models.scan.densities`` in float64, which tests compare with mpmath at
-60 digits. The truth of the scenes of :func:`cases` is evaluated in float64 on the device's rounded inputs and expected
-ranges.
+:func:`density_grid` evaluates the mixture of beam models on a grid of densities for which the textbook's formulas fail;
+the truth is ``gpusense.models.scan.densities`` in float64, which tests compare with mpmath at 60 digits. The truth of
+the scenes of :func:`cases` is evaluated in float64 on the device's rounded inputs and expected ranges.
 """
 
 from __future__ import annotations
@@ -21,14 +20,11 @@ from gpusense._util.typing import Precision, Reals
 from gpusense.backends import Backend, Selection, get_backend
 from gpusense.evaluation.replay import Launch, Recorder, replay
 from gpusense.evaluation.tolerances import TOLERANCES, Check, Tolerance, beam_tolerance, per_scan
-from gpusense.interface import structs
-from gpusense.interface.launches import launch
 from gpusense.localization.weights import normalize_weights
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.densities import log_mixture
 from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.tables.rectangles import Planes, empty_rectangles
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 from gpusense.world.scanner import Scanner
@@ -73,52 +69,28 @@ class Densities:
 
 
 def density_grid(backend: Selection, precision: Precision) -> Densities:
-    """Evaluate the density grid in the kernel ``score_beams``.
+    """Evaluate the density grid by beam models of a scanner with equal beams.
 
-    The map is one row of cells with a wall. Eight particles face it from distances that are exact in cells: inside the
-    wall, an ulp before it, and farther, to beyond range_max. Deviations and rates are rounded to the precision first,
-    so that device and truth have the same inputs.
+    Eight particles face a wall from distances that are exact in cells: inside the wall, an ulp before it, and farther,
+    to beyond range_max. Deviations and rates are rounded to the precision first, so that device and truth have the same
+    inputs.
     """
-    device, real, obstacles = get_backend(backend), np.dtype(precision), np.arange(48)[None] >= 40
+    device, real = get_backend(backend), np.dtype(precision)
     ulp = float(np.spacing(real.type(RANGE_MAX / 2)))
-    poses = np.full((8, 4), (0.5, 0.5, 1.0, 0.0), real)
-    poses[1:7, 0] = 1 - ulp / 16, 0.9990234375, 0.5, 0.7109375, 0.328125, ulp
-    rectangles, count = empty_rectangles(device, obstacles, Planes(1)), len(poses)
-    cells = device.upload(np.array([(c, 0) for c in (40, 39, 39, 39, 37, 31, 24, 20)], np.int32))
-    pose, ray, ranges = device.upload(poses), device.upload(np.array([[1, 0]], real)), device.empty(count, real)
-    wide = frozenset({"FLOAT64"} if real == np.float64 else ())
-    casting = dict(
-        map_table=rectangles, pose_cell=cells, pose=pose, ray=ray, window=structs.Window(0, 0, *obstacles.shape),
-        particles=count, rays=1, caster=structs.Caster(0, 0.0, 0.0),
-        scale=structs.RangeScale(RANGE_MAX, 1.0, RANGE_MAX),
-    )  # fmt: skip
-    device.run((launch("cast_ranges", wide, (1, count), **casting, ranges=ranges),))
-    expected = device.download(ranges, np.empty(count, real))
-
+    grid, poses = OccupancyGrid(100 * (np.arange(48)[None] < 1)), np.full((8, 3), (0.5, 0.5, math.pi))
+    poses[1:, 0] += 0.5 + np.array([ulp / 8, 0.0009765625, 0.5, 2.2890625, 8.671875, RANGE_MAX - 2 * ulp, 19.5])
     # Warp compiles each set of flags for seconds, so its kernel is unspecialised and compiled once.
-    specialize = device.info.backend != "warp"
-    flags = wide | {"PER_BEAM", "SHARED_RAYS"} | (set() if specialize else {"ALL_READINGS", "ORIGINS_OUTSIDE"})
-    options: dict[str, Any] = dict(backend=device, precision=precision, specialize=specialize)
-    scene = OccupancyGrid(obstacles.astype(np.int8)), Scanner([0.0], RANGE_MAX)
+    options: dict[str, Any] = dict(precision=precision, specialize=device.info.backend != "warp")
+    expected = RayCaster(grid, RANGE_MAX, backend=device, precision=precision).cast(poses, [0.0])[:, 0]
     blocks = []
     for p in _grid_parameters(real):
-        model = BeamModel(*scene, p, **options)
-        z = _grid_readings(p, expected, ulp)
-        parts = device.empty(count * len(z), real)
-        first = device.upload(np.array([0, len(z)], np.int32))
-        mixture = model._beam_pipeline.mixture
-        # Rays that are shared do not end behind a reading.
-        scoring = launch(
-            "score_beams", flags | (mixture.flags - {"STOPS"}), (count,), **casting, first=first,
-            reading=device.upload(z), terms=device.upload(np.stack(mixture.terms, axis=1)),
-            masses=device.upload(mixture.masses), log_p=device.empty(count, real), parts=parts, readings=len(z),
-            tables=structs.MixtureTables(1, 0, 0.0), cone=structs.Cone(1, 0.0), score=structs.Score(0.0, 1.0),
-        )  # fmt: skip
-        device.run((scoring,))
-        log_p = device.download(parts, np.empty(count * len(z), real))
-        values = np.repeat(np.array([list(p.to_dict().values())], real).T, log_p.size, axis=1)
-        blocks.append(np.vstack([np.tile(z, count), np.repeat(expected, len(z)), log_p, values]))
-    table = np.concatenate(blocks, axis=1)
+        z, recorder = _grid_readings(p, expected, ulp), Recorder(device)
+        model = BeamModel(grid, Scanner(np.zeros(len(z)), RANGE_MAX), p, backend=recorder, **options)
+        model.log_likelihood(poses, z, per_beam=True)
+        for launch in recorder.launches:
+            values = np.repeat(np.array([list(p.to_dict().values())], real).T, launch.parts.size, axis=1)
+            blocks.append(np.vstack([*(part.ravel() for part in (*_inputs(launch), launch.parts)), values]))
+    table = np.concatenate(blocks, axis=1).astype(real)
     return Densities(table[0], table[1], dict(zip(p.to_dict(), table[3:], strict=True)), table[2])
 
 
@@ -268,14 +240,19 @@ def case_checks(case: Case, device: Backend, precision: Precision) -> Iterator[C
             yield check(f"{name}, weights", abs(float(result.weights.sum()) - 1) if consistent else math.inf, _WEIGHTS)
 
 
+def _inputs(launch: Launch) -> tuple[Reals, Reals]:
+    """Return the readings and expected ranges (particles, readings) of a launch of a beam model."""
+    expected, first = launch.expected, launch.values["first"]
+    assert expected is not None
+    expected = expected if first is None else np.repeat(expected, np.diff(first), axis=1)
+    return np.broadcast_to(launch.values["reading"], expected.shape), expected
+
+
 def _truth(launch: Launch, parameters: Any) -> Reals:
     """Compute log p of a launch's beams in float64, on its rounded readings and expected ranges."""
     if launch.expected is None:
         return replay(launch)[1]
-    z, top = launch.values["reading"].astype(np.float64), float(launch.values["scale"].range_max)
-    expected, first = launch.expected.astype(np.float64), launch.values["first"]
-    if first is not None:
-        expected = np.repeat(expected, np.diff(first), axis=1)
+    (z, expected), top = (one.astype(np.float64) for one in _inputs(launch)), float(launch.values["scale"].range_max)
     # A reading below range_max may round to range_max in the launch's precision, and is still a hit.
     z = np.where(z == top, np.nextafter(top, 0), z)
     return np.where(np.isnan(z), 0.0, log_mixture(z, expected, range_max=top, **parameters.to_dict()))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gpusense._util.typing import Floats
-from gpusense.evaluation.steps import Step, repeats_odometry
+from gpusense.evaluation.log_steps import Step, repeats_odometry
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.filter import ParticleFilter
 from gpusense.localization.pose_algebra import pose_difference, wrap_angle

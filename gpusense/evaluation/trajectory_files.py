@@ -90,35 +90,30 @@ def poses_at(
     ``scans``: Times of the scans [s], at least one. ``times``: (T,) increasing times of the trajectory [s]. ``poses``:
     (T, 3) its poses. ``near``: Largest time from a scan to a single pose near it [s].
     """
-    found = [_pose_at(time, times, poses, near) for time in scans]
-    if not any(found):
-        span, wanted = f"{times[0]:.3f} to {times[-1]:.3f} s", f"{scans[0]:.3f} to {scans[-1]:.3f} s"
-        raise ValueError(f"{name}: must have poses at times of the scans, {wanted}, got {span}")
-    return found
+    wanted = np.asarray(scans, np.float64)
+    nearest, (before, after) = nearest_index(wanted, times), _neighbours(wanted, times)
+    span, apart = times[after] - times[before], np.abs(times[nearest] - wanted)
+    between = (times[before] < wanted) & (wanted <= times[after]) & (span <= _FARTHEST)
+    single = (apart <= _SAME_TIME) | ((apart <= near) & ~between)
+    known = single | between
+    if not known.any():
+        held, asked = f"{times[0]:.3f} to {times[-1]:.3f} s", f"{scans[0]:.3f} to {scans[-1]:.3f} s"
+        raise ValueError(f"{name}: must have poses at times of the scans, {asked}, got {held}")
+    change = poses[after] - poses[before]
+    change[:, 2] = wrap_angle(change[:, 2])
+    share = (wanted - times[before]) / np.where(span > 0, span, 1.0)
+    found = np.where(single[:, None], poses[nearest], poses[before] + share[:, None] * change)
+    return [(x, y, theta) if sure else None for (x, y, theta), sure in zip(found.tolist(), known, strict=True)]
 
 
-def nearest_index(scans: Sequence[float], times: Floats) -> NDArray[np.int64]:
+def nearest_index(scans: Sequence[float] | Floats, times: Floats) -> NDArray[np.int64]:
     """Return the index of the pose of a trajectory nearest to each time of a scan."""
     wanted = np.asarray(scans, np.float64)
-    after = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
-    before = after - 1
-    after = np.minimum(after, len(times) - 1)
+    before, after = _neighbours(wanted, times)
     return np.where(wanted - times[before] <= times[after] - wanted, before, after)
 
 
-def _pose_at(time: float, times: Floats, poses: Floats, near: float) -> Pose | None:
-    """Return the pose of a trajectory at a time; None if none is near."""
-    nearest = int(nearest_index([time], times)[0])
-    after = int(np.searchsorted(times, time))
-    apart = abs(times[nearest] - time)
-    between = 0 < after < len(times) and times[after] - times[after - 1] <= _FARTHEST
-    if apart <= _SAME_TIME or (apart <= near and not between):
-        x, y, theta = (float(value) for value in poses[nearest])
-        return x, y, theta
-    if not between:
-        return None
-    share = (time - times[after - 1]) / (times[after] - times[after - 1])
-    change = poses[after] - poses[after - 1]
-    change[2] = wrap_angle(change[2])
-    x, y, theta = (float(value) for value in poses[after - 1] + share * change)
-    return x, y, theta
+def _neighbours(wanted: Floats, times: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the indices of the poses before and after each time, within the trajectory."""
+    after = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
+    return after - 1, np.minimum(after, len(times) - 1)

@@ -30,7 +30,7 @@ from gpusense.world.grid import OccupancyGrid
 
 if TYPE_CHECKING:
     from gpusense.evaluation.judging import Judgement
-    from gpusense.evaluation.steps import Step
+    from gpusense.evaluation.log_steps import Step
     from gpusense.evaluation.tracking import Track
     from gpusense.localization.filter import ParticleFilter
     from gpusense.logs import Scan

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from gpusense._util import checks
 
 if TYPE_CHECKING:
-    from gpusense.evaluation.steps import Step
+    from gpusense.evaluation.log_steps import Step
     from gpusense.logs import Scan
     from gpusense.world.grid import OccupancyGrid
 
@@ -170,7 +170,7 @@ class Store:
 
     def steps(self, job: Job, group: str = "", *, odometry: bool = True) -> list[Step]:
         """Return the scans of a job, with their odometry or not; ``group`` names the options that choose them."""
-        from gpusense.evaluation.steps import read_steps
+        from gpusense.evaluation.log_steps import read_steps
 
         chosen, topic = _chosen(job, group), _topic(job)
         key, options = (job.log, topic, odometry, *chosen.items()), chosen | {"odometry": odometry}
@@ -179,7 +179,7 @@ class Store:
 
     def scans(self, job: Job, group: str = "") -> list[tuple[int, Scan]]:
         """Return the scans of a job with logged poses; see :meth:`steps`."""
-        from gpusense.evaluation.steps import with_poses
+        from gpusense.evaluation.log_steps import with_poses
 
         return with_poses(self.steps(job, group, odometry=False), self.path(job.log))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 from pathlib import Path
 
@@ -9,7 +10,8 @@ import pytest
 from support.bench_world import ERRORS, TIMES
 
 import gpusense as gs
-from gpusense.commands import cli
+from gpusense.commands import bench, cli
+from gpusense.commands.arguments import quantity
 from gpusense.evaluation.benchmark import candidates, scenes
 from gpusense.interface.casters import ENTRIES
 
@@ -114,3 +116,11 @@ def test_bad_options_are_one_line(argv, message, tmp_path, monkeypatch, capsys):
     assert (out, err.count("\n")) == ("", 1)
     assert err.startswith(f"gpusense: error: {message}")
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_limits_have_units():
+    limit = quantity(bench._ERRORS)
+    assert limit("0.01 nats") == ("nats", 0.01) and limit("1%") == ("%", 0.01) and limit(" 2e-1 cm") == ("m", 0.002)
+    for text in ("2", "cm", "-1 cm", "nan m", "1e999 m", "1 ms", "0 %", "1.2.3 m", ""):
+        with pytest.raises(argparse.ArgumentTypeError, match=r"must be a number > 0 with a unit of nats, .*, got"):
+            limit(text)

@@ -50,6 +50,18 @@ def test_command_help_has_an_example(name, capsys):
     assert "--json" in out or name == "ros"  # a node has no result
 
 
+def test_help_executes_no_model_and_opens_no_device(tmp_path):
+    done = script(
+        "from gpusense.commands import cli; cli._build(cli.COMMANDS); print(*(name for name, module in "
+        "sys.modules.items() if type(module).__name__ != '_LazyModule'))", cwd=tmp_path,
+    )  # fmt: skip
+    executed = set(done.stdout.split())
+    assert {f"gpusense.commands.{name.replace('-', '_')}" for name in cli.COMMANDS} <= executed, done.stderr
+    rooms = ("models.scan.model", "backends.base", "matching.match", "localization.filter", "logs.records",
+             "plots.drawing", "evaluation.tracking", "sweeps.job")  # fmt: skip
+    assert not executed & {"scipy", "matplotlib", *(f"gpusense.{name}" for name in rooms)}
+
+
 def test_options_of_a_page_belong_to_a_command_that_it_names():
     (group,) = cli._build(cli.COMMANDS)._subparsers._group_actions
     commands = group.choices
@@ -205,7 +217,7 @@ def test_devices_survive_a_broken_auto(monkeypatch, capsys):
     def fail(selection: str) -> object:
         raise RuntimeError("driver lost")
 
-    monkeypatch.setattr("gpusense.commands.devices.get_backend", fail)
+    monkeypatch.setattr("gpusense.backends.get_backend", fail)
     assert cli.main(["devices"]) == 0
     assert "'auto' does not work: RuntimeError: driver lost" in capsys.readouterr().out
 

@@ -70,7 +70,8 @@ def test_parts_are_measured_and_texts_printed(capsys):
     ("options", "message"),
     [
         (["--log", "{log}"], "--map: must come with --log, got --log {log} alone"),
-        (["--range-max", "3"], "--range-max: must come with --log, got it alone"),
+        (["--range-max", "3"], "--range-max: must come with --log, got 3.0"),
+        (["--scan", "0"], "--scan: must come with --log, got 0"),
         (["--map", "{map}", "--log", "{log}", "--scan", "2"], "--scan: must be below the log's number of scans, 2,"),
         (["--model", "field", "--caster", "dda"], "--caster: must be left out with the field, got dda"),
         (["--model", "field", "--set", "z_short=0.1"], "LikelihoodFieldParameters: every field must be one of"),

@@ -114,7 +114,7 @@ def test_a_fit_interrupted_after_its_search_prints_it(capsys, recorded, monkeypa
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gpusense.commands.fit.compare_held_out", interrupted)
+    monkeypatch.setattr("gpusense.evaluation.range_data.compare_held_out", interrupted)
     assert main(fit(recorded, "--holdout")) == 130
     assert "this fit had ended" in capsys.readouterr().out
 

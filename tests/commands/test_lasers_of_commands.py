@@ -57,6 +57,12 @@ def command(place, name, log="run", *more):
     return [name, "--log", str(place / log), "--backend", "numpy", *options, *out.get(name, []), *more]
 
 
+def test_a_fit_needs_poses(place, capsys):
+    argv = command(place, "fit", "run", "--topic", "/front")
+    del argv[argv.index("--reference") : argv.index("--reference") + 2]
+    assert "every scan must have a pose, of its own or by --reference" in error_of(argv, capsys)
+
+
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", READERS)
 def test_each_command_takes_a_topic(place, capsys, name):

@@ -14,7 +14,7 @@ from support.command_line import error_of
 import gpusense as gs
 from gpusense.commands import cli
 from gpusense.evaluation import tracking
-from gpusense.evaluation.steps import read_steps
+from gpusense.evaluation.log_steps import read_steps
 from gpusense.plots import viewer
 
 BEARINGS = np.radians(np.arange(-90, 91, 1.0))
@@ -124,7 +124,7 @@ def test_an_interrupted_run_keeps_what_it_has(place, capsys, monkeypatch):
             if len(track.steps) == 3:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr("gpusense.commands.localize.follow", stop_after_three)
+    monkeypatch.setattr("gpusense.evaluation.tracking.follow", stop_after_three)
     tum = place / "part.tum"
     assert cli.main(call(place, "--tum", str(tum))) == 130
     assert "interrupted: results of 3 of 12 scans" in capsys.readouterr().out

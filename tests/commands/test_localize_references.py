@@ -12,7 +12,7 @@ from support.room_log import write_room_map
 
 import gpusense as gs
 from gpusense.commands import cli
-from gpusense.evaluation.steps import read_steps, references_to_learn_from, with_references
+from gpusense.evaluation.log_steps import read_steps, references_to_learn_from, with_references
 from gpusense.evaluation.tracking import Track, summary
 from gpusense.evaluation.trajectory_files import read_tum, write_tum
 
@@ -219,7 +219,7 @@ def test_a_trajectory_is_read_as_written_and_flattened(tmp_path):
 
 
 def test_poses_between_those_of_a_trajectory_are_interpolated(place):
-    from gpusense.evaluation.steps import read_steps, with_references
+    from gpusense.evaluation.log_steps import read_steps, with_references
 
     steps = read_steps(place / "raw.log", range_max=20.0)
     times = np.array([0.8, 1.2, 3.0, 5.9, 6.6])
@@ -312,28 +312,3 @@ def test_a_trajectory_of_indices_is_not_taken_for_times(place, capsys, tmp_path)
     assert len(np.loadtxt(tum)) == COUNT
     message = error_of(["fit", *log, *room, "--reference", str(tum)], capsys)
     assert message.endswith("run.tum: must have times of scans, got their indices")
-
-
-def test_a_laser_of_a_bag_is_chosen_by_its_topic(place, capsys, tmp_path):
-    from support.bags import BASE, Writer
-
-    caster, pose = gs.RayCaster(gs.read_map(place / "map.yaml"), range_max=20.0, backend="numpy"), (3.0, 1.5, 0.2)
-    with Writer(tmp_path, "mcap") as bag:
-        for name, mount in {"front": (0.2, 0.0, 0.0), "rear": (-0.2, 0.0, np.pi)}.items():
-            bag.transform(0.0, BASE, name, mount[:2], mount[2])
-            ranges = caster.cast(gs.compose_poses(pose, mount)[None], BEARINGS)[0]
-            for step in range(3):
-                bag.odometry(step, 0.0, 0.0, 0.0)
-                bag.scan(step, ranges, BEARINGS[0], BEARINGS[1] - BEARINGS[0], f"/{name}", frame=name, range_max=20.0)
-    write_tum(tmp_path / "true.tum", [0.0, 1.0, 2.0], [pose] * 3)
-    command = ["fit", "--map", str(place / "map.yaml"), "--log", str(bag.path), "--backend", "numpy"]
-    command += ["--reference", str(tmp_path / "true.tum")]
-    for more in ([], ["--fit-motion"]):
-        assert "topic: must be given, one of /front, /rear" in error_of([*command, *more], capsys)
-    for name in ("/front", "/rear"):
-        assert cli.main([*command, "--topic", name, "--json"]) in (0, 1)
-        found = json.loads(capsys.readouterr().out)["fit"]["parameters"]
-        assert found["z_hit"] > 0.95 and found["sigma_hit"] < 0.05
-    assert "every scan must have a pose, of its own or by --reference" in error_of(
-        [*command[:-2], "--topic", "/rear"], capsys
-    )

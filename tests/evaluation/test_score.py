@@ -12,7 +12,7 @@ import yaml
 import gpusense as gs
 from gpusense.commands.cli import main
 from gpusense.commands.parameter_files import read_localization
-from gpusense.evaluation import scoring, steps
+from gpusense.evaluation import log_steps, scoring
 from gpusense.evaluation.worlds import building, free_pose, simulate_scan
 
 
@@ -114,7 +114,7 @@ def test_temperature_is_calibrated_from_the_log_or_given(capsys, recorded):
     options = ["--model", "field", "--particles", "50", "--backend", "numpy"]
     _, out, _ = run(capsys, recorded, *options, "--json")
     grid = gs.read_map(recorded / "map.yaml")
-    scans = [step.scan for step in steps.read_steps(recorded / "run.log")]
+    scans = [step.scan for step in log_steps.read_steps(recorded / "run.log")]
     model = gs.LikelihoodFieldModel(grid, scans[0].scanner, backend="numpy")
     poses = np.array([scan.pose for scan in scans])
     wanted = gs.calibrate_temperature(model, np.array([scan.ranges for scan in scans]), poses)

@@ -10,7 +10,7 @@ from support.room_log import write_room
 
 import gpusense as gs
 from gpusense.commands import cli
-from gpusense.evaluation.steps import read_steps
+from gpusense.evaluation.log_steps import read_steps
 from gpusense.evaluation.tracking import Track, follow, start, summary
 from gpusense.sweep import Job, ProcessExecutor, SerialExecutor, SweepLost
 from gpusense.sweeps.job import contents_of

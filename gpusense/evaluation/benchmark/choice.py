@@ -12,7 +12,6 @@ is kept until another method is better by more than what noise of both days make
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -25,39 +24,9 @@ CLOSE = 1.25
 ROUNDING = 1e-6
 """Errors below this are equal: rounding of float32."""
 
-
-LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 # By unit of a limit, the unit of the measure to which it applies, and the largest error if no limit is passed.
 _UNITS = {"%": "share", "cells": "cells", "nats": "nats", "m": "m"}
 _LIMITS = {"share": 0.01, "nats": 0.01}
-_QUANTITY = re.compile(r"\s*([0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([a-z%]+)\s*")
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
-
-
-def parse_error(text: str) -> tuple[str, float]:
-    """Read a limit of the error, such as "0.01 nats", "2 cm" or "1 %"; return unit and value (a share for "%")."""
-    value, unit = _quantity(text, ("nats", "cells", "%", *LENGTHS), "--max-error")
-    if unit in LENGTHS:
-        return "m", value * LENGTHS[unit]
-    return unit, value / 100 if unit == "%" else value
-
-
-def parse_time(text: str) -> float:
-    """Read a limit of the time of a call, such as ``"1 ms"``; return seconds."""
-    value, unit = _quantity(text, tuple(_SECONDS), "--max-time")
-    return value * _SECONDS[unit]
-
-
-def _quantity(text: str, units: Sequence[str], name: str) -> tuple[float, str]:
-    rule = f"{name}: must be a number > 0 with a unit of {', '.join(units)}"
-    match = _QUANTITY.fullmatch(text)
-    try:
-        value = float(match[1]) if match else math.nan
-    except ValueError:
-        value = math.nan
-    if match is None or match[2] not in units or not 0 < value < math.inf:
-        raise ValueError(f"{rule}, got {text!r}")
-    return value, match[2]
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:

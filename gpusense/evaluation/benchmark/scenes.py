@@ -29,7 +29,6 @@ RANGE_MAX = 30.0
 # Width and height of the generated maps, in full and in quick runs [m].
 _SIZES = {"building": (50.0, 50.0), "clutter": (50.0, 50.0)}
 _QUICK_SIZES = {"building": (20.0, 14.0), "clutter": (15.0, 15.0)}
-GENERATED = tuple(_SIZES)
 _RESOLUTION = 0.05
 _CLEARANCE = 0.4  # from the true pose to the nearest cell that is not free [m]
 _TRIED_POSES = 32

@@ -77,7 +77,7 @@ def density_grid(backend: Selection, precision: Precision) -> Densities:
     """
     device, real = get_backend(backend), np.dtype(precision)
     ulp = float(np.spacing(real.type(RANGE_MAX / 2)))
-    grid, poses = OccupancyGrid(100 * (np.arange(48)[None] < 1)), np.full((8, 3), (0.5, 0.5, math.pi))
+    grid, poses = OccupancyGrid(100 * (np.arange(48)[None] < 1), 1.0), np.full((8, 3), (0.5, 0.5, math.pi))
     poses[1:, 0] += 0.5 + np.array([ulp / 8, 0.0009765625, 0.5, 2.2890625, 8.671875, RANGE_MAX - 2 * ulp, 19.5])
     # Warp compiles each set of flags for seconds, so its kernel is unspecialised and compiled once.
     options: dict[str, Any] = dict(precision=precision, specialize=device.info.backend != "warp")

@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import Any
 
 from gpusense._util import checks
-from gpusense.sweeps.process import Worker
+from gpusense.sweeps.process import Worker, result_of
 
 
 class SerialExecutor(Executor):
@@ -61,13 +61,7 @@ class SupervisedExecutor(Executor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Queue a function for the next free worker; if that ends, the future raises :class:`WorkerDied`."""
-        return self._threads.submit(self._run, fn, args, kwargs)
-
-    def _run(self, *call: Any) -> Any:
-        succeeded, value = pickle.loads(self.call(*call))
-        if succeeded:
-            return value
-        raise value
+        return self._threads.submit(lambda: result_of(self.call(fn, args, kwargs)))
 
     def terminate(self) -> None:
         """End the workers at once, together with their jobs."""

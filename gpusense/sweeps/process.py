@@ -242,6 +242,14 @@ class Worker:
             process.join(_GRACE)
 
 
+def result_of(answer: bytes) -> Any:
+    """Return the result of a call, or raise its error."""
+    succeeded, value = pickle.loads(answer)
+    if succeeded:
+        return value
+    raise value
+
+
 @contextlib.contextmanager
 def _starting() -> Iterator[None]:
     """Let processes start with one thread for linear algebra, unless the environment says otherwise, deaf to Ctrl-C."""

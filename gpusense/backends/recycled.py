@@ -34,7 +34,7 @@ class ResultMemory:
                 break
         else:
             block = np.empty(size, np.uint8)
-        return np.asarray(_Loan(self, block)).view(dtype).reshape(shape)
+        return np.asarray(Loan(self, block)).view(dtype).reshape(shape)
 
     def take_back(self, block: np.ndarray) -> None:
         """Keep the block of a freed result; the oldest blocks are dropped if there are too many."""
@@ -43,15 +43,16 @@ class ResultMemory:
             self._free.pop(next(iter([*self._free]), 0), None)
 
 
-class _Loan:
+class Loan:
     """The owner of a result's memory, as NumPy sees it: it gives the memory back when the last array is gone."""
 
-    def __init__(self, memory: ResultMemory, block: np.ndarray) -> None:
+    def __init__(self, memory: Any, block: Any) -> None:
         self._memory, self._block = weakref.ref(memory), block
 
     @property
     def __array_interface__(self) -> dict[str, Any]:
-        return self._block.__array_interface__
+        interface: dict[str, Any] = self._block.__array_interface__
+        return interface
 
     def __del__(self) -> None:
         memory = self._memory()

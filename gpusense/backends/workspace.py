@@ -148,13 +148,10 @@ class Workspace:
         if records:
             # A recording keeps its numbers, but no buffer, alive: addresses of buffers identify it.
             key = (key, *map(self._identity, changing.values()))
-            kept = self._programs.get((records, key)) or self._programs.keep(
-                (records, key), RecordedProgram(backend, make())
-            )
-        else:
-            kept = self._programs.get((records, key)) or self._programs.keep(
-                (records, key), ChangingProgram(backend, make(), changing)
-            )
+        kept = self._programs.get((records, key))
+        if kept is None:
+            made = RecordedProgram(backend, make()) if records else ChangingProgram(backend, make(), changing)
+            kept = self._programs.keep((records, key), made)
         kept(changing)
         return kept.flags
 
@@ -322,29 +319,53 @@ class RecordedProgram:
         self.recording()
 
 
-class RepeatedPrograms:
+class RepeatCache(ProgramCache[T]):
+    """Programs by their keys, each recorded once its key has occurred ``before`` times.
+
+    If ``patience`` is not 0, a full cache makes room only after this number of calls without a recording: a recording
+    takes as long as many calls, so that keys must not evict each other in turn.
+    """
+
+    def __init__(self, most: int, before: int, patience: int = 0) -> None:
+        super().__init__(most)
+        self._before, self._patience, self._since = before, patience, 0
+        # Numbers of calls by keys without a recording.
+        self._seen = ProgramCache[int](most)
+
+    def found(self, key: Hashable, record: Callable[[], T]) -> T | None:
+        """Return the program of a key, or record it; None if the key must occur again, or there is no room."""
+        self._since += 1
+        program = self.get(key)
+        if program is not None:
+            return program
+        seen = self._seen.get(key) or 0
+        if seen < self._before:
+            self._seen.keep(key, seen + 1)
+            return None
+        if self._patience and len(self) >= self._most:
+            if self._since < self._patience:
+                return None
+            super().clear()
+        self._since = 0
+        return self.keep(key, record())
+
+    def clear(self) -> None:
+        super().clear()
+        self._seen.clear()
+
+
+class RepeatedPrograms(RepeatCache[Recording]):
     """Programs that may run again: each is recorded when it runs a second time."""
 
     def __init__(self, backend: Backend, most: int) -> None:
-        self._backend, self._programs = backend, ProgramCache[Recording](most)
-        # Keys of programs that have run once.
-        self._seen = ProgramCache[bool](most)
+        super().__init__(most, 1)
+        self._backend = backend
 
     def run(self, key: Hashable, make: Callable[[], Program]) -> None:
         """Run the program of a key, which determines it."""
-        recording = self._programs.get(key)
-        if recording is not None:
+        recording = self.found(key, lambda: self._backend.record(make()))
+        if recording is None:
+            self._backend.run(make())
+        else:
             self._backend.check_process()
             recording()
-            return
-        program = make()
-        self._backend.run(program)
-        if self._seen.get(key):
-            self._programs.keep(key, self._backend.record(program))
-        else:
-            self._seen.keep(key, True)
-
-    def clear(self) -> None:
-        """Drop all programs."""
-        self._programs.clear()
-        self._seen.clear()

@@ -91,10 +91,16 @@ def _halved(piece: Piece) -> int:
 
 def finish(space: Workspace, on_device: bool, name: str = "poses") -> None:
     """Wait for a call to end."""
-    if on_device:
+    flag, dtype = POSE_STATUS
+    if not on_device:
+        space.wait()
+    elif space.backend.in_batch:
         finish_all([(space, True)], name)
     else:
-        space.wait()
+        # A copy that blocks is the only wait.
+        state = np.zeros(2, dtype)
+        space.read(space.empty(flag, 2, dtype, zero=True), state)
+        _refuse([space], [state], name)
 
 
 def finish_all(spaces: Sequence[tuple[Workspace, bool]], name: str = "poses") -> None:
@@ -107,7 +113,13 @@ def finish_all(spaces: Sequence[tuple[Workspace, bool]], name: str = "poses") ->
     for space, _ in spaces:
         # The first wait already covers all work on the device.
         space.wait()
-    bad = [space for (space, _), state in zip(spaces, states, strict=True) if state[0]]
+    _refuse([space for space, _ in spaces], states, name)
+
+
+def _refuse(spaces: Sequence[Workspace], states: Sequence[np.ndarray], name: str) -> None:
+    """Raise the error of device poses by the non-finite flags of workspaces, and clear these."""
+    flag, dtype = POSE_STATUS
+    bad = [space for space, state in zip(spaces, states, strict=True) if state[0]]
     no_world = any(state[0] > 1 for state in states)
     for space in bad:
         space.upload(flag, np.zeros(2, dtype))

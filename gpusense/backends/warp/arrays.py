@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import math
 import sys
-import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -19,6 +18,7 @@ import warp as wp
 from gpusense._util.checks import check_gradients, show
 from gpusense.backends.base import Adopted, Buffer
 from gpusense.backends.processor import Slot
+from gpusense.backends.recycled import Loan
 
 # Types of numbers that are read, by their names, and Warp's types.
 _NAMES = {name: np.dtype(name) for name in ("float32", "float64", "int32", "int64")}
@@ -89,7 +89,7 @@ class Results:
             memory = self._memory(count * dtype.itemsize)
             address = memory.ptr
             made = wp.array(ptr=address, dtype=_TYPES[dtype], shape=shape, device=self._device)
-            made._gpusense_owner = _Loan(self, memory)
+            made._gpusense_owner = Loan(self, memory)
         else:
             return None
         return made, _flat(address, count, _TYPES[dtype], self._device.alias)
@@ -113,18 +113,6 @@ class Results:
         """Keep the memory of a freed array, and free the oldest if there is too much."""
         self._free.append(memory)
         del self._free[:-_MOST_KEPT]
-
-
-class _Loan:
-    """The owner of a result's memory, which goes back when the last array on it is freed."""
-
-    def __init__(self, results: Results, memory: wp.array) -> None:
-        self._results, self._memory = weakref.ref(results), memory
-
-    def __del__(self) -> None:
-        results = self._results()
-        if results is not None:
-            results.take_back(self._memory)
 
 
 def _view(array: Any, device: wp.Device, name: str) -> wp.array:

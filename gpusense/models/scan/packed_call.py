@@ -11,7 +11,6 @@ from __future__ import annotations
 import functools
 import math
 import threading
-from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +18,7 @@ import numpy as np
 from gpusense.backends import arrays
 from gpusense.backends.arrays import FLOATS, Result
 from gpusense.backends.base import Adopted
-from gpusense.backends.workspace import Packed, ProgramCache
+from gpusense.backends.workspace import Packed, RepeatCache
 from gpusense.models.poses import corners_of
 from gpusense.models.scan.bound import RecordedCall
 from gpusense.models.scan.pipeline import ScanPipeline
@@ -153,35 +152,6 @@ class _Last(NamedTuple):
         return self.call.shown(self.poses, self.ranges)
 
 
-class _Recordings(ProgramCache[PackedCall]):
-    """Calls by their keys, each recorded once its key repeats.
-
-    If ``patience`` is not 0, a full cache makes room only after this number of calls without a recording: a recording
-    takes as long as many calls, so that keys must not evict each other in turn.
-    """
-
-    def __init__(self, most: int, patience: int) -> None:
-        super().__init__(most)
-        self._patience, self._since, self._seen = patience, 0, ProgramCache[int](most)
-
-    def found(self, key: Hashable, record: Callable[[], PackedCall]) -> PackedCall | None:
-        """Return the call of a key, or record it; None if it has not repeated, or there is no room."""
-        self._since += 1
-        call = self.get(key)
-        if call is not None:
-            return call
-        seen = self._seen.get(key) or 0
-        if seen < _BEFORE:
-            self._seen.keep(key, seen + 1)
-            return None
-        if self._patience and len(self) >= self._most:
-            if self._since < self._patience:
-                return None
-            self.clear()
-        self._since = 0
-        return self.keep(key, record())
-
-
 class PackedCallCache:
     """Ordinary calls of a model that repeat a size of few particles, with the same bits as others.
 
@@ -195,7 +165,8 @@ class PackedCallCache:
         self._pipeline = pipeline
         self.last: _Last | None = None
         # Keyed by size and types; and by size, types and addresses of arrays in place.
-        self._sizes, self._places = _Recordings(_MOST_SIZES, 0), _Recordings(_MOST_PLACES, _PATIENCE)
+        self._sizes = RepeatCache[PackedCall](_MOST_SIZES, _BEFORE)
+        self._places = RepeatCache[PackedCall](_MOST_PLACES, _BEFORE, _PATIENCE)
         # A private lock, since the scoring thread holds the model's lock.
         self._lock = threading.Lock()
 

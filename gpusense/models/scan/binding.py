@@ -145,7 +145,7 @@ def _long_reason(pipeline: ScanPipeline, poses: Any, ranges: Any, out: Any) -> s
     here = [a for a in (poses, ranges, out) if not arrays.on_device(a)]
     if not all(type(a) is np.ndarray and a.dtype in FLOATS for a in here):
         return "only NumPy arrays of float32 or float64 are copied with a recorded program"
-    if not fits(len(poses), len(ranges)):
+    if not fits(poses, len(ranges)):
         return f"poses and ranges take more than {LARGEST >> 10} KiB"
     if pipeline.grid.cells.size > MOST_CELLS:
         return f"the map has more than {MOST_CELLS} cells"

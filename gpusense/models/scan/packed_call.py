@@ -26,19 +26,19 @@ from gpusense.models.scan.tiles import LEAST_ORDERED
 from gpusense.world.scanner import classify_ranges
 from gpusense.world.windows import Corners
 
-# Largest size that is copied with the launches [bytes]; longer arrays take the ordinary call.
+# Largest size of the host's arrays that are copied with the launches [bytes]; longer ones take the ordinary call.
 LARGEST = 256 << 10
 # Largest map of which a short call makes the whole table [cells].
 MOST_CELLS = 1 << 22
 _DOUBLE, _INT = np.dtype(np.float64), np.dtype(np.int32)
 # Numbers of sizes and of places of short calls that are kept; ordinary calls before the first short one; and calls
 # after which places make room for others.
-_MOST_SIZES, _MOST_PLACES, _BEFORE, _PATIENCE = 8, 24, 2, 4096
+_MOST_SIZES, _MOST_PLACES, _BEFORE, _PATIENCE = 8, 12, 2, 4096
 
 
-def fits(count: int, readings: int) -> bool:
-    """Return whether poses and readings are few enough to be copied with the launches."""
-    return _DOUBLE.itemsize * (3 * count + readings) <= LARGEST
+def fits(poses: Any, readings: int) -> bool:
+    """Return whether the arrays of the host are few enough numbers to be copied with the launches."""
+    return _DOUBLE.itemsize * ((3 * len(poses) if type(poses) is np.ndarray else 0) + readings) <= LARGEST
 
 
 def is_short(count: int, readings: int) -> bool:
@@ -186,7 +186,7 @@ class PackedCallCache:
         if shape[1:] != (3,) or getattr(ranges, "shape", None) != (size,):
             return None
         count = shape[0]
-        if not (is_short(count, size) and fits(count, size)):
+        if not (is_short(count, size) and fits(poses, size)):
             return None
         at, readings = self._operand(poses, "poses"), self._operand(ranges, "ranges")
         if at is None or readings is None:

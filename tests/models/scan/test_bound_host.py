@@ -137,6 +137,20 @@ def test_calls_that_are_not_short_take_the_ordinary_path(batching, monkeypatch):
     assert BEAM(GRID, NEAR, backend=device, compat="beluga").bind(cloud(1), mixed(1)).packed is None
 
 
+def test_many_poses_on_the_device_are_not_copied(batching):
+    """Only the sizes of the host's arrays count."""
+    model, plain = (FIELD(GRID, NEAR, backend=batching[0]) for _ in range(2))
+    plain._short = None
+    poses = to_device(cloud(1, 20_000))
+    expected = plain.log_likelihood(poses, mixed(1)).numpy()
+    call = model.bind(poses, mixed(1))
+    assert call.packed is not None and differing(call().numpy(), expected) == 0
+    for _ in range(4):
+        found = model.log_likelihood(poses, mixed(1))
+        assert differing(found.numpy(), expected) == 0
+    assert model._short.last is not None
+
+
 def refuse_memory(*arguments: Any) -> Any:
     raise MemoryError("no room for a table")
 

@@ -107,19 +107,21 @@ def _beside_line(problem: Problem, starts: Floats, line: tuple[Floats, Floats], 
     """Solve for beacons in line: return a solution and its mirror image, or a solution on the line."""
     point, direction = line
     normal = np.array([-direction[1], direction[0]])
+    assert problem.ranges is not None
+    along = ((problem.xy - point) @ direction)[:, None] + problem.ranges[:, None] * (-1, 1)
+    on, on_cost = minima(problem, point + along.reshape(-1, 1) * direction, line)
     # Mirror images cost the same: search the left side only.
     aside = (starts - point) @ normal
     states, costs = minima(problem, starts + (np.abs(aside) - aside)[:, None] * normal)
     aside = (states - point) @ normal
-    on_line = states - aside[:, None] * normal
-    # Rounding hides whether a solution near the line differs from its image.
+    # A solution nearer to the line than the root of the rounding error coincides with its image.
+    off = np.abs(aside) > 1e-7 * problem.spread
+    states, costs = distinct(problem, states[off] + (np.abs(aside) - aside)[off, None] * normal)
     rounding = (1e-14 * problem.spread * problem.scales.max()) ** 2 * len(problem.xy)
-    off = (np.abs(aside) > 1e-7 * problem.spread) & (problem.costs(on_line) > costs + rounding)
-    if not off[0]:
-        status = "at a beacon" if problem.at_beacon(on_line[0]) else "in line"
-        return problem.fix(on_line[:1], status, flat=True)
-    away = np.abs(aside)[:, None] * normal
-    best, _ = pick(*distinct(problem, (on_line + away)[off]), known_sigma=known_sigma)
+    if not len(states) or on_cost[0] <= costs[0] + rounding:
+        status = "at a beacon" if problem.at_beacon(on[0]) else "in line"
+        return problem.fix(on[:1], status, flat=True)
+    best, _ = pick(states, costs, known_sigma=known_sigma)
     image = best - 2 * ((best - point) @ normal)[:, None] * normal
     return problem.fix(np.stack([best, image], axis=1).reshape(-1, 2), "mirror" if len(best) == 1 else "ambiguous")
 

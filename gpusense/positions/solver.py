@@ -27,26 +27,32 @@ def distance(problem: Problem, states: Floats, state: Floats) -> Floats:
     return away if problem.dimension == 2 else np.maximum(away, np.abs(wrap(states[:, 2] - state[2])))
 
 
-def descend(problem: Problem, start: Floats, step: float) -> Floats:
+def descend(problem: Problem, start: Floats, line: tuple[Floats, Floats] | None, step: float) -> Floats:
     """Return the minimum that least squares (trust-region Gauss-Newton of SciPy) reaches from a (d,) state.
 
-    ``step`` is the relative change at which the search stops.
+    ``line`` (point, direction) constrains the position; ``step`` is the relative change at which the search stops.
     """
     from scipy.optimize import least_squares
 
-    # Positions in spreads of the scene, comparable to headings.
-    unit, scales = np.ones(problem.dimension), problem.scales
-    unit[:2] = problem.spread or 1.0
+    # Columns are the free directions of the state, with positions in spreads of the scene, comparable to headings.
+    base, moves, scales = np.zeros(problem.dimension), np.eye(problem.dimension), problem.scales
+    moves[:2] *= problem.spread or 1.0
+    if line is not None:
+        base[:2], moves = line[0], np.delete(moves, 1, axis=1)
+        moves[:2, 0] = moves[0, 0] * line[1]
     result = least_squares(
-        lambda x: problem.residuals((x * unit)[None])[0] * scales, start / unit,
+        lambda x: problem.residuals((base + moves @ x)[None])[0] * scales,
+        np.linalg.lstsq(moves, start - base, rcond=None)[0],
         # A residual is the measured less the expected value.
-        lambda x: -problem.jacobian(x * unit) * scales[:, None] * unit,
+        lambda x: -(problem.jacobian(base + moves @ x) * scales[:, None]) @ moves,
         loss=problem.loss, f_scale=problem.loss_scale, ftol=step, xtol=step, gtol=FINE, x_scale="jac", max_nfev=200,
     )  # fmt: skip
-    return np.asarray(result.x * unit)
+    return base + moves @ result.x
 
 
-def minima(problem: Problem, starts: Sequence[Floats] | Floats) -> tuple[Floats, Floats]:
+def minima(
+    problem: Problem, starts: Sequence[Floats] | Floats, line: tuple[Floats, Floats] | None = None
+) -> tuple[Floats, Floats]:
     """Return (S, d) different minima near the lowest, sorted, and their (S,) costs, from finite (N, d) starts."""
     pending = np.asarray(starts, np.float64).reshape(-1, problem.dimension)
     pending = pending[np.isfinite(pending).all(axis=1)]
@@ -56,7 +62,7 @@ def minima(problem: Problem, starts: Sequence[Floats] | Floats) -> tuple[Floats,
         if not len(pending):
             break
         start, pending = pending[0], pending[1:]
-        state = descend(problem, start, COARSE)
+        state = descend(problem, start, line, COARSE)
         for near in (start, state):
             pending = pending[distance(problem, pending, near) > APART]
         if not coarse or distance(problem, np.array(coarse), state).min() > APART / 10:
@@ -64,7 +70,7 @@ def minima(problem: Problem, starts: Sequence[Floats] | Floats) -> tuple[Floats,
     states = np.array(coarse).reshape(-1, problem.dimension)
     costs = problem.costs(states)
     near = states[costs <= 1.1 * costs.min(initial=np.inf) + 2 * AMBIGUOUS]
-    fine = [descend(problem, state, FINE) for state in near]
+    fine = [descend(problem, state, line, FINE) for state in near]
     return distinct(problem, np.array(fine).reshape(-1, problem.dimension))
 
 

@@ -51,12 +51,12 @@ class Drift:
         matrix = normal_equations(poses, local)
         # The first pose is known, so its rows and columns are 0.
         rows = (3 * (anchors[1:, None] - 1) + np.arange(3)).ravel()
-        whole, size = np.zeros_like(self._joint), 3 * len(anchors) - 3
-        whole[1:, :, 1:, :] = _reduced(matrix, rows).reshape(len(anchors) - 1, 3, len(anchors) - 1, 3)
+        whole, shape = np.zeros_like(self._joint), (len(anchors) - 1, 3, len(anchors) - 1, 3)
+        whole[1:, :, 1:, :] = _reduced(matrix, rows).reshape(shape)
         if moved.any():
             _add_closures(whole, poses, links[moved], anchors, spread)
-        inverse = _inverse(whole[1:, :, 1:, :].reshape(size, size))
-        self._joint[1:, :, 1:, :] = inverse.reshape(len(anchors) - 1, 3, len(anchors) - 1, 3)
+        inverse = np.linalg.inv(whole[1:, :, 1:, :].reshape(len(rows), len(rows)))
+        self._joint[1:, :, 1:, :] = (0.5 * (inverse + inverse.T)).reshape(shape)
 
     def relative(self, first: Integers, second: Integers) -> Floats:
         """Return the covariances (L, 3, 3) of the poses of second scans in the frames of first ones."""
@@ -156,24 +156,6 @@ def _ranks(groups: Integers) -> Integers:
     """Return the rank (M,) of each element in its group, for ascending numbers of groups (M,)."""
     ranks: Integers = np.arange(len(groups)) - np.searchsorted(groups, groups)
     return ranks
-
-
-def _inverse(matrix: Floats) -> Floats:
-    """Return the inverse of a symmetric positive definite matrix (M, M), from its lower triangle.
-
-    Cholesky's factor takes three eighths of the operations of a general inverse. Rounding may make a matrix with
-    hardly any information indefinite; it takes the general inverse.
-    """
-    from scipy.linalg import lapack
-
-    # Fortran's upper triangle is the lower one here.
-    factor, failed = lapack.dpotrf(matrix.T, lower=0, clean=1)
-    if failed:
-        return np.asarray(np.linalg.inv(0.5 * (matrix + matrix.T)), np.float64)
-    upper, _ = lapack.dpotri(factor, lower=0, overwrite_c=1)
-    inverse: Floats = upper + upper.T
-    inverse[np.diag_indices(len(inverse))] *= 0.5
-    return inverse
 
 
 def _add_closures(whole: Floats, poses: Floats, closures: Links, anchors: Integers, spread: Floats) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.memory import check_room
 from gpusense.backends import Selection, get_backend
-from gpusense.mapping.rays import SCANS, BandCounts, RayEnds, Survey, bands, batches, check_lengths, extent
+from gpusense.mapping.rays import SCANS, BandCounts, RayEnds, bands, batches, check_lengths, extent
 from gpusense.world.deskew import check_motion
 from gpusense.world.grid import GridFrame, OccupancyGrid, check_origin, check_resolution, grid_of_checked
 from gpusense.world.scanner import Scanner, float64_readings
@@ -137,8 +137,8 @@ class MapBuilder:
             checks.real("p_prior", p_prior, above=0, below=1),
         )  # fmt: skip
         self._threshold = checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
-        moved = check_motion("motion", motion, len(placed))
-        self._survey = Survey(data, placed, limit, clear_max, moved)
+        self._data, self._poses, self._limit, self._clear_max = data, placed, limit, clear_max
+        self._motion = check_motion("motion", motion, len(placed))
         self._each, self._backend = each, get_backend(backend)
         self._place(cell, origin, shape)
         self._bands = bands(self._shape, most)
@@ -152,13 +152,14 @@ class MapBuilder:
         placed = _frame(origin, shape)
         # Until a frame is known, boxes are in metres.
         frame = GridFrame(1.0, (0.0, 0.0, 0.0)) if placed is None else GridFrame(resolution, placed[0])
-        boxes = np.empty((len(self._survey.poses), 4))
+        boxes = np.empty((len(self._poses), 4))
+        few = sum(readings.size for readings in self._data.readings) <= _KEPT_RAYS
         self._kept: dict[bytes, RayEnds] = {}
         for part in batches(np.arange(len(boxes)), self._each):
-            ends = self._survey.rays(part)
+            ends = self._rays_of(part)
             check_lengths(ends, resolution, int(part[0]))
             boxes[part] = ends.boxes(len(part), frame)
-            if self._survey.readings <= _KEPT_RAYS:
+            if few:
                 self._kept[part.tobytes()] = ends
         if placed is None:
             placed = extent(boxes, resolution)
@@ -174,13 +175,28 @@ class MapBuilder:
             self._counts = BandCounts(self._backend, self._frame, self._shape, band)
             for part in parts:
                 key = part.tobytes()
-                self._counts.add(self._kept.pop(key) if key in self._kept else self._survey.rays(part))
+                self._counts.add(self._kept.pop(key) if key in self._kept else self._rays_of(part))
                 done += len(part)
                 if done < total:
                     yield done / total
             self._counts.occupancies(self._cells, self._occupancy)
             self._rays, self._counts, self._finished = self._rays + self._counts.rays, None, self._finished + 1
         yield 1.0
+
+    def _rays_of(self, chosen: np.ndarray) -> RayEnds:
+        """Return the rays of the scans with these indices."""
+        parts, sensor, place = [], self._data.sensor[chosen], self._data.places()[chosen]
+        for one in np.unique(sensor):
+            some = np.flatnonzero(sensor == one)
+            scanner, rows = self._data.scanners[one], chosen[some]
+            ends = RayEnds(
+                self._data.readings[one][place[some]], self._poses[rows], scanner,
+                min(self._limit, scanner.range_max), clear_max=self._clear_max,
+                motion=None if self._motion is None else self._motion[rows],
+            )  # fmt: skip
+            ends.scan = some[ends.scan]
+            parts.append(ends)
+        return parts[0] if len(parts) == 1 else RayEnds.joined(parts)
 
     def _scans_of(self, band: Window) -> np.ndarray:
         """Return the indices of the scans with rays that meet a band."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +16,6 @@ from gpusense.world.deskew import beam_poses
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import FARTHEST_ORIGIN, GridFrame
 from gpusense.world.scanner import Reading, Scanner, classify
-from gpusense.world.sensor_scans import SensorScans
 from gpusense.world.windows import LONGEST_SIDE, Window
 
 # Number of scans per launch.
@@ -26,39 +24,11 @@ LONGEST_RAY = 1 << 19
 """Most cells of a ray along an axis of the map: products of lengths in 1/4096 cell fit in 64 bits."""
 
 
-@dataclass(frozen=True)
-class Survey:
-    """Scans at known poses, and the rules for converting readings to rays."""
-
-    data: SensorScans  # the scans and their scanners
-    poses: np.ndarray  # (S, 3) poses of the robot [m, m, rad]
-    range_limit: float  # longer readings clear cells up to it and mark no obstacle, at most range_max [m]
-    clear_max: bool  # True if max readings clear cells up to ``range_limit``; otherwise they have no effect
-    motion: np.ndarray | None = None  # (S, 3) motions of the robot during the scans; None at rest
-
-    @property
-    def readings(self) -> int:
-        """Number of readings of all scans."""
-        return sum(readings.size for readings in self.data.readings)
-
-    def rays(self, chosen: np.ndarray) -> RayEnds:
-        """Return the rays of the scans with these indices."""
-        parts, sensor, place = [], self.data.sensor[chosen], self.data.places()[chosen]
-        for one in np.unique(sensor):
-            some = np.flatnonzero(sensor == one)
-            scanner, rows = self.data.scanners[one], chosen[some]
-            ends = RayEnds(
-                self.data.readings[one][place[some]], self.poses[rows], scanner,
-                min(self.range_limit, scanner.range_max), clear_max=self.clear_max,
-                motion=None if self.motion is None else self.motion[rows],
-            )  # fmt: skip
-            ends.scan = some[ends.scan]
-            parts.append(ends)
-        return parts[0] if len(parts) == 1 else RayEnds.joined(parts)
-
-
 class RayEnds:
-    """Start and end in the world of each ray that carries information about the map; options as in :class:`Survey`.
+    """Start and end in the world of each ray that carries information about the map.
+
+    Longer readings than ``range_limit`` clear cells up to it and mark no obstacle, and so do max readings if
+    ``clear_max``. ``motion`` (S, 3) is the robot's during the scans; None at rest.
 
     ``start`` and ``end`` are (R, 2) [m], ``hit`` (R,) marks obstacles at the end, ``scan`` (R,) is the scan's index.
     """

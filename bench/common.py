@@ -11,6 +11,7 @@ import contextlib
 import json
 import os
 import shlex
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -23,7 +24,6 @@ import numpy as np
 import gpusense as gs
 from gpusense.backends.base import Backend, Launcher, Recording
 from gpusense.backends.proxy import Proxy
-from gpusense.evaluation.benchmark.report import commit
 from gpusense.evaluation.log_steps import read_steps, with_poses
 from gpusense.evaluation.machine import machine
 from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
@@ -356,6 +356,19 @@ def table_line(cells: Iterable[Any]) -> str:
 def table(columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> str:
     """Format a Markdown table."""
     return "\n".join([table_line(columns), "| --- " * len(columns) + "|", *map(table_line, rows)])
+
+
+def git(*words: str, root: Path = ROOT) -> str:
+    """Return the output of git."""
+    command = ["git", "-C", str(root), *words]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout.strip()
+
+
+def commit() -> str | None:
+    """Return the commit of this checkout, with a plus if files differ; None outside a checkout."""
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        return git("rev-parse", "--short=12", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
+    return None
 
 
 def command_line(script: str) -> str:

@@ -28,7 +28,6 @@ import numpy as np
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation import stiff
-from gpusense.evaluation.benchmark.report import commit
 from gpusense.evaluation.tolerances import TOLERANCES, Check
 from gpusense.reference.mixture import log_density
 
@@ -36,7 +35,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
 from accuracy.extreme_tables import write_tables
-from common import FIGURES, command_line, make_parser, parse, publish, table
+from common import FIGURES, command_line, make_parser, parse, publish, stated_commit, table
 from support.textbook import textbook_log_hit, textbook_log_short, textbook_of
 
 mpl.use("Agg")
@@ -249,9 +248,7 @@ def main() -> int:
     parser.add_argument("--page", type=Path, help="page whose tables are written, such as docs/numerics.md")
     parser.add_argument("--step", type=float, default=0.25, help="of the plots [decades of sigma] (default: 0.25)")
     arguments = parse(parser)
-    stated = arguments.commit or commit() or ""
-    if arguments.page and (not stated or stated.endswith("+")):
-        parser.error(f"--page: the checkout must have no uncommitted changes, got {stated or 'no repository'}")
+    stated = stated_commit(parser, arguments) if arguments.page else ""
     arguments.figures.mkdir(parents=True, exist_ok=True)
     sigmas, rates = 10.0 ** np.arange(-8, 6.01, arguments.step), 10.0 ** np.arange(-20, 6.01, 2 * arguments.step)
     hits = {precision: sweep(precision, sigmas, (1.0, 0.0, 0.0, 0.0), around) for precision in PRECISIONS}

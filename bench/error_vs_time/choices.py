@@ -7,8 +7,10 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from common import table
+
 from gpusense.evaluation.benchmark.choice import choose, error_text, time_text
-from gpusense.evaluation.benchmark.report import ALL, Row, table
+from gpusense.evaluation.benchmark.report import ALL, Row
 
 WRONG, MEDIAN, TAIL, LARGEST = (
     "rays wrong by more than a cell", "median error of a ray", "95 % error of a ray", "largest error of a ray",
@@ -160,5 +162,5 @@ def answers(rows: Sequence[Row], devices: Sequence[str], wishes: Sequence[Wish],
         said = {device: answer(rows, wish, device, standing.get((device, wish.words), "")) for device in devices}
         said = {device: text for device, text in said.items() if text != "-"}
         tables.setdefault(tuple(said), []).append((wish.words, *said.values()))
-    made = [table(("to do", *measured), lines, 1 + len(measured)) for measured, lines in tables.items() if measured]
-    return [line for lines in made for line in (*lines, "")][:-1]
+    made = [table(("to do", *measured), lines) for measured, lines in tables.items() if measured]
+    return [line for text in made for line in (text, "")][:-1]

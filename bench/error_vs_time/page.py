@@ -18,6 +18,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from common import table
 from error_vs_time.charts import Chart, Mark, drawing
 from error_vs_time.choices import (
     KL,
@@ -35,7 +36,7 @@ from error_vs_time.reports import LIMIT, RESULTS, ROOT, Source, commit_trouble, 
 
 from gpusense._util.files import write_whole
 from gpusense.evaluation.benchmark.choice import front, time_text
-from gpusense.evaluation.benchmark.report import ALL, Row, table
+from gpusense.evaluation.benchmark.report import ALL, Row
 from gpusense.plots.error_page import error_page
 
 HERE = Path(__file__).parent
@@ -88,7 +89,7 @@ def methods(rows: Sequence[Row], need: str, devices: Sequence[str], *, fronts: b
               for error, name, there in zip(worst, measures, known, strict=True)),
             f"`{first.code}`",
         ])  # fmt: skip
-    return table(columns, lines, len(columns))
+    return [table(columns, lines)]
 
 
 def _time(row: Row | None) -> str:
@@ -111,7 +112,7 @@ def peers(rows: Sequence[Row]) -> list[str]:
                 rate = row.work / row.seconds / 1e6
                 error = value(row.errors[measure], row.units[measure]) + " nats" * (need != "rays")
                 lines.append((need, row.text, row.outside or "gpusense", f"{rate:.3g}", error, device))
-    return table(("for", "method", "version, threads", "M/s of one core, whole calls", "error", "processor"), lines, 3)
+    return [table(("for", "method", "version, threads", "M/s of one core, whole calls", "error", "processor"), lines)]
 
 
 def rivals(rows: Sequence[Row], need: str, of: str) -> list[str]:
@@ -127,7 +128,7 @@ def rivals(rows: Sequence[Row], need: str, of: str) -> list[str]:
             lines.append((row.method, row.setting, row.outside or "gpusense", *times, *errors, device))
     columns = ("method", "setting", "version, threads", f"{of}, one core", "elapsed", *SHOWN[need], "processor")
     missing = "None in these reports; an [earlier run](../bench/results/other_programs.md) has some."
-    return table(columns, lines, 3) if lines else [missing]
+    return [table(columns, lines) if lines else missing]
 
 
 def by_map(rows: Sequence[Row], devices: Sequence[str]) -> list[str]:
@@ -139,7 +140,7 @@ def by_map(rows: Sequence[Row], devices: Sequence[str]) -> list[str]:
             rate, wrong = row.work / row.seconds / 1e6, value(row.errors[WRONG], "share")
             thin = known.get(("beam model", "exact, fewer beams, every = 4", device, scene))
             lines.append((device, scene, f"{rate:.4g}", wrong, value(thin.errors[KL], "nats") if thin else "-"))
-    return table(("device", "map", "M rays/s, exact, whole calls", "wrong", "nats, every 4th beam"), lines, 2)
+    return [table(("device", "map", "M rays/s, exact, whole calls", "wrong", "nats, every 4th beam"), lines)]
 
 
 def listing(found: Sequence[Source]) -> list[str]:
@@ -149,7 +150,7 @@ def listing(found: Sequence[Source]) -> list[str]:
          str(source.report["commit"]), source.missing, f"`{source.report['command']}`")
         for source in found
     ]  # fmt: skip
-    return table(("report", "devices", "date", "commit", "not measured", "command"), lines, 6)
+    return [table(("report", "devices", "date", "commit", "not measured", "command"), lines)]
 
 
 def drive(found: Sequence[Source]) -> list[str]:

@@ -16,10 +16,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from gpusense._util.files import write_whole
-from gpusense.evaluation.benchmark.report import ALL, MODEL_MEASURES, Row, model_rows, origin_of, titles_of
+from common import ROOT, git
 
-ROOT = Path(__file__).resolve().parents[2]
+from gpusense._util.files import write_whole
+from gpusense.evaluation.benchmark.report import ALL, MODEL_MEASURES, Row, model_rows, origin_of
+
 RESULTS = ROOT / "bench" / "results"
 PATTERN = "error_vs_time_*_{}.json"
 # Folders whose changes make a report old, and the number of commits to them after which it must not be published.
@@ -70,12 +71,6 @@ class Source:
 # ---- commits
 
 
-def git(*words: str, root: Path = ROOT) -> str:
-    """Return the output of git."""
-    command = ["git", "-C", str(root), *words]
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout.strip()
-
-
 def has_history(root: Path = ROOT) -> bool:
     """Return whether the folder is a checkout with its whole history."""
     try:
@@ -117,11 +112,8 @@ def sources(folder: Path = RESULTS) -> list[Source]:
             report = read(file, kind)
             if not report["commit"] or report["commit"].endswith("+"):
                 raise ValueError(f"{file.name}: {commit_trouble(report['commit'] or '')}")
-            points = report[LISTS[kind]]
-            named = titles_of(
-                (p for p in points if p["backend"] != "outside"), report["machine"], report.get("devices", ())
-            )
-            found.append(Source(file.name, kind, report, tuple(named.values())))
+            named = [title for name, title in titles_of(report, kind).items() if name != "outside"]
+            found.append(Source(file.name, kind, report, tuple(named)))
     kinds = [(source.kind, title) for source in found for title in source.titles]
     twice = {name for name in kinds if kinds.count(name) > 1}
     if twice:
@@ -167,15 +159,9 @@ def _json(value: Any) -> str:
 
 def read(file: Path, kind: str) -> dict[str, Any]:
     """Read a report file."""
-    return parsed(file.read_text(encoding="utf-8"), file.name, kind)
-
-
-def parsed(text: str, name: str, kind: str) -> dict[str, Any]:
-    """Read a report from its text; see :func:`read`."""
-    report = json.loads(text)
+    report = json.loads(file.read_text(encoding="utf-8"))
     if not isinstance(report, dict) or report.get("schema") != SCHEMAS[kind]:
-        raise ValueError(f"{name}: must be a report of {kind} by bench/error_vs_time/measure.py")
-    # Reports in the history before this form hold the list itself.
+        raise ValueError(f"{file.name}: must be a report of {kind} by bench/error_vs_time/measure.py")
     if LISTS[kind] not in report:
         same, texts, fields, lines = (report.pop(key) for key in ("same", "texts", "fields", "lines"))
         report[LISTS[kind]] = [
@@ -209,9 +195,41 @@ def _nested(flat: Mapping[str, Any]) -> Any:
 # ---- rows
 
 
+def title_of(point: Mapping[str, Any], machine: Mapping[str, Any], driver: str = "", target: str = "") -> str:
+    """Name a point's device: library, and processor with cores or GPU; PoCL's ``target`` "haswell" has no AVX-512."""
+    library = {"opencl": "Intel's OpenCL" if driver.startswith("Intel") else "OpenCL", "warp:cuda": "CUDA",
+               "warp:cpu": "Warp"}  # fmt: skip
+    made = next((text for name, text in library.items() if point["backend"].startswith(name)), "NumPy")
+    if point["kind"] == "gpu":
+        return f"{point['device']}, {made}"
+    made = "PoCL" if "pthread" in point["device"] or "cpu-" in point["device"] else made
+    made += ", AVX2 only" if target == "haswell" else ""
+    cores = 1 if point["backend"].startswith("warp:cpu") else machine["processors"]
+    return f"{cores} core{'s' * (cores > 1)} of an {machine['processor']}, {made}"
+
+
+def titles_of(report: Mapping[str, Any], kind: str) -> dict[str, str]:
+    """Return a title for each device of a report, by selection string; equal titles are extended by device names.
+
+    Other implementations (selection string ``"outside"``) have the title of the first processor.
+    """
+    drivers = {one["selection"]: (one["driver"], one.get("target", "")) for one in report.get("devices", ())}
+    first: dict[str, Mapping[str, Any]] = {}
+    for point in report[LISTS[kind]]:
+        first.setdefault(point["backend"], point)
+    outside = first.pop("outside", None)
+    plain = {name: title_of(point, report["machine"], *drivers.get(name, ())) for name, point in first.items()}
+    alike = list(plain.values())
+    titles = {name: f"{title}, {name}" if alike.count(title) > 1 else title for name, title in plain.items()}
+    if outside is not None:
+        own = next((titles[name] for name, point in first.items() if point["kind"] == outside["kind"]), None)
+        titles["outside"] = own or next(iter(titles.values()), title_of(outside, report["machine"]))
+    return titles
+
+
 def task_rows(report: Mapping[str, Any]) -> list[Row]:
     """Return the rows of a report of needs.py."""
-    rows, titles, origin = [], titles_of(report["rows"], report["machine"]), origin_of(report)
+    rows, titles, origin = [], titles_of(report, "tasks"), origin_of(report)
     for one in report["rows"]:
         if one["seconds"] is None:
             continue
@@ -239,7 +257,9 @@ def doubt(row: Mapping[str, Any]) -> float:
     return float(1 + 2 * spread / math.sqrt(row["runs"]))
 
 
-ROWS: dict[str, Callable[[Mapping[str, Any]], list[Row]]] = {"models": model_rows, "tasks": task_rows}
+ROWS: dict[str, Callable[[Mapping[str, Any]], list[Row]]] = {
+    "models": lambda report: model_rows(report, titles_of(report, "models")), "tasks": task_rows,
+}  # fmt: skip
 
 
 def rows_of(found: Sequence[Source]) -> list[Row]:

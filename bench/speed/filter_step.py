@@ -34,11 +34,10 @@ import json
 
 import numpy as np
 from accuracy.compiled_peers import Follower, Weigher
-from common import command_line, make_parser, middle_pose
+from common import command_line, commit, make_parser, middle_pose, table, table_line
 from speed.filters import PEERS, load
 
 import gpusense as gs
-from gpusense.evaluation.benchmark.report import commit
 from gpusense.evaluation.machine import machine, machine_line
 from gpusense.evaluation.worlds import building
 
@@ -248,33 +247,22 @@ def main() -> None:
             print_steps(rows[-1])
         return _write(args, rows)
     if args.peers:
-        names = ("filter", "particles x beams", "median ms", "least ms", "of all cores, median ms")
-        print(f"| {' | '.join(names)} |\n|{' --- |' * len(names)}")
+        print(table(("filter", "particles x beams", "median ms", "least ms", "of all cores, median ms"), ()))
         for particles, beams in args.size or ((500, 60), (2000, 60)):
             for one in measure_peers(args.backend, particles, beams, args.steps):
                 rows.append(one)
-                print(
-                    f"| {one['filter']} | {particles} x {beams} | {one['median_ms']:.2f} | {one['least_ms']:.2f} | "
-                    f"{one['processor_ms']:.2f} |",
-                    flush=True,
-                )
+                figures = (f"{one[name]:.2f}" for name in ("median_ms", "least_ms", "processor_ms"))
+                print(table_line((one["filter"], f"{particles} x {beams}", *figures)), flush=True)
         return _write(args, rows)
-    print(
-        "| particles x beams | stages | median ms | least ms | verdict, more ms | and recovery, more ms | "
-        "recorded ones in a row ms | start |\n"
-        "| --- | --- | --- | --- | --- | --- | --- | --- |"
-    )
+    print(table(("particles x beams", "stages", "median ms", "least ms", "verdict, more ms", "and recovery, more ms",
+                 "recorded ones in a row ms", "start"), ()))  # fmt: skip
     for particles, beams in args.size or SIZES:
         for stages in (1, 4):
             one = measure(args.backend, particles, beams, stages, max(args.steps * 2000 // particles, 10))
             rows.append(one)
-            print(
-                f"| {particles} x {beams} | {stages} | {one['median_ms']:.2f} | {one['least_ms']:.2f} | "
-                f"{one['verdict_ms']:.3f} | {one['recovery_ms']:.3f} | "
-                f"{_text(one['in_a_row_ms'])} | "
-                f"{one['start']} |",
-                flush=True,
-            )
+            figures = (f"{one[name]:.3f}" for name in ("median_ms", "least_ms", "verdict_ms", "recovery_ms"))
+            last = (_text(one["in_a_row_ms"]), one["start"])
+            print(table_line((f"{particles} x {beams}", stages, *figures, *last)), flush=True)
     _write(args, rows)
 
 

@@ -107,7 +107,8 @@ def run(args: argparse.Namespace) -> int:
     if args.html is not None:
         from gpusense.plots.error_page import error_page
 
-        page = error_page(report.model_rows(made), text=f"{made['date']}. {machine_line()}")
+        titles = {one.info.selection: f"{one.info.name}, {one.info.selection}" for one in plan.backends}
+        page = error_page(report.model_rows(made, titles), text=f"{made['date']}. {machine_line()}")
         write_whole(args.html, lambda stream: stream.write(page.encode()))
     if args.json:
         output.document(made)

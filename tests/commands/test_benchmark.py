@@ -34,7 +34,7 @@ def test_quick_run_writes_whole_files(needs, tmp_path, capsys):
     written = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     assert written == printed
     assert set(written) == {
-        "schema", "date", "commit", "command", "arguments", "machine", "devices", "absent", "truth", "scenes", "points",
+        "schema", "date", "command", "arguments", "machine", "devices", "absent", "truth", "scenes", "points",
     }  # fmt: skip
     assert written["schema"] == 2
     for point in written["points"]:

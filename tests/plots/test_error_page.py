@@ -162,7 +162,7 @@ def test_rows_have_each_scene() -> None:
     ]  # fmt: skip
     assert exact.seconds == pytest.approx(math.sqrt(0.004 * 0.016))
     assert rows["exact", "two"].seconds == pytest.approx(0.016)
-    assert (exact.origin, exact.device) == ("gpusense bench (2026-01-01, commit abc)", "2 cores of an X, NumPy")
+    assert (exact.origin, exact.device) == ("gpusense bench (2026-01-01, commit abc)", "numpy")
     assert rows["march", ALL].errors[MEASURE] == 0.2 and rows["march", "one"].cases == ()
 
 
@@ -175,22 +175,6 @@ def test_a_scene_without_any_method_does_not_count() -> None:
         assert {row.maps for row in rows if row.scene == ALL} == maps
     ((_, _, front),) = choice.choices(report | {"points": [*report["points"], *late]}, {"%": 1.0})
     assert {method for _, method, *_ in front} == {"exact"}
-
-
-def test_devices_with_equal_titles_are_distinguished() -> None:
-    points = [made_point(backend=name, device="pthread-X") for name in ("opencl:0:0", "opencl:1:0")]
-    rows = model_rows(report_of(points=[*points, made_point(backend="outside", outside=True)]))
-    assert {row.device for row in rows if not row.outside} == {
-        "2 cores of an X, PoCL, opencl:0:0", "2 cores of an X, PoCL, opencl:1:0",
-    }  # fmt: skip
-    assert {row.device for row in rows if row.outside} == {"2 cores of an X, PoCL, opencl:0:0"}
-
-
-def test_a_title_names_the_runtime_of_a_processor() -> None:
-    points = [made_point(backend=name, device=device) for name, device in (("opencl:0:0", "X"), ("opencl:1:0", "X"))]
-    devices = [{"selection": "opencl:0:0", "driver": "Intel(R) OpenCL 1"}, {"selection": "opencl:1:0", "driver": "A"}]
-    rows = model_rows(report_of(points=points, devices=devices))
-    assert {row.device for row in rows} == {"2 cores of an X, Intel's OpenCL", "2 cores of an X, OpenCL"}
 
 
 # ---- the page

@@ -52,6 +52,18 @@ def test_reports_are_of_this_code(reports: ModuleType) -> None:
     assert {name: trouble for name, trouble in found.items() if trouble} == {} and found
 
 
+@pytest.mark.parametrize(("devices", "titles"), [
+    ({"opencl:0:0": "Intel(R) OpenCL 1", "opencl:1:0": "A"}, ["Intel's OpenCL", "OpenCL"]),
+    ({"opencl:0:0": "A", "opencl:1:0": "A"}, ["OpenCL, opencl:0:0", "OpenCL, opencl:1:0"]),
+])  # fmt: skip
+def test_titles_tell_devices_apart(reports: ModuleType, devices: dict[str, str], titles: list[str]) -> None:
+    points = [made_point(backend=name, device="X") for name in devices] + [made_point(backend="outside", outside=True)]
+    listed = [{"selection": name, "driver": driver} for name, driver in devices.items()]
+    report = {"points": points, "machine": {"processors": 2, "processor": "X"}, "devices": listed}
+    named = reports.titles_of(report, "models")
+    assert list(named.values()) == [f"2 cores of an X, {title}" for title in (*titles, titles[0])]
+
+
 def test_reports_state_command_and_device(reports: ModuleType) -> None:
     for source in reports.sources():
         assert re.match("python bench/error_vs_time/", source.report["command"]), source.name

@@ -1,15 +1,12 @@
-"""Write the report of a run as one JSON document, and tables as Markdown."""
+"""Write the report of a run as one JSON document, and rank methods in rows."""
 
 from __future__ import annotations
 
-import contextlib
 import math
 import re
-import subprocess
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from gpusense.evaluation.benchmark.runner import Outcome, Plan
@@ -32,7 +29,6 @@ def document(
     value = {
         "schema": SCHEMA,
         "date": time.strftime("%Y-%m-%d"),
-        "commit": commit(),
         "command": command,
         "arguments": dict(arguments),
         "machine": dict(machine),
@@ -54,29 +50,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
     return value
-
-
-def commit() -> str | None:
-    """Return the commit of the package's checkout, with a plus if files differ; None outside a checkout."""
-    root = Path(__file__).resolve().parents[3]
-    if not ((root / "pyproject.toml").is_file() and (root / "gpusense").is_dir()):
-        return None
-
-    def git(*words: str) -> str:
-        command = ["git", "-C", str(root), *words]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=20).stdout.strip()
-
-    with contextlib.suppress(OSError, subprocess.SubprocessError):
-        return git("rev-parse", "--short=12", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
-    return None
-
-
-def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: int) -> list[str]:
-    """Format the lines of a Markdown table; columns from ``numbers`` on are right-aligned."""
-    rule = [" --- " if i < numbers else " ---: " for i in range(len(columns))]
-    cells = [columns, *([text.replace("|", "\\|") for text in row] for row in rows)]
-    lines = [f"| {' | '.join(row)} |" for row in cells]
-    return [lines[0], f"|{'|'.join(rule)}|", *lines[1:]]
 
 
 ALL = "all maps"
@@ -172,44 +145,10 @@ class Row:
         return not self.exact, self.precision != "float32", self.method.count(","), other, self.method, coarse
 
 
-def title_of(point: Mapping[str, Any], machine: Mapping[str, Any], driver: str = "", target: str = "") -> str:
-    """Name a point's device: library, and processor with cores or GPU; PoCL's ``target`` "haswell" has no AVX-512."""
-    library = {"opencl": "OpenCL", "warp:cuda": "CUDA", "warp:cpu": "Warp"}
-    if driver.startswith("Intel"):
-        library["opencl"] = "Intel's OpenCL"
-    prefix = next((name for name in ("warp:cuda", "warp:cpu", "opencl") if point["backend"].startswith(name)), "")
-    if point["kind"] == "gpu":
-        return f"{point['device']}, {library[prefix]}"
-    made = "PoCL" if "pthread" in point["device"] or "cpu-" in point["device"] else library.get(prefix, "NumPy")
-    made += ", AVX2 only" if target == "haswell" else ""
-    cores = 1 if prefix == "warp:cpu" else machine["processors"]
-    return f"{cores} core{'s' * (cores > 1)} of an {machine['processor']}, {made}"
-
-
-def titles_of(
-    points: Iterable[Mapping[str, Any]], machine: Mapping[str, Any], devices: Iterable[Mapping[str, Any]] = ()
-) -> dict[str, str]:
-    """Return a title for each device of some points, by selection string; equal titles are extended by device names.
-
-    Other implementations (selection string ``"outside"``) have the title of the first processor.
-    """
-    drivers = {device["selection"]: (device["driver"], device.get("target", "")) for device in devices}
-    first: dict[str, Mapping[str, Any]] = {}
-    for point in points:
-        first.setdefault(point["backend"], point)
-    outside = first.pop("outside", None)
-    plain = {name: title_of(point, machine, *drivers.get(name, ())) for name, point in first.items()}
-    alike = list(plain.values())
-    titles = {name: f"{title}, {name}" if alike.count(title) > 1 else title for name, title in plain.items()}
-    if outside is not None:
-        own = next((titles[name] for name, point in first.items() if point["kind"] == outside["kind"]), None)
-        titles["outside"] = own or next(iter(titles.values()), title_of(outside, machine))
-    return titles
-
-
 def origin_of(report: Mapping[str, Any]) -> str:
-    """Name the command of a report, its date and its commit."""
-    return f"{report['command'] or 'gpusense bench'} ({report['date']}, commit {report['commit'] or 'unknown'})"
+    """Name the command of a report, its date and, if known, its commit."""
+    commit = f", commit {report['commit']}" if report.get("commit") else ""
+    return f"{report['command'] or 'gpusense bench'} ({report['date']}{commit})"
 
 
 def mean(numbers: Iterable[float]) -> float:
@@ -241,17 +180,17 @@ def seconds_of(point: Mapping[str, Any], *, elapsed: bool = False) -> float | No
     return float(value) if value else None
 
 
-def model_rows(report: Mapping[str, Any], *, elapsed: bool = False) -> list[Row]:
+def model_rows(
+    report: Mapping[str, Any], titles: Mapping[str, str] | None = None, *, elapsed: bool = False
+) -> list[Row]:
     """Return the rows of a report of ``gpusense bench``, for each map and for all together.
 
-    ``elapsed``: Whether to take elapsed times on processors too, and to name devices by their selection strings.
+    ``titles``: Names of the devices by their selection strings, which name them by default. ``elapsed``: Whether to
+    take elapsed times on processors too.
 
     A method that failed in a scene has no row for the scene and none for all maps. A scene where every method was left
     out, such as one after the deadline of a quick run, does not count.
     """
-    titles: Mapping[str, str] = {point["backend"]: point["backend"] for point in report["points"]}
-    if not elapsed:
-        titles = titles_of(report["points"], report["machine"], report.get("devices", ()))
     origin = origin_of(report)
     groups: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
     everywhere: dict[tuple[str, ...], set[tuple[str, str]]] = {}
@@ -266,7 +205,7 @@ def model_rows(report: Mapping[str, Any], *, elapsed: bool = False) -> list[Row]
         whole = len(everywhere.get((need, backend, precision), ()))
         for scene in [*dict.fromkeys(point["scene"] for point in kept), ALL]:
             part = kept if scene == ALL else [point for point in kept if point["scene"] == scene]
-            made = _model_row(need, titles[backend], scene, part, elapsed) if part else None
+            made = _model_row(need, (titles or {}).get(backend, backend), scene, part, elapsed) if part else None
             if made is not None:
                 some = scene == ALL and len(part) < whole
                 maps = f"{len(part)} of {whole} clouds" if some else ""

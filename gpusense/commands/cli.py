@@ -72,7 +72,12 @@ keeps and prints the results so far."""
 
 
 class Parser(argparse.ArgumentParser):
-    """Parser that reports an error in one line."""
+    """Parser that reports an error in one line, and takes negative numbers with exponents, such as -1e-3."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        # The pattern of argparse lacks exponents before Python 3.14.
+        self._negative_number_matcher = re.compile(r"-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
 
     def error(self, message: str) -> NoReturn:
         """Print the message with a likely correction instead of the usage, and exit."""

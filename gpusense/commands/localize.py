@@ -118,7 +118,8 @@ def run(args: argparse.Namespace) -> int:
     steps = read_chosen(args, read)
     pf = make_filter(args, grid, steps, read)
     pose, covariance = start_of(args, read.nav2) or (None, None)
-    tracking.start(pf, steps, everywhere=args.everywhere, pose=pose, covariance=covariance)
+    with options_named():
+        tracking.start(pf, steps, everywhere=args.everywhere, pose=pose, covariance=covariance)
     track, recorders = tracking.Track(), dict[Path, "Recorder"]()
     if args.record is not None:
         recorders[args.record] = viewer.Recording(pf.grid)

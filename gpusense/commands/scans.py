@@ -24,7 +24,7 @@ FORMATS = "CARMEN or Wean Hall, plain or .gz; a bag of ROS 1 (.bag) or of ROS 2 
 OPTIONS = {
     "topic": "topic", "sensors": "topic", "mount": "mount", "node": "node", "frame": "frame",
     "odometry_from": "odometry", "range_min": "range-min", "range_max": "range-max",
-    "poses": "poses", "risk": "risk",
+    "poses": "poses", "risk": "risk", "mean": "start",
 }  # fmt: skip
 """Command line options by the library's arguments."""
 

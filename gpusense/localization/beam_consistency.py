@@ -112,7 +112,10 @@ def _place_of(grid: OccupancyGrid, pose: Floats) -> tuple[bool, bool]:
     (x, y, _), (x0, y0, yaw) = pose.tolist(), grid.origin
     side, cells, occupied, (rows, columns) = grid.resolution, grid.cells, grid.occupied_threshold, grid.shape
     c, s, dx, dy = math.cos(yaw), math.sin(yaw), x - x0, y - y0
-    column, row = math.floor((c * dx + s * dy) / side), math.floor((-s * dx + c * dy) / side)
+    along, across = (c * dx + s * dy) / side, (-s * dx + c * dy) / side
+    if not (math.isfinite(along) and math.isfinite(across)):
+        return False, True
+    column, row = math.floor(along), math.floor(across)
     if 0 <= row < rows and 0 <= column < columns and 0 <= cells[row, column] < occupied:
         return False, False
     reach = max(1, round(BESIDE / side))

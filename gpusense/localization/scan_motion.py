@@ -40,6 +40,8 @@ _APART, _MANY = 9.0, 0.15
 _FAR, _STAYS_FAR, _MOST_FAR = 16.0, 0.34, {"mount": 0.12, "time": 0.05}
 # Median of a squared residual of unit variance, and degrees of freedom of the density of residuals.
 _MEDIAN, _FREEDOM = 2.37, 3.0
+# Largest coordinate of a guess [m].
+_FARTHEST = 1e3
 # Largest distance between matches from several guesses that agree [m, rad].
 _SAME, _SAME_TURN = 0.05, 0.03
 # Least number of matched pairs, and least share of them.
@@ -123,7 +125,8 @@ def _matches(
         known = [getattr(moments[k], name) for k in (*first, *second)]
         if all(each is not None for each in known):
             poses = np.array(known, np.float64)
-            guesses.append(pose_difference(poses[: len(first)], poses[len(first) :]))
+            # Scans show no motion beyond this; a diverged filter has estimates that are farther apart.
+            guesses.append(np.clip(pose_difference(poses[: len(first)], poses[len(first) :]), -_FARTHEST, _FARTHEST))
     count = len(guesses)
     match = match_scan(np.tile(one, (count, 1)), np.tile(two, (count, 1)), scanner, np.vstack(guesses), backend=backend)
     found, good = np.asarray(match.pose).reshape(count, -1, 3), np.asarray(match.converged).reshape(count, -1)

@@ -44,7 +44,7 @@ def _wrapped(poses: np.ndarray) -> np.ndarray:
 
 def normal(mean: Any, covariance: Any, count: int, key: Key) -> np.ndarray:
     """Draw poses from a normal density."""
-    centre, matrix = checks.array("mean", mean, (3,)), checks.array("covariance", covariance, (3, 3))
+    centre, matrix = checks.array("mean", mean, (3,), largest=1e300), checks.array("covariance", covariance, (3, 3))
     if np.abs(matrix - matrix.T).max() > 1e-9 * max(np.abs(matrix).max(), 1e-300):
         raise ValueError("covariance: must be symmetric, got one that is not")
     values, vectors = np.linalg.eigh(matrix)

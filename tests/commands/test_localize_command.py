@@ -131,6 +131,17 @@ def test_an_interrupted_run_keeps_what_it_has(place, capsys, monkeypatch):
     assert len(tum.read_text().splitlines()) == 3
 
 
+@pytest.mark.parametrize("options", [
+    ["--start", "1e9", "0", "0"], ["--start", "-1e200", "1e200", "1e9"], ["--motion-noise", *["1e300"] * 4],
+])  # fmt: skip
+@pytest.mark.filterwarnings("ignore:start. ")
+def test_a_filter_that_leaves_any_map_ends_with_a_verdict(place, capsys, options):
+    assert cli.main(call(place, *options)) in (0, 1)
+    assert re.match(r"[A-Z ]+(:| \(p_lost )", capsys.readouterr().out)
+    message = error_of(call(place, "--start", "0", "1e308", "0"), capsys)
+    assert message.startswith("--start: every value must be from -1e+300 to 1e+300, got 1e+308")
+
+
 def test_odometry_that_copies_corrected_poses_is_chained_from_wheel_readings(tmp_path):
     def scan(x, step):
         return f"FLASER 3 1 2 3 {x} 0 0 {x} 0 0 {step} robot {step}"

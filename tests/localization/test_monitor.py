@@ -46,6 +46,12 @@ def test_right_poses_are_tracked_and_wrong_ones_lost(model):
     assert "wrong start" in told.text and monitor.diagnose(search=False).elsewhere is None
 
 
+def test_a_pose_beyond_any_map_is_lost(model):
+    for far in (1e9, 1e308):
+        _, found = watched(model, [np.array([far, -far, 0.5])] * 4, [scan_at(pose) for pose in POSES[:4]])
+        assert found[-1].verdict in ("uncertain", "lost") and math.isnan(found[-1].explained)
+
+
 @pytest.mark.sampled(1)
 def test_wrong_maps_and_wrong_mounts_are_distinguished(model):
     blocks = np.zeros((80, 80), int)

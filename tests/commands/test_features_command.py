@@ -85,22 +85,6 @@ def test_landmarks_of_a_map(capsys, tmp_path):
     assert [row["kind"] for row in document["landmarks"]] == ["line"] * 4 + ["corner"] * 4
 
 
-def test_an_interrupt_keeps_the_results_so_far(capsys, log, monkeypatch):
-    monkeypatch.setattr(command, "_CALL", 5)
-    whole, calls = command._extract, []
-
-    def extract(args, scans):
-        calls.append(len(scans))
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return whole(args, scans)
-
-    monkeypatch.setattr(command, "_extract", extract)
-    assert main(["features", "--backend", "numpy", "--log", str(log)]) == 130
-    captured = capsys.readouterr()
-    assert "interrupted: results of 5 of 12 scans" in captured.out
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

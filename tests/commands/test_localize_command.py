@@ -13,7 +13,6 @@ from support.command_line import error_of
 
 import gpusense as gs
 from gpusense.commands import cli
-from gpusense.evaluation import tracking
 from gpusense.evaluation.log_steps import read_steps
 from gpusense.plots import viewer
 
@@ -113,22 +112,6 @@ def test_a_filter_that_has_not_converged_is_uncertain(place, capsys):
     assert "without the first 1 of 1 scans" in printed.out and not (place / "none.tum").read_text()
     assert cli.main([*arguments, "--tum-from", "start"]) == 1
     assert len((place / "none.tum").read_text().splitlines()) == 1
-
-
-def test_an_interrupted_run_keeps_what_it_has(place, capsys, monkeypatch):
-    follow = tracking.follow
-
-    def stop_after_three(pf, steps, track):
-        for step in follow(pf, steps, track):
-            yield step
-            if len(track.steps) == 3:
-                raise KeyboardInterrupt
-
-    monkeypatch.setattr("gpusense.evaluation.tracking.follow", stop_after_three)
-    tum = place / "part.tum"
-    assert cli.main(call(place, "--tum", str(tum))) == 130
-    assert "interrupted: results of 3 of 12 scans" in capsys.readouterr().out
-    assert len(tum.read_text().splitlines()) == 3
 
 
 @pytest.mark.parametrize("options", [

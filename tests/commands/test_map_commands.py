@@ -65,34 +65,6 @@ def test_a_map_is_built_and_its_likelihoods_are_drawn(log, tmp_path, capsys):
     assert re.match(r"(ONE PLACE: |\d PLACES within)", text) and "too coarse for the model" in text
 
 
-def test_an_interrupt_keeps_the_results_so_far(log, tmp_path, capsys, monkeypatch):
-    out, picture = tmp_path / "map.yaml", tmp_path / "likelihood.png"
-    monkeypatch.setattr("gpusense.commands.map._SCANS", 2)
-
-    def stop_after(share):
-        def show(text: str) -> None:
-            if text >= share:
-                raise KeyboardInterrupt
-
-        return show
-
-    import contextlib
-
-    @contextlib.contextmanager
-    def interrupting(total):
-        yield stop_after("5")
-
-    monkeypatch.setattr("gpusense.commands.signals.progress", interrupting)
-    assert main(["map", "--log", str(log), "--out", str(out), "--backend", "numpy", "--range-max", "50"]) == 130
-    assert "results of 2 of 4 scans" in capsys.readouterr().out
-    assert gs.read_map(out).occupied.any()
-    monkeypatch.setattr("gpusense.matching.pose_likelihood._TILE", 6000)
-    code = main(["likelihood-map", "--map", str(out), "--log", str(log), "--out", str(picture), "--headings", "4",
-                 "--backend", "numpy", "--range-max", "50", "--resolution", "0.05"])  # fmt: skip
-    assert code == 130 and picture.is_file()
-    assert "per cent of the positions" in capsys.readouterr().out
-
-
 def test_bad_input_is_one_line(log, tmp_path, capsys):
     out = str(tmp_path / "map.yaml")
     assert "--p-hit" not in error_of(["map", "--log", str(tmp_path / "none.log"), "--out", out], capsys)

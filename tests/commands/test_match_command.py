@@ -10,7 +10,6 @@ from support.matching_scenes import ROOM, segments_scan
 
 import gpusense as gs
 from gpusense.commands.cli import main
-from gpusense.evaluation import matching
 
 SCANNER = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / 180, count=180, range_max=81.83)
 
@@ -65,18 +64,3 @@ def test_scans_are_matched_to_a_map(capsys, log, tmp_path):
     gs.write_map(gs.OccupancyGrid(cells, resolution=0.05, origin=(-5.0, -4.0, 0.0)), tmp_path / "map.yaml")
     text = run(capsys, "--log", log, "--map", tmp_path / "map.yaml", "--shift", 0.2, "--turn", 5)
     assert text.startswith("MATCHED: 8 of 8 scans agree; median error ") and "0 wrong" in text
-
-
-def test_results_so_far_are_kept_when_interrupted(capsys, log, monkeypatch):
-    monkeypatch.setattr(matching, "_BATCH", 3)
-    original, calls = matching.match_scan, []
-
-    def interrupted(*arguments):
-        calls.append(1)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return original(*arguments)
-
-    monkeypatch.setattr(matching, "match_scan", interrupted)
-    assert main(["match", "--backend", "numpy", "--log", str(log)]) == 130
-    assert "interrupted: results of 3 of 7 matches" in capsys.readouterr().out

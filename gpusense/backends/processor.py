@@ -47,7 +47,7 @@ def host_memory() -> int:
 
 @functools.cache
 def _fields() -> dict[str, str]:
-    """Return the fields of Linux's list, those of the first processor where several have one."""
+    """Return the fields of Linux's list; the first processor sets a repeated field."""
     try:
         with open(_CPUINFO, encoding="utf-8", errors="replace") as file:
             text = file.read(1 << 16)

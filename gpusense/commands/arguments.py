@@ -193,7 +193,7 @@ range_number = real_number(
 
 
 def quantity(units: Mapping[str, tuple[str, float]]) -> Callable[[str], tuple[str, float]]:
-    """Make a type for ``add_argument``: a number > 0 with a unit, converted to another one by a factor."""
+    """Make a type for ``add_argument``: a number > 0 with a unit, which maps to a base unit and a factor."""
 
     def convert(text: str) -> tuple[str, float]:
         found = re.fullmatch(r"\s*((?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-z%]+)\s*", text)
@@ -258,7 +258,7 @@ def temperature(text: str) -> float | str:
 
 
 def refuse(args: argparse.Namespace, names: Iterable[str], rule: str) -> None:
-    """Refuse options that were given; ``names`` are those of the namespace."""
+    """Refuse options that the user set; ``names`` are attributes of ``args``."""
     for name in names:
         value = getattr(args, name)
         if value is not None and value is not False:

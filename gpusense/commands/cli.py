@@ -106,7 +106,7 @@ class Parser(argparse.ArgumentParser):
 
 
 class _Postponed(importlib.abc.MetaPathFinder):
-    """Finder that executes a module of the library when one of its names is first used: help needs few of them."""
+    """Finder that postpones the execution of library modules until their first use; help executes few modules."""
 
     def find_spec(self, fullname: str, path: Any, target: Any = None) -> importlib.machinery.ModuleSpec | None:
         """Return the specification of a module outside the commands."""

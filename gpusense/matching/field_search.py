@@ -2,10 +2,10 @@
 
 A score of a cell is its log density in 255 steps. With the nearest cell's distance the sum of scores differs from the
 log-likelihood by rounding alone. With bilinear distances an end point's density depends on its place within a cell. All
-positions are centres of cells, so this place is the same at all positions with one heading. A cell is divided into
-tiles; each tile of the cell has its table of the largest density within the tile, rounded up. A bilinear function has
-its least value over a tile at a corner, so these are bounds, and every pose whose bound reaches the log-likelihood of
-some known pose is evaluated by the model.
+positions are centres of cells, so this place is the same at all positions with one heading. Squares between four
+centres are divided into tiles, the cells of a finer table of the largest density within each tile, rounded up. A
+bilinear function has its least value over a tile at a corner, so these are bounds, and every pose whose bound reaches
+the log-likelihood of some known pose is evaluated by the model.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from gpusense._util.angles import wrapped
 from gpusense._util.typing import Space
 from gpusense.backends import get_backend
-from gpusense.matching.pose_grid import Found, PoseGrid, end_places
+from gpusense.matching.pose_grid import Found, PoseGrid
 from gpusense.matching.score_tables import TOP, ScoreTables, quantized
 from gpusense.matching.search import Search
 from gpusense.models.scan.caster import RayCaster
@@ -38,6 +38,8 @@ from gpusense.world.scanner import classify_ranges
 _BLOCK, _MOST_LEVELS = 0.8, 5
 # Tiles along a side of a cell for bilinear fields, if this many table cells suffice.
 _TILES, _MOST_TABLE_CELLS = (4, 2, 1), 1 << 25
+# Rows of cells that are divided into tiles at a time.
+_ROWS = 64
 # Rounding of a log-likelihood, in steps for each hit.
 _ROUNDING = 2e-3
 # Larger than the number of any pose.
@@ -88,7 +90,7 @@ class FieldSearch:
         levels = min(math.log2(max(_BLOCK * p.max_distance / (cell * stride), 1)), math.log2(max(shortest / 4, 1)))
         self._search = Search(
             ScoreTables(
-                backend, scores, levels=min(int(levels), _MOST_LEVELS), stride=stride,
+                backend, scores, levels=min(int(levels), _MOST_LEVELS), stride=stride * (self._tiles or 1),
                 beyond=TOP if self._walled else 0,
             )
         )  # fmt: skip
@@ -99,18 +101,15 @@ class FieldSearch:
         )  # fmt: skip
 
     def _tile_scores(self, density: FieldDensity, distances: np.ndarray) -> np.ndarray:
-        """Return the largest scores (n * n, H + 1, W + 1) of the tiles between four centres, rounded up."""
-        n = self._tiles
-        along = np.linspace(0, 1, n + 1)
-        rows = [(1 - f) * distances[:-1] + f * distances[1:] for f in along]
-        scores = np.empty((n * n, distances.shape[0] - 1, distances.shape[1] - 1), np.uint8)
-        corners = [[(1 - f) * row[:, :-1] + f * row[:, 1:] for f in along] for row in rows]
-        for i in range(n):
-            for j in range(n):
-                four = corners[i][j], corners[i][j + 1], corners[i + 1][j], corners[i + 1][j + 1]
-                least = np.minimum.reduce(four)
-                exact = (np.clip(density.log(least), self._low, self._high) - self._low) * (TOP / self._step())
-                scores[i * n + j] = np.minimum(np.ceil(exact + 0.01), TOP)
+        """Return the largest scores (n (H + 1), n (W + 1)) of n x n tiles between four centres, rounded up."""
+        n, (rows, cols) = self._tiles, distances.shape
+        scores = np.empty((n * (rows - 1), n * (cols - 1)), np.uint8)
+        for row in range(0, rows - 1, _ROWS):
+            corners = _finer(_finer(distances[row : row + _ROWS + 1], n).T, n).T
+            upper, lower = (np.minimum(part[:, :-1], part[:, 1:]) for part in (corners[:-1], corners[1:]))
+            logs = np.clip(density.log(np.minimum(upper, lower)), self._low, self._high)
+            exact = (logs - self._low) * (TOP / self._step())
+            scores[n * row : n * row + len(exact)] = np.minimum(np.ceil(exact + 0.01), TOP)
         return scores
 
     def _step(self) -> float:
@@ -167,8 +166,9 @@ class FieldSearch:
         known = np.full(len(poses), np.nan)
         known[rows] = log_p
         # The first of equal ones by row, then column, then heading.
-        place = (found.row.astype(np.int64) * grid.width + found.col) * turns + found.heading
-        likeliest = np.where(log_p == log_p.max(axis=1, keepdims=True), place[rows], _FAR).argmin(axis=1)
+        row, col, heading = (part[rows].astype(np.int64) for part in (found.row, found.col, found.heading))
+        place = (row * grid.width + col) * turns + heading
+        likeliest = np.where(log_p == log_p.max(axis=1, keepdims=True), place, _FAR).argmin(axis=1)
         score = found.score / (TOP * hits)[found.scan]
         best = rows[np.arange(scans), likeliest]
         return Candidates(poses, score, known, found.scan, best, found.evaluated // scans)
@@ -181,14 +181,13 @@ class FieldSearch:
 
         All poses whose bounds reach a known likelihood are evaluated; the last number counts them and their blocks.
         """
-        # A cell of the tables lies between four centres, also in the ring outside the map.
-        shifted = PoseGrid(searched.start + 0.5, searched.headings, searched.height, searched.width)
+        # Tiles begin at the centres of the ring of cells outside the map.
+        start, points = self._tiles * (searched.start + 0.5), self._tiles * cells
 
         def run(headings: slice, floor: int) -> Found:
-            part = PoseGrid(shifted.start, shifted.headings[:, headings], shifted.height, shifted.width)
-            images = _tile_numbers(cells, part.headings[0], part.start[0], self._tiles)
+            part = PoseGrid(start, searched.headings[:, headings], searched.height, searched.width)
             slack = TOP * len(cells) if floor >= 0 else len(cells)
-            return self._search.find([cells], part, slack=slack, allowed=allowed, images=[images], floor=floor)
+            return self._search.find([points], part, slack=slack, allowed=allowed, floor=floor)
 
         everything = slice(0, searched.headings.shape[1])
         first = run(everything, -1)
@@ -205,8 +204,8 @@ class FieldSearch:
             (part.row, part.col, part.heading + headings.start) for headings, part in parts
         ], strict=True)]  # fmt: skip
         row, col, heading = found
-        start, stride = searched.start[0], self.stride
-        local = np.stack([start[0] + stride * col, start[1] + stride * row, searched.headings[0, heading]], axis=1)
+        (x, y), stride = searched.start[0], self.stride
+        local = np.stack([x + stride * col, y + stride * row, searched.headings[0, heading]], axis=1)
         poses = to_world(self.grid, local)
         score = self._steps(model, ranges, len(cells), poses)
         order = np.lexsort((heading, col, row, -score))
@@ -222,6 +221,13 @@ class FieldSearch:
         log_p -= float(model.log_likelihood(poses[:1], others)[0])
         steps: np.ndarray = (log_p / model.temperature - hits * self._low) * (TOP / self._step())
         return steps
+
+
+def _finer(values: np.ndarray, parts: int) -> np.ndarray:
+    """Return rows of numbers with rows interpolated between them, for ``parts`` parts."""
+    share = np.arange(parts)[:, None] / parts
+    between = (1 - share) * values[:-1, None] + share * values[1:, None]
+    return np.concatenate([between.reshape(-1, values.shape[1]), values[-1:]])
 
 
 def padded_rows(first: np.ndarray, count: np.ndarray) -> np.ndarray:
@@ -282,14 +288,6 @@ def field_search(model: LikelihoodFieldModel, stride: int) -> FieldSearch:
     if search is None:
         search = kept[stride] = FieldSearch(model, stride)
     return search
-
-
-def _tile_numbers(points: np.ndarray, headings: np.ndarray, start: np.ndarray, tiles: int) -> np.ndarray:
-    """Return the numbers (A, K) of the tiles that hold end points at each heading; see ``end_places``."""
-    place = end_places(points, headings, start)
-    tile = np.minimum(np.floor((place - np.floor(place)) * tiles), tiles - 1).astype(np.int32)
-    number: np.ndarray = tile[..., 1] * tiles + tile[..., 0]
-    return number
 
 
 def to_world(grid: OccupancyGrid, cells: np.ndarray) -> np.ndarray:

@@ -163,8 +163,15 @@ def _matches(
         own = scan_noise(np.concatenate([first, second]), scanner)
         noise = match_noise(own[: len(first)], own[len(first) :])
     if method not in ("gauss_newton", "correlative") or not len(second):
-        moved = before, motion
-        return _to_scans(first, second, scanner, poses, method, device, precision, options, moved, noise), single
+        moved = None
+        if before is not None or motion is not None:
+            both = (first, before), (second, motion)
+            moved = np.concatenate([np.zeros((len(scans), 3)) if m is None else m for scans, m in both])
+        pairs = np.empty((len(second), 2), np.intp)
+        pairs[:, 0] = np.arange(len(second)) if len(first) == len(second) else 0
+        pairs[:, 1] = np.arange(len(first), len(first) + len(second))
+        scans = np.concatenate([first, second])
+        return _pairs_of(scans, scanner, pairs, poses, method, device, precision, options, noise, moved), single
     first, second = _still(first, scanner, before), _still(second, scanner, motion)
 
     def by_maps(rows: np.ndarray, chosen: MatchOptions) -> ScanMatch:
@@ -186,50 +193,35 @@ def _by_noise(
     return ScanMatch.joined(parts).ordered(np.argsort(np.concatenate(rows)))
 
 
-def _to_scans(
-    first: np.ndarray, second: np.ndarray, scanner: Scanner, poses: np.ndarray, method: Method, device: Backend,
-    precision: Precision, options: MatchOptions, motions: tuple[np.ndarray | None, np.ndarray | None],
-    noise: np.ndarray,
-) -> ScanMatch:  # fmt: skip
-    """Match (S, K) scans to (S, K) or (1, K) reference scans, with noise (S,) of ranges."""
-    before, motion = motions
-    reference = np.arange(len(second)) if len(first) == len(second) else np.zeros(len(second), np.intp)
-    if len(first) != len(second) and len(noise) > 1:
-        # Lines depend on the noise, so each level of it has a separate reference.
-        levels, reference = np.unique(noise, return_inverse=True)
-        first = np.repeat(first, len(levels), axis=0)
-        before = None if before is None else np.repeat(before, len(levels), axis=0)
-    real = np.dtype(precision)
-    moved = None
-    if before is not None or motion is not None:
-        both = (first, before), (second, motion)
-        moved = np.concatenate([np.zeros((len(scans), 3)) if m is None else m for scans, m in both])
-    points = scan_points(np.concatenate([first, second]), scanner, real, moved)
-    pairs = np.empty((len(second), 2), np.intp)
-    pairs[:, 0], pairs[:, 1] = reference, np.arange(len(first), len(first) + len(second))
-    match = match_pairs(device, real, points, pairs, poses, method, options, scanner.mount[:2], noise)
-    return judged(match, poses, options)
-
-
 def match_log(
-    readings: np.ndarray, scanner: Scanner, first: np.ndarray, second: np.ndarray, guess: np.ndarray, own: np.ndarray,
+    scans: np.ndarray, scanner: Scanner, first: np.ndarray, second: np.ndarray, guess: np.ndarray, own: np.ndarray,
     backend: Backend, precision: Precision, window: ArrayLike, motion: np.ndarray | None = None,
 ) -> ScanMatch:  # fmt: skip
     """Match L pairs of checked scans of a log as ``match_scan`` does; points and lines of each scan are made once.
 
-    ``readings`` are (S, K) [m], ``first`` and ``second`` (L,) indices of scans, ``guess`` (L, 3) poses of the second
+    ``scans`` are (S, K) [m], ``first`` and ``second`` (L,) indices of scans, ``guess`` (L, 3) poses of the second
     robot frames in the first ones, ``own`` (S,) the noise from ``scan_noise`` [m], ``window`` half widths of the search
     [m, rad] and ``motion`` (S, 3) motions during the scans, or None.
     """
     options, poses = check_options(ASSUMED_NOISE, 1.0, window), check_guess(guess, len(second))
-    noise = match_noise(own[first], own[second])
-    # Lines depend on the noise, so a scan has points for each level.
-    level = np.unique(noise, return_inverse=True)[1] * len(readings)
-    used, pairs = np.unique(np.concatenate([level + first, level + second]), return_inverse=True)
-    scans = used % len(readings)
+    noise, pairs = match_noise(own[first], own[second]), np.stack([first, second], axis=1)
+    return _pairs_of(scans, scanner, pairs, poses, "auto", backend, precision, options, noise, motion)
+
+
+def _pairs_of(
+    scans: np.ndarray, scanner: Scanner, pairs: np.ndarray, poses: np.ndarray, method: str, device: Backend,
+    precision: Precision, options: MatchOptions, noise: np.ndarray, motion: np.ndarray | None,
+) -> ScanMatch:  # fmt: skip
+    """Match pairs (L, 2) of scans (S, K) from guesses (L, 3), with noise (L,) of ranges and motions (S, 3) or None."""
+    if len(noise) and (len(scans) > pairs.size or noise.min() < noise.max()):
+        # Lines depend on the noise, so a scan has points for each level; scans without a pair have none.
+        level = np.unique(noise, return_inverse=True)[1] * len(scans)
+        used, numbers = np.unique(level[:, None] + pairs, return_inverse=True)
+        chosen, pairs = used % len(scans), numbers.reshape(pairs.shape)
+        scans, motion = scans[chosen], None if motion is None else motion[chosen]
     real = np.dtype(precision)
-    points = scan_points(readings[scans], scanner, real, None if motion is None else motion[scans])
-    match = match_pairs(backend, real, points, pairs.reshape(2, -1).T, poses, "auto", options, scanner.mount[:2], noise)
+    points = scan_points(scans, scanner, real, motion)
+    match = match_pairs(device, real, points, pairs, poses, method, options, scanner.mount[:2], noise)
     return judged(match, poses, options)
 
 

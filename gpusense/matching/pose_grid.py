@@ -83,13 +83,6 @@ class Found:
         return np.searchsorted(self.scan, np.arange(len(self.complete)))
 
 
-def end_places(points: np.ndarray, headings: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return (A, K, 2) places of (K, 2) end points on the robot at (A,) headings, at the position ``start`` [cells]."""
-    cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
-    x, y = points[:, 0], points[:, 1]
-    return np.stack([start[0] + (cos * x - sin * y), start[1] + (sin * x + cos * y)], axis=-1)
-
-
 def distinct_poses(
     poses: np.ndarray, count: int, radius: float, angle: float, scan: np.ndarray | None = None,
     best: np.ndarray | None = None,

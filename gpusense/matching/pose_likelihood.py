@@ -256,23 +256,18 @@ def _free_cells(free: NDArray[np.bool], step: int) -> tuple[NDArray[np.int64], N
 
     Of equally near cells the lowest column counts, then the lowest row. Tiles without a free cell have their middle.
     """
-    middles, columns = [_middles(size, step) for size in free.shape], np.arange(free.shape[1])
+    far, sides = np.iinfo(np.int64).max, [min(step, size) for size in free.shape]
+    middles = [_middles(size, step) for size in free.shape]
     cells = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1)
-    has_free = np.zeros(cells.shape[:2], bool)
-    far = np.iinfo(np.int64).max // 2
-    across = (columns - middles[1][columns // step]) ** 2
-    first = np.arange(0, len(columns), step)
-    for k, row in enumerate(middles[0]):
-        part = free[k * step : (k + 1) * step]
-        # The nearest free row of each column, then the nearest column of each tile.
-        down = np.where(part, (np.arange(k * step, k * step + len(part)) - row)[:, None] ** 2, far)
-        nearest = down.argmin(axis=0)
-        squared = np.where(part.any(axis=0), down[nearest, columns] + across, far)
-        least = np.minimum.reduceat(squared, first)
-        has_free[k] = least < far
-        chosen = np.flatnonzero((squared == np.repeat(least, np.diff([*first, len(columns)]))) & (squared < far))
-        tiles, at = np.unique(chosen // step, return_index=True)
-        cells[k, tiles] = np.stack([k * step + nearest[chosen[at]], chosen[at]], axis=1)
+    (rows, cols), (high, wide) = cells.shape[:2], sides
+    down, across = (np.arange(size) - np.repeat(middle, side)[:size]
+                    for size, side, middle in zip(free.shape, sides, middles, strict=True))  # fmt: skip
+    squared = np.full((rows * high, cols * wide), far)
+    squared[: len(down), : len(across)] = np.where(free, down[:, None] ** 2 + across**2, far)
+    tiles = squared.reshape(rows, high, cols, wide).transpose(0, 2, 3, 1).reshape(rows, cols, -1)
+    nearest, has_free = tiles.argmin(axis=2), tiles.min(axis=2) < far
+    within = np.stack([nearest % high, nearest // high], axis=-1) + np.moveaxis(np.mgrid[:rows, :cols], 0, -1) * sides
+    cells[has_free] = within[has_free]
     return cells, has_free
 
 

@@ -25,7 +25,7 @@ __all__ = ["Found", "PoseGrid", "Search"]
 
 _INT = np.dtype(np.int32)
 _NO_FLAGS: frozenset[str] = frozenset()
-# Numbers that count the rows of a scan by their scores, as in the kernel file.
+# Numbers that count the lines of a scan by their scores, as in the kernel file.
 BINS = 512
 # Blocks of a scan that are followed down to poses for its first lower bound.
 _FOLLOWED = 512
@@ -64,7 +64,7 @@ class Search:
         """Return the best pose of each scan, and all poses whose scores are at most ``slack`` or (S,) lower.
 
         ``points`` (K_s, 2) are end points of each of S scans in the robot's frame [cells of the tables], ``images``
-        (K_s,) the table of each, or (A, K_s) at each heading; None: the scans'. Blocks of ``2^level`` x ``2^level``
+        (K_s,) the table of each; None: the scans'. Blocks of ``2^level`` x ``2^level``
         positions are bounded first; 0 is brute force, None the tables' last level, or the one before it if its bounds
         take few sums. ``allowed`` (height, width) are the positions that may be found; it must not change while it is
         in use. Poses below ``floor`` are not found. At most 262 144 poses of a scan are kept; of equal ones, the first
@@ -128,6 +128,11 @@ class _Run:
         room = _PARTS[self._backend.info.kind]
         self._parts = room + room // 16 * scans
         self._evaluated = 0
+        # Lines of shifts, see ``line_maxima``: rows on processors, columns on GPUs.
+        if self._backend.info.kind == "cpu":
+            self._lines = self._items * self._height, self._height, self._width, self._width, 1
+        else:
+            self._lines = self._items * self._width, self._width, self._height, 1, self._width
         self._ahead = flags_if(READ_AHEAD=self._backend.info.kind == "gpu")
 
     def _launch(self, kernel: str, size: tuple[int, ...], *arguments: Any, flags: frozenset[str] = _NO_FLAGS) -> None:
@@ -194,7 +199,6 @@ class _Run:
                 some = max(min(some, chosen - begin) // 4, 1)
             else:
                 self._evaluated += 4 * (min(some, chosen - begin) + int(counts[1:-1].sum())) if self._level else 0
-                self._raise(poses)
                 self._keep(poses)
                 begin += some
                 if begin >= chosen:
@@ -204,22 +208,29 @@ class _Run:
             self._counts = self._space.upload("count", counts)
 
     def _bound(self) -> None:
-        """Bound all blocks: scores (S * A, rows, cols), -1 where none is allowed, and the best of each row."""
-        folded, rows = self._tables.folded(self._level), self._items * self._height
-        self._score = self._space.empty("bounds", rows * self._width, _INT)
-        columns = -(-self._width // RUN) if folded.flags else self._width
+        """Bound all blocks: scores (S * A, rows, cols), -1 where none is allowed, and the best of each line."""
+        folded, lines = self._tables.folded(self._level), self._lines[0]
+        self._score = self._space.empty("bounds", lines * self._lines[2], _INT)
+        runs = -(-self._width // RUN) if folded.flags else self._width
         self._launch(
-            "shift_scores", (columns, -(-self._height // SHIFT_ROWS), self._items), folded.table, *self._bound_ends,
+            "shift_scores", (runs, -(-self._height // SHIFT_ROWS), self._items), folded.table, *self._bound_ends,
             self._allowed[self._level], self._score, folded.shape, self._items, self._height, self._width, folded.unit,
             flags=folded.flags,
         )  # fmt: skip
-        self._evaluated += rows * self._width
-        self._maxima = self._space.empty("row maxima", 2 * rows, _INT)
+        self._evaluated += lines * self._lines[2]
+        self._maxima = self._space.empty("line maxima", 2 * lines, _INT)
         self._shift = max((TOP * self._most).bit_length() - BINS.bit_length() + 1, 0)
         self._launch(
-            "row_maxima", (rows,), self._score, self._maxima, self._histogram, rows, self._width, self._height,
-            self._turns, self._shift,
-        )  # fmt: skip
+            "line_maxima",
+            (lines,),
+            self._score,
+            self._maxima,
+            self._histogram,
+            *self._lines,
+            self._turns,
+            self._shift,
+            flags=self._ahead,
+        )
 
     def _quarters(self, level: int) -> tuple[tuple[Any, ...], ScoreTable, tuple[int, int]]:
         """Return quarters and end points of a level, the tables' sizes, and the cells between 2^n positions with n."""
@@ -230,14 +241,14 @@ class _Run:
 
     def _follow(self) -> None:
         """Raise lower bounds: follow the best parts of promising blocks down to poses."""
-        most = min(_FOLLOWED, self._turns * self._height)
+        most = min(_FOLLOWED, self._turns * self._lines[1])
         count = most * len(self._best)
         number, blocks = self._space.empty("number", self._items, _INT), self._space.empty("followed", 4 * count, _INT)
-        numbers = self._items, self._height, self._turns
-        self._launch("count_promising", (self._items,), self._maxima, self._histogram, number, *numbers, self._shift,
-                     most)  # fmt: skip
-        self._launch("pick_blocks", (self._items,), self._maxima, self._histogram, number, blocks, *numbers,
-                     self._level, self._shift, most)  # fmt: skip
+        lines = self._items, self._lines[1]
+        self._launch("count_promising", (self._items,), self._maxima, self._histogram, number, *lines, self._turns,
+                     self._shift, most)  # fmt: skip
+        self._launch("pick_blocks", (self._items,), self._maxima, self._histogram, number, blocks, *lines, self._width,
+                     self._turns, self._level, self._shift, most)  # fmt: skip
         for level in reversed(range(self._level)):
             quarters, shape, spacing = self._quarters(level)
             self._launch(
@@ -252,12 +263,11 @@ class _Run:
 
     def _choose(self) -> None:
         """Collect the blocks whose bounds reach the lower bound of their scan."""
-        rows = self._items * self._height
         self._room = max(self._search.room, _ROOM * len(self._best))
         self._chosen = self._space.empty("chosen", 4 * self._room, _INT)
         self._launch(
-            "choose_blocks", (rows,), self._score, self._maxima, self._low, self._chosen, self._counts, rows,
-            self._height, self._width, self._turns, self._level, self._room,
+            "choose_blocks", self._lines[:1], self._score, self._maxima, self._low, self._chosen, self._counts,
+            *self._lines, self._width, self._turns, self._level, self._room, flags=self._ahead,
         )  # fmt: skip
 
     def _divide(self, begin: int, some: int) -> None:
@@ -294,63 +304,60 @@ class _Run:
         self._space.read(self._low, low)
         self._low = self._space.upload("low", np.maximum(low, self._floor).astype(np.int32))
 
-    def _raise(self, poses: np.ndarray) -> None:
-        """Raise the lower bounds of scans."""
-        # Of equal types, which NumPy does not convert number by number.
-        np.maximum.at(self._best, poses[:, 0] // self._turns, poses[:, 3].astype(np.int64))
-        np.maximum(self._floor, np.where(self._best >= 0, self._best - self._slack, -1), out=self._floor)
-
     def _keep(self, poses: np.ndarray) -> None:
-        """Keep poses that reach the floor; with too many of them, raise the floor."""
-        self._kept.append(poses[poses[:, 3] >= self._floor[poses[:, 0] // self._turns]])
+        """Raise the lower bounds of scans, and keep poses that reach the floor; with too many poses, raise it."""
+        scan = poses[:, 0] // self._turns
+        # Of equal types, which NumPy does not convert number by number.
+        np.maximum.at(self._best, scan, poses[:, 3].astype(np.int64))
+        np.maximum(self._floor, np.where(self._best >= 0, self._best - self._slack, -1), out=self._floor)
+        self._kept.append(poses[poses[:, 3] >= self._floor[scan]])
         if sum(map(len, self._kept)) > _MOST_KEPT * len(self._best):
             self._compact()
 
     def _compact(self) -> None:
         """Drop poses below the floor, raise it for scans with too many poses, and keep the first of equal poses."""
-        poses = np.concatenate(self._kept)
-        scan, score = poses[:, 0] // self._turns, poses[:, 3]
-        crowded = (_ranks(scan, score) == _MOST_KEPT) & (score >= self._floor[scan])
+        scan, row, col, heading, score = self._ordered()
+        rank = np.arange(len(scan)) - np.searchsorted(scan, scan)
+        crowded = rank == _MOST_KEPT
         np.maximum.at(self._floor, scan[crowded], np.minimum(score[crowded] + 1, self._best[scan[crowded]]))
         self._complete[scan[crowded]] = False
-        poses = self._ordered(poses)
-        scan, score = poses[:, 0] // self._turns, poses[:, 3]
-        self._kept = [poses[(score >= self._floor[scan]) & (_ranks(scan, score) < _MOST_KEPT)]]
+        kept = (score >= self._floor[scan]) & (rank < _MOST_KEPT)
+        self._kept = [np.stack([scan * self._turns + heading, row, col, score], axis=1)[kept].astype(np.int32)]
 
-    def _ordered(self, poses: np.ndarray) -> np.ndarray:
-        """Return poses by scan, falling score, row, column and heading."""
-        scan, heading = np.divmod(poses[:, 0].astype(np.int64), self._turns)
-        place = (poses[:, 1].astype(np.int64) * self._grid.width + poses[:, 2]) * self._turns + heading
-        places = self._grid.height * self._grid.width * self._turns
-        loss = int(poses[:, 3].max(initial=0)) - poses[:, 3].astype(np.int64)
-        rank = scan * (int(loss.max(initial=0)) + 1) + loss
-        # A single number is sorted faster than two keys, where 64 bits suffice.
-        single = (int(rank.max(initial=0)) + 1) * places < 1 << 63
-        ordered: np.ndarray = poses[np.argsort(rank * places + place) if single else np.lexsort((place, rank))]
-        return ordered
+    def _ordered(self) -> list[np.ndarray]:
+        """Return scans, rows, columns, headings and scores of the poses that reach the floor, as in ``Found``."""
+        poses = self._kept[0] if len(self._kept) == 1 else np.concatenate([np.empty((0, 4), np.int32), *self._kept])
+        scan, heading = np.divmod(poses[:, 0], self._turns)
+        if len(self._kept) > 1:
+            reach = poses[:, 3] >= self._floor[scan]
+            poses, scan, heading = poses[reach], scan[reach], heading[reach]
+        most = int(poses[:, 3].max(initial=0))
+        columns = [scan, most - poses[:, 3], poses[:, 1], poses[:, 2], heading]
+        bits = [int(column.max(initial=0)).bit_length() for column in columns]
+        if sum(bits) < 64:
+            # A number for each pose is sorted several times faster than indices.
+            key = np.zeros(len(poses), np.int64)
+            for column, size in zip(columns, bits, strict=True):
+                key = key << size | column
+            key.sort()
+            shifts = np.cumsum([0, *bits[:0:-1]])[::-1].tolist()
+            columns = [key >> shift & (1 << size) - 1 for shift, size in zip(shifts, bits, strict=True)]
+        else:
+            order = np.lexsort(columns[::-1])
+            columns = [column[order] for column in columns]
+        scan, loss, row, col, heading = columns
+        return [scan, row, col, heading, most - loss]
 
     def found(self) -> Found:
         """Return the poses in falling order of score."""
-        poses = np.concatenate([np.empty((0, 4), np.int32), *self._kept])
-        poses = self._ordered(poses[poses[:, 3] >= self._floor[poses[:, 0] // self._turns]])
-        scan, heading = np.divmod(poses[:, 0], self._turns)
-        return Found(scan, poses[:, 1], poses[:, 2], heading, poses[:, 3], self._evaluated, self._complete)
+        scan, row, col, heading, score = self._ordered()
+        return Found(scan, row, col, heading, score, self._evaluated, self._complete)
 
 
 @functools.lru_cache(maxsize=64)
 def _order(count: int) -> np.ndarray:
     """Return the order in which points are summed."""
     return np.argsort(np.arange(count) * _TURN % 1)
-
-
-def _ranks(scan: np.ndarray, score: np.ndarray) -> np.ndarray:
-    """Return the rank of each score within its scan, 0 for the largest."""
-    order = np.lexsort((-score.astype(np.int64), scan))
-    ordered = scan[order]
-    first = np.searchsorted(ordered, ordered)
-    rank = np.empty(len(scan), np.int64)
-    rank[order] = np.arange(len(scan)) - first
-    return rank
 
 
 def _pooled_masks(allowed: np.ndarray, levels: int) -> list[np.ndarray]:

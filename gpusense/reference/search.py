@@ -21,7 +21,7 @@ from gpusense.reference.score_cells import TOP, cell_index, padded_lines, padded
 
 # Sums of a block of candidates.
 _BLOCK = 1 << 22
-# Numbers that count the rows of a scan by their scores.
+# Numbers that count the lines of a scan by their scores.
 BINS = 512
 
 
@@ -133,41 +133,48 @@ def shift_scores(flags, table, point, image, first, allowed, score, scores, item
     total[:, allowed[: height * width].reshape(height, width) == 0] = -1
 
 
-def row_maxima(flags, score, best, histogram, rows, width, height, turns, shift):
-    """Find the largest score of each row of shifts and its first column, and count the rows of scans by scores."""
-    values = score[: rows * width].reshape(rows, width)
-    place = values.argmax(axis=1)
-    most = values[np.arange(rows), place]
-    best[: 2 * rows : 2], best[1 : 2 * rows : 2] = most, place
+def _of_lines(score: np.ndarray, count: int, lines: int, length: int, spacing: int, along: int) -> np.ndarray:
+    """Return the scores (items * lines, length) of lines of shifts, see ``line_maxima``."""
+    values = score[: count * length].reshape(-1, lines * length)
+    cells: np.ndarray = values[:, np.arange(lines)[:, None] * spacing + np.arange(length) * along]
+    return cells.reshape(count, length)
+
+
+def line_maxima(flags, score, best, histogram, all, lines, length, spacing, along, turns, shift):
+    """Find the largest score of each line of shifts and its first shift, and count the lines of scans by scores."""
+    values = _of_lines(score, all, lines, length, spacing, along)
+    place, most = values.argmax(axis=1), values.max(axis=1)
+    best[: 2 * all : 2], best[1 : 2 * all : 2] = most, np.arange(all) % lines * spacing + place * along
     some = np.flatnonzero(most >= 0)
-    np.add.at(histogram, some // (height * turns) * BINS + (most[some] >> shift), 1)
+    np.add.at(histogram, some // (lines * turns) * BINS + (most[some] >> shift), 1)
 
 
-def promising(best: np.ndarray, histogram: np.ndarray, rows: int, scan: int, shift: int, most: int) -> np.ndarray:
-    """Return which of a scan's rows have its ``most`` largest scores, or others as good."""
+def promising(best: np.ndarray, histogram: np.ndarray, lines: int, scan: int, shift: int, most: int) -> np.ndarray:
+    """Return which of a scan's lines have its ``most`` largest scores, or others as good."""
     above = np.cumsum(histogram[scan * BINS : (scan + 1) * BINS][::-1])
     least = max(BINS - 1 - int(np.searchsorted(above, most)), 0) << shift
-    chosen: np.ndarray = best[2 * scan * rows : 2 * (scan + 1) * rows : 2] >= least
+    chosen: np.ndarray = best[2 * scan * lines : 2 * (scan + 1) * lines : 2] >= least
     return chosen
 
 
-def count_promising(flags, best, histogram, number, items, height, turns, shift, most):
-    """Count the promising rows of each item."""
+def count_promising(flags, best, histogram, number, items, lines, turns, shift, most):
+    """Count the promising lines of each item."""
     for scan in range(items // turns):
-        chosen = promising(best, histogram, height * turns, scan, shift, most)
-        number[scan * turns : (scan + 1) * turns] = chosen.reshape(turns, height).sum(axis=1)
+        chosen = promising(best, histogram, lines * turns, scan, shift, most)
+        number[scan * turns : (scan + 1) * turns] = chosen.reshape(turns, lines).sum(axis=1)
 
 
-def pick_blocks(flags, best, histogram, number, block, items, height, turns, level, shift, most):
-    """Take most of the promising rows of each scan, evenly spaced, as blocks; missing blocks have the score -1."""
-    rows = height * turns
+def pick_blocks(flags, best, histogram, number, block, items, lines, width, turns, level, shift, most):
+    """Take most of the promising lines of each scan, evenly spaced, as blocks; missing blocks have the score -1."""
+    each = lines * turns
     made = block[: 4 * most * (items // turns)].reshape(-1, most, 4)
     for scan in range(len(made)):
-        chosen = np.flatnonzero(promising(best, histogram, rows, scan, shift, most))
+        chosen = np.flatnonzero(promising(best, histogram, each, scan, shift, most))
         taken = min(len(chosen), most)
-        row = chosen[np.arange(taken) * len(chosen) // max(taken, 1)] + scan * rows
-        columns = row // height, row % height << level, best[2 * row + 1] << level, best[2 * row]
-        made[scan, :taken], made[scan, taken:, 3] = np.stack(columns, axis=1), -1
+        line = chosen[np.arange(taken) * len(chosen) // max(taken, 1)] + scan * each
+        at = best[2 * line + 1]
+        picked = line // lines, at // width << level, at % width << level, best[2 * line]
+        made[scan, :taken], made[scan, taken:, 3] = np.stack(picked, axis=1), -1
 
 
 def raise_low(flags, block, slack, low, blocks, most):
@@ -177,9 +184,11 @@ def raise_low(flags, block, slack, low, blocks, most):
     low[:scans] = np.where(score >= 0, np.maximum(low[:scans], score - slack[:scans]), low[:scans])
 
 
-def choose_blocks(flags, score, best, low, block, count, rows, height, width, turns, level, room):
+def choose_blocks(
+    flags, score, best, low, block, count, all, lines, length, spacing, along, width, turns, level, room
+):  # fmt: skip
     """Collect the shifts whose scores are at least low of their scan."""
-    values = score[: rows * width].reshape(-1, height, width)
+    values = score[: all * length].reshape(-1, lines * length // width, width)
     scan = np.arange(len(values)) // turns
     item, row, col = np.nonzero(values >= low[scan][:, None, None])
     chosen = np.stack([item, row << level, col << level, values[item, row, col]], axis=1)[:room]

@@ -14,8 +14,14 @@
 // Points after which sums are compared, and points whose losses fit 15 bits.
 #define STEP 48
 #define TOGETHER 128
-// Numbers that count the rows of a scan by their scores.
+// Numbers that count the lines of a scan by their scores.
 #define BINS 512
+// The distance of a shift from the first one of its line: lines are rows on processors.
+#if READ_AHEAD
+#define ALONG(i) ((i) * along)
+#else
+#define ALONG(i) (i)
+#endif
 
 // Write the maximum of each cell and the cells up to reach rows and columns further. One work-item takes a cell.
 kernel void pool_scores(ARGUMENTS) {
@@ -158,38 +164,49 @@ kernel void shift_scores(ARGUMENTS) {
     }
 }
 
-// Find the largest score of each row of shifts and its first column, and count the rows of each scan by their scores,
-// divided by 2^shift. The caller clears the counts. One work-item takes a row of an item.
-kernel void row_maxima(ARGUMENTS) {
+// Find the largest score of each line of shifts and its first shift, and count the lines of each scan by their scores,
+// divided by 2^shift. The caller clears the counts. The lines of an item begin spacing shifts apart, and have length shifts,
+// along apart: they are rows on processors, which make vectors of one, and columns on GPUs, whose neighbours read
+// neighbours. One work-item takes a line of an item.
+kernel void line_maxima(ARGUMENTS) {
     const int n = get_global_id(0);
-    if (n >= rows) return;
-    // Two loops, since compilers make vector code of the first one.
+    if (n >= all) return;
     int most = -1, place = 0;
-    for (int col = 0; col < width; ++col) most = score[n * width + col] > most ? score[n * width + col] : most;
-    while (score[n * width + place] < most) ++place;
+#if READ_AHEAD
+    global const int *mine = score + n / lines * lines * length + n % lines * spacing;
+    for (int i = 0; i < length; ++i) {
+        place = mine[ALONG(i)] > most ? i : place;
+        most = mine[ALONG(i)] > most ? mine[ALONG(i)] : most;
+    }
+#else
+    // Two loops, since compilers make vector code of the first one.
+    global const int *mine = score + n * length;
+    for (int i = 0; i < length; ++i) most = mine[ALONG(i)] > most ? mine[ALONG(i)] : most;
+    while (mine[ALONG(place)] < most) ++place;
+#endif
     best[2 * n] = most;
-    best[2 * n + 1] = place;
-    if (most >= 0) atomic_add(&histogram[n / (height * turns) * BINS + (most >> shift)], 1);
+    best[2 * n + 1] = n % lines * spacing + ALONG(place);
+    if (most >= 0) atomic_add(&histogram[n / (lines * turns) * BINS + (most >> shift)], 1);
 }
 
-// Return the least score, divided by 2^shift, of a scan's most rows with the largest scores, and of others as good.
+// Return the least score, divided by 2^shift, of a scan's most lines with the largest scores, and of others as good.
 int promising(global const int *histogram, const int most) {
     int bin = BINS - 1;
-    for (int rows = histogram[bin]; rows < most && bin > 0; rows += histogram[--bin]);
+    for (int lines = histogram[bin]; lines < most && bin > 0; lines += histogram[--bin]);
     return bin;
 }
 
-// Count the promising rows of each item. One work-item takes an item.
+// Count the promising lines of each item. One work-item takes an item.
 kernel void count_promising(ARGUMENTS) {
     const int item = get_global_id(0);
     if (item >= items) return;
     const int least = promising(histogram + item / turns * BINS, most) << shift;
-    int rows = 0;
-    for (int row = 0; row < height; ++row) rows += best[2 * (item * height + row)] >= least;
-    number[item] = rows;
+    int some = 0;
+    for (int line = 0; line < lines; ++line) some += best[2 * (item * lines + line)] >= least;
+    number[item] = some;
 }
 
-// Take most of the promising rows of each scan, evenly spaced: many bounds are equal, most of all the largest. Their best
+// Take most of the promising lines of each scan, evenly spaced: many bounds are equal, most of all the largest. Their best
 // blocks follow each other as item, first row and column, and score; blocks that are missing have the score -1. One
 // work-item takes an item.
 kernel void pick_blocks(ARGUMENTS) {
@@ -204,15 +221,15 @@ kernel void pick_blocks(ARGUMENTS) {
     const long taken = min(total, most);
     for (int i = item % turns; i < most; i += turns)
         if (i >= taken) block[4 * (scan * most + i) + 3] = -1;
-    for (int row = 0; row < height; ++row) {
-        const int value = best[2 * (item * height + row)];
+    for (int line = 0; line < lines; ++line) {
+        const int value = best[2 * (item * lines + line)];
         if (value < least) continue;
         const int i = (int)((before * taken + total - 1) / total);
         if (i < taken && i * (long)total / taken == before) {
             global int *out = block + 4 * (scan * most + i);
             out[0] = item;
-            out[1] = row << level;
-            out[2] = best[2 * (item * height + row) + 1] << level;
+            out[1] = best[2 * (item * lines + line) + 1] / width << level;
+            out[2] = best[2 * (item * lines + line) + 1] % width << level;
             out[3] = value;
         }
         ++before;
@@ -229,22 +246,24 @@ kernel void raise_low(ARGUMENTS) {
 
 // Collect the shifts whose scores are at least low of their scan, in no certain order: item, first row and column of each
 // block, and score. count[level], which the caller clears, may exceed room: then some are left out. best is the result of
-// row_maxima. One work-item takes a row of an item.
+// line_maxima. One work-item takes a line of an item.
 kernel void choose_blocks(ARGUMENTS) {
     const int k = get_global_id(0);
-    if (k >= rows) return;
-    const int item = k / height, least = low[item / turns];
+    if (k >= all) return;
+    const int item = k / lines, least = low[item / turns], begin = k % lines * spacing;
     if (best[2 * k] < least) return;
-    // A single addition for the whole row.
+    global const int *mine = score + item * lines * length + begin;
+    // A single addition for the whole line.
     int some = 0;
-    for (int col = 0; col < width; ++col) some += score[k * width + col] >= least;
+    for (int i = 0; i < length; ++i) some += mine[ALONG(i)] >= least;
     int n = atomic_add(&count[level], some);
-    for (int col = 0; col < width && n < room; ++col) {
-        const int value = score[k * width + col];
+    const int row = begin / width, col = begin % width, down = along / width, right = along % width;
+    for (int i = 0; i < length && n < room; ++i) {
+        const int value = mine[ALONG(i)];
         if (value < least) continue;
         block[4 * n] = item;
-        block[4 * n + 1] = k % height << level;
-        block[4 * n + 2] = col << level;
+        block[4 * n + 1] = row + i * down << level;
+        block[4 * n + 2] = col + i * right << level;
         block[4 * n + 3] = value;
         ++n;
     }

@@ -24,7 +24,7 @@ Rows = wp.types.vector(length=SHIFT_ROWS, dtype=wp.int32)
 STEP = 48
 AT_ONCE = 8
 TOGETHER = 128
-# Numbers that count the rows of a scan by their scores.
+# Numbers that count the lines of a scan by their scores.
 BINS = 512
 
 
@@ -220,55 +220,58 @@ def shift_scores(table, point, image, first, allowed, score, scores, items, heig
 
 
 @kernel
-def row_maxima(score, best, histogram, rows, width, height, turns, shift):
-    """Find the largest score of each row of shifts and its first column, and count the rows of each scan by their
-    scores, divided by 2^shift.
+def line_maxima(score, best, histogram, all, lines, length, spacing, along, turns, shift):
+    """Find the largest score of each line of shifts and its first shift, and count the lines of each scan by their
+    scores, divided by 2^shift. Lines are rows on processors, and columns on GPUs, whose neighbours read neighbours.
     """
     n = wp.tid()
-    if n >= rows:
+    if n >= all:
         return
+    begin = n % lines * spacing
+    mine = n // lines * lines * length + begin
     most = int(-1)
     place = int(0)
-    for col in range(width):
-        if score[n * width + col] > most:
-            most = score[n * width + col]
-            place = col
+    for i in range(length):
+        value = number_at(score, mine + i * along)
+        if value > most:
+            most = value
+            place = begin + i * along
     best[2 * n] = most
     best[2 * n + 1] = place
     if most >= 0:
-        wp.atomic_add(histogram, n // (height * turns) * BINS + (most >> shift), 1)
+        wp.atomic_add(histogram, n // (lines * turns) * BINS + (most >> shift), 1)
 
 
 @wp.func
 def promising(histogram: wp.array(dtype=wp.int32), scan: wp.int32, most: wp.int32):
-    """Return the least score, divided by 2^shift, of a scan's most rows with the largest scores, and of
+    """Return the least score, divided by 2^shift, of a scan's most lines with the largest scores, and of
     others as good.
     """
     bin = int(BINS - 1)
-    rows = histogram[scan * BINS + bin]
-    while rows < most and bin > 0:
+    lines = histogram[scan * BINS + bin]
+    while lines < most and bin > 0:
         bin = bin - 1
-        rows = rows + histogram[scan * BINS + bin]
+        lines = lines + histogram[scan * BINS + bin]
     return bin
 
 
 @kernel
-def count_promising(best, histogram, number, items, height, turns, shift, most):
-    """Count the promising rows of each item. One work-item takes an item."""
+def count_promising(best, histogram, number, items, lines, turns, shift, most):
+    """Count the promising lines of each item. One work-item takes an item."""
     item = wp.tid()
     if item >= items:
         return
     least = promising(histogram, item // turns, most) << shift
-    rows = int(0)
-    for row in range(height):
-        if best[2 * (item * height + row)] >= least:
-            rows = rows + 1
-    number[item] = rows
+    some = int(0)
+    for line in range(lines):
+        if best[2 * (item * lines + line)] >= least:
+            some = some + 1
+    number[item] = some
 
 
 @kernel
-def pick_blocks(best, histogram, number, block, items, height, turns, level, shift, most):
-    """Take most of the promising rows of each scan, evenly spaced: many bounds are equal, most of all the largest."""
+def pick_blocks(best, histogram, number, block, items, lines, width, turns, level, shift, most):
+    """Take most of the promising lines of each scan, evenly spaced: many bounds are equal, most of all the largest."""
     item = wp.tid()
     if item >= items:
         return
@@ -284,15 +287,16 @@ def pick_blocks(best, histogram, number, block, items, height, turns, level, shi
     for i in range(item % turns, most, turns):
         if wp.int64(i) >= taken:
             block[4 * (scan * most + i) + 3] = -1
-    for row in range(height):
-        value = best[2 * (item * height + row)]
+    for line in range(lines):
+        value = best[2 * (item * lines + line)]
         if value >= least:
             place = (wp.int64(before) * taken + wp.int64(total - 1)) // wp.int64(total)
             if place < taken and place * wp.int64(total) // taken == wp.int64(before):
                 out = 4 * (scan * most + int(place))
                 block[out] = item
-                block[out + 1] = row << level
-                block[out + 2] = best[2 * (item * height + row) + 1] << level
+                at = best[2 * (item * lines + line) + 1]
+                block[out + 1] = (at // width) << level
+                block[out + 2] = (at % width) << level
                 block[out + 3] = value
             before = before + 1
 
@@ -308,27 +312,33 @@ def raise_low(block, slack, low, blocks, most):
 
 
 @kernel
-def choose_blocks(score, best, low, block, count, rows, height, width, turns, level, room):
+def choose_blocks(score, best, low, block, count, all, lines, length, spacing, along, width, turns, level, room):
     """Collect the shifts whose scores are at least low of their scan, in no certain order."""
     k = wp.tid()
-    if k >= rows:
+    if k >= all:
         return
-    item = k // height
+    item = k // lines
     least = low[item // turns]
     if best[2 * k] < least:
         return
-    # A single addition for the whole row.
+    begin = k % lines * spacing
+    mine = item * lines * length + begin
+    # A single addition for the whole line.
     some = int(0)
-    for col in range(width):
-        if score[k * width + col] >= least:
+    for i in range(length):
+        if number_at(score, mine + i * along) >= least:
             some = some + 1
     n = wp.atomic_add(count, level, some)
-    for col in range(width):
-        value = score[k * width + col]
+    row = begin // width
+    col = begin % width
+    down = along // width
+    right = along % width
+    for i in range(length):
+        value = number_at(score, mine + i * along)
         if value >= least and n < room:
             block[4 * n] = item
-            block[4 * n + 1] = (k % height) << level
-            block[4 * n + 2] = col << level
+            block[4 * n + 1] = (row + i * down) << level
+            block[4 * n + 2] = (col + i * right) << level
             block[4 * n + 3] = value
             n = n + 1
 

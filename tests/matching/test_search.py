@@ -43,7 +43,7 @@ def brute_force(scores, points, grid, stride, beyond):
     return sums
 
 
-@pytest.mark.parametrize("name", [*BACKENDS, "opencl, one by one"])
+@pytest.mark.parametrize("name", [*BACKENDS, "opencl, as a GPU", "warp, as a GPU"])
 @pytest.mark.parametrize(
     ("tables", "stride", "levels", "beyond"), [(1, 1, 3, 0), (3, 1, 2, 0), (1, 2, 2, 7), (3, 3, 1, 255), (1, 1, 0, 9)]
 )
@@ -51,7 +51,7 @@ def test_branch_and_bound_finds_the_poses_of_brute_force(name, tables, stride, l
     scores, points, grid = scene(tables, beyond=beyond)
     device = get_backend(needs(name.partition(",")[0]))
     if "," in name:
-        monkeypatch.setattr(device, "info", dataclasses.replace(device.info, lanes=1))
+        monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1))
     search = Search(ScoreTables(device, scores, levels=levels, stride=stride, beyond=beyond))
     sums = brute_force(scores, points, grid, stride, beyond)
     allowed = np.random.default_rng(3).random((grid.height, grid.width)) < 0.3

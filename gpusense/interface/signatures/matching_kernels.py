@@ -24,6 +24,8 @@ def _size(table: str) -> str:
 # Tables of scores, the losses of quarters of blocks, and the end points of scans that read them.
 _CELLS, _QUARTERS = f"uchar table [{_size('scores')}]", f"int quarters [{_size('scores')}]"
 _ENDS = ("int2 point [points]", "int image [points]", "int first [items + 1]")
+# All lines of shifts of items, lines of an item, shifts of a line, shifts between lines and along them.
+_LINES = ("int all", "int lines", "int length", "int spacing", "int along")
 _NOISY = (*_POINTS, "real noise [scans]")
 # Parts of scans: first point and number of points.
 _PARTS = ("int2 part [parts]", "int scan [parts]")
@@ -101,26 +103,27 @@ KERNELS: dict[str, Kernel] = {
         "out int score [items * height * width]", "ScoreTable scores", "int items", "int height", "int width",
         "int unit",
     ),
-    "row_maxima": kernel(
-        "search", "row", "int score [rows * width]", "out int best [2 * rows]", "out int histogram [bins]",
-        "int rows", "int width", "int height", "int turns", "int shift",
+    "line_maxima": kernel(
+        "search", "line", "int score [all * length]", "out int best [2 * all]", "out int histogram [bins]", *_LINES,
+        "int turns", "int shift",
     ),
     "count_promising": kernel(
-        "search", "item", "int best [2 * items * height]", "int histogram [bins]", "out int number [items]",
-        "int items", "int height", "int turns", "int shift", "int most",
+        "search", "item", "int best [2 * items * lines]", "int histogram [bins]", "out int number [items]",
+        "int items", "int lines", "int turns", "int shift", "int most",
     ),
     "pick_blocks": kernel(
-        "search", "item", "int best [2 * items * height]", "int histogram [bins]", "int number [items]",
-        "out int block [4 * followed]", "int items", "int height", "int turns", "int level", "int shift", "int most",
+        "search", "item", "int best [2 * items * lines]", "int histogram [bins]", "int number [items]",
+        "out int block [4 * followed]", "int items", "int lines", "int width", "int turns", "int level", "int shift",
+        "int most",
     ),
     "raise_low": kernel(
         "search", "pose", "int block [4 * blocks]", "int slack [scans]", "out int low [scans]", "int blocks",
         "int most",
     ),
     "choose_blocks": kernel(
-        "search", "row", "int score [rows * width]", "int best [2 * rows]", "int low [scans]",
-        "out int block [4 * room]", "out int count [levels]", "int rows", "int height", "int width", "int turns",
-        "int level", "int room",
+        "search", "line", "int score [all * length]", "int best [2 * all]", "int low [scans]",
+        "out int block [4 * room]", "out int count [levels]", *_LINES, "int width", "int turns", "int level",
+        "int room",
     ),
     "follow_blocks": kernel(
         "search", "block", _QUARTERS, *_ENDS, "uchar allowed [rows * columns]", "out int block [4 * blocks]",

@@ -254,12 +254,12 @@ COLUMNS = (
     "runs of", "runs", "false alarms [%]", "said 'lost' [%]", "right, not tracking [%]", "missed [%]",
     "missed, tracking [%]", "last verdict right", "AUROC",
 )  # fmt: skip
-SHARES = ("false", "false_word", "not_tracking", "missed", "missed_tracking")
+RATES = ("false", "false_word", "not_tracking", "missed", "missed_tracking")
 
 
 def _cells(name, r):
     finals = f"{r['finals'] - r['finals_wrong']} of {r['finals']}"
-    return name, r["runs"], *(_text(r[share]) for share in SHARES), finals, _text(r["auroc"], ".4f", 1.0)
+    return name, r["runs"], *(_text(r[share]) for share in RATES), finals, _text(r["auroc"], ".4f", 1.0)
 
 
 def reliability_table(groups):

@@ -2,7 +2,7 @@
 
 A correction runs stages until the temperature is used up. On a GPU motion, scores, weights, the estimate and the beams
 to judge are one recorded program of a stage: one copy writes all of its inputs, and one reads all of its results. In
-CUDA the copies are part of its graph. The second pass of the estimate is part of it if the last correction needed that,
+CUDA the copies are part of its graph. The second pass of the estimate is part of it if the particles were almost wide,
 and a judgement if the pose will probably be judged. While the device works, the host learns from the last lesson
 (:mod:`gpusense.localization.lessons`).
 """
@@ -53,8 +53,8 @@ class Cloud(Particles):
         self._passes = dict[bool, Hashable](_NO_PASSES)
         self._known: tuple[Hashable, np.ndarray] | None = None
         self._snapshots: list[weakref.ref[Snapshot]] = []
-        # Whether the last correction's estimate needed its second pass; whether stages of the present one compute it.
-        self._was_refined, self._refines_too = False, False
+        # Whether stages of the present correction compute the second pass of the estimate.
+        self._refines_too = False
         # Number of sensors of the present correction; judges of its scans.
         self._used = 0
         self._judges: list[MapJudge] = []
@@ -106,17 +106,17 @@ class Cloud(Particles):
 
     def correct(
         self, settings: np.ndarray, kind: int, stages: int, drawn: int, readings: list[SensorReadings],
-        judged: Sequence[SensorReadings] = (), meanwhile: Callable[[], None] | None = None,
+        judged: Sequence[SensorReadings] = (), meanwhile: Callable[[], None] | None = None, *, refines: bool = False,
     ) -> None:  # fmt: skip
         """Run a correction by readings after a kind of motion: stages until the temperature is used up.
 
-        It draws a number of particles, estimates the pose, judges scans there, and calls ``meanwhile`` while the device
-        works on the first stage.
+        It draws a number of particles, estimates the pose (``refines``: by both passes), judges scans there, and calls
+        ``meanwhile`` while the device works on the first stage.
         """
         indices = [index for index, _ in readings]
         self._begin_change()
         self._used = len(indices)
-        self._refines_too, self._was_refined = self._was_refined, False
+        self._refines_too = refines
         recorded = self.backend.info.kind == "gpu"
         for index, reading in readings:
             recorded = recorded and self._scored[index].records(reading)
@@ -329,7 +329,6 @@ class Cloud(Particles):
     def _passed(self, count: int, *, second: bool = False) -> np.ndarray:
         """Return a pass of the present estimate; compute it unless the last correction did."""
         places, refined = self.places, self.refined if second else None
-        self._was_refined = self._was_refined or second
         if self._passes[second] != (places, count):
             self._change_results()
             # Clouds of varying size rarely repeat a size.

@@ -1,10 +1,10 @@
 """Learn the temperature of a scan sensor from lessons: scans at the estimated pose, spread over several corrections.
 
-A correction that begins a lesson only keeps its scan and estimate. The next one, or the same one among the first scans,
-starts the terms of the readings at poses around the estimate, once the device has ended the step. Another one reads
-them. In later corrections, while the device works on the step, the host places the terms, chooses beams, adds up their
-scores, fits, and learns: one part of the oldest lesson per correction. Each of the first scans is a lesson, whose parts
-all run at once. A lesson ends a fixed number of corrections later on every device.
+A correction that begins a lesson only keeps its scan and estimate. The next one places poses around the estimate while
+the device works on the step, and then starts the terms of the readings there. Another one reads them. In later
+corrections, while the device works on the step, the host fits the scores and learns: one part of the oldest lesson per
+correction, short enough for the wait. Each of the first scans is a lesson, whose parts all run at once. A lesson ends a
+fixed number of corrections later on every device.
 """
 
 from __future__ import annotations
@@ -18,26 +18,29 @@ import numpy as np
 from gpusense.backends.base import Exchange
 from gpusense.backends.workspace import Packed
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around, scores_of, sums_of
+from gpusense.localization.temperature import PARTS, BeamCorrelation, TaughtScan, axes_of, poses_around, sectors_of
 from gpusense.models.scan.model import ScanModel
 
 _DOUBLE = np.dtype(np.float64)
-# Number of poses of a lesson; its stages.
+# Number of poses of a lesson; its stages, of which the last ones are the parts after the terms.
 _POSES = 7
-_KEPT, _STARTED, _RECEIVED, _PLACED, _CHOSEN, _SUMMED, _SCORED, _LEARNED = range(8)
+_KEPT, _PLACED, _STARTED, _RECEIVED, _PARTS = range(5)
+_LAST = _PARTS + len(PARTS) + 1
 
 
 class Lesson(NamedTuple):
     """A scan that teaches the temperature, and its results so far."""
 
     pose: np.ndarray  # (3,) estimate
-    axes: np.ndarray  # (3, 3) steps to the poses around it
+    covariance: np.ndarray  # (3, 3) its covariance
     ranges: np.ndarray | None  # (K,) readings; None if the host has computed the terms
     scan: int  # number of the scan
     follows: bool  # whether the scan directly follows the previous lesson
     stage: int = _KEPT
-    # Terms of the readings as the device writes them, then (7, K) terms, then chosen beams, their sums and scores.
-    result: Any = None
+    axes: Any = None  # (3, 3) steps to the poses around the estimate; None before they are placed
+    around: Any = None  # (7, 3) these poses
+    columns: Any = None  # places of the evaluated readings, and of those with a constant term
+    result: Any = None  # terms of the readings as the device writes them, then the taught scan; None of too few beams
 
 
 class Learner:
@@ -80,14 +83,18 @@ class Learner:
 
         ``ranges``: its readings on the host, for a recorded program; None where the model must prepare them.
         """
-        axes, terms = axes_of(covariance), None
+        lesson = Lesson(pose, covariance, ranges, self.seen, self.learned == self.seen - 1)
         if ranges is None or self._bound[1] is None:
-            around = poses_around(pose, axes)
-            terms = np.asarray(self._model.log_likelihood(around, *reading, per_beam=True)[1], np.float64)
-        stage = _KEPT if terms is None else _PLACED
-        lesson = Lesson(pose, axes, ranges, self.seen, self.learned == self.seen - 1, stage, terms)
+            axes = axes_of(covariance)
+            terms = np.asarray(self._model.log_likelihood(poses_around(pose, axes), *reading, per_beam=True)[1])
+            lesson = lesson._replace(axes=axes, stage=_PARTS, result=self._taught(terms, lesson, axes))
         self.lessons = *self.lessons, lesson
         self.learned = self.seen
+
+    def _taught(self, terms: np.ndarray, lesson: Lesson, axes: np.ndarray) -> TaughtScan:
+        """Return the scan of a lesson with (7, K) terms of its readings."""
+        directions = self._model.scanner.bearings + lesson.pose[2]
+        return TaughtScan(terms.astype(np.float64), axes, directions, self._sectors, lesson.follows)
 
     def receive(self) -> None:
         """Wait for the terms of a started lesson."""
@@ -111,7 +118,7 @@ class Learner:
         for place, lesson in enumerate(lessons):
             if lesson.stage == _STARTED:
                 lessons[place] = self._with_terms(lesson)._replace(stage=_RECEIVED)
-            elif lesson.stage == _KEPT and (self._is_early or lesson.scan < self.seen):
+            elif lesson.stage < _STARTED and (self._is_early or lesson.stage == _PLACED):
                 lessons[place] = self._started(lesson)
                 break
         self.lessons = tuple(lessons)
@@ -121,43 +128,56 @@ class Learner:
         """Return whether every scan is still a lesson."""
         return self.seen <= DEFAULTS.calibrations
 
+    def _placed(self, lesson: Lesson) -> Lesson:
+        """Class the readings of a lesson, and place poses around its estimate."""
+        axes = axes_of(lesson.covariance)
+        around, columns = poses_around(lesson.pose, axes), self._bound[1].columns(lesson.ranges)
+        return lesson._replace(stage=_PLACED, axes=axes, around=around, columns=columns)
+
     def _started(self, lesson: Lesson) -> Lesson:
         """Start the terms of a lesson."""
+        lesson = self._placed(lesson) if lesson.stage == _KEPT else lesson
         inputs, call = self._bound
         recording, self._exchange = call.exchange(inputs)
         given, (poses, ranges) = self._exchange.begin(), inputs.spans
-        given[poses], given[ranges] = poses_around(lesson.pose, lesson.axes).reshape(-1), lesson.ranges
+        given[poses], given[ranges] = lesson.around.reshape(-1), lesson.ranges
         self._exchange.start(recording)
         return lesson._replace(stage=_STARTED)
 
     def work(self, *, doubted: bool) -> None:
-        """Do the next part of the oldest lesson, or all parts among the first scans; drop all if scans are doubted."""
+        """Do the next part of the oldest lesson, or all parts among the first scans; drop all if scans are doubted.
+
+        If the device works on the oldest lesson, do the next part of the lesson after it.
+        """
         if doubted:
             self.lessons, self.learned = (), -1
             return
-        first, *rest = self.lessons
-        parts = _LEARNED if self._is_early else 1
-        while parts and _RECEIVED <= first.stage < _LEARNED:
-            first, parts = self._advanced(first), parts - 1
-        self.lessons = tuple(rest if first.stage == _LEARNED else [first, *rest])
+        lessons, parts = list(self.lessons), _LAST if self._is_early else 1
+        for place, lesson in enumerate(lessons):
+            while parts and (lesson.stage == _KEPT or _RECEIVED <= lesson.stage < _LAST):
+                lesson, parts = self._advanced(lesson), parts - 1
+            lessons[place] = lesson
+        self.lessons = tuple([one for one in lessons if one.stage < _LAST])
 
     def _advanced(self, lesson: Lesson) -> Lesson:
-        """Return a received lesson after its next part."""
+        """Return a kept or received lesson after its next part."""
         result, stage = lesson.result, lesson.stage
+        if stage == _KEPT:
+            return self._placed(lesson)
         if stage == _RECEIVED:
-            result = self._bound[1].terms(result, lesson.ranges)
-        elif stage == _SUMMED:
-            result = None if result is None else scores_of(result)
-        elif stage == _CHOSEN:
-            result = None if result is None else sums_of(*result)
-        else:
+            result = self._taught(self._bound[1].terms(result, lesson.columns), lesson, lesson.axes)
+        elif stage == _LAST - 1:
             # A new object, since the correlation is part of the state.
             self.correlation = copy.copy(self.correlation)
-            if stage == _PLACED:
-                result = self.correlation.chosen(result, self._model.scanner.bearings + lesson.pose[2])
-            else:
-                self.correlation.learn(result, lesson.axes, follows=lesson.follows)
+            self.correlation.learn(result)
+        elif result is not None:
+            result = PARTS[stage - _PARTS](result)
         return lesson._replace(stage=stage + 1, result=result)
+
+    @functools.cached_property
+    def _sectors(self) -> int:
+        """Number of sectors of the world for comparing scans."""
+        return sectors_of(self._model.scanner.bearings) if self._model.scanner.count > 1 else 0
 
     @functools.cached_property
     def _bound(self) -> tuple[Packed, Any]:

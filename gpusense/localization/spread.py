@@ -62,6 +62,7 @@ class Spread(NamedTuple):
     # True if the position's is below 0.2 m and the heading's below 0.1 rad: a normal density then describes the
     # particles.
     narrow: bool
+    clear: bool  # true if both are below three quarters of these limits: the next ones will probably be narrow
 
 
 def spread_of(covariance: Floats) -> Spread:
@@ -69,7 +70,7 @@ def spread_of(covariance: Floats) -> Spread:
     position, heading = deviations(covariance)
     return Spread(
         position, heading, position > WIDE or heading > WIDE_TURN, position > FAR or heading > FAR_TURN,
-        position < _NARROW and heading < _NARROW_TURN,
+        position < _NARROW and heading < _NARROW_TURN, position < 0.75 * _NARROW and heading < 0.75 * _NARROW_TURN,
     )  # fmt: skip
 
 

@@ -84,58 +84,86 @@ def poses_around(pose: np.ndarray, axes: np.ndarray) -> np.ndarray:
     return poses
 
 
-class ScoreSums(NamedTuple):
-    """Scores of the used beams of a scan along the axes of :func:`poses_around`, summed over groups of beams."""
+class TaughtScan(NamedTuple):
+    """A scan that teaches the temperature, after some ``PARTS`` of the computation."""
 
-    beams: int  # number of used beams
-    curvature: float  # negative second derivatives of the log-likelihood, summed over the axes
+    values: np.ndarray  # (7, K) log-likelihoods of beams at poses_around the pose; later (10, K) scores and products
+    axes: np.ndarray  # (3, 3) axes of these poses
+    directions: np.ndarray  # (K,) directions of the beams in the world [rad]
+    around: int  # number of sectors of the world for comparing scans; 0 without directions
+    follows: bool = True  # whether the scan directly follows the last one
+    curvature: float = 0.0  # negative second derivatives of the log-likelihood, summed over the axes
     # (10, B) sums of three scores, their six products, and 1, over short blocks, long blocks, and sectors of the world.
-    groups: np.ndarray
-
-
-class Scores(NamedTuple):
-    """Scores of a scan after a fit of the pose."""
-
-    beams: int  # number of used beams
-    curvature: float  # negative second derivatives of the log-likelihood, summed over the axes
-    trace: float  # sum of the squared scores
+    sums: np.ndarray = np.empty((_ROWS, 0))
+    # (3, B) sums of scores after a fit of the pose, (3, 3) inverse of the products' sum, (3, 3, B) products.
+    fit: tuple[np.ndarray, ...] = ()
+    trace: float = 0.0  # sum of the squared scores
     # Variances of long blocks, measured and if independent, and the same of short blocks.
-    variances: tuple[float, float, float, float]
-    sectors: np.ndarray  # (3, A) sums over sectors of the world; A is 0 without directions
-    seen: np.ndarray  # (A,) whether a sector has beams
+    variances: tuple[float, ...] = ()
 
 
-def sums_of(parts: np.ndarray, sector: np.ndarray, sectors: int) -> ScoreSums:
-    """Return the sums of scores of (7, K) log-likelihoods of used beams, by the sector (K,) of each beam."""
-    beams = parts.shape[1]
+def _use_beams(scan: TaughtScan) -> TaughtScan | None:
+    """Drop beams with 0 or a non-finite value; return None if too few are left."""
+    values = scan.values
+    used = np.isfinite(values).all(axis=0) & values.any(axis=0)
+    count = int(np.count_nonzero(used))
+    if count < _FEWEST:
+        return None
+    return scan if count == len(used) else scan._replace(values=values[:, used], directions=scan.directions[used])
+
+
+def _score(scan: TaughtScan) -> TaughtScan:
+    """Compute scores and curvature of the used beams."""
+    parts, rows = scan.values, np.ones((_ROWS, scan.values.shape[1]))
     at, *around = parts.sum(axis=1).tolist()
-    rows = np.ones((_ROWS, beams))
     np.subtract(parts[1:4], parts[4:], out=rows[:3])
     rows[:3] /= 2 * _FAR
     np.multiply(rows[_FIRST], rows[_SECOND], out=rows[3:9])
-    short = _sums_of(rows, _neighbors(beams), _SHORT)
-    groups = [short, short.reshape(_ROWS, _LONG, -1).sum(axis=2)]
-    if sectors:
-        groups.append(_sums_of(rows, sector, sectors))
-    return ScoreSums(beams, (6 * at - sum(around)) / _FAR**2, np.concatenate(groups, axis=1))
+    return scan._replace(values=rows, curvature=(6 * at - sum(around)) / _FAR**2)
 
 
-def scores_of(sums: ScoreSums) -> Scores:
-    """Return the scores of a scan after a fit of the pose."""
-    groups, end = sums.groups, _SHORT + _LONG
-    *scores, xx, xy, xt, yy, yt, tt, _ = groups[:, :_SHORT].sum(axis=1).tolist()
+def _add_blocks(scan: TaughtScan) -> TaughtScan:
+    """Sum over blocks of neighbours."""
+    short = _sums_of(scan.values, _neighbors(scan.values.shape[1]), _SHORT)
+    return scan._replace(sums=np.concatenate([short, short.reshape(_ROWS, _LONG, -1).sum(axis=2)], axis=1))
+
+
+def _add_sectors(scan: TaughtScan) -> TaughtScan:
+    """Sum over sectors of the world."""
+    if not scan.around:
+        return scan
+    sector = np.floor(scan.directions * (scan.around / math.tau)).astype(np.int64) % scan.around
+    return scan._replace(sums=np.concatenate([scan.sums, _sums_of(scan.values, sector, scan.around)], axis=1))
+
+
+def _fit(scan: TaughtScan) -> TaughtScan:
+    """Fit the pose, and remove its part from the sums of scores."""
+    *scores, xx, xy, xt, yy, yt, tt, _ = scan.sums[:, :_SHORT].sum(axis=1).tolist()
     least = 1e-9 * max(xx + yy + tt, 1e-30)
-    trace = xx + yy + tt + 3 * least
     inverse = _inverse_of(((xx + least, xy, xt), (xy, yy + least, yt), (xt, yt, tt + least)))
-    outer = groups[_OUTER]
-    fitted = groups[:3] - np.einsum("ijb,j->ib", outer, (inverse * scores).sum(axis=1))
+    outer = scan.sums[_OUTER]
+    fitted = scan.sums[:3] - np.einsum("ijb,j->ib", outer, (inverse * scores).sum(axis=1))
+    return scan._replace(fit=(fitted, inverse, outer), trace=xx + yy + tt + 3 * least)
+
+
+def _find_variances(scan: TaughtScan) -> TaughtScan:
+    """Compute the variances of blocks, measured and if independent."""
+    (fitted, inverse, outer), end = scan.fit, _SHORT + _LONG
     measured = (fitted * fitted).sum(axis=0).tolist()
-    removed = np.einsum("ijb,jk,kib->b", outer, inverse, outer).tolist()
-    variances = (
-        sum(measured[_SHORT:end]), trace - sum(removed[_SHORT:end]),
-        sum(measured[:_SHORT]), trace - sum(removed[:_SHORT]),
-    )  # fmt: skip
-    return Scores(sums.beams, sums.curvature, trace, variances, fitted[:, end:], groups[9, end:] > 0)
+    removed = np.einsum("ijb,jk,kib->b", outer[..., :end], inverse, outer[..., :end]).tolist()
+    long, short = scan.trace - sum(removed[_SHORT:]), scan.trace - sum(removed[:_SHORT])
+    return scan._replace(variances=(sum(measured[_SHORT:end]), long, sum(measured[:_SHORT]), short))
+
+
+PARTS = (_use_beams, _score, _add_blocks, _add_sectors, _fit, _find_variances)
+"""Parts of the computation of a scan's variances, each short enough for a wait of a filter's step."""
+
+
+def sectors_of(directions: np.ndarray) -> int:
+    """Return the number of sectors per turn, each an eighth of a scan with beams in (K,) directions [rad]."""
+    ordered = np.sort(np.mod(directions, math.tau))
+    gap = max(float(np.max(ordered[1:] - ordered[:-1])), float(ordered[0] + math.tau - ordered[-1]))
+    return max(round(_SECTORS * math.tau / max(math.tau - gap, 0.1)), 1)
 
 
 def _sums_of(rows: np.ndarray, block: np.ndarray, blocks: int) -> np.ndarray:
@@ -177,8 +205,6 @@ class BeamCorrelation:
         self._products, self._pairs = np.zeros(2), 0
         # Gradients in sectors of the world of the last scan, and the sectors with beams.
         self._previous: tuple[np.ndarray, np.ndarray] | None = None
-        # Number of sectors of the world for comparing scans; 0 before the first scan.
-        self._around = 0
 
     def add(self, parts: AnyArray, axes: AnyArray, directions: AnyArray | None = None, *, follows: bool = True) -> None:
         """Add a scan: (7, K) log-likelihoods of beams at :func:`poses_around` the pose, by bearing, with (3, 3) axes.
@@ -186,57 +212,39 @@ class BeamCorrelation:
         Beams with 0 or a non-finite value are ignored. Directions (K,) in the world [rad] serve to compare a scan with
         the previous one if it ``follows`` directly.
         """
-        chosen = self.chosen(parts, directions)
-        steps = checks.array("axes", axes, (3, 3))
-        self.learn(None if chosen is None else scores_of(sums_of(*chosen)), steps, follows=follows)
-
-    def chosen(self, parts: AnyArray, directions: AnyArray | None = None) -> tuple[np.ndarray, np.ndarray, int] | None:
-        """Return what ``sums_of`` needs of a scan, as for :meth:`add`; None of too few beams."""
         values = checks.array("parts", parts, (7, "K"), finite=False)
-        used = np.isfinite(values).all(axis=0) & values.any(axis=0)
-        count, around, sector = int(np.count_nonzero(used)), 0, used
-        if count < _FEWEST:
-            return None
-        if directions is not None:
-            sector = self._sectors_of(checks.array("directions", directions, (len(used),)))
-            around = self._around
-        if count < len(used):
-            values, sector = values[:, used], sector[used]
-        return values, sector, around
+        steps, count = checks.array("axes", axes, (3, 3)), values.shape[1]
+        ways = np.zeros(count) if directions is None else checks.array("directions", directions, (count,))
+        around = sectors_of(ways) if directions is not None and count >= _FEWEST else 0
+        scan: TaughtScan | None = TaughtScan(values, steps, ways, around, follows)
+        for part in PARTS:
+            scan = None if scan is None else part(scan)
+        self.learn(scan)
 
-    def learn(self, scores: Scores | None, axes: np.ndarray, *, follows: bool = True) -> None:
-        """Add the scores of a scan with (3, 3) axes."""
-        if scores is None:
+    def learn(self, scan: TaughtScan | None) -> None:
+        """Add a scan after all ``PARTS``, or None for a scan with too few beams."""
+        if scan is None:
             self._previous = None
             return
-        count = scores.beams
-        gain = min(max(self.temperature(count) * scores.curvature / 3, 0.0), 1.0)
-        found = (scores.curvature, scores.trace * count / (count - 3), *scores.variances, gain, count)
+        count = scan.values.shape[1]
+        gain = min(max(self.temperature(count) * scan.curvature / 3, 0.0), 1.0)
+        found = (scan.curvature, scan.trace * count / (count - 3), *scan.variances, gain, count)
         self._means = _mixed(self._means, np.array(found), 1 - 1 / min(self.scans + 1, _MEMORY))
         self.scans += 1
-        if len(scores.seen):
-            self._compare(scores, axes, follows)
+        if scan.around:
+            end = _SHORT + _LONG
+            self._compare(scan.fit[0][:, end:], scan.sums[9, end:] > 0, scan.axes, scan.follows)
 
-    def _sectors_of(self, directions: np.ndarray) -> np.ndarray:
-        """Return the sector of the world of each direction (K,): an eighth of a scan, a whole number per turn."""
-        ahead = np.mod(directions, math.tau)
-        if not self._around:
-            ordered = np.sort(ahead)
-            gap = max(float(np.max(ordered[1:] - ordered[:-1])), float(ordered[0] + math.tau - ordered[-1]))
-            self._around = max(round(_SECTORS * math.tau / max(math.tau - gap, 0.1)), 1)
-        return (ahead * (self._around / math.tau)).astype(np.int64) % self._around
-
-    def _compare(self, scores: Scores, axes: np.ndarray, follows: bool) -> None:
-        """Correlate the sectors of a scan and of the last one."""
-        if follows and self._previous is not None:
-            now, then = scores.sectors, np.einsum("ji,jt->it", axes, self._previous[0])
-            squares = ((now * now + then * then) * (scores.seen & self._previous[1])).sum() / 2
+    def _compare(self, now: np.ndarray, seen: np.ndarray, axes: np.ndarray, follows: bool) -> None:
+        """Correlate (3, A) scores of the sectors of a scan, and which have beams, with the last scan's."""
+        if follows and self._previous is not None and len(self._previous[1]) == len(seen):
+            then = np.einsum("ji,jt->it", axes, self._previous[0])
+            squares = ((now * now + then * then) * (seen & self._previous[1])).sum() / 2
             found = np.array([(now * then).sum(), squares])
             self._products = _mixed(self._products, found, 1 - 1 / min(self._pairs + 1, _MEMORY))
             self._pairs += 1
         # Gradients in the world, times this scan's root of the covariance.
-        world = np.einsum("ji,jt->it", _inverse_of(axes.tolist()), scores.sectors)
-        self._previous = world, scores.seen
+        self._previous = np.einsum("ji,jt->it", _inverse_of(axes.tolist()), now), seen
 
     @property
     def beams(self) -> float:

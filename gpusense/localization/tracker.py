@@ -173,7 +173,8 @@ class Tracker:
         motion = self.progress.motion or STILL
         settings = self.settings(motion, [index for index, _ in readings])
         self.shown, self.progress = self.cloud.count, Progress(self.progress.step, copies=copies)
-        self.cloud.correct(settings, motion.kind, chosen.stages, drawn, readings, judged, meanwhile)
+        refines = self._moments is not None and not self._moments[2].clear
+        self.cloud.correct(settings, motion.kind, chosen.stages, drawn, readings, judged, meanwhile, refines=refines)
         self.wide = max(self.wide - 1, 0)
 
     def sample_size(self) -> float:

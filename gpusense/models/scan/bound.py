@@ -252,10 +252,14 @@ class RecordedCall(ReplayedCall):
             self._exchange = self._parts, exchange
         return recording, self._exchange[1]
 
-    def terms(self, results: np.ndarray, ranges: np.ndarray) -> np.ndarray:
-        """Return the (N, K) terms of readings ``ranges`` from the results of an exchange."""
-        each = results.reshape(self._poses.count, -1)
-        return terms_of(self._pipeline, each, self._pipeline.classed(ranges[None]))
+    def columns(self, ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the evaluated readings of (K,) readings, and those with a constant term, for ``terms``."""
+        scans = self._pipeline.classed(ranges[None])
+        return scans.columns, scans.left_out.constant_max
+
+    def terms(self, results: np.ndarray, columns: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """Return the (N, K) terms of the readings of a scan from the results of an exchange."""
+        return terms_of(self._pipeline, results.reshape(self._poses.count, -1), *columns)
 
     def _placed_readings(self, adopted: Adopted, limits: np.dtype) -> Readings:
         """Return the readings as the kernel ``place_inputs`` places them."""

@@ -52,11 +52,11 @@ def run(pipeline: ScanPipeline, request: Request, space: Workspace, last: LastCa
             space.submit()
 
 
-def terms_of(pipeline: ScanPipeline, each: np.ndarray, scans: ClassedScans) -> np.ndarray:
+def terms_of(pipeline: ScanPipeline, each: np.ndarray, columns: np.ndarray, constant_max: np.ndarray) -> np.ndarray:
     """Return (N, K) terms of the readings of a scan from the (N, R) terms of its rays; readings left out have 0."""
     terms = np.zeros((len(each), pipeline.scanner.count), pipeline.real)
-    terms[:, scans.columns] = each[:, : len(scans.columns)]
-    terms[:, scans.left_out.constant_max] = NoReturn(pipeline.rules.z_max).number
+    terms[:, columns] = each[:, : len(columns)]
+    terms[:, constant_max] = NoReturn(pipeline.rules.z_max).number
     return terms
 
 
@@ -168,7 +168,7 @@ class _Scorer:
         if request.per_beam:
             each = np.empty((piece.count, len(scans.readings)), pipeline.real)
             each = pipeline.backend.download(pipeline.parts(scoring).buffer, each)
-            self._rows(piece)[...] = terms_of(pipeline, each, scans)
+            self._rows(piece)[...] = terms_of(pipeline, each, scans.columns, scans.left_out.constant_max)
 
     def _fill(self, piece: Piece, scans: ClassedScans, value: float) -> None:
         """Set log-likelihoods that do not depend on the poses; device poses are still inspected."""

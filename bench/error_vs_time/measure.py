@@ -32,10 +32,10 @@ from speed.baselines import candidates as outside
 from gpusense.backends import get_backend
 from gpusense.commands import bench
 from gpusense.commands.arguments import Options
-from gpusense.evaluation.benchmark.report import document, plain
+from gpusense.commands.output import machine
+from gpusense.evaluation.benchmark.report import document
 from gpusense.evaluation.benchmark.runner import Outcome, Plan, run
 from gpusense.evaluation.benchmark.scenes import MapSource
-from gpusense.evaluation.machine import machine
 
 SIZE = ["--particles", "10000", "--beams", "360", "--repeats", "15"]
 QUICK = ["--particles", "512", "--beams", "60", "--repeats", "3", "--checked", "64"]
@@ -140,7 +140,7 @@ def earlier(output: Path, kind: str, stated: str) -> dict[str, Any] | None:
         return None
     report = reports.read(file, kind)
     same(report["commit"], stated, "the commit")
-    same(report["machine"], plain(machine()), "the machine")
+    same(report["machine"], machine(), "the machine")
     return report
 
 

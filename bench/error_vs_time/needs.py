@@ -35,10 +35,10 @@ from typing import Any
 import numpy as np
 
 import gpusense as gs
+from gpusense._util.documents import plain
 from gpusense.backends import Backend
+from gpusense.commands.output import machine
 from gpusense.evaluation.benchmark.accuracy import factor_for, posterior_errors, temperature_of
-from gpusense.evaluation.benchmark.report import plain
-from gpusense.evaluation.machine import machine
 from gpusense.evaluation.simulation.changes import surface_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -273,4 +273,4 @@ def document(rows: Sequence[dict[str, Any]], stated: str | None, command: str) -
     return plain({
         "schema": SCHEMA, "kind": "needs", "date": time.strftime("%Y-%m-%d"), "commit": stated, "command": command,
         "machine": machine(), "drive": {"scans": SCANS, "settling": SETTLING}, "rows": list(rows),
-    })  # fmt: skip
+    }, 6)  # fmt: skip

@@ -38,7 +38,7 @@ from common import command_line, commit, make_parser, middle_pose, table, table_
 from speed.filters import PEERS, load
 
 import gpusense as gs
-from gpusense.evaluation.machine import machine, machine_line
+from gpusense.commands.output import machine, machine_line
 from gpusense.evaluation.worlds import building
 
 SIZES = ((2000, 60), (4000, 60), (100_000, 60))

@@ -1,10 +1,13 @@
-"""Read YAML documents within bounds, without executing their contents."""
+"""Read YAML documents within bounds, without executing their contents; convert values for JSON documents."""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import math
+import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -155,3 +158,24 @@ def _problem(error: Exception) -> str:
         if text := getattr(error, name, None):
             return " ".join(str(text).split())
     return str(error) if type(error) is ValueError and str(error) else type(error).__name__
+
+
+def plain(value: Any, digits: int | None = None) -> Any:
+    """Convert a value to JSON's types.
+
+    Dataclasses become mappings, NumPy's scalars and arrays numbers and lists, NaN and infinities None.
+
+    ``digits``: Significant digits to which numbers are rounded; None for all.
+    """
+    if dataclasses.is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain(item, digits) for key, item in value.items()}
+    if hasattr(value, "tolist"):
+        return plain(value.tolist(), digits)
+    if isinstance(value, (list, tuple)):
+        return [plain(item, digits) for item in value]
+    if isinstance(value, float):
+        shown = value if digits is None else float(f"{value:.{digits}g}")
+        return shown if math.isfinite(value) else None
+    return str(value) if isinstance(value, os.PathLike) else value

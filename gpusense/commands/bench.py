@@ -24,9 +24,9 @@ from gpusense.commands.arguments import (
     quantity,
     whole_number,
 )
+from gpusense.commands.output import machine, machine_line
 from gpusense.commands.signals import working
 from gpusense.evaluation.benchmark import candidates, choice, report, runner, scenes
-from gpusense.evaluation.machine import machine, machine_line
 
 FIRST = ("quick", "html", "map", "max_error", "max_time")
 SHARED = ("json",)

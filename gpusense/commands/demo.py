@@ -19,9 +19,8 @@ from gpusense._util.files import check_writable
 from gpusense._util.typing import Precision
 from gpusense.commands import output
 from gpusense.commands.arguments import BACKEND_HELP, Options, open_backends, picture, whole_number
-from gpusense.commands.output import grouped
+from gpusense.commands.output import grouped, machine
 from gpusense.commands.signals import working
-from gpusense.evaluation.machine import machine
 
 if TYPE_CHECKING:
     from gpusense.backends import Backend, Selection

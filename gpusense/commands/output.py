@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import os
+import platform
 import shutil
 import sys
 import textwrap
@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gpusense._util.documents import plain
 from gpusense._util.files import write_whole
 from gpusense._util.progress import is_terminal
-from gpusense.evaluation.machine import machine, machine_line
+from gpusense._version import __version__
 
 if TYPE_CHECKING:
     import argparse
@@ -34,7 +35,7 @@ _OPENERS = {".rrd": "rerun", ".tum": "evo_traj tum"}
 
 def document(document: dict[str, Any]) -> None:
     """Print one JSON document; NaN and infinities become null."""
-    print(json.dumps(_plain(document), indent=2, allow_nan=False))
+    print(json.dumps(plain(document), indent=2, allow_nan=False))
 
 
 def report(facts: dict[str, Any], args: argparse.Namespace | None = None) -> None:
@@ -44,19 +45,24 @@ def report(facts: dict[str, Any], args: argparse.Namespace | None = None) -> Non
     document({**options, **facts, "machine": machine()})
 
 
-def _plain(value: Any) -> Any:
-    """Convert a value to JSON's types: dataclasses to mappings, NumPy's scalars and arrays to numbers and lists."""
-    if dataclasses.is_dataclass(value):
-        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return str(value) if isinstance(value, os.PathLike) else value
+def machine() -> dict[str, Any]:
+    """Return platform, processor, number of usable processors and versions, by name."""
+    from gpusense.backends import processor
+
+    return {
+        "gpusense": __version__, "platform": platform.platform(), "processor": processor.name(),
+        "processors": processor.threads(),
+        "python": f"{platform.python_implementation()} {platform.python_version()}", "numpy": np.__version__,
+    }  # fmt: skip
+
+
+def machine_line() -> str:
+    """Format :func:`machine` as one line."""
+    facts = machine()
+    return (
+        f"gpusense {facts['gpusense']}, {facts['processor']} ({facts['processors']} usable), {facts['platform']}, "
+        f"{facts['python']}, NumPy {facts['numpy']}"
+    )
 
 
 def result(text: str) -> None:

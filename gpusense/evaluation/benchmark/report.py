@@ -6,9 +6,10 @@ import math
 import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
+from gpusense._util.documents import plain
 from gpusense.evaluation.benchmark.runner import Outcome, Plan
 
 SCHEMA = 2
@@ -18,38 +19,16 @@ _DIGITS = 6
 
 
 def document(
-    plan: Plan,
-    outcome: Outcome,
-    arguments: Mapping[str, Any],
-    machine: Mapping[str, Any],
-    absent: Sequence[str],
+    plan: Plan, outcome: Outcome, arguments: Mapping[str, Any], machine: Mapping[str, Any], absent: Sequence[str],
     command: str = "",
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Build the report from plain values; non-finite numbers become None."""
-    value = {
-        "schema": SCHEMA,
-        "date": time.strftime("%Y-%m-%d"),
-        "command": command,
-        "arguments": dict(arguments),
-        "machine": dict(machine),
-        "devices": [asdict(backend.info) for backend in plan.backends],
-        "absent": list(absent),
-        "truth": outcome.truth,
-        "scenes": outcome.scenes,
-        "points": outcome.points,
-    }
-    return {key: plain(item) for key, item in value.items()}
-
-
-def plain(value: Any) -> Any:
-    """Convert a value to JSON's types; round numbers to six digits and replace non-finite ones by None."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, float):
-        return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
-    return value
+    made: dict[str, Any] = plain({
+        "schema": SCHEMA, "date": time.strftime("%Y-%m-%d"), "command": command, "arguments": arguments,
+        "machine": machine, "devices": [backend.info for backend in plan.backends], "absent": absent,
+        "truth": outcome.truth, "scenes": outcome.scenes, "points": outcome.points,
+    }, _DIGITS)  # fmt: skip
+    return made
 
 
 ALL = "all maps"

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.bench_world import made_point, made_report
 
+from gpusense._util.documents import plain
 from gpusense.evaluation.benchmark import choice, report
 
 
@@ -22,7 +23,7 @@ def test_pareto_front_by_hand():
 
 def test_numbers_of_a_report_are_json():
     value = {"a": (np.float64(1 / 3), math.inf), "b": {"c": math.nan, "d": None, "e": True}}
-    assert report.plain(value) == {"a": [0.333333, None], "b": {"c": None, "d": None, "e": True}}
+    assert plain(value, 6) == {"a": [0.333333, None], "b": {"c": None, "d": None, "e": True}}
 
 
 def entry(method, error, seconds, setting="", precision="float32", **changes):

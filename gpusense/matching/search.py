@@ -168,9 +168,10 @@ class _Run:
         if len(given) < len(_GIVEN):
             inputs.append(there.empty("table 0", total, _INT, zero=True))
         made = [there.empty(name, size * total, _INT) for name, size in _MADE.items()]
-        backend.compile("place_ends", _NO_FLAGS)(
-            (self._most, self._items), *inputs, *made, self._items, self._turns, tables.stride, self._level,
-            tables.step(self._level).bit_length() - 1, tables.shape.margin,
+        workers = self._most if backend.info.kind == "gpu" else 1
+        backend.compile("place_ends", self._ahead)(
+            (workers, self._items), *inputs, *made, self._items, self._turns, tables.stride, self._level,
+            tables.step(self._level).bit_length() - 1, tables.shape.margin, workers,
         )  # fmt: skip
         if there is not space:
             inputs, made = ([space.upload(name, array) for name, array in zip(names, arrays, strict=True)]

@@ -5,7 +5,7 @@ import numpy as np
 
 def place_ends(
     flags, end, heading, start, first, image, point, folded, bound_image, quarter_image, items, turns, stride, level,
-    step_level, offset,
+    step_level, offset, workers,
 ):  # fmt: skip
     """Place the end points of scans at headings in cells of the tables, and in cells and images of folded tables."""
     period, side = stride << level, stride << (level - step_level)

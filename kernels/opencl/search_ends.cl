@@ -13,19 +13,28 @@ int cell_of(const double place) {
 }
 
 // Place the end points of a scan at a heading in cells of the tables, in cells of folded tables, and in the images of folded
-// bounds and of folded quarters. One work-item takes a point of an item.
+// bounds and of folded quarters. One work-item takes each workers-th point of an item.
 kernel void place_ends(ARGUMENTS) {
-    const int n = get_global_id(0), item = get_global_id(1);
-    if (item >= items || n >= first[item + 1] - first[item]) return;
-    const int scan = item / turns, side = stride << (level - step_level), k = first[item] + n, m = 2 * (first[scan * turns] / turns + n);
-    const double cosine = heading[2 * item], sine = heading[2 * item + 1];
-    const double across = cosine * end[m] - sine * end[m + 1], along = sine * end[m] + cosine * end[m + 1];
-    const int2 cell = (int2)(cell_of(start[2 * scan] + across), cell_of(start[2 * scan + 1] + along));
-    const int x = cell.x + offset, y = cell.y + offset, period = stride << level;
-    const int2 whole = (int2)(periods(x, stride, level), periods(y, stride, level));
-    const int col = x - whole.x * period, row = y - whole.y * period;
-    point[k] = cell;
-    folded[k] = whole;
-    bound_image[k] = (image[k] * side + (row >> step_level)) * side + (col >> step_level);
-    quarter_image[k] = (image[k] * period + row) * period + col;
+    const int item = get_global_id(1);
+    if (item >= items || get_global_id(0) >= workers) return;
+    const int scan = item / turns, side = stride << (level - step_level), period = stride << level;
+    const double cosine = heading[2 * item], sine = heading[2 * item + 1], x0 = start[2 * scan], y0 = start[2 * scan + 1];
+    global const double *ends = end + 2 * (first[scan * turns] / turns);
+#if READ_AHEAD
+    for (int k = first[item] + get_global_id(0), n = get_global_id(0); k < first[item + 1]; k += workers, n += workers) {
+#else
+    // A single worker, so that compilers make vector code.
+    const int begin = first[item], last = first[item + 1];
+    for (int k = begin, n = 0; k < last; ++k, ++n) {
+#endif
+        const double across = cosine * ends[2 * n] - sine * ends[2 * n + 1], along = sine * ends[2 * n] + cosine * ends[2 * n + 1];
+        const int2 cell = (int2)(cell_of(x0 + across), cell_of(y0 + along));
+        const int x = cell.x + offset, y = cell.y + offset;
+        const int2 whole = (int2)(periods(x, stride, level), periods(y, stride, level));
+        const int col = x - whole.x * period, row = y - whole.y * period;
+        point[k] = cell;
+        folded[k] = whole;
+        bound_image[k] = (image[k] * side + (row >> step_level)) * side + (col >> step_level);
+        quarter_image[k] = (image[k] * period + row) * period + col;
+    }
 }

@@ -18,30 +18,30 @@ def periods(cell: wp.int32, stride: wp.int32, level: wp.int32):
 @kernel
 def place_ends(
     end, heading, start, first, image, point, folded, bound_image, quarter_image, items, turns, stride, level,
-    step_level, offset,
+    step_level, offset, workers,
 ):  # fmt: skip
     """Place the end points of a scan at a heading in cells of tables, and in cells and images of folded tables."""
     item, n = wp.tid()
-    if item >= items:
-        return
-    k = first[item] + n
-    if k >= first[item + 1]:
+    if item >= items or n >= workers:
         return
     scan = item // turns
     side = stride << (level - step_level)
     period = stride << level
-    m = 2 * (first[scan * turns] // turns + n)
     cosine = heading[2 * item]
     sine = heading[2 * item + 1]
-    across = cosine * end[m] - sine * end[m + 1]
-    along = sine * end[m] + cosine * end[m + 1]
-    cell = wp.vec2i(int(wp.floor(start[2 * scan] + across)), int(wp.floor(start[2 * scan + 1] + along)))
-    x = cell.x + offset
-    y = cell.y + offset
-    whole = wp.vec2i(periods(x, stride, level), periods(y, stride, level))
-    col = x - whole.x * period
-    row = y - whole.y * period
-    point[k] = cell
-    folded[k] = whole
-    bound_image[k] = (image[k] * side + (row >> step_level)) * side + (col >> step_level)
-    quarter_image[k] = (image[k] * period + row) * period + col
+    begin = first[item]
+    ends = 2 * (first[scan * turns] // turns)
+    for k in range(begin + n, first[item + 1], workers):
+        m = ends + 2 * (k - begin)
+        across = cosine * end[m] - sine * end[m + 1]
+        along = sine * end[m] + cosine * end[m + 1]
+        cell = wp.vec2i(int(wp.floor(start[2 * scan] + across)), int(wp.floor(start[2 * scan + 1] + along)))
+        x = cell.x + offset
+        y = cell.y + offset
+        whole = wp.vec2i(periods(x, stride, level), periods(y, stride, level))
+        col = x - whole.x * period
+        row = y - whole.y * period
+        point[k] = cell
+        folded[k] = whole
+        bound_image[k] = (image[k] * side + (row >> step_level)) * side + (col >> step_level)
+        quarter_image[k] = (image[k] * period + row) * period + col

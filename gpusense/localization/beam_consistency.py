@@ -29,7 +29,7 @@ from gpusense._util.typing import Floats
 from gpusense.backends import arrays
 from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.workspace import Packed, Workspace
-from gpusense.interface.constants import AGREES, MOMENTS, NOTHING, SHORT, THROUGH
+from gpusense.interface.constants import AGREES, MOMENTS, NOTHING, SHORT, THROUGH, VANISHED
 from gpusense.interface.lanes import with_teams_flags
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import BeamRules, Frame
@@ -44,9 +44,8 @@ BEAMS, _FARTHEST = 32, 20.0
 BESIDE, _APART, _MOST_BESIDE, _MOST_APART = 0.08, 0.025, 0.3, 0.1
 # Tolerance of a range: relative, and least values [m] and [cells]; largest distance of close agreement [m].
 _PART, _LEAST, _LEAST_CELLS, _CLOSE = 0.02, 0.2, 2.0, 0.1
-# Numbers of a judgement; classes as the kernel writes them.
+# Numbers of a judgement.
 JUDGED = 2 * BEAMS
-_AGREES, *_OTHERS = map(float, (AGREES, THROUGH, SHORT, NOTHING))
 _DOUBLE, _PLAIN, _STILL = np.dtype(np.float64), frozenset[str](), np.zeros((3, 3))
 # Numbers of maps on devices, keys of recorded launches.
 _VERSIONS = itertools.count(1)
@@ -99,12 +98,13 @@ class Counts(NamedTuple):
 
 def counts_of(scans: Sequence[BeamConsistency]) -> Counts:
     """Return the counts of several scans."""
-    kinds, close = list[float](), 0
+    kinds, close = [0] * (VANISHED + 1), 0
     for one in scans:
-        kinds += one.kind.tolist()
-        is_close = (one.distance < one.reading + one.near) & (one.distance > one.reading - one.near)
-        close += int(np.count_nonzero(is_close & (one.kind == _AGREES)))
-    return Counts(kinds.count(_AGREES), close, *[kinds.count(kind) for kind in _OTHERS])
+        agree = (one.kind == AGREES).nonzero()[0]
+        close += int(np.count_nonzero(np.abs(one.reading[agree] - one.distance[agree]) < one.near))
+        these = np.bincount(one.kind.astype(np.int64), minlength=VANISHED + 1).tolist()
+        kinds = [sum(pair) for pair in zip(kinds, these, strict=True)]
+    return Counts(kinds[AGREES], close, kinds[THROUGH], kinds[SHORT], kinds[NOTHING])
 
 
 def _place_of(grid: OccupancyGrid, pose: Floats) -> tuple[bool, bool]:

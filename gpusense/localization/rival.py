@@ -10,7 +10,8 @@ predicted particles. The logarithm of the Bayes factor
 
 is evidence for the rival (Kass and Raftery, "Bayes factors" (1995)); the scan that chose the rival is none. Terms of
 nearby scans repeat one another, since the same furniture is wrong in all of them; against a tracked pose only the new
-part of each counts (:mod:`gpusense.localization.belief`). ``docs/localization.md`` describes when a rival wins or ends.
+part of each counts (:mod:`gpusense.localization.belief`). ``docs/background/localization.md`` describes when a rival
+wins.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ def deviations(covariance: Floats) -> tuple[float, float]:
     """Return the largest standard deviation of the position over directions [m], and the heading's deviation [rad]."""
     # Python's floats are several times faster than arrays of nine items.
     (xx, xy, xt), (yx, yy, yt), (tx, ty, tt) = covariance.tolist()
-    if not all(map(math.isfinite, (xx, xy, xt, yx, yy, yt, tx, ty, tt))):
+    if not math.isfinite(xx + xy + xt + yx + yy + yt + tx + ty + tt):
         return math.inf, math.inf
     largest = (xx + yy) / 2 + math.hypot((xx - yy) / 2, xy)
     return math.sqrt(max(largest, 0.0)), math.sqrt(max(tt, 0.0))

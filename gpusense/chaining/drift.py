@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gpusense._util.typing import Flags, Floats, Integers
+from gpusense._util.typing import Floats, Integers
 from gpusense.chaining.graph import Solution, normal_equations, order_of, pose_jacobians
 from gpusense.chaining.links import CLOSURE, Links
 
@@ -22,8 +22,8 @@ from gpusense.chaining.links import CLOSURE, Links
 _ANCHORS, _BREAKS, _LOOSE = 300, 0.4, 10.0
 # Length that converts heading to position variance [m].
 _LEVER = 3.0
-# Poses per eliminated stretch, and stretches joined for the next elimination.
-_STRETCH, _JOINED = 32, 16
+# Poses per stretch that is eliminated at once.
+_STRETCH = 16
 # Damping [1/m^2, 1/rad^2]; its inverse is the variance along a direction that no link observes.
 DAMPING = 1e-6
 
@@ -50,12 +50,11 @@ class Drift:
         local = links[~moved]
         matrix = normal_equations(poses, local)
         # The first pose is known, so its rows and columns are 0.
-        rows = (3 * (anchors[1:, None] - 1) + np.arange(3)).ravel()
         whole, shape = np.zeros_like(self._joint), (len(anchors) - 1, 3, len(anchors) - 1, 3)
-        whole[1:, :, 1:, :] = _reduced(matrix, rows).reshape(shape)
+        whole[1:, :, 1:, :] = _reduced(matrix, anchors[1:] - 1).reshape(shape)
         if moved.any():
             _add_closures(whole, poses, links[moved], anchors, spread)
-        inverse = np.linalg.inv(whole[1:, :, 1:, :].reshape(len(rows), len(rows)))
+        inverse = np.linalg.inv(whole[1:, :, 1:, :].reshape(3 * shape[0], 3 * shape[0]))
         self._joint[1:, :, 1:, :] = (0.5 * (inverse + inverse.T)).reshape(shape)
 
     def relative(self, first: Integers, second: Integers) -> Floats:
@@ -91,71 +90,28 @@ def _anchors_of(spread: Floats, most: int) -> Integers:
     return anchors
 
 
-def _reduced(matrix: Any, rows: Integers) -> Floats:
-    """Eliminate all but some rows of sparse information, by Schur's complement, and return the information of these.
+def _reduced(matrix: Any, kept: Integers) -> Floats:
+    """Eliminate all poses but some ascending ones from sparse information; return the information of these.
 
-    Links join nearby poses of the chain. Stretches are therefore eliminated as dense matrices, except poses with links
-    to a later stretch; longer stretches of the rest follow.
+    Links join nearby poses of the chain. Every second stretch of poses is therefore eliminated, then every second one
+    of the rest, and so on; poses with a link to a farther stretch come last.
     """
-    from scipy import sparse
-
-    if not len(rows):
-        return np.zeros((0, 0))
-    kept = np.zeros(matrix.shape[0], bool)
-    kept[rows] = True
-    stretch = np.arange(len(kept)) // (3 * _STRETCH)
-    left = (matrix + DAMPING * sparse.identity(len(kept), format="csc")).tocsr()
-    while not kept.all():
-        left, inner = _without_stretches(left, kept, stretch)
-        kept, stretch = kept[~inner], stretch[~inner] // _JOINED
-    result: Floats = left.toarray()
-    return result
-
-
-def _without_stretches(matrix: Any, kept: Flags, stretch: Integers) -> tuple[Any, Flags]:
-    """Eliminate rows of sparse information that link later stretches only at kept rows.
-
-    ``stretch`` (M,) numbers the stretches of the rows in ascending order. Returns the information of all other rows,
-    and whether each row (M,) was eliminated.
-    """
-    from scipy import sparse
-
-    entries, count = matrix.tocoo(), len(kept)
-    row, column, value = entries.row, entries.col, entries.data
-    inner = ~kept
-    inner[row[inner[row] & inner[column] & (stretch[row] < stretch[column])]] = False
-    members = np.flatnonzero(inner)
-    parts, part = np.unique(stretch[members], return_inverse=True)
-    place, of = np.zeros((2, count), np.int64)
-    of[members], place[members] = part, _ranks(part)
-    size = int(place.max(initial=-1)) + 1
-    # Missing rows of short stretches are rows of an identity.
-    pivots = np.tile(np.eye(size), (len(parts), 1, 1))
-    some = inner[row] & inner[column]
-    pivots[of[row[some]], place[row[some]], place[column[some]]] = value[some]
-    some = inner[row] & ~inner[column]
-    ends, end = np.unique(of[row[some]] * count + column[some], return_inverse=True)
-    rank = _ranks(ends // count)
-    sides = np.zeros((len(parts), size, int(rank.max(initial=-1)) + 1))
-    sides[of[row[some]], place[row[some]], rank[end]] = value[some]
-    numbers = np.full((len(parts), sides.shape[2]), -1)
-    numbers[ends // count, rank] = ends % count
-    change = -sides.transpose(0, 2, 1) @ np.linalg.solve(pivots, sides)
-    one, two = np.broadcast_to(numbers[:, :, None], change.shape), np.broadcast_to(numbers[:, None, :], change.shape)
-    real = (one >= 0) & (two >= 0)
-    some = ~inner[row] & ~inner[column]
-    # Entries of the same place are added.
-    triples = zip((value[some], row[some], column[some]), (change[real], one[real], two[real]), strict=True)
-    values, rows, columns = (np.concatenate(pair) for pair in triples)
-    number = np.cumsum(~inner) - 1
-    left = int(np.count_nonzero(~inner))
-    return sparse.csr_matrix((values, (number[rows], number[columns])), shape=(left, left)), inner
-
-
-def _ranks(groups: Integers) -> Integers:
-    """Return the rank (M,) of each element in its group, for ascending numbers of groups (M,)."""
-    ranks: Integers = np.arange(len(groups)) - np.searchsorted(groups, groups)
-    return ranks
+    blocks = _blocks_of(matrix)
+    count = blocks.shape[0] // 3
+    inner, stretch = np.setdiff1d(np.arange(count), kept), np.arange(count) // _STRETCH + 1
+    row, column = blocks.indices, np.repeat(np.arange(count), np.diff(blocks.indptr))
+    # The lowest set bit of a stretch's number.
+    rank = stretch & -stretch
+    rank[row[np.abs(stretch[row] - stretch[column]) > 1]] = count
+    order = np.append(inner[np.lexsort((inner, rank[inner]))], kept)
+    parts, parent = _parts_of(blocks, order, len(inner))
+    _, updates = _eliminated(blocks, order, parts, parent, DAMPING)
+    rows = _scalars(np.arange(count), kept)
+    left: Floats = matrix[rows][:, rows].toarray() + DAMPING * np.eye(len(rows))
+    for below, update in updates:
+        at = _scalars(np.arange(len(inner), count), below)
+        left[at[:, None], at] += update
+    return left
 
 
 def _add_closures(whole: Floats, poses: Floats, closures: Links, anchors: Integers, spread: Floats) -> None:
@@ -206,15 +162,11 @@ def pose_covariances(solution: Solution) -> Floats:
 
 def inverse_blocks(matrix: Any, damping: float) -> Floats:
     """Return the diagonal blocks (N, 3, 3) of the inverse of a sparse positive definite matrix plus damping."""
-    blocks = matrix.tobsr((3, 3))
-    blocks.sort_indices()
+    blocks = _blocks_of(matrix)
     count = blocks.shape[0] // 3
     order = order_of(blocks.indices, np.repeat(np.arange(count), np.diff(blocks.indptr)))
-    parts = _parts_of(blocks, order)
-    home = np.repeat(np.arange(len(parts)), [end - begin for begin, end, _ in parts])
-    # Part of the first row below each part; -1 for a root.
-    parent = np.array([home[below[0]] if len(below) else -1 for _, _, below in parts])
-    factors = _eliminated(blocks, order, parts, parent, damping)
+    parts, parent = _parts_of(blocks, order, count)
+    factors, _ = _eliminated(blocks, order, parts, parent, damping)
     result, fronts = np.empty((count, 3, 3)), dict[int, tuple[Integers, Floats]]()
     waiting = np.bincount(parent[parent >= 0], minlength=len(parts))
     for k in range(len(parts) - 1, -1, -1):
@@ -238,18 +190,27 @@ def inverse_blocks(matrix: Any, damping: float) -> Floats:
     return 0.5 * (result + result.transpose(0, 2, 1))
 
 
-def _parts_of(blocks: Any, order: Integers) -> list[tuple[int, int, Integers]]:
-    """Return runs of elimination steps, each with its first step, its end, and the common rows below."""
-    count = len(order)
-    place = np.empty(count, np.int64)
-    place[order] = np.arange(count)
+def _blocks_of(matrix: Any) -> Any:
+    """Return a sparse matrix in sorted 3 x 3 blocks."""
+    blocks = matrix.tobsr((3, 3))
+    blocks.sort_indices()
+    return blocks
+
+
+def _parts_of(blocks: Any, order: Integers, count: int) -> tuple[list[tuple[int, int, Integers]], Integers]:
+    """Return runs of the first ``count`` elimination steps: first step, end, and common rows below; and their parents.
+
+    The parent is the part of the first row below; -1 without one among these steps.
+    """
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
     places, starts = place[blocks.indices].tolist(), blocks.indptr.tolist()
     below: list[list[int]] = []
     children: list[list[list[int]]] = [[] for _ in range(count)]
-    for k, step in enumerate(order.tolist()):
+    for k, step in enumerate(order[:count].tolist()):
         rows = sorted({row for row in places[starts[step] : starts[step + 1]] if row > k}.union(*children[k]))
         children[k] = []
-        if rows:
+        if rows and rows[0] < count:
             children[rows[0]].append(rows[1:])
         below.append(rows)
     parts, begin = [], 0
@@ -258,13 +219,14 @@ def _parts_of(blocks: Any, order: Integers) -> list[tuple[int, int, Integers]]:
         if k + 1 == count or not len(rows) or rows[0] != k + 1 or len(rows) != len(below[k + 1]) + 1:
             parts.append((begin, k + 1, np.array(rows, np.int64)))
             begin = k + 1
-    return parts
+    home = np.repeat(np.arange(len(parts)), [end - begin for begin, end, _ in parts])
+    return parts, np.array([home[below[0]] if len(below) and below[0] < count else -1 for _, _, below in parts])
 
 
 def _eliminated(
     blocks: Any, order: Integers, parts: list[tuple[int, int, Integers]], parent: Integers, damping: float
-) -> list[tuple[Floats, Floats]]:
-    """Return the inverse pivots and the factor L of each part."""
+) -> tuple[list[tuple[Floats, Floats]], list[tuple[Integers, Floats]]]:
+    """Return the inverse pivots and the factor L of each part, and the changes of rows that are no part."""
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
     places, starts = place[blocks.indices], blocks.indptr
@@ -288,7 +250,7 @@ def _eliminated(
         factors.append((inverse, factor))
         if len(below):
             updates.setdefault(int(parent[k]), []).append((below, front[size:, size:] - factor @ side.T))
-    return factors
+    return factors, updates.pop(-1, [])
 
 
 def _scalars(rows: Integers, some: Integers) -> Integers:

@@ -175,14 +175,14 @@ def without_needless(problem: Problem, value: Value) -> Value:
     return value
 
 
-# Bound on the change of a log weight relative to the largest weight.
+# Bound on a log weight relative to the largest one: weights are between e^-25 and e^25 times the largest weight.
 _WIDEST = 25.0
 # Largest number of rotations of the directions of a stuck hill climb.
 _TURNS = 5
 
 
 class _Search:
-    """The objective as a function of a step from a point, with the best value so far and the trace."""
+    """The objective as a function of the free coordinates, with the best value so far and the trace."""
 
     def __init__(self, problem: Problem, start: Point, watch: Watch) -> None:
         self.problem, self.watch = problem, watch
@@ -191,33 +191,35 @@ class _Search:
         self.restart()
 
     def restart(self) -> None:
-        """Count steps from the best point: in logs of weights but the largest, of shapes, and in bias / range_max."""
+        """Begin at the best point: logs of weights but the largest, and of shapes, and bias / range_max."""
         problem, self._start = self.problem, self.best.point
-        used, bounds, at = self._start.weights > 0, problem.bounds, self._start.coordinates()
+        used, bounds, self._at = self._start.weights > 0, problem.bounds, self._start.coordinates()
         free = np.append(used, [used[HIT], used[SHORT], problem.fit_bias and used[HIT]])
-        free[int(np.argmax(self._start.weights))] = False
-        ends = np.log([bounds.sigma, bounds.rate]), [(-bounds.bias, bounds.bias)]
-        limits = np.concatenate([np.tile([-_WIDEST, _WIDEST], (4, 1)), np.concatenate(ends) - at[SIGMA:, None]])
+        largest = int(np.argmax(self._start.weights))
+        free[largest] = False
+        wide = [(self._at[largest] - _WIDEST, self._at[largest] + _WIDEST)] * 4
+        limits = np.array([*wide, *np.log([bounds.sigma, bounds.rate]), (-bounds.bias, bounds.bias)])
         self.places = np.flatnonzero(free)
         self.unit = np.where(np.arange(FORM) == BIAS, problem.pairs.range_max, 1.0)[self.places]
         self.limits = limits[self.places] / self.unit[:, None]
+        self.first = np.clip(self._at[self.places] / self.unit, *self.limits.T)
 
-    def value(self, step: Floats) -> Value:
-        """Evaluate a step along the free coordinates, and remember the best value."""
-        whole = np.zeros(FORM)
-        whole[self.places] = step * self.unit
-        value = self.problem.value(self._start.moved(whole, self.problem.bounds))
+    def value(self, vector: Floats) -> Value:
+        """Evaluate free coordinates, and remember the best value."""
+        step = np.zeros(FORM)
+        step[self.places] = vector * self.unit - self._at[self.places]
+        value = self.problem.value(self._start.moved(step, self.problem.bounds))
         if value.objective > self.best.objective:
             self.best = value
         return value
 
-    def cost(self, step: Floats) -> float:
+    def cost(self, vector: Floats) -> float:
         """Return minus the objective per reading."""
-        return -self.value(step).objective / self.problem.total
+        return -self.value(vector).objective / self.problem.total
 
-    def cost_and_gradient(self, step: Floats) -> tuple[float, Floats]:
+    def cost_and_gradient(self, vector: Floats) -> tuple[float, Floats]:
         """Return minus the objective per reading and its gradient."""
-        value = self.value(step)
+        value = self.value(vector)
         return -value.objective / self.problem.total, -value.gradient[self.places] * self.unit / self.problem.total
 
     def end_iteration(self, *_: Any) -> None:
@@ -277,7 +279,7 @@ def _restarted(
         directions = np.linalg.qr(rng.normal(size=(size, size)))[0] if turned else np.eye(size)
         more = {"direc": directions} if powell else {}
         result = minimize(
-            search.cost if powell else search.cost_and_gradient, np.zeros(size), jac=not powell,
+            search.cost if powell else search.cost_and_gradient, search.first, jac=not powell,
             method="Powell" if powell else "L-BFGS-B", bounds=search.limits, callback=search.end_iteration,
             options=options | {"maxiter": max_iterations + 1 - len(search.trace)} | more,
         )  # fmt: skip
@@ -296,8 +298,10 @@ def _evolve(search: _Search, seed: int, max_iterations: int) -> None:
     from scipy.optimize import differential_evolution
 
     # Weights far below one reading are left to L-BFGS-B.
-    narrow = np.where(search.places <= RAND, math.log(10 * search.problem.total), math.inf)[:, None]
+    narrow = np.where(search.places <= RAND, math.log(10 * search.problem.total), math.inf)
+    low, high = search.limits.T
+    limits = np.stack([np.maximum(low, search.first - narrow), np.minimum(high, search.first + narrow)], axis=1)
     differential_evolution(
-        search.cost, np.clip(search.limits, -narrow, narrow), x0=np.zeros(len(narrow)), rng=seed,
+        search.cost, limits, x0=search.first, rng=seed,
         maxiter=max_iterations, popsize=10, tol=1e-6, atol=1e-9, polish=False, callback=search.end_iteration,
     )  # fmt: skip

@@ -201,35 +201,28 @@ def textbook_em(problem: Problem, start: Point, *, max_iterations: int, toleranc
     the result then has the last finite parameters.
     """
     value = problem.value(start)
-    trace = [value.objective]
-    falls, deepest = 0, 0.0
-    notes: list[str] = []
-    converged = False
+    trace, notes, converged = [value.objective], list[str](), False
     for iteration in range(1, max_iterations + 1):
         point = book_step(problem, value)
-        broken = [
-            f"{name} became {number:g} in iteration {iteration}, where the book's form ends"
-            for name, number in (("sigma_hit", point.sigma), ("lambda_short", point.rate))
-            if not _SMALLEST < number < 1 / _SMALLEST
-        ]
-        if broken:
-            notes += broken
-            break
-        following = problem.value(point)
-        change = following.objective - value.objective
+        for name, number in (("sigma_hit", point.sigma), ("lambda_short", point.rate)):
+            if not _SMALLEST < number < 1 / _SMALLEST:
+                notes.append(f"{name} became {number:g} in iteration {iteration}, where the book's form ends")
+        following = value if notes else problem.value(point)
         if not math.isfinite(following.objective):
             notes.append(f"the log-likelihood became {following.objective} in iteration {iteration}")
+        if notes:
             break
-        if change < -problem.noise(value):
-            falls, deepest = falls + 1, max(deepest, -change)
-        value = following
+        value, change = following, following.objective - value.objective
         trace.append(value.objective)
         watch(iteration, value)
         if abs(change) <= tolerance:
             converged = True
             break
-    if falls:
-        notes.append(f"the log-likelihood fell in {falls} of {len(trace) - 1} iterations, by up to {deepest:.3g} nats")
+    falls = -np.diff(trace)
+    falls = falls[falls > problem.noise(value)]
+    if len(falls):
+        part = f"{len(falls)} of {len(trace) - 1} iterations"
+        notes.append(f"the log-likelihood fell in {part}, by up to {max(falls):.3g} nats")
     if value.objective < max(trace):
         notes.append(f"the end is {max(trace) - value.objective:.3g} nats below the best iteration")
     return Climb(value, trace, converged, notes)

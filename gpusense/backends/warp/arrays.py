@@ -18,7 +18,7 @@ import warp as wp
 from gpusense._util.checks import check_gradients, show
 from gpusense.backends.base import Adopted, Buffer
 from gpusense.backends.processor import Slot
-from gpusense.backends.recycled import Loan
+from gpusense.backends.recycled import FreedMemory, Loan
 
 # Types of numbers that are read, by their names, and Warp's types.
 _NAMES = {name: np.dtype(name) for name in ("float32", "float64", "int32", "int64")}
@@ -61,7 +61,7 @@ def adopted(array: Any, device: wp.Device, name: str) -> Adopted:
     return Adopted(buffer, tuple(view.shape), dtype, view.numpy, view, None if view.is_contiguous else view.strides)
 
 
-class Results:
+class Results(FreedMemory):
     """New arrays for results, each of the library of the poses.
 
     PyTorch and CuPy allocate faster than Warp, which would also have to export the array. Memory of a few freed small
@@ -69,10 +69,9 @@ class Results:
     are recorded.
     """
 
-    def __init__(self, device: wp.Device) -> None:
-        self._device = device
-        # Freed memory, the newest last.
-        self._free: list[wp.array] = []
+    def __init__(self, device: wp.Device, empty: Callable[[int, np.dtype], Buffer]) -> None:
+        super().__init__(_MOST_KEPT, _MOST_KEPT * _LARGEST_KEPT)
+        self._device, self._empty = device, empty
 
     def empty_like(self, array: Any, shape: tuple[int, ...], dtype: np.dtype) -> tuple[Any, Buffer] | None:
         """See Backend.empty_like."""
@@ -80,7 +79,10 @@ class Results:
         if not count:
             return None
         if module == "torch" and array.is_cuda:
-            made = array.new_empty(shape, dtype=getattr(sys.modules["torch"], dtype.name))
+            try:
+                made = array.new_empty(shape, dtype=getattr(sys.modules["torch"], dtype.name))
+            except RuntimeError as error:
+                raise MemoryError(f"PyTorch allocates no result: {error}") from error
             address = made.data_ptr()
         elif module == "cupy" and sys.modules["cupy"].cuda.runtime.getDevice() == self._device.ordinal:
             made = sys.modules["cupy"].empty(shape, dtype)
@@ -96,23 +98,13 @@ class Results:
 
     def _memory(self, size: int) -> wp.array:
         """Return memory that no array uses."""
-        for memory in [*self._free][::-1]:
-            if memory.size == size:
-                try:
-                    self._free.remove(memory)
-                except ValueError:
-                    # Another thread has taken it.
-                    continue
-                if self._device.is_cuda:
-                    # Any blocking stream may still work on the freed array; Warp frees memory in the same order.
-                    _wait_for(self._device, self._device.null_stream)
-                return memory
-        return wp.empty(size, dtype=wp.uint8, device=self._device)
-
-    def take_back(self, memory: wp.array) -> None:
-        """Keep the memory of a freed array, and free the oldest if there is too much."""
-        self._free.append(memory)
-        del self._free[:-_MOST_KEPT]
+        memory = self.take(size)
+        if memory is None:
+            return self._empty(size, np.dtype(np.uint8))
+        if self._device.is_cuda:
+            # Any blocking stream may still work on the freed array; Warp frees memory in the same order.
+            _wait_for(self._device, self._device.null_stream)
+        return memory
 
 
 def _view(array: Any, device: wp.Device, name: str) -> wp.array:

@@ -45,7 +45,7 @@ class WarpBackend(ProcessBound, Backend):
         self._device = wp.get_device(device)
         self._graphs = GraphCache(self._device)
         self.results = ResultMemory() if info.kind == "gpu" else None
-        self._results_there = Results(self._device)
+        self._results_there = Results(self._device, self.empty)
         # Large copies; None on the processor, which uses the host's memory.
         self._staging = Staging(functools.partial(slots_of, self._device)) if self._device.is_cuda else None
         # The queue of each thread that has a batch, and the queues that no call uses.

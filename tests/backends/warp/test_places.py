@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gpusense.backends import get_backend
+
 NUMBERS = np.arange(12.0).reshape(4, 3)
 SIDE_STREAM = 77
 
@@ -156,7 +158,7 @@ def test_the_device_follows_the_stream_of_the_library(make, device):
 def test_results_are_allocated_by_the_library(make, device):
     from gpusense.backends.warp.arrays import Results
 
-    empty_like = Results(device).empty_like
+    empty_like = Results(device, None).empty_like
     made: list[Any] = []
     facts = {}
     if make is as_torch:
@@ -177,7 +179,7 @@ def test_memory_of_freed_results_is_used_again(needs):
     from gpusense.backends.warp.arrays import _MOST_KEPT, Results
 
     needs("warp")
-    poses, owners = to_device(NUMBERS), [Results(wp.get_device("cpu"))]
+    poses, owners = to_device(NUMBERS), [Results(wp.get_device("cpu"), get_backend("warp:cpu").empty)]
 
     def made(count: int = 8, real: type = np.float32) -> Any:
         return owners[0].empty_like(poses, (count,), np.dtype(real))[0]

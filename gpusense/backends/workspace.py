@@ -140,32 +140,34 @@ class Workspace:
         versions are dropped.
         """
         backend = self.backend
+        programs = self._programs if version == self._version else self._programs_of(version)
         records = backend.info.graphs and backend.in_batch
-        if version != self._version:
-            # In this order, so that an interrupt in between leaves no programs of the old table.
-            self._programs.clear()
-            self._version = version
         if records:
             # A recording keeps its numbers, but no buffer, alive: addresses of buffers identify it.
             key = (key, *map(self._identity, changing.values()))
-        kept = self._programs.get((records, key))
+        kept = programs.get((records, key))
         if kept is None:
             made = RecordedProgram(backend, make()) if records else ChangingProgram(backend, make(), changing)
-            kept = self._programs.keep((records, key), made)
+            kept = programs.keep((records, key), made)
         kept(changing)
         return kept.flags
 
     def kept(self, key: Hashable, version: int) -> Any:
         """Return what ``keep`` has stored; None if it has gone with a buffer, or with the table of the map."""
-        return self._programs.get(("kept", key)) if version == self._version else None
+        return self._programs_of(version).get(("kept", key))
 
     def keep(self, key: Hashable, program: T, version: int) -> T:
         """Store a program on this workspace's buffers for a version of the map's table, and return it."""
+        self._programs_of(version).keep(("kept", key), program)
+        return program
+
+    def _programs_of(self, version: int) -> ProgramCache[Any]:
+        """Return the programs of a version of the map's table."""
         if version != self._version:
+            # In this order, so that an interrupt in between leaves no programs of the old table.
             self._programs.clear()
             self._version = version
-        self._programs.keep(("kept", key), program)
-        return program
+        return self._programs
 
     def _identity(self, value: Any) -> Hashable:
         """Return a number or struct unchanged, and a buffer by its address."""

@@ -81,7 +81,6 @@ def without_collector():
 def programs_of(owner):
     """Return weak references to the programs of an owner's caches."""
     caches = [value for value in vars(owner).values() if isinstance(value, ProgramCache)]
-    caches += [value._programs for value in vars(owner).values() if isinstance(value, RepeatedPrograms)]
     return [weakref.ref(value) for cache in caches for _, value in cache.items() if not isinstance(value, tuple)]
 
 

@@ -191,25 +191,20 @@ class PackedCallCache:
         at, readings = self._operand(poses, "poses"), self._operand(ranges, "ranges")
         if at is None or readings is None:
             return None
-        in_host, there = type(at) is np.ndarray, type(readings) is not np.ndarray
-        if there and (pipeline.rules.first_scans.left or pipeline.context.temperature < 1):
-            # The host inspects the first scans, and whether a range depends on the pose; see below.
-            return None
-        if in_host and not (out is None or self._writes(count, out)):
-            return None
+        in_host, rules = type(at) is np.ndarray, pipeline.rules
         corners = self._corners(poses) if in_host else None
         if in_host and corners is None:
             return None
-        if pipeline.context.temperature < 1 and not classify_ranges(ranges, *pipeline.rules.limits)[0].any():
-            # Without a range that depends on the pose, the constant term is rounded differently.
-            return None
+        if pipeline.context.temperature < 1 or rules.first_scans.left:
+            if isinstance(readings, Adopted):
+                # The host inspects them.
+                ranges = pipeline.backend.download(readings.buffer, np.empty(size, readings.dtype))
+            if pipeline.context.temperature < 1 and not classify_ranges(ranges, *rules.limits)[0].any():
+                # Without a range that depends on the pose, the constant term is rounded differently.
+                return None
         try:
-            result = None
-            if in_host:
-                target = np.empty(count, pipeline.real) if out is None else out
-            else:
-                result = Result(poses, out, (count,), pipeline.real, pipeline.backend, on_device=True)
-                target = result.flat
+            result = Result(poses, out, (count,), pipeline.real, pipeline.backend, on_device=not in_host)
+            target = result.flat
             # Libraries of CUDA reuse the memory of earlier results.
             in_place = not in_host and (out is not None or pipeline.backend.info.graphs)
             call = self._call((at, readings), target, corners, in_place=in_place)
@@ -220,10 +215,10 @@ class PackedCallCache:
             self._sizes.clear()
             self._places.clear()
             return None
-        self.last, rules = _Last(call, poses, ranges), pipeline.rules
+        self.last = _Last(call, poses, ranges)
         if rules.first_scans.left:
             rules.first_scans.look_at("ranges", ranges[None], rules.map_size)
-        return target if result is None else result.user_array()
+        return result.user_array()
 
     def _operand(self, array: Any, name: str) -> np.ndarray | Adopted | None:
         """Return an array of the host or of the device; None if the ordinary call must read or refuse it."""
@@ -269,11 +264,6 @@ class PackedCallCache:
         ]
         out = None if there[0] is None else real if result is None else view(target, (count,), real)
         return PackedCall(self._pipeline, self._lock, count, (inputs[0], inputs[1]), out, limits, corners)
-
-    def _writes(self, count: int, out: Any) -> bool:
-        """Return whether results can be written to an array of the host."""
-        usable = type(out) is np.ndarray and out.dtype == self._pipeline.real and out.shape == (count,)
-        return usable and out.flags.c_contiguous and out.flags.writeable
 
     def _corners(self, poses: np.ndarray) -> Corners | None:
         """Return corners of the box of poses; None where one is not finite."""

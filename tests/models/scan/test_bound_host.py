@@ -197,9 +197,8 @@ def test_arrays_on_the_device_repeat_a_recording(case, batching):
             assert type(found) is type(expected) and (out is None or found is out)
             found, expected = (one.numpy() if there[0] else one for one in (found, expected))
             assert differing(found, expected) == 0, (seed, there)
-        recorded = short and (model.temperature == 1 or not there[1])
-        assert (model._short is not None and model._short.last is not None) == recorded
-        assert not recorded or graphs == 1
+        assert (model._short is not None and model._short.last is not None) == short
+        assert not short or graphs == 1
         assert model.explain() == plain.explain()
         if there[0]:
             host[0][3, 1] = np.nan
@@ -209,7 +208,7 @@ def test_arrays_on_the_device_repeat_a_recording(case, batching):
             host[0][3, 1] = 1.0
             found, expected = (one.log_likelihood(to_device(host[0]), ranges) for one in (model, plain))
             assert differing(found.numpy(), expected.numpy()) == 0
-            assert (model._short is not None and model._short.last is not None) == recorded
+            assert (model._short is not None and model._short.last is not None) == short
     with pytest.raises(TypeError, match="must hold float32 or float64"):
         model.log_likelihood(to_device(np.zeros((COUNT, 3), np.int32)), scan[:beams])
 

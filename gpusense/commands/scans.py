@@ -58,10 +58,10 @@ def options_named() -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        found = re.match(r"(\w+): ", str(error))
-        if found is None or found[1] not in OPTIONS:
+        found = re.match(r"(.*:\d+: )?(\w+): ", str(error))
+        if found is None or found[2] not in OPTIONS:
             raise
-        raise ValueError(f"--{OPTIONS[found[1]]}: {str(error)[found.end() :]}") from None
+        raise ValueError(f"{found[1] or ''}--{OPTIONS[found[2]]}: {str(error)[found.end() :]}") from None
 
 
 def read_scans(args: argparse.Namespace) -> list[tuple[int, gs.Scan]]:

@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 from support.command_line import error_of
+from support.room_log import write_log
 
 import gpusense as gs
 from gpusense.commands.cli import main
@@ -22,9 +23,8 @@ def recorded(tmp_path):
     poses = [(1.0, 1.0, 0.0), (2.5, 1.2, 1.5)]
     ranges = gs.BeamModel(grid, scanner, backend="numpy").expected_ranges(np.array(poses))
     ranges[1, :7] = 60.0
-    numbers = [" ".join(f"{value:.3f}" for value in [*z, *p, *p]) for z, p in zip(ranges, poses, strict=True)]
-    log, world, parameters = tmp_path / "run.log", tmp_path / "map.yaml", tmp_path / "parameters.yaml"
-    log.write_text("".join(f"FLASER 181 {row} {i}.0 robot {i}.0\n" for i, row in enumerate(numbers)))
+    world, parameters = tmp_path / "map.yaml", tmp_path / "parameters.yaml"
+    log = write_log(tmp_path / "run.log", ranges, poses)
     gs.write_map(grid, world)
     parameters.write_text("beam_model: {z_hit: 0.8, z_short: 0, z_max: 0.1, z_rand: 0.1, sigma_hit: 0.05}\n")
     return {"log": str(log), "map": str(world), "parameters": str(parameters)}

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support.command_line import error_of
 from support.feature_scenes import floor_plan
+from support.room_log import write_log
 
 import gpusense as gs
 from gpusense.commands import features as command
@@ -28,12 +29,7 @@ def log(tmp_path_factory):
     poses = np.column_stack([2 + 0.3 * np.arange(SCANS), np.zeros(SCANS), 0.3 * np.sin(np.arange(SCANS))])
     exact, _ = floor.cast(poses, SCANNER.bearings)
     ranges = exact + 0.01 * np.random.default_rng(0).standard_normal(exact.shape)
-    lines = []
-    for i, (pose, scan) in enumerate(zip(poses, ranges, strict=True)):
-        fields = [*np.minimum(scan, 81.83), *pose, *pose, float(i)]
-        lines.append(f"FLASER 361 {' '.join(f'{value:.4f}' for value in fields)} robot {i}.0")
-    path.write_text("\n".join(lines) + "\n")
-    return path
+    return write_log(path, np.minimum(ranges, 81.83), poses)
 
 
 def run(capsys, *arguments):

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 import sys
 
 import numpy as np
 import pytest
 from support.command_line import error_of
+from support.room_log import write_building
 
 import gpusense as gs
 from gpusense.commands import output
 from gpusense.commands.cli import main
 from gpusense.evaluation import scoring
-from gpusense.evaluation.worlds import building, free_pose, simulate_scan
 from gpusense.learning.beam import fit as learning
 
 
@@ -23,17 +22,8 @@ from gpusense.learning.beam import fit as learning
 def recorded(tmp_path_factory):
     """Write a map of a building, a log of five scans in it, and a file of pairs; return options of ``score``."""
     folder = tmp_path_factory.mktemp("recorded")
-    grid = building(2, (14.0, 12.0))
-    gs.write_map(grid, folder / "map.yaml")
-    scanner = gs.Scanner.uniform(angle_min=-math.pi / 2, angle_increment=math.pi / 30, count=31, range_max=10.0)
-    random, lines = np.random.default_rng(4), []
-    for i in range(5):
-        x, y, theta = free_pose(grid, random)
-        ranges = simulate_scan(grid, scanner, (x, y, theta), gs.BeamParameters(), random)
-        readings = " ".join(f"{z:.4f}" for z in np.where(np.isfinite(ranges), ranges, 10.0))
-        lines.append(f"FLASER 31 {readings} {x} {y} {theta} {x} {y} {theta} {i}.0 host {i}.0")
-    (folder / "run.log").write_text("\n".join(lines) + "\n")
-    z = np.abs(random.normal(4, 0.1, 300))
+    write_building(folder, 5, 31)
+    z = np.abs(np.random.default_rng(4).normal(4, 0.1, 300))
     (folder / "pairs.csv").write_text("\n".join(f"{each:.4f},4.0" for each in z) + "\n")
     return folder
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import yaml
 from scipy.integrate import quad
+from support.room_log import write_building
 
 import gpusense as gs
 from gpusense.commands.cli import main
 from gpusense.evaluation import range_data as fitting
-from gpusense.evaluation.worlds import building, free_pose, simulate_scan
 from gpusense.models.scan.densities import log_mixture
 
 TRUTH = gs.BeamParameters(z_hit=0.8, z_short=0.08, z_max=0.05, z_rand=0.07, sigma_hit=0.04, lambda_short=0.5)
@@ -25,20 +25,10 @@ SCANS, BEAMS, RANGE = 60, 60, 10.0
 def recorded(tmp_path_factory):
     """Write a building's map, a log of 60 scans in it, and the same readings as pairs."""
     folder = tmp_path_factory.mktemp("recorded")
-    grid = building(2, (14.0, 12.0))
-    gs.write_map(grid, folder / "map.yaml")
-    scanner = gs.Scanner.uniform(angle_min=-math.pi / 2, angle_increment=math.pi / 60, count=BEAMS, range_max=RANGE)
-    random, lines, pairs = np.random.default_rng(4), [], ["z,expected"]
+    grid, scanner, poses, ranges = write_building(folder, SCANS, BEAMS, TRUTH)
     model = gs.BeamModel(grid, scanner, backend="numpy", precision="float64")
-    for i in range(SCANS):
-        pose = free_pose(grid, random)
-        ranges = simulate_scan(grid, scanner, pose, TRUTH, random)
-        readings = " ".join(f"{z:.4f}" for z in np.where(np.isfinite(ranges), ranges, RANGE))
-        place = " ".join(repr(float(value)) for value in pose)
-        lines.append(f"FLASER {BEAMS} {readings} {place} {place} {i}.0 host {i}.0")
-        expected = model.expected_ranges([pose])[0]
-        pairs += [f"{z:.4f}, {e!r}" for z, e in zip(ranges, expected.tolist(), strict=True)]
-    (folder / "run.log").write_text("\n".join(lines) + "\n")
+    readings = zip(np.concatenate(ranges), model.expected_ranges(poses).ravel(), strict=True)
+    pairs = ["z,expected", *(f"{z:.4f}, {float(e)!r}" for z, e in readings)]
     (folder / "pairs.csv").write_text("\n".join(pairs) + "\n")
     with gzip.open(folder / "pairs.csv.gz", "wt") as stream:
         stream.write("\n".join(pairs) + "\n")

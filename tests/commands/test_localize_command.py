@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from support.command_line import error_of
+from support.room_log import write_log
 
 import gpusense as gs
 from gpusense.commands import cli
@@ -37,14 +38,12 @@ def place(tmp_path_factory):
         blocks[20 * row + 6 : 20 * row + 14, 20 * column + 6 : 20 * column + 14] = 100
     gs.write_map(gs.OccupancyGrid(blocks, resolution=0.1), folder / "other.yaml")
     caster = gs.RayCaster(grid, range_max=20.0, backend="numpy")
-    pose, odometry, lines = np.array([3.0, 1.5, 0.2]), np.zeros(3), []
-    for step in range(12):
-        ranges = caster.cast(pose[None], BEARINGS)[0] + rng.normal(0, 0.02, len(BEARINGS))
-        numbers = [*ranges, *pose, *odometry]
-        lines.append(f"FLASER 181 {' '.join(f'{value:.4f}' for value in numbers)} {step}.0 robot {step}.0")
-        pose = gs.compose_poses(pose, rng.normal((0.2, 0, 0.1), 0.01))
-        odometry = gs.compose_poses(odometry, (0.2, 0, 0.1))
-    (folder / "run.log").write_text("\n".join(lines))
+    ranges, poses, odometry = [], [np.array([3.0, 1.5, 0.2])], [np.zeros(3)]
+    for _ in range(12):
+        ranges.append(caster.cast(poses[-1][None], BEARINGS)[0] + rng.normal(0, 0.02, len(BEARINGS)))
+        poses.append(gs.compose_poses(poses[-1], rng.normal((0.2, 0, 0.1), 0.01)))
+        odometry.append(gs.compose_poses(odometry[-1], (0.2, 0, 0.1)))
+    write_log(folder / "run.log", ranges, poses[:-1], odometry[:-1])
     (folder / "poses.yaml").write_text(
         "beam_model: {z_hit: 0.8, z_short: 0.05, z_max: 0.05, z_rand: 0.1, sigma_hit: 0.05, lambda_short: 0.5}\n"
     )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from support.command_line import error_of
-from support.room_log import write_room_map
+from support.room_log import write_log, write_room_map
 
 import gpusense as gs
 from gpusense.commands import cli
@@ -26,14 +26,12 @@ def place(tmp_path_factory):
     folder, rng = tmp_path_factory.mktemp("references"), np.random.default_rng(1)
     grid = write_room_map(folder)
     caster = gs.RayCaster(grid, range_max=20.0, backend="numpy")
-    poses, odometry, lines = [np.array([3.0, 1.5, 3.0])], np.zeros(3), []
-    for step in range(COUNT):
-        ranges = caster.cast(poses[-1][None], BEARINGS)[0] + rng.normal(0, 0.02, len(BEARINGS))
-        numbers = [*ranges, *odometry, *odometry]
-        lines.append(f"FLASER 181 {' '.join(f'{value:.4f}' for value in numbers)} {step}.0 robot {step}.0")
+    ranges, poses, odometry = [], [np.array([3.0, 1.5, 3.0])], [np.zeros(3)]
+    for _ in range(COUNT):
+        ranges.append(caster.cast(poses[-1][None], BEARINGS)[0] + rng.normal(0, 0.02, len(BEARINGS)))
         poses.append(gs.compose_poses(poses[-1], rng.normal((0.15, 0, 0.1), 0.01)))
-        odometry = gs.compose_poses(odometry, (0.15, 0, 0.1))
-    (folder / "raw.log").write_text("\n".join(lines))
+        odometry.append(gs.compose_poses(odometry[-1], (0.15, 0, 0.1)))
+    write_log(folder / "raw.log", ranges, odometry[:-1])
     write_tum(folder / "true.tum", np.arange(0, COUNT, 2), poses[:COUNT:2])
     return folder
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support.command_line import error_of
 from support.matching_scenes import FRONT, ROOM, segments_scan
+from support.room_log import write_log
 
 import gpusense as gs
 from gpusense.commands.cli import main
@@ -35,14 +36,9 @@ def odometry(truth: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def log(truth: np.ndarray, odometry: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write a CARMEN log with copies of the odometry as poses."""
-    rng, lines = np.random.default_rng(0), []
-    for k, (pose, wheels) in enumerate(zip(truth, odometry, strict=True)):
-        z = np.minimum(segments_scan(ROOM, tuple(pose), FRONT) + rng.normal(0, 0.01, FRONT.count), 30.0)
-        numbers = " ".join(f"{value:.4f}" for value in [*z, *wheels, *wheels])
-        lines.append(f"FLASER {FRONT.count} {numbers} {0.2 * k:.1f} robot {0.2 * k:.1f}")
-    path = tmp_path_factory.mktemp("chain") / "run.log"
-    path.write_text("\n".join(lines) + "\n")
-    return path
+    rng = np.random.default_rng(0)
+    ranges = [segments_scan(ROOM, tuple(pose), FRONT) + rng.normal(0, 0.01, FRONT.count) for pose in truth]
+    return write_log(tmp_path_factory.mktemp("chain") / "run.log", np.minimum(ranges, 30.0), odometry, period=0.2)
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 from support.command_line import error_of
+from support.room_log import write_log
 
 import gpusense as gs
 from gpusense.commands.cli import main
@@ -22,13 +23,7 @@ def log(tmp_path):
     scanner = gs.Scanner(np.radians(np.arange(-90, 91)), range_max=50.0)
     model = gs.BeamModel(gs.OccupancyGrid(cells, 0.1), scanner, backend="numpy")
     ranges = model.expected_ranges(np.array(POSES)) + 0.02
-    lines = []
-    for i, (pose, z) in enumerate(zip(POSES, ranges, strict=True)):
-        numbers = " ".join(f"{value:.3f}" for value in [*z, *pose, *pose])
-        lines.append(f"FLASER 181 {numbers} {i}.0 robot {i}.0")
-    path = tmp_path / "run.log"
-    path.write_text("\n".join(lines) + "\n")
-    return path
+    return write_log(tmp_path / "run.log", ranges, POSES)
 
 
 def test_a_map_is_built_and_its_likelihoods_are_drawn(log, tmp_path, capsys):

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 from support.matching_scenes import ROOM, segments_scan
+from support.room_log import write_log
 
 import gpusense as gs
 from gpusense.commands.cli import main
@@ -17,16 +18,11 @@ SCANNER = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / 180, 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
     """Write a CARMEN log of eight scans on an arc with slightly wrong odometry."""
-    path = tmp_path_factory.mktemp("log") / "run.log"
-    lines = []
-    for i in range(8):
-        x, y, theta = 0.2 * i - 1.0, 0.05 * i, 0.1 * i
-        scan = np.minimum(segments_scan(ROOM, (x, y, theta), SCANNER), 81.83)
-        odometry = (x + 0.03 * i, y - 0.02 * i, theta + 0.01 * i)
-        fields = [*scan.round(4), x, y, theta, *odometry, float(i)]
-        lines.append(f"FLASER 180 {' '.join(f'{value:.4f}' for value in fields)} robot {i}.0")
-    path.write_text("\n".join(lines) + "\n")
-    return path
+    step = np.arange(8.0)[:, None]
+    poses = step * (0.2, 0.05, 0.1) - (1.0, 0.0, 0.0)
+    ranges = [np.minimum(segments_scan(ROOM, tuple(pose), SCANNER), 81.83) for pose in poses]
+    log = tmp_path_factory.mktemp("log") / "run.log"
+    return write_log(log, ranges, poses, poses + step * (0.03, -0.02, 0.01))
 
 
 def run(capsys, *arguments):

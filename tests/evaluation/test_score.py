@@ -8,12 +8,13 @@ import math
 import numpy as np
 import pytest
 import yaml
+from support.room_log import write_building
 
 import gpusense as gs
 from gpusense.commands.cli import main
 from gpusense.commands.parameter_files import read_localization
 from gpusense.evaluation import log_steps, scoring
-from gpusense.evaluation.worlds import building, free_pose, simulate_scan
+from gpusense.evaluation.worlds import building
 
 
 def score(log_p, poses=None):
@@ -76,18 +77,8 @@ def test_cloud_is_the_pose_its_surroundings_and_the_free_cells():
 def recorded(tmp_path_factory):
     """Write a map of a building and a CARMEN log of eight scans in it."""
     folder = tmp_path_factory.mktemp("recorded")
-    grid = building(2, (14.0, 12.0))
-    gs.write_map(grid, folder / "map.yaml")
-    scanner = gs.Scanner.uniform(angle_min=-math.pi / 2, angle_increment=math.pi / 60, count=61, range_max=10.0)
-    random = np.random.default_rng(4)
     parameters = gs.BeamParameters(z_hit=0.9, z_short=0.02, z_max=0.04, z_rand=0.04, sigma_hit=0.03)
-    lines = []
-    for i in range(8):
-        x, y, theta = free_pose(grid, random)
-        ranges = simulate_scan(grid, scanner, (x, y, theta), parameters, random)
-        readings = " ".join(f"{z:.4f}" for z in np.where(np.isfinite(ranges), ranges, 10.0))
-        lines.append(f"FLASER 61 {readings} {x} {y} {theta} {x} {y} {theta} {i}.0 host {i}.0")
-    (folder / "run.log").write_text("\n".join(lines) + "\n")
+    write_building(folder, 8, 61, parameters)
     return folder
 
 

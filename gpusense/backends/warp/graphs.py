@@ -60,27 +60,19 @@ class GraphCache:
 
     def start(self, steps: list[Step]) -> None:
         """Start the steps of a call in their order."""
-        if len(steps) < 2:
-            reason = SHORT
-        elif len(steps) > _MOST_STEPS:
-            reason = f"a call of more than {_MOST_STEPS} launches and copies gains nothing by a graph"
-        elif self.refusal and not self._graphs:
-            reason = self.refusal
-        else:
+        if 1 < len(steps) <= _MOST_STEPS and (self._graphs or not self.refusal):
             key = tuple([step.key for step in steps])
             # A graph must not be started by two threads at once.
             with self._lock:
                 self._calls += 1
                 graph, _ = self._graphs.pop(key, (None, 0))
-                reason = ""
                 if graph is None:
-                    graph, reason, _ = self._captured(key, steps)
+                    graph = self._captured(key, steps)
                 if graph is not None:
                     _remember(self._graphs, key, (graph, self._calls), _MOST_GRAPHS)
                     wp.capture_launch(graph)
                     return
                 _remember(self._seen, key, None, _MOST_SEEN)
-        _note(steps, one_by_one, reason)
         for step in steps:
             step.replay()
 
@@ -91,20 +83,14 @@ class GraphCache:
         with self._lock:
             return self._capture(steps)
 
-    def _captured(self, key: Hashable, steps: list[Step]) -> Capture:
-        """Capture a call that was started before and has no graph."""
-        if self._seen.pop(key, key) is not None:
-            return Capture(None, FIRST)
-        if key in self._refused:
-            return Capture(None, self._refused[key], True)
-        if not self._has_room():
-            return Capture(None, f"{_MOST_GRAPHS} other calls have graphs that are in use")
+    def _captured(self, key: Hashable, steps: list[Step]) -> Any:
+        """Return a graph of a call that was started before; None where there is none."""
+        if self._seen.pop(key, key) is not None or key in self._refused or not self._has_room():
+            return None
         capture = self._capture(steps)
         if capture.final:
             _remember(self._refused, key, capture.reason, _MOST_SEEN)
-        if capture.graph is not None:
-            _note(steps, as_graph)
-        return capture
+        return capture.graph
 
     def _has_room(self) -> bool:
         """Return whether another graph may be kept."""
@@ -152,15 +138,6 @@ class GraphCache:
         return Capture(None, reason, True)
 
 
-def _note(steps: list[Step], words: Callable[..., str], *reason: str) -> None:
-    """Let steps that report it note how their call is started."""
-    listeners = [step for step in steps if step.reports]
-    if listeners:
-        started = words(steps, *reason)
-        for step in listeners:
-            step.note(started)
-
-
 def _other_threads() -> list[str]:
     """Return the names of threads that may wait for the device."""
     this = threading.current_thread()
@@ -180,7 +157,6 @@ def _remember(entries: dict[Hashable, Any], key: Hashable, value: Any, most: int
 class WarpRecording(Recording, Step):
     """Launches of a program, one step of a batch."""
 
-    reports = True
     _numbers = itertools.count()
 
     def __init__(self, device: wp.Device, graphs: GraphCache, steps: list[Step]) -> None:
@@ -204,9 +180,6 @@ class WarpRecording(Recording, Step):
 
     def replay(self) -> None:
         self()
-
-    def note(self, started: str) -> None:
-        self._started = started
 
     def explain(self) -> str:
         return self._started

@@ -99,7 +99,6 @@ class Step(ABC):
     key: Hashable  # the work and its memory: steps of equal keys are the same
     launches: int = 0  # number of launches in it
     copies: int = 0  # number of copies in it
-    reports: bool = False  # true if it reports how the call with it is started
 
     @abstractmethod
     def start(self, stream: wp.Stream | None) -> None:
@@ -108,9 +107,6 @@ class Step(ABC):
     def replay(self) -> None:
         """Start it on the device's current stream, as a graph where it has one."""
         self.start(None)
-
-    def note(self, started: str) -> None:  # noqa: B027
-        """Note how the call with this step is started."""
 
 
 class Copy(Step):

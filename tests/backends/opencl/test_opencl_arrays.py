@@ -133,6 +133,29 @@ def test_arrays_of_a_memory_pool(as_gpu, queue, monkeypatch):
     assert differing(model.bind(one, ranges)().get(), model.log_likelihood(one, mixed(2)).get()) == 0
 
 
+@pytest.mark.parametrize("kind", MODELS)
+def test_ordinary_calls_whose_arrays_repeat_copy_none(kind, as_gpu, queue, there, monkeypatch):
+    """Arrays that are freed meanwhile, and whose places others take, change no result."""
+    model, plain = (kind(GRID, NEAR, backend=queue) for _ in range(2))
+    plain._short = None
+    poses, ranges, out = there(cloud(0)), there(mixed(0)), there(np.zeros(COUNT, np.float32))
+    copied, copy = [], as_gpu.copy
+    monkeypatch.setattr(as_gpu, "copy", lambda *given, **how: (copied.append(given), copy(*given, **how)))
+    for seed in range(6):
+        poses.set(cloud(seed))
+        ranges.set(mixed(seed))
+        assert model.log_likelihood(poses, ranges, out=out) is out
+        assert differing(out.get(), plain.log_likelihood(poses, mixed(seed)).get()) == 0
+    assert model._short.last is not None and not copied
+    del poses, ranges
+    for seed in range(12):
+        given = there(cloud(seed)), there(mixed(seed))
+        found = model.log_likelihood(*given)
+        assert differing(found.get(), plain.log_likelihood(*given).get()) == 0
+        del given
+        gc.collect()
+
+
 def test_arrays_in_shared_virtual_memory(queue):
     import pyopencl as cl
     import pyopencl.array
@@ -174,7 +197,8 @@ def test_an_error_leaves_no_verdict_behind(kind, queue, there, monkeypatch):
 
     for call in (lambda: model.log_likelihood(there(bad), scan(1)), lambda: several([model], there(bad), [scan(1)])):
         with monkeypatch.context() as patch:
-            patch.setattr(model._workspace, "wait", ends)
+            for name in ("read", "wait"):
+                patch.setattr(model._workspace, name, ends)
             with pytest.raises(KeyboardInterrupt):
                 call()
         assert differing(model.log_likelihood(there(poses), scan(1)).get(), expected) == 0

@@ -1,18 +1,10 @@
 """Judge the beams of a scan against the map at a pose: agreeing, too short, or through walls.
 
 Each judged beam is traced through the map with two diverging companion rays, so that a slightly wrong pose, the edge
-of a door or a grazed wall is no evidence. A beam
-
-- **agrees** if its reading is between the walls of the three rays, within a tolerance;
-- **passes through** if all three meet a wall well before the reading: no person or box lengthens a beam;
-- is **short** if it ends in mapped free space and no ray has met a wall: people, furniture, or a wrong pose;
-- is **no** evidence if unknown cells or the map's edge come first, if the rays contradict each other, or without a
-  reading.
-
-The walk needs only grid and pose, and costs the same for every model: a few thousand look-ups per scan, on the map's
-device or on the host. A diagonal pair of walls stops a ray, as in the casters. The kernel ``judge_beams`` reads pose
-and covariance from the results of ``finish_estimate``, so that its launch can follow a correction's estimate at once,
-and one copy reads both.
+of a door or a grazed wall is no evidence. ``docs/background/localization.md`` defines the classes. The walk needs only
+grid and pose, and costs the same for every model: a few thousand look-ups per scan. The kernel ``judge_beams`` reads
+pose and covariance from the results of ``finish_estimate``, so that its launch can follow a correction's estimate at
+once, and one copy reads both.
 """
 
 from __future__ import annotations

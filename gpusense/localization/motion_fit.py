@@ -1,23 +1,17 @@
 """Fit the noise of the odometry model to a log with reference poses, by maximum likelihood with weak priors.
 
-The difference between reference and odometry over a step is, to first order, normal: (along, across, heading) = (noise
-of the translation, trans * noise of the first turn + sideways noise, noise of both turns). Between distant references
-it is the sum of the errors of all steps, each carried to the end of the gap: a turn displaces the end by the angle
-times its distance. The covariance is therefore a sum of variances times matrices of the path. A Student t density with
-4 degrees of freedom prevents single slips from inflating the noise of all steps. The probability of a reverse comes
-from the number of steps that fit better with a reversed translation. Since a filter draws normal noise, the variances
-are multiplied by the mean square of standardised errors, each at most 9.
+The difference between reference and odometry over a step is, to first order, normal. Between distant references it is
+the sum of the errors of all steps, each carried to the end of the gap: a turn displaces the end by the angle times its
+distance. The covariance is therefore a sum of variances times matrices of the path. A Student t density with 4 degrees
+of freedom prevents single slips from inflating the noise of all steps, but a filter draws normal noise, so the
+variances are multiplied by the mean square of standardised errors, each at most 9.
 
-An odometer's errors repeat from step to step (a wheel's radius, a slope), while a filter draws new noise at each step.
-Their constant part is also fitted (on the intel log 3 degrees a metre). The variances of the rest are multiplied by 1 +
-2 sum rho_l, if significant: the autocorrelation rho_l of standardised errors inflates the variance of a sum.
+An odometer's errors repeat from step to step (a wheel's radius, a slope). Their constant part is also fitted, and the
+variances of the rest are multiplied by 1 + 2 sum rho_l, the autocorrelation of standardised errors, if significant.
 
-A log may leave variances undetermined: a robot that never turned reveals nothing about the noise of turns. The
-logarithm of each variance has a normal prior around the default, with a deviation of a factor of ten. A variance
-without data keeps the default; a variance determined by 100 steps moves by 2 % of the distance to the default. The
+The logarithm of each variance has a normal prior around the default, with a deviation of a factor of ten. The
 covariance of the logarithms is (I + 1 / prior variance)^-1, with the Fisher information I of the t density (Lange,
-Little and Taylor 1989). A variance is determined if the data at least halve the prior's deviation. An undetermined
-variance, including its inflation, is at most the default.
+Little and Taylor 1989). A variance is determined if the data at least halve the prior's deviation.
 """
 
 from __future__ import annotations

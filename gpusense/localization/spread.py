@@ -1,17 +1,9 @@
 """Compute the probability that a pose is far off, its word, and the protection level of a position.
 
-The protection level is a radius that the error exceeds with at most a stated probability, the risk. Let p_lost be the
-probability that the pose is lost. The protection level is the smallest r with
-
-    p_lost + (1 - p_lost) P(|error| > r | not lost) <= risk
-
-(Joerger and others, "Integrity monitoring of localization systems", *Sensors* 18(8), 2018, 2740, use the same terms).
-P comes from a normal density with the covariance of the position, and from the distances of spread-out particles. If
-the localiser states no covariance, it comes from the last scan: the likelihoods of poses around the pose, up to the
-errors of a lost one, with the temperature of ten independent beams.
-
-Errors of filters have longer tails than the particles, and the walls of a map are off by about a cell. So the radius is
-multiplied by a factor, and a margin is added; both were measured on logs.
+The protection level is a radius that the error exceeds with at most a stated probability, the risk (Joerger and others,
+"Integrity monitoring of localization systems", *Sensors* 18(8), 2018, 2740). Errors of filters have longer tails than
+the particles, and the walls of a map are off by about a cell. So the radius is multiplied by a factor, and a margin is
+added; both were measured on logs.
 """
 
 from __future__ import annotations

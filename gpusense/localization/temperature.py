@@ -2,29 +2,19 @@
 
 The product over a scan's beams treats them as independent, but an error of the map, or a person, changes many
 neighbours. Let s_k be the score of beam k, the gradient of its log-likelihood with respect to the pose, H the sum of
-the negative second derivatives, and J the variance of the sum of the s_k. A likelihood has J = H (Bartlett's second
-identity). At the temperature T, T^2 J = T H on average, so T = tr(P H) / tr(P J) (Pauli, Racugno and Ventura, "Bayesian
-composite marginal likelihoods" (2011); Ribatet, Cooley and Davison, "Bayesian inference from composite likelihoods"
-(2012)). P is the covariance of the pose, which gives uncertain directions more weight.
+the negative second derivatives, J the variance of the sum of the s_k, and P the covariance of the pose. A likelihood
+has J = H (Bartlett's second identity), so T = tr(P H) / tr(P J) (Pauli, Racugno and Ventura, "Bayesian composite
+marginal likelihoods" (2011); Ribatet, Cooley and Davison, "Bayesian inference from composite likelihoods" (2012)).
 
-J is measured. B, the sum of s_k s_k', is the variance for independent beams. Blocks of neighbours with scores g_b and
-sums B_b have the variance B_b under independence. A fit to the scan removes B_b B^-1 of the sum of all scores from
-each, and leaves B_b - B_b B^-1 B_b. The ratio F_n of the measured variance to this value, for n blocks, is 1 for
-independent beams at any n; for a correlation shorter than a block it is the inflation of the variance. Four blocks are
-the longest blocks that leave a degree of freedom.
+J is measured over blocks of neighbours, whose scores g_b lose B_b B^-1 of the sum of all scores to a fit of the scan: B
+is the sum of s_k s_k', B_b that of a block, which leaves B_b - B_b B^-1 B_b for independent beams. F_n is the ratio of
+the measured variance of n blocks to that. Errors of maps are correlated over any length (aggregated variance: Beran,
+*Statistics for Long-Memory Processes* (1994), section 4.4), so let the inflations of sixteenths, quarters and the whole
+be V, x V and x^2 V. The fit removes the part common to all blocks: F_16 = (V - x^2 V / 16) / (1 - 1 / 16) and F_4 = (x V
+- x^2 V / 4) / (1 - 1 / 4). With R = F_4 / F_16, at most 5/3, x is 4 R / (5 - R), and x^2 V = F_4 3 R / (5 - 2 R).
 
-Errors of maps are correlated over any length, so that the variance grows further from blocks to the whole scan. Let it
-grow by a factor x whenever blocks become four times as long (method of aggregated variance: Beran, *Statistics for
-Long-Memory Processes* (1994), section 4.4). The fit removes the part common to all blocks. The inflations V, x V and
-x^2 V of sixteenths, quarters and the whole are therefore observed as F_16 = (V - x^2 V / 16) / (1 - 1 / 16) and F_4 =
-(x V - x^2 V / 4) / (1 - 1 / 4).
-
-Let R = F_4 / F_16. Then x is 4 R / (5 - R), and the inflation of the whole x^2 V = F_4 3 R / (5 - 2 R): F_4 for R = 1.
-R is limited to 5/3, where sums over n beams have the variance n^1.5; beyond, the fit hides most of the errors.
-
-Errors that repeat from scan to scan add up in a filter. Let r be the correlation of blocks' scores at the same
-direction in consecutive scans, and f the share of information that the filter keeps. Errors have (1 + r f) / (1 - r f)
-times the variance of independent errors; the inverse is the second factor of the temperature.
+Errors that repeat from scan to scan, with a correlation r in the same direction and a share f of information that the
+filter keeps, have (1 + r f) / (1 - r f) times the variance; the inverse is the second factor of the temperature.
 """
 
 from __future__ import annotations

@@ -101,21 +101,16 @@ def clustered(poses: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.nd
     """Return mean and covariance of the heaviest cluster of touching bins, of (N, 3) poses and (N,) weights."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
 
     turns = round(2 * np.pi / _BIN_TURN)
     cells = np.floor(poses[:, :2] / _BIN).astype(np.int64)
     heading = np.floor(wrap_angle(poses[:, 2]) / (2 * np.pi) * turns).astype(np.int64) % turns
     bins, member = np.unique(np.column_stack([cells, heading]), axis=0, return_inverse=True)
     member = member.reshape(-1)
-    places = {tuple(one): i for i, one in enumerate(bins.tolist())}
-    offsets = [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]
-    pairs = [
-        (a, places[key])
-        for (x, y, t), a in places.items()
-        for i, j, k in offsets
-        if (key := (x + i, y + j, (t + k) % turns)) in places
-    ]
-    rows, columns = np.array(pairs).T
+    # Headings are periodic.
+    pairs = cKDTree(bins, boxsize=(0, 0, turns)).query_pairs(1.0, p=np.inf, output_type="ndarray")
+    rows, columns = pairs.T
     touching = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(bins), len(bins)))
     label = connected_components(touching, directed=False)[1][member]
     chosen = label == np.argmax(np.bincount(label, weights))

@@ -10,8 +10,8 @@ J is measured over blocks of neighbours, whose scores g_b lose B_b B^-1 of the s
 is the sum of s_k s_k', B_b that of a block, which leaves B_b - B_b B^-1 B_b for independent beams. F_n is the ratio of
 the measured variance of n blocks to that. Errors of maps are correlated over any length (aggregated variance: Beran,
 *Statistics for Long-Memory Processes* (1994), section 4.4), so let the inflations of sixteenths, quarters and the whole
-be V, x V and x^2 V. The fit removes the part common to all blocks: F_16 = (V - x^2 V / 16) / (1 - 1 / 16) and F_4 = (x V
-- x^2 V / 4) / (1 - 1 / 4). With R = F_4 / F_16, at most 5/3, x is 4 R / (5 - R), and x^2 V = F_4 3 R / (5 - 2 R).
+be V, x V and x^2 V. The fit removes the part common to all blocks: F_16 = (V - x^2 V / 16) / (1 - 1 / 16) and F_4 =
+(x V - x^2 V / 4) / (1 - 1 / 4). With R = F_4 / F_16, at most 5/3, x is 4 R / (5 - R), and x^2 V = F_4 3 R / (5 - 2 R).
 
 Errors that repeat from scan to scan, with a correlation r in the same direction and a share f of information that the
 filter keeps, have (1 + r f) / (1 - r f) times the variance; the inverse is the second factor of the temperature.

@@ -161,6 +161,16 @@ def draw_pose(ax: Axes, pose: ArrayLike, *, length: float, colour: str = ROBOT) 
                 markeredgewidth=width, linestyle="none", zorder=7)  # fmt: skip
 
 
+def draw_ellipse(ax: Axes, xy: ArrayLike, covariance: NDArray[np.float64], deviations: float, **style: Any) -> None:
+    """Draw the ellipse of some standard deviations of a (2, 2) covariance around a point."""
+    from matplotlib.patches import Ellipse
+
+    values, axes = np.linalg.eigh(covariance)
+    width, height = 2 * deviations * np.sqrt(np.maximum(values, 0.0))
+    angle, (x, y) = math.degrees(math.atan2(axes[1, 0], axes[0, 0])), np.asarray(xy, np.float64)
+    ax.add_patch(Ellipse((float(x), float(y)), width, height, angle=angle, fill=False, **style))
+
+
 def add_legend(ax: Axes, columns: int = 4) -> None:
     """Draw the legend below an axes, where it hides nothing.
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense._util.typing import Floats
-from gpusense.plots.drawing import BEAM, FRAME, OCCUPIED, ROBOT, colours, draw_pose
+from gpusense.plots.drawing import BEAM, FRAME, OCCUPIED, ROBOT, colours, draw_ellipse, draw_pose
 from gpusense.positions.fix import PositionFix
 from gpusense.positions.problem import Problem, make_problem
 
@@ -192,8 +192,6 @@ def draw_fix(ax: Axes, fix: PositionFix, *, length: float = 0.0, ellipses: bool 
         >>> fix = gs.trilaterate([(0.0, 0.0), (4.0, 0.0)], [2.5, 2.5], sigma=0.1)
         >>> gs.plots.draw_fix(gs.plots.new_figure(6.0, 4.0).subplots(), fix)
     """
-    from matplotlib.patches import Ellipse
-
     for solution, covariance in zip(fix.solutions, fix.covariance, strict=True):
         if not ellipses:
             heading = solution[2] if len(solution) == 3 else 0.0
@@ -201,11 +199,7 @@ def draw_fix(ax: Axes, fix: PositionFix, *, length: float = 0.0, ellipses: bool 
             continue
         ax.plot(*solution[:2], marker="o", markersize=5, color=ROBOT, markeredgecolor="white", zorder=7)
         if np.isfinite(covariance).all():
-            values, axes = np.linalg.eigh(covariance[:2, :2])
-            width, height = 2 * SIGMAS_95 * np.sqrt(np.maximum(values, 0.0))
-            angle = math.degrees(math.atan2(axes[1, 0], axes[0, 0]))
-            at = (solution[0], solution[1])
-            ax.add_patch(Ellipse(at, width, height, angle=angle, fill=False, color="white", linewidth=1.6, zorder=5))
+            draw_ellipse(ax, solution[:2], covariance[:2, :2], SIGMAS_95, color="white", linewidth=1.6, zorder=5)
 
 
 def draw_position_density(

@@ -20,6 +20,7 @@ from gpusense.plots.drawing import (
     VERDICTS,
     add_colour_bar,
     add_legend,
+    draw_ellipse,
     draw_map,
     end_points,
     new_figure,
@@ -127,21 +128,12 @@ def chain_figure(grid: OccupancyGrid, chain: ScanChain) -> Figure:
         ax.plot(part[:, 0], part[:, 1], "-", color=DOUBTED, lw=2.2, label="" if number else "doubtful")
     for number, k in enumerate(chain.keys[:: max(len(chain.keys) // _ELLIPSES, 1)]):
         label = "" if number else "one deviation, from the first pose"
-        _ellipse(ax, poses[k], chain.covariance[k, :2, :2], float(np.ptp(poses[:, :2], axis=0).max()), label)
+        draw_ellipse(ax, poses[k, :2], chain.covariance[k, :2, :2], 1.0, color=PATH, lw=0.5, alpha=0.7, label=label)
     ax.set(xlabel="x [m]", ylabel="y [m]")
     doubts = f"DOUBTFUL in {len(chain.doubts)} places" if chain.doubts else "CONSISTENT"
     ax.set_title(f"{doubts}: {len(poses)} scans, {len(chain.corrections)} closures", loc="left")
     add_legend(ax, 5)
     return figure
-
-
-def _ellipse(ax: object, pose: np.ndarray, covariance: np.ndarray, largest: float, label: str) -> None:
-    """Draw an ellipse of one deviation, no larger than the trajectory."""
-    values, vectors = np.linalg.eigh(covariance)
-    axes = np.minimum(np.sqrt(np.maximum(values, 0.0)), max(largest, 1e-3))
-    t = np.linspace(0, 2 * np.pi, 37)
-    x, y = pose[:2, None] + vectors @ (axes[:, None] * np.stack([np.cos(t), np.sin(t)]))
-    ax.plot(x, y, "-", color=PATH, lw=0.5, alpha=0.7, label=label)  # type: ignore[attr-defined]
 
 
 def match_figure(

@@ -58,18 +58,14 @@ class Recording:
 
     def add(self, pf: ParticleFilter, track: Track, step: Step) -> None:
         """Record the last scan of a track."""
-        rr, pose = self._rr, track.poses[-1]
-        self._stream.set_time("scan", sequence=step.index)
-        cloud = pf.host_particles()
+        pose, error, cloud = track.poses[-1], math.nan, pf.host_particles()
+        if step.reference is not None:
+            error = float(np.hypot(*(pose[:2] - step.reference[:2])))
+        self._scan(step.index, step.scan, pose, "estimate", error=error, effective_sample_size=track.sizes[-1],
+                   p_lost=track.p_lost[-1])  # fmt: skip
         self._points("particles", cloud[:: max(len(cloud) // _PARTICLES, 1), :2], _CLOUD, 0.02)
-        self._points("scan", end_points(step.scan.ranges, step.scan.scanner, pose), _SCAN, 0.03)
-        self._arrow("estimate", pose, _ESTIMATE)
         if step.reference is not None:
             self._arrow("reference", np.array(step.reference), _REFERENCE)
-            error = float(np.hypot(*(pose[:2] - step.reference[:2])))
-            self._stream.log("error", rr.Scalars(error))
-        self._stream.log("effective_sample_size", rr.Scalars(track.sizes[-1]))
-        self._stream.log("p_lost", rr.Scalars(float(track.p_lost[-1])))
 
     def write(self, track: Track, path: Path) -> None:
         """Write the recording atomically as a file .rrd."""
@@ -81,19 +77,23 @@ class Recording:
 
     def write_judgement(self, found: Judgement, scans: Sequence[Scan], path: Path) -> None:
         """Write a judgement of N poses by N scans atomically as a file .rrd."""
-        rr = self._rr
-        for k, scan in enumerate(scans):
-            self._stream.set_time("scan", sequence=int(found.index[k]))
-            self._points("scan", end_points(scan.ranges, scan.scanner, found.poses[k]), _SCAN, 0.03)
-            self._arrow("pose", found.poses[k], _ESTIMATE)
-            for name, values in (("p_lost", found.p_lost), ("explained", found.explained), ("radius", found.radii)):
-                if math.isfinite(values[k]):
-                    self._stream.log(name, rr.Scalars(float(values[k])))
+        columns = (found.index.tolist(), scans, found.poses, found.p_lost, found.explained, found.radii)
+        for index, scan, pose, p_lost, explained, radius in zip(*columns, strict=True):
+            self._scan(index, scan, pose, "pose", p_lost=p_lost, explained=explained, radius=radius)
         for one in found.stretches:
             if one.place is not None and math.isfinite(one.off):
                 self._stream.set_time("scan", sequence=int(found.index[one.first]))
                 self._arrow("likeliest_place", one.place.pose, _REFERENCE)
         self._write([("path/poses", found.poses, _ESTIMATE)], path)
+
+    def _scan(self, index: int, scan: Scan, pose: NDArray[np.float64], name: str, **numbers: float) -> None:
+        """Record a scan at a pose, with the finite ones of some numbers."""
+        self._stream.set_time("scan", sequence=index)
+        self._points("scan", end_points(scan.ranges, scan.scanner, pose), _SCAN, 0.03)
+        self._arrow(name, pose, _ESTIMATE)
+        for key, number in numbers.items():
+            if math.isfinite(number):
+                self._stream.log(key, self._rr.Scalars(float(number)))
 
     def _write(self, paths: Sequence[tuple[str, NDArray[np.float64], tuple[int, ...]]], path: Path) -> None:
         for name, poses, colour in paths:

@@ -227,7 +227,7 @@ def test_a_run_is_recorded_for_the_viewer(place, capsys, monkeypatch, tmp_path):
     assert cli.main(call(place, "--limit", "3", "--record", str(path))) == 0
     assert f"written    {path}; open it with: rerun {path}" in capsys.readouterr().out
     names = path.read_text().split()
-    each = ["particles", "scan", "estimate", "reference", "error", "effective_sample_size", "p_lost"]
+    each = ["scan", "estimate", "error", "effective_sample_size", "p_lost", "particles", "reference"]
     assert names == ["map", *each * 3, "path/estimate", "path/reference"]
     assert streams[0].times == [("scan", k) for k in range(3)]
     kept = dict(streams[0].logged)

@@ -34,9 +34,9 @@ _MOST_SUMS = {"cpu": 1 << 29, "gpu": 1 << 32}
 # Room at first for chosen blocks of a scan, room for their parts on each level by kind of device, a sixteenth of which
 # each scan adds, and most poses that are kept of a scan.
 _ROOM, _PARTS, _MOST_KEPT = 1 << 17, {"cpu": 1 << 18, "gpu": 1 << 20}, 1 << 18
-# Most items of several scans that are searched together, since some drivers allow 65535 groups along the last axis, and
-# most blocks whose bounds are kept, by kind of device.
-_MOST_ITEMS, _MOST_BLOCKS = 1 << 15, {"cpu": 1 << 25, "gpu": 1 << 27}
+# Most items of several scans that are searched together, since some drivers allow 65535 groups along the last axis;
+# most blocks whose bounds are kept, by kind of device, and bytes of a device's memory for each of them.
+_MOST_ITEMS, _MOST_BLOCKS, _MEMORY = 1 << 15, {"cpu": 1 << 25, "gpu": 1 << 29}, 64
 # Poses of a scan that are read together with their number; by kind of device, work-items that divide blocks, and the
 # neighbouring blocks that each of them takes at a time.
 _READ, _WORKERS = 512, {"gpu": (1 << 17, 1), "cpu": (1 << 10, 64)}
@@ -77,7 +77,9 @@ class Search:
         masks, slacks = self.masks(grid, allowed), np.broadcast_to(slack, scans)
         turns = grid.headings.shape[1]
         blocks = turns * -(-grid.height >> level) * -(-grid.width >> level)
-        each = max(min(_MOST_ITEMS // turns, _MOST_BLOCKS[self.tables.backend.info.kind] // blocks), 1)
+        info = self.tables.backend.info
+        most = min(_MOST_BLOCKS[info.kind], info.memory // _MEMORY)
+        each = max(min(_MOST_ITEMS // turns, most // blocks), 1)
         found = []
         for part in (slice(begin, begin + each) for begin in range(0, scans, each)):
             some = PoseGrid(grid.start[part], grid.headings[part], grid.height, grid.width)
@@ -222,16 +224,9 @@ class _Run:
         self._maxima = self._space.empty("line maxima", 2 * lines, _INT)
         self._shift = max((TOP * self._most).bit_length() - BINS.bit_length() + 1, 0)
         self._launch(
-            "line_maxima",
-            (lines,),
-            self._score,
-            self._maxima,
-            self._histogram,
-            *self._lines,
-            self._turns,
-            self._shift,
+            "line_maxima", (lines,), self._score, self._maxima, self._histogram, *self._lines, self._turns, self._shift,
             flags=self._ahead,
-        )
+        )  # fmt: skip
 
     def _quarters(self, level: int) -> tuple[tuple[Any, ...], ScoreTable, tuple[int, int]]:
         """Return quarters and end points of a level, the tables' sizes, and the cells between 2^n positions with n."""

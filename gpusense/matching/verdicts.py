@@ -15,7 +15,6 @@ neighbouring places and of places without anything in common; right and wrong po
 
 from __future__ import annotations
 
-import bisect
 import functools
 import itertools
 import math
@@ -248,26 +247,9 @@ def noise_of(ratio: Column) -> tuple[Column, Column]:
     ``ratio`` (S,) is the sum of w e^2 over the sum of w, for errors in scales, and weights (1 / (1 + e^2))^2.
     Deviations are at most 2; the factor of the inverse of the sum of w J J' is E[w] E[w^2 e^2] / E[d(w e)/de]^2.
     """
-    if isinstance(ratio, np.ndarray):
-        known, sigma, factor = _noise_table()
-        return np.interp(ratio, known, sigma), np.interp(ratio, known, factor)
-    return _between(float(ratio))
-
-
-def _between(ratio: float) -> tuple[float, float]:
-    """Return the numbers of ``noise_of`` for one ratio, with the bits of ``numpy.interp``."""
-    known, sigma, factor = _noise_lists()
-    if not ratio < known[-1]:
-        return (sigma[-1], factor[-1]) if ratio == ratio else (ratio, ratio)
-    k = max(bisect.bisect_right(known, ratio) - 1, 0)
-    off, step = larger(ratio - known[k], 0.0), known[k + 1] - known[k]
-    return (sigma[k + 1] - sigma[k]) / step * off + sigma[k], (factor[k + 1] - factor[k]) / step * off + factor[k]
-
-
-@functools.cache
-def _noise_lists() -> list[list[float]]:
-    """Return the ratios, deviations and factors as Python's numbers."""
-    return [column.tolist() for column in _noise_table()]
+    known, sigma, factor = _noise_table()
+    deviation, whole = np.interp(ratio, known, sigma), np.interp(ratio, known, factor)
+    return (deviation, whole) if isinstance(ratio, np.ndarray) else (float(deviation), float(whole))
 
 
 @functools.cache

@@ -52,6 +52,11 @@ class Folded(NamedTuple):
     quarters_shape: ScoreTable  # their sizes
 
 
+def cells_of(shape: ScoreTable) -> int:
+    """Return the cells of one table with its margins."""
+    return (shape.cols + 2 * shape.margin) * (shape.rows + 2 * shape.margin)
+
+
 def _launched(shape: ScoreTable) -> tuple[int, int, int]:
     """Return the columns, rows and number of tables with their margins."""
     return shape.cols + 2 * shape.margin, shape.rows + 2 * shape.margin, shape.tables

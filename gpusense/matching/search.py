@@ -19,7 +19,7 @@ from gpusense.backends.workspace import Workspace
 from gpusense.interface.flags import flags_if
 from gpusense.interface.structs import ScoreTable
 from gpusense.matching.pose_grid import Found, PoseGrid
-from gpusense.matching.score_tables import RUN, SHIFT_ROWS, TOP, ScoreTables
+from gpusense.matching.score_tables import RUN, SHIFT_ROWS, TOP, ScoreTables, cells_of
 
 __all__ = ["Found", "PoseGrid", "Search"]
 
@@ -170,10 +170,12 @@ class _Run:
         if len(given) < len(_GIVEN):
             inputs.append(there.empty("table 0", total, _INT, zero=True))
         made = [there.empty(name, size * total, _INT) for name, size in _MADE.items()]
+        folded = tables.folded(self._level)
         workers = self._most if backend.info.kind == "gpu" else 1
         backend.compile("place_ends", self._ahead)(
             (workers, self._items), *inputs, *made, self._items, self._turns, tables.stride, self._level,
-            tables.step(self._level).bit_length() - 1, tables.shape.margin, workers,
+            tables.step(self._level).bit_length() - 1, tables.shape.margin, workers, cells_of(tables.shape),
+            cells_of(folded.shape), cells_of(folded.quarters_shape),
         )  # fmt: skip
         if there is not space:
             inputs, made = ([space.upload(name, array) for name, array in zip(names, arrays, strict=True)]

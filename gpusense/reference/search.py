@@ -7,9 +7,9 @@ of all scores in the square (Hess et al., Real-time loop closure in 2D lidar SLA
 integers, so a bound is never below a score that it bounds.
 
 Tables are consecutive, each with a margin of cells around the map. An item is a scan at a heading; its points are
-first[item] to first[item + 1] - 1, each of which names the table (image) that it reads. A folded table holds every
-period-th cell of a table as a separate image: shifts by whole periods read neighbours. It holds losses: the largest
-score less the cell's, divided by a unit and rounded down, so that losses of several points fit a byte.
+first[item] to first[item + 1] - 1, each of which has the first cell of the table (image) that it reads. A folded table
+holds every period-th cell of a table as a separate image: shifts by whole periods read neighbours. It holds losses: the
+largest score less the cell's, divided by a unit and rounded down, so that losses of several points fit a byte.
 """
 
 from __future__ import annotations
@@ -93,11 +93,10 @@ def divided(
     scores: ScoreTable, spacing: int, shift: int,
 ) -> np.ndarray:  # fmt: skip
     """Return the scores (M, 4) of the quarters of blocks (M, 4): score less the losses of the item's points."""
-    size = padded_lines(scores) * padded_stride(scores)
     total = np.empty((len(block), 4), np.int32)
     for item in np.unique(block[:, 0]):
         points = slice(first[item], first[item + 1])
-        begin = image[points].astype(np.int64) * size
+        begin = image[points].astype(np.int64)
         mine = np.flatnonzero(block[:, 0] == item)
         step = max(_BLOCK // max(len(begin), 1), 1)
         for chosen in (mine[i : i + step] for i in range(0, len(mine), step)):
@@ -122,13 +121,12 @@ def shift_scores(flags, table, point, image, first, allowed, score, scores, item
 
     A shift that is not allowed has -1.
     """
-    size = padded_lines(scores) * padded_stride(scores)
     total = score[: items * height * width].reshape(items, height, width)
     rows, cols = np.arange(height)[:, None], np.arange(width)[None, :]
     for item in range(items):
         total[item] = TOP * (first[item + 1] - first[item])
         for k in range(first[item], first[item + 1]):
-            cells = table[int(image[k]) * size + cell_index(scores, point[k, 1] + rows, point[k, 0] + cols)]
+            cells = table[int(image[k]) + cell_index(scores, point[k, 1] + rows, point[k, 0] + cols)]
             total[item] -= unit * (cells & 255)
     total[:, allowed[: height * width].reshape(height, width) == 0] = -1
 

@@ -6,6 +6,7 @@ import numpy as np
 def place_ends(
     flags, end, heading, start, first, image, point, folded, bound_image, quarter_image, items, turns, stride, level,
     step_level, offset, workers,
+    size, bound_size, quarter_size,
 ):  # fmt: skip
     """Place the end points of scans at headings in cells of the tables, and in cells and images of folded tables."""
     period, side = stride << level, stride << (level - step_level)
@@ -20,7 +21,8 @@ def place_ends(
         point[at:last] = cells
         folded[at:last] = (cells + offset) // period
         phase = cells + offset - folded[at:last] * period
-        for images, count, (col, row) in (
-            (bound_image, side, (phase >> step_level).T), (quarter_image, period, phase.T)
+        for images, count, cells, (col, row) in (
+            (bound_image, side, bound_size, (phase >> step_level).T), (quarter_image, period, quarter_size, phase.T)
         ):  # fmt: skip
-            images[at:last] = (image[at:last] * count + row) * count + col
+            images[at:last] = cells * ((image[at:last] * count + row) * count + col)
+        image[at:last] *= size

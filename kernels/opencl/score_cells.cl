@@ -18,9 +18,8 @@ int padded_stride(const ScoreTable scores) { return scores.cols + 2 * scores.mar
 // the margin have the value of the margin's outer cells.
 int block_index(const ScoreTable scores, const int row, const int col, const int rows, const int cols) {
     // Comparisons, since PoCL compiles min and max as calls.
-    const int low = -scores.margin, last_line = scores.rows + scores.margin - 1 - rows;
-    const int last_col = scores.cols + scores.margin - 1 - cols;
-    const int line = (row < low ? low : row > last_line ? last_line : row) + scores.margin;
-    const int begin = (col < low ? low : col > last_col ? last_col : col) + scores.margin;
-    return line * padded_stride(scores) + begin;
+    const int last_line = padded_lines(scores) - 1 - rows, last_col = padded_stride(scores) - 1 - cols;
+    const int line = row + scores.margin, begin = col + scores.margin;
+    return (line < 0 ? 0 : line > last_line ? last_line : line) * padded_stride(scores) +
+           (begin < 0 ? 0 : begin > last_col ? last_col : begin);
 }

@@ -6,7 +6,7 @@
 // a score that it bounds.
 //
 // Tables are consecutive, each with a margin of cells around the map. An item is a scan at a heading; its points are
-// first[item] to first[item + 1] - 1, each of which names the table (image) that it reads. A folded table holds every
+// first[item] to first[item + 1] - 1, each of which has the first cell of the table (image) that it reads. A folded table holds every
 // period-th cell of a table as a separate image: shifts by whole periods read neighbours. It holds losses: the largest score
 // less the cell's, divided by a unit and rounded down, so that losses of several points fit a byte.
 // requires: score_cells
@@ -96,7 +96,6 @@ kernel void fold_quarters(ARGUMENTS) {
 // other points are left out.
 int4 divided(global const int *quarters, global const int2 *point, global const int *image, const ScoreTable scores,
              const int begin, const int end, const int row, const int col, const int score, const int least) {
-    const int size = padded_lines(scores) * padded_stride(scores);
     int4 total = (int4)(score);
     for (int k = begin; k < end;) {
         const int stop = end - k > STEP ? k + STEP : end;
@@ -106,7 +105,7 @@ int4 divided(global const int *quarters, global const int2 *point, global const 
 #pragma unroll 8
 #endif
         for (; k < stop; ++k) {
-            const int four = quarters[image[k] * size + block_index(scores, point[k].y + row, point[k].x + col, 0, 0)];
+            const int four = quarters[image[k] + block_index(scores, point[k].y + row, point[k].x + col, 0, 0)];
             even += four & 0xff00ff;
             odd += four >> 8 & 0xff00ff;
         }
@@ -133,8 +132,7 @@ kernel void shift_scores(ARGUMENTS) {
     if (col >= width || row >= height || item >= items) return;
     int some = 0;
     for (int i = 0; i < SHIFT_ROWS && row + i < height; ++i) some |= allowed[(row + i) * width + col];
-    const int stride = padded_stride(scores), size = padded_lines(scores) * stride;
-    const int last = some ? first[item + 1] : first[item];
+    const int stride = padded_stride(scores), last = some ? first[item + 1] : first[item];
     int total[SHIFT_ROWS] = {0};
     for (int k = first[item]; k < last;) {
         const int stop = last - k > TOGETHER ? k + TOGETHER : last;
@@ -142,7 +140,7 @@ kernel void shift_scores(ARGUMENTS) {
         uint even[SHIFT_ROWS / 4] = {0}, odd[SHIFT_ROWS / 4] = {0};
         for (; k < stop; ++k) {
             global const int *cells =
-                table + image[k] * size + block_index(scores, point[k].y + row, point[k].x + col, SHIFT_ROWS - 1, 0);
+                table + image[k] + block_index(scores, point[k].y + row, point[k].x + col, SHIFT_ROWS - 1, 0);
             for (int i = 0; i < SHIFT_ROWS / 4; ++i) {
                 const uint four = cells[4 * i * stride];
                 even[i] += four & 0xff00ff;

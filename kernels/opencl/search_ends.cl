@@ -13,7 +13,7 @@ int cell_of(const double place) {
 }
 
 // Place the end points of a scan at a heading in cells of the tables, in cells of folded tables, and in the images of folded
-// bounds and of folded quarters. One work-item takes each workers-th point of an item.
+// bounds and of folded quarters, each by its first cell; numbers of tables become their first cells. One work-item takes each workers-th point of an item.
 kernel void place_ends(ARGUMENTS) {
     const int item = get_global_id(1);
     if (item >= items || get_global_id(0) >= workers) return;
@@ -27,6 +27,7 @@ kernel void place_ends(ARGUMENTS) {
     const int begin = first[item], last = first[item + 1];
     for (int k = begin, n = 0; k < last; ++k, ++n) {
 #endif
+        const int table = image[k];
         const double across = cosine * ends[2 * n] - sine * ends[2 * n + 1], along = sine * ends[2 * n] + cosine * ends[2 * n + 1];
         const int2 cell = (int2)(cell_of(x0 + across), cell_of(y0 + along));
         const int x = cell.x + offset, y = cell.y + offset;
@@ -34,7 +35,8 @@ kernel void place_ends(ARGUMENTS) {
         const int col = x - whole.x * period, row = y - whole.y * period;
         point[k] = cell;
         folded[k] = whole;
-        bound_image[k] = (image[k] * side + (row >> step_level)) * side + (col >> step_level);
-        quarter_image[k] = (image[k] * period + row) * period + col;
+        image[k] = size * table;
+        bound_image[k] = bound_size * ((table * side + (row >> step_level)) * side + (col >> step_level));
+        quarter_image[k] = quarter_size * ((table * period + row) * period + col);
     }
 }

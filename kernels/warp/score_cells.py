@@ -25,6 +25,6 @@ def padded_stride(scores: ScoreTable):
 @wp.func
 def block_index(scores: ScoreTable, row: wp.int32, col: wp.int32, rows: wp.int32, cols: wp.int32):
     """Return the index of a cell in its table, from which cells up to rows lines and cols columns further are read."""
-    line = wp.min(wp.max(row, -scores.margin), scores.rows + scores.margin - 1 - rows) + scores.margin
-    begin = wp.min(wp.max(col, -scores.margin), scores.cols + scores.margin - 1 - cols) + scores.margin
+    line = wp.min(wp.max(row + scores.margin, 0), padded_lines(scores) - 1 - rows)
+    begin = wp.min(wp.max(col + scores.margin, 0), padded_stride(scores) - 1 - cols)
     return line * padded_stride(scores) + begin

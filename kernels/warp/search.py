@@ -7,9 +7,9 @@ of all scores in the square (Hess et al., Real-time loop closure in 2D lidar SLA
 integers, so a bound is never below a score that it bounds.
 
 Tables are consecutive, each with a margin of cells around the map. An item is a scan at a heading; its points are
-first[item] to first[item + 1] - 1, each of which names the table (image) that it reads. A folded table holds every
-period-th cell of a table as a separate image: shifts by whole periods read neighbours. It holds losses: the largest
-score less the cell's, divided by a unit and rounded down, so that losses of several points fit a byte.
+first[item] to first[item + 1] - 1, each of which has the first cell of the table (image) that it reads. A folded table
+holds every period-th cell of a table as a separate image: shifts by whole periods read neighbours. It holds losses: the
+largest score less the cell's, divided by a unit and rounded down, so that losses of several points fit a byte.
 """
 
 import warp as wp
@@ -134,7 +134,6 @@ def divided(
     scores: ScoreTable, begin: wp.int32, end: wp.int32, row: wp.int32, col: wp.int32, score: wp.int32, least: wp.int32,
 ):  # fmt: skip
     """Return the scores of a block's quarters: score less the losses of points begin to end - 1."""
-    size = padded_lines(scores) * padded_stride(scores)
     total = wp.vec4i(score, score, score, score)
     k = int(begin)
     while k < end:
@@ -146,8 +145,7 @@ def divided(
             for i in range(AT_ONCE):
                 n = wp.min(k + i, stop - 1)
                 cell = cell_at(point, n)
-                begins = number_at(image, n) * size
-                four = number_at(quarters, begins + block_index(scores, cell.y + row, cell.x + col, 0, 0))
+                four = number_at(quarters, number_at(image, n) + block_index(scores, cell.y + row, cell.x + col, 0, 0))
                 if k + i >= stop:
                     four = int(0)
                 even = even + (four & 0xFF00FF)
@@ -186,7 +184,6 @@ def shift_scores(table, point, image, first, allowed, score, scores, items, heig
     for i in range(wp.min(SHIFT_ROWS, height - row)):
         some = some + int(allowed[(row + i) * width + col])
     stride = padded_stride(scores)
-    size = padded_lines(scores) * stride
     last = first[item]
     if some > 0:
         last = first[item + 1]
@@ -199,7 +196,7 @@ def shift_scores(table, point, image, first, allowed, score, scores, items, heig
         odd = wp.vec2i()
         while k < stop:
             cell = cell_at(point, k)
-            place = number_at(image, k) * size + block_index(scores, cell.y + row, cell.x + col, SHIFT_ROWS - 1, 0)
+            place = number_at(image, k) + block_index(scores, cell.y + row, cell.x + col, SHIFT_ROWS - 1, 0)
             for i in range(2):
                 four = number_at(table, place + 4 * i * stride)
                 even[i] = even[i] + (four & 0xFF00FF)

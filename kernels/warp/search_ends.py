@@ -19,6 +19,7 @@ def periods(cell: wp.int32, stride: wp.int32, level: wp.int32):
 def place_ends(
     end, heading, start, first, image, point, folded, bound_image, quarter_image, items, turns, stride, level,
     step_level, offset, workers,
+    size, bound_size, quarter_size,
 ):  # fmt: skip
     """Place the end points of a scan at a heading in cells of tables, and in cells and images of folded tables."""
     item, n = wp.tid()
@@ -43,5 +44,7 @@ def place_ends(
         row = y - whole.y * period
         point[k] = cell
         folded[k] = whole
-        bound_image[k] = (image[k] * side + (row >> step_level)) * side + (col >> step_level)
-        quarter_image[k] = (image[k] * period + row) * period + col
+        table = image[k]
+        image[k] = size * table
+        bound_image[k] = bound_size * ((table * side + (row >> step_level)) * side + (col >> step_level))
+        quarter_image[k] = quarter_size * ((table * period + row) * period + col)

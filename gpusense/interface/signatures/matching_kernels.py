@@ -91,9 +91,10 @@ KERNELS: dict[str, Kernel] = {
     ),
     "place_ends": kernel(
         "search_ends", "worker item", "double end [2 * ends]", "double heading [2 * items]", "double start [2 * scans]",
-        "int first [items + 1]", "int image [points]", "out int2 point [points]", "out int2 folded [points]",
+        "int first [items + 1]", "out int image [points]", "out int2 point [points]", "out int2 folded [points]",
         "out int bound_image [points]", "out int quarter_image [points]", "int items", "int turns", "int stride",
         "int level", "int step_level", "int offset", "int workers",
+        "int size", "int bound_size", "int quarter_size",
     ),
     "pack_rows": kernel(
         "search", "col line image", _CELLS, f"out int packed [{_size('scores')}]", "ScoreTable scores",

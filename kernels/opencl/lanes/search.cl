@@ -14,7 +14,7 @@ kernel void shift_scores(ARGUMENTS) {
     int some = 0;
     for (int i = 0; i < rows; ++i)
         for (int j = 0; j < cols; ++j) some |= allowed[(row + i) * width + col + j];
-    const int stride = padded_stride(scores), size = padded_lines(scores) * stride, together = 255 / (TOP / unit);
+    const int stride = padded_stride(scores), together = 255 / (TOP / unit);
     const int last = some ? first[item + 1] : first[item];
     uint total[SHIFT_ROWS][RUN] = {{0}};
     for (int k = first[item]; k < last;) {
@@ -27,7 +27,7 @@ kernel void shift_scores(ARGUMENTS) {
             for (int i = 0; i < SHIFT_ROWS; ++i) few[i] = (uint8)0;
             const int stop = last - k > together ? k + together : last;
             for (; k < stop; ++k) {
-                global const uchar *cells = (global const uchar *)table + image[k] * size +
+                global const uchar *cells = (global const uchar *)table + image[k] +
                                             block_index(scores, point[k].y + row, point[k].x + col, SHIFT_ROWS - 1, RUN - 1);
 #pragma unroll
                 for (int i = 0; i < SHIFT_ROWS; ++i) few[i] += *(global const unaligned *)(cells + i * stride);

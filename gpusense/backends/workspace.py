@@ -321,38 +321,50 @@ class RecordedProgram:
         self.recording()
 
 
-class RepeatCache(ProgramCache[T]):
+class RepeatCache(Generic[T]):
     """Programs by their keys, each recorded once its key has occurred ``before`` times.
 
-    If ``patience`` is not 0, a full cache makes room only after this number of calls without a recording: a recording
-    takes as long as many calls, so that keys must not evict each other in turn.
+    A full cache evicts the program that was used least recently, but only after ``patience`` calls without it: a
+    recording takes as long as many calls, so that keys must not evict each other in turn.
     """
 
     def __init__(self, most: int, before: int, patience: int = 0) -> None:
-        super().__init__(most)
-        self._before, self._patience, self._since = before, patience, 0
+        self._most, self._before, self._patience, self._calls = most, before, patience, 0
+        # The least recently used first, each with the number of the call that used it last.
+        self._kept: dict[Hashable, tuple[T, int]] = {}
         # Numbers of calls by keys without a recording.
-        self._seen = ProgramCache[int](most)
+        self._seen = ProgramCache[int](2 * most)
 
-    def found(self, key: Hashable, record: Callable[[], T]) -> T | None:
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def found(self, key: Hashable, record: Callable[[], T | None]) -> T | None:
         """Return the program of a key, or record it; None if the key must occur again, or there is no room."""
-        self._since += 1
-        program = self.get(key)
-        if program is not None:
-            return program
-        seen = self._seen.get(key) or 0
-        if seen < self._before:
-            self._seen.keep(key, seen + 1)
-            return None
-        if self._patience and len(self) >= self._most:
-            if self._since < self._patience:
+        self._calls += 1
+        program, _ = self._kept.pop(key, (None, 0))
+        if program is None:
+            seen = self._seen.get(key) or 0
+            if seen < self._before:
+                self._seen.keep(key, seen + 1)
                 return None
-            super().clear()
-        self._since = 0
-        return self.keep(key, record())
+            oldest = next(iter(self._kept.items()), None) if len(self._kept) >= self._most else None
+            if oldest is not None and self._calls - oldest[1][1] <= self._patience:
+                return None
+            program = record()
+            if program is None:
+                return None
+            if oldest is not None:
+                del self._kept[oldest[0]]
+        self._kept[key] = program, self._calls
+        return program
+
+    def items(self) -> list[tuple[Hashable, T]]:
+        """Return the keys with their programs, the last used at the end."""
+        return [(key, program) for key, (program, _) in self._kept.items()]
 
     def clear(self) -> None:
-        super().clear()
+        """Drop all programs."""
+        self._kept.clear()
         self._seen.clear()
 
 

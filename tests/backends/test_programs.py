@@ -11,7 +11,14 @@ from support.tracking_scene import GRID
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.backends.workspace import ChangingProgram, ProgramCache, RecordedProgram, RepeatedPrograms, Workspace
+from gpusense.backends.workspace import (
+    ChangingProgram,
+    ProgramCache,
+    RecordedProgram,
+    RepeatCache,
+    RepeatedPrograms,
+    Workspace,
+)
 from gpusense.interface.launches import launch
 
 REAL, POSES = np.dtype(np.float64), np.array([(1.0, 1.0, 0.3), (1.2, 1.1, -0.4)])
@@ -80,7 +87,7 @@ def without_collector():
 
 def programs_of(owner):
     """Return weak references to the programs of an owner's caches."""
-    caches = [value for value in vars(owner).values() if isinstance(value, ProgramCache)]
+    caches = [value for value in vars(owner).values() if isinstance(value, (ProgramCache, RepeatCache))]
     return [weakref.ref(value) for cache in caches for _, value in cache.items() if not isinstance(value, tuple)]
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import logging
 import threading
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,14 +18,12 @@ from gpusense.backends.base import Backend, Exchange, Recording
 from gpusense.backends.processor import HELPERS
 from gpusense.backends.warp.arrays import stream_of
 from gpusense.backends.warp.queue import Copy, Step, as_graph, one_by_one, start_each
+from gpusense.backends.workspace import RepeatCache
 
 _LOG = logging.getLogger("gpusense")
 
-# Largest numbers of graphs, of keys of calls that were started once, and of calls that the driver does not capture.
-_MOST_GRAPHS, _MOST_SEEN = 256, 512
-# The least recently used graph is evicted after this number of calls without it, in multiples of ``_MOST_GRAPHS``: a
-# capture takes longer than the starts that it replaces.
-_STALE = 16
+# Largest number of graphs, and calls without a graph after which it makes room for another.
+_MOST_GRAPHS, _STALE = 256, 4096
 # Longer calls take so long that their starts do not matter.
 _MOST_STEPS = 64
 # Number of consecutive failures after which no more captures are tried.
@@ -49,11 +47,8 @@ class GraphCache:
     def __init__(self, device: wp.Device) -> None:
         self.refusal = ""
         self._device = device
-        # The least recently used first, each with the number of the call that used it last.
-        self._graphs: dict[Hashable, tuple[Any, int]] = {}
-        self._calls = 0
-        self._seen: dict[Hashable, None] = {}
-        self._refused: dict[Hashable, str] = {}
+        # By the keys of steps; a capture without a graph was refused by the driver.
+        self._graphs = RepeatCache[Capture](_MOST_GRAPHS, 1, _STALE)
         self._failures = 0
         self._lock = threading.Lock()
         self._stream: wp.Stream | None = None
@@ -64,15 +59,10 @@ class GraphCache:
             key = tuple([step.key for step in steps])
             # A graph must not be started by two threads at once.
             with self._lock:
-                self._calls += 1
-                graph, _ = self._graphs.pop(key, (None, 0))
-                if graph is None:
-                    graph = self._captured(key, steps)
-                if graph is not None:
-                    _remember(self._graphs, key, (graph, self._calls), _MOST_GRAPHS)
-                    wp.capture_launch(graph)
+                capture = self._graphs.found(key, lambda: self._captured(steps))
+                if capture is not None and capture.graph is not None:
+                    wp.capture_launch(capture.graph)
                     return
-                _remember(self._seen, key, None, _MOST_SEEN)
         for step in steps:
             step.replay()
 
@@ -83,21 +73,10 @@ class GraphCache:
         with self._lock:
             return self._capture(steps)
 
-    def _captured(self, key: Hashable, steps: list[Step]) -> Any:
-        """Return a graph of a call that was started before; None where there is none."""
-        if self._seen.pop(key, key) is not None or key in self._refused or not self._has_room():
-            return None
+    def _captured(self, steps: list[Step]) -> Capture | None:
+        """Return a capture of a call; None if another attempt may succeed."""
         capture = self._capture(steps)
-        if capture.final:
-            _remember(self._refused, key, capture.reason, _MOST_SEEN)
-        return capture.graph
-
-    def _has_room(self) -> bool:
-        """Return whether another graph may be kept."""
-        if len(self._graphs) < _MOST_GRAPHS:
-            return True
-        _, used = next(iter(self._graphs.values()))
-        return self._calls - used > _STALE * _MOST_GRAPHS
+        return capture if capture.final or capture.graph is not None else None
 
     def _capture(self, steps: list[Step]) -> Capture:
         """Capture steps if nothing prevents it.
@@ -142,13 +121,6 @@ def _other_threads() -> list[str]:
     """Return the names of threads that may wait for the device."""
     this = threading.current_thread()
     return [one.name for one in threading.enumerate() if one is not this and not one.name.startswith(HELPERS)]
-
-
-def _remember(entries: dict[Hashable, Any], key: Hashable, value: Any, most: int) -> None:
-    """Keep a value as the newest of at most ``most``."""
-    entries[key] = value
-    if len(entries) > most:
-        del entries[next(iter(entries))]
 
 
 # ---- recordings: programs whose launches are bound, started as one graph as soon as it can be captured

@@ -298,19 +298,20 @@ def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(batching, 
 
     device = batching[0]
     monkeypatch.setattr(_warp_graphs, "_MOST_GRAPHS", 2)
-    monkeypatch.setattr(_warp_graphs, "_MOST_SEEN", 2)
+    monkeypatch.setattr(device, "_graphs", _warp_graphs.GraphCache(device._device))
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=device)
     model.log_likelihood(cloud(0), scan(0))
     for count in (300, 200, 100, 50):
         for _ in range(3):
             model.log_likelihood(cloud(count, count), scan(1))
     # Two entries in use are never evicted for others, to avoid evicting in turn.
-    assert len(device._graphs._graphs) == 2 and len(device._graphs._seen) <= 2
-    held = {*device._graphs._graphs}
-    monkeypatch.setattr(_warp_graphs, "_STALE", 2)
+    graphs = device._graphs._graphs
+    assert len(graphs) == 2
+    held = {key for key, _ in graphs.items()}
+    monkeypatch.setattr(graphs, "_patience", 4)
     for _ in range(4):
         model.log_likelihood(cloud(50, 50), scan(1))
-    assert len(device._graphs._graphs) == 2 and {*device._graphs._graphs} != held
+    assert len(graphs) == 2 and {key for key, _ in graphs.items()} != held
 
     def refuse(*arguments, **options):
         raise RuntimeError("no graphs here")
@@ -319,7 +320,7 @@ def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(batching, 
     expected = plainly(device, monkeypatch, lambda: model.log_likelihood(cloud(1, 77), scan(1)))
     for _ in range(3):
         assert differing(model.log_likelihood(cloud(1, 77), scan(1)), expected) == 0
-    assert list(device._graphs._refused.values()) == ["the driver captured no graph: no graphs here"]
+    assert [capture.reason for _, capture in graphs.items()][-1] == "the driver captured no graph: no graphs here"
 
 
 def test_an_error_forgets_no_memory_that_launches_still_need(batching, monkeypatch):

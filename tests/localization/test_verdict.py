@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -343,6 +344,21 @@ def test_a_carried_robot_is_lost_within_a_few_scans(model):
     # The evidence names the robot's place.
     told = pf.diagnose()
     assert told.cause == "start" and math.dist(told.elsewhere[:2], (poses[-1] + np.array([3.5, 2.0, 0.0]))[:2]) < 0.3
+
+
+def test_a_pose_is_judged_at_each_scan_until_it_is_sure_and_then_after_half_a_metre(model):
+    monitor, judged = gs.PoseMonitor(model), []
+    for pose in circle(60, step=0.08):
+        before = monitor.state
+        monitor.update(pose, scan_at(pose))
+        if monitor.state.judged == monitor.state.corrections:
+            judged.append((pose, before.belief.wrong))
+    unsure = [wrong > 0.01 for _, wrong in judged]
+    first = unsure.index(False)
+    assert first > 1 and not any(unsure[first:]) and len(judged) < 30
+    for (pose, _), (after, _) in itertools.pairwise(judged[first - 1 :]):
+        way, turn = math.dist(pose[:2], after[:2]), abs(gs.wrap_angle(after[2] - pose[2]))
+        assert max(way, turn) > 0.49
 
 
 def test_people_and_a_state_that_is_put_back(model):
